@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     cls=Group,
     name="benchmarks",
-    help="Measure speed and error of every system and of its rivals.",
+    help="Measure the speed and the error of every system and of rival methods.",
     pretty_exceptions_enable=False,
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -38,26 +38,26 @@ def _option(kind: Any, flag: str, text: str, **more: Any) -> Any:
     return Annotated[kind, typer.Option(flag, help=text, **more)]
 
 
-_PROFILE = "The profile, by name or YAML file, that is varied."
+_PROFILE = "Name or YAML file of the profile whose settings are varied."
 # The annotation and the default of each option, by the name of its argument.
 _OPTIONS: dict[str, tuple[Any, Any]] = {
     "quick": (_option(bool, "--quick", "Measure fewer, smaller cases: minutes on a CPU."), False),
     "device": (Device, "cpu"),
-    "set_path": (_option(Path | None, "--set", "A lightmap set. Default: the demo's.", metavar="SET"), None),
-    "profiles": (_option(list[str] | None, "--profile", "A profile or YAML file. Repeatable.", metavar="NAME"), None),
+    "set_path": (_option(Path | None, "--set", "Lightmap set to measure. Default: the demo's.", metavar="SET"), None),
+    "profiles": (_option(list[str] | None, "--profile", "Profile or its YAML file. Repeatable.", metavar="NAME"), None),
     "profile": (_option(str, "--profile", _PROFILE, metavar="NAME"), "paper"),
-    "rivals": (_option(bool, "--rivals/--no-rivals", "Measure the rivals too, in minutes on a CPU."), True),
-    "rivals_only": (_option(bool, "--rivals-only", "Measure only the rivals."), False),
+    "rivals": (_option(bool, "--rivals/--no-rivals", "Measure rival methods too: minutes on a CPU."), True),
+    "rivals_only": (_option(bool, "--rivals-only", "Measure only the rival methods."), False),
     "rival_names": (_option(list[str] | None, "--rival", "Measure only this rival. Repeatable.", metavar="NAME"), None),
     "rivals_at": (
-        _option(Path | None, "--rivals-at", "Measure only the rivals, at our sizes in this file.", metavar="FILE.json"),
+        _option(Path | None, "--rivals-at", "Measure only rivals, at our models' sizes in FILE.", metavar="FILE.json"),
         None,
     ),
-    "probes_path": (_option(Path | None, "--probes", "Light probes. Default: the demo's.", metavar="FILE"), None),
-    "keys": (_option(list[str] | None, "--key", "Array of --probes to measure. Repeatable."), None),
+    "probes_path": (_option(Path | None, "--probes", "Light probe file. Default: the demo's.", metavar="FILE"), None),
+    "keys": (_option(list[str] | None, "--key", "Name of an array of --probes to measure. Repeatable."), None),
     "volume_only": (_option(bool, "--volume-only", "Measure only the cascaded probe volume."), False),
     "meshes_path": (
-        _option(Path | None, "--meshes", "Folder of a mesh, or of such folders: .glb, .exr, mask.png.", metavar="DIR"),
+        _option(Path | None, "--meshes", "Folder of a .glb, its .exr and mask.png, or of such folders.", metavar="DIR"),
         None,
     ),
     "mesh_path": (_option(Path | None, "--mesh", "One mesh in place of --meshes.", metavar="FILE"), None),
@@ -65,23 +65,23 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
         _option(list[Path] | None, "--lightmap", "A lightmap of --mesh. Repeatable.", metavar="FILE.exr"),
         None,
     ),
-    "mask_path": (_option(Path | None, "--mask", "The mask of --lightmap.", metavar="FILE.png"), None),
+    "mask_path": (_option(Path | None, "--mask", "Image of the valid texels of --lightmap.", metavar="FILE.png"), None),
     "scene_path": (_option(Path, "--set", "A lightmap set that names its mesh.", metavar="SET"), ...),
     "hours": (_option(list[float] | None, "--hour", "An hour to measure. Repeatable; default: all."), None),
     "side": (_option(int | None, "--side", "Texels of the set's longer side after downsampling.", min=1), None),
-    "budget": (_option(float | None, "--budget", "Share of the uncompressed bits. Default: the profile's."), None),
-    "parts": (_option(bool, "--parts/--no-parts", "Measure each object and state alone at equal bits, too."), True),
+    "budget": (_option(float | None, "--budget", "Maximum share of the input's bits. Default: the profile's."), None),
+    "parts": (_option(bool, "--parts/--no-parts", "Also compress each object in each state alone."), True),
     "steps": (_option(int | None, "--steps", "Steps of each fit. Default: the profile's.", min=1), None),
     "only": (
         _option(list[str] | None, "--only", "A variant to measure. Repeatable; default: all.", metavar="ROW"),
         None,
     ),
     "networks": (
-        _option(list[Path] | None, "--network", "A trained network. Default: ours. Repeatable.", metavar="FILE"),
+        _option(list[Path] | None, "--network", "File of a trained network. Repeatable.", metavar="FILE"),
         None,
     ),
     "json_path": (
-        _option(Path | None, "--json", "Write the rows and the environment to this file.", metavar="FILE.json"),
+        _option(Path | None, "--json", "Write results and machine to this result file.", metavar="FILE.json"),
         None,
     ),
 }
@@ -93,7 +93,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("rivals_only", "rival_names", "quick", "profiles", "rivals", "device", "set_path"),
     ),
     "lightmap-ablation": (
-        "Measure lightmaps over time with other feature maps of the same size, and without block simulation.",
+        "Measure lightmaps over time: other feature maps of equal size, or no simulation of block compression.",
         ("quick", "device", "set_path", "steps", "only"),
     ),
     "probe": (
@@ -105,7 +105,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("rivals_at", "quick", "rivals", "device", *_MESHES, "profiles"),
     ),
     "atlas-scene": (
-        "Measure scenes: PSNR of all objects and hours in one model, and of each alone in as many bits.",
+        "Measure scenes: PSNR of one model of all objects and hours, and of a model for each in as many bits.",
         ("scene_path", "hours", "side", "profiles", "budget", "parts", "quick", "device"),
     ),
     "atlas-ablation": (
@@ -117,7 +117,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("quick", "device"),
     ),
     "smoke-orders": (
-        "Measure smoke with light of all orders: PSNR, FLIP, flicker and time of our method and its rivals.",
+        "Measure multiple scattering in smoke: PSNR, FLIP, flicker and time of our method and its rivals.",
         ("quick", "device"),
     ),
     "smoke-network": (
@@ -173,7 +173,7 @@ def _measure(name: str, values: dict[str, Any]) -> None:
 
 
 def _words(values: Mapping[str, Any]) -> list[str]:
-    """Returns command line words, such as "--device cuda:0": flags that are not at their default, all set values."""
+    """Returns the command line words that set the given options, without unset ones and flags at their default."""
     words = []
     for option, value in values.items():
         # typer keeps the first argument of `typer.Option`, which is the flag in an `Annotated`, as `default`.
@@ -192,17 +192,17 @@ for _name, (_summary, _options) in _COMMANDS.items():
     _add_command(_name, _summary, _options)
 
 
-_Results = Annotated[list[Path], typer.Argument(metavar="FILE.json...", help="Files that --json wrote.")]
+_Results = Annotated[list[Path], typer.Argument(metavar="FILE.json...", help="Result files that --json wrote.")]
 
 
 @app.command()
 def report(
     files: _Results,
     output: Annotated[
-        Path | None, output_option("INDEX.md", "The index; the pages go to a folder beside it. Default: print them.")
+        Path | None, output_option("INDEX.md", "Index to write; the pages go to a folder beside it. Default: print.")
     ] = None,
 ) -> None:
-    """Write result files as Markdown pages: an index, and one page for each system."""
+    """Convert result files to Markdown: an index, and one page for each system."""
     from benchmarks import pages
 
     if output is None:
@@ -240,13 +240,13 @@ def compare(
     new: Annotated[Path, typer.Argument(metavar="NEW.json", help="Results of the changed code.")],
     old: Annotated[Path, typer.Argument(metavar="OLD.json", help="Results of the code before the change.")],
 ) -> None:
-    """Compare two result files; fail if NEW has lost over 0.05 dB, or takes over 5% longer on the same machine."""
+    """Compare two result files; fail if NEW is over 0.05 dB worse, or over 5% slower on the same machine."""
     from benchmarks import FIGURES, read_runs
     from benchmarks import compare as changes_between
 
     changes = [change for run in read_runs(new) for change in changes_between(run, read_runs(old))]
     if not changes:
-        raise WlmError(f"{old}: expected rows of the same method, option and scene, found none")
+        raise WlmError(f"{old}: no row has the method, option and scene of a row of {new}")
     worse = [change for change in changes if change.worse]
     for change in worse:
         row, figure = change.row, FIGURES[change.name]

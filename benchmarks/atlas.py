@@ -1,16 +1,17 @@
-"""The atlas system against smaller lightmaps and block codecs: size, speed and error.
+"""Lightmaps compressed by `wlm.atlas`, against smaller lightmaps and block codecs: size, speed and error.
 
 For each lightmap of each mesh the results table has these kinds of rows:
 
-- method "ours", one row for each profile: the size of the file, the time to compress and write it, the error in views
-  from all around the mesh, and the time to read a million random points of its surface. A full run also measures the
-  first profile at the size of the first cascade, and at compression ratios (CR) of 92.5% and 95%.
+- method "ours", one row for each profile, a set of options: size of the file, time to compress and write it, error in
+  views from all around the mesh, and time to read a million random points of its surface. A full run also measures the
+  first profile at compression ratios (CR) of 92.5% and 95%, and in as many bits as the first profile of method
+  "cascade" takes.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
 - the rivals of `benchmarks.rivals.atlas` in as many bits as the first profile takes; in a full run also in as many as
-  each other profile takes. Bits are counted by eq. 9 of lightmap-uv-clustering-cascade, which leaves out UVs and
+  every other profile takes. Bits are counted by eq. 9 of lightmap-uv-clustering-cascade, which leaves out UVs and
   headers. A rival has no file, so its size in bytes is that number of bits.
-- method "fit", of the first lightmap alone: the cascade tuned in rendered views, as the paper does it, and tuned at
-  points of the surface; the time is that of the tuning alone.
+- method "fit", for the first lightmap alone: the textures of the cascade fitted in rendered views, as in the paper, and
+  fitted in UV space; the time is that of this fit alone.
 
 If there are several lightmaps, the last rows are means over all of them, with the minimum and maximum of some figures;
 the largest error of such a row is the maximum over the lightmaps.
@@ -49,7 +50,7 @@ from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
 from wlm.errors import WlmError
 
 PROFILES = ("standard", "astc", "cascade", "paper")
-"""Profiles of a run; the first has the bits of the first cascade too."""
+"""Profiles of a run. A full run also measures the first one in as many bits as "cascade" takes."""
 
 _RIVALS = {
     "downsampling": "downsampling",
@@ -69,7 +70,7 @@ _POINTS = 1_000_000
 _CHECKED = 1 << 17  # points that are compared with float64
 _SAME = 0.01  # shares of bits that differ by less are equal
 SCORES = ("psnr", "psnr_worst", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
-"""Figures of a row that are those of a `Score`."""
+"""Figures of a row that are copied from a `Score`, by name."""
 
 # Figures whose least and most are stated too.
 _RANGED = ("psnr", "texel_psnr", "tone_psnr", "one_minus_ssim", "flip", "seam_ratio")
@@ -103,15 +104,15 @@ def run(
     progress: Note | None = None,
     **paths: Any,
 ) -> list[Row]:
-    """Measures the atlas system.
+    """Measures lightmaps compressed by `wlm.atlas` and by rivals.
 
     Args:
-        quick: 8 small views instead of 50, the cascade tuned for a few steps, rivals at one size: under 90 seconds on
-            two CPU cores with the demo's mesh. The cascade's fit is not finished, so its error is large.
+        quick: Whether to render 8 small views instead of 50, fit the cascade in a few steps and measure rivals at one
+            size: under 90 seconds on two CPU cores with the demo's mesh. The unfinished cascade has a large error.
         device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
         profiles: Names or YAML files of profiles; None: `PROFILES`.
         rivals: Whether to measure block codecs, which take minutes on the CPU. Downsampling is always measured.
-        rivals_at: Measure only the rivals, on the CPU, in as many bits as our models took in this result file.
+        rivals_at: A result file. If given, only rivals are measured, on the CPU, in as many bits as our models in it.
         progress: Called with a line before each part of the work.
         paths: The arguments of `read_lightmaps`.
 
@@ -119,8 +120,8 @@ def run(
         The rows of each lightmap, in the order in which the module's docstring lists them, then their means.
 
     Raises:
-        WlmError: A file, a profile or the device does not exist, options contradict each other, the result file has no
-            row of a lightmap, or a compression failed.
+        WlmError: A file, a profile or the device does not exist, options contradict each other, the result file lacks
+            a lightmap, or a compression failed.
     """
     device = interop.check_device(device)
     loaded = [Profile.load(name) for name in profiles or PROFILES]
@@ -178,12 +179,12 @@ def read_lightmaps(
     for each in (folder, *sorted(path for path in folder.iterdir() if path.is_dir())):
         meshes, images = sorted(each.glob("*.glb")), sorted(each.glob("*.exr"))
         if len(meshes) > 1:
-            raise WlmError(f"{each}: expected one .glb a folder, found {len(meshes)}")
+            raise WlmError(f"{each}: expected one .glb file in the folder, found {len(meshes)}")
         if meshes and images:
             mask = each / "mask.png"
             lightmaps += _lightmaps(meshes[0], images, mask if mask.is_file() else None)
     if not lightmaps:
-        raise WlmError(f"{folder}: expected a .glb and its .exr in it or in folders of it, found none")
+        raise WlmError(f"{folder}: expected a .glb file and its .exr lightmaps, there or one folder below, found none")
     return lightmaps
 
 
@@ -208,7 +209,7 @@ def rival_rows(
         The rows of the rivals, measured on the CPU, and their means.
 
     Raises:
-        WlmError: `results` can't be read, or has no row of a lightmap.
+        WlmError: `results` can't be read, or lacks a lightmap.
     """
     ours = [row for row in read_json(results)[0] if (row.system, row.method) == ("atlas", "ours")]
     rows: list[Row] = []
@@ -219,7 +220,7 @@ def rival_rows(
             if row.scene == lightmap.scene and row.option in _HELD_TO and row.get("bpp")
         }
         if not shares:
-            raise WlmError(f"{results}: expected a row of method ours of {lightmap.scene}")
+            raise WlmError(f"{results}: expected a row of the method 'ours' and the scene {lightmap.scene}, found none")
         bench = _AtlasBench(lightmap, "cpu", progress, 1)
         rows += bench.scored(bench.rivals(shares, _METHODS), VIEWS, RESOLUTION)
     return rows + means(rows, len(lightmaps))
@@ -238,21 +239,21 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles. Arguments that are not listed here are as for `run`.
+    """Measures lightmaps with the given profiles. Arguments that are not listed here are as for `run`.
 
     Args:
         lightmaps: At least one lightmap.
-        profiles: At least one profile; the rivals get as many bits as the first one takes.
+        profiles: At least one profile; the rivals get as many bits as the model of the first profile takes.
         views, resolution: Number of cameras for the error, and pixels along a side of their pictures.
-        whole: Whether to measure the first profile also at the size of a cascade and at the compression ratios of
-            `_SMALLER`, and the rivals at the sizes of all profiles.
+        whole: Whether to measure the first profile also in as many bits as a cascade takes and at the compression
+            ratios `_SMALLER`, and the rivals at the sizes of all profiles.
         methods: Names of the rivals.
         points: Number of surface points that a timed decode reads.
         repeats: As for `Bench`.
     """
     if not lightmaps or not profiles:
         raise ValueError("expected at least one lightmap and one profile")
-    (progress or (lambda line: None))("compiling")
+    (progress or (lambda line: None))("compiling kernels")
     for profile in profiles:
         warm_up(profile, device)
     rows: list[Row] = []
@@ -280,7 +281,7 @@ def _smaller_name(profile: Profile, cr: float) -> str:
 
 
 def _share(row: Row) -> float:
-    """Returns the compressed size as a fraction of the lightmap's bits, both as eq. 9 counts them."""
+    """Returns the compressed size as a fraction of the lightmap's bits; both are counted by the paper's eq. 9."""
     return row["bpp"] / SOURCE_BITS
 
 
@@ -312,7 +313,7 @@ class _AtlasBench(Bench):
         self.triangle, self.weight = _surface_points(self.lit.sheets[0], points, np.random.default_rng(0))
 
     def ours(self, profiles: Sequence[Profile], whole: bool) -> list[_Entry]:
-        """Compresses by each profile; if `whole`, by the first also at smaller sizes and at the size of a cascade."""
+        """Compresses with each profile and, if `whole`, with the first one to smaller sizes and to a cascade's size."""
         entries = [self.entry(profile, profile.name) for profile in profiles]
         if not whole or profiles[0].method != "tiles":
             return entries
@@ -328,7 +329,7 @@ class _AtlasBench(Bench):
         return entries
 
     def entry(self, profile: Profile, option: str) -> _Entry:
-        """Compresses by a profile, writes the file and reads it back. Returns an entry with sizes and times."""
+        """Compresses with a profile, writes the file and reads it back. Returns an entry with sizes and times."""
         self.note(f"{option}: compressing")
         fit = self.fit(option, lambda: compress(self.lit, profile, device=self.device))
         model = replace(fit.model, report=fit.fitted.report)  # the file leaves the stages' times out
@@ -353,7 +354,7 @@ class _AtlasBench(Bench):
         return _Entry(row, Decoder(model, self.device), decode, model)
 
     def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
-        """Tunes the first cascade in rendered views and in UV space. Returns an entry for each of the two."""
+        """Fits the first cascade's textures in rendered views and in UV space. Returns an entry for each fit."""
         cascade = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
         if cascade is None:
             return []
@@ -376,7 +377,7 @@ class _AtlasBench(Bench):
         return tuned
 
     def original(self, model: AtlasModel) -> _Entry:
-        """Makes the entry of the uncompressed lightmap, read at the same points as a model."""
+        """Makes the entry of the uncompressed lightmap, whose decoder reads it at the surface points."""
         model = replace(
             model,
             method="plain",
@@ -392,16 +393,16 @@ class _AtlasBench(Bench):
         return _Entry(self.row("lightmap", "half floats", "as it is", **figures, **errors), decode=decode)
 
     def timed(self, entries: Sequence[_Entry]) -> list[_Entry]:
-        """Times the decoders of all entries that have one, in turns. Returns the entries with their times."""
+        """Times the decoders of all entries in turns. Returns the entries with their times."""
         peers = [entry for entry in entries if entry.decode is not None]
         rows = self.time_rows([(entry.row, entry.decode) for entry in peers])
         timed = {id(entry): row for entry, row in zip(peers, rows, strict=True)}
         return [replace(entry, row=timed.get(id(entry), entry.row)) for entry in entries]
 
     def rivals(self, shares: dict[str, float], methods: Sequence[str]) -> list[_Entry]:
-        """Compresses by the rivals in as many bits as each of our profiles takes; some rivals have one fixed size.
+        """Compresses with the rivals to as many bits as each of our profiles takes.
 
-        A rival that needs fewer bits for the whole lightmap at full resolution is not measured twice.
+        A rival that has reached the lightmap's full resolution is not measured again with more bits.
 
         Args:
             shares: Compressed size of each profile as a fraction of the lightmap's bits, by the profile's name.
@@ -424,7 +425,7 @@ class _AtlasBench(Bench):
         return entries
 
     def _rival(self, method: str, option: str, make: Callable[[], Rival]) -> _Entry:
-        self.note(f"{method}, {option}")
+        self.note(f"compressing: {method}, {option}")
         try:
             rival = make()
         except (WlmError, ValueError) as error:  # a package is missing, or nothing fits
@@ -455,7 +456,7 @@ class _AtlasBench(Bench):
         return rows
 
     def _decode(self, model: AtlasModel) -> tuple[Callable[[], object], dict[str, float]]:
-        """Returns a call that decodes the surface points, and its errors against a float64 decode."""
+        """Returns a call that decodes a model at the surface points, and its errors against a float64 decode."""
         decoder = Decoder(model, self.device)
         sheet = self.lit.sheets[0]
         corner = model.uv if len(model.uv) else sheet.uv[sheet.triangle]

@@ -5,12 +5,12 @@ lightmap, even if that has less error. The rows of method "ablation":
 
 - "whole": the profile without a change.
 - "no repacking": the mesh keeps its UVs, and the cascade begins as the lightmap itself (table 3).
-- "no cascade": the repacked lightmap as it is, without a lookup table and without tuning (table 3).
-- "not tuned": the cascade before it is tuned.
-- "ASTC": the texture T_p in blocks of 4 x 4 texels (table 2).
+- "no cascade": the repacked lightmap as it is, without a lookup table and without a fit (table 3).
+- "not tuned": the cascade before its textures are fitted.
+- "ASTC": the colour texture T_p in ASTC blocks of 4 x 4 texels (table 2).
 
-Rows of method "sweep" (figure 7) change one size factor: epsilon ("scale"), epsilon_p ("colour_scale") or epsilon_c
-("lut_scale").
+Rows of method "sweep" (figure 7) change one of the paper's size factors: epsilon ("scale"), epsilon_p ("colour_scale")
+or epsilon_c ("lut_scale").
 
 Triangles are grouped once per lightmap, and the time of this is not counted. The error at seams is measured at chart
 borders, in the UVs of the variant. A texel of half floats counts as 64 bits, as on a GPU; the paper counts 48.
@@ -57,7 +57,7 @@ SWEEPS = {
     "colour_scale": (0.2, 0.3, 0.4, 0.5, 0.6, 0.8),
     "lut_scale": (0.3, 0.5, 0.6, 0.7, 0.8, 1.0),
 }
-"""The values of each swept setting."""
+"""The values that rows of method "sweep" give to each setting."""
 
 _SEED = 0
 _QUICK = {"steps": 200, "resolution": 256}
@@ -79,7 +79,7 @@ def run(
     Args:
         profile: A profile of method "cascade": its name or a YAML file.
         only: Names of the variants to measure; None: all.
-        quick: Short fits in small views, which show on a CPU that everything works: the fits are not finished.
+        quick: Whether to make short fits in small views, which only show on a CPU that everything works.
         device: "cpu" or "cuda:0".
         steps: Steps of each fit; None: as the profile states.
         progress: Called with a line before each part of the work.
@@ -114,11 +114,11 @@ def run_rows(
     progress: Note | None = None,
     done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
-    """Fits the variants of a profile; errors are measured in `views` square pictures. Other arguments: see `run`."""
+    """Fits the variants of a profile and measures errors in `views` square pictures. Other arguments: see `run`."""
     chosen = choose(profile, only)
     of = f", ablation of {profile.name}"
     first = Bench("atlas", device, progress)
-    first.note("compiling")
+    first.note("compiling kernels")
     warm_up(profile, first.device)
     rows: list[Row] = []
     for lightmap in lightmaps:
@@ -130,10 +130,9 @@ def run_rows(
 
 
 def variants(base: Profile) -> list[tuple[str, str, Profile]]:
-    """Returns method, option and profile settings of all variants; a sweep leaves out the profile's own value.
+    """Returns the variants of a profile: the method and the option that a row states, and the changed profile.
 
-    Args:
-        base: The profile of which each variant changes one setting.
+    Values of `SWEEPS` that the profile already has are left out.
     """
     rows = [("ablation", name, base.override(changes)) for name, changes in ABLATION.items()]
     for setting, values in SWEEPS.items():
@@ -144,7 +143,7 @@ def variants(base: Profile) -> list[tuple[str, str, Profile]]:
 
 
 def choose(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]:
-    """Returns the requested variants of a profile, as `variants` does for all.
+    """Returns the requested variants of a profile, in the form that `variants` returns.
 
     Args:
         base: The profile of which each variant changes one setting.
@@ -154,7 +153,7 @@ def choose(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]
         WlmError: The profile is not a cascade, or no variant has such a name.
     """
     if base.method != "cascade":
-        raise WlmError(f"--profile: expected one of method cascade, found {base.name}, which has method {base.method}")
+        raise WlmError(f"--profile: expected a profile of method cascade, found {base.name} of method {base.method}")
     rows = variants(base)
     check_only(only, [option for _, option, _ in rows])
     return [row for row in rows if not only or row[1] in only]
@@ -175,7 +174,7 @@ def _rows(
         clusters = group_triangles(scene.sheets[0], base, Stages(device))
     rows, models = [], {}
     for i, (method, option, variant) in enumerate(chosen):
-        bench.note(option)
+        bench.note(f"fitting {option}")
         stages, start = Stages(device), time.perf_counter()
         try:
             model = fit_cascade(scene, clusters, variant, _SEED, stages, repack=option != KEPT_UVS)

@@ -9,8 +9,8 @@ The results table has a row of method "scene" for each profile: file size, times
 error in views of the whole scene. A row of method "parts" follows it: every object in every state is compressed alone
 by the profile `standard` (`benchmarks.rivals.scene_parts`), in the same total number of bits or a few more.
 
-"gain" is the mean PSNR of the scene over views and states, minus that of the parts; "least gain" is this difference in
-the state where it is smallest.
+"gain" is the mean PSNR of the scene's model over views and states, minus the mean PSNR of the parts; "least gain" is
+this difference in the state where it is smallest.
 """
 
 import math
@@ -70,9 +70,9 @@ def run(
     Args:
         scene_path, hours, side: As `path`, `hours` and `side` of `read_scene`.
         profiles: Names or YAML files of profiles; None: `PROFILES`.
-        budget: The share of the uncompressed bits that replaces the budget of the profiles; None: their own.
+        budget: Maximum share of the uncompressed bits, in place of the budget of each profile; None: not replaced.
         parts: Whether to measure the models of single objects too, which take most of the time.
-        quick: Few small views, for a CPU.
+        quick: Whether to measure errors in few small views, for a CPU.
         device: "cpu" or "cuda:0".
         progress: Called with a line before each part of the work.
 
@@ -98,8 +98,8 @@ def run_rows(
     resolution: int = SHARED_RESOLUTION,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures a scene against its parts in a number of cameras around the scene and as many from inside, whose
-    pictures have `resolution` pixels along a side. Other arguments are as for `run`."""
+    """Measures a scene's model against models of its objects, in `views` cameras around the scene and as many inside.
+    Pictures have `resolution` pixels along a side. Other arguments are as for `run`."""
     profiles = [Profile.load(name) for name in names]
     if budget is not None:
         profiles = [profile.override({"budget": budget}) for profile in profiles]
@@ -112,8 +112,6 @@ def run_rows(
 
 
 class _SceneBench(Bench):
-    """The benchmark of one scene, with the views in which errors are measured."""
-
     def __init__(
         self, title: str, scene: LightmappedScene, device: str, views: tuple[int, int], progress: Note | None
     ) -> None:
@@ -122,11 +120,11 @@ class _SceneBench(Bench):
         self._varies = variation(scene, peaks_of(scene), device)
 
     def rows(self, profile: Profile, parts: bool) -> list[Row]:
-        """Returns the row of the scene and, if `parts`, the row of its objects compressed one by one."""
+        """Returns the row of the scene and, if `parts`, the row of its objects compressed alone in each state."""
         scene, device = self._scene, self.device
-        self.note(f"{profile.name}: compiling")
+        self.note(f"{profile.name}: compiling kernels")
         compress(_small(len(scene.states)), profile.override({"budget": 1.0, "views": 1}), device=device)
-        self.note(f"{profile.name}: compressing")
+        self.note(f"{profile.name}: compressing the scene")
         fit = self.fit(profile.name, lambda: compress(scene, profile, device=device))
         model = fit.model
         stages = {f"{name}_seconds": seconds for name, seconds in fit.fitted.report["seconds"].items()}
@@ -144,7 +142,7 @@ class _SceneBench(Bench):
         )
         rows = [row]
         if parts:
-            self.note(f"{profile.name}: {len(scene.sheets) * len(scene.states)} parts")
+            self.note(f"{profile.name}: compressing {len(scene.sheets) * len(scene.states)} lightmaps alone")
             weights = scene_weights(scene, self._varies, profile, _SEED, device)
             alone = scene_parts(scene, weights, model.bits, profile.colour, device)
             decoders["parts"] = alone
@@ -156,7 +154,7 @@ class _SceneBench(Bench):
                     "parts", f"bits of {profile.name}", notes, bpp=self._bpp(alone.bits), compression_ratio=1.0 - share
                 )
             )
-        self.note("scoring")
+        self.note("measuring errors in views")
         scores = compare(scene, decoders, device=device, **self._views)
         for number, name in enumerate(scores):
             figures = {each: getattr(scores[name], each) for each in ("psnr", "psnr_worst", "texel_psnr")}
@@ -175,7 +173,7 @@ class _SceneBench(Bench):
 
 
 def _small(states: int) -> LightmappedScene:
-    """Makes a square with this number of lighting states; compressing it compiles all kernels before the timing."""
+    """Makes a scene of one square in this many lighting states, whose compression compiles all kernels beforehand."""
     side = np.linspace(0.1, 1.0, 32)
     image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
@@ -203,17 +201,17 @@ def read_scene(
     """
     lightmaps = load_set(path, trust=trust).light
     if lightmaps.mesh is None:
-        raise WlmError(f"{path}: expected a set with a mesh")
+        raise WlmError(f"{path}: expected a lightmap set that names its mesh")
     for hour in hours:
         if not np.isclose(lightmaps.times, hour).any():
             raise WlmError(f"{path}: no lightmap of {hour:g} h; it has {', '.join(f'{t:g}' for t in lightmaps.times)}")
     chosen = np.isclose(lightmaps.times[:, None], np.array(hours or lightmaps.times)).any(1)
     longest = max(lightmaps.mask.shape)
     if side is not None and not (0 < side <= longest and longest % side == 0):
-        raise WlmError(f"{path}: side: expected a divisor of {longest}, got {side}")
+        raise WlmError(f"{path}: side: expected a divisor of the longer side, {longest} texels, got {side}")
     primitives = [each for each in read_gltf(lightmaps.mesh, trust)[1] if 0 in each.uv]
     if not primitives:
-        raise WlmError(f"{lightmaps.mesh}: expected triangles with TEXCOORD_0")
+        raise WlmError(f"{lightmaps.mesh}: expected triangles with the attribute TEXCOORD_0, found none")
     first = np.cumsum([0, *(len(each.position) for each in primitives)])
     arrays = (
         np.concatenate([each.position for each in primitives]),
@@ -261,7 +259,7 @@ def cut(
 def _piece(
     frames: np.ndarray, inside: np.ndarray, corner: np.ndarray, number: int, factor: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Downsamples a chart in M states. Returns light [M, h, w, 3], mask [h, w], and x and y of its first texel."""
+    """Downsamples a chart. Returns light [states, h, w, 3], mask [h, w], and x and y of the chart in the lightmaps."""
     height, width = inside.shape
     low = np.floor(corner.min(0)).clip(0, (width - 1, height - 1)).astype(int) // factor * factor
     high = np.maximum(np.ceil(corner.max(0)).astype(int), low + 1)

@@ -20,7 +20,7 @@ class Change:
         name: Name of the figure in `benchmarks.figures`.
         old, new: Values of the figure before and after.
         worse: Whether a figure in dB fell by more than 0.05 dB, or a time grew by more than 5% and by more than the
-            samples of the timing scatter.
+            scatter of its samples.
     """
 
     row: Row

@@ -52,7 +52,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "gain": Figure("gain", "dB", "+.3f"),  # PSNR minus the PSNR of another method
         "psnr_worst": Figure("worst view", "dB", ".2f"),
         "texel_psnr": Figure("texels", "dB", ".2f"),
-        "tone_psnr": Figure("tone mapped", "dB", ".2f"),  # as a screen shows it, `wlm.atlas.display`
+        "tone_psnr": Figure("tone mapped", "dB", ".2f"),  # as a screen shows it, `wlm.atlas.evaluation`
         "irradiance_psnr": Figure("irradiance", "dB", ".2f"),
         "nearest_psnr": Figure("nearest", "dB", ".2f"),  # interpolation of uncompressed probes, as the next figure
         "distance_psnr": Figure("by distance", "dB", ".2f"),
@@ -61,7 +61,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "network_psnr": Figure("network", "dB", ".2f"),
         "opacity_psnr": Figure("opacity", "dB", ".2f"),
         "emission_psnr": Figure("emission", "dB", ".2f"),
-        "seen": Figure("seen", "dB", ".2f"),  # these as in `wlm.lightmap.seen`
+        "seen": Figure("seen", "dB", ".2f"),  # this and the next ones as in `wlm.lightmap.view_scores`
         "worst_seen": Figure("worst", "dB", ".2f"),
         "ring": Figure("ring", "dB", ".2f"),
         "between": Figure("between", "dB", ".2f"),

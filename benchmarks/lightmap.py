@@ -5,15 +5,16 @@ The results table has these kinds of rows:
 - method "ours", one row for each profile: file size, time of the fit, errors of the float decode against the input,
   time to decode the whole map to 8 bits by the fast kernel, and time to unpack one tile of the file. The largest error
   is in units of radiance, against a float64 decode.
-- methods "exact" (kernel of one texel per thread) and "strip" (the fast kernel), one row for each form of the GELU, and
-  on CUDA "matrix" (the fast kernel on matrix units), all of profile M: the error of the 8-bit output against the input,
-  and its largest error against a float64 decode, where 1 stands for 255 levels. Rounding to 8 bits alone errs by
-  0.00196, half a level.
+- methods "exact" (a kernel of one texel per thread) and "strip" (the fast kernel), one row for each way to compute the
+  network's GELU, and on CUDA "matrix" (the fast kernel on matrix units), all of profile M: error of the 8-bit output
+  against the input, and largest error against a float64 decode, where 1 stands for 255 levels. Rounding to 8 bits
+  alone errs by 0.00196, half a level.
 - method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
-  (`wlm.lightmap.runtime_texture`), its errors and how long it takes from the stored bytes.
+  (`wlm.lightmap.runtime_texture`): its errors, and the time to decode it.
 - the rivals of `benchmarks.rivals.lightmap`, on the same lightmaps: block codecs, temporal PCA, a neural texture codec
   and a video codec; between stored times their lightmaps are interpolated linearly.
-- method "fit", one row for each profile: the speed of the fit alone; and some steps of the same fit in plain torch.
+- method "fit", one row for each profile: the speed of the fit alone. Method "fit in plain torch" has the speed of the
+  same fit in torch, over some steps.
 
 Profiles and rivals also have the errors of `wlm.lightmap.view_scores`: at times half-way between two scored times, and
 in a full run also in rendered views.
@@ -95,17 +96,17 @@ def run(
     rival_names: Sequence[str] | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the lightmap system on one set.
+    """Measures the compression of one set of lightmaps over time.
 
     Args:
-        quick: Three profiles with short fits and a third of the rivals, scored at three times (9, 12 and 21 h if the
-            set has them): five minutes on two CPU cores for 16 tiles. The fits are not finished, so errors are large.
+        quick: Whether to fit three profiles for few steps, measure a third of the rivals, and measure errors at three
+            times only. This takes five minutes on two CPU cores for 16 tiles; the unfinished fits have large errors.
         device: "cpu" or "cuda:0", for fits and decodes.
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
         profiles: Names or YAML files of profiles; None: `QUICK_PROFILES` if `quick`, else `PROFILES`.
         rivals: Whether to measure the rivals too.
-        rivals_only: Measure only the rivals. They need no GPU, except those that are fitted.
-        rival_names: Measure only these keys of `benchmarks.rivals.lightmap.RIVALS`.
+        rivals_only: Whether to measure only the rivals. They need no GPU, except neural texture compression.
+        rival_names: Keys of `benchmarks.rivals.lightmap.RIVALS`. If given, only these rivals are measured.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -142,12 +143,12 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on a given set. Arguments that are not listed here are as for `run`.
+    """Measures given profiles on a given lightmap set. Arguments that are not listed here are as for `run`.
 
     Args:
-        lightmaps: The set.
+        lightmaps: The lightmap set.
         profiles: At least one profile. The ways to decode are measured with the profile "M", or else the first.
-        chosen: Indices of the times at which errors are measured, int [K], at least one.
+        chosen: Indices of the times at which errors are measured, at least one.
         rivals: Keys of `benchmarks.rivals.lightmap.RIVALS`.
         repeats: As for `Bench`.
     """
@@ -229,7 +230,7 @@ class _LightmapBench(Bench):
         self.scored_at = "" if whole else f"scored at {_hours(self.times)}; "
 
     def fit_profile(self, profile: Profile) -> Fit:
-        """Compresses the set by a profile, writes and reloads the file. Compiling of kernels is not timed."""
+        """Compresses the set with a profile, writes the file and reads it back. Kernels are compiled beforehand."""
         if profile.frames == "always":  # no kernel is compiled
             self.note(f"{profile.name}: encoding {self.grid.count} tiles")
             return self.fit(profile.name, lambda: compress(self.set, profile, device=self.device))
@@ -238,8 +239,8 @@ class _LightmapBench(Bench):
         return self.fit(profile.name, lambda: compress(self.set, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of a compressed model, and a call that decodes it to 8 bits, which is timed later."""
-        self.note(f"{fit.option}: scoring")
+        """Returns the row of a compressed model, and a call that decodes the model to 8 bits, for the timing."""
+        self.note(f"{fit.option}: measuring errors")
         model = fit.model.light
         decoder = SheetDecoder(model, self.device)
         frames = {t: decoder.frame(t) for t in self.times}
@@ -266,8 +267,8 @@ class _LightmapBench(Bench):
         return row, self._decode(self._decoders(model, "fast", None))
 
     def texture_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of the RGB9E5 texture with mips that a renderer samples, and a call that decodes it."""
-        self.note(f"{fit.option}: texture")
+        """Returns the row of the RGB9E5 texture that a renderer samples, and a call that decodes the texture."""
+        self.note(f"{fit.option}: measuring the texture")
         decoder = MapDecoder(fit.model.light, self.device)
 
         def frame(t: float) -> np.ndarray:
@@ -285,7 +286,7 @@ class _LightmapBench(Bench):
         return row, self.replay(decoder.decode)
 
     def option_row(self, fit: Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of one kernel and one form of the GELU, and a call that decodes the model to 8 bits so."""
+        """Returns the row of one decoding kernel with one form of the GELU, and a call that decodes with it."""
         self.note(f"{fit.option}: {path} decode with {gelu} GELU")
         model = fit.model.light
         decoders = self._decoders(model, path, gelu)
@@ -313,7 +314,7 @@ class _LightmapBench(Bench):
     def rival_row(self, name: str) -> Row:
         """Returns the row of a rival on the same lightmaps."""
         method = RIVALS[name]
-        self.note(method.label)
+        self.note(f"compressing: {method.label}")
         try:
             tally = self._tally(name)
             score = functools.partial(self._frame, name, tally)
@@ -335,7 +336,7 @@ class _LightmapBench(Bench):
         return self.row(method.title, method.option, "; ".join(filter(None, notes)), **figures)
 
     def fit_row(self, fit: Fit) -> Row:
-        """Returns the row of the fit's speed alone."""
+        """Returns the row with the speed of the fit alone."""
         profile = fit.model.profile
         return self.row(
             "fit",
@@ -349,14 +350,14 @@ class _LightmapBench(Bench):
         )
 
     def plain_rows(self, fit: Fit) -> list[Row]:
-        """Times some steps of the same fit in plain torch. Returns one row, or none if no tile is dynamic."""
+        """Times some steps of the same fit in plain torch. Returns one row, or none if no tile changes over time."""
         # What a file would hold is left out: the loss is the plain square, and the maps stay continuous.
         plain = {"metric_weight": 0.0, "quantise_from": 1.0, "freeze_from": 1.0}
         profile = fit.model.profile.model_copy(update=plain)
         targets = dynamic_targets(self.lightmaps, profile)
         if targets is None:
             return []
-        self.note(f"{fit.option}: the fit in plain torch")
+        self.note(f"{fit.option}: fitting in plain torch")
         axis = TimeAxis(self.lightmaps.times, self.lightmaps.period, profile.time_axis)
         peer = PlainFit(profile, axis, targets, device=self.device)
         peer.step().item()
@@ -383,7 +384,7 @@ class _LightmapBench(Bench):
         return image
 
     def _tiles(self, model: SheetModel) -> dict[str, int]:
-        """Returns the number of tiles of each kind; tiles without valid texels are not counted."""
+        """Returns the number of tiles of each kind: constant, static, dynamic and stored frames, but not empty."""
         kinds = count_kinds(model).items()
         return {f"{kind}_tiles": count for kind, count in kinds if count and kind != "empty"}
 
@@ -395,7 +396,7 @@ class _LightmapBench(Bench):
         decode: Callable[[float], np.ndarray] | None = None,
         views: int = VIEWS,
     ) -> dict[str, float]:
-        """Returns the errors of lightmaps at the chosen times, and if `decode` is given also those of `view_scores`."""
+        """Returns the errors of lightmaps at the chosen times and, if `decode` is given, those of `view_scores`."""
         tally = None if decode is None else self._tally(name, decode, views)
         pairs = zip(self.chosen.tolist(), frames, strict=True)
         return self._figures([self._frame(name, tally, i, frame, metrics) for i, frame in pairs], tally)
@@ -429,7 +430,7 @@ class _LightmapBench(Bench):
         return figures | {key: where["psnr"] for key, where in worst.items() if where is not None}
 
     def _decoders(self, model: SheetModel, path: str, gelu: str | None) -> list[RuntimeDecoder]:
-        """Makes the decoders of all tiles that have feature maps or frames; constant tiles need none."""
+        """Makes the decoders of all tiles with feature maps or stored frames; tiles of constant light need none."""
         decoders: list[RuntimeDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
             make = {"exact": ExactDecoder, "strip": StripDecoder, "matrix": _matrix, "fast": _fast}[path]
@@ -453,7 +454,7 @@ class _LightmapBench(Bench):
     def _tiles_8bit(
         self, model: SheetModel, decoders: Sequence[RuntimeDecoder], t: float, compare: bool
     ) -> tuple[np.ndarray, float]:
-        """Decodes all tiles to 8 bits. Returns their radiance and, if `compare`, the largest error (1: 255 levels)."""
+        """Decodes all tiles to 8 bits. Returns radiance and, if `compare`, the largest error, where 1 is 255 levels."""
         tiles = np.zeros((self.grid.count, TILE, TILE, 3))
         worst = 0.0
         for number in np.flatnonzero(model.kind == TileKind.CONSTANT).tolist():

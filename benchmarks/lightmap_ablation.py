@@ -4,7 +4,7 @@ One profile is fitted again and again in plain torch (`benchmarks.rivals.lightma
 many steps, each time with other feature maps of about the same size in bytes. Errors are those after quantisation, with
 the network fitted to the quantised maps at the end (section 4). The rows:
 
-- "hybrid": the maps F_uv, F_uvt, F_ut and F_vt, as in the paper and in the profile.
+- "hybrid": the maps F_uv, F_uvt, F_ut and F_vt over texture coordinates u, v and time t, as in paper and profile.
 - "2D alone": two maps F_uv and no other map. "3D alone": one F_uvt of 48 x 48 x 15 texels (table 6, figure 9).
 - "tri-plane": F_uv, and F_ut and F_vt of six channels in place of F_uvt.
 - "8 channels of F_uv": two maps F_uv in place of F_ut and F_vt (table 8).
@@ -12,7 +12,7 @@ the network fitted to the quantised maps at the end (section 4). The rows:
   figure 10).
 - "kernels": the hybrid fitted by `wlm.lightmap.compress`, as a check of the fit in plain torch.
 
-Only dynamic tiles are fitted, and sizes and errors are of these tiles alone.
+Only dynamic tiles, whose light changes over time by more than a common factor, are fitted and measured.
 """
 
 import os
@@ -35,7 +35,7 @@ METHOD = "ablation"
 """The table of these rows."""
 
 KERNELS = "kernels"
-"""The row of the fused fit."""
+"""The row of the fit with fused kernels."""
 
 VARIANTS = {
     "hybrid": Features(),
@@ -70,7 +70,7 @@ def run(
 
     Args:
         only: Names of the variants to measure; None: all.
-        quick: Short fits that show on a CPU that everything works; their errors are not meaningful.
+        quick: Whether to make short fits, which only show on a CPU that everything works.
         device: "cpu" or "cuda:0".
         set_path: A lightmap set; None: the checkout's `demos/data/city`, two tiles of the city.
         steps: Steps of each fit; None: as the profile states.
@@ -81,7 +81,7 @@ def run(
         One row for each variant.
 
     Raises:
-        WlmError: The set or the device isn't there, no row has such a name, no tile is dynamic, or a fit diverged.
+        WlmError: The set or the device isn't there, a name is unknown, no tile is dynamic, or a fit diverged.
     """
     only = only or ()
     check_only(only, ROWS)
@@ -107,7 +107,7 @@ def run_rows(
     rows = []
     for name in ROWS:
         if not only or name in only:
-            bench.note(f"fits {name}")
+            bench.note(f"fitting {name}")
             rows.append(bench.kernels_row() if name == KERNELS else bench.variant_row(name))
             if done is not None:
                 done(rows)
@@ -115,8 +115,6 @@ def run_rows(
 
 
 class _AblationBench(Bench):
-    """The ablation of one lightmap set, with the dynamic tiles that are fitted."""
-
     def __init__(self, lightmaps: LightmapSet, profile: Profile, device: str, progress: Note | None) -> None:
         super().__init__("lightmap", device, progress, scene=f"{lightmaps.name}, ablation")
         self._set, self._lightmaps, self._profile = lightmaps, lightmaps.light, profile

@@ -39,7 +39,7 @@ def choose_variant() -> str:
         WlmError: Mitsuba is not installed.
     """
     if not has_tracer():
-        raise WlmError("path tracing needs mitsuba: install wlm[bake]")
+        raise WlmError("path tracing needs the package mitsuba: install wlm[bake]")
     import drjit
 
     fast = drjit.has_backend(drjit.JitBackend.LLVM) and drjit.detail.llvm_version()[0] >= _LLVM
@@ -102,7 +102,7 @@ class PathTracer:
         return images[..., 0], 1.0 - images[..., 3].mean(0)
 
     def trace(self, direction: np.ndarray, samples: int, seed: int = 0) -> np.ndarray:
-        """Traces RGBA float32 [H, W, 4] under one light of irradiance 4 pi; `direction` [3] is in camera axes."""
+        """Traces RGBA float32 [H, W, 4] under one light of irradiance 4 pi, from `direction` [3] in camera axes."""
         light = {
             "type": "directional",
             "direction": [float(-w) for w in self._camera.axes.T @ direction],
@@ -151,13 +151,13 @@ class PathTracer:
 
 
 def denoise(lightmaps: np.ndarray) -> np.ndarray:
-    """Denoises N lightmaps [N, H, W] one by one.
+    """Denoises N lightmaps [N, H, W] one by one with Open Image Denoise.
 
     Raises:
         WlmError: Open Image Denoise isn't installed.
     """
     if not has_denoiser():
-        raise WlmError("denoising needs pyoidn: install wlm[bake]")
+        raise WlmError("denoising needs the package pyoidn: install wlm[bake]")
     import pyoidn
 
     grey = np.repeat(np.asarray(lightmaps, np.float32)[..., None], 3, axis=-1)
@@ -166,7 +166,7 @@ def denoise(lightmaps: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def denoiser_device(device: str) -> str:
-    """Returns the device on which Open Image Denoise runs for pictures on `device`: that device, or "cpu"."""
+    """Returns `device` if Open Image Denoise runs there, else "cpu"."""
     import pyoidn
 
     try:
@@ -177,13 +177,13 @@ def denoiser_device(device: str) -> str:
 
 
 def denoised_picture(picture: torch.Tensor) -> torch.Tensor:
-    """Denoises a picture [H, W, 3] of linear light, on `denoiser_device`.
+    """Denoises a picture [H, W, 3] of linear light with Open Image Denoise, on the device of the picture if possible.
 
     Raises:
         WlmError: Open Image Denoise isn't installed.
     """
     if not has_denoiser():
-        raise WlmError("denoising needs pyoidn: install wlm[bake]")
+        raise WlmError("denoising needs the package pyoidn: install wlm[bake]")
     import pyoidn
 
     there = picture.float().contiguous().to(denoiser_device(str(picture.device)))

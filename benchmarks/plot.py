@@ -58,7 +58,7 @@ class Panel:
                 raise WlmError(f"plot: unknown figure {name!r}")
 
     def position(self, row: Row) -> tuple[float, float] | None:
-        """Returns a row's x and y value; None if the panel does not show its method, or a value is missing."""
+        """Returns a row's values on the x and y axis; None if the panel does not show the row or it lacks a value."""
         if self.methods is not None and row.method not in self.methods:
             return None
         return (row[self.x], row[self.y]) if {self.x, self.y} <= row.figures.keys() else None
@@ -92,7 +92,7 @@ def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | 
     Args:
         rows: The results.
         path: Picture to write, `.png`, `.svg` or `.pdf`.
-        x: One panel or several. A name of a figure stands for a panel of all methods' PSNR against that figure.
+        x: One panel or several. The name of a figure stands for a panel of PSNR against this figure, of all methods.
 
     Raises:
         WlmError: The figure or the file's suffix is unknown, no row has both values of a panel, or the file can't be
@@ -110,7 +110,7 @@ def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | 
     methods = list(dict.fromkeys(row.method for row in rows))
     for panel in panels:
         if not any(panel.position(row) for row in rows):
-            raise WlmError(f"plot: no row has both a {panel.y} and a {panel.x}")
+            raise WlmError(f"plot: no row has both figures, {panel.y} and {panel.x}")
 
     # A Figure of its own canvas, not pyplot: no global state, no window, nothing to close.
     figure = Figure(figsize=(5.0 * len(panels), 3.9 * len(scenes)), dpi=150, layout="constrained")

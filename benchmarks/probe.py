@@ -2,9 +2,9 @@
 
 The results table of each set of probes has these rows, by method:
 
-- "ours": one row for each profile, and for the first profile at each ratio of gaussian-probe-compression, tables 2 and
-  3. Size on disk and on a GPU, time to fit and write, errors against the input, time to decode all live probes. "pca"
-  has the same figures for the profile of principal components.
+- "ours": one row for each profile, and one for the first profile at each compression ratio of tables 2 and 3 of
+  gaussian-probe-compression: size on disk and on a GPU, time to fit and write, errors against the input, and time to
+  decode all live probes. "pca" has the same figures for the profile of principal components.
 - "decode": the first profile, with Gaussians that are cut off at ellipsoids, or at spheres as in the paper (eq. 6);
   each is a fit of its own.
 - "fit": speed of the fit by the first profile on the first set. "dense torch": the same fit in plain torch, with as
@@ -12,12 +12,12 @@ The results table of each set of probes has these rows, by method:
 - The rivals of `benchmarks.rivals.probe` at given percentages of the probes' size as float32, and Unreal's packing,
   which has one size. The list of dead probes is counted for rivals too; positions are counted for no method.
 - "held out": every fifth probe is left out of a fit by the first profile. The model predicts the light at these probes
-  and half-way between probes; two simple interpolations of the uncompressed other probes do so for comparison.
+  and half-way between probes; for comparison two simple interpolations of the uncompressed other probes predict it.
 - "volume", the first profile: a viewer walks through the cascaded volume, which is filled from the original probes
   ("lossless") or from a model. Times are means and 95th percentiles over frames. The PSNR compares light read from the
   volume at probes near the viewer with the input; further columns have the PSNR of the decoded probes at the same
-  places, and of light read farther away. The walk starts with an empty volume: time of the first frame, and number of
-  frames until no block waits. RMS and RMSE of the light are against the probes that filled the volume.
+  places, and of light read farther away. The walk starts with an empty volume: hence the time of the first frame,
+  and the frames until all blocks are filled. RMSE compares light read from the volume with the light that fills it.
 - "views", the first profile: pictures of balls at the probes, compared after tone mapping, see `wlm.probe.views`.
 
 The largest error of a model is measured against a float64 decode of the same model. A decode on CUDA is timed as the
@@ -92,17 +92,17 @@ def run(
     volume_only: bool = False,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the probe system on one file.
+    """Measures the compression of the light probes of one file.
 
     Args:
-        quick: Short fits, no further ratios, rivals at one size, a short walk, and of the demo's probes only noon: less
-            than two minutes on two CPU cores. The fits are not finished, so errors are large.
+        quick: Whether to make short fits at one compression ratio, measure rivals at one size and measure the demo's
+            probes at noon only: under two minutes on two CPU cores. The unfinished fits have large errors.
         device: "cpu" or "cuda:0", for fits, decodes and the volume.
         probes_path: A file that `wlm.probe.load` can read; None: the checkout's `demos/data/probes/street.npz`.
         keys: Names of arrays in the file, each one a set of probes; None: the only array, or the demo's noon and night.
-        rivals: Whether to measure the PCA family and Unreal's packing, which take minutes on the CPU and no GPU.
+        rivals: Whether to measure PCA methods and Unreal's packing, which take minutes on the CPU and need no GPU.
         rivals_at: A result file. If given, only the rivals are measured, at the same percentages as in that file.
-        volume_only: Measure only the volume, filled from the original probes and from principal components.
+        volume_only: Whether to measure only the volume, filled from the original probes and from principal components.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -149,14 +149,14 @@ def run_rows(
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
-    """Measures the given profiles on given sets. Arguments that are not listed here are as for `run`.
+    """Measures given profiles on given sets of probes. Arguments that are not listed here are as for `run`.
 
     Args:
         sets: At least one set of probes.
         profiles: At least one profile; all rows except "ours" are measured with the first one.
         ratios: Further compression ratios for the first profile; its own ratio is not measured twice.
         shares: Sizes of the rivals, in per cent of the probes' size as float32.
-        frames: Frames of the walk, at least one; None: the viewer moves by a tenth of a block in each frame.
+        frames: Frames of the walk through the volume, at least one; None: each moves the viewer by 1/10 block.
         rivals: Whether to measure the rivals.
         repeats: As for `Bench`.
     """
@@ -192,18 +192,18 @@ class ProbeBench(Bench):
         self.position, self.values = probes.position[probes.live], probes.values[probes.live]
 
     def volume(self, frames: int | None = None) -> list[Row]:
-        """Returns the rows of walks with volumes filled from the original probes and from principal components."""
+        """Returns the rows of walks through volumes filled from the original probes and from principal components."""
         return volume_rows(self, self.probes, {"pca": compress(self.probes, "pca")}, frames)
 
     def fit_profile(self, profile: Profile, option: str) -> Fit:
-        """Compresses the probes by a profile, writes and reloads the file. Compiling of kernels is not timed."""
+        """Compresses the probes with a profile, writes the file and reads it back. Kernels are compiled beforehand."""
         self.note(f"{option}: fitting {len(self.position):,} probes, {profile.steps:,} steps")
         profile = profile.model_copy(update={"method": "gaussians"})
         compress(self.probes, profile.model_copy(update={"steps": 10}), device=self.device)
         return self.fit(option, lambda: compress(self.probes, profile, device=self.device))
 
     def profile_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of a compressed model, and a call that decodes its probes, which is timed later."""
+        """Returns the row of a compressed model, and a call that decodes the model's probes, for the timing."""
         model, decoder = fit.model, GaussianDecoder(fit.model, self.device)
         points = decoder.points(self.position)
         report, errors = self._decode(decoder, points, decode64(model, self.position), fit.bytes)
@@ -223,8 +223,8 @@ class ProbeBench(Bench):
         return row, self.replay(lambda: decoder.run(points))
 
     def component_row(self) -> tuple[Row, Callable[[], object]]:
-        """Returns the row of principal components, and a call that decodes the probes, which is timed later."""
-        self.note("principal components")
+        """Returns the row of principal components, and a call that decodes the probes, for the timing."""
+        self.note("compressing to principal components")
         fit = self.fit("pca", lambda: compress(self.probes, "pca"))
         decoder = fit.model.decoder(self.device)
         report = score(decoder.decode_probes(), self.probes, fit.bytes)
@@ -269,7 +269,7 @@ class ProbeBench(Bench):
         )
 
     def decode_rows(self, fit: Fit) -> list[tuple[Row, Callable[[], object]]]:
-        """Returns, for ellipsoids and for spheres, the row and a call that decodes the probes."""
+        """Returns a row and a decoding call for Gaussians cut off at spheres, and for those cut off at ellipsoids."""
         model = fit.model
         spheres = self.fit_profile(model.profile.model_copy(update={"support": "sphere"}), "sphere").model
         exact, sphere_exact = decode64(model, self.position), decode64(spheres, self.position)
@@ -309,7 +309,7 @@ class ProbeBench(Bench):
         ours = self.row(
             "fit", option, "with the first places", encode_seconds=fit.fit_seconds, step_ms=step_ms, **counts
         )
-        self.note(f"{fit.option}: the fit in plain torch")
+        self.note(f"{fit.option}: fitting in plain torch")
         peer = DenseFit(
             model.normalise(self.position),
             self.values,
@@ -342,12 +342,12 @@ class ProbeBench(Bench):
         return [ours, dense]
 
     def rival_rows(self, shares: Sequence[int]) -> list[Row]:
-        """Returns rows of rivals at sizes in per cent of float32 probes, and of Unreal's packing at its fixed size."""
+        """Returns the rows of rivals at sizes in per cent of the float32 probes, and of Unreal's fixed-size packing."""
         rows = []
         for share in shares:
             option, size = f"{share}%", share * self.probes.float_bytes // 100
             for name, (baseline, bits) in _RIVALS.items():
-                self.note(f"{name}, {option}")
+                self.note(f"compressing: {name}, {option}")
                 encode = partial(at_bytes, baseline, budget_bytes=size - self._dead_bytes(), bits=bits)
                 rows.append(self._rival_row(name, option, encode))
         return [*rows, self._rival_row("Unreal packing", "", unreal_packing)]
@@ -370,13 +370,13 @@ class ProbeBench(Bench):
     def _decode(
         self, decoder: GaussianDecoder, points: Points, exact: np.ndarray, size: int
     ) -> tuple[Report, dict[str, float]]:
-        """Decodes the probes. Returns PSNR and other scores, and the errors against a float64 decode."""
+        """Decodes the probes. Returns PSNR and other scores, and the errors against `exact`, a float64 decode."""
         decoder.run(points)
         values = points.values()
         return score(self._all(values), self.probes, size), exact_errors(values, exact)
 
     def _all(self, live: np.ndarray) -> np.ndarray:
-        """Returns values [N, D] of all probes from those of the live ones; dead probes get zeros."""
+        """Returns values of all probes, given the live probes' values [live, numbers]; dead probes get zeros."""
         values = np.zeros_like(self.probes.values)
         values[self.probes.live] = live
         return values
@@ -393,20 +393,20 @@ def _size_and_psnr(report: Report, gpu_bytes: int) -> dict[str, float]:
 
 
 def volume_rows(bench: Bench, probes: ProbeSet, models: Mapping[str, ProbeModel], frames: int | None) -> list[Row]:
-    """Measures a viewer's walk through a volume filled from the original probes, and one for each model.
+    """Measures a viewer's walks through a volume filled from the original probes, and through one for each model.
 
     Args:
         bench: Benchmark of the set, on the device of the volume.
         probes: The original probes.
         models: Compressed models, by the names that the results table prints.
-        frames: Frames of the walk, at least one; None: each frame moves the viewer by a tenth of a block.
+        frames: Frames of a walk, at least one; None: each frame moves the viewer by a tenth of a block.
     """
     rows = []
     lights: dict[str, Light] = {"lossless": StoredLight(probes.values, bench.device)}
     for name, model in models.items():
         lights[name] = model.decoder(bench.device).light(probes.position)
     for name, light in lights.items():
-        bench.note(f"the volume, {name}")
+        bench.note(f"walking through the volume: {name}")
         walked = score_volume(probes, light, frames=frames)
         spread = {"update_ms": walked["update_ms"], "blocks": walked["updated"], "probes_decoded": walked["probes"]}
         rows.append(
@@ -438,7 +438,7 @@ def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> 
         model: The compressed probes.
         views: Number of pictures, at least one.
     """
-    bench.note(f"{views} views of balls")
+    bench.note(f"rendering {views} views of balls")
     decoded = model.decoder(bench.device, position=probes.position).decode_probes()
     try:
         scores = score_views(probes, decoded, views=views, device=bench.device)
@@ -458,6 +458,6 @@ def view_rows(bench: Bench, probes: ProbeSet, model: ProbeModel, views: int) -> 
 
 
 def _light(figures: dict[str, Any]) -> dict[str, float | None]:
-    """Returns coverage, RMSE and RMS of the light read during a walk; None if no probe was near the viewer."""
+    """Returns the covered share, RMSE and RMS of light read during a walk; None if no probe was near the viewer."""
     names = {"coverage": "coverage", "light_rmse": "rmse", "light": "rms"}
     return {name: figures[key]["mean"] if figures[key] else None for name, key in names.items()}

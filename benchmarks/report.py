@@ -66,7 +66,7 @@ def tables(rows: Sequence[Row]) -> str:
 
 
 def _group(rows: list[Row]) -> str:
-    """Returns one Markdown table, or if that is too wide several with fewer columns and numbered notes below."""
+    """Returns rows as one Markdown table, or as several narrower ones with numbered notes if one would be too wide."""
     labels = [[row.method, row.option] if len({row.method for row in rows}) > 1 else [row.option] for row in rows]
     figures = {name: figure for table in TABLES.values() for name, figure in table.items()}
     whole = _table(figures, "notes", rows, labels, [row.notes for row in rows])

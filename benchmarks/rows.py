@@ -1,8 +1,8 @@
 """The rows of results that every benchmark reports, and the JSON files that store them.
 
-A row has the figures of one method with one option on one scene. A result file has the runs of one machine, each of
-another system or other scenes. Its JSON: ``{"format": "wlm-bench", "version": 3, "runs": [{"environment":
-{...}, "rows": [{"system": ..., "figures": {"psnr": 45.98, ...}, "notes": "..."}, ...]}, ...]}``.
+A row has the figures of one method with one option on one scene. A result file has the runs on one
+machine; each run measured one system on some scenes. Its JSON: ``{"format": "wlm-bench", "version": 3, "runs":
+[{"environment": {...}, "rows": [{"system": ..., "figures": {"psnr": 45.98, ...}, "notes": "..."}, ...]}, ...]}``.
 """
 
 from __future__ import annotations

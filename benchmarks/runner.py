@@ -142,7 +142,7 @@ class Bench:
         return StepGraph(call, self.device, warmup=1)
 
     def time(self, calls: Mapping[Any, Callable[[], object]], *, few: bool = False) -> dict[Any, Timing]:
-        """Times calls in turns; returns the `Timing` of each by its name. `few`: take fewer samples of each."""
+        """Times calls in turns and returns the `Timing` of each by its name; `few`: with fewer samples of each call."""
         warmup, repeats = (1, self._few) if few else (self._warmup, self._repeats)
         return time_together(calls, self.device, warmup, repeats)
 
@@ -161,7 +161,7 @@ def expect_alone(option: str, others: Mapping[str, object]) -> None:
         others: For each other option, by name, a value that is true if the option was given.
     """
     if any(others.values()):
-        raise WlmError(f"{option}: expected without {' and '.join(others)}")
+        raise WlmError(f"{option}: cannot be combined with {' and '.join(others)}")
 
 
 def check_only(only: Sequence[str], names: Sequence[str]) -> None:
@@ -205,5 +205,5 @@ def demo_data(name: str, option: str) -> Path:
     """
     path = Path(wlm.__file__).resolve().parents[1] / "demos" / "data" / name
     if not path.exists():
-        raise WlmError(f"the demo data {name} exist only in a checkout: expected {option}")
+        raise WlmError(f"the demo data {name} exist only in a checkout of the repository: give {option}")
     return path

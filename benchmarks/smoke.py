@@ -1,4 +1,4 @@
-"""Speed and error of the smoke system, against memory copies, exact solutions and finer ray marches, in one run.
+"""Speed and error of smoke simulation and lighting, against memory copies, exact solutions and finer ray marches.
 
 Each method has a table of its own:
 
@@ -161,13 +161,13 @@ class SmokeBench(Bench):
         self.sizes, self.bandwidth = sizes, math.nan
 
     def of_copy(self, bytes_moved: float, ms: float) -> float:
-        """Returns the bandwidth of moving some bytes in `ms` milliseconds, as a fraction of a copy's bandwidth."""
+        """Returns the bandwidth of moving bytes in `ms` milliseconds, as a fraction of a memory copy's bandwidth."""
         return bytes_moved / (1e-3 * ms) / self.bandwidth
 
 
 def lattice_rows(bench: SmokeBench) -> list[Row]:
     """Times a memory copy, and steps of the fluid solver with each boundary, storage and collision operator."""
-    bench.note("lattice")
+    bench.note("timing the fluid solver")
     cells, small = bench.sizes.lattice, bench.sizes.small
     cases = {
         "float32, periodic": (cells, {"faces": "periodic"}),
@@ -209,7 +209,7 @@ def lattice_rows(bench: SmokeBench) -> list[Row]:
 
 def storage_rows(bench: SmokeBench) -> list[Row]:
     """Measures the error of the fluid solver with 16-bit storage against 32 bits, and the mass drift of both."""
-    bench.note("lattice: 16 bits against 32")
+    bench.note("comparing 16-bit and 32-bit storage of the fluid solver")
     sizes = bench.sizes
     exact, half = (_jet(bench, sizes.small, storage=storage) for storage in ("float32", "float16"))
     before = exact.mass(), half.mass()
@@ -230,12 +230,12 @@ def storage_rows(bench: SmokeBench) -> list[Row]:
 
 
 def advection_rows(bench: SmokeBench) -> list[Row]:
-    """Measures advection by scheme and storage: time with and without solids, error after a ball's full turn."""
+    """Measures each scheme and storage of advection: time with and without a solid, error after a ball's full turn."""
     rows = []
     n = bench.sizes.coarse
     box, cells = _box(n), (_RATIO * n) ** 3
     for storage in advection.STORAGES:
-        bench.note(f"advection: {storage}")
+        bench.note(f"measuring advection in {storage}")
         fields = [_fields(torch.full((cells,), 0.5), storage, bench.device) for _ in range(3)]
         velocity = _swirl(n, bench.device)
         calls = {}
@@ -262,8 +262,8 @@ def advection_rows(bench: SmokeBench) -> list[Row]:
 
 
 def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
-    """Times an advection step in sparse bricks, for several shares of the box that contain smoke."""
-    bench.note("advection: bricks")
+    """Times an advection step in sparse bricks, with smoke in several shares of the box."""
+    bench.note("timing advection in sparse bricks")
     n, rows = bench.sizes.coarse, []
     edge = _RATIO * n
     box, velocity = _box(n), _swirl(n, bench.device)
@@ -344,7 +344,7 @@ def _fields(density: torch.Tensor, storage: str, device: str) -> advection.Field
 
 
 def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
-    """Marks the cells of a central sphere, whose radius is a share of the edge; an empty array for a radius of 0."""
+    """Marks the cells of a central sphere; `radius` is a share of the box's edge, and 0 gives an empty array."""
     n = box.coarse[0]
     walls = wp.zeros(n**3 if radius else 0, dtype=wp.uint8, device=device)
     if radius:
@@ -355,7 +355,7 @@ def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
 
 
 def _swirl(n: int, device: str) -> wp.array:
-    """Makes the velocity field of eddies as large as the box, at the speed of air in the fluid solver."""
+    """Makes a velocity field [cells, 3] of eddies as large as the box, in cells per step."""
     at = 2 * np.pi * (np.arange(n) + 0.5) / n
     x, y, _ = np.meshgrid(at, at, at, indexing="ij")
     u = _SPEED * np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y), 0.5 * np.sin(x + y)], -1)
@@ -383,7 +383,7 @@ def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields
 
 
 def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
-    """Returns a call that does one advection step in sparse bricks and updates their lists, and the bricks."""
+    """Returns a call that does one advection step in sparse bricks, including their lists, and returns the bricks."""
     fields = _cubes(bench, fill, scheme)
     rings = advection_places.rings_for(math.sqrt(1.0 / 3.0) * _SUBSTEPS * _RATIO)
     bricks = advection_places.make_bricks(box, rings, _THRESHOLD, bench.device)
@@ -409,10 +409,10 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
 
 
 def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
-    """Moves a smooth ball by a full rotation about the box's axis, after which the exact solution is the start.
+    """Moves a smooth ball of smoke by a full rotation about the box's axis, after which it should be as at the start.
 
     Returns:
-        `rms`, RMS error over the RMS of the ball; `max_error`, where the ball's peak density is 1; `smoke_gained`.
+        `rms`, RMS error over the ball's RMS; `max_error`, where the ball's peak is 1; `smoke_gained`, over all smoke.
     """
     n, device = bench.sizes.coarse, bench.device
     edge, box = _RATIO * n, _box(n)
@@ -468,8 +468,8 @@ def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
 
 
 def guide_rows(bench: SmokeBench) -> Iterator[Row]:
-    """Measures guiding maps by step size, with marches to the lights shared by pixels or not, against a fine march."""
-    bench.note("guide")
+    """Compares guiding maps with a fine march, at each step size; pixels share light marches or have their own."""
+    bench.note("measuring guiding maps")
     sizes = bench.sizes
     volumes, camera = _cloud(bench)
     fine = guide(volumes["float32"], camera, March(sizes.exact, jitter=0.0, cutoff=0.0), shared=False)
@@ -511,8 +511,8 @@ def guide_rows(bench: SmokeBench) -> Iterator[Row]:
 
 
 def six_rows(bench: SmokeBench) -> Iterator[Row]:
-    """Measures the fine ray march of six-way lightmaps by step size, with its own estimate of its error."""
-    bench.note("six ways")
+    """Measures the fine ray march of six-way lightmaps at each step size, and the march's own estimate of its error."""
+    bench.note("measuring the fine ray march")
     sizes = bench.sizes
     volumes, camera = _cloud(bench)
     cases = {f"step {step:g}": (volumes["float32"], step) for step in sizes.six}
@@ -538,8 +538,8 @@ def six_rows(bench: SmokeBench) -> Iterator[Row]:
 
 
 def weight_rows(bench: SmokeBench) -> Iterator[Row]:
-    """Measures the rules that weight six lightmaps for oblique lights against a ray march for each, on a plume."""
-    bench.note("weights")
+    """Compares six lightmaps weighted for oblique lights, by each rule, with a ray march for each light, on a plume."""
+    bench.note("measuring the weights of six lightmaps")
     volume = make_plume(hot=False, extinction=_PLUME, device=bench.device)
     size = volume.voxel * np.array(volume.shape)
     camera = make_camera(CameraSettings(resolution=bench.sizes.plume), volume.origin, size)
@@ -567,14 +567,14 @@ def weight_rows(bench: SmokeBench) -> Iterator[Row]:
 
 
 def frame_rows(bench: SmokeBench) -> list[Row]:
-    """Times the stages of a frame: air alone, whole simulation, guiding map, shadows and shading; everything that
-    `wlm smoke run` does after the simulation; a point light in the smoke, fire, and path tracing."""
+    """Times the stages of a frame: air alone, whole simulation, guiding map, shadows and shading. Also times all that
+    `wlm smoke run` does after the simulation, multiple scattering of a point light and of fire, and path tracing."""
     sizes, device = bench.sizes, bench.device
     scene = load_scene("jet-sphere").scaled(sizes.scale)
     scene = scene.model_copy(
         update={"camera": scene.camera.model_copy(update={"resolution": sizes.resolution}), "frames": sizes.frames + 1}
     )
-    bench.note(f"frame: {sizes.frames} frames before it")
+    bench.note(f"simulating {sizes.frames} frames before the timed one")
     steps = scene.steps // scene.smoke.substeps
     in_bricks = scene.model_copy(update={"smoke": scene.smoke.model_copy(update={"bricks": True})})
     dense, bricked, air = (make_solver(settings, device=device) for settings in (scene, in_bricks, scene))
@@ -585,7 +585,7 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
     volume, camera = volume_of(scene, dense), make_camera(scene.camera, scene.grid.origin, scene.grid.size)
     # The smoke that the frame shows stays as it is while the simulation goes on.
     volume = DensityVolume(volume.density.clone(), volume.extinction, volume.voxel, volume.origin)
-    bench.note("frame: its stages")
+    bench.note("timing the stages of a frame")
     surface = guide(volume, camera)
     six = bake(volume, camera, estimate=False)
     lights = [settings.light() for settings in scene.lights]
@@ -719,13 +719,13 @@ _PARTS: tuple[Callable[[SmokeBench], Iterable[Row]], ...] = (
 
 
 def run(*, quick: bool = False, device: str, sizes: Sizes | None = None, progress: Note | None = None) -> list[Row]:
-    """Measures the smoke system.
+    """Measures the simulation and the lighting of smoke.
 
     Args:
         quick: Whether to use the sizes `QUICK`, for a minute on a CPU, instead of the grids of the paper, which need a
             GPU with 40 GB.
         device: "cpu" or "cuda:0".
-        sizes: Sizes that replace both; None: as `quick` says.
+        sizes: Sizes to use whatever `quick` is; None: `QUICK` or the default sizes.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -739,6 +739,6 @@ def run(*, quick: bool = False, device: str, sizes: Sizes | None = None, progres
 
 
 def plotted(rows: Sequence[Row]) -> list[Row]:
-    """Returns the rows that a plot shows."""
+    """Returns the rows that a plot shows: those of a method that a panel of `PANELS` shows."""
     methods = {method for panel in PANELS for method in panel.methods}
     return [row for row in rows if row.method in methods]

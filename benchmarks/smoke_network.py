@@ -4,8 +4,8 @@ All rows are of held-out frames of a jet, a plume, a flame and a burst, from one
 ray march in steps of half a voxel. PSNR is over the six lightmaps of an image, in sRGB with a peak of 1: mean, minimum
 and maximum over the images. Each method has a table of its own:
 
-- "time against error": the fine ray march ("six ways") and the coarse one at several step sizes in voxels, the coarse
-  one also with lattice nodes that are nearer or farther apart than a step; and networks, timed from the guiding map to
+- "time against error": the fine ray march ("six ways") and the coarse march at several step sizes in voxels, the coarse
+  march also with nodes of its lattice nearer or farther apart than a step; and networks, timed from the guiding map to
   the decoded lightmaps. The error of emission is over frames that glow. Times are means over all frames: on a GPU of
   replayed graphs, and in another column of the calls that a user makes.
 - "frame": the stages of a frame, and the simulation. "shade" weights six lightmaps for two lights.
@@ -15,7 +15,7 @@ and maximum over the images. Each method has a table of its own:
   extra `bake`.
 - "profiles": the time of each profile's network, with random weights.
 - "density": the same frames, each with the frame a moment before, at other smoke densities. Flicker is the mean change
-  of the lightmaps between the two after motion compensation, in levels of 255, and its ratio to that of the reference.
+  of lightmaps between two frames after motion compensation, in levels of 255, and also as a ratio to the reference's.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -153,7 +153,7 @@ class Frame:
 
     Attributes:
         earlier, later: The smoke in the first and in the second frame.
-        motion: Motion between the frames in the camera's image, [2, H, W], as in `Pool.motion`.
+        motion: Motion of the smoke in the image between the frames, in pixels, [2, H, W], as in `Pool.motion`.
         seed: Seed of the jitter of the earlier frame's guiding map; the later frame has the next seed.
     """
 
@@ -180,7 +180,7 @@ class Subject:
     Attributes:
         name: Name of the network, as the results table prints it.
         model: The network, on the CPU.
-        settings: Settings with which its training samples were made.
+        settings: Settings with which the network's training samples were made.
         trained: False if its weights are random; then only its time is measured.
     """
 
@@ -214,29 +214,29 @@ class NetworkBench(Bench):
         return [subject for subject in self.subjects if subject.trained]
 
     def turned(self, degrees: float) -> Camera:
-        """Returns the camera turned about the centre of the smoke."""
+        """Returns the camera, turned by some degrees about the centre of the smoke."""
         view = CameraSettings(extent=_EXTENT, resolution=self.sizes.resolution).turned(_TURN + degrees)
         return make_camera(view, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
     def reference(self, volume: DensityVolume, camera: Camera | None = None) -> torch.Tensor:
-        """Computes the reference image planes [8, H, W] by the finest ray march; by default from the bench's camera."""
+        """Computes the reference image planes [8, H, W] by the finest ray march; by default from `self.camera`."""
         return encode_lightmaps(bake(volume, camera or self.camera, step=EXACT, estimate=False))
 
     def replayed(self, calls: Mapping[str, Callable[[], object]], *, few: bool = False) -> dict[str, Timing]:
-        """Times calls that are replayed as CUDA graphs. Returns nothing on a CPU."""
+        """Times calls as replays of CUDA graphs. Returns an empty dict on a CPU."""
         if self.device == "cpu":
             return {}
         return self.time({key: self.replay(call) for key, call in calls.items()}, few=few)
 
     def _simulate(self) -> None:
-        """Simulates one random scene of each kind, from a seed not used in model selection; returns its frames."""
+        """Simulates a random scene of each kind, from a seed not used in model selection, and sets `frames`."""
         kinds, frames, trouble = self.sizes.kinds, {}, None
         for index in range(_DRAWN):
             scene = draw_scene(self.settings, self.settings.test_seed, index, validation=True)
             kind = scene.name.split()[0]
             if kind in frames or kind not in kinds:
                 continue
-            self.note(f"simulates {scene.name}")
+            self.note(f"simulating {scene.name}")
             try:
                 frames[kind] = self._run(scene)
             except WlmError as error:
@@ -244,7 +244,7 @@ class NetworkBench(Bench):
             if len(frames) == len(kinds):
                 break
         if len(frames) < len(kinds):
-            raise WlmError(f"expected scenes of {', '.join(kinds)}, got {', '.join(frames)}; last: {trouble}")
+            raise WlmError(f"expected scenes of {', '.join(kinds)}, got {', '.join(frames)}; last error: {trouble}")
         self.frames = [frame for kind in kinds for frame in frames[kind]]
 
     def _run(self, scene: Scene) -> list[Frame]:
@@ -337,7 +337,7 @@ def open_subjects(networks: Sequence[str | Path], profiles: Sequence[str]) -> li
     """Reads trained networks from files, and makes untrained networks from profiles.
 
     Raises:
-        WlmError: A file or a profile can't be read, a file lacks the settings of its samples, or two have one name.
+        WlmError: A file or a profile can't be read, a file lacks its dataset's settings, or two names are the same.
     """
     subjects = []
     for path in map(Path, networks):
@@ -368,7 +368,7 @@ def run(
     Args:
         networks: Files of trained networks; if neither these nor profiles are given, the network that wlm ships.
         profiles: Names of profiles; an untrained network of each is timed.
-        quick: Small grids, for a minute on a CPU. Otherwise the paper's, for a GPU.
+        quick: Whether to use small grids, for a minute on a CPU, instead of the paper's grids, for a GPU.
         device: "cpu" or "cuda:0".
         progress: Called with a line before each part of the work.
 
@@ -392,8 +392,8 @@ def run_rows(
 
 
 def error_rows(bench: NetworkBench) -> list[Row]:
-    """Measures time and error of ray marches at several step sizes, and of networks."""
-    bench.note(_TABLE)
+    """Measures the time and the error of ray marches at several step sizes and of networks."""
+    bench.note("measuring time and error")
     marches = {f"six ways, step {step:g}": _six(step) for step in bench.sizes.six}
     steps_of = {f"coarse, h {step:g}": (step, step) for step in bench.sizes.coarse}
     steps_of |= {f"coarse, h {step:g}, nodes {spacing:g}": (step, spacing) for step, spacing in bench.sizes.swept}
@@ -442,7 +442,7 @@ def error_rows(bench: NetworkBench) -> list[Row]:
 
 
 def plotted(rows: Sequence[Row]) -> list[Row]:
-    """Returns the rows that a plot shows, with the first part of their option as the method."""
+    """Returns the rows of "time against error" for a plot, which groups them by the first part of their option."""
     points = []
     for row in rows:
         if row.method == _TABLE:
@@ -452,7 +452,7 @@ def plotted(rows: Sequence[Row]) -> list[Row]:
 
 
 def _plane_psnr(plane: int, predicted: Sequence[torch.Tensor], references: Sequence[torch.Tensor]) -> float:
-    """Returns the PSNR of the image plane with index `plane`, over all frames."""
+    """Returns the PSNR of one image plane, given by its index, over all frames."""
     squares = [float((a[plane] - b[plane]).square().mean()) for a, b in zip(predicted, references, strict=True)]
     return psnr_from_mse(sum(squares) / len(squares), 1.0)
 
@@ -493,8 +493,8 @@ def _in_turn(parts: Sequence[Callable[[], object]]) -> Callable[[], object]:
 
 
 def frame_rows(bench: NetworkBench) -> list[Row]:
-    """Times the stages of a frame: simulation; guiding map, network and decoding for each network; and shading."""
-    bench.note("frame")
+    """Times the simulation, guiding map, network and decoding for each network, and the shading of a frame."""
+    bench.note("timing the stages of a frame")
     count, size = len(bench.frames), bench.sizes.resolution
     half = bench.device != "cpu"
     calls: dict[tuple[str, str], Callable[[], object]] = {}
@@ -533,7 +533,7 @@ def frame_rows(bench: NetworkBench) -> list[Row]:
 
 def profile_rows(bench: NetworkBench) -> list[Row]:
     """Times the network of each profile, with random weights."""
-    bench.note("profiles")
+    bench.note("timing the networks of all profiles")
     size, cuda = bench.sizes.profile, bench.device != "cpu"
     settings = {name: Profile.load(name).network for name in profile_names(Profile.FILES)}
     calls, counts = {}, {}
@@ -556,7 +556,7 @@ def profile_rows(bench: NetworkBench) -> list[Row]:
 
 def density_rows(bench: NetworkBench) -> list[Row]:
     """Measures error and flicker of the networks and of the coarse ray march on thinner and denser smoke."""
-    bench.note("density")
+    bench.note("measuring thinner and denser smoke")
     size, step = bench.sizes.resolution, bench.settings.look(bench.frames[0].later.shape).step
     rows = []
     for scale in bench.sizes.scales:
@@ -586,7 +586,7 @@ def density_rows(bench: NetworkBench) -> list[Row]:
 
 
 def _pool(bench: NetworkBench, frames: Sequence[Frame], targets: torch.Tensor, settings: DatasetSettings) -> Pool:
-    """Makes evaluation samples: for each frame its guiding maps by the given settings, its motion and its target."""
+    """Makes an evaluation sample of each frame: guiding maps by the given settings, motion, and target lightmaps."""
     guides = []
     for frame in frames:
         shape = frame.later.shape
@@ -615,8 +615,8 @@ def _all_of(parts: Sequence[dict[str, Callable[[], object]]], name: str) -> Call
 
 
 def flipbook_rows(bench: NetworkBench) -> list[Row]:
-    """Measures the error of a flip book that was baked for one camera, seen by cameras turned away from it."""
-    bench.note("flip book")
+    """Measures the error of a flip book baked for one camera and seen by cameras that are turned from this one."""
+    bench.note("measuring the flip book")
     frames = bench.frames[:: bench.sizes.frames]  # one of each scene
     baked = [bake(frame.later, bench.camera, step=EXACT, estimate=False) for frame in frames]
     pivots = [frame.later.centre for frame in frames]
@@ -647,9 +647,9 @@ def flipbook_rows(bench: NetworkBench) -> list[Row]:
 def traced_rows(bench: NetworkBench) -> list[Row]:
     """Measures six-way lightmaps by Mitsuba on the CPU, raw and denoised; no rows without the extra `bake`."""
     if not has_tracer():
-        bench.note("path tracing: left out, mitsuba is not installed: wlm[bake]")
+        bench.note("path tracing is left out, because mitsuba is not installed: install wlm[bake]")
         return []
-    bench.note("path tracing")
+    bench.note("measuring path tracing")
     numbers = range(0, len(bench.frames), bench.sizes.frames)  # one frame of each scene
     tracers = [PathTracer(bench.frames[i].later, bench.camera) for i in numbers]
     references = [bench.references[i].cpu() for i in numbers]

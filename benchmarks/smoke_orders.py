@@ -12,27 +12,27 @@ The options of method "all orders"; PSNR and FLIP of a picture are in sRGB, agai
 - "three octaves" (Wrenninge) and "fitted octaves", fifteen of them;
 - "fitted filter", a linear filter of planes blurred at four scales;
 - "1 sample, denoised": our path tracer and Open Image Denoise, only with the extra `bake`;
-- "diffusion" on a grid of 32^3 and single scattering, which are the inputs of
-- "learned mix", a weighted sum with learned weights, the result of `wlm.smoke.transport.scatter`.
+- "diffusion", the sum of diffusion on a grid of 32^3 cells and single scattering;
+- "learned mix", a sum of these two with learned weights, the result of `wlm.smoke.transport.scatter`.
 
 The gain and the weights of the fitted octaves and of the fitted filter are fitted to the references of the score
 itself: weights fitted to other smoke could not score higher. A reference is the mean of two pictures that are traced
 independently; the row "path tracing" is its noise, estimated from their difference. Flicker is the RMS change from
 one frame to the next where smoke is visible, after the earlier picture is warped by the motion of the smoke, and its
-ratio to the change of the references, whose noise cancels in the product of the two.
+ratio to the references' change, which is a mean product of the changes of their two pictures, so that noise cancels.
 
 Method "gain by grid" has one row for each grid: plumes and clouds that the mix was not trained on, with extinctions
 inside and outside the range of the training, under single lights, from random sides. The gain is the PSNR of the mix
-minus the PSNR of single scattering and diffusion, its input, for one light at one albedo.
+minus the PSNR of single scattering plus diffusion, for one light at one albedo.
 
 Methods "phase functions" and "light in smoke" measure cases that the mix was not trained on: several mean cosines g of
 the Henyey-Greenstein phase function; and a point light in the middle or at a random point of a plume and of a cloud,
 and a burning plume without another light. The PSNR of "light in smoke" is of pictures scaled to their maximum, and the
-bias is that of all light that reaches the camera. A gain is the PSNR minus that of single scattering; of fire, minus
-that of its emission.
+bias is that of all light that reaches the camera. A gain is the PSNR of the mix minus that of single scattering, or
+for fire minus that of its emission alone.
 
-A time is that of a whole picture, from the smoke to the shaded image: on CUDA one graph, except for the path tracer and
-the denoiser, which are calls.
+A time is that of a whole picture, from the smoke to the shaded image. On CUDA it is the replay of one graph, except for
+the path tracer with the denoiser.
 """
 
 import math
@@ -113,7 +113,7 @@ class OrdersSizes:
 
     Attributes:
         plumes: Number of plumes.
-        cells: Voxels along the edge of a plume as it is drawn; None: 40 to 64.
+        cells: Voxels along the edge of a plume as it is made; None: random numbers from 40 to 64.
         voxels: Voxels along the edge to which a plume is resampled; None: it is not resampled.
         pixels: Width and height of a picture in pixels.
         samples: Paths for each pixel of a reference picture.
@@ -121,7 +121,7 @@ class OrdersSizes:
         frames: Frames of the scene before the first measured frame.
         sides: Number of cameras around the scene.
         repeats: Number of samples of each measured time.
-        single: Sizes of `grid_rows`.
+        single: Sizes for `grid_rows`.
         other: Arguments of `other_rows`, by name.
     """
 
@@ -164,7 +164,7 @@ class Shot:
         camera: Orthographic camera.
         lights: Directional lights with their irradiance.
         seed: Seed of the random paths.
-        motion: Motion from the previous shot to this one, float32 tensor [2, H, W]; None if that shows other smoke.
+        motion: Motion of the smoke since the previous shot in pixels, float32 [2, H, W]; None: it shows other smoke.
     """
 
     volume: DensityVolume
@@ -187,7 +187,7 @@ def run(
     sizes = sizes or (QUICK if quick else OrdersSizes())
     bench = Bench("smoke", device, progress, clock="time_ms", repeats=sizes.repeats, few=2)
     if not has_denoiser():
-        bench.note(f"{_DENOISED}: left out, pyoidn isn't installed: wlm[bake]")
+        bench.note(f"{_DENOISED}: left out, because pyoidn is not installed: install wlm[bake]")
     plumes, jet = [_plume(sizes, number, bench.device) for number in range(sizes.plumes)], _jet(sizes, bench)
     rows = []
     for name, shots in (("plumes", plumes), ("jet", jet)):
@@ -196,12 +196,12 @@ def run(
 
 
 def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) -> list[Row]:
-    """Measures all methods on the shots of one scene at both albedos; returns a row for each method and albedo."""
+    """Measures all methods on the shots of one scene; returns a row for each method at each albedo of `ALBEDOS`."""
     found: dict[float, dict[str, list[torch.Tensor]]] = {albedo: {} for albedo in ALBEDOS}
     traced: list[tuple[dict[float, torch.Tensor], ...]] = []
     opacity = []
     for number, shot in enumerate(shots, 1):
-        bench.note(f"{name}: {number} of {len(shots)}")
+        bench.note(f"{name}: picture {number} of {len(shots)}")
         traced.append(tuple(_trace(shot, sizes.samples // 2, salt) for salt in (0, 1)))
         once = _once(shot)
         opacity.append(1.0 - once.transparency)
@@ -210,7 +210,7 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
             pictures = {way: make(shot, albedo) for way, make in _ways().items()}
             for way, picture in (pictures | fitted).items():
                 found[albedo].setdefault(way, []).append(picture)
-    bench.note(f"{name}: times")
+    bench.note(f"{name}: timing the methods")
     times = _times(bench, shots[0], sizes)
     rows = []
     settings = {"voxels": max(shots[0].volume.shape), "pixels": sizes.pixels, "lights": _LIGHTS}
@@ -234,7 +234,7 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
 
 
 def _ways() -> dict[str, Callable[[Shot, float], torch.Tensor]]:
-    """Returns, by name, the methods without fitted weights: functions of shot and albedo to float32 [H, W, 3]."""
+    """Returns the methods without fitted weights by name: functions of a shot and an albedo that return a picture."""
     ways = {
         "single scattering": lambda shot, albedo: _once(shot).shade(albedo=(albedo,) * 3),
         "three octaves": lambda shot, albedo: three_octaves(shot.volume, shot.camera, shot.lights, albedo),
@@ -254,7 +254,7 @@ def _denoised(shot: Shot, albedo: float) -> torch.Tensor:
 
 
 def _octaves_by_angle(shot: Shot) -> torch.Tensor:
-    """Returns the pictures of all octaves, each times 3 powers of the light-camera cosine: [O * 3, H, W, 3]."""
+    """Returns O octaves' pictures times 3 powers of the cosine between light and camera, summed: [3 O, H, W, 3]."""
     height, width = shot.camera.height, shot.camera.width
     parts = torch.zeros((_POWERS, len(FITTED), height, width, 3), device=shot.volume.device)
     for light in shot.lights:
@@ -266,7 +266,7 @@ def _octaves_by_angle(shot: Shot) -> torch.Tensor:
 
 
 def _filter_by_angle(shot: Shot) -> torch.Tensor:
-    """Returns the P filter planes, each times 3 powers of the light-camera cosine, summed: [P * 3, H, W, 3]."""
+    """Returns P filter planes times 3 powers of the cosine between light and camera, summed: [3 P, H, W, 3]."""
     parts = 0.0
     for light, planes in zip(shot.lights, filter_planes(shot.volume, shot.camera, shot.lights), strict=True):
         cosine = float(unit(light.toward) @ np.asarray(shot.camera.toward))
@@ -283,7 +283,7 @@ def _trace(shot: Shot, samples: int, salt: int) -> dict[float, torch.Tensor]:
 
 
 def _at_albedo(made: Transport, albedo: float) -> torch.Tensor:
-    """Returns the light of each order at an albedo. Below 1, light scattered over `_KEPT` times is left out."""
+    """Returns light of each scattering order at an albedo; below 1 without light scattered over `_KEPT` times."""
     powers = albedo ** torch.arange(_KEPT + 2, device=made.planes.device)
     powers[-1] *= albedo == 1.0
     return made.planes * powers[:, None, None, None]
@@ -335,7 +335,7 @@ def _flicker(
     halves: Sequence[tuple[torch.Tensor, torch.Tensor]],
     opacity: Sequence[torch.Tensor],
 ) -> dict[str, float]:
-    """Computes the RMS change between consecutive shots in levels of 255, and its ratio to that of the references.
+    """Computes the RMS change between consecutive shots in levels of 255, and its ratio to the references' change.
 
     The ratio is left out if the references change by no more than their noise.
     """
@@ -380,7 +380,7 @@ def _plume(sizes: OrdersSizes, number: int, device: str) -> Shot:
 
 def _jet(sizes: OrdersSizes, bench: Bench) -> list[Shot]:
     """Simulates a jet and returns shots of two consecutive frames from each of several cameras."""
-    bench.note("jet: simulates")
+    bench.note("simulating the jet")
     scene = load_scene("jet-sphere").scaled(sizes.scale)
     solver = make_solver(scene, device=bench.device)
     for frame in range(1, sizes.frames + 1):
@@ -414,7 +414,7 @@ def grid_rows(bench: Bench, sizes: GridSizes, model: OrdersModel | None = None) 
     model = (load_orders() if model is None else model).to(bench.device)
     rows = []
     for cells in sizes.grids:
-        bench.note(f"grid of {cells}^3")
+        bench.note(f"measuring a grid of {cells}^3 voxels")
         diffused, mixed = (np.array(part) for part in zip(*_scores(bench.device, sizes, cells, model), strict=True))
         gains = mixed - diffused
         figures = {"psnr": mixed.mean(), "psnr_min": mixed.min(), "gain": gains.mean(), "gain_min": gains.min()}
@@ -425,7 +425,7 @@ def grid_rows(bench: Bench, sizes: GridSizes, model: OrdersModel | None = None) 
 
 
 def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> Iterator[tuple[float, float]]:
-    """Yields, for each light at each albedo, the PSNR of diffusion and the PSNR of the learned mix."""
+    """Yields, for each light at each albedo, the PSNR by diffusion and the PSNR by the learned mix."""
     for number, (density, extinction) in enumerate(_smoke(device, sizes, cells)):
         random = np.random.default_rng([cells, number])
         volume = DensityVolume(density, extinction, 1.0 / cells)
@@ -466,13 +466,13 @@ def other_rows(bench: Bench, *, views: int = _VIEWS, samples: int = _SAMPLES, ce
     rows = []
     settings = {"pixels": _PIXELS, "samples": samples}
     for g in _G:
-        bench.note(f"phase function of g {g:g}")
+        bench.note(f"measuring the phase function of mean cosine {g:g}")
         for albedo in ALBEDOS:
             values, once = np.array([_phase(bench.device, n, g, albedo, samples) for n in range(views)]).T
             figures = {"psnr": values.mean(), "psnr_min": values.min(), "gain": (values - once).mean()}
             option = f"g {g:g}, albedo {albedo:g}"
             rows.append(bench.row(PHASES, option, f"{views} pictures", scene="plumes", **figures, **settings))
-    bench.note(INSIDE)
+    bench.note("measuring light in smoke")
     for option, wanted, found, once in _inside(bench.device, samples, cells):
         scale = 1.0 / float(wanted.max())
         value, plain = (psnr(scale * picture, scale * wanted) for picture in (found, once))
@@ -482,7 +482,7 @@ def other_rows(bench: Bench, *, views: int = _VIEWS, samples: int = _SAMPLES, ce
 
 
 def _phase(device: str, number: int, g: float, albedo: float, samples: int) -> tuple[float, float]:
-    """Returns the PSNR of the learned mix for a plume under three lights, and the PSNR of single scattering."""
+    """Returns the PSNR of the learned mix and of single scattering, for one plume under three lights."""
     volume, camera, ways = draw_view(_SEED, number, pixels=_PIXELS, lights=3)
     volume = replace(volume, density=volume.density.to(device))
     lights = [Light(way.toward, (_FOUR_PI / 3,) * 3) for way in ways]
@@ -493,7 +493,7 @@ def _phase(device: str, number: int, g: float, albedo: float, samples: int) -> t
 
 
 def _inside(device: str, samples: int, cells: int) -> Iterator[tuple[str, torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Yields each case's name, and its pictures by path tracing, the learned mix and single scattering."""
+    """Yields the name of each case, and its pictures by path tracing, the learned mix and single scattering."""
     random = np.random.default_rng(_SEED)
     plume = make_plume(cells, seed=11, hot=False).density.to(device)
     for name, density in (("plume", plume), ("cloud", make_cloud(cells, device))):

@@ -80,7 +80,7 @@ _Sampler = Callable[[Callable[[], object], int], float]
 
 @contextlib.contextmanager
 def _clock(device: str) -> Iterator[_Sampler]:
-    """Yields a function that takes a function and a number of calls, and returns the milliseconds per call."""
+    """Yields a timer: it makes a given number of calls of a function and returns the milliseconds per call."""
     # Imported here so that reading results needs neither torch nor Warp.
     from wlm import interop
 

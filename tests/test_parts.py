@@ -145,10 +145,10 @@ def _sized(*size) -> dict:
         ("lightmap", _sized(128), "setting sheets.0.size"),
         ("lightmap", _sized(128, 128, 3), "setting sheets.0.size"),
         ("lightmap", _sized(True, 128), "setting sheets.0.size.0"),
-        ("lightmap", _sized(128, -128), "setting size: expected width and height"),
-        ("lightmap", _sized(10**12, 10**12), "of all sheets"),
+        ("lightmap", _sized(128, -128), "setting size: expected a width and a height"),
+        ("lightmap", _sized(10**12, 10**12), "in all sheets together"),
         ("lightmap", {"period": -5}, "setting period: expected greater than 0, got -5"),
-        ("lightmap", {"period": 1e-320}, "part times: expected 0 to 9.99989e-321, the period, found 0 to 19"),
+        ("lightmap", {"period": 1e-320}, "part times: expected 0 to the period 9.99989e-321, found 0 to 19"),
         ("lightmap", {"profile": {"name": "a", "hidden": 9999}}, "setting profile.hidden"),
         ("lightmap", {"profile": {"name": "a", "gamma": "NaN"}}, "setting profile.gamma"),
         ("lightmap", {"unheard": 1}, "setting unknown key 'unheard'"),
@@ -181,7 +181,7 @@ def test_a_few_bytes_that_claim_a_large_lightmap(path):
     kept = written(path, "lightmap")
     parts = {name: GONE for name in read_artifact(path).tensors if name not in ("0.kind", "times")}
     rewrite(path, _sized(32768, 32768), parts | {"0.kind": np.zeros(65536, np.uint8)})
-    refused(kept, path, "at most 268435456 texels of all sheets, found 1073741824")
+    refused(kept, path, "at most 268435456 texels in all sheets together, found 1073741824")
     rewrite(path, _sized(16384, 16384), {"0.kind": np.zeros(16384, np.uint8)})
     assert wlm.load(path).atlases == {"0": (16384, 16384)}
 
@@ -203,7 +203,7 @@ def test_a_few_bytes_that_claim_a_large_atlas(path):
     mask = np.full(1 << 23, 255, np.uint8)
     frame = np.frombuffer(compress(mask.tobytes()), np.uint8)
     rewrite(path, {"sizes": [[8192, 8192]], "parts": {"mask": [1 << 23]}}, {"mask": frame})
-    refused(kept, path, "at most 65536 texels for each of the 1 of its textures, found 8192x8192")
+    refused(kept, path, "at most 65536 texels per stored texel, of which there are 1, found 8192x8192")
 
 
 def test_a_few_bytes_that_claim_a_large_network(path):

@@ -1,4 +1,4 @@
-"""Warp kernels of wlm: no torch, no files, no state.
+"""Warp kernels of wlm, which need no torch, read no files and keep no state.
 
 Each module holds the kernels of one subject and the functions that launch them; see the module docstrings.
 """

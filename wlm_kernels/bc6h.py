@@ -1,9 +1,11 @@
 """Encodes blocks of 4 x 4 texels as unsigned BC6H with a small weighted squared error in linear light.
 
 BC6H interpolates between two colours in a space that is roughly the logarithm of light. A block is fitted there by
-weighted least squares, with the squared slope of light as a further weight of each texel; the texels' indices are then
-chosen by their error in linear light. The most precise mode that can represent the endpoints is used. One line for all
-texels and the two best of the 32 partitions into two lines are encoded, and the best of these blocks is kept.
+weighted least squares, with the squared derivative of light as a further weight of each texel; the texels' indices are
+then chosen by their error in linear light. The most precise mode that can represent the endpoints is used.
+
+A block has one line in colour space for all texels, or two lines, to which one of 32 partitions assigns the texels. The
+one line and the two best partitions are encoded, and the encoding with the least error is kept.
 
 The tables are those of `wlm.formats.bc6h`, whose decoder is the reference.
 """
@@ -22,7 +24,7 @@ _LEAST_NORMAL = wp.constant(6.103515625e-05)  # 2 ** -14
 _STRETCH = wp.constant(64.0 / 31.0)  # factor from a half float's bits to BC6H's 16-bit space
 _POWER_ROUNDS = wp.constant(4)
 _AXIS_ROUNDS = wp.constant(8)
-_REFINED = wp.constant(2)  # number of fits of a line to its texels' levels
+_REFINED = wp.constant(2)  # number of fits of a line to its texels' nearest indices
 _REFITTED = wp.constant(2)  # number of refits of a block's endpoints to its indices
 _TRIED = wp.constant(2)  # number of partitions tried that are encoded
 _LEAST_WEIGHT = wp.constant(1.0e-4)  # fraction of the largest texel weight
@@ -56,7 +58,7 @@ class _Texels:
 
 @wp.struct
 class _Sums:
-    """The normal equations of a line's two ends, by channel.
+    """The normal equations of a line's two ends, for each channel.
 
     Attributes:
         aa, ab, bb: Weighted sums of products of the texels' interpolation weights a (first end) and b (second end).
@@ -89,7 +91,8 @@ def _in(mask: int, texel: int) -> bool:
 
 @wp.func
 def _axis_of(m: _Moments, rounds: int) -> wp.vec4:
-    """Computes the principal axis of `_moments`, and the variance along the axis times the total weight."""
+    """Computes the principal axis of points with the moments m, in `rounds` power iterations, and their scatter along
+    it."""
     inverse = 1.0 / wp.max(m[0], 1.0e-30)
     xx, xy, xz = m[4] - m[1] * m[1] * inverse, m[5] - m[1] * m[2] * inverse, m[6] - m[1] * m[3] * inverse
     yy, yz, zz = m[7] - m[2] * m[2] * inverse, m[8] - m[2] * m[3] * inverse, m[9] - m[3] * m[3] * inverse
@@ -112,7 +115,7 @@ def _axis_of(m: _Moments, rounds: int) -> wp.vec4:
 
 @wp.func
 def _spread(m: _Moments) -> float:
-    """Computes the trace of the scatter matrix about the mean."""
+    """Computes the scatter of points with the moments m: the weighted sum of squared distances from the mean."""
     inverse = 1.0 / wp.max(m[0], 1.0e-30)
     return wp.max(m[4] + m[7] + m[9] - (m[1] * m[1] + m[2] * m[2] + m[3] * m[3]) * inverse, 0.0)
 
@@ -170,7 +173,7 @@ def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, moments: _Moment
 
 @wp.func
 def _solved(products: wp.vec3, right: wp.vec2, before: wp.vec2) -> wp.vec2:
-    """Solves for both ends of a channel within the format's range; returns `before` if they are underdetermined."""
+    """Solves for the two ends of a channel within the format's range; returns `before` if they are underdetermined."""
     aa, ab, bb = products[0], products[1], products[2]
     determinant = aa * bb - ab * ab
     if not (determinant > 1.0e-5 * aa * bb and determinant > 0.0):
@@ -202,7 +205,7 @@ def _added(sums: _Sums, pull: wp.vec3, place: wp.vec3, t: float) -> _Sums:
 
 @wp.func
 def _ends_of(sums: _Sums, a: wp.vec3, b: wp.vec3):
-    """Solves the normal equations for the ends; `a` and `b` are the previous ends."""
+    """Solves the normal equations for a line's ends; `a` and `b` are the previous ends."""
     for c in range(3):
         products = wp.vec3(sums.aa[c], sums.ab[c], sums.bb[c])
         pair = _solved(products, wp.vec2(sums.ay[c], sums.by[c]), wp.vec2(a[c], b[c]))
@@ -232,7 +235,7 @@ def _regressed(texels: _Texels, mask: int, a: wp.vec3, b: wp.vec3, steps: int):
 
 @wp.func
 def _whole(code: int, bits: int) -> int:
-    """Expands an endpoint's channel to 16 bits."""
+    """Expands an endpoint's channel from `bits` bits to 16 bits."""
     if bits == 16 or code == 0:
         return code
     if code == (1 << bits) - 1:
@@ -262,11 +265,8 @@ def _share(index: int, steps: int) -> int:
 
 @wp.func
 def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> int:
-    """Finds the most precise mode from `first` to `last` - 1 whose differences can store the ends, -1 for none.
-
-    Args:
-        ends: The endpoints, of which `count` are used.
-    """
+    """Finds the most precise of the modes `first` to `last` - 1 that can store the first `count` ends; -1 if none can.
+    Most modes store all ends but the first as differences to it, which have fewer bits."""
     best = int(-1)
     for mode in range(first, last):
         bits = tables.modes[mode, 3]
@@ -285,7 +285,7 @@ def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> i
 
 @wp.func
 def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> Block:
-    """Encodes a block in a mode: rounds the ends and chooses the best index of each texel."""
+    """Encodes a block in a mode: rounds the ends and chooses the index with the least error for each texel."""
     block = Block()
     block.mode = mode
     block.partition = partition
@@ -335,7 +335,7 @@ def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition:
 
 @wp.func
 def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
-    """Swaps a line's ends if that brings the first nearer to the anchor texel, whose index has one bit less."""
+    """Swaps a line's ends if that brings the first end nearer to the anchor texel, whose index has one bit less."""
     a, b = ends[2 * line], ends[2 * line + 1]
     pull = texels.pull[anchor]
     along = wp.cw_mul(pull, b - a)
@@ -361,7 +361,6 @@ def _refitted(texels: _Texels, block: Block, mask: int, ends: _Ends, line: int, 
 
 @wp.func
 def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int) -> _Texels:
-    """Loads the texels of a block."""
     texels = _Texels()
     heaviest = float(0.0)
     for i in range(_TEXELS):
@@ -388,7 +387,8 @@ def _gathered(light: wp.array2d[wp.vec3], weight: wp.array2d[float], number: int
 
 @wp.func
 def _split(texels: _Texels, tables: Tables, whole: _Moments, tried: int) -> wp.vec2:
-    """Returns the partition, of those not in `tried`, with the least scatter about its two lines, and the scatter."""
+    """Finds the partition, among those not in the bit mask `tried`, whose two lines fit best. Returns its number and
+    the expected weighted sum of squared errors."""
     least = float(_HUGE)
     partition = int(0)
     for p in range(32):
@@ -422,8 +422,8 @@ def _encode(
 ):
     """Encodes one block per thread.
 
-    Every function is called at one place, in loops over partitions, lines and rounds: compilers inline each call, and
-    ten copies of a function took the CUDA compiler half a minute.
+    Every function is called at one place, in loops over partitions, lines and fits: compilers inline each call, and ten
+    copies of a function took the CUDA compiler half a minute.
     """
     number = wp.tid()
     texels = _gathered(light, weight, number)

@@ -12,13 +12,13 @@ Codes = wp.types.matrix(shape=(4, 3), dtype=int)
 
 @wp.struct
 class Tables:
-    """The tables of the format, from `wlm.formats.bc6h`.
+    """The tables of the format, described in `wlm.formats.bc6h`.
 
     Attributes:
-        modes: int [14, 7], `MODES`.
-        layout: int [14, 82], `LAYOUT`.
-        masks: int [32], `MASKS`.
-        anchors: int [32], `SECOND_ANCHORS`.
+        modes: int [14, 7], bit counts of each mode: `MODES`.
+        layout: int [14, 82], meaning of each bit in each mode: `LAYOUT`.
+        masks: int [32], texels on the second line of each partition: `MASKS`.
+        anchors: int [32], anchor texel of the second line of each partition: `SECOND_ANCHORS`.
         halves: float [31,744], the value of each half float by its bit pattern.
     """
 
@@ -31,12 +31,12 @@ class Tables:
 
 @wp.struct
 class Block:
-    """A block in one mode.
+    """A block that is encoded in one mode.
 
     Attributes:
         error: Weighted squared error of its texels.
         mode, partition: Rows of the mode and of the partition in `Tables.modes` and `Tables.masks`.
-        code: The endpoints w, x, y and z as the mode stores them, without differences.
+        code: The endpoints w, x, y and z in the mode's number of bits, before differences to w are taken.
         index: Index of each texel.
         light: Decoded light of each texel.
     """

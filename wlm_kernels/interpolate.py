@@ -1,8 +1,8 @@
 """Linear sampling of feature planes and volumes whose first axis is clamped or periodic.
 
-A plane is `[T, W, C]`: row = time (or v), column = u. A volume is `[T, H, W, C]`. Space is clamped to the border;
-the first axis is clamped, or wraps round when `periodic` (its last slice is the first's neighbour). Coordinates are
-in [0, 1], cell centres at (i + 1/2) / size. C is arbitrary. Torch references: `wlm.ops.plain`.
+A plane is `[T, W, C]`: rows are times (or v), columns are u. A volume is `[T, H, W, C]`. Space is clamped to the
+border; the first axis is clamped, or wraps round when `periodic`, so that the first slice follows the last. Coordinates
+are in [0, 1], cell centres at (i + 1/2) / size. C is arbitrary. `wlm.ops.plain` computes the same in torch.
 """
 
 import warp as wp
@@ -17,7 +17,7 @@ _CLAMP, _WRAP = (wp.constant(BOUNDARIES.index(name)) for name in ("clamp", "wrap
 
 @wp.func
 def cell(coordinate: float, size: int) -> int:
-    """Returns the lower neighbour of a coordinate in [0, 1] on an axis of `size` cells; may be -1."""
+    """Returns the index of the last cell centre at or before a coordinate in [0, 1] among `size` cells; -1 for none."""
     return int(wp.floor(coordinate * float(size) - 0.5))
 
 
@@ -37,10 +37,8 @@ def axis_index(i: int, size: int, periodic: int) -> int:
 
 @wp.struct
 class _Cell:
-    """A point's cells and weights along width (x), height (y) and first axis (t); its volume starts at row `base`.
-
-    A plane is a volume of height 1, in which only the first four of eight corners differ.
-    """
+    """The cells around a point and their weights along width (x), height (y) and first axis (t). `base` is the first
+    slice of the plane or volume; `corners` is the number of cells, 4 in a plane or 8 in a volume."""
 
     x: Axis
     y: Axis
@@ -152,7 +150,7 @@ def sample(values, times: int, layers, points, out, periodic: bool = False) -> N
         values: float [L * T, H, W, C], L planes (H = 1) or volumes, concatenated because Warp arrays have at most four
             dimensions.
         times: T, number of slices of each plane or volume.
-        layers: int [N], the plane or volume of each point, 0 to L - 1; of shape [0]: L is 1.
+        layers: int [N], number of the plane or volume of each point, 0 to L - 1; of shape [0] if L is 1.
         points: float [N, 2] (u, t) or [N, 3] (u, v, t).
         out: float [N, C], written.
         periodic: Whether the first axis, of length T, wraps round.
@@ -164,15 +162,16 @@ def sample(values, times: int, layers, points, out, periodic: bool = False) -> N
 def sample_backward(
     values, times: int, layers, points, grad_out, grad_values, grad_points, periodic: bool = False
 ) -> None:
-    """Backward pass of `sample`; a coordinate's gradient is the slope between two cell centres, 0 where clamped.
+    """Computes gradients from the gradient of a result of `sample`. A coordinate's gradient is the slope between two
+    cell centres, 0 where it is clamped.
 
     On CUDA points are added to `grad_values` in any order, so that the last bits change from run to run.
 
     Args:
         values, times, layers, points, periodic: Arguments of `sample`.
-        grad_out: float [N, C].
-        grad_values: float [L * T, H, W, C], added to; of shape [0, 0, 0, 0]: not computed.
-        grad_points: float, like `points`, written; of shape [0, 0]: not computed.
+        grad_out: float [N, C], gradient of the result.
+        grad_values: float [L * T, H, W, C], to which the gradient is added; of shape [0, 0, 0, 0] if it is not wanted.
+        grad_points: float, like `points`, written; of shape [0, 0] if it is not wanted.
     """
     inputs = [values, times, layers, points, int(periodic), grad_out]
     outputs = [grad_values, grad_points]

@@ -5,12 +5,12 @@ The weights of N networks are stored in two arrays, column by column, so that a 
     hidden  [N, I + 1 + H + 1] of vecH: I columns of the first layer, its bias, H columns of the second, its bias
     output  [N, H + 1] of vecO:         H columns of the third layer, its bias
 
-I inputs, H units (any width; 8 to 64 are tested), O outputs. `kernels` builds and caches the functions of one
-shape. GELU is "exact" (erf), "tanh" (the tanh form, within 4.8e-4 of it) or "fast" (the tanh form with the GPU's own
-tanh instruction, 2^-11 relative; on the CPU the same as "tanh").
+A network has I inputs, H units in each hidden layer (any width; 8 to 64 are tested) and O outputs. `kernels` builds and
+caches the functions of one shape. GELU is "exact" (erf), "tanh" (the tanh form, within 4.8e-4 of "exact") or "fast"
+(the tanh form with the GPU's tanh instruction, whose relative error is 2^-11; on the CPU the same as "tanh").
 
-`MlpKernels.backward` is the adjoint of the inputs and of each layer; the gradients of the weights are matrix products
-of what it writes, which `wlm.ops.mlp` leaves to torch. `wlm.ops.plain.mlp` is the same network in ten lines.
+`MlpKernels.backward` computes the gradients of the inputs and of each layer's result. The gradients of the weights are
+matrix products of these, which `wlm.ops.mlp` leaves to torch. `wlm.ops.plain.mlp` is the same network in ten lines.
 """
 
 import functools
@@ -76,20 +76,17 @@ _GELU = {
 
 @dataclass(frozen=True)
 class MlpKernels:
-    """The functions of one shape of network, for use inside kernels, and two launchers.
+    """The functions of one shape of network, for use inside kernels, and two functions that launch kernels.
 
     Attributes:
         inputs: I, number of inputs.
-        hidden: H, width of both hidden layers.
-        vec_in: vec of I floats.
-        vec_hidden: vec of H floats.
-        vec_out: vec of O floats.
+        hidden: H, width of the two hidden layers.
+        vec_in, vec_hidden, vec_out: Warp's types of vectors of I, H and O floats.
         first, second, third: `wp.func` of each layer before its activation.
-        act: `wp.func` vecH -> vecH, GELU.
+        act: `wp.func` of GELU, from vecH to vecH.
         gate, slope: `wp.func`s with act(a) = a gate(a), and its derivative slope(a, gate(a)).
-        back_hidden: `wp.func`: delta of the second layer -> gradient of its input.
-        back_output: `wp.func`: delta of the third layer -> gradient of its input.
-        back_input: `wp.func`: delta of the first layer -> gradient of the network's input.
+        back_hidden, back_output, back_input: `wp.func`s that convert the gradient of the result before activation of
+            the second, third and first layer to the gradient of the layer's input.
     """
 
     inputs: int
@@ -113,25 +110,25 @@ class MlpKernels:
         """Evaluates N networks on B inputs each.
 
         Args:
-            hidden: vecH [N, I + H + 2], see the module.
-            output: vecO [N, H + 1].
-            x: vecI [N, B].
-            y: vecO [N, B], written.
+            hidden: vecH [N, I + H + 2], the hidden layers, see the module.
+            output: vecO [N, H + 1], the output layers.
+            x: vecI [N, B], the inputs.
+            y: vecO [N, B], written: the outputs.
         """
         wp.launch(self._forward, x.shape, inputs=[hidden, output, x], outputs=[y], device=x.device)
 
     def backward(self, hidden, output, x, grad_y, grad_x, h1, h2, d1, d2) -> None:
-        """Computes the adjoint of each layer, one input of one network per thread.
+        """Computes the gradients of the inputs and of each layer's result, one input of one network per thread.
 
-        With a layer's input h and the adjoint d of its result before the activation, the gradient of its weights is h^T
-        d and of its bias the sum of d. The three layers' (h, d) are (x, d1), (h1, d2), (h2, grad_y).
+        If h is a layer's input and d the gradient of its result before the activation, the gradient of its weights is
+        h^T d, and of its bias the sum of d. The three layers' (h, d) are (x, d1), (h1, d2), (h2, grad_y).
 
         Args:
             hidden, output, x: Weights and inputs, see `forward`.
-            grad_y: vecO [N, B].
-            grad_x: vecI [N, B], written.
-            h1, h2: vecH [N, B], written: the layers' results.
-            d1, d2: vecH [N, B], written: the adjoints of the layers' results before their activation.
+            grad_y: vecO [N, B], gradient of the outputs.
+            grad_x: vecI [N, B], written: gradient of the inputs.
+            h1, h2: vecH [N, B], written: the hidden layers' results.
+            d1, d2: vecH [N, B], written: gradients of the hidden layers' results before their activation.
         """
         inputs = [hidden, output, x, grad_y]
         wp.launch(self._backward, x.shape, inputs=inputs, outputs=[grad_x, h1, h2, d1, d2], device=x.device)
@@ -147,16 +144,16 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact", outputs: int = 3) -> 
     """Returns the functions of one network shape, which are built once and cached.
 
     Args:
-        inputs: I >= 1.
-        hidden: H >= 1.
+        inputs: I >= 1, number of inputs.
+        hidden: H >= 1, width of the two hidden layers.
         gelu: One of `GELUS`.
-        outputs: O >= 1.
+        outputs: O >= 1, number of outputs.
 
     Raises:
-        ValueError: On a shape below 1 or an unknown activation.
+        ValueError: A size is below 1, or the activation is unknown.
     """
     if min(inputs, hidden, outputs) < 1 or gelu not in GELUS:
-        raise ValueError(f"no MLP of {inputs} inputs, {hidden} units, {outputs} outputs and GELU {gelu!r}")
+        raise ValueError(f"MLP: expected sizes above 0, GELU exact, tanh or fast; got {inputs, hidden, outputs, gelu}")
     vec_in = wp.types.vector(inputs, float)
     vec_hidden = wp.types.vector(hidden, float)
     vec_out = wp.vec3 if outputs == 3 else wp.types.vector(outputs, float)

@@ -1,4 +1,4 @@
-"""Loads bodies of native functions: CUDA C++ files in the folder `native` beside the kernels that use them."""
+"""Reads the code of native functions: CUDA C++ files in the folder `native` beside the kernels that use them."""
 
 from importlib import resources
 
@@ -19,10 +19,6 @@ def native_source(package: str, name: str, **constants: int) -> str:
 
 
 def on_cuda(code: str, otherwise: str) -> str:
-    """Returns a body that compiles `code` for CUDA only, and another statement for the CPU.
-
-    Args:
-        code: Result of `native_source`.
-        otherwise: The CPU's statement.
-    """
+    """Returns the body of a native function: `code`, which `native_source` has returned, on CUDA, and the statement
+    `otherwise` on the CPU."""
     return f"#if defined(__CUDA_ARCH__)\n{code}#else\n{otherwise}\n#endif\n"

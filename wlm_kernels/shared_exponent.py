@@ -1,6 +1,6 @@
 """RGB9E5 texels in kernels: three mantissas of nine bits and one exponent.
 
-Read `wlm.formats.shared_exponent` first: the same in NumPy.
+Read `wlm.formats.shared_exponent` first, which does the same in NumPy.
 """
 
 import warp as wp

@@ -1,15 +1,15 @@
 """Rivals of a compressed lightmap (lightmap-uv-clustering-cascade, sections 4.3 and 4.4).
 
-A budget is a share of the lightmap's bits at 48 per texel, 1 - CR of eq. 9. Each method gives its best result within
-the share. `bytes` are those of everything that a decoder needs except the UVs, which cost nothing in eq. 9, and
-`decoded` is a `Sampler` of `wlm.atlas.evaluation`. Charts are dilated from the nearest texel before they are resized.
+A budget is stated as a share of the lightmap's bits at 48 per texel, 1 - CR in eq. 9 of the paper. Each method gives
+its best result within the share. `bytes` counts all that a decoder needs except the UVs, which cost nothing in eq. 9,
+and `decoded` is a `Sampler` of `wlm.atlas.evaluation`. Gaps around charts are filled before the lightmap is resized.
 
-Our tiles leave out the gaps between charts, so a texture of a rival costs only the texels or blocks that its charts
-read: as if a packer had put them side by side without any loss.
+Our tiles leave out the gaps between charts, so a rival's texture is counted only in the texels or blocks that are read
+for its charts, as if a packer had put charts side by side without any loss.
 
-The paper's DownSampling is bilinear, in half floats. RGB9E5 has half their bits on a GPU and little more error, and the
-smaller texture of least squared error where it is read at the charts' texels is 1.7 dB above bilinear reading on 18
-lightmaps of 512² at a share of 0.17, 1.5 dB above Lanczos and 2.0 dB above a box filter; so that is `downsampling`.
+The paper's DownSampling is bilinear, in half floats. `downsampling` is better: RGB9E5 has half the bits on a GPU and
+little more error, and the smaller texture has the least squared error at the texels of charts. On 18 lightmaps of 512²
+at a share of 0.17 this is 1.7 dB better than bilinear downsampling, 1.5 dB than Lanczos and 2.0 dB than a box filter.
 """
 
 import functools
@@ -41,11 +41,11 @@ def share_of(rival: Rival, scene: LightmappedScene) -> float:
 
 
 def downsampling(scene: LightmappedScene, share: float, bilinear: bool = False) -> Rival:
-    """Stores the lightmap at a lower resolution in RGB9E5, read bilinearly.
+    """Stores the lightmap at a lower resolution in RGB9E5, to be read bilinearly.
 
     Args:
         scene: A scene of one lightmap.
-        share: Budget as a share of the lightmap's bits; from 2/3 on the lightmap keeps its full resolution.
+        share: Budget as a share of the lightmap's bits at 48 per texel; from 2/3 on full resolution is kept.
         bilinear: Whether to downsample bilinearly as in the paper, instead of by least squares.
 
     Raises:
@@ -64,7 +64,7 @@ def downsampling(scene: LightmappedScene, share: float, bilinear: bool = False) 
 
 
 def block_codec(scene: LightmappedScene, share: float, codec: str) -> Rival:
-    """Stores the lightmap in blocks of 16 bytes, at the highest resolution whose blocks are within the budget.
+    """Stores the lightmap in a block format, at the highest resolution whose blocks of 16 bytes fit the budget.
 
     Args:
         scene: A scene of one lightmap.
@@ -98,7 +98,7 @@ def block_codec(scene: LightmappedScene, share: float, codec: str) -> Rival:
 def best_astc(scene: LightmappedScene, share: float) -> Rival:
     """Stores the lightmap in the smallest ASTC blocks with which its full resolution fits the budget.
 
-    If none do, it is downsampled and stored as `astc12x12`: larger blocks lose less than a slight downsampling does.
+    If no blocks fit, it is downsampled and stored as `astc12x12`: larger blocks lose less than slight downsampling.
     """
     (sheet,) = scene.sheets
     most = share * sheet.mask.size * SOURCE_BITS / _BLOCK_BITS
@@ -108,10 +108,10 @@ def best_astc(scene: LightmappedScene, share: float) -> Rival:
 
 
 def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int) -> tuple[tuple[int, int], int]:
-    """Finds the largest resolution at which the blocks that the charts read fit the budget. Returns width, height and
-    the number of these blocks."""
+    """Finds the largest resolution at which the blocks that are read for charts fit the budget. Returns height and
+    width, and the number of these blocks."""
     if not 0.0 < share < math.inf:
-        raise ValueError(f"share: expected above 0, got {share}")
+        raise ValueError(f"share: expected a number above 0, got {share}")
     most = int(share * sheet.mask.size * SOURCE_BITS) // bits
     longest = max(sheet.mask.shape)
 
@@ -128,12 +128,12 @@ def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int)
         else:
             high = middle - 1
     if low == 0:
-        raise ValueError(f"share: {share} of {sheet.mask.shape} texels has no room for {bits} bits")
+        raise ValueError(f"share: {share} leaves less than the {bits} bits of a block for texels {sheet.mask.shape}")
     return size(low), _read_blocks(sheet, size(low), block)
 
 
 def _read_blocks(sheet: Sheet, size: tuple[int, int], block: tuple[int, int]) -> int:
-    """Counts the blocks of a texture of some size that bilinear reads at the centres of the chart texels touch."""
+    """Counts the blocks of a resized texture that are read for bilinear samples at the centres of charts' texels."""
     place = (np.argwhere(sheet.mask) + 0.5) * (np.array(size) / sheet.mask.shape) - 0.5
     low = np.floor(place).astype(np.int64)
     # A read at a texel's centre touches only this texel.
@@ -164,4 +164,4 @@ RIVALS: dict[str, Callable[[LightmappedScene, float], Rival]] = {
     },
     "astc": best_astc,
 }
-"""Rivals by name: functions of a scene and a share."""
+"""Rivals by name: functions of a scene and a budget, as a share of the lightmap's bits."""

@@ -1,9 +1,9 @@
 """Rivals of compressed lightmaps over time, each tuned as carefully as our method.
 
 `RIVALS` has them by name: block codecs that engines ship (`lightmap_blocks`), principal components over the hours
-(`lightmap_pca`), neural texture compression (`lightmap_ntc`), and a video codec (`lightmap_video`). `bytes` are those
-in a GPU's memory, with all that a decoder needs; `disk_bytes` the same under lossless compression, each lightmap of a
-block codec on its own. A video has only the latter, and no random access.
+(`lightmap_pca`), neural texture compression (`lightmap_ntc`), and a video codec (`lightmap_video`). `bytes` is the
+size in a GPU's memory of all that a decoder needs; `disk_bytes` is the size after lossless compression, of each
+lightmap on its own for block codecs. A video has no random access, so only its size on disk counts.
 """
 
 import functools
@@ -45,7 +45,7 @@ class Method:
 
     @property
     def label(self) -> str:
-        """Title and option as one text, for lines of progress."""
+        """The title and the option as one text, for lines of progress."""
         return f"{self.title} {self.option}".strip()
 
 
@@ -92,7 +92,7 @@ _FEW_FITTED = ("ntc-medium",)
 
 
 def usual(device: str, quick: bool = False) -> tuple[str, ...]:
-    """Returns the names of the default methods; on a CPU without the fitted methods, which take hours there.
+    """Returns the names of the methods to measure by default; without fitted methods on a CPU, where they take hours.
 
     Args:
         device: "cpu", "cuda" or "cuda:N".
@@ -127,10 +127,10 @@ def encode_set(
         device: "cpu", "cuda" or "cuda:N", for methods that are fitted.
 
     Returns:
-        The rival, with the size and the seconds of all times but no decoded lightmaps, and the results of `visit`.
+        The rival, with size and seconds for all times but without decoded lightmaps, and the results of `visit`.
 
     Raises:
-        WlmError: An unknown name, a package is missing, or there is no such device.
+        WlmError: The name is unknown, a package is missing, or there is no such device.
     """
     check_rival(name)
     method, count = RIVALS[name], len(lightmaps.frames)

@@ -5,8 +5,8 @@ Each encoder takes one lightmap [H, W, 3] in linear RGB and its mask [H, W], tru
 the largest half float, are clamped; with an empty mask a black lightmap is encoded. Gaps between charts are dilated
 from the nearest valid texel first, as every engine does: zeros there cost 10 dB at the edges of charts. Blocks that no
 read reaches are black. 8 bits and the LDR formats store levels between minimum and maximum of a tile, with a gamma
-(`benchmarks.rivals.lightmap_levels`). Times are those of the codec alone on one thread, without the preparation. A
-size includes the padding to whole blocks.
+(`benchmarks.rivals.lightmap_levels`). Times are those of the codec alone on one thread, without the preparation. Sizes
+include the padding to whole blocks.
 
 BC6H and BC7 can be optimised for rate and distortion (`wlm.formats.block_reuse`): `loss` is the root mean square error,
 in levels of 255, by which a block may become worse to compress better; 0 leaves the encoder's blocks as they are.
@@ -42,7 +42,7 @@ _NO_LIMIT_DB = 999.0
 
 
 def encode_bc6h(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival:
-    """Encodes as BC6H, unsigned, 8 bits a texel, with Intel's ISPC texture compressor."""
+    """Encodes a lightmap as unsigned BC6H, 8 bits a texel, with Intel's ISPC texture compressor."""
     _check_bc("bc6h", loss)
     image = prepare(frame, mask)
     seen = seen_texels(mask)
@@ -65,9 +65,9 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival
 
 
 def ispc_bc6h(texels: np.ndarray) -> bytes:
-    """Encodes texels, half [H, W, 3], finite and not negative, as unsigned BC6H by Intel's ISPC texture compressor.
+    """Encodes texels, half [H, W, 3], as unsigned BC6H with Intel's ISPC texture compressor. Returns the blocks.
 
-    H and W are multiples of 4.
+    Texels must be finite and not negative; H and W must be multiples of 4.
     """
     texcomp, (height, width) = need("ispc_texcomp", EXTRA), texels.shape[:2]
     rgba = np.pad(texels, ((0, 0), (0, 0), (0, 1)), constant_values=1)
@@ -76,7 +76,7 @@ def ispc_bc6h(texels: np.ndarray) -> bytes:
 
 
 def encode_bc7(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival:
-    """Encodes as BC7 with gamma 2.2 and the range of each tile; 8 bits a texel and 12 bytes a tile."""
+    """Encodes a lightmap as BC7 with gamma 2.2, scaled by each tile's range; 8 bits a texel and 12 bytes a tile."""
     _check_bc("bc7", loss)
     image = prepare(frame, mask)
     levels, ranges = _levels(image, mask, _BC_BLOCK)
@@ -97,14 +97,14 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival:
 
 
 def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, profile: str = "best") -> Rival:
-    """Encodes as ASTC in square blocks of 16 bytes, with astcenc: from 8 bits a texel at 4x4 to 0.89 at 12x12.
+    """Encodes a lightmap as ASTC in blocks of 16 bytes, with astcenc: 8 bits a texel at 4x4 to 0.89 at 12x12.
 
-    LDR stores levels with gamma 2.2 and the range of each tile, as BC7 does, but reads them at 16 bits; HDR stores the
-    radiance. If the side of a block does not divide a tile, the range changes within blocks, which costs less than one
-    range for the whole map does.
+    LDR stores levels with gamma 2.2, scaled by the range of each tile, as for BC7, but decodes them to 16 bits; HDR
+    stores radiance. A block that spans two tiles holds levels of two ranges, which loses less quality than one range
+    for the whole map would.
 
     Args:
-        frame, mask: The lightmap.
+        frame, mask: The lightmap [H, W, 3] and its mask [H, W].
         block: Side of a block in texels: 4, 5, 6, 8, 10 or 12.
         profile: `ldr`, `hdr`, or `best`, the one with the higher PSNR; the `option` of the rival states the choice.
     """
@@ -124,7 +124,7 @@ def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, profile: s
 
 
 def encode_8bit(frame: np.ndarray, mask: np.ndarray) -> Rival:
-    """Encodes as 3 bytes per texel with gamma 2.2 and the range of each tile: about the best that BC7 can reach."""
+    """Encodes a lightmap in 3 bytes per texel with gamma 2.2, scaled by each tile's range: about BC7's best quality."""
     image = prepare(frame, mask)
     levels, ranges = _levels(image, mask, 1)
     rival = _measured(
@@ -195,7 +195,7 @@ def _weight(mask: np.ndarray) -> np.ndarray:
 
 
 def _levels(image: np.ndarray, mask: np.ndarray, block: int) -> tuple[np.ndarray, TileRanges]:
-    """Returns a lightmap as levels [H, W, 3] in [0, 1] relative to the range of each tile, and these ranges."""
+    """Returns a lightmap as levels [H, W, 3] in [0, 1] relative to the range of each tile, and the ranges."""
     codes, seen = to_codes(image), seen_texels(mask)
     ranges = TileRanges.of(codes, seen)
     return clear_unseen(ranges.levels(codes), seen, block), ranges

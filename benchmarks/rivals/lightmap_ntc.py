@@ -2,19 +2,19 @@
 
 "Random-Access Neural Compression of Material Textures" (Vaidyanathan et al., 2023) and its successors keep the channels
 of a material in two grids of quantised latents and a network of two hidden layers of 64, one for each texture set. Here
-the hours' colours are the channels, all of them at once, so that what hours share is stored once. A texel is read so:
+the colours at all hours are the channels, so that what hours share is stored once. A texel is decoded as:
 
-    x = [fine latents at 4 nodes, coarse latents between 4 nodes, place in the coarse cell],     levels = network(x)
+    x = [fine latents at 4 nodes, coarse latents between 4 nodes, position in the coarse cell],   levels = network(x)
 
-- The network weighs the fine grid's nodes itself; the coarse grid is read bilinearly.
+- The network gets the latents of all 4 nearest fine nodes; latents of the coarse grid are interpolated bilinearly.
 - Fine latents have 4 bits, coarse ones 8. In training uniform noise of one step stands for the rounding; for the last
   twentieth of the steps latents are rounded and frozen, and the network is fitted to them.
-- The place is its sines and cosines over one and two turns a cell, along both axes.
-- The network's numbers are half floats; a map has one for each 1024 x 1024 texels.
+- The position is given as sines and cosines with one and two periods per coarse cell, along both axes.
+- The network's parameters are half floats; a map has one network for each 1024 x 1024 texels.
 
-The levels are those of `benchmarks.rivals.lightmap_levels`, relative to a tile's range over the day. Errors are
-weighted half-way to what PSNR measures, as ours are, and the ring round charts by a quarter. `docs/lightmap.md` tells
-what these choices are worth. It needs torch alone; a GPU fits it in minutes, a CPU in hours.
+The output levels are colours with a gamma, scaled by a tile's range over the day (`benchmarks.rivals.lightmap_levels`).
+Errors have weights half-way between equal ones and PSNR's, like ours, and texels just outside charts weigh a quarter.
+`docs/lightmap.md` compares these choices. The fit needs torch alone, and takes minutes on a GPU or hours on a CPU.
 """
 
 import itertools
@@ -33,7 +33,7 @@ from wlm.errors import WlmError
 from wlm.interop import check_device
 
 NETWORK_TEXELS = 1024
-"""Side of what one network is for."""
+"""Side in texels of the square of a map that one network decodes."""
 
 _HIDDEN = 64
 _FINE_BITS, _COARSE_BITS = 4, 8
@@ -51,7 +51,7 @@ _CHUNK = 1 << 14  # texels decoded at once
 
 @dataclass(frozen=True)
 class Latents:
-    """Sizes of the two grids.
+    """Sizes of the two grids of latents, which are numbers that the fit learns.
 
     Attributes:
         fine_step, coarse_step: Texels along the side of a cell of the fine and of the coarse grid.
@@ -80,7 +80,7 @@ LADDER = {
     "high": Latents(1, 4, 4, 16),
     "highest": Latents(1, 12, 4, 16),
 }
-"""Sizes by name: 7 to 56 bits of latents a texel."""
+"""Sizes of the grids by name: 7 to 56 bits of latents a texel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,22 +111,22 @@ def encode_ntc(
     seed: int = 0,
     device: str = "cpu",
 ) -> Rival:
-    """Encodes all lightmaps of a set as latents and a network.
+    """Encodes all lightmaps of a set as latents on two grids and a network.
 
     Args:
-        frames: [T, H, W, 3], linear RGB.
+        frames: Lightmaps at T times, [T, H, W, 3], linear RGB.
         mask: [H, W], true where a texel is valid.
-        latents: A key of `LADDER`, or the sizes of the two grids.
+        latents: A key of `LADDER`, or the sizes of the two grids of latents.
         steps: Steps of each network's fit, at least 1.
-        samples: Random texels of each step, at all hours.
+        samples: Number of random texels in each step, each at all hours.
         seed: Seed of all random numbers; on the CPU the same seed gives the same result.
         device: "cpu", "cuda" or "cuda:N", for encoding and decoding.
 
     Returns:
-        The rival; `decoded` is float32 [T, H, W, 3]. `disk_bytes` are under LZMA, which is part of Python.
+        The rival; `decoded` is float32 [T, H, W, 3]; `disk_bytes` is the size under LZMA, which is part of Python.
 
     Raises:
-        WlmError: As the block codecs, a setting is out of range, or there is no such device.
+        WlmError: As for the block codecs; or a setting is out of range, or there is no such device.
     """
     if isinstance(latents, str) and latents not in LADDER:
         raise WlmError(f"ntc: unknown latents {latents!r}, expected one of {', '.join(LADDER)}")
@@ -167,7 +167,7 @@ def encode_ntc(
 
 
 def _weight(images: np.ndarray, codes: np.ndarray, ranges: TileRanges, mask: np.ndarray) -> np.ndarray:
-    """Returns relative weights of the squared errors of levels, float32 [T, H, W, 3]."""
+    """Returns the relative weights of squared errors of levels in the loss, float32 [T, H, W, 3]."""
     height, width = mask.shape
     valid = np.asarray(mask).astype(bool)
     # PSNR is relative to a tile's range of radiance at that hour, over its valid texels.
@@ -185,7 +185,7 @@ def _areas(height: int, width: int) -> Iterator[tuple[slice, slice]]:
 
 
 class _Places:
-    """Rows and columns, within a region, of its N decoded texels, at which these read the grids of latents."""
+    """Nodes, bilinear weights and positions at which the N decoded texels of a region read the grids of latents."""
 
     def __init__(self, inside: np.ndarray, sizes: Latents, device: str) -> None:
         self.texels = np.nonzero(inside)
@@ -197,7 +197,7 @@ class _Places:
         self.fine, self.coarse = (torch.from_numpy(a).to(device) for a in (self.fine, self.coarse))
 
     def _nodes(self, shape: tuple[int, int], step: int) -> tuple[tuple[int, int], np.ndarray, np.ndarray]:
-        """Returns rows and columns of a grid, and each texel's 4 node indices [N, 4] and bilinear weights [N, 4]."""
+        """Returns a grid's rows and columns, and the texels' nearest 4 nodes [N, 4] and bilinear weights [N, 4]."""
         rows, columns = (-(-size // step) + 1 for size in shape)
         at = [(i + 0.5) / step for i in self.texels]
         (y, x), (fy, fx) = ([part(a) for a in at] for part in (lambda a: a.astype(np.int64), lambda a: a % 1.0))
@@ -300,7 +300,7 @@ def _answer(
     chosen: torch.Tensor,
     random: torch.Generator | None,
 ) -> torch.Tensor:
-    """Computes levels [B, 3 T] of B texels from latents [nodes, count] in [0, 1]; a generator adds training noise."""
+    """Computes levels [B, 3 T] at T times for B chosen texels; if `random` is given, training noise is added."""
 
     def read(latents: torch.Tensor, nodes: torch.Tensor, top: int) -> torch.Tensor:
         values = functional.embedding(nodes[chosen], latents)  # [B, 4, count]
@@ -344,7 +344,7 @@ def _nibbles(levels: np.ndarray) -> bytes:
 
 
 def _disk_bytes(ranges: TileRanges, regions: list[_Region]) -> int:
-    """Returns the size in bytes under LZMA; 4-bit latents take a byte each first, which compresses better."""
+    """Returns the size in bytes under LZMA. Each 4-bit latent takes a byte first, as this compresses better."""
     rest = [ranges.tobytes(), *(values.tobytes() for region in regions for values in region.network)]
     planes = [np.moveaxis(grid, -1, 0).tobytes() for region in regions for grid in (region.fine, region.coarse)]
     packed = sum(len(lzma.compress(part)) for part in (*planes, b"".join(rest)))

@@ -1,16 +1,16 @@
 """Principal components over the hours: a few maps of coefficients for each tile, and how each changes over the day.
 
-For each 128 x 128 tile the levels of its texels at all hours (`benchmarks.rivals.lightmap_levels`; the ranges are over
-all hours) are vectors of 3 T numbers. A texel keeps its coefficients along the first K principal axes of these, and
-a tile the axes and the mean as half floats: any texel at any hour is one dot product. Two ways to keep the maps:
+In each 128 x 128 tile a texel's levels at T hours (`benchmarks.rivals.lightmap_levels`; the ranges are over all hours)
+are a vector of 3 T numbers. A texel keeps the coefficients of its vector along the tile's first K principal axes; the
+tile keeps the axes and the mean vector as half floats. Two functions store the maps of coefficients differently:
 
 - `encode_pca_bc4`: K maps as BC4 textures, 4 bits a texel each.
-- `encode_pca`: every map rounded with the same step, which is what a given rate is best spent on where errors add up
-  as squares; K follows from the step. Maps are bytes in memory and lossless JPEG XL on disk, a quarter less than
-  under zstd.
+- `encode_pca`: every map rounded with the same step, which gives the smallest squared error at a given rate; K follows
+  from the step. A map takes a byte per texel in memory, and on disk it is lossless JPEG XL, a quarter smaller than
+  with zstd.
 
 Both take lightmaps [T, H, W, 3] in linear RGB and their mask [H, W], and return a `Rival` whose `decoded` is float32
-[T, H, W, 3]. They raise a `WlmError` as the block codecs do.
+[T, H, W, 3]. They raise a `WlmError` like the block codecs.
 """
 
 from collections.abc import Iterator
@@ -49,11 +49,11 @@ class _Tile:
 
 
 def encode_pca_bc4(frames: np.ndarray, mask: np.ndarray, components: int = 4) -> Rival:
-    """Encodes K coefficients per texel as BC4 textures, whose 256 levels span the map's range in the tile.
+    """Encodes K principal coefficients per texel as BC4 textures, whose 256 levels span a map's range in a tile.
 
     Args:
         frames, mask: The lightmaps [T, H, W, 3] and their mask [H, W].
-        components: K, at least 1; a tile has no more than 3 T.
+        components: K, at least 1; a tile has at most 3 T coefficients per texel.
     """
     if components < 1:
         raise WlmError(f"pca: expected at least 1 component, got {components}")
@@ -85,12 +85,12 @@ def encode_pca_bc4(frames: np.ndarray, mask: np.ndarray, components: int = 4) ->
 
 
 def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Rival:
-    """Encodes coefficients rounded to a step, without the maps that are all zero.
+    """Encodes principal coefficients rounded to multiples of a step, and leaves out maps that become zero.
 
     Args:
         frames, mask: The lightmaps [T, H, W, 3] and their mask [H, W].
         step: Step of the rounding, above 0, where levels range from 0 to 1. A map that would need more than 256 steps
-            gets wider ones.
+            gets a wider step.
     """
     if not 0.0 < step < np.inf:
         raise WlmError(f"pca: expected a step above 0, got {step:g}")
@@ -107,7 +107,7 @@ def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Riva
         return _decode(read, ranges, images.shape)
 
     def size(payload: tuple) -> int:
-        """Returns the size in bytes on a GPU: one byte for each texel and map."""
+        """Returns the size in bytes in a GPU's memory, where a map takes one byte per texel."""
         ranges, tiles = payload
         texels = sum(tile.inside.size * planes.shape[1] for tile, planes, _ in tiles)
         rest = sum(len(_basis(tile, planes.shape[1])) + scale.nbytes for tile, planes, scale in tiles)
@@ -123,7 +123,7 @@ def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Riva
 
 
 def _tiles(images: np.ndarray, mask: np.ndarray) -> tuple[TileRanges, list[_Tile]]:
-    """Computes the ranges of all tiles, and the principal components of every tile that has a texel to code."""
+    """Computes the ranges of all tiles, and the principal components of every tile that has a texel to encode."""
     seen = seen_texels(mask)
     codes = to_codes(images)
     ranges = TileRanges.over_times(codes, seen)
@@ -144,7 +144,7 @@ def _areas(height: int, width: int) -> Iterator[tuple[slice, slice]]:
 
 
 def _principal(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Computes the PCA of N vectors [N, D]. Returns mean half [D], axes half [D, D], coefficients float32 [N, D]."""
+    """Computes the PCA of N vectors [N, D]. Returns mean, half [D], axes, half [D, D], and coefficients [N, D]."""
     mean = vectors.mean(axis=0, dtype=np.float64).astype(np.float16)
     centred = vectors - mean.astype(np.float32)
     _, axes = np.linalg.eigh(centred.T.astype(np.float64) @ centred)
@@ -157,7 +157,7 @@ def _basis(tile: _Tile, components: int) -> bytes:
 
 
 def _rounded(tile: _Tile, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rounds K maps, without those that are all zero: bytes [N, K], and minimum and step of each, float32 [K, 2]."""
+    """Rounds a tile's coefficients. Returns bytes [N, K] of K maps, and each map's minimum and step, float32 [K, 2]."""
     span = np.ptp(tile.coefficients, axis=0)
     steps = np.maximum(np.float32(step), span / np.float32(_MOST_LEVELS - 1))
     whole = np.rint(tile.coefficients / steps)
@@ -172,7 +172,7 @@ def _lossless(plane: np.ndarray, tile: _Tile) -> bytes:
 
 
 def _over_tile(values: np.ndarray, tile: _Tile) -> np.ndarray:
-    """Returns a map [h, w] of the N coded texels' values [N]; other texels take the nearest value."""
+    """Spreads the values [N] of a tile's N coded texels over a map [h, w]; other texels take the nearest value."""
     texels = np.zeros(tile.inside.shape, values.dtype)
     texels[tile.inside] = values
     return fill_gaps(texels[..., None], tile.inside)[..., 0]
@@ -202,7 +202,7 @@ def _decode(
     ranges: TileRanges,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Decodes lightmaps [T, H, W, 3] from coefficients [N, K] of each tile; black where no texel is seen."""
+    """Decodes lightmaps [T, H, W, 3] from each tile's coefficients [N, K]; black where no texel is coded."""
     levels = np.zeros(shape, np.float32)
     for tile, coefficients in tiles:
         axes = tile.axes[: coefficients.shape[1]].astype(np.float32)

@@ -1,9 +1,9 @@
 """The temporal lightmap fit in plain torch: the peer that the fused kernels are timed and checked against.
 
-The same model, samples a step, optimiser, schedule and stages as `wlm.lightmap`, written with batched matrix products,
-`grid_sample` and autograd as neural-dynamic-gi, sections 3.3 to 4, describes it. What it is trained to is decoded from
-the levels that a file would hold, but it writes none. Its feature maps can be others than a profile's: with these the
-paper's ablations (section 11) are made.
+It has the model, samples per step, optimiser, schedule and stages of `wlm.lightmap`, but is written with batched matrix
+products, `grid_sample` and autograd (neural-dynamic-gi, sections 3.3 to 4). It decodes from quantised values, as a file
+would hold them, but writes no file. Its feature maps can differ from a profile's, for the paper's ablations (section
+11).
 """
 
 import itertools
@@ -30,14 +30,14 @@ _LEAST = 0.02  # smallest colour, over its scale, that weights an error: it keep
 
 @dataclass(frozen=True)
 class Features:
-    """The feature maps of a tile, all of them stored with 8 bits a texel of a block or a channel of a plane.
+    """Sizes of a tile's feature maps. F_uv and F_uvt take 8 bits a texel, in blocks; F_ut and F_vt 8 bits a channel.
 
     Attributes:
-        uv: Maps F_uv, each of 128 x 128 texels and 4 channels.
-        uvt: Texels of F_uvt along u and along v, a multiple of 4; 0: there is no F_uvt.
-        slices: Slices of F_uvt along time.
-        columns, rows: Size of F_ut and F_vt: along u or v, and along time.
-        channels: Channels of F_ut and of F_vt; 0: there are no such maps.
+        uv: Number of maps F_uv over texture coordinates u and v, each of 128 x 128 texels and 4 channels.
+        uvt: Texels of the map F_uvt along u and along v, a multiple of 4; 0: there is no F_uvt.
+        slices: Texels of F_uvt along time.
+        columns, rows: Texels of the maps F_ut and F_vt along u or v, and along time.
+        channels: Number of channels of F_ut and of F_vt; 0: there are no such maps.
         blocks: Whether F_uv and F_uvt are trained as endpoints and weights of BC7 blocks (eq. 7 and 8). Otherwise
             their texels are trained, and a BC7 encoder runs when they are frozen (extra `baselines`).
     """
@@ -52,24 +52,24 @@ class Features:
 
     @classmethod
     def of(cls, profile: Profile) -> "Features":
-        """Returns the maps of a profile: the hybrid of eq. 5."""
+        """Returns the sizes of a profile's feature maps: 2D and 3D maps together, as in eq. 5."""
         sizes = {"columns": profile.plane_columns, "rows": profile.plane_rows}
         return cls(uvt=profile.uvt_resolution, slices=profile.uvt_slices, **sizes)
 
     @property
     def inputs(self) -> int:
-        """Returns the number of inputs of the network, with the encoded time."""
+        """Returns the number of inputs of the network, including the encoded time."""
         return 4 * (self.uv + (self.uvt > 0)) + 2 * self.channels + _ENCODED
 
     @property
     def bytes(self) -> int:
-        """Returns the bytes of the maps of a tile."""
+        """Returns the size in bytes of a tile's maps."""
         planes = 2 * self.channels * self.columns * self.rows
         return self.uv * TILE * TILE + self.slices * self.uvt**2 + planes
 
 
 class PlainFit:
-    """N dynamic tiles being fitted.
+    """The fit of N dynamic tiles, whose light changes over time.
 
     Attributes:
         parameters: The tensors that the optimiser moves, maps first.
@@ -89,10 +89,10 @@ class PlainFit:
         """Initialises the parameters at random.
 
         Args:
-            profile: The settings; those of the maps count only without `features`.
-            axis: The time axis.
-            targets: What to fit, of N tiles.
-            features: The maps; None: the profile's.
+            profile: The settings; the sizes of maps are used only if `features` is None.
+            axis: The times at which lightmaps are stored.
+            targets: The colours of N tiles, which are fitted.
+            features: Sizes of the feature maps; None: as in the profile.
             seed: Seed of all random numbers.
             device: "cpu" or "cuda:0".
         """
@@ -145,7 +145,7 @@ class PlainFit:
         return torch.rand(*shape, device=self._device, generator=self._random)
 
     def step(self) -> torch.Tensor:
-        """Does one step, in the stages of `Profile.quantise_from` and `freeze_from`.
+        """Does one step of the fit. The profile states from which steps on maps are quantised and frozen.
 
         Returns:
             The loss of the step, the mean over tiles, samples and channels, a tensor on the device.
@@ -174,7 +174,7 @@ class PlainFit:
 
     @torch.no_grad()
     def decode(self) -> np.ndarray:
-        """Decodes radiance at the stored times from the levels of a file, float32 [N, T, 128, 128, 3]."""
+        """Decodes radiance at the T stored times from maps quantised as in a file, float32 [N, T, 128, 128, 3]."""
         maps = self._stored() if self._fixed is None else self._fixed
         layers = [(w.half().float(), b.half().float()) for w, b in self._layers]
         n, times = self._colour.shape[:2]
@@ -188,7 +188,8 @@ class PlainFit:
         return result
 
     def _maps(self, quantised: bool) -> list[torch.Tensor]:
-        """Returns texels of F_uv [N, M, 128, 128, 4], F_uvt [N, S, R, R, 4], F_ut and F_vt [N, C, rows, columns]."""
+        """Returns the texels of N tiles' maps: F_uv [N, maps, 128, 128, 4], F_uvt [N, slices, side, side, 4], and F_ut
+        and F_vt [N, channels, rows, columns]. Maps that a tile lacks are left out."""
 
         def levels(values):
             used = values.clamp(0.0, 1.0)
@@ -201,7 +202,7 @@ class PlainFit:
 
     @torch.no_grad()
     def _stored(self) -> list[torch.Tensor]:
-        """Returns the maps as `_maps` does, with the quantised values that a file would hold."""
+        """Returns maps as `_maps` does, with values quantised as in a file."""
         maps = self._maps(quantised=True)
         count = len(maps) - len(self._planes)
         if self._features.blocks:
@@ -228,7 +229,7 @@ class PlainFit:
         return x.transpose(1, 2)
 
     def _sample(self, values, tau, *place):
-        """Interpolates maps [N, C, times, ...] at B places in [0, 1], one [N, B] for each axis; returns [N, C, B]."""
+        """Interpolates maps [N, C, times, ...] at coordinates in [0, 1], [N, B] for each axis. Returns [N, C, B]."""
         if self._periodic:
             rows = values.shape[2]
             values = torch.cat([values[:, :, -1:], values, values[:, :, :1]], 2)

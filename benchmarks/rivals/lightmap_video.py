@@ -28,9 +28,9 @@ def encode_av1(frames: np.ndarray, mask: np.ndarray, quality: int = 80) -> Rival
     """Encodes all lightmaps of a set as one AV1 sequence.
 
     Args:
-        frames: [T, H, W, 3], linear RGB.
+        frames: Lightmaps at T times, [T, H, W, 3], linear RGB.
         mask: [H, W], true where a texel is valid.
-        quality: 0 to 100.
+        quality: Quality setting of the encoder, 0 to 100; higher is better and larger.
 
     Returns:
         The rival; `decoded` is float32 [T, H, W, 3].
@@ -58,7 +58,7 @@ def encode_av1(frames: np.ndarray, mask: np.ndarray, quality: int = 80) -> Rival
 
 
 def encode_levels(levels: np.ndarray, quality: int) -> bytes:
-    """Encodes levels, float32 [T, H, W, 3] in [0, 1], as one AVIF sequence.
+    """Encodes colour levels, float32 [T, H, W, 3] in [0, 1], as one AVIF sequence.
 
     The stream is the same on any machine with the same version of the encoder.
 
@@ -85,7 +85,7 @@ def encode_levels(levels: np.ndarray, quality: int) -> bytes:
 
 
 def decode_levels(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
-    """Decodes levels to integers up to `WHITE`, uint16 of the shape [T, H, W, 3].
+    """Decodes the result of `encode_levels` to integers from 0 to `WHITE`, uint16 of the shape [T, H, W, 3].
 
     Raises:
         WlmError: The decoder is missing.
@@ -123,7 +123,7 @@ def _stream_bytes(data: bytes) -> int:
 
 
 def _pull_push(values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Fills gaps in values [..., h, w, C] that are premultiplied by weights [h, w, 1] in [0, 1]."""
+    """Fills gaps, where weights [h, w, 1] are below 1, in values [..., h, w, C] that are premultiplied by them."""
     height, width = weight.shape[:2]
     if height == width == 1:
         return values / np.where(weight > 0.0, weight, np.float32(1.0))

@@ -1,15 +1,14 @@
 """Rivals of a compressed probe set: the PCA family, a moving basis, and the 8-bit packing of an engine.
 
-Each function takes N probes, their positions [N, 3] and values [N, D] in any unit, and returns a `Rival` whose
-`decoded` is float32 [N, D], read from the byte string that `bytes` counts (gaussian-probe-compression, sections 2.2
-and 5.1). The positions are an engine's own and cost nothing here, as in the paper. The paper gives its rivals no bits
-to choose; weights of 4 or 5 bits leave room for more components and gain several decibels at the same size, so
-`at_bytes` tries them too.
+Each function takes N probes, their positions [N, 3] and D values of each, [N, D] in any unit. It returns a `Rival` with
+the values decoded from `bytes` bytes, float32 [N, D] (gaussian-probe-compression, sections 2.2 and 5.1). Positions cost
+nothing, as in the paper, because an engine has them anyway. The paper's rivals store weights as half floats; weights of
+4 or 5 bits leave room for more components and gain several decibels at the same size, so `at_bytes` tries them too.
 
-The settings that the functions share are the number of `components`, basis vectors of a part, 1 to D, and the
-`bits` of a weight, 1 to 16, over the range of each part and component; None for half floats. Means and bases are half
-floats always. All raise a `WlmError` where there are no probes, or NaN or infinite numbers, and a `ValueError` for
-wrong shapes or a setting out of range.
+The functions share two settings: `components`, the number of basis vectors of a part of the set, 1 to D; and `bits`,
+the bits of a weight, 1 to 16, over the range of each part and component, or None for half floats. Means and bases are
+always half floats. All functions raise a `WlmError` where there are no probes, or NaN or infinite numbers, and a
+`ValueError` for wrong shapes or a setting out of range.
 """
 
 import bisect
@@ -36,7 +35,7 @@ _ROUNDS = 10
 
 
 def global_pca(position: np.ndarray, values: np.ndarray, components: int, *, bits: int | None = None) -> Rival:
-    """Compresses all probes, as one part, by principal components (GPCA)."""
+    """Compresses all probes with one set of principal components (global PCA)."""
     position, values = _checked(position, values, components, bits)
     return _pca("global_pca", "part", position, values, components, bits, lambda: probe_pca.whole(position))
 
@@ -51,15 +50,15 @@ def clustered_pca(
     signal: bool = False,
     bits: int | None = None,
 ) -> Rival:
-    """Compresses each cluster by principal components (CPCA).
+    """Compresses each cluster of probes with its own principal components (clustered PCA).
 
     Args:
-        position, values, components, bits: See the module.
+        position, values, components, bits: As the module's docstring states.
         clusters: Number of clusters, at least 1; clusters that end up empty are dropped.
         seed: Seed of the initial centres.
         signal: False clusters the positions with k-means (gaussian-probe-compression, section 5.1): the centres are
             stored, and a probe needs no index. True assigns each probe to the cluster that reconstructs it best (Sloan
-            et al. 2003): an index of ceil(log2 clusters) bits a probe is stored and counted.
+            et al. 2003): each probe stores an index of ceil(log2 clusters) bits.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("clusters", clusters, 1)
@@ -79,12 +78,12 @@ def moving_basis(
     *,
     bits: int | None = None,
 ) -> Rival:
-    """Compresses by moving basis decomposition (MBD, Silvennoinen and Sloan 2021) at free positions.
+    """Compresses probes at any positions by moving basis decomposition (Silvennoinen and Sloan 2021).
 
     Args:
-        position, values, components, bits: See the module; a part is a cell, the basis vectors are at its corners.
+        position, values, components, bits: As the module's docstring states, where a part is a cell of the grid.
         grid: Cells along the longest side of the probes' box, 1 to 2**20.
-        iterations: Rounds of alternating least squares from the PCA of all probes, at least 0.
+        iterations: Rounds of alternating least squares, which start from the PCA of all probes; at least 0.
     """
     position, values = _checked(position, values, components, bits)
     _in_range("grid", grid, 1, probe_pca.MAX_CELLS)
@@ -98,24 +97,24 @@ def moving_basis(
 
 
 def unreal_packing(position: np.ndarray, values: np.ndarray) -> Rival:
-    """Packs SH like the bricks of Unreal's volumetric lightmap, without sky occlusion: 28 bytes per probe at L2.
+    """Packs spherical harmonics like Unreal's volumetric lightmap, without sky occlusion: 28 bytes a probe at order 2.
 
-    The ambient colour L0 is R11G11B10F; every other coefficient is divided by it and by the range that light can
-    have, and takes 8 bits. A ratio beyond that range is clamped to it. Light that is nowhere negative stays within,
-    except for the rounding of L0; a coefficient over an ambient of zero or less decodes to zero, and an ambient above
-    65,024 (64,512 in blue) becomes that. Ambient and ratios are rounded to nearest; the ratio is that to the ambient
-    as it is decoded, which costs nothing and is closer than the engine's own ratio.
+    The ambient colour, coefficient L00, is stored as R11G11B10F; values above 65,024 (64,512 in blue) are clamped.
+    Every other coefficient is stored in 8 bits as its ratio to the ambient colour, which is 0 where the ambient is not
+    above 0. Ratios are clamped to the range that light without negative values can have, up to rounding.
+    Everything is rounded to nearest. Ratios are taken to the ambient colour as it is decoded, which costs nothing and
+    is more exact than the engine's own ratio.
 
     Args:
         position: Positions of the probes; only their number is used.
-        values: SH coefficients from L00, each red, green and blue: 3, 12 or 27 numbers take 4, 13 or 28 bytes. Any
-            other count raises a `WlmError`.
+        values: Coefficients from L00 on, each in red, green and blue: 3, 12 or 27 numbers (order 0, 1 or 2) take 4, 13
+            or 28 bytes. Any other count raises a `WlmError`.
     """
     position, values = _checked(position, values)
     width = values.shape[1]
     bands = {3: 1, 12: 2, 27: 3}.get(width)
     if bands is None:
-        raise WlmError(f"probes: unreal: expected 3, 12 or 27 numbers a probe (L0, L1 or L2 in RGB), got {width}")
+        raise WlmError(f"probes: unreal: expected 3, 12 or 27 numbers a probe (RGB of order 0, 1 or 2), got {width}")
     return measure(
         "unreal",
         lambda: pack_unreal(values, bands),
@@ -125,13 +124,13 @@ def unreal_packing(position: np.ndarray, values: np.ndarray) -> Rival:
 
 
 def pack_unreal(values: np.ndarray, bands: int) -> bytes:
-    """Packs the first bands of probes [N, D]: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios."""
+    """Packs spherical harmonics [N, D] up to `bands`: uint32 [N] ambient colours, uint8 [N, 3, bands² - 1] ratios."""
     ambient, level = packed(np.asarray(values, np.float64).reshape(len(values), -1, 3)[:, : bands**2])
     return ambient.tobytes() + level.tobytes()
 
 
 def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
-    """Unpacks the result of `pack_unreal`, float32 [N, D] with D = `width`; zero beyond the stored bands."""
+    """Unpacks the result of `pack_unreal` to float32 [N, width]; coefficients beyond the stored bands are zero."""
     probes = len(payload) // (4 + 3 * (bands**2 - 1))
     level = np.frombuffer(payload, np.uint8, offset=4 * probes).reshape(probes, 3, bands**2 - 1)
     colour = ambient_colour(np.frombuffer(payload, "<u4", probes))
@@ -148,22 +147,22 @@ def at_bytes(
     budget_bytes: int,
     bits: Sequence[int | None] = WEIGHT_BITS,
 ) -> Rival:
-    """Searches for the settings of one method that have the least squared error within a size.
+    """Searches for the settings with which one method has the least squared error within a size in bytes.
 
-    For each number of bits the component counts are tried from the largest downwards until two in a row gain
-    nothing, each with as many parts as fit, at most `MAX_PARTS` or `MAX_GRID` cells.
+    For each number of bits, numbers of components are tried from the largest down, until two in a row are no better.
+    Each is tried with as many parts as fit: at most `MAX_PARTS` clusters, or `MAX_GRID` cells along the longest side.
 
     Args:
         name: A key of `RIVALS`.
-        position, values: See the module.
+        position, values: As the module's docstring states.
         budget_bytes: The maximum size in bytes.
-        bits: Bits of a weight to try; `(None,)` keeps to half floats as gaussian-probe-compression's table has them.
+        bits: Bits of a weight to try; `(None,)` tries half floats alone, as in gaussian-probe-compression.
 
     Returns:
         The best result; its times are those of its settings alone, without the search.
 
     Raises:
-        WlmError: An unknown name, or a budget that nothing fits.
+        WlmError: The name is unknown, or no settings fit the budget.
     """
     if name not in RIVALS:
         raise WlmError(f"probes: unknown baseline {name!r}, expected one of {', '.join(RIVALS)}")
@@ -172,7 +171,7 @@ def at_bytes(
     position, values = _checked(position, values)
     best = RIVALS[name](position, values, budget_bytes, bits)
     if best is None:
-        raise WlmError(f"probes: {name}: nothing fits into {budget_bytes} bytes for {len(values)} probes")
+        raise WlmError(f"probes: {name}: no settings fit {len(values)} probes into {budget_bytes} bytes")
     return best
 
 
@@ -182,9 +181,9 @@ def _search(
     largest: Callable[[int, int | None], int],
     make: Callable[[int, int, int | None], Rival],
 ) -> tuple[Rival, tuple[int, int, int | None]] | None:
-    """Searches numbers of components, parts and bits for the result of least squared error, for `at_bytes`.
+    """Searches for the numbers of components, parts and bits with the least squared error, for `at_bytes`.
 
-    `largest` returns how many parts fit for components and bits, 0 if none; `make` compresses with all three settings.
+    `largest` returns how many parts fit with given components and bits, or 0; `make` compresses with all three.
     Returns the best result and its three settings, or None if nothing fits.
     """
     tried: list[tuple[float, Rival, tuple[int, int, int | None]]] = []

@@ -1,16 +1,16 @@
-"""Moving basis decomposition (Silvennoinen and Sloan 2021) for probes at free positions.
+"""Moving basis decomposition (Silvennoinen and Sloan 2021) for probes at any positions.
 
     y_n ~ m(x_n) + sum_j w_nj b_j(x_n)
 
-with the mean m and the K basis vectors b_j interpolated trilinearly from the corners of a coarse grid, and K weights
-w_n a probe. With one mean and basis everywhere this is global PCA, with one for each cube blockwise PCA, whose seams
-the interpolation removes. Weights belong to probes and not to a second grid, so free positions, which
-gaussian-probe-compression, section 2.2, calls a weakness of the method, need no extension.
+Probe y_n at position x_n has K weights w_nj. The mean m and the K basis vectors b_j are interpolated trilinearly from
+the corners of a coarse grid. One mean and basis for all probes would be global PCA, and one for each cell blockwise
+PCA, whose seams the interpolation removes. Weights belong to probes and not to a second grid, so probes can be
+anywhere; gaussian-probe-compression, section 2.2, says that the method does not allow this.
 
-What is stored, in this order and little-endian: a header (bits of a weight, 0 for half floats; D, K, cells along the
-box's longest side, scale), float16 [V, K + 1, D] means and bases in units of the scale, and the weights as in
-`probe_pca`, a cell of the grid being a part. Only corners with a share in a probe and cells with a probe are stored; a
-decoder finds them from the positions.
+What is stored, in this order and little-endian: a header (bits of a weight, 0 for half floats; D numbers per probe, K,
+cells along the box's longest side, scale), means and bases at V corners, float16 [V, K + 1, D] in units of the scale,
+and weights as in `probe_pca`, where each cell is a part. Only corners that some probe's interpolation reads and cells
+with a probe are stored; a decoder finds them from the positions.
 """
 
 import struct
@@ -40,15 +40,15 @@ _STAY = 1e-3
 
 
 class Solver:
-    """Alternating least squares, from the PCA of all probes.
+    """Alternating least squares for weights and bases, which starts from the PCA of all probes.
 
     Each half step minimises the squared error plus a small multiple of the squared change, so the error never rises.
-    The largest array is that of the bases at the probes, 8 N (K + 1) D bytes: 50 MB for 15,000 probes, 27 numbers
-    and 15 components.
+    The largest array has the bases at all N probes, 8 N (K + 1) D bytes: 50 MB for 15,000 probes, D = 27 numbers and
+    K = 15 components.
 
     Attributes:
-        corner: float64 [V, K + 1, D], means and bases at the grid's corners.
-        weight: float64 [N, K].
+        corner: Mean and K basis vectors at each of V grid corners, float64 [V, K + 1, D].
+        weight: K weights of each probe, float64 [N, K].
     """
 
     def __init__(self, position: np.ndarray, values: np.ndarray, components: int, grid: int) -> None:
@@ -56,8 +56,8 @@ class Solver:
 
         Args:
             position: float64 [N, 3].
-            values: float64 [N, D].
-            components: K, 1 to D.
+            values: D numbers of each probe, float64 [N, D].
+            components: K, the number of basis vectors, 1 to D.
             grid: Cells along the longest side of the probes' box, at least 1.
         """
         self._values = values
@@ -67,7 +67,7 @@ class Solver:
         self.weight = (values - mean) @ basis[0].T
 
     def step(self, rounds: int = 1) -> None:
-        """Improves weights and corners alternately, `rounds` times."""
+        """Improves the corners and then the weights, `rounds` times."""
         for _ in range(rounds):
             self.solve_corners()
             self.solve_weights()
@@ -77,7 +77,7 @@ class Solver:
         return float(np.square(self._residual(self._at_probes())).sum())
 
     def solve_weights(self) -> None:
-        """Solves for the weights at fixed corners, and normalises them to a root mean square of 1."""
+        """Solves for the weights while corners are fixed, and normalises them to a root mean square of 1."""
         here = self._at_probes()
         basis = here[:, 1:]
         gram = basis @ basis.transpose(0, 2, 1)
@@ -90,7 +90,7 @@ class Solver:
         self.corner[:, 1:] *= size[:, None]
 
     def solve_corners(self) -> None:
-        """Solves for the corners at fixed weights."""
+        """Solves for means and bases at the corners while weights are fixed."""
         corners, columns, width = self.corner.shape
         factor = np.concatenate([np.ones((len(self.weight), 1)), self.weight], 1)
         data = self._share[:, :, None] * factor[:, None, :]
@@ -106,7 +106,7 @@ class Solver:
         self.corner += solved.reshape(corners, columns, width)
 
     def _at_probes(self) -> np.ndarray:
-        """Returns mean and basis at each probe, [N, K + 1, D]."""
+        """Returns the mean and the basis vectors interpolated at each probe, [N, K + 1, D]."""
         return _interpolate(self.corner, self._near, self._share)
 
     def _residual(self, here: np.ndarray) -> np.ndarray:
@@ -120,10 +120,10 @@ def encode(
 
     Args:
         position: float64 [N, 3].
-        values: float64 [N, D].
-        components: K, 1 to D.
+        values: D numbers of each probe, float64 [N, D].
+        components: K, the number of basis vectors, 1 to D.
         grid: Cells along the longest side of the probes' box, 1 to `MAX_CELLS`.
-        iterations: Rounds of the solver, at least 0; with none this is global PCA.
+        iterations: Rounds of the solver, at least 0; with 0 rounds this is global PCA.
         bits: Bits of a weight, 1 to 16, over the range of each cell and component; None for half floats.
 
     Returns:
@@ -143,12 +143,12 @@ def encode(
 
 
 def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
-    """Decodes float32 [N, D] of the probes at positions [N, 3]; a `WlmError` refuses a payload of other probes."""
+    """Decodes the probes at positions [N, 3] to float32 [N, D]; a `WlmError` if the payload doesn't fit them."""
     probes = len(position)
     try:
         bits, width, components, grid, scale = _HEADER.unpack_from(payload)
     except struct.error as error:
-        raise WlmError(f"probes: not a payload of a moving basis: {len(payload)} bytes") from error
+        raise WlmError(f"probes: expected a moving basis with a header, got {len(payload)} bytes") from error
     near, share, cell = _interpolation(position, grid)
     size = payload_bytes(probes, width, components, (near.max() + 1, cell.max() + 1), bits or None)
     if size != len(payload):
@@ -162,13 +162,13 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
 
 
 def payload_bytes(probes: int, width: int, components: int, parts: tuple[int, int], bits: int | None) -> int:
-    """Returns the length of a payload, from N, D, K, the `grid_parts` and the bits of a weight."""
+    """Returns a payload's bytes, for `width` numbers per probe, `parts` from `grid_parts` and `bits` per weight."""
     corners, cells = parts
     return _HEADER.size + corners * (components + 1) * width * 2 + weight_bytes(probes, components, cells, bits)
 
 
 def grid_parts(position: np.ndarray, grid: int) -> tuple[int, int]:
-    """Returns V, the corners of the grid with a share in a probe, and the number of cells that contain a probe."""
+    """Returns the number of grid corners that some probe's interpolation reads, and of cells that contain a probe."""
     near, _, cell = _interpolation(position, grid)
     return int(near.max()) + 1, int(cell.max()) + 1
 
@@ -184,8 +184,8 @@ def _interpolation(position: np.ndarray, grid: int) -> tuple[np.ndarray, np.ndar
     """Locates the probes in the grid.
 
     Returns:
-        The 8 corners around each probe, int64 [N, 8]; their shares, float64 [N, 8]; and the cell that each probe lies
-        in, int64 [N]. Corners with a share and cells in use are numbered from 0.
+        The 8 corners around each probe, int64 [N, 8]; their trilinear shares, float64 [N, 8]; and the cell that each
+        probe lies in, int64 [N]. Only corners with a share and cells with a probe are numbered, from 0.
     """
     at = (position - position.min(0)) * (grid / extent_of(position))
     # A probe on the box's far side belongs to the last cell, not to one behind it.

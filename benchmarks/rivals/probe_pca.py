@@ -1,13 +1,13 @@
 """Affine subspaces for parts of a probe set: how the set is divided, and what is stored.
 
-A probe of part c is its mean and a few of its basis vectors, y ~ m_c + sum_j w_j b_cj. How the set is divided is all
-that differs between the PCA family of gaussian-probe-compression, section 5.1. What is stored, in this order and
-little-endian:
+A probe y in part c is the part's mean plus a weighted sum of its basis vectors, y ~ m_c + sum_j w_j b_cj. The methods
+of the PCA family of gaussian-probe-compression, section 5.1, differ only in how they divide the set. For N probes of D
+numbers, with K basis vectors for each of C parts, this is stored, in this order and little-endian:
 
 ====================  =====================================================================================
 part                  content
 ====================  =====================================================================================
-header                kind of the partition, bits of a weight (0: half float), D, K, parts C, scale (float32)
+header                kind of the partition, bits of a weight (0: half float), D, K, C, scale (float32)
 partition             nothing (one part); the centres (uint16 [C, 3] over the box);
                       or each probe's part in ceil(log2 C) bits
 means, bases          float16 [C, D] and [C, K, D], in units of the scale
@@ -15,8 +15,8 @@ lowest, highest       float16 [C, K, 2], only with weights in bits
 weights               [N, K], float16 or in bits
 ====================  =====================================================================================
 
-The positions are the engine's own, so parts that follow from them cost no index a probe. Values are divided by the
-largest magnitude among them first: no half float overflows, and values near 1e-6 keep their digits.
+An engine has the positions anyway, so parts that follow from them need no index for each probe. Values are divided by
+the largest magnitude among them first: no half float overflows, and values near 1e-6 keep their digits.
 """
 
 import struct
@@ -51,7 +51,7 @@ class Partition:
         kind: How a decoder finds the parts.
         label: int64 [N], the part of each probe, from 0.
         count: C, the number of parts.
-        stored: What a decoder needs besides the positions.
+        stored: Bytes that a decoder needs to find the parts, besides the positions.
     """
 
     kind: int
@@ -66,7 +66,7 @@ class Partition:
 
 
 def whole(position: np.ndarray) -> Partition:
-    """Returns all probes as one part."""
+    """Returns a partition with all probes in one part."""
     return Partition(WHOLE, np.zeros(len(position), np.int64), 1, b"")
 
 
@@ -75,8 +75,8 @@ def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
 
     Args:
         position: float64 [N, 3].
-        clusters: The most parts; fewer where there are fewer distinct positions, or where two centres or an
-            empty one fall away.
+        clusters: Largest number of parts. There are fewer if fewer positions are distinct, or if no probe is nearest
+            to a stored centre.
         seed: Seed of the initial centres.
     """
     low, extent = position.min(0), extent_of(position)
@@ -99,13 +99,13 @@ def by_place(position: np.ndarray, clusters: int, seed: int) -> Partition:
 def by_signal(values: np.ndarray, clusters: int, components: int, seed: int) -> Partition:
     """Divides probes by clustered PCA (Sloan et al. 2003): each probe has the affine subspace of least error.
 
-    Lloyd's iteration with subspaces in place of centres, first with none of the basis vectors, which is k-means on
-    the values, then with all of them. A cluster that loses all its probes falls away.
+    It is Lloyd's iteration with subspaces in place of centres, first without basis vectors, which is k-means on the
+    values, then with all basis vectors. A part that loses all its probes is dropped.
 
     Args:
-        values: float64 [N, D].
-        clusters: The most parts; fewer where there are fewer distinct probes.
-        components: K, basis vectors of a subspace.
+        values: D numbers of each probe, float64 [N, D].
+        clusters: Largest number of parts; there are fewer if fewer probes are distinct.
+        components: K, number of basis vectors of a subspace.
         seed: Seed of the initial centres.
     """
     values = values / scale_of(values)
@@ -125,16 +125,16 @@ def by_signal(values: np.ndarray, clusters: int, components: int, seed: int) -> 
 
 
 def fit_subspaces(values: np.ndarray, members: Sequence[np.ndarray], components: int) -> tuple[np.ndarray, np.ndarray]:
-    """Computes mean and principal directions of each part.
+    """Computes the mean and the principal directions of each part.
 
     Args:
-        values: float64 [N, D].
+        values: D numbers of each probe, float64 [N, D].
         members: For each of C parts the indices of its probes, at least one; parts may share probes.
-        components: K, 0 to D.
+        components: K, the number of directions of a part, 0 to D.
 
     Returns:
-        float64 [C, D] means and [C, K, D] orthonormal directions, the strongest first. A part with no spread left
-        gets any directions that complete the set.
+        float64 [C, D] means and [C, K, D] orthonormal directions, those of the largest variance first. A part
+        without enough variance gets arbitrary further directions.
     """
     width = values.shape[1]
     mean = np.empty((len(members), width))
@@ -152,13 +152,13 @@ def encode(values: np.ndarray, partition: Partition, components: int, bits: int 
     """Fits the subspaces of all parts and packs them.
 
     Args:
-        values: float64 [N, D].
+        values: D numbers of each probe, float64 [N, D].
         partition: Partition of the N probes.
-        components: K, 1 to D.
+        components: K, the number of basis vectors of a part, 1 to D.
         bits: Bits of a weight, 1 to 16, over the range of each part and component; None for half floats.
 
     Returns:
-        The layout of this module.
+        The bytes, in the layout that the module's docstring describes.
     """
     scale = scale_of(values)
     values = values / scale
@@ -178,21 +178,21 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
     """Decodes the result of `encode`.
 
     Args:
-        payload: The layout of this module.
-        position: float64 [N, 3], of the probes that were encoded.
+        payload: Bytes that `encode` returned.
+        position: Positions of the probes that were encoded, float64 [N, 3].
 
     Returns:
         float32 [N, D].
 
     Raises:
-        WlmError: The payload is no such layout for this number of probes.
+        WlmError: `payload` does not have the layout, or is of another number of probes.
     """
     probes = len(position)
     try:
         kind, bits, width, components, count, scale = HEADER.unpack_from(payload)
         size = payload_bytes(kind, probes, width, components, count, bits or None)
     except (struct.error, KeyError) as error:
-        raise WlmError(f"probes: not a payload of the PCA family: {len(payload)} bytes") from error
+        raise WlmError(f"probes: expected probes compressed by PCA, got {len(payload)} other bytes") from error
     if size != len(payload):
         raise WlmError(f"probes: expected a payload of {size} bytes for {probes} probes, got {len(payload)}")
     start = HEADER.size + _PARTITION_BYTES[kind](probes, count)
@@ -209,23 +209,23 @@ def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
 
 
 def part_count(payload: bytes) -> int:
-    """Returns the number of parts C of a payload."""
+    """Returns the number of parts in a result of `encode`."""
     return HEADER.unpack_from(payload)[4]
 
 
 def payload_bytes(kind: int, probes: int, width: int, components: int, count: int, bits: int | None) -> int:
-    """Returns the length of a payload, from the kind of `Partition`, N, D, K, C and the bits of a weight."""
+    """Returns how many bytes `encode` makes, for `width` numbers per probe, `count` parts and `bits` per weight."""
     size = HEADER.size + _PARTITION_BYTES[kind](probes, count) + count * (components + 1) * width * 2
     return size + weight_bytes(probes, components, count, bits)
 
 
 def scale_of(values: np.ndarray) -> float:
-    """Returns the largest magnitude in float32; 1 if all values are zero."""
+    """Returns the largest magnitude of values, rounded to float32; 1 if all values are zero."""
     return float(np.float32(np.abs(values).max())) or 1.0
 
 
 def rescale(decoded: np.ndarray, scale: float) -> np.ndarray:
-    """Multiplies decoded values [N, D] by the scale; the result is float32 within its range."""
+    """Multiplies decoded values [N, D] by the scale. The result is float32; values beyond its range are clipped."""
     limit = float(np.finfo(np.float32).max)
     return np.clip(decoded.astype(np.float64) * scale, -limit, limit).astype(np.float32)
 
@@ -238,16 +238,16 @@ def weight_bytes(probes: int, components: int, count: int, bits: int | None) -> 
 
 
 def write_weights(weight: np.ndarray, label: np.ndarray, count: int, bits: int | None) -> bytes:
-    """Packs weights as half floats, or in bits with the range of each part and component before them.
+    """Packs weights as half floats, or as integers of a few bits after the range of each part and component.
 
     Args:
-        weight: float64 [N, K]. Magnitudes above half float's largest become that.
-        label: int [N], each probe's part.
+        weight: K weights of each probe, float64 [N, K]; clipped to the range of half floats.
+        label: Number of each probe's part, int [N].
         count: C, the number of parts.
-        bits: 1 to 16, or None.
+        bits: Bits of a weight, 1 to 16; None for half floats.
 
     Returns:
-        `weight_bytes` bytes.
+        The packed weights; `weight_bytes` returns their length.
     """
     weight = np.clip(weight, -HALF_MAX, HALF_MAX)
     if bits is None:
@@ -267,7 +267,7 @@ def write_weights(weight: np.ndarray, label: np.ndarray, count: int, bits: int |
 
 
 def read_weights(data: bytes, label: np.ndarray, count: int, components: int, bits: int | None) -> np.ndarray:
-    """Reads what `write_weights` wrote, float32 [N, K]."""
+    """Unpacks the result of `write_weights` to float32 [N, K]."""
     probes = len(label)
     if bits is None:
         return np.frombuffer(data, "<f2", probes * components).reshape(probes, components).astype(np.float32)
@@ -285,7 +285,7 @@ def _pack_numbers(numbers: np.ndarray, bits: int) -> bytes:
 def _read_numbers(data: bytes, count: int, bits: int) -> np.ndarray:
     """Reads `count` numbers of `bits` bits each, int64."""
     if len(data) != -(-count * bits // 8):
-        raise ValueError(f"expected {count} numbers of {bits} bits, found {len(data)} bytes")
+        raise ValueError(f"expected {count} numbers of {bits} bits each, found {len(data)} bytes")
     columns = np.unpackbits(np.frombuffer(data, np.uint8), count=count * bits, bitorder="little").reshape(count, bits)
     return columns @ (1 << np.arange(bits))
 
@@ -332,7 +332,7 @@ def _members(label: np.ndarray, count: int) -> list[np.ndarray]:
 
 
 def compact(label: np.ndarray) -> tuple[np.ndarray, int]:
-    """Renumbers labels from 0 without gaps, in the same order."""
+    """Renumbers labels from 0 without gaps, in the same order. Returns new labels, int64, and their number."""
     used, compact = np.unique(label, return_inverse=True)
     return compact.astype(np.int64), len(used)
 
@@ -348,7 +348,7 @@ def _sums(values: np.ndarray, label: np.ndarray, count: int) -> np.ndarray:
 
 
 def _seeds(points: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
-    """Draws initial centres by k-means++: with chances by squared distance to the nearest centre drawn so far."""
+    """Draws initial centres by k-means++: a point's chance grows as its squared distance to the nearest centre."""
     chosen = [points[random.integers(len(points))]]
     distance = np.square(points - chosen[0]).sum(1)
     while len(chosen) < count and distance.sum() > 0.0:
@@ -358,7 +358,7 @@ def _seeds(points: np.ndarray, count: int, random: np.random.Generator) -> np.nd
 
 
 def _closest(values: np.ndarray, mean: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the index of the subspace of least error for each of N values, int64 [N], and the total squared error."""
+    """Returns the index of each value's subspace of least error, int64 [N], and the total squared error."""
     count, rank, width = basis.shape
     flat = basis.reshape(count * rank, width)
     offset = np.einsum("ckd,cd->ck", basis, mean)

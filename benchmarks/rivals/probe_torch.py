@@ -1,8 +1,8 @@
 """The probe fit in plain torch: the reference for the speed and the quality of the kernels' fit.
 
-The same model as `wlm.probe` (gaussian-probe-compression, eq. 2 to 10), but every Gaussian counts at every probe
-(eq. 5 without eq. 6), with autograd, on dense matrices of probes times Gaussians. Its start is the paper's: centres by
-k-means, scales from the nearest centre. It writes no file, and the network stays in float32.
+It fits the model of `wlm.probe` (gaussian-probe-compression, eq. 2 to 10), but every Gaussian counts at every probe
+(eq. 5 without eq. 6). It uses autograd on dense matrices of probes times Gaussians. It starts as in the paper, with
+centres by k-means and scales from the nearest centre. It writes no file, and the network stays in float32.
 """
 
 import itertools
@@ -21,12 +21,12 @@ _QUANTISE_FROM = 5 / 6  # share of the steps after which the Gaussians are used 
 
 
 class DenseFit:
-    """The fit of a probe set.
+    """The fit of N probes of D numbers by K Gaussians with L numbers each.
 
     Attributes:
         parameters: The optimised tensors: centres [K, 3], logs of the scales [K, 3], quaternions
             w x y z [K, 4], latents [K, L], then the network's weights and biases, layer by layer.
-        steps_done: Steps so far.
+        steps_done: Number of steps done so far.
         seconds: Time spent in `run` so far, including waiting for the device.
     """
 
@@ -49,14 +49,14 @@ class DenseFit:
 
         Args:
             x: [N, 3], positions in the unit cube.
-            values: [N, D], values to fit.
+            values: [N, D], the numbers of each probe, which are fitted.
             count: Requested number of Gaussians; limited to the number of distinct positions.
-            latent: L, numbers in a Gaussian's latent.
+            latent: L, the size of each Gaussian's latent vector.
             hidden: Width of both hidden layers.
             steps: Steps of the whole fit, which define the schedule.
             rates: Initial learning rates: centre, log of the scale, rotation, latent, network.
-            final: All rates end here, on half a cosine, as a share of the first.
-            bits: Bits of each number except the centre's, which has 16, in the last sixth (eq. 13 and 14).
+            final: Last learning rates as a share of the initial ones; they fall along half a cosine.
+            bits: Bits to which Gaussians are quantised in the last sixth of the steps (eq. 13, 14); centres have 16.
             seed: Seed of all random numbers.
             device: "cpu" or "cuda:0".
 
@@ -67,7 +67,7 @@ class DenseFit:
         if values.ndim != 2 or 0 in values.shape or x.shape != (len(values), 3):
             raise ValueError(f"expected positions [N, 3] and values [N, D], got {x.shape} and {values.shape}")
         if min(count, steps, latent, hidden) < 1:
-            raise ValueError(f"expected at least 1 of each, got {count=}, {steps=}, {latent=}, {hidden=}")
+            raise ValueError(f"expected numbers of at least 1, got {count=}, {steps=}, {latent=}, {hidden=}")
         self.steps_done, self.seconds = 0, 0.0
         self._steps, self._device = steps, device
         random = np.random.default_rng(seed)
@@ -146,7 +146,7 @@ class DenseFit:
 
 
 def _features(x, centre, log_scale, rotation, latent):  # [N, 3], [K, 3], [K, 3], [K, 4], [K, L] -> [N, L]
-    """Evaluates eq. 2 to 5 of the paper: the features of N probes as sums over all Gaussians."""
+    """Evaluates eq. 2 to 5 of the paper: features [N, L] of N probes, as sums over the latents of all K Gaussians."""
     whiten = _matrices(rotation).transpose(1, 2) * torch.exp(-log_scale)[:, :, None]  # [K, 3, 3], S^-1 R^T
     u = torch.einsum("kij,nj->nki", whiten, x) - torch.einsum("kij,kj->ki", whiten, centre)
     return torch.exp(-0.5 * (u * u).sum(-1)) @ latent
@@ -163,7 +163,7 @@ def _matrices(rotation):  # [K, 4] -> [K, 3, 3]
 
 
 def _on_levels(values, levels):  # [K, C] -> [K, C]
-    """Quantises by eq. 13 and 14, with a straight-through gradient."""
+    """Quantises values to evenly spaced levels (eq. 13 and 14), with a straight-through gradient."""
     with torch.no_grad():
         low, high = values.amin(0), values.amax(0)
         size = torch.where(high > low, (high - low) / levels, 1.0)
@@ -172,7 +172,7 @@ def _on_levels(values, levels):  # [K, C] -> [K, C]
 
 
 def _first_gaussians(x: np.ndarray, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Returns centres float64 [K, 3] by k-means, and scales float64 [K] from the nearest centre (section 3.2)."""
+    """Returns K centres [K, 3] by k-means, and as scales [K] the distances to the nearest centre (section 3.2)."""
     distinct = np.unique(x, axis=0)
     centre = distinct[random.choice(len(distinct), min(count, len(distinct)), replace=False)]
     for _ in range(_ROUNDS):

@@ -22,9 +22,9 @@ class Rival:
     Attributes:
         name: Name of the method, a key of `RIVALS` in its module.
         bytes: Size in bytes of everything that a decoder needs.
-        encode_seconds: Wall-clock time from the input to these bytes, on the CPU unless the method is given a device.
-        decode_seconds: Wall-clock time from these bytes to `decoded` on the same device; None: not timed. For block
-            formats it says nothing about a GPU, whose texture unit decodes them.
+        encode_seconds: Wall-clock time to compress, on the CPU unless the method is given a device.
+        decode_seconds: Wall-clock time to decompress on the same device; None: not timed. For block formats it says
+            nothing about a GPU, whose texture unit decodes them.
         decoded: The decompressed data whose error is measured: a lightmap float32 [H, W, 3], a `Sampler` of an atlas,
             or probes float32 [N, D].
         option: Settings that the method chose, as the results table prints them.
@@ -51,14 +51,14 @@ def measure(
     disk_bytes: Callable[[_Payload], int] | None = None,
     option: Callable[[_Payload], str] = lambda payload: "",
 ) -> Rival:
-    """Encodes and decodes by a method, times both, and returns the `Rival`.
+    """Encodes and decodes with a method, measures both times, and returns the `Rival`.
 
     Args:
         name: Name of the method.
         encode: Function that makes the encoded payload.
         decode: Function that decodes a payload.
         bytes: Function that returns a payload's size in bytes.
-        disk_bytes: Function that returns its size in bytes on disk; lossless compression for that is not timed.
+        disk_bytes: Function that returns a payload's size in bytes on disk; this lossless compression is not timed.
         option: Function that returns the settings of a payload as text.
     """
     start = time.perf_counter()

@@ -1,7 +1,8 @@
-"""Compresses each lightmap of a scene, of one object in one lighting state, alone, by the profile `standard`.
+"""Compresses each object of a scene in each lighting state alone, with the profile `standard`.
 
-These parts are the rival of one model whose tiles all objects share: each part has its own tiles and textures, and a
-share of the bits in proportion to its texels. All parts are fitted at once, weighted for views of the whole scene.
+These lightmaps, called parts, are the rival of one model whose tiles all objects share: each part has its own tiles and
+textures, and a share of the bits in proportion to its texels. All parts are fitted at once, and errors are weighted for
+views of the whole scene.
 """
 
 import math
@@ -30,7 +31,7 @@ _TRIES, _CLOSE = (
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One sheet's lightmap in one lighting state, as a scene, and the range of its tile numbers among all parts."""
+    """One object's lightmap in one lighting state, as a scene of its own, and the range of its tiles among all."""
 
     scene: LightmappedScene
     sheet: int
@@ -75,10 +76,10 @@ def scene_parts(
 
     Args:
         scene: The scene.
-        weights: For each sheet [2 H, 2 W], how much each quarter of a texel counts, `scene_weights`.
+        weights: Weights of the quarters of all texels, [2 H, 2 W] for each sheet, from `scene_weights`.
         bits: Total bits of all parts. The result has as many or a few more, as texture sizes allow, unless some parts
             become plain smaller lightmaps.
-        colour: The storage of colour, which replaces the setting of `standard`.
+        colour: How colours are stored, in place of the setting of the profile `standard`.
         device: "cpu" or "cuda:N".
 
     Returns:
@@ -123,7 +124,7 @@ def _compressed(
 def _cut(
     scene: LightmappedScene, weights: Sequence[np.ndarray], profile: Profile, device: str
 ) -> tuple[Tiles, list[_Part]]:
-    """Cuts all parts into tiles, the weights of each part adding up to 1. Returns tiles and parts, sheet by sheet."""
+    """Cuts all parts into tiles. The weights of each part add up to 1. Returns tiles and parts, sheet by sheet."""
     pieces, parts, first = [], [], 0
     for number, (sheet, weight) in enumerate(zip(scene.sheets, weights, strict=True)):
         for state, lightmap in zip(scene.states, sheet.lightmaps, strict=True):
@@ -148,7 +149,7 @@ def _placed(error: torch.Tensor, sizes: list[Size], part: _Part, share: float, p
 
 
 def _bits(placed: Layout | None, part: _Part, share: float, profile: Profile) -> float:
-    """Returns the bits of a part's textures, or an estimate if the part becomes a smaller lightmap."""
+    """Returns the bits of a part's textures, or an estimate if the part becomes a plain smaller lightmap."""
     size = part.scene.sheets[0].mask.shape
     if placed is None:
         return share * part.scene.texels * SOURCE_BITS
@@ -161,7 +162,7 @@ def _bits(placed: Layout | None, part: _Part, share: float, profile: Profile) ->
 def _by_part(
     samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]], parts: list[_Part]
 ) -> list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]]:
-    """Splits the result of `solved` by parts, each with its own numbers of tiles."""
+    """Splits `samples`, the result of `solved`, by parts, and numbers the tiles of each part from 0."""
     ends = np.array([part.tiles.stop for part in parts])
     result: list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]] = [[] for _ in parts]
     for members, values, weight in samples:

@@ -29,7 +29,9 @@ def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) 
     if source.perspective or camera.perspective:
         raise ValueError("a billboard needs orthographic cameras, as the lightmaps do")
     if tuple(baked.lightmaps.shape[1:]) != (source.height, source.width):
-        raise ValueError(f"baked: expected {source.height} x {source.width}, got {tuple(baked.lightmaps.shape[1:])}")
+        raise ValueError(
+            f"baked: expected {source.height} x {source.width} pixels, got {tuple(baked.lightmaps.shape[1:])}"
+        )
     if baked.transparency is None:
         raise ValueError("baked: expected lightmaps with their transparency")
     planes = [baked.lightmaps, 1.0 - baked.transparency[None]]
@@ -47,6 +49,6 @@ def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) 
 
 
 def _offset(camera: Camera, pivot: np.ndarray) -> tuple[float, float]:
-    """Returns a point's offset from the image centre, to the right and up, in world units."""
+    """Returns the offset of the pivot from the image centre, to the right and up, in world units."""
     right, up, _ = camera.axes @ (np.asarray(pivot, np.float64) - np.asarray(camera.position, np.float64))
     return float(right), float(up)

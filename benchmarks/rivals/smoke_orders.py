@@ -32,7 +32,7 @@ _REACH = 3.0  # standard deviations
 
 
 def three_octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
-    """Returns a picture with multiple scattering approximated by three octaves, float32 [H, W, 3]."""
+    """Returns a picture with multiple scattering approximated by three octaves of single scattering, [H, W, 3]."""
     march = orders_march(volume)
     picture = light_smoke(volume, camera, lights, march).shade(albedo=(albedo,) * 3)
     for share, shadow in CLASSIC:
@@ -52,22 +52,22 @@ def octaves(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> t
 
 
 def diffused(volume: DensityVolume, camera: Camera, lights: Sequence[Light], albedo: float) -> torch.Tensor:
-    """Returns a picture by single scattering plus diffusion, the inputs of our learned model, float32 [H, W, 3]."""
+    """Returns a picture by single scattering plus diffusion, which our learned model mixes, float32 [H, W, 3]."""
     with stream(device_name(volume.device)):
         lit, inputs = make_inputs(volume, camera, lights, [albedo], orders_march(volume))
         return lit.compose(inputs.by_diffusion(albedo)[..., None].expand(-1, -1, -1, 3))
 
 
 def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]) -> torch.Tensor:
-    """Returns P image planes for each of L lights of irradiance 4 pi, float32 [L, P, H, W], which the filter adds up.
+    """Returns P image planes for each of L lights of irradiance 4 pi, float32 [L, P, H, W], for a weighted sum.
 
     The planes are the smoke lit by the light, by the opposite light and from all around, opacity, squared opacity and
     optical depth; each also blurred at several scales, and all of these also multiplied by opacity.
 
     Args:
         volume: The smoke.
-        camera: Orthographic.
-        lights: At least one.
+        camera: Orthographic camera.
+        lights: At least one directional light.
     """
     march = orders_march(volume)
     lit = light_smoke(volume, camera, lights, march)
@@ -82,7 +82,7 @@ def filter_planes(volume: DensityVolume, camera: Camera, lights: Sequence[Light]
 
 
 def _blurred(planes: torch.Tensor, sigma: float) -> torch.Tensor:
-    """Blurs planes [L, P, H, W] by a Gaussian with a standard deviation in pixels; outside is black."""
+    """Blurs planes [L, P, H, W] by a Gaussian of standard deviation `sigma` in pixels, with black outside."""
     reach = max(1, round(_REACH * sigma))
     away = torch.arange(-reach, reach + 1, device=planes.device) / max(sigma, 1e-3)
     weights = torch.exp(-0.5 * away**2)

@@ -159,10 +159,10 @@ def test_what_is_refused(tmp_path, lightmaps):
         with pytest.raises(WlmError, match=line):
             read_lightmaps(*paths)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(WlmError, match="expected a .glb and its .exr in it or in folders of it, found none"):
+    with pytest.raises(WlmError, match="expected a .glb file and its .exr lightmaps, there or one folder below"):
         read_lightmaps(tmp_path / "empty")
     (tmp_path / "Cube" / "second.glb").write_bytes(mesh.read_bytes())
-    with pytest.raises(WlmError, match="Cube: expected one .glb a folder, found 2"):
+    with pytest.raises(WlmError, match="Cube: expected one .glb file in the folder, found 2"):
         read_lightmaps(tmp_path)
     with pytest.raises(ValueError, match="at least one lightmap and one profile"):
         run_rows(lightmaps, [], device="cpu", views=1, resolution=32, whole=False)
@@ -180,5 +180,5 @@ def test_the_rivals_alone(lightmaps, rows, tmp_path, monkeypatch):
     for name in ("bytes", "psnr"):
         assert [row[name] for row in alone] == [row[name] for row in beside]
     write_json(tmp_path / "few.json", [row for row in rows if row.scene == "cube night"], {})
-    with pytest.raises(WlmError, match="expected a row of method ours of sheet day"):
+    with pytest.raises(WlmError, match="expected a row of the method 'ours' and the scene sheet day"):
         rival_rows(tmp_path / "few.json", lightmaps)

@@ -107,9 +107,9 @@ def test_a_set_is_read_and_what_is_wrong_is_said(tmp_path):
     scene = read_scene(tmp_path, [12.0], 48)
     assert scene.name == "boxes 48" and scene.states == ("12 h",) and len(scene.sheets) == 2
     assert "no lightmap of 7 h; it has 6, 12" in error_of(read_scene, tmp_path, [7.0])
-    assert "side: expected a divisor of 96, got 50" in error_of(read_scene, tmp_path, (), 50)
+    assert "side: expected a divisor of the longer side, 96 texels, got 50" in error_of(read_scene, tmp_path, (), 50)
     (tmp_path / "set.json").write_text(json.dumps({k: v for k, v in text.items() if k != "mesh"}))
-    assert "expected a set with a mesh" in error_of(read_scene, tmp_path)
+    assert "expected a lightmap set that names its mesh" in error_of(read_scene, tmp_path)
 
 
 def test_rows(scene, rows, tmp_path):

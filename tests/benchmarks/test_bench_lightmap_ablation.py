@@ -35,7 +35,7 @@ def test_every_row_has_its_figures(made, lightmaps, tmp_path):
     rows, lines, counts = made
     names = [*VARIANTS, KERNELS]
     assert [row.option for row in rows] == names and counts == list(range(1, len(names) + 1))
-    assert lines == [f"two, ablation: fits {name}" for name in names]
+    assert lines == [f"two, ablation: fitting {name}" for name in names]
     for row in rows:
         assert (row.system, row.scene, row.method) == ("lightmap", "two, ablation", "ablation")
         assert row["psnr"] > 10.0 and 0.0 < row["ssim"] < 1.0 and row["dynamic_tiles"] == 1

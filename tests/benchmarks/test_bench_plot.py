@@ -134,10 +134,10 @@ def test_labels_of_a_crowd_do_not_overlap(tmp_path, monkeypatch):
         (ROWS, "p.png", "speed", "unknown figure 'speed'"),
         (ROWS, "p.gif", "bpp", r"\.gif.*ends in"),
         ([], "p.png", "bpp", "no row"),
-        ([Row("l", "c", "m", "", {"psnr": 1.0})], "p.png", "bpp", "no row has both a psnr and a bpp"),
+        ([Row("l", "c", "m", "", {"psnr": 1.0})], "p.png", "bpp", "no row has both figures, psnr and bpp"),
         (ROWS, "nowhere/p.png", "bpp", "nowhere"),
-        (ROWS, "p.png", Panel("bpp", "max_error"), "no row has both a max_error and a bpp"),
-        (ROWS, "p.png", Panel("bpp", methods=("PCA",)), "no row has both a psnr and a bpp"),
+        (ROWS, "p.png", Panel("bpp", "max_error"), "no row has both figures, max_error and bpp"),
+        (ROWS, "p.png", Panel("bpp", methods=("PCA",)), "no row has both figures, psnr and bpp"),
     ],
 )
 def test_what_cannot_be_drawn_is_one_clear_line(tmp_path, rows, name, x, message):

@@ -175,7 +175,7 @@ def test_errors_against_float64():
 
 def test_data_of_the_demos():
     assert demo_data("city", "--set").is_dir()
-    with pytest.raises(WlmError, match="probes/absent.npz exist only in a checkout: expected --probes FILE"):
+    with pytest.raises(WlmError, match="probes/absent.npz exist only in a checkout of the repository: give"):
         demo_data("probes/absent.npz", "--probes FILE")
 
 

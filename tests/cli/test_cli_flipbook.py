@@ -136,10 +136,10 @@ def test_wrong_flip_books(straight, tmp_path):
     words, out = ["smoke", "shade", first, "--with", second, "--from", "o3de"], ["-o", tmp_path / "out"]
     for extra, line in (
         (["--cells", "2x2"], "no opacity"),
-        (["--cells", "2x2", "--straight"], "expected opacity"),
+        (["--cells", "2x2", "--straight"], "for straight alpha, found none"),
         ([], "--cells: expected rows and columns"),
         (["--cells", "0x2"], "--cells: expected rows and columns"),
-        (["--cells", "3x3"], "expected 3 x 3 cells of whole pixels"),
+        (["--cells", "3x3"], "expected sides that divide into 3 rows and 3 columns"),
         (["--with", opacity, "--with", opacity, "--cells", "2x2"], "got 4"),
     ):
         assert line in fails(*words, *extra, *out)

@@ -52,5 +52,5 @@ def test_decode_writes_a_layer_with_its_channels(made, tmp_path):
 def test_wrong_layers_and_export(made, tmp_path):
     folder, _ = made
     command = ["compress", folder / "scene", "-o", tmp_path / "a.wlm"]
-    assert "expected some of light, dir" in fails(*command, "--layers=ao")
+    assert "expected names among light, dir" in fails(*command, "--layers=ao")
     assert "bundle.json" in call("export", folder / "a.wlm", "-o", tmp_path / "engine")

@@ -86,7 +86,7 @@ def test_warnings_of_the_set_are_shown(profile, tmp_path):
     words = ["compress", tmp_path / "a.npz", "-o", tmp_path / "a.wlm", "--profile", profile]
     call(*words, "--key", "noon")
     assert re.search(r"^warning: .*1 probe", call.stderr, re.MULTILINE)
-    assert "several sets of values" in fails(*words)
+    assert "found several arrays of values" in fails(*words)
 
 
 def decoded(path, *words):

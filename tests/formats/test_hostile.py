@@ -200,11 +200,11 @@ rate: RATE
     ("changes", "expected"),
     [
         ({"VELOCITY": "1.0e+300"}, "inlets.0.velocity.1: expected less than or equal to 1000000000000000000"),
-        ({"VELOCITY": "1.0e+12"}, "expected at most 1,000,000 steps a frame, found a speed of 1e+12 m/s"),
+        ({"VELOCITY": "1.0e+12"}, "expected at most 1,000,000 steps per frame, found a speed of 1e+12 m/s"),
         ({"CELL": "1.0e-300"}, "grid.cell: expected greater than or equal to 0.000000001"),
         ({"CELL": "1.0e+300"}, "grid.cell: expected less than or equal to 1000000000"),
         ({"RATE": "1.0e-9"}, "rate: expected greater than or equal to 0.000001"),
-        ({"SPEED": "1.0e-300"}, "expected at most 1,000,000 steps a frame"),
+        ({"SPEED": "1.0e-300"}, "expected at most 1,000,000 steps per frame"),
     ],
 )
 def test_scenes(tmp_path, changes, expected):
@@ -442,7 +442,7 @@ def test_alpha_that_is_no_number_is_told_and_not_valid(tmp_path):
     write_exr(tmp_path / "a.exr", pixels, half=False)
     loaded = lightmap.load(path)
     assert np.argwhere(~loaded.light.mask).tolist() == [[0, 0], [0, 1], [1, 0]]
-    assert loaded.warnings == ("a.exr: 3 texels with an alpha NaN or infinite: not valid",)
+    assert loaded.warnings == ("a.exr: 3 texels are not valid: alpha is NaN or infinite",)
 
 
 def test_what_a_terminal_obeys_is_escaped(capsys):

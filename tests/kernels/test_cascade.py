@@ -102,9 +102,9 @@ def test_nothing_to_read(device: str):
 
 def test_wrong_shapes(device: str):
     uv = np.zeros((1, 2), np.float32)
-    with pytest.raises(ValueError, match=r"colour: expected \[Hp, Wp, 3\], no side 0, got \(2, 2, 4\)"):
+    with pytest.raises(ValueError, match=r"colour: expected shape .* sides above 0, got \(2, 2, 4\)"):
         Reading(np.zeros((2, 2, 4)), None, uv, device).forward()
-    with pytest.raises(ValueError, match=r"lut: expected \[Hc, Wc, 2\] or \[0, 0, 2\], got \(2, 2, 3\)"):
+    with pytest.raises(ValueError, match=r"lut: expected shape .* \[0, 0, 2\] for none, got \(2, 2, 3\)"):
         Reading(np.zeros((2, 2, 3)), np.zeros((2, 2, 3)), uv, device).forward()
 
 

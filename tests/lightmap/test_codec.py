@@ -87,7 +87,7 @@ def test_any_block_of_mode_6_comes_back(tmp_path, part):
     assert_same(wlm.load(tmp_path / "a.wlm"), model)
     words[..., 0] |= np.uint64(1)
     other = _file_of(dataclasses.replace(sheet, **{part: words.view(np.uint8)}))
-    assert "BC7 mode 6" in error_of(other.save, tmp_path / "b")
+    assert "BC7 blocks of mode 6" in error_of(other.save, tmp_path / "b")
     assert not (tmp_path / "b").exists()
 
 
@@ -156,8 +156,8 @@ def test_damage_is_one_line(tmp_path):
     def moved(sizes):
         return sizes + np.array([2**32 - 9, 9], np.uint32)
 
-    assert "part tile_sizes: expected those of 2 tiles" in _changed(tmp_path, tile_sizes=more)
-    assert "part tile_sizes: expected those of 2 tiles" in _changed(tmp_path, tile_sizes=lambda sizes: sizes[:1])
+    assert "part tile_sizes: expected the sizes of 2 tiles" in _changed(tmp_path, tile_sizes=more)
+    assert "part tile_sizes: expected the sizes of 2 tiles" in _changed(tmp_path, tile_sizes=lambda sizes: sizes[:1])
     assert "part tile_sizes is uint32 (1, 2), expected uint32 (any)" in _changed(
         tmp_path, tile_sizes=lambda sizes: sizes[None]
     )
@@ -232,7 +232,7 @@ def test_networks_of_bytes_come_back(tmp_path, factor):
 def test_networks_off_their_levels_are_one_line(tmp_path):
     sheet = random_sheet((3, 0))
     wrong = dataclasses.replace(sheet, profile=sheet.profile.override({"net_bits": 8}))
-    assert "net: expected weights on 8-bit levels" in error_of(_file_of(wrong).save, tmp_path / "a.wlm")
+    assert "net: expected weights that 8 bits store" in error_of(_file_of(wrong).save, tmp_path / "a.wlm")
 
 
 def test_a_fit_on_levels_is_what_its_file_decodes_to(tmp_path):

@@ -134,7 +134,7 @@ def test_mask_from_alpha_may_differ_by_frame(tmp_path):
     expected[1, 1] = False
     np.testing.assert_array_equal(lightmaps.mask, expected)
     np.testing.assert_array_equal(lightmaps.covered, frames[..., 3] > 0)
-    assert "2 texels are in some lightmaps alone" in lightmaps.warnings[0]
+    assert "2 texels are valid in only some lightmaps" in lightmaps.warnings[0]
     # What a frame lacks is the nearest frame's; the rest is as it was.
     for i in range(len(frames)):
         assert np.array_equal(lightmaps.valid(i), frames[i, ..., 3] > 0)
@@ -278,10 +278,10 @@ def test_sizes_that_disagree_name_both_files(tmp_path):
     path = _write_set(tmp_path, _frames())
     write_exr(tmp_path / "b.exr", np.zeros((HEIGHT, WIDTH - 1, 3), np.float32))
     message = error_of(load, path)
-    assert "b.exr: is 6x5" in message and "a.exr is 7x5" in message
+    assert "b.exr: has 6x5 pixels" in message and "a.exr has 7x5" in message
     path = _write_set(tmp_path, _frames(), width=WIDTH + 1)
     message = error_of(load, path)
-    assert "a.exr: is 7x5" in message and "set.json states 8x5" in message
+    assert "a.exr: has 7x5 pixels" in message and "set.json states 8x5" in message
 
 
 def test_missing_truncated_and_misnamed_exr_name_the_file(tmp_path):
@@ -338,7 +338,7 @@ def test_set_that_is_no_json_object_names_the_file(tmp_path, text):
 
 def test_path_that_does_not_exist(tmp_path):
     assert "nowhere" in error_of(load, tmp_path / "nowhere")
-    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds), found neither" in error_of(load, tmp_path)
+    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds), found none" in error_of(load, tmp_path)
 
 
 def test_plain_folder_takes_files_in_natural_order(tmp_path):
@@ -368,7 +368,7 @@ def test_plain_folder_may_mix_formats(tmp_path):
     np.testing.assert_allclose(lightmaps.frames, frames, rtol=2**-7)
     assert lightmaps.source == from_arrays(expected, [1, 2, 3, 4]).source
     message = error_of(load, tmp_path, mask="alpha")
-    assert "m_2h.hdr: expected a channel A, which the mask is to come from, found R, G, B" in message
+    assert "m_2h.hdr: expected a channel A for the mask, found the channels R, G, B" in message
     (tmp_path / "m_2h.hdr").unlink()
     (tmp_path / "m_4h.DDS").unlink()
     np.testing.assert_array_equal(load(tmp_path, mask="alpha").mask, alpha[..., 0] > 0)
@@ -496,10 +496,10 @@ def test_states_that_differ_are_one_line(tmp_path):
     text = error_of(wlm.lightmap.load, folder)
     assert "day_12h has no Lightmap-1_comp_dir, but day_0h has it" in text and "--layers" in text
     assert len(wlm.lightmap.load(folder, layers=["light"]).sheets) == 2
-    assert "expected some of light, dir, got 'ao'" in error_of(wlm.lightmap.load, folder / "day_0h", layers=["ao"])
+    assert "expected names among light, dir, got 'ao'" in error_of(wlm.lightmap.load, folder / "day_0h", layers=["ao"])
     (late / "Lightmap-1_comp_shadowmask.png").rename(late / "Lightmap-1_comp_dir.png")
     write_exr(late / "Lightmap-0_comp_light.exr", np.ones((4, 12, 4)))
-    assert "is 12x4, but" in error_of(wlm.lightmap.load, folder)
+    assert "has 12x4 pixels, but" in error_of(wlm.lightmap.load, folder)
     write_unity(tmp_path / "other", hours=(3.0, 9.0))
     dark = tmp_path / "other" / "day_9h"
     light = read_exr(dark / "Lightmap-1_comp_light.exr")[0]
@@ -563,7 +563,7 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
         ({"layers": {"light": {"encoding": "unit", "channels": []}}}, "layers.light.channels"),
         ({"layers": {"a\nb": "unit"}}, "printable"),
         ({"atlases": None}, "atlases is missing"),
-        ({"atlases": {"0": {"width": 3, "height": 4}}}, "a.exr: is 5x2, but"),
+        ({"atlases": {"0": {"width": 3, "height": 4}}}, "a.exr: has 5x2 pixels, but"),
         ({"atlases": {"0": {"width": 3}}}, "atlases.0.height is missing"),
         ({"atlases": {"0": {}, "1": {}}}, "lightmaps[0].files.1 is missing"),
         ({"atlases": {"0": {"mask": "alpha"}}}, "expected a channel A"),
@@ -577,10 +577,10 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
         ),
         (
             {"lightmaps": [{"time_hours": 1.0, "files": {"0": {"light": {"file": "a.exr", "slice": 0, "slices": 3}}}}]},
-            "expected 3 slices of one height, found 2 rows",
+            "expected 3 slices of equal height, found 2 rows",
         ),
-        ({"layers": {"light": {"encoding": "unit", "channels": ["R"] * 2}}}, "each channel of a layer once"),
-        ({"layers": {"light": {"encoding": "unit", "channels": ["R", "G", "B"] * 2}}}, "each channel of a layer once"),
+        ({"layers": {"light": {"encoding": "unit", "channels": ["R"] * 2}}}, "12 different names"),
+        ({"layers": {"light": {"encoding": "unit", "channels": ["R", "G", "B"] * 2}}}, "12 different names"),
     ],
 )
 def test_a_wrong_set_is_one_line(tmp_path, changes, words):
@@ -611,9 +611,9 @@ def test_twelve_channels_and_no_more():
     other = Layer(np.zeros((1, 5, 4, 1)), "c", "1")
     assert len(from_layers([*layers, other], [0.0]).sheets) == 5
     wrong = Layer(np.zeros((1, 5, 4, 1)), "c")
-    assert "0/c R is 4x5, but atlas 0 is 4x4" in error_of(from_layers, [*layers, wrong], [0.0])
+    assert "0/c R has 4x5 texels, but atlas 0 has 4x4" in error_of(from_layers, [*layers, wrong], [0.0])
     # Not the second in place of the first.
-    assert "0/b: expected each channel of a layer once" in error_of(from_layers, [*layers, layers[1]], [0.0])
+    assert "0/b: expected every channel once" in error_of(from_layers, [*layers, layers[1]], [0.0])
 
 
 def test_names_of_arrays_are_those_that_a_file_can_have():
@@ -622,7 +622,7 @@ def test_names_of_arrays_are_those_that_a_file_can_have():
         assert "1 to 128 printable characters" in error_of(from_layers, [Layer(frames, **options)], [0.0])
     assert next(iter(from_layers([Layer(frames, channels=["x", "y", "z"])], [0.0]).sheets)).channels == tuple("xyz")
     masks = {"b": np.ones((4, 4), bool)}
-    assert "masks: expected those of atlases" in error_of(from_layers, [Layer(frames)], [0.0], masks)
+    assert "masks: expected names of atlases" in error_of(from_layers, [Layer(frames)], [0.0], masks)
 
 
 def test_sheets_that_are_large_together_lie_in_a_file(tmp_path, monkeypatch):

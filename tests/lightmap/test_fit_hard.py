@@ -76,7 +76,7 @@ def test_a_fit_that_diverged_keeps_nothing():
         kept = trainer.hidden[0, 2, 1].item()
         with torch.no_grad():
             trainer.hidden[0, 2, 1] = wrong
-        with pytest.raises(WlmError, match="tile 0: the fit diverged; expected a smaller map_rate or net_rate than"):
+        with pytest.raises(WlmError, match="tile 0: the fit diverged; take a smaller map_rate or net_rate"):
             trainer.state()
         with torch.no_grad():
             trainer.hidden[0, 2, 1] = kept
@@ -265,7 +265,7 @@ def test_times_outside_the_range_wrap_or_stop(tmp_path):
     ("options", "says"),
     [
         ({"steps": 1}, "steps: expected greater than or equal to 10"),
-        ({"quantise_from": 1.0, "freeze_from": 0.5}, "quantise_from must not be later than freeze_from"),
+        ({"quantise_from": 1.0, "freeze_from": 0.5}, "quantise_from must not be greater than freeze_from"),
         ({"device": "tpu"}, "device 'tpu'"),
     ],
 )

@@ -63,12 +63,12 @@ def test_files_that_claim_too_much_are_one_line(tmp_path):
         return {"sheets": [item | values if i == number else item for i, item in enumerate(sheets)]}
 
     refused({"sheets": sheets[:1] * 2000}, {}, "setting sheets")
-    refused({"sheets": [*sheets, sheets[0]]}, {}, "each of them once")
+    refused({"sheets": [*sheets, sheets[0]]}, {}, "found one twice")
     refused({"sheets": sheets[:3]}, {}, "part 3.")
-    refused(changed(2, channels=["G"]), {}, "each channel of a layer once")
-    refused(changed(1, size=[119, 107]), {}, "expected one size")
+    refused(changed(2, channels=["G"]), {}, "every channel once")
+    refused(changed(1, size=[119, 107]), {}, "texels, but atlas")
     refused(changed(1, encoding="srgb"), {}, "setting sheets.1.encoding")
-    refused({}, {"1.mask": stored.tensors["0.mask"]}, "part 1.mask: expected it with the first sheet of that atlas")
+    refused({}, {"1.mask": stored.tensors["0.mask"]}, "part 1.mask: expected a mask only with the first sheet")
 
     refused({}, {"0.times": stored.tensors["times"], "times": GONE}, "times")
 
@@ -140,7 +140,7 @@ def test_scores_are_relative_to_the_encodings_range(fitted, tmp_path):
     text = json.loads(json.dumps(report.to_json(), allow_nan=False))
     assert text["sheets"][1]["layer"] == "dir" and text["sheets"][1]["psnr"] == pytest.approx(directions.psnr)
     other = from_layers([Layer(original, "dir", encoding="unit")], hours, period=24.0, name="other")
-    assert "expected the sheets of the file" in error_of(wlm.lightmap.evaluate, model, other)
+    assert "expected the same sheets as in the file" in error_of(wlm.lightmap.evaluate, model, other)
 
 
 def test_a_layer_of_light_alone_is_fitted_as_without_layers(tmp_path):

@@ -92,7 +92,7 @@ def test_what_is_refused():
         StripDecoder(random_sheet((2, 0)))
     with pytest.raises(WlmError, match="expected at least one static tile, found none"):
         ExactDecoder(random_sheet((3, 0)), kind=TileKind.STATIC)
-    with pytest.raises(WlmError, match="expected cuda for the matrix path, got cpu"):
+    with pytest.raises(WlmError, match="expected cuda for MatrixDecoder, got cpu"):
         MatrixDecoder(random_sheet((3, 0)), "cpu")
     with pytest.raises(WlmError, match="gelu: expected one of"):
         StripDecoder(random_sheet((3, 0)), gelu="relu")

@@ -109,7 +109,7 @@ def test_what_several_workers_were_at_is_resumed_by_another_number(lightmaps, tm
 
 def test_a_batch_that_no_worker_survives_is_named(lightmaps, monkeypatch):
     monkeypatch.setattr(fit, "start_workers", functools.partial(Several, lose=range(100)))
-    with pytest.raises(WlmError, match="^fit: batch 0 has lost 3 workers: it was unlucky$"):
+    with pytest.raises(WlmError, match="^fit: 3 workers died while fitting batch 0: it was unlucky$"):
         fit.compress(lightmaps, PROFILE, workers=2)
 
 

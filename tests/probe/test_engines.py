@@ -53,7 +53,7 @@ def test_texture_as_three_lays_it_out(grid):
 
 def test_export_refuses(tmp_path):
     for model, settings, message in [
-        (random_model(outputs=12), {}, "expected L2 in RGB"),
+        (random_model(outputs=12), {}, "expected 27 numbers per probe"),
         (random_model(), {"cells": 0}, "cells: expected"),
         (random_model(), {"cells": 257}, "cells: expected"),
     ]:
@@ -255,7 +255,7 @@ def test_the_shader_compiles(model, tmp_path):
 def test_what_unreal_refuses(model, tmp_path):
     bright = wlm.probe.compress(wlm.probe.from_arrays(np.eye(3), np.full((3, 27), 1e6)), positions=True)
     for made, settings, message in [
-        (random_model(outputs=12, positions=True), {}, "expected L2 in RGB"),
+        (random_model(outputs=12, positions=True), {}, "expected 27 numbers per probe"),
         (model, {"cells": 129}, "cells: expected 1 to 128"),
         (bright, {}, "expected light within 64512"),
     ]:
@@ -345,8 +345,8 @@ def test_what_is_refused(tmp_path):
     path.write_bytes(writer.file(bake(writer, points, np.ones((9, 9, 3)))))
     model = wlm.probe.compress(from_arrays(points[::-1] + 1.0, np.ones((9, 27))))
     for refused, settings, message in [
-        (random_model(outputs=12), {}, "expected L2 in RGB"),
-        (random_model(outputs=12), {"original": path}, "expected L2 in RGB"),
+        (random_model(outputs=12), {}, "expected 27 numbers per probe"),
+        (random_model(outputs=12), {"original": path}, "expected 27 numbers per probe"),
         (random_model(), {"cells": 65}, "cells: expected 1 to 64"),
         (random_model(), {"cells": 4, "original": path}, "cells: expected none"),
         (model, {"original": path}, "a.lmbake: expected the 9 probes"),

@@ -149,7 +149,7 @@ def test_conventions_that_do_not_fit(tmp_path):
     path = _write(tmp_path / "a.npz", sh=_values(N, 16, 3))
     assert load(path, convention="godot").outputs == 48
     message = error_of(load, path, convention="unity")
-    assert str(path) in message and "knows L0 to L2, got L3" in message
+    assert str(path) in message and "expected bands L0 to L2, got L3" in message
     for values in (_values(N, 5), _values(N, 6), _values(N, 5, 3)):
         assert from_arrays(_position(), values).outputs == np.prod(values.shape[1:])
         assert "expected spherical harmonics" in error_of(from_arrays, _position(), values, convention="unreal")
@@ -161,9 +161,9 @@ def test_conventions_that_do_not_fit(tmp_path):
         assert str(path) in message and "expected threejs, godot, unreal, unity, got 'Unity'" in message
     for wrong in (np.array(3), np.array(["unity"])):
         message = error_of(load, _write(tmp_path / "b.npz", convention=wrong))
-        assert "b.npz: convention: expected a name, got" in message
+        assert "b.npz: convention: expected a string, got" in message
     content = {"position": [[0, 0, 0]], "sh": [[1]], "convention": {}}
-    assert "expected a name, got an object" in error_of(load, _write_json(tmp_path / "b.json", content))
+    assert "expected a string, got an object" in error_of(load, _write_json(tmp_path / "b.json", content))
 
 
 def test_godot_file(tmp_path, monkeypatch):
@@ -224,10 +224,10 @@ def test_no_live_probe_and_no_probe(tmp_path):
     for values in (np.zeros((N, 27)), np.full((N, 27), np.nan), np.full((N, 27), 1e-60)):
         assert "array: sh: every probe is zero, not finite or not valid" in error_of(from_arrays, _position(), values)
     path = _write(tmp_path / "a.npz", position=np.zeros((0, 3)), sh=np.zeros((0, 9, 3)))
-    assert "a.npz: position: expected at least one, found none" in error_of(load, path)
+    assert "a.npz: position: expected at least one probe, found none" in error_of(load, path)
     for content in ({"probes": []}, {"position": [], "sh": []}):
         path = _write_json(tmp_path / "a.json", content)
-        assert "position: expected at least one, found none" in error_of(load, path)
+        assert "position: expected at least one probe, found none" in error_of(load, path)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
@@ -294,7 +294,7 @@ def test_number_types_are_converted(tmp_path, dtype):
     ("changes", "expected"),
     [
         ({"position": np.zeros((N, 2))}, "position: expected (N, 3), got (6, 2)"),
-        ({"position": np.float64(3)}, "position: expected at least one, found none"),
+        ({"position": np.float64(3)}, "position: expected at least one probe, found none"),
         ({"position": np.full((N, 3), "a")}, "position: expected numbers, got <U1"),
         ({"sh": _values(N - 1, 9, 3)}, "sh: expected (6, C, 3) with RGB last or (6, D), a row for each position, got"),
         ({"sh": _values(N, 3, 9)}, "got (6, 3, 9)"),
@@ -374,12 +374,12 @@ def test_positions_of_any_file(tmp_path, monkeypatch):
         ("3", "expected a JSON object, got 3"),
         ("{}", "position: expected a list, got null"),
         ('{"probes": [{"sh": 3}]}', "probes[0].position is missing"),
-        ("[]", "position: expected at least one, found none"),
+        ("[]", "position: expected at least one probe, found none"),
         ("[[1, 2]]", "position: expected (N, 3), got (1, 2)"),
         ('[[0, 0, 0], [0, 1, "2"]]', "position[1]: expected numbers, as many as position[0] has, got [0, 1, "),
         ("[[0, 1, 1e999]]", "position[0]: expected finite numbers"),
         ({"path": np.zeros((2, 3))}, "position is missing; found path"),
-        ({"position": np.zeros((0, 3))}, "position: expected at least one, found none"),
+        ({"position": np.zeros((0, 3))}, "position: expected at least one probe, found none"),
     ],
 )
 def test_what_holds_no_positions(tmp_path, content, expected):
@@ -429,7 +429,7 @@ def test_writing_is_refused_without_touching_the_file(tmp_path):
     path.write_bytes(b"precious")
     arguments = path, _position(), _values(N, 27)
     for key in ("position", "convention", "probes", "file", "allow_pickle"):
-        assert "means something else" in error_of(save_probes, *arguments, key=key)
+        assert "no other field" in error_of(save_probes, *arguments, key=key)
     assert "expected spherical harmonics" in error_of(save_probes, path, _position(), _values(N, 5), convention="unity")
     assert "ends in .npz or .json, found .lmbake" in error_of(save_probes, tmp_path / "a.lmbake", *arguments[1:])
     assert "does not exist" in error_of(save_probes, tmp_path / "no" / "a.json", *arguments[1:])

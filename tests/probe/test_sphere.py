@@ -333,7 +333,7 @@ def test_higher_bands_where_a_convention_has_a_rule_for_them(name):
 
 def test_errors():
     for name in LIMITED:
-        with pytest.raises(WlmError, match=rf"convention {name}: knows L0 to L2, got L3 \(16 coefficients\)"):
+        with pytest.raises(WlmError, match=rf"convention {name}: expected bands L0 to L2, got L3 \(16 coefficients\)"):
             to_canonical(np.ones((1, 16, 3)), name)
     for name in CONVENTIONS:
         for count in (2, 8):

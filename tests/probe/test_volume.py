@@ -364,7 +364,7 @@ def test_wrong_arrays():
     with pytest.raises(WlmError, match="probe 4: expected finite"):
         StoredLight(np.where(np.arange(10)[:, None] == 4, np.nan, _field(position)))
     volume = _volume(position)
-    with pytest.raises(ValueError, match="after an update"):
+    with pytest.raises(ValueError, match="a call of `update` before"):
         volume.read(position)
     volume.update([0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="read"):

@@ -340,7 +340,7 @@ def test_pool_of_a_volume(tmp_path, device: str):
     thin = pool_of_volume(tmp_path / "a.npz", FEW, device=device, extinction=1e-3)
     assert thin.targets[:, 0, OPACITY_PLANE].max() < 0.3
     np.savez(tmp_path / "none.npz", density=np.zeros((4, 4, 4)))
-    with pytest.raises(WlmError, match=r"none.npz: density: is zero everywhere"):
+    with pytest.raises(WlmError, match=r"none.npz: density is zero everywhere"):
         pool_of_volume(tmp_path / "none.npz", FEW, device=device)
     with pytest.raises(WlmError, match="No such file"):
         pool_of_volume(tmp_path / "missing.npz", FEW, device=device)
@@ -351,7 +351,7 @@ def test_pools_are_checked_and_taken_apart():
     with pytest.raises(ValueError, match="motion"):
         dataclasses.replace(pool, motion=pool.motion[:, :1])
     for planes in (0, 2, 4, 10):
-        with pytest.raises(ValueError, match="guides: .* of one of GUIDES"):
+        with pytest.raises(ValueError, match="guides: .* of a kind in GUIDES"):
             dataclasses.replace(pool, guides=pool.guides[:, :, :1].repeat(1, 1, planes, 1, 1))
     six = dataclasses.replace(pool, guides=pool.guides.repeat(1, 1, 3, 1, 1))
     assert six.guides.shape[2] == len(GUIDES["six"]) and len(pool.to("cpu")) == len(pool) == 6

@@ -116,7 +116,7 @@ def test_straight_alpha_in_a_third_texture(tmp_path: Path):
     np.testing.assert_allclose(read[1].lightmaps, expected, atol=0.01)
     np.testing.assert_allclose(read[1].transparency, frames[1].transparency, atol=0.003)
     assert not is_straight(read) and is_straight(plain)
-    with pytest.raises(WlmError, match="expected opacity"):
+    with pytest.raises(WlmError, match="expected an alpha channel or a third texture for straight alpha"):
         read_flipbook([*paths], "unity", rows=1, columns=2, straight=True)
     Image.new("L", (8, 8)).save(book[2])
     with pytest.raises(WlmError, match="expected textures of one size"):
@@ -132,12 +132,12 @@ def test_wrong_files(tmp_path: Path):
 
     refused("a_1.png: cannot read the picture")
     write_book(_book(_frames(1)), tmp_path / "a.png")
-    refused("expected 4 x 4 cells of whole pixels, found 6 x 9", cells=4)
-    refused("expected 12 x 12 cells of whole pixels, found 6 x 9", cells=12)
+    refused("expected sides that divide into 4 rows and 4 columns, found 6 x 9", cells=4)
+    refused("expected sides that divide into 12 rows and 12 columns, found 6 x 9", cells=12)
     Image.new("RGB", (9, 5)).save(paths[1])
     refused("textures of one size")
     Image.new("L", (9, 6)).save(paths[1])
-    refused("a_2.png: expected RGB or RGBA of 8 bits, found L")
+    refused("a_2.png: expected RGB or RGBA with 8 bits per channel, found L")
     whole = paths[0].read_bytes()
     paths[0].write_bytes(whole[: len(whole) // 2])
     refused("a_1.png: cannot read the picture")
@@ -148,7 +148,7 @@ def test_wrong_files(tmp_path: Path):
     for path in paths:
         Image.new("RGB", (9, 6)).save(path)
     refused("layout o3de-tlrb: expected channels for bottom", "o3de-tlrb")
-    with pytest.raises(WlmError, match="expected two textures, and possibly one of opacity, got 1"):
+    with pytest.raises(WlmError, match="expected two textures, or three with one of opacity, got 1"):
         read_flipbook(paths[:1], "unity", rows=1, columns=1)
     write_exr(tmp_path / "a.exr", np.full((2, 2, 3), np.nan, np.float32))
     with pytest.raises(WlmError, match="a.exr: expected finite light"):
@@ -167,5 +167,5 @@ def test_wrong_files(tmp_path: Path):
 def test_wrong_settings(options: dict, message: str):
     with pytest.raises(ValueError, match=message):
         _book(_frames(3), **options)
-    with pytest.raises(ValueError, match="expected lightmaps of one size"):
+    with pytest.raises(ValueError, match="shots: expected lightmaps of one size"):
         _book([*_frames(1), *_frames(1, size=(3, 3))])

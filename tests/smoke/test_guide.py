@@ -87,5 +87,5 @@ def test_steps_against_a_fine_march(device: str):
 @pytest.mark.parametrize("name", ["spacing", "light_step"])
 def test_settings_of_the_coarse_march_are_refused(name: str):
     volume = _ball("cpu", 4)
-    with pytest.raises(ValueError, match=f"{name}: expected none"):
+    with pytest.raises(ValueError, match=f"{name}: expected None"):
         guide(volume, _camera(volume), March(**{name: 2.0}))

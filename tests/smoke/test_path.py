@@ -211,7 +211,7 @@ def test_wrong_settings_are_named():
     for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"{name}: expected"):
             trace(volume, camera, [Light(WAY)], **{name: value})
-    with pytest.raises(WlmError, match="optical depth of at most"):
+    with pytest.raises(WlmError, match="smoke: expected optical depths of at most"):
         trace(ball(depth=1e7), camera, samples=2)
     with pytest.raises(ValueError, match="obstacles: expected triangles"):
         trace(volume, camera, obstacles=(np.zeros((3, 3)), np.array([[0, 1, 7]])))

@@ -107,7 +107,7 @@ def test_other_kinds_are_refused():
     volume = plume()
     with pytest.raises(ValueError, match="kind: expected one of paper, six, got 'back'"):
         render_guide(volume, view_of(volume), "back", MARCH)
-    with pytest.raises(ValueError, match="spacing: expected none"):
+    with pytest.raises(ValueError, match="spacing: expected None"):
         render_guide(volume, view_of(volume), "paper", replace(MARCH, spacing=2.0))
 
 

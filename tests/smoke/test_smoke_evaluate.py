@@ -83,7 +83,7 @@ def test_hard_pools():
     report = evaluate(_network(), empty)
     assert report.psnr > 90 and math.isnan(report.flicker) and math.isnan(report.flicker_ratio)
     assert report.to_json()["flicker"] is None and json.dumps(report.to_json(), allow_nan=False)
-    with pytest.raises(ValueError, match=r"planes: expected \[2, 2, 8, 32, 32\], got \[2, 2, 7, 32, 32\]"):
+    with pytest.raises(ValueError, match=r"planes: expected shape \[2, 2, 8, 32, 32\], got \[2, 2, 7, 32, 32\]"):
         score(lambda pool, part: pool.targets[part][:, :, :7], pool)
 
 

@@ -100,7 +100,7 @@ def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, te
         assert {**row, "seconds": 0} == {**expected, "seconds": 0}
     # Finished, it is left alone.
     content = path.read_bytes()
-    with pytest.raises(WlmError, match=r"parts: is finished; without --resume it is trained anew$"):
+    with pytest.raises(WlmError, match=r"parts: cannot resume: the training is finished; start anew without --resume$"):
         _train(path, profile, seed=1, resume=True)
     assert path.read_bytes() == content and not (tmp_path / "parts.partial").exists()
 
@@ -220,7 +220,7 @@ def test_nan_in_a_pool_is_an_error(tmp_path, name):
     with pytest.raises(WlmError, match=f"round 1: {name}: sample 2: expected finite"):
         _train(tmp_path / "a", _profile(steps=2), make_pool=broken)
     empty = small_pool().take(torch.zeros(6, dtype=torch.bool))
-    with pytest.raises(WlmError, match="validation: expected samples, found none"):
+    with pytest.raises(WlmError, match="validation: expected samples with smoke, found none"):
         _train(tmp_path / "a", _profile(), make_validation=lambda *a, **k: empty)
 
 
@@ -253,7 +253,7 @@ def test_a_training_that_diverges_ends(tmp_path, monkeypatch):
         return guides, torch.full_like(targets, math.inf), motion
 
     monkeypatch.setattr(Trainer, "_gather", infinite)
-    with pytest.raises(WlmError, match=r"diverged: 12 steps of round 0.*smaller rate than 0.001"):
+    with pytest.raises(WlmError, match=r"diverged: 12 steps of round 0.*learning rate below 0.001"):
         _train(tmp_path / "a", _profile(steps=40))
     # Resuming doesn't reset the count.
     path = tmp_path / "b"
@@ -400,11 +400,11 @@ def test_a_profile_is_overridden_part_by_part():
 @pytest.mark.parametrize(
     "network, dataset, message",
     [
-        ("{guide: six}", "{}", "dataset.guide: expected six, which network.guide is, found paper"),
-        ("{}", "{guide: six}", "dataset.guide: expected paper, which network.guide is, found six"),
+        ("{guide: six}", "{}", "dataset.guide: expected six like network.guide, found paper"),
+        ("{}", "{guide: six}", "dataset.guide: expected paper like network.guide, found six"),
         ("{guide: back}", "{}", "network.guide: expected 'paper' or 'six'"),
         ("{levels: 1}", "{}", "network.levels: "),
-        ("{}", "{resolution: 32}\ntraining: {crop: 64}", "training.crop: expected at most 32, which dataset.res"),
+        ("{}", "{resolution: 32}\ntraining: {crop: 64}", "training.crop: expected at most dataset.resolution"),
     ],
 )
 def test_a_profile_whose_parts_disagree_is_one_line(tmp_path, network, dataset, message):

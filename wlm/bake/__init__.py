@@ -1,4 +1,4 @@
-"""Bakes inputs of the systems: lightmaps and probes over the day with Mitsuba 3, six-way lightmaps with our tracer.
+"""Bakes light to compress: lightmaps and probes over the day with Mitsuba 3, six-way lightmaps with our path tracer.
 
 The extra `bake` installs Mitsuba, which needs LLVM 16 or later on the CPU. The documentation is docs/bake.md.
 """

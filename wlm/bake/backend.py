@@ -22,25 +22,25 @@ def start(device: str = "cpu") -> ModuleType:
         WlmError: A package, LLVM or a GPU is missing; the line says what to install.
     """
     if device not in _VARIANTS:
-        raise WlmError(f"device: expected cpu or cuda, the first GPU, for a bake, got {device}")
+        raise WlmError(f"device: expected cpu or cuda (the first GPU) for a bake, got {device}")
     # Dr.Jit's C library writes lines when it finds no LLVM.
     with captured_stderr(lambda line: line.startswith(_CHATTER)):
         mitsuba, drjit = need("mitsuba", _EXTRA), need("drjit", _EXTRA)
         has_llvm = drjit.has_backend(drjit.JitBackend.LLVM)
     if device == "cpu":
         if not has_llvm:
-            raise WlmError(f"{_EXTRA}: LLVM is missing, with which Mitsuba compiles for the CPU: {_INSTALL}")
+            raise WlmError(f"{_EXTRA}: LLVM, with which Mitsuba compiles for the CPU, is missing: {_INSTALL}")
         if (path := _old_llvm()) is not None:
             # An older LLVM would end the process at the first unknown instruction.
-            raise WlmError(f"{_EXTRA}: {path} is older than what Mitsuba's kernels need: {_INSTALL}")
+            raise WlmError(f"{_EXTRA}: {path} is older than LLVM 16, which Mitsuba's kernels need: {_INSTALL}")
     elif not drjit.has_backend(drjit.JitBackend.CUDA):
-        raise WlmError(f"{_EXTRA}: Mitsuba finds no NVIDIA GPU, or no OptiX in its driver: take --device cpu")
+        raise WlmError(f"{_EXTRA}: Mitsuba finds no NVIDIA GPU, or no OptiX in its driver: use --device cpu")
     mitsuba.set_variant(_VARIANTS[device])
     return mitsuba
 
 
 def _old_llvm() -> str | None:
-    """Returns the path of the loaded LLVM library if it is older than 16, the first version that reports itself."""
+    """Returns the path of the loaded LLVM library if its version is below 16, the first that reports its version."""
     try:
         lines = _MAPS.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:  # only Linux lists the loaded libraries

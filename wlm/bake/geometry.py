@@ -35,7 +35,7 @@ class Material:
         name: Name by which lamps refer to it; "" if it has none.
         colour: Linear RGB albedo, multiplied by the texture's if there is one.
         texture: Linear RGB albedo, float32 [H, W, 3], or None.
-        uv_set: n of the texture's `TEXCOORD_n`.
+        uv_set: The number n of the UV set `TEXCOORD_n` that the texture uses.
         placed: Matrix of `KHR_texture_transform`, [2, 3], applied to (u, v, 1); None for the identity.
         emission: Radiance on the front, RGB.
         double: Whether the back reflects as well; otherwise it absorbs all light.
@@ -78,8 +78,8 @@ class Geometry:
     Attributes:
         document: The file, to which new UVs are written.
         surfaces: The surfaces in the order of the file.
-        replacements: Input of `write_glb` for an unwrapped file; otherwise empty.
-        uv_set: n of the lightmap's `TEXCOORD_n`; None if it wasn't requested.
+        replacements: The primitives with new UVs, for `write_glb`; empty if the file wasn't unwrapped.
+        uv_set: The number n of the lightmap's UV set `TEXCOORD_n`; None if no lightmap UVs were requested.
         usual: Whether readers choose this UV set by default: `TEXCOORD_1` if it exists, else `TEXCOORD_0`.
     """
 
@@ -120,7 +120,7 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
         number = own if settings.uv_set is None else settings.uv_set
         usual = number == own
         if number not in sets:
-            raise WlmError(f"{path}: expected TEXCOORD_{number}, the lightmap's UVs: lightmap.unwrap: true makes some")
+            raise WlmError(f"{path}: expected lightmap UVs in TEXCOORD_{number}; lightmap.unwrap: true creates UVs")
     cache: dict[int | None, Material] = {}
     surfaces = []
     normals = vertex_normals(document, primitives)
@@ -137,14 +137,14 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
         if len(surface.triangle):
             surfaces.append(surface)
     if not surfaces:
-        raise WlmError(f"{path}: expected triangles with area, found none")
+        raise WlmError(f"{path}: expected at least one triangle with an area above 0, found none")
     geometry = Geometry(document, tuple(surfaces), tuple(replacements), number, usual)
     low, high = geometry.box
     size, reach = float(np.linalg.norm(high - low)), float(np.maximum(-low, high).max())
     if not _NEAREST * (1.0 + reach) <= size <= _LARGEST:
         raise WlmError(
-            f"{path}: expected a scene of a size of at most {_LARGEST:g}, and of at least {_NEAREST:g} times 1 plus "
-            f"its farthest coordinate, {reach:.3g}, found {size:.3g}: rays have no more digits"
+            f"{path}: expected a scene diagonal from {_NEAREST * (1.0 + reach):.3g} to {_LARGEST:g}, found {size:.3g}: "
+            f"float32 rays are too coarse at the farthest coordinate, {reach:.3g}"
         )
     return geometry
 
@@ -157,7 +157,7 @@ def _surface(
     uv: np.ndarray | None,
     material: Material,
 ) -> Surface:
-    """Returns the non-degenerate triangles of a primitive, with fronts on the side of their normals."""
+    """Returns a primitive's triangles whose area isn't 0, with their front faces on the side of their normals."""
     position = primitive.position[gather]
     triangle = np.asarray(triangle, np.int32)
     a, b, c = position[triangle].transpose(1, 0, 2)
@@ -184,7 +184,7 @@ def _surface(
 def unwrap(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], settings: LightmapSettings
 ) -> list[Replacement]:
-    """Creates UVs in one unit square for all primitives together, in proportion to their world-space size.
+    """Creates UVs in one unit square for all primitives together; UV areas are proportional to areas in the world.
 
     Returns:
         A replacement for each primitive that has a triangle with area, its UVs in [0, 1].
@@ -203,14 +203,14 @@ def unwrap(
             local = (each.position - each.position.mean(0)).astype(np.float32)
             meshes.append(uvunwrap.Mesh(local, each.triangle[area].astype(np.uint32)))
     if not meshes:
-        raise WlmError(f"{document.path}: expected triangles with area, found none")
+        raise WlmError(f"{document.path}: expected at least one triangle with an area above 0, found none")
     try:
         atlas = uvunwrap.generate(meshes, page_size=settings.resolution, padding=settings.padding)
     except uvunwrap.UnwrapError as error:
         raise WlmError(f"{document.path}: uvunwrap: {one_line(error)}") from error
     if atlas.page_count != 1 or max(atlas.width, atlas.height) > settings.resolution:
         raise WlmError(
-            f"{document.path}: the charts don't fit on {settings.resolution} texels: use more, or less padding"
+            f"{document.path}: charts don't fit on {settings.resolution} texels: use more texels, or less padding"
         )
     scale = np.array([atlas.width, atlas.height]) / settings.resolution
     replacements = []
@@ -234,15 +234,11 @@ def unwrap(
 def _without_lightmap(
     document: GltfDocument, primitives: Sequence[GltfPrimitive]
 ) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Returns a copy without the UV sets from 1 on, which belong to an old lightmap; a texture that reads one is an
-    error.
-    """
+    """Returns a copy without `TEXCOORD_1` and above, which belong to an old lightmap; they must not be in use."""
     content = copy.deepcopy(document.content)
     for material in content.get("materials", []):
         if used := [one for one in _texture_sets(material) if one >= _UNWRAPPED]:
-            raise WlmError(
-                f"{document.path}: a texture reads TEXCOORD_{used[0]}, where the lightmap's new UVs would go"
-            )
+            raise WlmError(f"{document.path}: a texture reads TEXCOORD_{used[0]}, which new lightmap UVs would replace")
     for mesh in content.get("meshes", []):
         for primitive in mesh["primitives"]:
             for name in [name for name in primitive["attributes"] if name.startswith("TEXCOORD_")]:
@@ -253,7 +249,7 @@ def _without_lightmap(
 
 
 def _texture_sets(value: Any) -> list[int]:
-    """Returns the UV sets that a material's textures use."""
+    """Returns the number n of each UV set `TEXCOORD_n` that a texture in this part of the document uses."""
     if isinstance(value, list):
         return [one for each in value for one in _texture_sets(each)]
     if not isinstance(value, dict):
@@ -275,10 +271,10 @@ def _material(document: GltfDocument, number: int | None) -> Material:
     emission = np.array(content.get("emissiveFactor", (0.0, 0.0, 0.0)), np.float64) * strength
     if emission.shape != (3,) or not ((emission >= 0) & (emission <= _STRONGEST)).all():
         raise WlmError(
-            f"{document.path}: materials[{number}]: expected an emission of three numbers, 0 to {_STRONGEST:g}"
+            f"{document.path}: materials[{number}]: expected an emission of three numbers from 0 to {_STRONGEST:g}"
         )
     if factor.shape != (3,) or np.isnan(factor).any():
-        raise WlmError(f"{document.path}: materials[{number}]: expected a base colour of three numbers, not NaN")
+        raise WlmError(f"{document.path}: materials[{number}]: expected a base colour of three numbers, none NaN")
     texture, uv_set, placed = None, 0, None
     if "baseColorTexture" in surface:
         used = surface["baseColorTexture"]
@@ -305,7 +301,7 @@ def _placed(where: str, transform: dict[str, Any]) -> np.ndarray:
     scale, turn, offset = (np.array(transform.get(name, usual), np.float64) for name, usual in names.items())
     numbers = [*scale.ravel(), *turn.ravel(), *offset.ravel()]
     if (scale.shape, turn.shape, offset.shape) != ((2,), (), (2,)) or not np.abs(numbers).max() <= _LARGEST:
-        raise WlmError(f"{where}: {_TRANSFORM}: expected two numbers of scale and of offset, and one of rotation")
+        raise WlmError(f"{where}: {_TRANSFORM}: expected two numbers each for scale and offset, and one for rotation")
     cosine, sine = np.cos(turn), np.sin(turn)
     return np.column_stack([np.array([[cosine, sine], [-sine, cosine]]) * scale, offset])
 
@@ -324,7 +320,7 @@ def _texture(document: GltfDocument, number: int) -> np.ndarray:
     try:
         with Image.open(io.BytesIO(data), formats=["PNG", "JPEG", "WEBP"]) as picture:
             if picture.width * picture.height > _MOST_IMAGE:
-                raise WlmError(f"{where}: expected at most {_MOST_IMAGE:,} pixels")
+                raise WlmError(f"{where}: expected an image of at most {_MOST_IMAGE:,} pixels, found more")
             pixels = np.asarray(picture.convert("RGB"), np.float32) / np.float32(255.0)
     except UnidentifiedImageError as error:
         raise WlmError(f"{where}: expected a PNG, JPEG or WebP image") from error

@@ -42,7 +42,7 @@ _ABOUT = (
 
 @dataclass(frozen=True, eq=False)
 class BakedLightmaps:
-    """Lightmaps over time.
+    """The baked lightmaps of a scene, for T hours.
 
     Attributes:
         hours: Hours in ascending order.
@@ -91,8 +91,9 @@ def bake_lightmaps(
     All hours use the same random numbers, so that remaining noise doesn't flicker between them.
 
     Args:
-        task, checkpoint: Results of `wlm.bake.work.open_task` and `open_checkpoint`; the latter may be None.
-        device: "cpu" or "cuda".
+        task: The scene, from `wlm.bake.work.open_task`.
+        checkpoint: From `wlm.bake.work.open_checkpoint`; None: the bake can't be resumed.
+        device: "cpu" or "cuda" (the first GPU).
         progress: Called from time to time; a KeyboardInterrupt that it raises leaves a written checkpoint.
 
     Raises:
@@ -132,7 +133,7 @@ def bake_lightmaps(
     back = np.mean([each["back"] for each in results], axis=0)
     visible = back <= _HIDDEN
     if not visible.any():
-        raise WlmError(f"{task.geometry}: every texel is within an object: do its faces point inwards?")
+        raise WlmError(f"{task.geometry}: every texel seems to be inside an object: do its faces point inwards?")
     mask = texels.image(visible.astype(np.float32)) > 0
     light = np.stack([_finished(texels, each["light"], mask, denoise).astype(np.float16) for each in results])
     noise = np.stack([texels.image(each["noise"]).astype(np.float16) for each in results])
@@ -183,7 +184,7 @@ def check_folder(folder: str | os.PathLike[str]) -> None:
     """Checks, before a long bake, that lightmaps can be written to a folder.
 
     Raises:
-        WlmError: The folder isn't writable, or it contains other files.
+        WlmError: The folder isn't writable, or contains files other than an earlier bake.
     """
     claim(Path(folder), INDEX, FORMAT)
 
@@ -192,7 +193,7 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
     """Writes a lightmap set for `wlm compress`, replacing an earlier one, and returns the paths of its files.
 
     Raises:
-        WlmError: The folder contains other files, or can't be written.
+        WlmError: The folder can't be written, or contains files other than an earlier bake.
     """
     folder = Path(folder)
     height, width = baked.mask.shape

@@ -1,8 +1,8 @@
 """Path tracing with Mitsuba: incident light at surface points and at points in space.
 
-Each path starts at such a point. Lights are sampled from it and from every surface that the path hits, and lights hit
-by the path count too; multiple importance sampling uses the power heuristic (Veach 1995, with exponent 2). The sun is
-sampled separately from the other lights, so that its direct light can be excluded.
+Each path starts at one of these points. Lights are sampled from it and from every surface that the path hits, and
+lights hit by the path count too; multiple importance sampling uses the power heuristic (Veach 1995, with exponent 2).
+The sun is sampled separately from the other lights, so that its direct light can be excluded.
 
 Mitsuba's types depend on its variant, which `wlm.bake.backend.start` sets first.
 """
@@ -34,7 +34,7 @@ _COEFFICIENTS = 9
 
 @dataclass(frozen=True)
 class Sun:
-    """The sun.
+    """The sun as a distant light.
 
     Attributes:
         direction: Direction to the sun, [3], of unit length.
@@ -161,8 +161,7 @@ def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool =
 
 
 def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any = None) -> Gathered:
-    """Projects radiance at points [N, 3] onto orthonormal L2 spherical harmonics, in the order of
-    `wlm.probe.sphere.basis`.
+    """Projects radiance at points [N, 3] onto the second-order spherical harmonics of `wlm.probe.sphere.basis`.
 
     Returns:
         Estimates with 27 channels: red, green and blue of each coefficient.

@@ -1,4 +1,4 @@
-"""Bakes a scene's light probes for each hour: radiance as L2 spherical harmonics, on surfaces or in a lattice."""
+"""Bakes a scene's light probes for each hour: RGB radiance in spherical harmonics, on surfaces or in a lattice."""
 
 import math
 import os
@@ -25,12 +25,12 @@ _HIDDEN = 0.25  # share of rays that hit back faces above which a probe counts a
 
 @dataclass(frozen=True, eq=False)
 class BakedProbes:
-    """Probes over time.
+    """The N baked probes of a scene, for T hours.
 
     Attributes:
         hours: Hours in ascending order.
         position: float32 [N, 3], metres.
-        values: float32 [T, N, 9, 3], orthonormal SH of radiance, RGB; 0 for a probe inside an object.
+        values: float32 [T, N, 9, 3], radiance in nine orthonormal spherical harmonics, RGB; 0 inside an object.
         noise: float32 [T, N, 9, 3], standard errors of the values.
     """
 
@@ -75,7 +75,7 @@ def place_probes(settings: ProbeSettings, geometry: Geometry, seed: int = 0) -> 
 
 def _check_count(count: float) -> None:
     if not count <= _MOST:
-        raise WlmError(f"probes.spacing: expected at most {_MOST:,} probes, found {count:,.0f}: take a wider spacing")
+        raise WlmError(f"probes.spacing: expected at most {_MOST:,} probes, found {count:,.0f}: use a larger spacing")
 
 
 def bake_probes(
@@ -125,7 +125,7 @@ def bake_probes(
 
 
 def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
-    """Writes probes as `.npz`: `position`, `sh` for one hour or `sh_HOUR` for each of several, and likewise the noise.
+    """Writes probes as `.npz`: `position`; for one hour `sh` and `noise`, for several `sh_HOUR` and `noise_HOUR`.
 
     Raises:
         WlmError: The file can't be written.

@@ -10,8 +10,8 @@
     probes: {spacing: 0.5}
     samples: 256
 
-Lengths are the glTF file's, metres; +y is up, as in glTF. Light is linear RGB: daylight is in W/m2/nm, the unit of
-Mitsuba's model (about 1.5 at a clear noon), times `scale`; other lights use the same unit or any other.
+Lengths are in metres, as in the glTF file; +y is up. Light is linear RGB: daylight is in W/m2/nm, the unit of Mitsuba's
+model (about 1.5 at a clear noon), times `scale`; other lights use the same unit or any other.
 """
 
 import os
@@ -50,7 +50,7 @@ class Daylight(_Settings):
         albedo: Albedo of the ground, which affects the sky.
         scale: Factor of the sun and the sky.
         direct: Whether the result includes the sun's direct light; it always includes its indirect light.
-        night: Radiance of the sky added at all hours.
+        night: Radiance of the sky that is added at all hours, R, G, B.
     """
 
     latitude: float = Field(45.0, ge=-90.0, le=90.0)
@@ -96,10 +96,10 @@ class Lamp(_Settings):
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
         if (self.position is None) == (self.material is None):
-            raise ValueError("expected a lamp at a position or of a material")
+            raise ValueError("expected a lamp with either a position or a material")
         given = self.model_fields_set
         if ("radiance" in given and self.material is None) or ("intensity" in given and self.position is None):
-            raise ValueError("expected intensity with a position, radiance with a material")
+            raise ValueError("expected an intensity for a lamp with a position, a radiance for a lamp with a material")
         return self
 
     def is_lit(self, hour: float) -> bool:
@@ -115,10 +115,10 @@ class LightmapSettings(_Settings):
 
     Attributes:
         resolution: Width and height in texels.
-        uv_set: n of `TEXCOORD_n`; None: 1 if it exists, else 0.
+        uv_set: The number n of the lightmap's UV set `TEXCOORD_n`; None: 1 if it exists, else 0.
         unwrap: Whether to create new UVs, `TEXCOORD_1`, and write the mesh with them.
         padding: Distance between new charts, in texels.
-        supersample: Sample positions along a texel's side; a texel is their mean.
+        supersample: Number of sample positions along a texel's side; a texel is the mean over its samples.
         directional: Whether to bake light directions, too.
     """
 
@@ -181,9 +181,9 @@ class BakeScene(_Settings):
         if self.daylight is not None and self.sky is not None:
             raise ValueError("expected daylight or sky, found both")
         if len({f"{hour:.9g}" for hour in self.hours}) < len(self.hours):  # as files are named
-            raise ValueError("hours: expected each once, when rounded to nine digits")
+            raise ValueError("hours: expected different hours, found two that are equal after rounding to nine digits")
         if self.period is not None and not all(0 <= hour < self.period for hour in self.hours):
-            raise ValueError(f"hours: expected 0 to below the period of {self.period:g}")
+            raise ValueError(f"hours: expected hours of at least 0 and below the period of {self.period:g}")
         return self
 
     @property

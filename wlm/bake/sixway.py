@@ -1,8 +1,10 @@
 """Bakes six-way lightmaps of smoke with multiple scattering, using the path tracer of `wlm.smoke.transport`.
 
-smoke: jet.nvdb
-camera: {toward: [0, 0, 1], resolution: 256}
-samples: 256
+The settings are a YAML file such as
+
+    smoke: jet.nvdb
+    camera: {toward: [0, 0, 1], resolution: 256}
+    samples: 256
 """
 
 import math
@@ -32,8 +34,8 @@ class SixWayScene(BaseModel):
     Attributes:
         smoke: A `.npz`, `.nvdb` or `.vdb` volume, or a folder of frames, beside the YAML file.
         camera: An orthographic camera, with the settings of a `wlm smoke` scene.
-        extinction, emission: Factors of the smoke's density and temperature; None uses the scene's, or 1.
-        up: The up axis in files of other programs.
+        extinction, emission: Factors of the smoke's density and temperature. None: from the smoke's `scene.json`, or 1.
+        up: Axis that points up in volumes of other programs, "y" or "z"; None: y.
         albedo: Single-scattering albedo.
         g: Mean cosine of the Henyey-Greenstein phase function.
         samples: Paths per pixel.

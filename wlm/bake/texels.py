@@ -50,17 +50,17 @@ class Texels:
 
 
 def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, supersample: int) -> Texels:
-    """Computes the sample positions of all texels: the covered points of a lattice in each.
+    """Computes the sample positions of all texels: those points of a lattice in each texel that a triangle covers.
 
     Surfaces without lightmap UVs are skipped; `where` names the geometry in errors.
 
     Raises:
-        WlmError: There are too many samples, no triangle covers one, or charts overlap.
+        WlmError: There are too many samples, no triangle covers any sample, or charts overlap.
     """
     used = [each for each in surfaces if each.uv is not None]
     side = resolution * supersample
     if side > _MOST_SIDE:
-        raise WlmError(f"lightmap: resolution times supersample: expected at most {_MOST_SIDE}, found {side}")
+        raise WlmError(f"lightmap: resolution times supersample: expected at most {_MOST_SIDE}, got {side}")
     if not used:
         raise WlmError(f"{where}: expected surfaces with lightmap UVs, found none")
     start = np.cumsum([0, *(len(each.position) for each in used)])
@@ -78,12 +78,12 @@ def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, super
     number = raster.triangle.numpy()
     row, column = np.nonzero(number >= 0)
     if not len(row):
-        raise WlmError(f"{where}: its lightmap UVs cover no texel")
+        raise WlmError(f"{where}: expected lightmap UVs that cover at least one texel, found none")
     overlap = float((raster.coverage.numpy()[row, column] > 1).mean())
     if overlap > _OVERLAP:
         raise WlmError(
             f"{where}: lightmap UVs: {overlap:.0%} of the covered area lies in several triangles, expected no "
-            "overlap: lightmap.unwrap: true makes new UVs"
+            "overlap: set lightmap.unwrap: true to create new UVs"
         )
     chosen = number[row, column]
     local = np.arange(3 * len(triangle), dtype=np.int32).reshape(-1, 3)

@@ -29,7 +29,7 @@ class Task:
         path: The YAML file.
         geometry: The glTF file.
         sky: The environment map, float32 [H, W, 3], or None.
-        source: 32 hexadecimal digits of BLAKE2b over the geometry and the environment map.
+        source: Hash of the geometry and the environment map: 32 hexadecimal digits of BLAKE2b.
         trust: Whether the files may refer to files outside their folder.
     """
 
@@ -59,9 +59,9 @@ def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bo
     if picture is not None:
         sky = np.ascontiguousarray(read_light(picture)[0][..., :3])
         if not np.isfinite(sky).all() or (sky < 0).any():
-            raise WlmError(f"{picture}: expected finite light, not negative")
+            raise WlmError(f"{picture}: expected finite light of at least 0, found other values")
         if sky.shape[1] != 2 * sky.shape[0]:
-            raise WlmError(f"{picture}: expected a picture twice as wide as high, found {sky.shape[1]}x{sky.shape[0]}")
+            raise WlmError(f"{picture}: expected an image twice as wide as high, found {sky.shape[1]}x{sky.shape[0]}")
         digest.update(sky)
     return Task(scene, Path(path), geometry, sky, digest.hexdigest(), trust)
 

@@ -51,7 +51,7 @@ def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
 
 
 def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, hour: float) -> Hour:
-    """Builds the scene at an hour.
+    """Builds the Mitsuba scene with the lights of one hour.
 
     Args:
         scene: The settings.

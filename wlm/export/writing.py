@@ -1,10 +1,10 @@
 """`export`: a model as a folder of files for other programs, or as a kit for one engine.
 
-Both are written from the model's `Bundle`. The folder's index, `bundle.json`, holds the bundle's document at its top
-level, and beside it:
+Folders and kits are written from the model's `Bundle`. The folder's index, `bundle.json`, holds the entries of the
+bundle's `document`, and beside them:
 
     format, version     "wlm-bundle" and its number
-    system, name        those of the bundle
+    system, name        the bundle's system and name
     engine              the engine of a kit; null for a raw folder
     shader              file of the shader; null for a collection
     textures            by name: file, format, width, height, layers of an array (0: no array), mips
@@ -35,7 +35,7 @@ _KITS = {
     "probe": "wlm.probe.engines.{engine}",
     "smoke": "wlm.export.engines.smoke",
 }
-"""Modules whose `write_kit` writes a bundle of a system for an engine; those of probes are beside their readers."""
+"""Module of each system, whose function `write_kit` writes a bundle for an engine; probes have one per engine."""
 
 
 def export(
@@ -51,7 +51,7 @@ def export(
     """Writes a model as a folder: raw textures, buffers and a shader, or a kit for an engine.
 
     All files are written beside the folder and moved in together, the index `bundle.json` last. An earlier export is
-    replaced; other files stay.
+    replaced; files that were added to it stay.
 
     Args:
         model: A lightmap, atlas or probe model, a flip book of smoke, or any object with a method `bundle`; or the
@@ -111,10 +111,10 @@ def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: 
     """Writes the kit of a bundle, or of each part of a collection that contains light, in a subfolder each."""
     if not bundle.parts:
         if bundle.system not in _KITS:
-            raise WlmError(f"{bundle.name}: there is no kit for {engine}; expected the raw folder")
+            raise WlmError(f"{bundle.name}: there is no kit for {engine}; export a raw folder")
         write_kit = import_module(_KITS[bundle.system].format(engine=engine)).write_kit
         known = tuple(signature(write_kit).parameters)[3:]
-        _check_options(options, known, f"{bundle.system} and {engine}")
+        _check_options(options, known, f"a {bundle.system} kit for {engine}")
         if "device" in known:
             options = options | {"device": device}
         entries = write_kit(bundle, folder, engine, **options)
@@ -124,7 +124,7 @@ def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: 
         return
     parts = {name: part for name, part in bundle.parts.items() if "values" not in part.document}
     if not parts:
-        raise WlmError(f"{bundle.name}: cannot export for {engine}: expected a layer of light, found other values")
+        raise WlmError(f"{bundle.name}: cannot export for {engine}: expected a layer of light, found other values only")
     for name, part in parts.items():
         (folder / name).mkdir()
         _write_kit(part, folder / name, engine, device, options)
@@ -137,7 +137,7 @@ def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: 
 def _check_options(options: Iterable[str], known: Sequence[str], where: str) -> None:
     for name in options:
         if name not in known:
-            raise WlmError(f"{name}: has no meaning for {where}")
+            raise WlmError(f"option {name}: has no meaning for {where}")
 
 
 def _write_index(bundle: Bundle, folder: Path, entries: dict[str, Any], document: Mapping[str, Any]) -> None:

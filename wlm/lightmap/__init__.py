@@ -1,4 +1,4 @@
-"""Lightmaps that change over time: each tile is block-compressed feature maps and a small MLP (neural-dynamic-gi)."""
+"""Lightmaps over time: a tile is stored as block-compressed feature maps and a small MLP (neural-dynamic-gi)."""
 
 from wlm._facade import facade
 

@@ -26,7 +26,7 @@ MOST_SIDE = 16384
 """Largest side of a texture of all tiles, in texels."""
 
 MOST_LAYERS = 2048
-"""Largest number of layers of a texture array: stored times of tiles that are frames."""
+"""Largest number of layers of a texture array, and so of stored times if tiles are stored as frames."""
 
 _ABOUT = {
     "tiles": "Tiles of tile_size texels at (column, row) of the grid. A tile that is not listed is empty: 0.",
@@ -69,11 +69,13 @@ _SHEETS = "Each part is a sheet: up to three channels of a layer of an atlas, in
 
 
 def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
-    """Makes the bundle of a model; if the model has several sheets, a collection with one bundle for each sheet.
+    """Makes the bundle of a model, or a collection with a bundle for each sheet if the model has several sheets.
+
+    A sheet holds up to three channels of one layer of an atlas.
 
     Args:
         model: The model.
-        device: Device that decodes the reference.
+        device: Device that decodes the reference image.
 
     Raises:
         WlmError: There is no such device, a number of the model is not finite, or a texture is larger than GPUs take.
@@ -94,19 +96,20 @@ def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
 
 
 def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device: str = "cpu") -> Bundle:
-    """Makes the bundle of one sheet.
+    """Makes the bundle (shader, textures and buffers) of one sheet, which has up to three channels of a layer.
 
-    The textures `uv` (BC7), `uvt` (BC7) and `planes` (R8G8_UNORM) hold the feature maps F_uv, F_uvt, and F_ut beside
-    F_vt, of all tiles (neural-dynamic-gi, table 1); `frames` (BC7) is an array with a layer for each stored time;
-    `valid` is 255 inside charts. BC7 blocks are copied from the model without re-encoding. `networks`, float32 [n, 4],
-    and `hours`, float32 [T, hour_fours, 4], are the buffers. The reference `frame` is the map at the first stored time.
+    The textures `uv` (BC7) and `uvt` (BC7) hold the feature maps F_uv and F_uvt of all tiles, `planes` (R8G8_UNORM)
+    holds F_ut and F_vt side by side (neural-dynamic-gi, table 1), `frames` (BC7) has a layer for each stored time, and
+    `valid` is 255 inside charts. BC7 blocks are copied from the model without re-encoding. The buffer `networks`,
+    float32 [n, 4], holds the weights, and `hours` the result of `hour_tables`. The reference image `frame` is the map
+    at the first stored time.
 
     Args:
         sheet: The sheet.
         model: Its model.
         name: Name of the bundle.
         source: Hash of the input.
-        device: Device that decodes the reference.
+        device: Device that decodes the reference image.
     """
     textures = {key: texture for encoding in ENCODINGS for key, texture in encoding.textures(model).items()}
     for key, texture in textures.items():
@@ -134,15 +137,15 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
 def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
     """Computes the tables that the shader reads, one for each given hour.
 
-    `_ABOUT["hours"]` above describes the content of a table. The fourth number is the number of tile columns of the
-    grid.
+    The bundle's JSON document describes the content of a table under "about" and "hours". In addition, the fourth
+    number of a table is the number of tile columns of the grid.
 
     Args:
         model: The sheet.
-        times: Stored times; if the networks can evaluate times between them, any times.
+        times: Stored times, or any times if the model interpolates with the network (`Profile.interpolation`).
 
     Returns:
-        float32 [times, 2 + tiles record_fours, 4].
+        float32 [times, rows, 4]: two rows, then `record_fours` rows for each tile.
 
     Raises:
         ValueError: A time lies between two stored times, and the model blends their radiance, which needs two tables.
@@ -151,7 +154,7 @@ def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
     tables = np.zeros((len(times), HEAD + model.kind.size * size, 4), np.float32)
     for table, time in zip(tables, times, strict=True):
         if axis.neighbours(time)[2] and axis.interpolation == "radiance":
-            raise ValueError(f"time: expected a stored one, got {time}")
+            raise ValueError(f"time: expected one of the stored times, got {time}")
         tau = axis.place(time)
         for i, count in enumerate((profile.uvt_slices, profile.plane_rows)):
             table[i, :3] = _between(tau, count, axis.periodic)
@@ -165,7 +168,6 @@ def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
 
 
 def _document(model: SheetModel, textures: dict[str, Texture], source: str) -> dict[str, Any]:
-    """Returns the description of the textures, buffers and tiles as JSON values."""
     profile, axis = model.profile, model.axis
     sides = {
         "uvt": (profile.uvt_resolution, profile.uvt_resolution),
@@ -204,7 +206,7 @@ def _document(model: SheetModel, textures: dict[str, Texture], source: str) -> d
 
 
 def _between(tau: float, count: int, repeats: bool) -> tuple[int, int, float]:
-    """Returns the two texels of an axis that a linear filter reads at `tau` in [0, 1], and the second one's weight."""
+    """Returns the two texels that a linear filter reads at position `tau` in [0, 1], and the second texel's weight."""
     position = tau * count - 0.5
     low = int(np.floor(position))
     pair = [i % count if repeats else min(max(i, 0), count - 1) for i in (low, low + 1)]

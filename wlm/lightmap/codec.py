@@ -1,8 +1,8 @@
 """Converts a lightmap model to the named parts of its file, and back.
 
-Parts of sheet k are called `k.NAME`. Times are stored once, and the mask of an atlas with the first sheet of that
-atlas. Each tile (its maps and network, or its BC7 frames) is one zstd frame in the part `k.tiles`; `k.tile_sizes` has
-the size of each zstd frame, so that a tile can be read alone.
+Parts of sheet k (up to three channels of a layer of an atlas) are called `k.NAME`. All sheets share the part `times`;
+the mask of an atlas is stored with the atlas's first sheet. Each tile (its maps and network, or its BC7 frames) is one
+zstd frame in the part `k.tiles`; `k.tile_sizes` has the size of each zstd frame, so that a tile can be read alone.
 """
 
 import math
@@ -96,10 +96,10 @@ def decode(artifact: Artifact) -> LightmapModel:
     header = check_settings(_Header, artifact.settings, "setting ")
     sheets = [Sheet(item.atlas, item.layer, tuple(item.channels), item.encoding) for item in header.sheets]
     if len(set(sheets)) < len(sheets):
-        raise ValueError("setting sheets: expected each of them once")
+        raise ValueError("setting sheets: expected different sheets, found one twice")
     sizes = [(item.size[1], item.size[0]) for item in header.sheets]
     if min(map(min, sizes)) < 1:
-        raise ValueError("setting size: expected width and height of each sheet")
+        raise ValueError("setting size: expected a width and a height of at least 1 texel for each sheet")
     check_sheets("setting sheets", dict(zip(sheets, sizes, strict=True)))
     times = check_part(artifact.tensors, "times", _TIMES).astype(np.float64)
     _check_times(times.tolist(), header.period)
@@ -118,7 +118,7 @@ def decode(artifact: Artifact) -> LightmapModel:
     for number, (sheet, item, table) in enumerate(zip(sheets, header.sheets, tables, strict=True)):
         own = parts[number]
         if sheet.atlas in masks and "mask" in own:
-            raise ValueError(f"part {number}.mask: expected it with the first sheet of that atlas")
+            raise ValueError(f"part {number}.mask: expected a mask only with the first sheet of its atlas")
         with _named(number):
             if sheet.atlas not in masks:
                 masks[sheet.atlas] = _mask(own, *sizes[number])
@@ -141,14 +141,14 @@ def decode(artifact: Artifact) -> LightmapModel:
             _unpack_tiles(models[sheet], packed)
             check_parts({name: getattr(models[sheet], name) for name in PACKED}, {name: table[name] for name in PACKED})
             if (arrays["ranges"][:, :, 0] > arrays["ranges"][:, :, 1]).any():
-                raise ValueError("part ranges: expected no least above its greatest")
+                raise ValueError("part ranges: expected the least colour of a frame not to exceed its greatest colour")
     return LightmapModel(name=header.name, source=artifact.source, profile=header.profile, sheets=models)
 
 
 def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
     """Returns the size in bytes of each part of a model's file, summed over all sheets, largest part first.
 
-    `tiles` is the size of the packed tiles; `header` is that of the file's header and of the table of tile sizes.
+    `tiles` is the size of the packed tiles, and `header` the size of the file's header and of the table of tile sizes.
 
     Raises:
         ValueError: `file_bytes` is less than the sum of the parts.
@@ -160,12 +160,12 @@ def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
             parts[name] = parts.get(name, 0) + value.nbytes
     parts["header"] = file_bytes - sum(parts.values())
     if parts["header"] < 0:
-        raise ValueError(f"file_bytes: expected at least {file_bytes - parts['header']}, got {file_bytes}")
+        raise ValueError(f"file_bytes: expected at least {file_bytes - parts['header']} bytes, got {file_bytes}")
     return dict(sorted(((name, size) for name, size in parts.items() if size), key=lambda part: -part[1]))
 
 
 def sheet_bytes(model: LightmapModel) -> dict[Sheet, int]:
-    """Returns the size in bytes of each sheet in the file; a mask counts for the first sheet of its atlas."""
+    """Returns each sheet's bytes in the file; the mask that an atlas's sheets share counts for the first of them."""
     sizes = [0] * len(model.sheets)
     for name, value in encode(model)[1].items():
         number, _, own = name.partition(".")
@@ -175,7 +175,7 @@ def sheet_bytes(model: LightmapModel) -> dict[Sheet, int]:
 
 
 def tile_sizes(sheet: SheetModel) -> np.ndarray:
-    """Returns the size in bytes of each tile's zstd frame, int [tiles]; 0 for tiles without one."""
+    """Returns the size in bytes of each tile's zstd frame, int [tiles]; 0 for tiles without a zstd frame."""
     sizes = np.zeros(len(sheet.kind), int)
     sizes[_packed_tiles(sheet)] = _pack_tiles(sheet).get("tile_sizes", ())
     return sizes
@@ -211,7 +211,7 @@ def _unpack_tiles(sheet: SheetModel, packed: Mapping[str, np.ndarray]) -> None:
     tiles, sizes = (check_part(packed, name, part) for name, part in (("tiles", _BYTES), ("tile_sizes", _SIZES)))
     if len(sizes) != len(numbers) or int(sizes.sum(dtype=np.uint64)) != len(tiles):
         raise ValueError(
-            f"part tile_sizes: expected those of {len(numbers)} tiles and {len(tiles)} bytes, found others"
+            f"part tile_sizes: expected the sizes of {len(numbers)} tiles, {len(tiles)} bytes in all, found other sizes"
         )
     ends = np.cumsum(sizes.astype(np.int64)).tolist()
 
@@ -239,14 +239,14 @@ def _named(number: int) -> Iterator[None]:
 
 
 def _by_sheet(tensors: Mapping[str, np.ndarray], count: int) -> list[dict[str, np.ndarray]]:
-    """Returns the parts of each sheet, by name without the sheet's number; the shared part `times` is left out."""
+    """Sorts the parts by sheet, with names without the sheet's number; the shared part `times` is left out."""
     parts: list[dict[str, np.ndarray]] = [{} for _ in range(count)]
     for name, value in tensors.items():
         number, _, own = name.partition(".")
         if re.fullmatch("0|[1-9][0-9]{0,3}", number) and int(number) < count and own:
             parts[int(number)][own] = value
         elif name != "times":
-            raise ValueError(f"part {one_line(name, 60)} is none of the file's")
+            raise ValueError(f"part {one_line(name, 60)}: a lightmap file has no part of this name")
     return parts
 
 
@@ -267,7 +267,7 @@ def _mask(tensors: Mapping[str, np.ndarray], height: int, width: int) -> np.ndar
 
 def _check_times(times: list[float], period: float | None) -> None:
     if len(times) < 1 or not math.isfinite(times[-1] - times[0]) or not all(a < b for a, b in pairwise(times)):
-        raise ValueError("part times: expected times that increase")
+        raise ValueError("part times: expected finite times that increase")
     # A file may hold a time that was rounded up to the period.
     if period is not None and not (times[0] >= 0 and times[-1] <= period * (1 + _ROUNDING)):
-        raise ValueError(f"part times: expected 0 to {period:g}, the period, found {times[0]:g} to {times[-1]:g}")
+        raise ValueError(f"part times: expected 0 to the period {period:g}, found {times[0]:g} to {times[-1]:g}")

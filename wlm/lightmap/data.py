@@ -1,6 +1,6 @@
 """Reads sets of lightmaps over time from files or arrays, checks them and repairs them.
 
-The rules for input. Each repair adds a line with the number of texels to `LightmapSet.warnings`:
+These are the rules for input; each repair adds a line with the number of texels to `LightmapSet.warnings`:
 
 - Inside the mask a NaN or infinite texel takes the value of the nearest finite texel at that time, negative channels
   are clamped to 0, and values above 65,504, the maximum of half floats, to 65,504. Outside the mask the same repairs
@@ -18,7 +18,7 @@ The rules for input. Each repair adds a line with the number of texels to `Light
   maps black to the range's lower end and white to its upper end. All states must have the same layers and channels, at
   most 12 channels in an atlas.
 
-Layout of a set and its evaluation: neural-dynamic-gi, section 10.1.
+The layout of a set and its evaluation follow neural-dynamic-gi, section 10.1.
 """
 
 import hashlib
@@ -51,23 +51,23 @@ _ALL, _FROM_ALPHA = "all", "alpha"
 
 @dataclass(frozen=True, eq=False)
 class SheetFrames:
-    """The lightmaps of one sheet at several times, checked and repaired by the module's rules.
+    """Checked and repaired lightmaps of one sheet (up to three channels of a layer of an atlas) at several times.
 
     Attributes:
-        name: Name of the set, and of the sheet if it is not the ordinary lightmap.
+        name: Name of the set; for any sheet but the ordinary lightmap, followed by the sheet's name.
         times: `[T]` float64, strictly increasing, in hours or any other unit.
-        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]; if the sheet is linear, normalised
-            values in [0, 1]. Row 0 is v = 0. Arrays of more than 1 GiB are mapped from a file, see
+        frames: `[T, H, W, 3]` float32, linear RGB irradiance, finite, in [0, 65504]; if the sheet is not light,
+            normalised values in [0, 1]. Row 0 is v = 0. Arrays of more than 1 GiB are mapped from a file, see
             `wlm.formats.scratch`.
         mask: `[H, W]` bool, true where a texel belongs to a chart; at least one is.
         period: Length of the day in the unit of `times`, all of which are then in [0, period); None if the set is not
             periodic: times before the first or after the last are then clamped.
-        source: 16 hexadecimal digits of BLAKE2b over the checked pixels, the times and the mask.
-        warnings: Repairs, one line each.
+        source: Hash of the checked pixels, the times and the mask: 16 hexadecimal digits of BLAKE2b.
+        warnings: Descriptions of the repairs, one line each.
         mesh: Path of the mesh that the lightmaps belong to, as the set names it; the file may be missing. None if the
             set names no mesh.
-        covered: `[T, H, W]` bool, the valid texels that each frame has; None if every frame has all of them. A texel
-            that a frame lacks holds the light of the frame nearest in time that has it.
+        covered: `[T, H, W]` bool, which valid texels of `mask` are valid in each frame; None if all are valid in every
+            frame. A texel that is not valid in a frame holds its light from the nearest time at which it is valid.
     """
 
     name: str
@@ -81,13 +81,13 @@ class SheetFrames:
     covered: np.ndarray | None = None
 
     def valid(self, index: int) -> np.ndarray:
-        """Returns the valid texels that a frame has, bool [H, W]."""
+        """Returns which texels are valid in the frame with this index, bool [H, W]."""
         return self.mask if self.covered is None else self.covered[index]
 
 
 @dataclass(frozen=True, eq=False)
 class LightmapSet:
-    """Lightmaps over time: one or more sheets at the same times.
+    """Lightmaps over time: one or more sheets, each up to three channels of a layer of an atlas, at the same times.
 
     Attributes:
         name: Name of the set.
@@ -99,18 +99,19 @@ class LightmapSet:
 
     @property
     def light(self) -> SheetFrames:
-        """The first sheet of radiance; without one, the first sheet. An ordinary set has only this sheet."""
+        """The lightmaps of the first sheet of radiance, or of the first sheet if no sheet is radiance."""
         return self.sheets[first_light(self.sheets)]
 
     def find(self, sheet: Sheet) -> SheetFrames:
-        """Returns the lightmaps of a sheet, or the only lightmaps of a set with one sheet.
+        """Returns the lightmaps of `sheet`. If the set has only one sheet, it returns the lightmaps of that sheet
+        instead.
 
         Raises:
-            WlmError: The set has several sheets, but not this one.
+            WlmError: The set has several sheets, and `sheet` is not one of them.
         """
         if sheet not in self.sheets and len(self.sheets) > 1:
             found = ", ".join(one.label for one in self.sheets)
-            raise WlmError(f"{self.name}: expected a set with {sheet.label}, found {found}")
+            raise WlmError(f"{self.name}: expected a set with the sheet {sheet.label}, found {found}")
         return self.sheets.get(sheet, self.light)
 
     @property
@@ -120,12 +121,12 @@ class LightmapSet:
 
     @property
     def period(self) -> float | None:
-        """Length of the day in the unit of the times, or None."""
+        """Length of the day in the unit of the times; None if the set is not periodic."""
         return self.light.period
 
     @property
     def source(self) -> str:
-        """16 hexadecimal digits of BLAKE2b over the sheets and their names."""
+        """Hash of all sheets and their names: 16 hexadecimal digits of BLAKE2b."""
         digest = hashlib.blake2b(digest_size=8)
         for sheet, own in self.sheets.items():
             digest.update(repr((sheet, own.source)).encode())
@@ -133,18 +134,18 @@ class LightmapSet:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Repairs, one line each."""
+        """Descriptions of the repairs of all sheets, one line each."""
         return tuple(dict.fromkeys(text for own in self.sheets.values() for text in own.warnings))
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A layer of an atlas in memory.
+    """One layer of an atlas at all times, given as arrays.
 
     Attributes:
         frames: The pixels at each time, numeric `[T, H, W, C]`.
         name, atlas: Names of the layer and of the atlas.
-        encoding: A key of `wlm.lightmap.sheet.VALUE_RANGES`.
+        encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
         channels: Names of the C channels; None: R, G, B, A, or numbers if there are more than four.
     """
 
@@ -180,7 +181,7 @@ def load(
 
     Args:
         path: The `set.json` or the folder.
-        times: A time for each state in the order of the list or of the names; replaces those of `set.json`.
+        times: A time for each state, in the order of `set.json` or of the file names; replaces the times of `set.json`.
         mask: A PNG (a texel is valid if any colour channel is above 0), "alpha" (valid if the alpha channel of a frame
             is above 0; frames may differ) or "all"; None uses the mask of the set. It applies to all atlases.
         period: Length of the day in the unit of the times; None uses the set's `period_hours`, if any.
@@ -235,7 +236,7 @@ def from_arrays(
     Args:
         frames: `[T, H, W, 3]` of numbers, linear RGB irradiance; copied.
         times: `[T]`, in any order.
-        mask: `[H, W]`, true where a texel is valid, or `[T, H, W]`, true where each frame has it; None for all.
+        mask: `[H, W]`, true where a texel is valid, or `[T, H, W]` if this differs by frame; None: all are valid.
         period: Length of the day in the unit of the times; None for a set that is not periodic.
         name: Name of the set, also in messages.
 
@@ -263,8 +264,7 @@ def from_layers(
     Args:
         layers: The layers in the order in which they are stored; those of one atlas have the same height and width.
         times: `[T]`, in any order.
-        masks: By name of the atlas, bool `[H, W]`, true where a texel is valid, or `[T, H, W]`; without one all are
-            valid.
+        masks: Masks by the name of their atlas, as for `from_arrays`. In an atlas without a mask all texels are valid.
         period, name: As for `from_arrays`.
 
     Raises:
@@ -282,21 +282,21 @@ def from_layers(
         channels = tuple(layer.channels or ("RGBA"[:count] if count <= 4 else map(str, range(count))))
         if not all(is_name(value) for value in (layer.atlas, layer.name, *channels)):
             raise WlmError(
-                f"{name}: atlases, layers, channels: expected names of 1 to {MOST_NAME} printable characters"
+                f"{name}: expected names of atlases, layers and channels of 1 to {MOST_NAME} printable characters"
             )
         if layer.encoding not in VALUE_RANGES or len(channels) != count:
             raise WlmError(
-                f"{where}: expected an encoding of {', '.join(VALUE_RANGES)} and {count} channels, got "
-                f"{layer.encoding!r} and {len(channels)}"
+                f"{where}: expected {count} names of channels and one of the encodings {', '.join(VALUE_RANGES)}, got "
+                f"{len(channels)} names and {layer.encoding!r}"
             )
         for sheet in sheets_of(layer.atlas, layer.name, channels, layer.encoding):
             if sheet in sizes:
-                raise WlmError(f"{where}: expected each channel of a layer once")
+                raise WlmError(f"{where}: expected every channel once, found one twice")
             sizes[sheet] = frames.shape[1:3]
             sources[sheet] = frames, [channels.index(channel) for channel in sheet.channels]
     check_sheets(name, sizes)
     if unknown := (masks or {}).keys() - {sheet.atlas for sheet in sizes}:
-        raise WlmError(f"{name}: masks: expected those of atlases that layers are of, found {sorted(unknown)[0]!r}")
+        raise WlmError(f"{name}: masks: expected names of atlases that have layers, got {sorted(unknown)[0]!r}")
     labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
     check_times(name, labels, stamps, period)
     states = _States(labels, stamps, period, name, "the mask", True)
@@ -304,7 +304,7 @@ def from_layers(
     for sheet, (frames, chosen) in sources.items():
         valid = np.asarray((masks or {}).get(sheet.atlas, np.ones(sizes[sheet], bool))).astype(bool)
         if valid.shape not in (frames.shape[1:3], frames.shape[:3]):
-            raise WlmError(f"{name}: expected a mask of {frames.shape[1:3]}, got {valid.shape}")
+            raise WlmError(f"{name}: expected a mask of the shape {frames.shape[1:3]}, got {valid.shape}")
         copied = room((*frames.shape[:3], 3), np.float32, name, made)
         made += copied.nbytes
         with np.errstate(over="ignore"):  # float64 beyond float32 becomes Inf and is repaired as Inf
@@ -327,7 +327,7 @@ def parse_times(text: str) -> list[float]:
         The times in the order written, at least one.
 
     Raises:
-        WlmError: A part that is no number or range, a step that never reaches the stop, or more than 100,000 times.
+        WlmError: A part is not a number or a range, a step never reaches the stop, or there are over 100,000 times.
     """
     times: list[float] = []
     for part in text.split(","):
@@ -344,9 +344,9 @@ def parse_times(text: str) -> list[float]:
         # The small slack keeps 0.1:0.4:0.1 at three times, although (0.4 - 0.1) / 0.1 is a little above 3.
         steps = (stop - start) / step - 1e-9 if step else 0.0
         if not 0.0 < steps < math.inf:
-            raise WlmError(f"times: the range {part.strip()!r} holds no time before its stop")
+            raise WlmError(f"times: the range {part.strip()!r} is empty: its step leads away from its stop, or is 0")
         if len(times) + steps > TIMES:
-            raise WlmError(f"times: the range {part.strip()!r} holds more than {TIMES:,} times")
+            raise WlmError(f"times: expected at most {TIMES:,} times, exceeded at the range {part.strip()!r}")
         times.extend(start + i * step for i in range(math.ceil(steps)))
     return times
 
@@ -363,7 +363,7 @@ def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: fl
         if not math.isfinite(time):
             raise WlmError(f"{where}: the time of {label} is {time:g}; expected a finite number")
         if period is not None and not 0 <= time < period:
-            raise WlmError(f"{where}: the time of {label} is {time:g}; expected 0 to below {period:g}, the period")
+            raise WlmError(f"{where}: the time of {label} is {time:g}; expected 0 to less than the period {period:g}")
     order = np.argsort(times, kind="stable")
     for i, j in pairwise(order):
         if times[i] == times[j]:
@@ -372,8 +372,6 @@ def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: fl
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """One layer of one atlas at all times."""
-
     frames: dict[Sheet, np.ndarray]
     alpha: np.ndarray | None
     warnings: list[str]
@@ -388,7 +386,6 @@ class _Reader:
         self._made = 0  # bytes of the sheets that memory was allocated for
 
     def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None) -> _Stack:
-        """Reads a layer of an atlas at all times."""
         sources = [state[atlas.name, layer.name] for state in self._listing.states]
         first = sources[0]
         pixels, names = _read(first, layer)
@@ -399,16 +396,16 @@ class _Reader:
         def put(index: int, pixels: np.ndarray, names: tuple[str, ...]) -> int:
             place, source = self._place[index], sources[index]
             if pixels.shape[:2] != size:
-                raise WlmError(f"{source.path}: is {_size(pixels.shape)}, but {first.path} is {_size(size)}")
+                raise WlmError(f"{source.path}: has {_size(pixels.shape)} pixels, but {first.path} has {_size(size)}")
             if layer.encoding != LIGHT.encoding and names != known:
-                raise WlmError(f"{source.path}: has {', '.join(names)}, but {first.path} has {', '.join(known)}")
+                raise WlmError(f"{source.path}: channels {', '.join(names)}, but {first.path} has {', '.join(known)}")
             for sheet, frames in stack.frames.items():
                 frames[place] = sheet.to_levels(pixels[..., [names.index(name) for name in sheet.channels]])
             if stack.alpha is None:
                 return 0
             if _ALPHA not in names:
                 found = ", ".join(names)
-                raise WlmError(f"{source.path}: expected a channel A, which the mask is to come from, found {found}")
+                raise WlmError(f"{source.path}: expected a channel A for the mask, found the channels {found}")
             alpha = pixels[..., names.index(_ALPHA)]
             stack.alpha[place] = np.isfinite(alpha) & (alpha > 0)
             return int(np.count_nonzero(~np.isfinite(alpha)))
@@ -422,7 +419,7 @@ class _Reader:
             pool.shutdown(cancel_futures=True)
         for source, count in zip(sources, broken, strict=True):
             if count:
-                stack.warnings.append(f"{source.label}: {count} texels with an alpha NaN or infinite: not valid")
+                stack.warnings.append(f"{source.label}: {count} texels are not valid: alpha is NaN or infinite")
         return stack
 
     def _stack(
@@ -438,10 +435,10 @@ class _Reader:
         channels = layer.channels or (_LIGHT_CHANNELS if layer.encoding == LIGHT.encoding else names)
         if missing := [channel for channel in channels if channel not in names]:
             found = ", ".join(names)
-            raise WlmError(f"{first}: layer {layer.name}: expected a channel {missing[0]}, found {found}")
+            raise WlmError(f"{first}: layer {layer.name}: expected a channel {missing[0]}, found the channels {found}")
         where = self._listing.where
         if atlas.size not in (None, size):
-            raise WlmError(f"{first}: is {_size(size)}, but {where} states {_size(atlas.size)}")
+            raise WlmError(f"{first}: has {_size(size)} pixels, but {where} states {_size(atlas.size)}")
         sheets = sheets_of(atlas.name, layer.name, channels, layer.encoding)
         self._sizes |= dict.fromkeys(sheets, size)
         check_sheets(str(where), self._sizes)
@@ -465,14 +462,14 @@ def _read(source: Source, layer: LayerInfo) -> tuple[np.ndarray, tuple[str, ...]
     else:
         pixels, names, levels = read_channels(source.path)
         if levels and layer.encoding == LIGHT.encoding:
-            raise WlmError(f"{source.path}: layer {layer.name}: expected light, found a PNG, whose bits are not light")
+            raise WlmError(f"{source.path}: layer {layer.name}: expected linear light, such as an EXR, found a PNG")
         if levels:
             least, greatest = VALUE_RANGES[layer.encoding]
             pixels = np.float32(least) + pixels * np.float32(greatest - least)
     if source.slices > 1:
         height, rest = divmod(len(pixels), source.slices)
         if rest or not height:
-            raise WlmError(f"{source.path}: expected {source.slices} slices of one height, found {len(pixels)} rows")
+            raise WlmError(f"{source.path}: expected {source.slices} slices of equal height, found {len(pixels)} rows")
         pixels = pixels[source.slice * height : (source.slice + 1) * height]
     return pixels, names
 
@@ -483,7 +480,7 @@ def _valid(listing: Listing, atlas: AtlasInfo, layer: LayerInfo, stack: _Stack, 
     if stack.alpha is not None:
         return stack.alpha
     if mask == _FROM_ALPHA:
-        raise WlmError(f"{first}: expected light with a channel A, which the mask is to come from, found none")
+        raise WlmError(f"{first}: expected a channel A for the mask, found none")
     if mask in (_ALL, None):
         return np.ones(size, bool)
     return read_mask(Path(mask), first, size, ', "alpha" or "all"')
@@ -491,7 +488,7 @@ def _valid(listing: Listing, atlas: AtlasInfo, layer: LayerInfo, stack: _Stack, 
 
 @dataclass(frozen=True, eq=False)
 class _States:
-    """Times and labels of a set's lightmaps, in the order given, and the words that messages about them need."""
+    """Times and labels of a set's lightmaps, in the order given; `where` and `mask_from` are words for messages."""
 
     labels: Sequence[str]
     times: np.ndarray
@@ -520,7 +517,7 @@ class _States:
             raise WlmError(f"{where}: the mask is empty: no texel is valid ({self.mask_from})")
         warnings, order = list(warnings), self.order
         if (np.diff(order) < 0).any() and self.warn_order:
-            warnings.append(f"{where}: the times were not in order: sorted, with their frames")
+            warnings.append(f"{where}: the times were not in order: the frames were sorted by time")
         times, labels = self.times[order], [self.labels[i] for i in order]
         if sheet.linear:
             warnings += _clamp(sheet, labels, frames, mask)
@@ -540,8 +537,8 @@ class _States:
             _fill_in_time(frames, covered, times, period)
             missing = np.count_nonzero(mask & ~covered.all(0))
             warnings.append(
-                f"{where}: {missing} texels are in some lightmaps alone: at the other times they are fitted to the "
-                "nearest lightmap that has them, and not scored"
+                f"{where}: {missing} texels are valid in only some lightmaps: at other times they are fitted to the "
+                "light of the nearest time at which they are valid, and are not scored"
             )
         return SheetFrames(
             name=name if sheet == LIGHT else f"{name} {sheet.label}",
@@ -587,7 +584,7 @@ def _fill_in_time(frames: np.ndarray, covered: np.ndarray, times: np.ndarray, pe
 
 
 def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:
-    """Hashes the input to 16 hexadecimal digits, the same on every machine."""
+    """Returns a hash of the input, 16 hexadecimal digits, which is the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(np.asarray(frames.shape, "<i8").tobytes())
     digest.update(np.asarray(times, "<f8").tobytes())

@@ -1,4 +1,4 @@
-"""Decodes lightmaps to arrays on the host: a tile or a whole map at any time, from the stored bytes alone."""
+"""Decodes lightmaps to arrays in host memory: a tile or a whole map at any time, from the stored bytes alone."""
 
 from collections.abc import Sequence
 
@@ -26,12 +26,12 @@ def gelu_of(model: SheetModel, gelu: str | None) -> str:
 
 
 class SheetDecoder:
-    """Uploads the stored bytes of a sheet to a device and decodes tiles and maps there.
+    """Decodes tiles and maps of a sheet (up to three channels of a layer) on a device, from the stored bytes.
 
-    Between two stored times the radiance of both is interpolated (eq. 2), or the network evaluates interpolated
-    features, see `Profile.interpolation`; for tiles stored as frames it is always the radiance. Times outside the day
-    wrap, or are clamped to the first and last time if the set is not periodic. Texels outside charts, within two texels
-    of one, get the light of the nearest valid texel, so that a map can be filtered.
+    Between two stored times, either the radiance of the two is interpolated (neural-dynamic-gi, eq. 2) or the network
+    evaluates interpolated features, see `Profile.interpolation`; for tiles stored as frames it is always the radiance.
+    Times outside the period wrap; in a set without a period they are clamped to the first and last stored time. Texels
+    outside charts, within two texels of one, get the light of the nearest valid texel, so that a map can be filtered.
 
     Attributes:
         model: The sheet.
@@ -65,7 +65,7 @@ class SheetDecoder:
             number: Number of the tile in the grid, row-major.
             time: In the unit of the set's times.
             border: Texels added on each side from the neighbouring tiles, so that a texture of tiles can be filtered;
-                past the edges of the map, its outer texels are mirrored (section 9).
+                past the edges of the map, its outer texels are mirrored (neural-dynamic-gi, section 9).
 
         Returns:
             Linear radiance, float32 [128 + 2 border, 128 + 2 border, 3].
@@ -122,7 +122,7 @@ class SheetDecoder:
         return out, bounds
 
     def frame(self, time: float) -> np.ndarray:
-        """Decodes the map, float32 [H, W, 3]: radiance, or a linear sheet's normalised values; 0 in empty tiles."""
+        """Decodes the map, float32 [H, W, 3]: radiance, or values in [0, 1] if it isn't light; 0 in empty tiles."""
         image = np.zeros((self._grid.height, self._grid.width, 3), np.float32)
         for numbers in self._stored():
             place(image, self.tiles(numbers.tolist(), time), numbers, self._grid)
@@ -157,7 +157,7 @@ class Decoder:
 
     @property
     def light(self) -> SheetDecoder:
-        """The decoder of the first sheet of radiance; without one, of the first sheet."""
+        """The decoder of the first sheet of radiance, or of the first sheet if no sheet is radiance."""
         return self.sheets[first_light(self.sheets)]
 
     @property
@@ -175,7 +175,8 @@ class Decoder:
 
         Args:
             time: In the unit of the set's times, stored or between.
-            layer, atlas: Names. None: the first layer of radiance (without one, the first layer); its first atlas.
+            layer: Name of the layer. None: the first layer of radiance, or the first layer if no layer is radiance.
+            atlas: Name of the atlas. None: the first atlas that has the layer.
 
         Returns:
             The channels, float32 [H, W, C]: linear radiance, or the layer's values; empty tiles have its lowest value.
@@ -185,7 +186,7 @@ class Decoder:
         return frames[0] if len(frames) == 1 else np.concatenate(frames, axis=2)
 
     def frames(self, time: float) -> dict[str, dict[str, np.ndarray]]:
-        """Decodes all layers at one time. Returns the channels, float32 [H, W, C], by names of atlas and layer."""
+        """Decodes all layers at one time. Returns the channels, float32 [H, W, C], by atlas, then by layer."""
         result: dict[str, dict[str, np.ndarray]] = {}
         for atlas, layer in dict.fromkeys((sheet.atlas, sheet.layer) for sheet in self.sheets):
             result.setdefault(atlas, {})[layer] = self.frame(time, layer, atlas)

@@ -29,13 +29,13 @@ Parts = dict[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Tiles of one kind of one sheet that are fitted together.
+    """Tiles of one sheet (three channels) and of one kind, which are fitted together.
 
     Attributes:
         number: Number of the batch, from 0.
         kind: STATIC or DYNAMIC.
         rows: int [n], indices of the tiles in `SheetFit.index`.
-        first: Number of tiles of that kind in earlier batches of the sheet.
+        first: Number of tiles of the same kind in earlier batches of the sheet.
         fit: The `wlm.lightmap.fit.SheetFit` of the sheet.
     """
 
@@ -48,8 +48,6 @@ class Batch:
 
 @dataclass(eq=False)
 class _Running:
-    """A batch that a worker is fitting."""
-
     batch: Batch
     step: int | None = None
     deaths: int = 0
@@ -68,7 +66,7 @@ def worker_devices(device: str, workers: int | None, cluster: str | None, sample
         raise WlmError(f"workers: expected at least 1, got {workers}")
     if cluster is not None:
         if device not in ("cpu", "cuda"):
-            raise WlmError(f"device '{device}': expected cpu or cuda, whichever the machines of a cluster have")
+            raise WlmError(f"device '{device}': expected cpu or cuda when the fit runs on a cluster")
         return [device]
     checked = interop.check_device(device)
     if device == "cpu":
@@ -80,7 +78,7 @@ def worker_devices(device: str, workers: int | None, cluster: str | None, sample
 def start_workers(
     devices: list[str], workers: int | None, cluster: str | None, batches: int, seed: int, track: bool
 ) -> Workers:
-    """Starts a `Fitter` for each device, or on the machines of a cluster at most one for each batch.
+    """Starts a `Fitter` for each device, or on a cluster at most one for each batch; with `track` they measure PSNR.
 
     Raises:
         WlmError: The cluster cannot be reached, or the system cannot start that many processes.
@@ -105,9 +103,8 @@ class Dispatch:
         meter: Meter,
         checkpoint: Checkpoint | None,
     ) -> None:
-        """Takes the workers, the batches of `steps` steps each, the number of batches finished in an earlier run
-        (`done`), the progress meter, and the checkpoint that stores states and results; None: no checkpoint.
-        """
+        """Prepares the fit of `batches`, each of `steps` training steps; nothing starts before `run`. `done` is the
+        number of batches that an earlier run finished; `checkpoint`, which may be None, stores states and results."""
         self._workers, self._steps, self._done = workers, steps, done
         self._meter, self._checkpoint = meter, checkpoint
         self._waiting = deque(batches)
@@ -160,18 +157,18 @@ class Dispatch:
         self._workers.call(number, "start", run.batch.fit.job(run.batch), state)
 
     def _restart(self, number: int, why: Lost) -> None:
-        """Starts the batch of a worker that died again, from the batch's last saved state."""
+        """Restarts the batch of a dead worker from the batch's last saved state."""
         self._dead.add(number)
         run = self._running.pop(number, None)
         if run is None or self._stop is not None:
             return
         run.deaths += 1
         if run.deaths == _DEATHS:
-            raise WlmError(f"fit: batch {run.batch.number} has lost {_DEATHS} workers: {why}")
+            raise WlmError(f"fit: {_DEATHS} workers died while fitting batch {run.batch.number}: {why}")
         self._begin(number, run)
 
     def _take(self, number: int, answer: Any) -> tuple[Batch, Parts] | None:
-        """Handles the answer of a worker and gives it more work. Returns its batch with the result if that is done."""
+        """Handles a worker's answer and gives the worker more work. Returns the batch and its result if it is done."""
         run = self._running[number]
         if isinstance(answer, BaseException):
             # A wrong state is the checkpoint's fault.

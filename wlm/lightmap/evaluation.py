@@ -38,7 +38,7 @@ _TIME_TOLERANCE = 1e-6  # stored times are float32 if that keeps them distinct, 
 
 @dataclass(frozen=True)
 class SheetReport(ShownScore):
-    """Error and size of a sheet. Means without any value and metrics that were not computed are NaN.
+    """Error and size of one sheet (up to three channels of a layer). Scores that were not computed are NaN.
 
     The scores of `ShownScore` and `ViewScore` are attributes too.
 
@@ -46,7 +46,7 @@ class SheetReport(ShownScore):
         psnr, ssim, flip: Means over all scored tiles and times. PSNR is in dB, 120 for an exact tile; SSIM is in [-1,
             1] and FLIP in [0, 1].
         psnr_unlimited: Mean PSNR in dB over the tiles and times that are not in `format_limited`.
-        bytes: Bytes of the sheet in the file; a mask counts for the first sheet of its atlas.
+        bytes: Bytes of the sheet in the file; the mask that an atlas's sheets share counts for the first of them.
         bpp: `bytes` as bits per texel and time, see `bits_per_texel`.
         memory_bpp: Bits per texel and time in the memory of a GPU, see `SheetModel.memory_bytes`.
         tiles: Number of tiles that are not empty.
@@ -56,11 +56,11 @@ class SheetReport(ShownScore):
         worst_tile: Tile and time of `worst_psnr`: `time`, `tile` (its number), `row`, `column`; None without a score.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the units of the input.
         scored: Number of pairs of a tile and a time that count in the means.
-        not_scored: Number of the other pairs by reason: `empty` (no valid texel), `not_held` (valid texels, but not in
-            the file), `few_texels`, `zero_range` (see `wlm.metrics`).
-        format_limited: `time` and `tile` of the scored pairs whose values only span a few steps of half float.
+        not_scored: Number of pairs that are not scored, by reason: `empty` (no valid texel), `not_held` (valid texels,
+            but not in the file), `few_texels`, `zero_range` (see `wlm.metrics`).
+        format_limited: `time` and `tile` of the scored pairs whose range is only a few steps of half floats wide.
         kinds: Number of tiles of each kind: `empty`, `constant`, `static`, `dynamic`, `frames`.
-        warnings: Lines about tiles that were not scored, and about lost light that the means do not show.
+        warnings: Lines about tiles that were not scored, and about lost light of few very bright texels.
     """
 
     psnr: float
@@ -129,7 +129,7 @@ class Report(system.Report):
 
     @property
     def light(self) -> SheetReport:
-        """The report of the first sheet of radiance; without one, of the first sheet."""
+        """The report of the first sheet of radiance, or of the first sheet if no sheet is radiance."""
         return self.sheets[first_light(self.sheets)]
 
     def to_json(self) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def evaluate(
         lightmaps: The input. Another set with the same sheets, sizes and times is scored too, with a warning.
         device: Device that decodes: "cpu", "cuda" or "cuda:N".
         metrics: Any of "psnr", "ssim", "flip", and "seen" for `ShownScore` and views; FLIP takes most of the time.
-        views: Number of rendered views of the set's mesh, scored with "seen"; 0: none. Without a mesh there are none.
+        views: Number of rendered views of the set's mesh, scored with "seen"; 0: none. A set without a mesh has none.
         progress: Called about twice a second.
         file_bytes: Size of the model's file; None: the size that the model would have as a file.
 
@@ -166,15 +166,15 @@ def evaluate(
         The report.
 
     Raises:
-        WlmError: The sheets, the size or the times of the set are not the model's, no tile of the model has a valid
-            texel, there is no such device, a metric is unknown, or the number of views is negative.
-        ValueError: `file_bytes` is less than the parts of the model take.
+        WlmError: The set and the model differ in sheets, size or times, no tile of the model has a valid texel, there
+            is no such device, a metric is unknown, or the number of views is negative.
+        ValueError: `file_bytes` is smaller than the model's parts.
     """
     start = time.perf_counter()
     for sheet in lightmaps.sheets.keys() ^ model.sheets.keys():
         owner = lightmaps.name if sheet in lightmaps.sheets else f"the file {model.name}"
         raise WlmError(
-            f"{lightmaps.name}: expected the sheets of the file {model.name}; only {owner} has {sheet.label}"
+            f"{lightmaps.name}: expected the same sheets as in the file {model.name}; only {owner} has {sheet.label}"
         )
     sizes, reports, warnings = sheet_bytes(model), {}, []
     if lightmaps.source != model.source:
@@ -292,10 +292,10 @@ def _place(tile: int, stamp: float) -> str:
 
 
 def bits_per_texel(model: SheetModel, mask: np.ndarray, size: int) -> float:
-    """Returns the bits per texel and time that `size` bytes are, given the valid texels of the input, bool [H, W].
+    """Converts a size in bytes to bits per texel and time; `mask`, bool [H, W], has the valid texels of the input.
 
-    The area is the whole map with the gaps between charts, as the file replaces textures of that size. If the model
-    only holds some of the tiles with a valid texel, it is the part of the map that these cover.
+    The area is the whole map with the gaps between charts, since the file replaces textures of that size. If the model
+    lacks some of the tiles that have valid texels, the area is the part of the map that its tiles cover.
     """
     return size * 8 / (_area(model, mask) * len(model.times))
 
@@ -304,7 +304,7 @@ def _area(model: SheetModel, mask: np.ndarray) -> int:
     stored = _stored(model)
     area = mask.size if not (mask & ~stored).any() else int(stored.sum())
     if area == 0:
-        raise WlmError(f"{model.name}: the file holds no tile")
+        raise WlmError(f"{model.name}: expected a file with tiles, found only empty tiles")
     return area
 
 
@@ -314,17 +314,17 @@ def count_kinds(model: SheetModel) -> dict[str, int]:
 
 
 def _stored(model: SheetModel) -> np.ndarray:
-    """Returns the texels of the tiles that are not empty, bool [H, W]."""
+    """Returns which texels lie in tiles that are not empty, bool [H, W]."""
     grid = model.grid
     return grid.texels_of((model.kind != TileKind.EMPTY).reshape(grid.rows, grid.cols))
 
 
 def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
-    """Checks that a sheet fits a model; returns the texels that are scored, the valid ones of stored tiles, [H, W]."""
+    """Checks that a sheet fits a model; returns which texels are scored, bool [H, W]: valid ones in stored tiles."""
     count, height, width = lightmaps.frames.shape[:3]
     if (height, width) != (model.height, model.width):
         raise WlmError(
-            f"{lightmaps.name}: is {width}x{height}, but the file {model.name} holds {model.width}x{model.height}"
+            f"{lightmaps.name}: has {width}x{height} texels, but the file {model.name} {model.width}x{model.height}"
         )
     if count != len(model.times):
         raise WlmError(f"{lightmaps.name}: has {count} times, but the file {model.name} holds {len(model.times)}")

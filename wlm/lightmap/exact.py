@@ -20,10 +20,10 @@ def decode_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
     Args:
         model: The sheet.
         number: Number of the tile in the grid, row-major.
-        time: In the unit of the set's times, stored or between; gaps are not filled.
+        time: In the unit of the set's times, stored or between.
 
     Returns:
-        Linear radiance, float64 [128, 128, 3]; 0 in an empty tile.
+        Linear radiance, float64 [128, 128, 3]; gaps between charts are not filled; 0 in an empty tile.
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.CONSTANT:
@@ -70,7 +70,7 @@ def bound64(model: SheetModel, number: int, time: float) -> float:
     Args:
         model: The sheet.
         number: Number of the tile in the grid.
-        time: In the unit of the set's times. Between two stored times it is the larger of their two values.
+        time: In the unit of the set's times. Between two stored times, the larger of the two colours is returned.
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.EMPTY:

@@ -23,7 +23,7 @@ from wlm.system import Meter, OnProgress
 from wlm.workers import each
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE
-"""Texels times times in a batch: 64 tiles of 26 times, 330 MB of training data."""
+"""Number of texels, counted at each time, in a batch: 64 tiles at 26 times, 330 MB of training data."""
 
 CPU_TILES = 4
 """Largest number of tiles in a batch on a CPU: two cores gain nothing from more, and many cores want many batches."""
@@ -45,12 +45,13 @@ def compress(
     checkpoint: Checkpoint | None = None,
     **settings: Any,
 ) -> LightmapModel:
-    """Compresses a lightmap set.
+    """Compresses a lightmap set: fits feature maps and a small network to each tile of 128 x 128 texels.
 
     Args:
         lightmaps: The set.
         profile: The settings: a name, the path of a YAML file, or a `Profile`.
-        tiles: Numbers of the tiles to compress, of a set with one sheet; None: all. Other tiles are stored as empty.
+        tiles: Numbers of the tiles to compress, only for a set with one sheet; None: all. Other tiles are stored as
+            empty.
         seed: One seed gives one result on one device.
         device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs.
         workers: Processes that fit batches of tiles side by side; the result does not depend on it. 1: only this
@@ -58,17 +59,17 @@ def compress(
             on a GPU; on a cluster as many as it has room for.
         cluster: Address of a Ray cluster whose machines fit the tiles, as `ray.init` takes it ("auto",
             "ray://host:10001"); each worker takes two CPUs, or a GPU if the device is "cuda". None: this machine.
-        progress: Called about twice a second; in the stage "fit" the figures are the loss and "PSNR dB" of the latest
-            samples, by the tiled protocol. The stages "tiles" and "frames" may come before it.
+        progress: Called about twice a second; in the stage "fit" with the loss and "PSNR dB" of the latest samples,
+            relative to each tile's range. The stages "tiles" and "frames" may come before it.
         checkpoint: From `open_checkpoint`: keeps a running fit, and resumes an interrupted one.
-        settings: Settings that replace those of the profile: `steps=500`.
+        settings: Values that replace fields of the profile, such as `steps=500`.
 
     Returns:
         The model; its `warnings` name the settings that could not be followed.
 
     Raises:
         WlmError: There is no such profile, setting, device, tile or cluster; the checkpoint is of another fit; the fit
-            diverged; workers died again and again; or the settings ask for frames and the extra for them is missing.
+            diverged; workers died again and again; or the settings ask for frames without a BC7 encoder.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     worker_devices(device, workers, cluster)  # an error before the set is classified
@@ -169,7 +170,7 @@ class SheetFit:
 
     Attributes:
         index: int [N], numbers of the tiles in their grid, rising.
-        kinds: int [N], `TileKind` of each.
+        kinds: int [N], `TileKind` of each tile.
         model: The model; maps and networks of batches that are not stored yet are still missing.
         warning: A setting that could not be followed, or None.
     """
@@ -184,7 +185,8 @@ class SheetFit:
         """Classifies the tiles (all, or those with the given numbers) and encodes the tiles that are stored as frames.
 
         Raises:
-            WlmError: A number is outside the grid or given twice, there is none, or the encoder of frames is missing.
+            WlmError: A tile's number is outside the grid or given twice, `tiles` is empty, or frames have no BC7
+                encoder.
         """
         # Frames are chosen by the sizes that the profile names, so that two states stay frames.
         fitted, self._lightmaps = profile.for_times(len(lightmaps.times)), lightmaps
@@ -297,7 +299,7 @@ class SheetFit:
 def _classify(
     lightmaps: SheetFrames, numbers: np.ndarray, meter: Meter, gamma: float, peak: float | None, budget_db: float
 ) -> list[_Facts]:
-    """Classifies tiles and computes the scale, shift and spread of each (section 4); for the settings see `Profile`."""
+    """Classifies tiles and computes the numbers that normalise each (section 4); for the settings see `Profile`."""
 
     def look(number: int) -> _Facts:
         tile = split(lightmaps, gamma, [number])

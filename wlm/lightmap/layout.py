@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 PICTURES = 8
-"""Number of frames of a set that are compared."""
+"""Largest number of frames of a set that are compared."""
 
 _LEAST_BORDER = 0.005  # share of the lit texels; a shorter border is no evidence
 _MOST_BORDER = 0.6  # share of the lit texels; a longer border is noise

@@ -54,7 +54,7 @@ class LayerInfo:
 
     Attributes:
         name: Name of the layer.
-        encoding: A key of `wlm.lightmap.sheet.VALUE_RANGES`.
+        encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
         channels: Channels to read; None reads R, G and B of radiance and all channels of other layers.
     """
 
@@ -89,7 +89,7 @@ class Listing:
         name: Name of the set.
         where: The `set.json` or the folder.
         times: A time for each state, not yet checked.
-        period: Length of the day in the unit of the times, or None.
+        period: Length of the day in the unit of the times; None if the set is not periodic.
         layers, atlases: The layers and atlases, in the order of the set.
         states: For each time, the pictures by names of atlas and layer.
         labels: Name of each state (the pictures of one time) in messages.
@@ -108,7 +108,7 @@ class Listing:
 
     @property
     def files(self) -> list[Path]:
-        """The files of all pictures, state by state."""
+        """The files of all pictures, one time after another."""
         return [source.path for state in self.states for source in state.values()]
 
 
@@ -138,7 +138,7 @@ def list_set(
     names = [layer.name for layer in listing.layers]
     wrong = [repr(name) for name in layers if name not in names] or ([] if layers else ["none"])
     if wrong:
-        raise WlmError(f"{path}: layers: expected some of {', '.join(names)}, got {wrong[0]}")
+        raise WlmError(f"{path}: layers: expected names among {', '.join(names)}, got {wrong[0]}")
     return replace(listing, layers=tuple(layer for layer in listing.layers if layer.name in layers))
 
 
@@ -148,7 +148,7 @@ def natural(name: str) -> list[str | int]:
 
 
 def time_of_name(stem: str) -> float | None:
-    """Returns the hour at the end of a file's name, or None."""
+    """Returns the hour at the end of a file's name, such as 18.55 of "map_18_55h"; None if it has none."""
     match = _NAME_TIME.search(stem)
     if not match:
         return None
@@ -184,7 +184,7 @@ def state_folders(folder: Path) -> list[Path]:
 
 def _check_count(where: Path, items: Sequence[object], times: Sequence[float], noun: str) -> None:
     if len(times) != len(items):
-        raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(items, noun)}; expected one each")
+        raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(items, noun)}; expected a time for each")
 
 
 def _list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
@@ -196,7 +196,7 @@ def _list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
     # Hidden files belong to other programs: macOS writes one beside every file on a foreign disk.
     files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (natural(f.name), f.name))
     if not files:
-        raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found neither")
+        raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found none of them")
     stamps = times
     if stamps is None:
         stamps = [time_of_name(f.stem) for f in files]
@@ -281,7 +281,7 @@ def _refuse(
     """Raises an error about states with different files; it names a picture, and a state that does not have it."""
     name, has = f"{key[0]}_comp_{key[1]}", [bool(files.get(key)) for files in found]
     if all(has):
-        raise WlmError(f"{folder}: {name} has no format that all states have; expected the same files in each")
+        raise WlmError(f"{folder}: {name}: expected one format in all states, found different formats")
     without = states[has.index(False)].name
     there = f"{states[has.index(True)].name} has it" if any(has) else "another atlas has that layer"
     raise WlmError(
@@ -312,7 +312,7 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
         named = _named(path, content, "atlases", "an object of atlases")
         atlases = tuple(_atlas(path, name, value, trust) for name, value in named.items())
     if len(layers) > MOST_CHANNELS or len(layers) * len(atlases) > MOST_SHEETS:
-        raise WlmError(f"{path}: expected at most {MOST_CHANNELS} layers and {MOST_SHEETS} of all atlases together")
+        raise WlmError(f"{path}: expected at most {MOST_CHANNELS} layers, {MOST_SHEETS} in all atlases together")
     entries = _field(path, content, "lightmaps", "", _is_list, "a list of lightmaps")
     name, period = path.resolve().parent.name, None
     if content.get("name") is not None:
@@ -322,7 +322,7 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
             _field(path, content, "period_hours", "", lambda value: _is_number(value) and value > 0, "a number above 0")
         )
     if len(entries) > TIMES:
-        raise WlmError(f"{path}: lightmaps: expected at most {TIMES:,}, got {len(entries):,}")
+        raise WlmError(f"{path}: lightmaps: expected at most {TIMES:,} entries, got {len(entries):,}")
     states, stamps, found = [], [], {}
     for i, entry in enumerate(entries):
         place = f"lightmaps[{i}]"
@@ -382,7 +382,7 @@ def _layer(path: Path, name: str, value: Any) -> LayerInfo:
     channels = _field(path, options, "channels", f"{place}.", _is_list, f"a list of 1 to {MOST_CHANNELS} channels")
     named = len(channels) <= MOST_CHANNELS and all(is_name(channel) for channel in channels)
     if not named or len(set(channels)) < len(channels):
-        raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} names, each channel of a layer once")
+        raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} different names of channels")
     return LayerInfo(name, encoding, tuple(channels))
 
 
@@ -437,7 +437,7 @@ def _is_source(value: object) -> bool:
 
 
 def _field(path: Path, holder: dict[str, Any], key: str, place: str, ok: Callable[[Any], bool], expected: str) -> Any:
-    """Returns the value of a field of an object at a place of the file, such as `lightmaps[0].`, if `ok` accepts it."""
+    """Returns `holder[key]` if `ok` accepts it. For messages: `place` of the object, such as `lightmaps[0].`."""
     if key not in holder:
         raise WlmError(f"{path}: {place}{key} is missing; expected {expected}")
     if not ok(holder[key]):
@@ -446,7 +446,7 @@ def _field(path: Path, holder: dict[str, Any], key: str, place: str, ok: Callabl
 
 
 def is_text(value: object) -> bool:
-    """Returns whether a value is text that can be a name."""
+    """Returns whether a value is text that can name a file or a set: not blank, and valid in file names."""
     # File names cannot have a NUL or half of a surrogate pair.
     if not isinstance(value, str) or not value.strip() or "\0" in value:
         return False

@@ -96,7 +96,7 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
 
 @dataclass(eq=False)
 class SheetModel:
-    """The arrays of one sheet. Their types and shapes are in `part_table`.
+    """The arrays of one sheet (up to three channels of a layer). Their types and shapes are in `part_table`.
 
     Attributes:
         name, width, height, times, period: Properties of the input, see `wlm.lightmap.data.SheetFrames`.
@@ -113,7 +113,7 @@ class SheetModel:
             cannot compensate for coarse rounding.
         peak: Codes of an upper bound of the tile at each time, in gamma space: the colour of level 255 of the 8-bit
             output.
-        affine: Shift and spread of the module's formula.
+        affine: The numbers `shift` and `spread` of the formula at the top of the module.
         constant: Radiance of constant tiles: half floats, or float32 if a half float would be more than 1% off.
         frames: BC7 blocks of any mode of the tiles that are stored as frames; blocks that no filtered read touches are
             black.
@@ -164,7 +164,7 @@ class SheetModel:
 
     @property
     def scales(self) -> np.ndarray:
-        """The decoded scale of each tile with feature maps at each time, float32 [N_m, T, 3]."""
+        """The mean of each channel of each tile with feature maps at each time, as decoded, float32 [N_m, T, 3]."""
         kinds = self.kind[self.mapped]
         result = np.empty((len(kinds), len(self.times), 3), np.float32)
         result[kinds == TileKind.DYNAMIC] = decode_scale(self.scale, self.profile.gamma)
@@ -181,17 +181,17 @@ class SheetModel:
         return np.flatnonzero(np.isin(self.kind, kinds))
 
     def row(self, number: int) -> int:
-        """Returns the index of a tile among the tiles of its own kind."""
+        """Returns the index of tile `number` among the tiles of its own kind."""
         return int((self.kind[:number] == self.kind[number]).sum())
 
     def map_row(self, number: int) -> int:
-        """Returns the index of a tile among the tiles that have feature maps."""
+        """Returns the index of tile `number` among the tiles that have feature maps."""
         return int((self.mapped < number).sum())
 
 
 @dataclass(eq=False)
 class LightmapModel(Model):
-    """A compressed lightmap set: a `SheetModel` for each sheet.
+    """A compressed lightmap set: a `SheetModel` for each sheet (up to three channels of a layer).
 
     Attributes:
         name: Name of the set.
@@ -211,7 +211,7 @@ class LightmapModel(Model):
 
     @property
     def light(self) -> SheetModel:
-        """The first sheet of radiance; without one, the first sheet. An ordinary lightmap has only this sheet."""
+        """The model of the first sheet of radiance, or of the first sheet if no sheet is radiance."""
         return self.sheets[first_light(self.sheets)]
 
     @property
@@ -221,7 +221,7 @@ class LightmapModel(Model):
 
     @property
     def period(self) -> float | None:
-        """Length of the day in the unit of the times, or None."""
+        """Length of the day in the unit of the times; None if the set is not periodic."""
         return self.light.period
 
     @property

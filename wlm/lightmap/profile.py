@@ -25,34 +25,34 @@ class Profile(Settings):
     FILES: ClassVar[str] = "lightmap"
 
     hidden: int = Field(16, ge=4, le=128)
-    """Width of both hidden layers of the network."""
+    """Units in each of the two hidden layers of the network."""
     uvt_resolution: int = Field(32, ge=4, le=128, multiple_of=4)
-    """Texels of F_uvt along u and along v."""
+    """Size of the feature map F_uvt along u and along v, in texels."""
     uvt_slices: int = Field(12, ge=1, le=_MOST_ALONG_TIME)
-    """Slices of F_uvt along time."""
+    """Number of slices of the feature map F_uvt along time."""
     plane_columns: int = Field(64, ge=1, le=128)
-    """Texels of F_ut along u and of F_vt along v."""
+    """Size of the feature maps F_ut along u and F_vt along v, in texels."""
     plane_rows: int = Field(24, ge=1, le=_MOST_ALONG_TIME)
-    """Texels of F_ut and F_vt along time."""
+    """Size of the feature maps F_ut and F_vt along time, in texels."""
     follow_times: bool = False
-    """Adapt the sizes along time to the number of stored times, see `Profile.for_times`."""
+    """Adapt the sizes of the maps along time to the number of stored times, see `Profile.for_times`."""
     net_bits: Literal[8, 16] = 16
     """Bits of a network weight in the file: 16 (half floats) or 8."""
     gelu: Literal["exact", "tanh"] = "tanh"
-    """Form of the GELU; GPUs have an instruction for tanh."""
+    """Formula of the GELU activation: exact, or the approximation by tanh, for which GPUs have an instruction."""
     gamma: float = Field(2.2, ge=1.0, le=4.0)
-    """The maps approximate radiance ** (1 / gamma)."""
+    """Exponent of the space in which light is fitted: radiance ** (1 / gamma)."""
     time_axis: Literal["paper", "frames"] = "frames"
     """Time axis of the features. "paper": the hour divided by the period, clamped at its ends. "frames": every interval
     between stored times has the same length, so that a lamp that is switched within minutes gets as many texels as an
     hour of the afternoon; the axis wraps if the set is periodic."""
     interpolation: Literal["radiance", "network"] = "radiance"
-    """Light between two stored times. "radiance": the mix of the radiance of both (eq. 2). "network": the network's
-    output for features that are interpolated in time, as in the paper."""
+    """How to decode between two stored times. "radiance": decode both times and interpolate the radiance linearly.
+    "network": evaluate the network once, with features that are interpolated in time, as in the paper."""
     steps: int = Field(20000, ge=10)
-    """Steps of the fit."""
+    """Number of training steps."""
     samples: int = Field(4096, ge=128, multiple_of=128)
-    """Random samples of each tile in one step."""
+    """Number of random samples (texel and time) of each tile in one training step."""
     map_rate: float = Field(2e-2, gt=0.0, lt=1.0)
     """Initial learning rate of the feature maps (Adam)."""
     net_rate: float = Field(1e-2, gt=0.0, lt=1.0)
@@ -60,29 +60,29 @@ class Profile(Settings):
     final_rate: float = Field(1e-3, ge=0.0, le=1.0)
     """Final learning rate as a fraction of the initial one; the schedule is half a cosine."""
     adam_decay: float = Field(0.999, ge=0.5, lt=1.0)
-    """Adam's decay of squared gradients, beta 2. A texel is sampled only every few steps and its gradient shrinks by
-    orders of magnitude during a fit: 0.99 follows that and gains 0.1 to 0.8 dB over 0.999 in short fits, and nothing in
-    long ones."""
+    """Adam's beta 2, the decay of the mean of squared gradients. A texel is sampled only every few steps, and its
+    gradient shrinks by orders of magnitude during a fit. 0.99 adapts faster and gains 0.1 to 0.8 dB over 0.999 in short
+    fits, and nothing in long ones."""
     metric_weight: float = Field(0.5, ge=0.0, le=1.0)
-    """Loss. 0: squared error in normalised gamma space, as in the paper. 1: squared error of linear radiance relative
-    to the range of the tile at that time, which is what PSNR measures. Values between take the geometric mean."""
+    """Error that training minimises. 0: squared error in normalised gamma space, as in the paper. 1: squared error of
+    linear radiance relative to the tile's range at the time, as in PSNR. Between: the weighted geometric mean."""
     quantise_from: float = Field(0.5, ge=0.0, le=1.0)
     """Fraction of the steps after which the maps are quantised to the exact levels of the file."""
     freeze_from: float = Field(0.95, ge=0.0, le=1.0)
     """Fraction of the steps after which the maps are frozen and only the network is trained."""
     peak: float | None = Field(None, gt=0.0)
-    """Range that errors are relative to, for values that are not light; default: the range of the tile at each time, as
-    in the paper's protocol."""
+    """Range of values that errors are relative to, for data other than light; default: the range of the tile at each
+    time, as in the paper's protocol."""
     static_budget_db: float = Field(60.0, gt=0.0)
-    """Lowest PSNR in dB with which a tile is stored as one pattern that only changes in brightness."""
+    """A tile is stored as one pattern that only changes in brightness if its PSNR in dB is then at least this."""
     frames: Literal["auto", "never", "always"] = "auto"
-    """Tiles that are stored as BC7 at each time instead of maps and a network. "auto": those that take no more bytes
-    of GPU memory that way."""
+    """Which tiles are stored as a BC7 image for each time instead of feature maps and a network. "auto": the tiles that
+    take no more bytes of GPU memory as BC7 images."""
 
     @model_validator(mode="after")
     def _stages_in_order(self) -> "Profile":
         if self.quantise_from > self.freeze_from:
-            raise ValueError("quantise_from must not be later than freeze_from")
+            raise ValueError("quantise_from must not be greater than freeze_from")
         return self
 
     def for_times(self, times: int) -> "Profile":
@@ -100,7 +100,7 @@ class Profile(Settings):
         return self.override(sizes | {"follow_times": False})
 
     def for_sheet(self, sheet: Sheet) -> "Profile":
-        """Returns the settings for one sheet. A linear sheet has gamma 1, and its errors are relative to [0, 1]."""
+        """Returns the settings for one sheet; values that are not light get gamma 1, and errors relative to [0, 1]."""
         return self.override({"gamma": 1.0, "peak": 1.0}) if sheet.linear else self
 
     def inputs(self, temporal: bool) -> int:
@@ -114,7 +114,7 @@ class TimeAxis:
 
     Attributes:
         times: float64 [T], increasing.
-        period: Length of the day in the unit of the times, or None.
+        period: Length of the day in the unit of the times; None if the set is not periodic.
         kind: "paper" or "frames", see `Profile.time_axis`.
         interpolation: "radiance" or "network", see `Profile.interpolation`.
     """
@@ -131,7 +131,7 @@ class TimeAxis:
 
     @property
     def turn(self) -> float:
-        """Factor of tau in the time encoding gamma(t) of eq. 4, in radians: 2 pi if the axis wraps."""
+        """Angle in radians that one length of the time axis takes in the time encoding (neural-dynamic-gi, eq. 4)."""
         return (2.0 if self.periodic else 1.0) * math.pi
 
     def wrap(self, t: float) -> float:
@@ -143,7 +143,7 @@ class TimeAxis:
         return float(np.clip(t, self.times[0], self.times[-1]))
 
     def neighbours(self, t: float) -> tuple[int, int, float]:
-        """Returns the indices of the stored times around t and the weight of the second one in eq. 2."""
+        """Returns the indices of the stored times before and after t, and the weight of the later one, 0 to 1."""
         t = self.wrap(t)
         n = len(self.times)
         after = int(np.searchsorted(self.times, t, side="right"))
@@ -168,7 +168,7 @@ class TimeAxis:
         return tau % 1.0 if self.periodic else tau
 
     def reads(self, t: float) -> list[tuple[float, float]]:
-        """Returns the one or two times at which a network is evaluated for time t, with weights of their radiance."""
+        """Returns the one or two times at which the network is evaluated for time t, and the weights of the results."""
         before, after, share = self.neighbours(t)
         if self.interpolation == "network":
             return [(t, 1.0)]
@@ -176,12 +176,12 @@ class TimeAxis:
         return [read for read in pair if read[1] > 0.0]
 
     def encode(self, t: float) -> np.ndarray:
-        """Returns the time encoding gamma(t) of eq. 4, float32 [4]."""
+        """Returns the time encoding of t, float32 [4]: sines and cosines (neural-dynamic-gi, eq. 4)."""
         turn = self.turn * self.place(t)
         return np.array([math.sin(turn), math.cos(turn), math.sin(2 * turn), math.cos(2 * turn)], np.float32)
 
 
 def encode_time(axis: TimeAxis) -> tuple[np.ndarray, np.ndarray]:
-    """Returns tau [T] and gamma(t) [T, 4] of every stored time, float32."""
+    """Returns each stored time's position on the time axis, [T], and its encoding, [T, 4], both float32."""
     tau = np.array([axis.place(t) for t in axis.times], np.float32)
     return tau, np.stack([axis.encode(t) for t in axis.times])

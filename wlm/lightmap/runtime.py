@@ -36,7 +36,7 @@ class RuntimeDecoder:
     _tiles: DeviceTiles
 
     def __init__(self, model: SheetModel, device: str, shared: bool) -> None:
-        """Allocates the output; `shared` chooses RGB9E5. The time is initially the first stored one."""
+        """Allocates the output: RGB9E5 if `shared`, else 8-bit RGBA. The time is initially the first stored one."""
         self.model, self.device, self.shared = model, device, shared
         self.numbers = self._tiles.numbers
         self._rows = wp.array(np.arange(len(self.numbers), dtype=np.int32), dtype=int, device=device)
@@ -50,8 +50,9 @@ class RuntimeDecoder:
         """Sets the time of the following decodes.
 
         A CUDA graph that was captured before must be captured again, because the position on the time axis is an
-        argument of the launches. Between two stored times, each decode decodes both and interpolates. A renderer that
-        keeps the light of both and interpolates by itself only has to decode once for each stored time.
+        argument of the launches. Between two stored times, each decode decodes the light of both times and
+        interpolates. A renderer that keeps the light of both and interpolates by itself only has to decode once for
+        each stored time.
 
         Args:
             time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
@@ -123,7 +124,7 @@ class _ScratchDecoder(_MapDecoder):
 
 
 class StripDecoder(_ScratchDecoder):
-    """Fast decoder of dynamic tiles: one thread decodes four texels (section 3.5).
+    """Fast decoder of dynamic tiles: one thread decodes four texels (neural-dynamic-gi, section 3.5).
 
     Attributes:
         gelu: The GELU variant in use.
@@ -163,9 +164,9 @@ class MatrixDecoder(_ScratchDecoder):
         """
         name, hidden = interop.check_device(device), model.profile.hidden
         if name == "cpu":
-            raise WlmError("device: expected cuda for the matrix path, got cpu")
+            raise WlmError("device: expected cuda for MatrixDecoder, got cpu")
         if hidden % 16:
-            raise WlmError(f"hidden: expected a multiple of 16 for the matrix path, got {hidden}")
+            raise WlmError(f"model: expected networks whose hidden width is a multiple of 16, got {hidden}")
         super().__init__(model, name, "fast", TileKind.DYNAMIC, shared)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
         self._kernels = matrix_decode.matrix_kernels(hidden, shared)
@@ -201,7 +202,7 @@ class FrameDecoder(RuntimeDecoder):
 
 
 def fast_decoder(model: SheetModel, device: str = "cpu", shared: bool = False) -> StripDecoder | MatrixDecoder:
-    """Makes the fastest decoder of dynamic tiles: on CUDA a `MatrixDecoder`, if width and GELU allow it."""
+    """Makes the fastest decoder of dynamic tiles: on CUDA a `MatrixDecoder` if network width and GELU allow it."""
     device = interop.check_device(device)
     tanh = device != "cpu" and model.profile.gelu == "tanh"
     if tanh and model.profile.hidden % 16 == 0:

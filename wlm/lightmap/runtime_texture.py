@@ -1,8 +1,7 @@
 """Decodes a whole map at run time into one texture that a renderer samples: RGB9E5 with mips, on the device.
 
-Decoded tiles with 8 bits per channel have different bounds, so that a filter must not read across two tiles. In this
-texture, also of 32 bits per texel, all tiles share one format; gaps between charts are filled, and mips average only
-texels inside charts.
+Tiles decoded to 8 bits per channel have different bounds, so that a filter must not read across two tiles. RGB9E5, also
+32 bits per texel, needs no bounds. Gaps between charts are filled, and mips average only texels inside charts.
 """
 
 import os
@@ -119,7 +118,7 @@ def write_texture(path: str | os.PathLike[str], model: SheetModel, time: float, 
     """
     if max(model.height, model.width) > MOST_SIDE:
         size = f"{model.width}x{model.height}"
-        raise WlmError(f"{model.name}: expected at most {MOST_SIDE} texels along a side for a DDS, found {size}")
+        raise WlmError(f"{model.name}: expected at most {MOST_SIDE} texels along each side of a DDS, found {size}")
     decoder = MapDecoder(model, device)
     decoder.set_time(time)
     decoder.decode()
@@ -129,7 +128,7 @@ def write_texture(path: str | os.PathLike[str], model: SheetModel, time: float, 
 
 
 def _halved(weight: np.ndarray) -> np.ndarray:
-    """Returns the sums of blocks of 2x2 texels [h, w]; at an odd side, the last covers three."""
+    """Sums blocks of 2x2 texels of an image [h, w]; if a side is odd, its last blocks are three texels long."""
     for axis in (0, 1):
         starts = np.arange(max(weight.shape[axis] // 2, 1)) * 2
         weight = np.add.reduceat(weight, starts, axis)

@@ -8,7 +8,7 @@ from wlm.lightmap.tiles import TILE
 from wlm.texels import REACH
 
 EXACT = "WLM_LIGHTMAP_EXACT"
-"""Macro with which the shader fetches texels and mixes them in floats."""
+"""Macro that makes the shader interpolate texels in float32 instead of with the GPU's texture filter."""
 
 HEAD = 2
 """Groups of four floats before the records of the tiles in the table of an hour."""
@@ -303,7 +303,7 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
 
     Args:
         model: The sheet; the shader depends on its settings and on the kinds of its tiles.
-        values: Range of a linear sheet, to which decoded levels from 0 to 1 are mapped; None: the sheet is radiance.
+        values: Range to which decoded levels from 0 to 1 are mapped if the sheet is not light; None: it is radiance.
 
     Returns:
         Source for GLSL 3.30 and GLSL ES 3.00; it also compiles for Vulkan if the bindings are defined.

@@ -20,8 +20,7 @@ from wlm.errors import WlmError
 from wlm.formats.limits import PICTURE_TEXELS
 
 VALUE_RANGES = {"radiance": (0.0, 1.0), "unit": (0.0, 1.0), "signed": (-1.0, 1.0)}
-"""The values that levels 0 and 1 stand for, by encoding. The levels of radiance are the values and have no upper
-end."""
+"""The values that levels 0 and 1 stand for, by encoding. Radiance is its own level and has no upper limit."""
 
 MOST_CHANNELS = 12
 """Largest number of channels of an atlas, over all layers."""
@@ -46,7 +45,7 @@ class Sheet:
     Attributes:
         atlas, layer: Names of the atlas and of the layer.
         channels: One to three names of channels.
-        encoding: A key of `VALUE_RANGES`.
+        encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
     """
 
     atlas: str = "0"
@@ -62,7 +61,7 @@ class Sheet:
 
     @property
     def linear(self) -> bool:
-        """Whether the sheet holds levels in [0, 1] instead of radiance."""
+        """Whether the sheet holds levels in [0, 1] (directions, ratios, masks) instead of radiance."""
         return self.encoding != "radiance"
 
     @property
@@ -95,12 +94,12 @@ LIGHT = Sheet()
 
 
 def sheets_of(atlas: str, layer: str, channels: tuple[str, ...], encoding: str) -> list[Sheet]:
-    """Returns the sheets of a layer of an atlas, three channels each, in the order of the channels."""
+    """Splits a layer of an atlas into sheets of up to three channels, in the order of the channels."""
     return [Sheet(atlas, layer, channels[first : first + WIDTH], encoding) for first in range(0, len(channels), WIDTH)]
 
 
 def first_light(sheets: Iterable[Sheet]) -> Sheet:
-    """Returns the first sheet of radiance; without one, the first sheet."""
+    """Returns the first sheet of radiance, or the first sheet if no sheet is radiance."""
     sheets = list(sheets)
     return next((sheet for sheet in sheets if not sheet.linear), sheets[0])
 
@@ -111,7 +110,7 @@ def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: 
     Args:
         where: Name of the collection, for messages.
         sheets: The sheets to choose from.
-        layer: Name of the layer; None: the first layer of radiance; without one, the first layer.
+        layer: Name of the layer; None: the first layer of radiance, or the first layer if no layer is radiance.
         atlas: Name of the atlas; None: the first atlas that has the layer.
     """
     sheets = list(sheets)
@@ -125,7 +124,7 @@ def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: 
 
 
 def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
-    """Checks the sheets that a set or a file claims to have, before memory is allocated for them.
+    """Checks the number and the sizes of the sheets that a set or a file claims to have, before memory is allocated.
 
     Args:
         where: The set or the file, for messages.
@@ -142,12 +141,12 @@ def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
     for sheet, size in sizes.items():
         if found.setdefault(sheet.atlas, size) != size:
             first, second = (f"{width}x{height}" for height, width in (found[sheet.atlas], size))
-            raise WlmError(f"{where}: {sheet.label} is {second}, but atlas {sheet.atlas} is {first}; expected one size")
+            raise WlmError(f"{where}: {sheet.label} has {second} texels, but atlas {sheet.atlas} has {first}")
         channels.setdefault(sheet.atlas, []).extend((sheet.layer, name) for name in sheet.channels)
     for atlas, names in channels.items():
         if len(set(names)) < len(names):
-            raise WlmError(f"{where}: atlas {atlas}: expected each channel of a layer once")
+            raise WlmError(f"{where}: atlas {atlas}: expected every channel once, found one twice")
         if len(names) > MOST_CHANNELS:
             raise WlmError(f"{where}: atlas {atlas}: expected at most {MOST_CHANNELS} channels, found {len(names)}")
     if (texels := sum(height * width for height, width in sizes.values())) > PICTURE_TEXELS:
-        raise WlmError(f"{where}: expected at most {PICTURE_TEXELS} texels of all sheets, found {texels}")
+        raise WlmError(f"{where}: expected at most {PICTURE_TEXELS} texels in all sheets together, found {texels}")

@@ -17,9 +17,9 @@ class Targets:
         colour: float32 [N, T, 128 * 128, 3], (colour / scale - shift) / spread.
         texels: int32 [N, K], flat indices of valid texels, padded to the largest count K.
         count: int32 [N], number of valid texels.
-        weight, emphasis: float32 [N, T, 3], and a number, see `wlm_kernels.lightmap.features.Batch`.
-        shift, spread: float32 [N, 3].
-        scale: float32 [N, T, 3].
+        weight, emphasis: Loss weights, float32 [N, T, 3], and a number, see `wlm_kernels.lightmap.features.Batch`.
+        shift, spread: float32 [N, 3], mean and standard deviation of colour / scale.
+        scale: float32 [N, T, 3], mean of each channel at each time.
         range: float32 [N, T], range of the radiance that errors are relative to, or `peak` if it is given.
     """
 
@@ -37,7 +37,7 @@ class Targets:
     ) -> None:
         """Normalises and weights gamma-space colours [N, T, 128, 128, 3] where `mask` [N, 128, 128] is true.
 
-        `scale` [N, T, 3] and `affine` [N, 2, 3], the shift and the spread, are float32, as rounded for the file.
+        `scale` [N, T, 3] and `affine` [N, 2, 3], which holds shift and spread, are float32, as rounded for the file.
         """
         n, times = colour.shape[:2]
         self.number = number.astype(np.int32)

@@ -47,7 +47,7 @@ class TileGrid:
 
     @classmethod
     def of(cls, height: int, width: int) -> TileGrid:
-        """Makes the grid of a map of a size in texels; raises WlmError if `wlm.texels.check_size` does not allow it."""
+        """Makes the grid of a map of `height` x `width` texels; raises WlmError if the size is out of range."""
         check_size(height, width)
         return cls(height, width, -(-height // TILE), -(-width // TILE))
 
@@ -69,7 +69,7 @@ class TileGrid:
         return slice(y, min(y + TILE, self.height)), slice(x, min(x + TILE, self.width))
 
     def tiles_with(self, mask: np.ndarray) -> np.ndarray:
-        """Returns which tiles have a texel in a mask [H, W], bool [rows, columns]."""
+        """Returns which tiles have a true texel in a mask [H, W], bool [rows, columns]."""
         whole = np.zeros((self.rows * TILE, self.cols * TILE), bool)
         whole[: self.height, : self.width] = mask
         return whole.reshape(self.rows, TILE, self.cols, TILE).any(axis=(1, 3))
@@ -135,7 +135,7 @@ class TileKind(IntEnum):
     EMPTY = 0
     """No valid texel: nothing is stored."""
     CONSTANT = 1
-    """One colour per time."""
+    """One colour at each time for all texels."""
     STATIC = 2
     """One colour per time and one pattern for all times: F_uv and a network."""
     DYNAMIC = 3
@@ -156,14 +156,14 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
         The N tiles.
 
     Raises:
-        WlmError: A number is outside the grid or given twice, or there is none.
+        WlmError: A tile's number is outside the grid or given twice, or `tiles` is empty.
     """
     grid = TileGrid.of(*lightmaps.mask.shape)
     return cut(lightmaps, np.arange(grid.count) if tiles is None else np.array(list(tiles), np.int64)).encoded(gamma)
 
 
 def cut(lightmaps: SheetFrames, index: np.ndarray) -> TileCut:
-    """Cuts tiles with the numbers `index` out of a sheet, as views without a copy. Raises as `check_index` does."""
+    """Cuts the tiles with the numbers `index` out of a sheet, without a copy. Raises WlmError as `check_index` does."""
     grid = TileGrid.of(*lightmaps.mask.shape)
     check_index(index, grid)
     windows = [grid.window(tile) for tile in index]
@@ -171,7 +171,7 @@ def cut(lightmaps: SheetFrames, index: np.ndarray) -> TileCut:
 
 
 def valid_texels(mask: np.ndarray, number: int) -> np.ndarray:
-    """Returns the part of a mask [H, W] in tile `number`, bool [128, 128]; false past the map's edges."""
+    """Cuts tile `number` out of a mask [H, W]: bool [128, 128], false past the map's edges."""
     return _whole(mask[TileGrid.of(*mask.shape).window(number)])
 
 
@@ -217,7 +217,7 @@ def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
 def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak: float | None = None) -> np.ndarray:
     """Finds for each tile the simplest `TileKind` that represents it within an error budget.
 
-    In linear space, over the valid texels:
+    A tile's valid texels are compared in linear space:
 
     - `EMPTY`: the tile has no valid texel.
     - `CONSTANT`: at every time, the greatest value of each channel is at most one step of half float above the least.
@@ -226,9 +226,9 @@ def classify(tiles: TileData, gamma: float, static_budget_db: float = 60.0, peak
       float.
     - `DYNAMIC`: all other tiles.
 
-    For values that are not light, `peak` replaces the range. Such a tile is also constant if, at every time, its
-    channel means have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the RMS error at that
-    PSNR, because 8-bit sources are never exactly flat.
+    For values that are not light, `peak` replaces the range, and a tile is also constant if, at every time, its channel
+    means have a PSNR of `_FLAT_DB` and no texel is off by more than `_OUTLIER` times the RMS error at that PSNR: 8-bit
+    sources are never exactly flat.
 
     Args:
         tiles: From `split`.
@@ -296,7 +296,7 @@ def _half_step(value: np.ndarray) -> np.ndarray:
 
 
 def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
-    """Returns whether no channel of [T, 128, 128, 3] spans more than a step of half float at any time."""
+    """Returns whether the range of every channel of a tile is at most a step of half float at every time."""
     encoded = colour[:, valid].astype(np.float64)  # [T, K, 3]
     # Decoding is monotonic, so the extremes are taken before it.
     low, high = encoded.min(axis=1) ** gamma, encoded.max(axis=1) ** gamma
@@ -314,7 +314,7 @@ def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -
 def _is_static(
     colour: np.ndarray, valid: np.ndarray, means: np.ndarray, gamma: float, budget_db: float, set_peak: float | None
 ) -> bool:
-    """Returns whether one colour per time [T, 3], multiplied by one pattern, meets the budget at every time."""
+    """Returns whether the product of one colour per time, `means` [T, 3], and one pattern meets the budget."""
     pattern = static_pattern(colour[None], means[None])[0][valid] ** gamma  # [K, 3]
     for frame, mean in zip(colour, means, strict=True):
         linear = frame[valid].astype(np.float64) ** gamma

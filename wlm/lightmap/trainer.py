@@ -31,18 +31,17 @@ _VECTOR = 16  # numbers in the widest vector of a CPU that torch uses (AVX-512)
 _CHUNK = {"cpu": 5, "cuda": 50}  # steps between two looks at the clock
 
 CPU_LANES = 2
-"""Ranges of samples with separate sums; fixed, so that results do not depend on the number of cores."""
+"""Number of CPU threads, which sum gradients separately; fixed, so that results do not depend on the cores."""
 
 
 def _padded(count: int) -> int:
-    """Returns the padded length of a tensor of `count` parameters."""
     # Torch's fused Adam handles the remainder after whole vectors in a separate loop, which rounds differently on some
     # CPUs: without a remainder, a tile is the same in any batch.
     return -(-count // _VECTOR) * _VECTOR
 
 
 def _parameter(shape: tuple[int, ...], device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns a flat, padded tensor of zeros for an optimiser, and a view of it in `shape`; both have gradients."""
+    """Returns a flat, padded tensor of zeros for the optimiser, and a view of it with `shape`; both have gradients."""
     count = math.prod(shape)
     stored = torch.zeros(_padded(count), device=device).requires_grad_()
     stored.grad = torch.zeros_like(stored)
@@ -203,7 +202,7 @@ class Trainer:
             self._net_sums, self._net_outs = net_sums, (*net_grads, wrap(self.loss), wrap(self._rates))
 
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
-        """Returns the state of our GPU Adam for one array of parameters, with all moments 0."""
+        """Returns the state of the optimiser (Adam) on the GPU for one array of parameters, with all moments 0."""
         adam = gather.Adam()
         adam.decay = wp.vec2(_MOMENTUM, self._decay)
         adam.epsilon = _ADAM_EPSILON
@@ -244,7 +243,7 @@ class Trainer:
         self.batch = batch
 
     def _rates_over_steps(self, final_rate: float) -> wp.array:
-        """Returns the learning rates and Adam's corrections at each step, vec3 [steps], for `gather.update_maps`."""
+        """Returns the learning rate and Adam's two bias corrections of each step, vec3 [steps]."""
         share = np.linspace(0.0, 1.0, self.steps)
         values = final_rate + (1.0 - final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
         done = np.arange(1, self.steps + 1)
@@ -327,7 +326,7 @@ class Trainer:
                 adam.step()
 
     def _share(self, work: Callable[[int], None]) -> None:
-        """Runs `work(lane)` for each CPU lane in a thread of its own; kernel launches release Python's lock."""
+        """Runs `work(i)` for i below `CPU_LANES`, each in its own thread; kernel launches release Python's lock."""
         list(self._pool.map(work, range(CPU_LANES)))
 
     def losses(self) -> np.ndarray:
@@ -344,7 +343,7 @@ class Trainer:
         return float((-10.0 * torch.log10(mean.clamp_min(1e-12))).mean())
 
     def quantised(self) -> dict[str, np.ndarray]:
-        """Returns maps and networks by their names in `SheetModel`; networks of static tiles are called `net` too."""
+        """Returns maps and networks as the file stores them, by their names in `SheetModel` (always `net`)."""
         nets = self.hidden.detach(), self.output.detach()
         if self._integers:
             nets = self._on_levels
@@ -361,7 +360,7 @@ class Trainer:
         return result
 
     def _blocks(self, name: str) -> np.ndarray:
-        """Returns the map of this name as BC7 blocks, uint8 [S, H/4, W/4, 16]; S counts tiles, or tiles and slices."""
+        """Returns a map as BC7 blocks, uint8 [S, H/4, W/4, 16]: S images of H x W texels, one per tile or slice."""
         endpoints, weights = (getattr(self._maps, f"{name}_{part}") for part in ("endpoints", "weights"))
         with interop.stream(self.device):
             levels = wp.empty(endpoints.shape, dtype=wp.vec4ub, device=self.device)
@@ -385,7 +384,7 @@ class Trainer:
         if bool(broken.any()):
             tile = self.numbers[broken.cpu().numpy()][0]
             raise WlmError(
-                f"tile {tile}: the fit diverged; expected a smaller map_rate or net_rate than {self._name}'s"
+                f"tile {tile}: the fit diverged; take a smaller map_rate or net_rate than in profile {self._name}"
             )
 
     def state(self) -> dict[str, np.ndarray]:
@@ -437,7 +436,7 @@ class Trainer:
                         adam.state[parameter] = {key: values[f"{name}.{i}.{key}"] for key in _ADAM_STATE}
 
     def close(self) -> None:
-        """Ends the threads that `_share` runs work in."""
+        """Ends the trainer's threads."""
         if self._pool is not None:
             self._pool.shutdown()
 
@@ -448,8 +447,8 @@ class Advance:
 
     Attributes:
         step: Number of steps done.
-        loss, psnr: Means over the batch's tiles, from the latest samples, see `Trainer`; NaN if not tracked. After the
-            last step they are means for the maps as the file holds them.
+        loss, psnr: Mean loss and mean PSNR in dB over the batch's tiles, from the latest samples; NaN if not tracked.
+            After the last step they describe the maps as the file holds them.
         parts: The maps and networks as the file holds them, once the batch is done.
     """
 
@@ -468,7 +467,7 @@ class Fitter:
         self._trainer: Trainer | None = None
 
     def start(self, job: TileJob, state: dict[str, np.ndarray] | None) -> Advance:
-        """Starts a batch, or continues it from a saved `state`; raises ValueError if that is of another batch."""
+        """Starts a batch, or continues it from a saved `state`; raises ValueError if it is another batch's."""
         self.close()
         options = job.dynamic, self._seed, self._device, self._track
         self._trainer = Trainer(job.profile, job.axis, job.targets(), *options)

@@ -2,7 +2,7 @@
 
 The paper's protocol (`wlm.metrics.tiled`) compares the centres of valid texels at the stored times. A renderer reads
 filtered light at any hour, so that texels of gaps between charts and of neighbouring tiles matter too. The scores of
-this module cover the same tiles and times; errors are relative to a tile's range of values at a time. The scores are
+this module cover the same tiles and times, and errors are relative to a tile's range at a time, too. The scores are
 described in docs/lightmap.md and at `ShownScore`. Random points and times are the same in every run, and reads are
 clamped at the edges of the map.
 
@@ -93,7 +93,7 @@ class Views:
         self._lightmaps, self._geometry, self._device = lightmaps, geometry, check_device(device)
         low, high = geometry.box
         if not (high > low).any():
-            raise WlmError("expected a mesh with a size, found all of its corners in one place")
+            raise WlmError("expected a mesh with an extent, found all vertices at one point")
         times = range(len(lightmaps.times)) if indices is None else [int(index) for index in indices]
         self._cameras: dict[int, list[int]] = {index: [] for index in times}
         for number in range(count):
@@ -173,7 +173,7 @@ class ShownScore(ViewScore):
     """The error of light as a renderer shows it, see the module. Scores without anything to measure are NaN or None.
 
     Attributes:
-        seen: PSNR of filtered reads, dB, mean over tiles and times.
+        seen: PSNR of bilinear reads at random points, dB, mean over tiles and times.
         seen_by_tile: float64 [rows, columns] of the grid, means over the times.
         seen_by_time: float64 [T], means over the tiles.
         worst_seen: The tile and time with the lowest `seen`: `psnr`, `time`, `tile` (its number), `row`, `column`.
@@ -260,7 +260,7 @@ class Tally:
         ring = error[self._ring.at]
         if not np.isfinite(ring).all():
             y, x = (int(at[np.argmin(np.isfinite(ring).all(1))]) for at in self._ring.at)
-            raise WlmError(f"{self._name}: decodes to NaN or infinity beside a chart, first at row {y}, column {x}")
+            raise WlmError(f"{self._name}: a texel beside a chart decodes to NaN or infinity: row {y}, column {x}")
         self._add_points(index, error, metrics)
         squared = self._ring.sums(np.square(ring, dtype=np.float64))
         counted = metrics.scored & (self._ring.count >= MIN_VALID_TEXELS)
@@ -310,7 +310,7 @@ class Tally:
 
     @functools.cached_property
     def _left_out(self) -> np.ndarray | None:
-        """All texels of tiles that have valid texels but no scored ones, bool [H, W]; None if there are none."""
+        """Texels of the tiles that have valid texels but none that is scored, bool [H, W]; None without such tiles."""
         grid = self._grid
         tiles = grid.tiles_with(self._lightmaps.mask) & ~grid.tiles_with(self._mask)
         return grid.texels_of(tiles) if tiles.any() else None
@@ -379,7 +379,7 @@ class Tally:
 
 
 class _Texels:
-    """A selection of a map's texels, whose values can be summed by tile."""
+    """Selected texels of a map, whose values can be summed by tile."""
 
     def __init__(self, mask: np.ndarray, grid: TileGrid) -> None:
         self.at = np.nonzero(mask)

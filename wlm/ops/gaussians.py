@@ -41,7 +41,7 @@ def gaussian_sum(
 
     Raises:
         ValueError: A tensor's shape, type or device doesn't fit, the cut isn't above 0, there is no such support, or a
-            number isn't finite. Finding that out waits for the GPU.
+            number isn't finite. The check of numbers waits for the GPU.
     """
     if support not in kernels.SUPPORTS:
         raise ValueError(f"support: expected one of {', '.join(kernels.SUPPORTS)}, got {support!r}")

@@ -29,14 +29,14 @@ def march(
     """Marches rays through a density grid; the reference is `plain.march`.
 
     Single scattering at albedo 1 (neural-six-way-lightmaps, eq. 1 to 3; for another albedo, scale the colours):
-    each sample of a ray scatters the directional lights that reach it towards the ray's origin, by the phase function
-    of Henyey and Greenstein, and emits; both are attenuated along the ray. The steps of a ray are equal, and each is
-    integrated exactly for the density at its middle. The optical depth to a light is marched from the nodes of a
-    lattice, spaced by a step but at least a voxel, and interpolated trilinearly between them.
+    each sample of a ray scatters light from directional lights towards the ray's origin, by the phase function of
+    Henyey and Greenstein, and emits light; this light is attenuated along the ray. The steps of a ray are equally long,
+    and each is integrated exactly for the density at its middle. The optical depth to a light is marched from the nodes
+    of a lattice, whose spacing is a step but at least a voxel, and interpolated trilinearly between the nodes.
 
     All lengths are in voxels: the grid fills the box from 0 to (X, Y, Z), the centre of voxel i is at i + 1/2, and
-    density and emission are trilinear between centres, with zero outside the grid. Time grows with rays times steps,
-    and for each light with voxels times steps.
+    density and emission are trilinear between centres, with zero outside the grid. Run time is proportional
+    to rays times steps, plus voxels times steps for each light.
 
     The density, the lights' colours and the emission have gradients, exact for the discretised result. The rays and the
     directions to the lights have none: to find directions of light, fit the colours of many lights. On CUDA the
@@ -59,7 +59,7 @@ def march(
 
     Raises:
         ValueError: A tensor's shape, type or device doesn't fit, only one of `toward` and `colour` is given, an
-            argument without a gradient requires one, or a number isn't finite or in range. The check of numbers waits
+            argument that has no gradient requires one, or a number isn't finite or in range. The check of numbers waits
             for the GPU and is skipped while a CUDA graph is captured.
     """
     if not (math.isfinite(step) and step > 0.0):
@@ -68,10 +68,10 @@ def march(
         raise ValueError(f"g: expected a number within -1 and 1, got {g}")
     check("density", density, (None, None, None))
     if 0 in density.shape:
-        raise ValueError(f"density: expected voxels, got {tuple(density.shape)}")
+        raise ValueError(f"density: expected at least one voxel, got {tuple(density.shape)}")
     device = density.device
     if (toward is None) != (colour is None):
-        raise ValueError("toward, colour: expected both or neither")
+        raise ValueError("toward, colour: expected both arguments or neither, got one")
     if toward is None or colour is None:
         toward = colour = density.new_empty(0, 3)
     check("toward", toward, (None, 3), device)
@@ -100,7 +100,7 @@ def march(
 
 
 class _March(torch.autograd.Function):
-    """Computes each ray's light scattered from each light (colour 1, no phase function), emission and optical depth."""
+    """Computes per ray the scattered light of each light (colour 1, no phase function), emission and optical depth."""
 
     @staticmethod
     def forward(ctx, density, emission, toward, origin, direction, step):

@@ -22,8 +22,8 @@ def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: st
         hidden: float [I + H + 2, H] or [N, I + H + 2, H], concatenated: W1 [I, H], b1 [1, H], W2 [H, H],
             b2 [1, H]. The weight of a `torch.nn.Linear` is the transpose of such a matrix.
         output: float [H + 1, O] or [N, H + 1, O]: W3 [H, O], b3 [1, O].
-        gelu: "exact" (erf); "tanh", within 4.8e-4 of it; "fast": "tanh" with the GPU's instruction, with a relative
-            error of 2^-11 and gradients within 5e-3. On the CPU "fast" equals "tanh".
+        gelu: "exact" (erf); "tanh", an approximation within 4.8e-4 of "exact"; "fast", like "tanh" but with the GPU's
+            instruction, whose relative error is 2^-11, gradients within 5e-3. On the CPU "fast" equals "tanh".
 
     Returns:
         float [B, O] or [N, B, O].
@@ -41,7 +41,7 @@ def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: st
     check("hidden", hidden, (*networks, x.shape[-1] + width + 2, width), x.device)
     check("output", output, (*networks, width + 1, outputs), x.device)
     if not (1 <= width <= WIDEST and x.shape[-1] and outputs):
-        raise ValueError(f"hidden: expected 1 to {WIDEST} units, inputs and outputs, got {tuple(hidden.shape)}")
+        raise ValueError(f"hidden: expected 1 to {WIDEST} units, and inputs and outputs, got {tuple(hidden.shape)}")
     check_finite(x=x, hidden=hidden, output=output)
     if x.ndim == 2:
         return _Mlp.apply(x[None], hidden[None], output[None], gelu)[0]
@@ -84,5 +84,5 @@ def _arrays(network: MlpKernels, x: torch.Tensor, hidden: torch.Tensor, output: 
 
 
 def _weights(h: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """Returns the gradient of a layer's weight matrix, with the gradient of its bias as the last row."""
+    """Returns the gradient of a layer's weights, and of its biases as the last row, from inputs h and gradient d."""
     return torch.cat([h.transpose(1, 2) @ d, d.sum(1, keepdim=True)], 1)

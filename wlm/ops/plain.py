@@ -43,7 +43,7 @@ def bc7_texels(endpoints: Tensor, weights: Tensor, *, quantised: bool = False) -
 
 
 def _endpoint_bytes(e: Tensor) -> Tensor:
-    """Rounds e [..., 4] to the nearest bytes with equal lowest bits, int64 [..., 4]; even bytes in a tie."""
+    """Rounds colours e [..., 4] to the nearest bytes with equal lowest bits, int64 [..., 4]; ties go to even bytes."""
     v = e * 255.0
     even, odd = (torch.floor((v - bit) / 2.0 + 0.5).clamp(0.0, 127.0) * 2.0 + bit for bit in (0.0, 1.0))
     nearer = ((odd - v) ** 2).sum(-1, keepdim=True) < ((even - v) ** 2).sum(-1, keepdim=True)
@@ -59,12 +59,12 @@ def _per_texel(blocks: Tensor) -> Tensor:
 
 
 def plane(values, points, *, layer=None, periodic: bool = False) -> Tensor:
-    """Samples [H, W, C], or plane `layer` of [L, H, W, C], at points (u, v) [..., 2]; returns [..., C]."""
+    """Samples a plane [H, W, C], or plane `layer` of [L, H, W, C], at points (u, v) [..., 2]; returns [..., C]."""
     return _sample(values, points, layer, periodic, 2)
 
 
 def volume(values, points, *, layer=None, periodic: bool = False) -> Tensor:
-    """Samples [D, H, W, C], or volume `layer` of [L, D, H, W, C], at points (u, v, w) [..., 3]; returns [..., C]."""
+    """Samples a volume [D, H, W, C], or volume `layer` of [L, D, H, W, C], at (u, v, w) [..., 3]; returns [..., C]."""
     return _sample(values, points, layer, periodic, 3)
 
 
@@ -279,7 +279,7 @@ def _optical_depth(density: Tensor, p: Tensor, toward: Tensor, step: float) -> T
 
 
 def _trilinear(grid: Tensor, p: Tensor) -> Tensor:
-    """Samples [X, Y, Z] or [X, Y, Z, C] at points [..., 3] in voxels; the centre of voxel i is at i + 1/2."""
+    """Samples a grid [X, Y, Z] or [X, Y, Z, C] at points [..., 3] in voxels; the centre of voxel i is at i + 1/2."""
     values = pad(grid.reshape(*grid.shape[:3], -1), (0, 0, 1, 1, 1, 1, 1, 1))
     shape = values.shape[:3]
     q = p + 0.5

@@ -25,7 +25,7 @@ class Raster:
     Attributes:
         triangle: int32 [H, W], index of the visible triangle, -1 for none.
         barycentric: float [H, W, 2], the weights, in [0, 1], of the triangle's corners 0 and 1 at the visible point;
-            corner 2 has 1 minus their sum. Has a gradient. 0 in uncovered pixels, like all attributes below.
+            corner 2 has 1 minus their sum. Has a gradient. 0 in uncovered pixels, like all fields below.
         depth: float [H, W], z / w; 0 everywhere in UV space. Has no gradient.
         derivative: float [H, W, 4], derivatives of the weights per pixel: du/dx, du/dy, dv/dx, dv/dy, x to the right
             and y down; None if not requested. Has no gradient.
@@ -58,7 +58,7 @@ def rasterize(
     Args:
         clip: float [V, 4], x, y, z, w; the image shows x/w and y/w in [-1, 1], y up. The barycentrics' gradient reaches
             x, y and w of the visible triangle; changes of visibility have no gradient.
-        triangle: int32 or int64 [F, 3], rows of `clip`, with either winding.
+        triangle: int32 or int64 [F, 3], indices of the corners in `clip`, in either winding.
         height, width: H and W in pixels, 1 to 16,384.
         cull: Whether to leave out triangles whose corners run clockwise on the screen.
         derivative, coverage: Whether to compute these fields of `Raster`.
@@ -86,7 +86,7 @@ def rasterize_uv(
     Args:
         uv: float [V, 2], u right, v down (glTF): the texture is [0, 1] x [0, 1], row 0 is v = 0, and texel i of n has
             its centre at (i + 1/2) / n. Parts outside aren't drawn. The barycentrics pass gradients to `uv`.
-        triangle: int32 or int64 [F, 3], rows of `uv`.
+        triangle: int32 or int64 [F, 3], indices of the corners in `uv`.
         height, width: H and W in texels, 1 to 16,384.
         cull: Whether to leave out triangles whose corners run clockwise where u points right and v up.
         derivative, coverage: Whether to compute these fields of `Raster`.
@@ -102,8 +102,8 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
 
     Args:
         attribute: float [V, C], has a gradient.
-        triangle: int32 or int64 [F, 3], rows of `attribute`: the same number of triangles as were drawn, but their
-            corners may have other indices.
+        triangle: int32 or int64 [F, 3], indices of the corners in `attribute`, for the triangles that were drawn; the
+            indices may differ from those used for drawing.
         raster: Result of the rasterization; its barycentrics have a gradient.
 
     Returns:
@@ -140,7 +140,7 @@ def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", bo
     texture_kernels.codes(filter, boundary)
     check("image", image, (None, None, None))
     if 0 in image.shape:
-        raise ValueError(f"image: expected texels and channels, got {tuple(image.shape)}")
+        raise ValueError(f"image: expected at least one texel and one channel, got {tuple(image.shape)}")
     check("uv", uv, (*uv.shape[:-1], 2), image.device)
     texels = _Texture.apply(image, uv.reshape(-1, 2), filter, boundary)
     return texels.reshape(*uv.shape[:-1], image.shape[2])

@@ -26,15 +26,15 @@ def plane(
         values: float [H, W, C], or [L, H, W, C] with `layer`; with a gradient.
         points: float [..., 2], u along the width, v along the height (the time, in a lightmap's planes;
             neural-dynamic-gi, eq. 5). Has a gradient: the slope between the adjacent cells.
-        layer: int32 or int64 [...], 0 to L - 1: the plane of each point.
+        layer: int32 or int64 [...], 0 to L - 1: the index of each point's plane.
         periodic: Whether v wraps round: row 0 is the neighbour of row H - 1.
 
     Returns:
         float [..., C].
 
     Raises:
-        ValueError: A tensor's shape, type or device doesn't fit, or a number isn't finite or in range. Finding that
-            out waits for the GPU and is skipped while a CUDA graph is captured.
+        ValueError: A tensor's shape, type or device doesn't fit, or a number isn't finite or in range. The check
+            of numbers waits for the GPU and is skipped while a CUDA graph is captured.
     """
     return sample(values, points, layer, periodic, axes=2)
 
@@ -47,7 +47,7 @@ def volume(
     Args:
         values: float [D, H, W, C], or [L, D, H, W, C] with `layer`; with a gradient.
         points: float [..., 3], u along the width, v along the height, w along the depth; with a gradient.
-        layer: int32 or int64 [...], 0 to L - 1: the volume of each point.
+        layer: int32 or int64 [...], 0 to L - 1: the index of each point's volume.
         periodic: Whether w wraps round.
 
     Returns:
@@ -74,7 +74,7 @@ def triplane(
             "concatenate", in the order of the arguments, where C may differ between the planes.
 
     Returns:
-        float [..., C], or [..., the sum of the three C].
+        float [..., C]; with "concatenate" the last size is the sum of the three C.
 
     Raises:
         ValueError: See `plane`; or there is no such reduction.
@@ -110,7 +110,7 @@ def sample(
     """Implements `plane` (`axes` = 2) and `volume` (3); `names`: names of the values and the points in messages."""
     check(names[0], values, (None,) * (axes + 1 if layer is None else axes + 2))
     if 0 in values.shape:
-        raise ValueError(f"{names[0]}: expected cells and channels, got {tuple(values.shape)}")
+        raise ValueError(f"{names[0]}: expected at least one cell and one channel, got {tuple(values.shape)}")
     check(names[1], points, (*points.shape[:-1], axes), values.device)
     check_finite(**dict(zip(names, (values, points), strict=True)))
     shape = points.shape[:-1]

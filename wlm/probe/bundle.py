@@ -11,14 +11,14 @@ from wlm.probe.sphere import sh_count
 _ABOUT = {
     "values": "A probe has `outputs` numbers. Spherical harmonics: coefficient after coefficient, each red, green and "
     "blue; orthonormal real basis in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2; all signs plus, of radiance.",
-    "dead": "Probes that are zero, by index from 0 in the order of compression: engines leave them inside walls.",
+    "dead": "Indices from 0, in the order of compression, of the probes whose light is zero, such as those in walls.",
     "positions": "If the buffer positions exists: 3 unsigned 16-bit codes per probe, position = origin + extent * size "
     "* code / 65535.",
 }
 
 
 def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:
-    """Returns a model's data for a GPU, in the layout of the model's method.
+    """Returns a model's buffers, shader and description for a GPU; the layout depends on the compression method.
 
     Args:
         model: The model.
@@ -26,11 +26,12 @@ def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:
 
     Returns:
         The buffers `gaussians` and `network` for Gaussians, or `probes` for principal components; and `positions` if
-        the model stores them. The reference has the decoded `values`, float32 [M, D], with their points `position`,
-        float64 [M, 3], for Gaussians, or the live probes' numbers `live`, int32 [M], for principal components.
+        the model stores them. `reference` has M decoded examples, to test a shader with: `values`, float32 [M, D],
+        and for Gaussians their points `position`, float64 [M, 3], or for principal components their indices `live`
+        among the live probes, int32 [M].
 
     Raises:
-        WlmError: The device does not exist, the light is not finite, or a number exceeds float32.
+        WlmError: The device does not exist, the decoded light is not finite, or a number exceeds float32.
     """
     form = model.content.gpu_form(model, model.decoder(device))
     if not np.isfinite(form.reference["values"]).all():

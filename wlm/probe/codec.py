@@ -7,8 +7,8 @@ field      content
 =========  =======================================================================================================
 length     U16, length of the header in bytes
 header     JSON, see `_Header`
-parts      to the end: one zstd frame of all parts, in the order of their table (`_table`, then the method's); the
-           bytes of each part are split into planes, first the lowest byte of every number
+parts      to the end: one zstd frame of all arrays (parts), in the order in which `_table` lists them; the bytes
+           of each array are split into planes, first the lowest byte of every number
 =========  =======================================================================================================
 
 Signed integers are stored as 2 n for n >= 0 and -2 n - 1 otherwise, so that small magnitudes have empty high planes.
@@ -35,17 +35,17 @@ from wlm.probe.pca import codec as pca_codec
 from wlm.system import Header, Name
 
 _METHODS = {"gaussians": gaussian_codec, "pca": pca_codec}
-"""The module that stores each method's content."""
+"""The module that reads and writes the models of each compression method."""
 
 _LENGTH = struct.Struct("<H")
 _FARTHEST = 1e150
 _SOURCE = 8  # hexadecimal digits of the source
-# Most bytes of unpacked parts: a frame of zeros has next to no bytes of its own.
+# Limits of the unpacked arrays in bytes, since a tiny file could unpack to huge arrays of zeros.
 _SURE, _PER_BYTE = 1 << 24, 4096
 
 
 class _Header(Header):
-    """The header of a file: `count` is the number of Gaussians or of components, and `profile` names the method."""
+    """The header of a file: `count` is the number of Gaussians or components; `profile.method` is the method used."""
 
     probes: int = Field(ge=1, le=PROBES)
     outputs: int = Field(27, ge=1, le=NUMBERS)
@@ -62,10 +62,10 @@ class _NameHeader(Header):
 
 
 def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Returns the settings, parts and source hash of a model's file, as `wlm.formats.artifact` takes them.
+    """Encodes a model for `wlm.formats.artifact`: returns no settings, one array of bytes, and an empty source hash.
 
     Raises:
-        ValueError: The content has not been quantised.
+        ValueError: The model's Gaussians have not been quantised to integers.
     """
     method = _METHODS[model.method]
     live = int(model.live.sum())
@@ -80,7 +80,7 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     if live < model.probes:
         parts["dead"] = np.packbits(model.dead)
     if model.has_positions:
-        # Differences from probe to probe modulo 2^16: those of a lattice repeat.
+        # Differences from probe to probe, modulo 2^16: on a lattice they repeat, which zstd compresses well.
         parts["positions"] = np.diff(model.positions, axis=0, prepend=np.zeros((1, 3), np.uint16)).T
     text = json.dumps(header, separators=(",", ":")).encode()
     table = _table(_Header.model_validate(header))
@@ -89,31 +89,31 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def decode(artifact: Artifact) -> ProbeModel:
-    """Builds the model of a file; all that `encode` stored is restored bit for bit, except the end of the source hash.
+    """Restores the model that `encode` stored, bit for bit, except that the input's hash keeps only 8 of 16 digits.
 
     Raises:
-        WlmError, ValueError: A setting or a part is missing or wrong, or they do not fit each other.
+        WlmError, ValueError: A setting or an array is missing or wrong, or they contradict each other.
     """
     name = check_settings(_NameHeader, artifact.settings, "setting ").name
     body = artifact.tensors[BODY].tobytes()
     start = _LENGTH.size + (_LENGTH.unpack_from(body)[0] if len(body) >= _LENGTH.size else len(body))
     if start > len(body):
-        raise ValueError("expected a header and a frame of parts, found fewer bytes")
+        raise ValueError("expected a header and compressed arrays, found fewer bytes than the header's length")
     try:
         settings = json.loads(body[_LENGTH.size : start])
     except (ValueError, RecursionError) as error:
-        raise ValueError("expected a header in JSON") from error
+        raise ValueError("header: expected JSON, found other bytes") from error
     header = check_settings(_Header, settings, "setting ")
     if header.profile.method not in _METHODS:
         raise ValueError(f"setting method: expected {' or '.join(_METHODS)}, found {header.profile.method}")
     if header.live is not None and header.live >= header.probes:
-        raise ValueError(f"setting live: expected fewer than {header.probes}, found {header.live}")
+        raise ValueError(f"setting live: expected fewer live probes than {header.probes}, found {header.live}")
     table = _table(header)
     stored = check_parts(_split(body[start:], table, len(body)), table)
     box = stored["box"]
     origin, extent, size = box[:3].copy(), float(box[3]), box[4:].copy()
     if not (extent > 0 and (np.abs(box) <= _FARTHEST).all() and (size >= 0).all() and (size <= 1).all()):
-        raise ValueError("part box: expected a positive extent and a size within it")
+        raise ValueError("part box: expected finite numbers, a longest side above 0, and relative sides from 0 to 1")
     dead = np.zeros(0, bool)
     if "dead" in table:
         dead = np.unpackbits(stored["dead"], count=header.probes).astype(bool)
@@ -138,7 +138,7 @@ def decode(artifact: Artifact) -> ProbeModel:
 
 
 def _table(header: _Header) -> dict[str, Part]:
-    """Returns the types and shapes of a file's parts, by name."""
+    """Returns the types and shapes of a file's arrays, by name."""
     live = header.probes if header.live is None else header.live
     table = {"box": Part(np.float64, (7,))}
     if header.live is not None:
@@ -151,7 +151,7 @@ def _table(header: _Header) -> dict[str, Part]:
 
 
 def _planes(part: np.ndarray) -> bytes:
-    """Returns the bytes of a part, split into planes: first the lowest byte of every number, then the next bytes."""
+    """Returns the bytes of an array, split into planes: first the lowest byte of every number, then the next bytes."""
     if part.dtype == np.int32:
         part = ((part << 1) ^ (part >> 31)).view(np.uint32)
     little = np.ascontiguousarray(part, part.dtype.newbyteorder("<"))
@@ -159,11 +159,11 @@ def _planes(part: np.ndarray) -> bytes:
 
 
 def _split(frame: bytes, table: Mapping[str, Part], size: int) -> dict[str, np.ndarray]:
-    """Returns the parts of a zstd frame, with the planes of `_planes` merged again."""
+    """Decompresses a zstd frame to a file's arrays and undoes `_planes`; `size` is the size of the file in bytes."""
     sizes = {name: math.prod(part.shape) * np.dtype(part.dtype).itemsize for name, part in table.items()}
     total, most = sum(sizes.values()), _SURE + _PER_BYTE * size
     if total > most:
-        raise ValueError(f"parts: expected at most {most} bytes for a file of {size}, found {total}")
+        raise ValueError(f"parts: expected at most {most} bytes of arrays in a file of {size} bytes, found {total}")
     data = np.frombuffer(zstd.decompress(frame, total, "parts"), np.uint8)
     result, at = {}, 0
     for name, part in table.items():

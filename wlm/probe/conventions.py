@@ -14,8 +14,8 @@ unity    SphericalHarmonicsL2 (LightProbes)          L0 to L2  K_lm A_l / pi
 =======  ==========================================  ========  ========================================
 
 - three.js: `getAt` is the radiance and `getIrradianceAt` the irradiance.
-- Godot: the baker averages 4 L Y over the sphere where the integral is 4 pi times the average, so that its shader,
-  which folds in pi, 2 pi / 3 and pi / 4, gets irradiance / pi without a division. Not convolved with the cosine.
+- Godot: the baker stores the average of 4 L Y over the sphere, which is the integral of L Y divided by pi. The numbers
+  are not convolved with the cosine: the shader multiplies the bands by pi, 2 pi / 3 and pi / 4 for irradiance / pi.
 - Unreal: y, x, yz and xz have a minus sign, z, xy, 3z2-1 and x2-y2 have none. Its tables end with band 2. These are the
   vectors of the engine's own maths, not the packed bricks of a volumetric lightmap.
 - Unity: `Evaluate` and the shader's ShadeSH9 are plain polynomials that yield irradiance / pi. The basis' constants
@@ -57,7 +57,7 @@ def to_canonical(values: np.ndarray, name: str) -> np.ndarray:
         float64 [N, C, 3]; `from_canonical` inverts it, without any rounding for "threejs" and "unreal".
 
     Raises:
-        WlmError: The name is unknown, C is not a whole number of bands, or the engine has no such band.
+        WlmError: The name is unknown, C is not the square of a number of bands, or the engine has fewer bands.
         ValueError: The shape is different.
     """
     return _checked(values) / _factors(values.shape[1], name)[:, None]
@@ -79,11 +79,11 @@ def _factors(coefficients: int, name: str) -> np.ndarray:
     if name not in CONVENTIONS:
         raise WlmError(f"convention: expected {', '.join(CONVENTIONS)}, got {name!r}")
     if sh_count(3 * coefficients) is None:
-        raise WlmError(f"convention {name}: expected 1, 4, 9 ... coefficients a channel, got {coefficients}")
+        raise WlmError(f"convention {name}: expected 1, 4, 9 ... coefficients per colour channel, got {coefficients}")
     bands = coefficient_bands(coefficients)
     highest, last = bands[-1], _LAST_BAND.get(name, bands[-1])
     if highest > last:
-        raise WlmError(f"convention {name}: knows L0 to L{last}, got L{highest} ({coefficients} coefficients)")
+        raise WlmError(f"convention {name}: expected bands L0 to L{last}, got L{highest} ({coefficients} coefficients)")
     if name == "godot":
         return np.full(coefficients, 1.0 / math.pi)
     if name == "unreal":

@@ -53,7 +53,7 @@ class ProbeSet:
         key: Name of the array that was read.
         live: bool [N], false where the probe takes no part in the fit and decodes to zero; at least one is true.
         source: Hash of the positions, the values and `live`, 16 hexadecimal digits of BLAKE2b.
-        warnings: Repairs, one line each.
+        warnings: A line of text for each kind of repair.
         normal: float64 [N, 3], unit normal of each probe's surface, 0 for a probe on no surface; None if unknown.
     """
 
@@ -73,7 +73,7 @@ class ProbeSet:
 
     @property
     def outputs(self) -> int:
-        """The count of numbers per probe, D: 27 for L2 spherical harmonics in RGB."""
+        """The count of numbers per probe, D: 27 for second-order spherical harmonics in three colours."""
         return self.values.shape[1]
 
     @property
@@ -96,10 +96,10 @@ class _Raw:
 def load(path: str | os.PathLike[str], *, key: str | None = None, convention: str | None = None) -> ProbeSet:
     """Reads light probes from a file.
 
-    - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if they are not
+    - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if `sh...` is not
       canonical; optionally `normal` (N, 3) and `valid` (N), as for `from_arrays`.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
-      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`, with the other fields in the same way.
+      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`; optional fields as for `.npz`.
     - `.lmbake`: a lightmap bake of Godot 4.
     - `.asset`: the lighting data or light probes of Unity's editor (extra `unity`).
 
@@ -114,7 +114,7 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
         The set, with its faults repaired where that is possible; see `ProbeSet.warnings`.
 
     Raises:
-        WlmError: The content is wrong or cannot be read; the line names the file and the field.
+        WlmError: The content is wrong or cannot be read; the message names the file and the field.
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
@@ -169,7 +169,7 @@ def from_arrays(
         position: [N, 3] of numbers; copied.
         values: [N, C, 3], RGB last, or [N, D] of numbers; copied.
         name: Name of the set, also used in messages.
-        key: Name of the values.
+        key: Name of the array of values.
         convention: Convention of the values, one of `wlm.probe.conventions.CONVENTIONS`.
         normal: [N, 3], normal of each probe's surface, of any length, 0 for a probe on no surface; copied.
         valid: [N], true or false, or from 0 to 1: a probe below 0.5 is dead.
@@ -200,24 +200,24 @@ def save_probes(
     Args:
         path: The file to write; its suffix determines the kind, and its folder must exist.
         position: [N, 3].
-        values: float32 [N, D], finite, canonical.
+        values: float32 [N, D], finite, in this package's own convention (canonical).
         key: Name of the array of values.
         convention: Convention to write the values in, one of `wlm.probe.conventions.CONVENTIONS`.
 
     Raises:
         ValueError: The shapes do not fit, or a number is NaN or infinite.
-        WlmError: The suffix is unknown, the convention does not fit, the key has another meaning, or the file cannot
-            be written.
+        WlmError: The suffix is unknown, the convention does not fit the values, the key is the name of another field,
+            or the file cannot be written.
     """
     path = Path(path)
     position, values = np.asarray(position), np.asarray(values, np.float32)
     if values.ndim != 2 or position.shape != (len(values), 3) or 0 in values.shape:
         raise ValueError(f"expected positions [N, 3] and values [N, D], got {position.shape} and {values.shape}")
     if not (np.isfinite(position).all() and np.isfinite(values).all()):
-        raise ValueError("expected finite positions and values")
+        raise ValueError("expected finite positions and values, got NaN or infinity")
     # `file` and `allow_pickle` are parameters of NumPy's writer.
     if key in (_POSITION, _CONVENTION, _PROBES, *_BESIDE, "file", "allow_pickle"):
-        raise WlmError(f"{path}: expected another name for the values, {key!r} means something else")
+        raise WlmError(f"{path}: key: expected a name that no other field of the file has, got {key!r}")
     engine = _convert(str(path), values, convention, from_canonical)
     if position.dtype != np.float32:  # float32 takes half the bytes, if the caller has no more digits
         position = position.astype(np.float64)
@@ -244,7 +244,7 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
     arrays = read_npz(path, choose, numbers=PROBES * NUMBERS)
     stated = arrays[_CONVENTION] if _CONVENTION in arrays else np.array(CANONICAL)
     if stated.dtype.kind != "U" or stated.ndim:
-        raise WlmError(f"{path}: {_CONVENTION}: expected a name, got {stated.dtype} {stated.shape}")
+        raise WlmError(f"{path}: {_CONVENTION}: expected a string, got {stated.dtype} {stated.shape}")
     beside = {field: arrays[field] for field in _BESIDE if field in arrays and field != name}
     return _Raw(arrays[_POSITION], arrays[name], name, str(stated), beside)
 
@@ -256,7 +256,7 @@ def _read_json(path: Path, key: str | None) -> _Raw:
     beside = {field: read(field) for field in _BESIDE if field in names}
     stated = content.get(_CONVENTION, CANONICAL)
     if not isinstance(stated, str):
-        raise WlmError(f"{path}: {_CONVENTION}: expected a name, got {kind_of(stated)}")
+        raise WlmError(f"{path}: {_CONVENTION}: expected a string, got {kind_of(stated)}")
     return _Raw(read(_POSITION), read(name), name, stated, beside)
 
 
@@ -276,8 +276,7 @@ _READERS = {".npz": _read_npz, ".json": _read_json, ".lmbake": _read_godot, ".as
 
 
 def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
-    """Returns the name of the values' array: the given name, with or without "sh_", or the only one with this
-    prefix."""
+    """Returns the name of the array of values: `key`, with or without "sh_", or else the only one that begins "sh"."""
     if _POSITION not in names:
         raise WlmError(f"{path}: {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
     fields = [name for name in names if name not in (_POSITION, _CONVENTION, *_BESIDE)]
@@ -289,9 +288,9 @@ def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
         raise WlmError(f"{path}: expected values named {key} or {_SH}_{key}; found {listed}")
     candidates = [name for name in fields if name.startswith(_SH)]
     if not candidates:
-        raise WlmError(f"{path}: expected values whose name begins with {_SH}, or the key of others; found {listed}")
+        raise WlmError(f"{path}: expected an array whose name begins with {_SH}, or the key of one; found {listed}")
     if len(candidates) > 1:
-        raise WlmError(f"{path}: several sets of values; give the key of one: {', '.join(candidates)}")
+        raise WlmError(f"{path}: found several arrays of values; choose one by its key: {', '.join(candidates)}")
     return candidates[0]
 
 
@@ -372,7 +371,7 @@ def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
         raise WlmError(f"{where}: {_POSITION}: expected numbers, got {position.dtype}")
     count = len(position) if position.ndim else 0
     if count == 0:
-        raise WlmError(f"{where}: {_POSITION}: expected at least one, found none")
+        raise WlmError(f"{where}: {_POSITION}: expected at least one probe, found none")
     if position.shape != (count, 3):
         raise WlmError(f"{where}: {_POSITION}: expected (N, 3), got {position.shape}")
     if count > PROBES:

@@ -1,4 +1,4 @@
-"""Decodes at runtime, on a device, the light of a model's own probes and of any other points."""
+"""Decodes the light of a compressed model on a CPU or GPU: at the model's own probes or at any points."""
 
 from abc import ABC, abstractmethod
 
@@ -11,7 +11,7 @@ from wlm.probe.volume.light import Light
 
 
 class Decoder(ABC):
-    """A model on a device; the base class of each method's decoder.
+    """A model loaded onto a CPU or GPU; the base class of the decoders of all compression methods.
 
     Attributes:
         model, device: The model, and the name of its device.
@@ -23,7 +23,7 @@ class Decoder(ABC):
         Args:
             model: The model.
             device: "cpu" or "cuda:N".
-            position: [N, 3], positions of the model's probes, in the order of the fit; None: those stored with it.
+            position: [N, 3], positions of the model's probes, in the order of the fit; None: the stored ones.
 
         Raises:
             WlmError: The device does not exist, or the positions are not those of the model's probes.
@@ -48,10 +48,10 @@ class Decoder(ABC):
                 surface.
 
         Returns:
-            float32 [M, D].
+            float32 [M, D], for each point as many numbers as a probe has.
 
         Raises:
-            WlmError: A position is not finite, or the model needs the positions of its probes and has none.
+            WlmError: A position is not finite, or the decoder needs the positions of the probes, and they are unknown.
             ValueError: The shape is different.
         """
 
@@ -60,15 +60,15 @@ class Decoder(ABC):
         """Returns the light of the model's own probes, float32 [N, D], zero for dead probes.
 
         Raises:
-            WlmError: The method needs the positions of the probes, and there are none.
+            WlmError: The decoder needs the positions of the probes, and they are unknown.
         """
 
     @abstractmethod
     def light(self, position: np.ndarray) -> Light:
-        """Returns a source of light of the probes at positions [N, 3] for a volume, which decodes probes on demand.
+        """Returns a source that decodes the light of probes at positions [N, 3] whenever a volume asks for it.
 
         Raises:
-            WlmError: A position is not finite, or is not a probe's and the model has principal components.
+            WlmError: A position is not finite; or the model has principal components and probes at other positions.
         """
 
     def own_positions(self) -> np.ndarray:

@@ -47,11 +47,11 @@ class Report(BaseReport):
         mse, max_abs_error: Errors over all coefficients of all probes.
         worst_probe: The probe with the largest mean squared error: `probe` (index), `psnr`, `position`; None if all are
             exact.
-        psnr_by_band: PSNR of each SH band over all probes and RGB.
+        psnr_by_band: PSNR of each band of spherical harmonics, over all probes and colours.
         irradiance_psnr: PSNR of the irradiance on `NORMALS` fixed normals of every live probe in RGB; its peak is the
             range of the input's irradiance.
-        warnings: Lines of text about lost light that the means hide.
-        between_psnr: The result of `between_psnr`; None if it was not computed.
+        warnings: Sentences about light that probes lost, which the mean errors do not show.
+        between_psnr: PSNR between the probes, see the function `between_psnr`; None if it was not computed.
     """
 
     name: str
@@ -95,7 +95,7 @@ def evaluate(
         The report.
 
     Raises:
-        WlmError: The device does not exist, or an error of `score`.
+        WlmError: The device does not exist, the set has other probes, or a decoded number is not finite.
     """
     meter = Meter(progress, "evaluate", 2)
     if len(probes.position) != model.probes:
@@ -136,7 +136,7 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         raise ValueError(f"file_bytes: expected a positive number, got {file_bytes}")
     decoded, values, live = np.asarray(decoded), probes.values, probes.live
     if decoded.ndim != 2:
-        raise ValueError(f"decoded: expected [N, D], got {decoded.shape}")
+        raise ValueError(f"decoded: expected an array [N, D], got {decoded.shape}")
     count, outputs = values.shape
     if decoded.shape != values.shape:
         raise WlmError(
@@ -196,7 +196,7 @@ def _worst(by_probe: np.ndarray, position: np.ndarray, peak: float) -> dict[str,
 
 
 def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int) -> float:
-    """Returns the PSNR of the irradiance of live probes [V, D]; NaN if there are none."""
+    """Returns the PSNR in dB of the irradiance that live probes [V, D] give; NaN if there are none."""
     if len(values) == 0:
         return math.nan
     normals = fibonacci_sphere(NORMALS)
@@ -213,8 +213,8 @@ def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int)
 def between_psnr(decoder: Decoder, probes: ProbeSet) -> float:
     """Returns the PSNR in dB of decoded light half-way from each live probe to its nearest neighbour, where no bake
     exists. The decoder must have the positions of its probes. The reference at those points is the input, interpolated
-    from the eight nearest probes with weights 1 / distance². The PSNR is over the range of the live probes, and NaN for
-    fewer than two of them."""
+    from the eight nearest probes with weights 1 / distance². The peak of the PSNR is the range of the live probes'
+    numbers. With fewer than two live probes the result is NaN."""
     place, values = probes.position[probes.live], probes.values[probes.live]
     if len(place) < 2:
         return float("nan")

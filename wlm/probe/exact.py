@@ -1,4 +1,4 @@
-"""Decodes in float64 from a model's stored codes to light: the reference for the kernels."""
+"""Decodes a model's stored codes to light in float64, as the reference for the float32 kernels."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,7 +15,7 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
     """Returns the light of Gaussians at points, by the sum over all Gaussians.
 
     Implements gaussian-probe-compression, eq. 2 to 7 and 14. The sum jumps where a Gaussian's support ends, by up to
-    exp(-CUT^2 / 2) = 0.011 times the Gaussian's latent. A point that float32 rounds across the edge differs.
+    exp(-CUT^2 / 2) = 0.011 times the Gaussian's latent. Kernels can differ from it near this edge, in float32.
 
     Args:
         model: A model of Gaussians.

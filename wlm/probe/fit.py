@@ -38,14 +38,14 @@ def open_checkpoint(
     """Opens the checkpoint of a fit, the file `OUTPUT.partial`.
 
     Args:
-        output: The file that the fit is for.
+        output: The model's file, which is written when the fit is finished.
         probes, profile, seed: The arguments of `compress`; the checkpoint is only valid for them.
         device: Only its kind matters: a fit can continue on another GPU.
         resume: Whether to continue from the file, if it exists.
         every: Seconds between two saves of a running fit; 0: after every few steps.
 
     Raises:
-        WlmError: With `resume`: the file is damaged or of another fit; the line names the difference.
+        WlmError: With `resume`: the file is damaged or of another fit; the message names the difference.
     """
     fit = {
         "input": probes.source,
@@ -71,7 +71,7 @@ def compress(
 
     A profile of the method "auto", as all shipped Gaussian profiles are, yields Gaussians unless principal components
     have less error in no more GPU memory, which is the case for a few hundred probes; `ProbeModel.choice` says why.
-    Dead probes take no part in the fit: the model has a bit for each probe if any is dead.
+    Dead probes take no part in the fit: the model stores one bit per probe if any probe is dead.
 
     Args:
         probes: The set.
@@ -81,7 +81,7 @@ def compress(
         progress: Called about twice a second, with the PSNR over all numbers of all probes.
         checkpoint: From `open_checkpoint` for the same settings, or None. A running fit is saved there, and an
             interrupted one is resumed from there.
-        positions: Whether the model stores the probes' positions, 16 bits per axis; an engine has them anyway.
+        positions: Whether the model stores the probes' positions, 16 bits per axis; not needed if the engine has them.
         overrides: Settings that replace the profile's, such as `steps=500`.
 
     Returns:
@@ -154,7 +154,7 @@ def _fit_gaussians(
     finally:
         trainer.close()
     if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
-        raise WlmError(f"{probes.name}: the fit diverged; expected smaller rates than those of {profile.name}")
+        raise WlmError(f"{probes.name}: the fit diverged; use smaller learning rates than {profile.name}")
     fitted = make(
         profile=profile.model_copy(update={"method": "gaussians"}),
         content=content,

@@ -1,4 +1,4 @@
-"""Reads probes from JSON: an object of lists, or a list of objects, one for each probe."""
+"""Reads probes from JSON: an object with a list for each field, or with a list `probes` of one object per probe."""
 
 import json
 from collections.abc import Callable
@@ -25,10 +25,10 @@ def read_json(path: Path) -> Any:
 
 
 def fields_of(path: Path, content: Any) -> tuple[list[str], Callable[[str], np.ndarray]]:
-    """Returns the names of the probes' fields in either form, and a function that reads one of them as an array.
+    """Returns the names of the probes' fields, and a function that reads the field of a name as an array.
 
     Raises:
-        WlmError: The content has neither form. The function raises it if a field is missing or is not numeric.
+        WlmError: The content has another form. The returned function raises it if a field is missing or not numeric.
     """
     if not isinstance(content, dict):
         raise WlmError(f"{path}: expected a JSON object, got {kind_of(content)}")
@@ -55,7 +55,7 @@ def _rows(path: Path, holder: dict, field: str) -> list:
 
 
 def numbers_of(path: Path, field: str, rows: list) -> np.ndarray:
-    """Converts nested lists of one shape to an array, of booleans only for fields that allow them.
+    """Converts nested lists of one shape to an array; booleans are allowed only in the fields `_FLAGS`.
 
     Raises:
         WlmError: The lists have several shapes, or an element is not a number.
@@ -70,8 +70,7 @@ def numbers_of(path: Path, field: str, rows: list) -> np.ndarray:
 
 
 def _array(value: object, kinds: str) -> np.ndarray | None:
-    """Converts a value to an array if its NumPy kind is in `kinds`; None for other values, text, null and ragged
-    lists."""
+    """Converts a value to an array; None if its NumPy kind is not in `kinds`, as for text, null and ragged lists."""
     try:
         array = np.asarray(value)
     except (ValueError, OverflowError):

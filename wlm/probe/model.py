@@ -1,4 +1,4 @@
-"""The model of a probe set: the settings of a fit, and the compressed light with its frame.
+"""The model of a probe set: the settings of a fit, and the compressed light with its bounding box.
 
 The method of compression is data: `ProbeModel.content` holds the light, either as Gaussians and a small network
 (`wlm.probe.gaussian`) or as principal components (`wlm.probe.pca`). Everything else is the same for both methods.
@@ -25,9 +25,9 @@ class Profile(Settings):
     FILES: ClassVar[str] = "probe"
 
     method: Literal["auto", "gaussians", "pca"] = "auto"
-    """Method: gaussians, pca, or auto, which takes PCA where it has less error in no more GPU memory."""
+    """Compression method: gaussians, pca, or auto, which takes PCA if it has less error in no more GPU memory."""
     ratio: float = Field(0.05, gt=0.0, le=1.0)
-    """Number of Gaussians as a share of the live probes."""
+    """Number of Gaussians per live probe, that is, per probe that holds light."""
     latent: int = Field(9, ge=1, le=32)
     """Length of the latent vector of a Gaussian."""
     hidden: int = Field(64, ge=8, le=128, multiple_of=8)
@@ -39,32 +39,32 @@ class Profile(Settings):
     steps: int = Field(12000, ge=10)
     """Number of training steps; each step runs over all probes."""
     centre_rate: float = Field(1e-3, gt=0.0, lt=1.0)
-    """First learning rate of the centres, in the normalised frame."""
+    """Initial learning rate of the Gaussians' centres, with the longest side of the probes' box as the unit."""
     scale_rate: float = Field(1e-2, gt=0.0, lt=1.0)
-    """First learning rate of the logarithms of the scales."""
+    """Initial learning rate of the logarithms of the Gaussians' scales."""
     rotation_rate: float = Field(1e-2, gt=0.0, lt=1.0)
-    """First learning rate of the quaternions."""
+    """Initial learning rate of the quaternions that rotate the Gaussians."""
     latent_rate: float = Field(3e-2, gt=0.0, lt=1.0)
-    """First learning rate of the latents."""
+    """Initial learning rate of the Gaussians' latent vectors."""
     net_rate: float = Field(2e-2, gt=0.0, lt=1.0)
-    """First learning rate of the network."""
+    """Initial learning rate of the network."""
     detail: float = Field(1.0, ge=0.0, le=4.0)
-    """Power of the local variance in the draw of the first centres; 0 draws uniformly, as k-means does."""
+    """Initial centres are denser where light varies, by this power of its local variance; 0: uniformly distributed."""
     first_scale: float = Field(0.7, gt=0.0, le=4.0)
-    """First scales as a share of the distance to the nearest other centre."""
+    """Initial scale of a Gaussian as a share of the distance to the nearest other centre."""
     gain: float = Field(3.0, gt=0.0, le=10.0)
-    """Magnitude of the first network weights, relative to a uniform draw of variance 1 / (3 inputs)."""
+    """Magnitude of the network's initial weights, relative to uniform random numbers of variance 1 / (3 * inputs)."""
 
 
 class GpuForm(NamedTuple):
-    """The part of a model's bundle that depends on the method.
+    """The part of a model's GPU bundle (`wlm.probe.bundle`) that depends on the compression method.
 
     Attributes:
         shader: GLSL that decodes the buffers.
         buffers: Arrays by name.
         document: Entries that describe the buffers, as JSON values.
-        about: Explanations of the entries.
-        reference: Arrays by name, `values` among them.
+        about: Explanations of the entries, by name.
+        reference: Decoded examples to test a shader with, arrays by name; `values` is their light.
     """
 
     shader: str
@@ -75,7 +75,7 @@ class GpuForm(NamedTuple):
 
 
 class Content(ABC):
-    """The compressed light of a model, in the form of one method.
+    """The compressed light of a model, in the form of one compression method.
 
     Attributes:
         METHOD: Name of the method in files and reports.
@@ -90,11 +90,11 @@ class Content(ABC):
 
     @abstractmethod
     def decoder(self, model: "ProbeModel", device: str, **options: Any) -> Any:
-        """Loads a model with this content onto a device."""
+        """Loads a model with this content onto a device and returns its decoder."""
 
     @abstractmethod
     def gpu_form(self, model: "ProbeModel", decoder: Any) -> GpuForm:
-        """Returns the GPU form of a model with this content; `decoder` computes the reference values."""
+        """Returns the shader, buffers and examples for a model with this content; `decoder` computes the examples."""
 
     @abstractmethod
     def facts(self) -> dict[str, Any]:
@@ -108,16 +108,16 @@ class ProbeModel(Model):
     Attributes:
         name: Name of the set.
         source: Hash of the input, 16 hexadecimal digits; a file stores the first 8.
-        profile: Settings of the fit, with the method that was used; for PCA only the name.
+        profile: Settings of the fit, with the method that was used; PCA has no other settings.
         probes: Number of probes, N.
-        outputs: Numbers per probe, D: 27 for L2 spherical harmonics in RGB.
+        outputs: Numbers per probe, D: 27 for second-order spherical harmonics in three colours.
         origin: float64 [3], lowest corner of the probes' bounding box, in the unit of the positions.
         extent: Longest side of the box; 1 if all probes coincide.
         size: float64 [3], sides of the box divided by `extent`, each in [0, 1].
         dead: bool [N], probes that decode to zero: all their numbers were zero, or one was not finite. Empty if
             there are none.
         positions: uint16 [N, 3], positions in 1/65535 of the box, if they are stored with the model; else empty.
-        content: The light, in the form of the method.
+        content: The compressed light, in the form of the method.
         choice: Sentence that says why the fit used this method. Files do not store it.
     """
 
@@ -148,15 +148,15 @@ class ProbeModel(Model):
 
     @property
     def has_positions(self) -> bool:
-        """Whether the probes' positions are stored."""
+        """Whether the model stores the positions of its probes."""
         return len(self.positions) > 0
 
     def decoder(self, device: str = "cpu", **options: Any) -> Any:
-        """Loads the model onto a device.
+        """Loads the model onto a device and returns its decoder.
 
         Args:
             device: "cpu" or "cuda:N".
-            options: Options of the method's decoder.
+            options: Further arguments of the decoder, such as `position`.
 
         Raises:
             WlmError: The device does not exist, or the options do not fit the model.
@@ -171,7 +171,7 @@ class ProbeModel(Model):
         return np.clip(x, 0.0, self.size).astype(np.float32)
 
     def stored_positions(self) -> np.ndarray:
-        """Returns the positions stored with the model, float64 [N, 3], to 1/65535 of the box.
+        """Returns the positions stored with the model, float64 [N, 3], exact to 1/65535 of the box.
 
         Raises:
             WlmError: The model stores no positions.
@@ -183,7 +183,7 @@ class ProbeModel(Model):
         return self.origin + self.extent * self.size * (self.positions / CODES)
 
     def has_probes_at(self, position: np.ndarray) -> bool:
-        """Tests whether positions, float64 [M, 3], have the number and the box of the model's own probes."""
+        """Tests whether positions, float64 [M, 3], equal those of the model's own probes in number and bounding box."""
         if len(position) != self.probes:
             return False
         box = np.stack([self.origin, self.origin + self.extent * self.size])

@@ -72,7 +72,7 @@ def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> 
 
 
 def ball_exposure(values: np.ndarray) -> float:
-    """Returns the exposure at which nearly all of white diffuse balls, lit by SH radiance [N, C, 3], is below white."""
+    """Returns the exposure at which white diffuse balls, lit by SH radiance [N, C, 3], are hardly anywhere clipped."""
     return exposure(irradiance(values, fibonacci_sphere(_NORMALS)) / np.pi)
 
 

@@ -13,8 +13,7 @@ _UNIT_TOLERANCE = 1e-3  # for a direction's length; float16 normals are within 6
 
 
 def sh_count(outputs: int) -> int | None:
-    """Returns the number C of coefficients of a probe with `outputs` numbers, or None if it has no whole SH bands in
-    RGB."""
+    """Returns the number C of SH coefficients in RGB of a probe with `outputs` numbers; None for incomplete bands."""
     count = outputs // 3
     return count if count > 0 and outputs == 3 * count and math.isqrt(count) ** 2 == count else None
 
@@ -97,7 +96,7 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
         float64 [..., M, 3], pi times the radiance if that is constant.
 
     Raises:
-        ValueError: An error of `basis`, or the shape is different.
+        ValueError: A shape is different, a normal's length is not 1, or C is not a square.
     """
     values = np.asarray(values, np.float64)
     if values.ndim < 2 or values.shape[-1] != 3:

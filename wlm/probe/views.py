@@ -1,6 +1,6 @@
 """Compares pictures of surfaces that probes light (gaussian-probe-compression, table 1): the visible error.
 
-50 viewers stand along the loop of `wlm evaluate --volume`, each looking in another direction with a field of view of 90
+50 viewers stand along a loop through the scene (`camera_path`), each with another direction and a field of view of 90
 degrees. They see balls at a subset of the probes, and the scene's mesh if it is given; all surfaces are diffuse and
 white. Three kinds of light are compared with the original probes:
 
@@ -47,7 +47,7 @@ _BALL_POINTS = 162
 _NEIGHBOURS = 8
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _DOWN = 0.2  # downward part of the viewing direction
-_BUDGET = 1024  # blocks decoded per frame; the volume is awaited
+_BUDGET = 1024  # blocks decoded per frame; many, since all are awaited
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def score_views(
     if count is None:
         raise WlmError(f"{probes.name}: expected spherical harmonics, found {probes.outputs} numbers per probe")
     if views < 1 or not 16 <= resolution <= 4096:
-        raise WlmError(f"views: expected at least 1 of 16 to 4096 pixels a side, got {views} of {resolution}")
+        raise WlmError(f"views: expected at least 1, with 16 to 4096 pixels a side, got {views} with {resolution}")
     live = np.flatnonzero(probes.live)
     scene = _Scene(probes, decoded, live, count, device)
     things = {"balls": scene.balls()} | ({} if geometry is None else {"mesh": _split(geometry)})
@@ -131,8 +131,7 @@ def score_views(
 
 @dataclass(frozen=True, eq=False)
 class _Mesh:
-    """Triangles without shared corners, vertex normals float64 [V, 3], and the probe's number of each triangle or
-    -1."""
+    """Triangles without shared corners, vertex normals float64 [V, 3], and each triangle's probe (index or -1)."""
 
     position: np.ndarray
     normal: np.ndarray
@@ -147,7 +146,7 @@ def _split(geometry: Geometry) -> _Mesh:
 
 
 class _Scene:
-    """The original and the decoded probes, and a volume of each around a viewer."""
+    """The original and the decoded probes, each with a cascaded lighting volume around the viewer."""
 
     def __init__(self, probes: ProbeSet, decoded: np.ndarray, live: np.ndarray, count: int, device: str) -> None:
         self._position, self._count = probes.position[live], count
@@ -179,8 +178,8 @@ class _Scene:
             settle(volume, eye)
 
     def lights(self, place: np.ndarray, normal: np.ndarray, owner: np.ndarray) -> Iterator[np.ndarray]:
-        """Yields SH coefficients, float64 [P, C, 3], at points [P, 3] or at their probes (`owner`): the original light,
-        then each of `KINDS`."""
+        """Yields SH coefficients, float64 [P, C, 3], of the original light and of each of `KINDS`, at points [P, 3] or,
+        where `owner` is not -1, at the probes with these indices."""
         ahead = None
         if owner[0] >= 0:
             direct = [values[owner] for values in self._values]
@@ -199,7 +198,6 @@ class _Scene:
 
 
 def _viewers(position: np.ndarray, views: int, up: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields the position and the viewing direction of each viewer."""
     plan = [axis for axis in range(3) if axis != up]
     for number, eye in enumerate(camera_path(position, views, up=up)):
         angle = number * _GOLDEN_ANGLE
@@ -211,8 +209,8 @@ def _viewers(position: np.ndarray, views: int, up: int) -> Iterator[tuple[np.nda
 def _look(
     mesh: _Mesh, eye: np.ndarray, forward: np.ndarray, up: int, resolution: int, device: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Renders a mesh from a viewer. Returns the visible pixels, bool [H, W], and for the P visible pixels the points
-    and normals, [P, 3] each, and the probes' numbers, [P]."""
+    """Renders a mesh from a viewer. Returns the pixels that show it, bool [H, W], and for these P pixels the surface
+    points and normals, [P, 3] each, and the indices of the surfaces' probes, [P]."""
     triangle = torch.arange(len(mesh.position), dtype=torch.int32, device=device).reshape(-1, 3)
     clip = torch.tensor(clip_from(mesh.position, eye, forward, up), device=device)
     with torch.no_grad():
@@ -230,8 +228,8 @@ def _look(
 
 
 def _shown(values: np.ndarray, normal: np.ndarray, seen: np.ndarray, exposure: float) -> np.ndarray:
-    """Returns a picture, sRGB [H, W, 3], of white diffuse points lit by SH radiance [P, C, 3]; pixels not in `seen` are
-    black."""
+    """Returns a picture, sRGB [H, W, 3], of white diffuse points lit by SH radiance [P, C, 3], at the pixels `seen`;
+    the other pixels are black."""
     count = values.shape[1]
     factor = np.array([cosine_factor(band) for band in coefficient_bands(count).tolist()])
     light = np.einsum("pc,pcd->pd", basis(normal, count) * factor, values) / math.pi * exposure

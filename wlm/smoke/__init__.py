@@ -1,4 +1,4 @@
-"""Smoke as six-way lightmaps: baked by ray marches or predicted by a network (neural-six-way-lightmaps)."""
+"""Six-way lightmaps of smoke: baked by ray marches, or predicted by a network (paper: neural-six-way-lightmaps)."""
 
 from wlm._facade import facade
 

@@ -1,4 +1,4 @@
-"""Exports a flip book as a bundle: 8-bit textures, and a shader that shows them on a billboard."""
+"""Exports a flip book of smoke as a bundle: 8-bit textures, and a shader that shows them on a billboard."""
 
 import numpy as np
 
@@ -24,22 +24,22 @@ _ABOUT = {
 
 
 def bundle(book: Book, *, name: str = "smoke", device: str = "cpu") -> Bundle:
-    """Makes the bundle of a flip book.
+    """Makes the bundle of a flip book: its textures with 8 bits per channel, their description, and a shader.
 
     Args:
-        book: The flip book, with an opacity.
+        book: The flip book; one of its textures must store the opacity of the smoke.
         name: Name of the smoke, for an engine's assets.
-        device: Not used: a flip book is already on the CPU.
+        device: Ignored, since a flip book is always in the memory of the CPU.
 
     Raises:
         WlmError: The flip book has no opacity, or its light is not finite.
     """
     if not any(ALPHA in names for names in book.channels.values()):
-        raise WlmError(f"{name}: has no opacity: expected an alpha channel or a separate texture")
+        raise WlmError(f"{name}: the flip book has no opacity: expected an alpha channel in one of its textures")
     textures, clipped = {}, 0
     for key, page in book.pages.items():
         if not np.isfinite(page).all():
-            raise WlmError(f"{name}: {key}: cannot export: expected finite light, found NaN or infinity")
+            raise WlmError(f"{name}: texture {key}: cannot export: expected finite light, found NaN or infinity")
         clipped += int((page > 1.0).sum())
         pixels = np.ones((*page.shape[:2], 4), np.float32)
         pixels[..., : page.shape[2]] = page

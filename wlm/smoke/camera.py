@@ -1,11 +1,12 @@
-"""Cameras, and conventions of directions: the six lightmaps, the weights of a light, the channels of engines.
+"""Cameras, the directions of the six lightmaps, their weights under a light, and the texture channels of engines.
 
 Directions are in the camera's axes: x to the right, y up, z from the smoke towards the camera. A lightmap is named
 after the direction from which its light comes: "right" is brighter on the image's right side, "front" is lit from the
 camera's side and "back" from behind the smoke. A light's direction points from the smoke to the light. Images have row
 0 at the top.
 
-Unity's local z is minus the billboard's normal: a light behind the smoke is at +z there, and at -z here.
+Unity's local z axis points away from the viewer: a light behind the smoke has a positive z in Unity and a negative z
+here.
 """
 
 from collections.abc import Sequence
@@ -51,19 +52,19 @@ def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarr
     vector = np.asarray(vector, np.float64)
     length = np.linalg.norm(vector)
     if vector.shape != (3,) or not _SHORTEST < length < np.inf:
-        raise ValueError(f"{name}: expected a direction of some length, got {vector.tolist()}")
+        raise ValueError(f"{name}: expected three finite numbers that are not all 0, got {vector.tolist()}")
     return vector / length
 
 
 def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
     """Returns the weights of the lightmaps under a light, in the order of `DIRECTIONS`.
 
-    The paper's weights (eq. 5) are the absolute components of the unit direction and sum to 1.73 for the most oblique
-    lights; their squares, which engines use, sum to 1.
+    The paper's weights (eq. 5) are the absolute components of the unit direction; their sum is up to 1.73, for a light
+    along a diagonal. Their squares, which engines use, always sum to 1.
 
     Args:
         toward: [..., 3], directions to the lights in the camera's axes, of any length except 0.
-        rule: One of `RULES`.
+        rule: Name of the formula for the weights, one of `RULES`.
 
     Returns:
         float64 [..., 6], not negative.
@@ -76,7 +77,7 @@ def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.n
     toward = np.asarray(toward, np.float64)
     length = np.linalg.norm(toward, axis=-1, keepdims=True)
     if toward.shape[-1:] != (3,) or not (np.isfinite(length) & (length > _SHORTEST)).all():
-        raise ValueError(f"expected directions [..., 3] of some length, got {toward.tolist()}")
+        raise ValueError(f"toward: expected finite directions [..., 3], none of them 0, got {toward.tolist()}")
     along = np.maximum((toward / length) @ VECTORS.T, 0.0)
     if rule == "squared":
         return along**2
@@ -88,12 +89,12 @@ class Camera:
     """An orthographic or perspective camera.
 
     Attributes:
-        position: Centre of the image in the camera's plane, or the eye, in the world's unit; smoke behind it is not
-            visible.
-        right, up, toward: The image's axes in the world, orthogonal and of length 1; right x up = toward, which
-            points from the smoke to the camera.
-        extent: Height of the image in the world's unit; in perspective, at distance 1 from the eye.
-        height, width: H and W in pixels, which are square.
+        position: In world units: the eye of a perspective camera, or the image centre of an orthographic one. Smoke
+            behind it is not visible.
+        right, up, toward: The image's axes in the world, orthogonal and of length 1; toward, the cross product of
+            right and up, points from the smoke to the camera.
+        extent: Height in world units of the region that the image shows; in perspective, at distance 1 from the eye.
+        height, width: Size of the image in pixels; pixels are square.
         perspective: Whether all rays start at the eye; six-way lightmaps are always orthographic.
     """
 
@@ -111,13 +112,13 @@ class Camera:
         if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-5):
             raise ValueError(f"right, up, toward: expected orthogonal directions of length 1, got {axes.tolist()}")
         if np.linalg.det(axes) < 0:
-            raise ValueError("right, up, toward: expected right x up = toward, got a mirrored frame")
+            raise ValueError("toward: expected the cross product of right and up, got the opposite direction")
         if np.shape(self.position) != (3,) or not np.isfinite(self.position).all():
             raise ValueError(f"position: expected three finite numbers, got {self.position}")
         if not 0 < self.extent < np.inf:
             raise ValueError(f"extent: expected a length above 0, got {self.extent}")
         if self.height < 1 or self.width < 1:
-            raise ValueError(f"expected at least one pixel, got {self.height} x {self.width}")
+            raise ValueError(f"height, width: expected at least 1 pixel, got {self.height}, {self.width}")
 
     @staticmethod
     def look_at(
@@ -132,7 +133,7 @@ class Camera:
     ) -> "Camera":
         """Makes a camera that looks from a position to a target.
 
-        If it looks along `world_up`, "up" is chosen among the axes of the world, always in the same way.
+        `world_up` is upwards in the image; if the camera looks along it, an axis of the world is used instead.
 
         Raises:
             ValueError: The position equals the target, or a size is wrong.
@@ -140,7 +141,7 @@ class Camera:
         toward = np.asarray(position, np.float64) - np.asarray(target, np.float64)
         length = np.linalg.norm(toward)
         if not _SHORTEST < length < np.inf:
-            raise ValueError(f"expected a position apart from its target, got {tuple(position)} and {tuple(target)}")
+            raise ValueError(f"position: expected another point than the target {tuple(target)}, got {tuple(position)}")
         toward = toward / length
         right = np.cross(world_up, toward)
         if np.linalg.norm(right) < 1e-6 * max(np.linalg.norm(world_up), 1e-300):
@@ -163,7 +164,7 @@ class Camera:
         up: Sequence[float] = (0.0, 1.0, 0.0),
         perspective: bool = False,
     ) -> "Camera":
-        """Makes a camera outside smoke that shows all of it.
+        """Makes a camera that shows a whole volume of smoke from outside.
 
         Args:
             smoke: A volume, or a box in the world: its corner [3] and its edges [3].
@@ -171,13 +172,13 @@ class Camera:
             pixels: Height of the image in pixels.
             aspect: Width of the image divided by its height.
             target: Point in the middle of the image; None: the box's centre.
-            extent: As in `Camera`; None: such that the image shows the whole box.
-            distance: Distance of the camera from its target; None: such that the camera is outside the box.
-            up: Direction that is upwards in the image.
+            extent: As in `Camera`; None: large enough that the image shows the whole box.
+            distance: Distance in world units from the camera to the target; None: far enough to be outside the box.
+            up: Direction in the world that is upwards in the image.
             perspective: Whether all rays start at the eye; six-way lightmaps are always orthographic.
 
         Raises:
-            ValueError: A direction has no length, or a size is wrong.
+            ValueError: A direction has length 0, or a size is not above 0.
         """
         if isinstance(smoke, DensityVolume):
             smoke = (smoke.origin, smoke.voxel * np.asarray(smoke.shape))
@@ -203,12 +204,12 @@ class Camera:
 
     @property
     def axes(self) -> np.ndarray:
-        """Rows right, up, toward, float64 [3, 3]: the rotation from the world to the camera's axes."""
+        """Rotation matrix from the world to the camera's axes, float64 [3, 3], with the rows right, up and toward."""
         return np.array([self.right, self.up, self.toward], np.float64)
 
     @property
     def pitch(self) -> float:
-        """Edge of a pixel in the world's unit; for a perspective camera, at distance 1 from the eye."""
+        """Edge of a pixel in world units; for a perspective camera, at distance 1 from the eye."""
         return self.extent / self.height
 
     def finer(self, factor: int) -> "Camera":
@@ -216,7 +217,7 @@ class Camera:
         return replace(self, height=self.height * factor, width=self.width * factor)
 
     def rays(self, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns origins and unit directions of the pixels' rays in the world, both float64 [H, W, 3]."""
+        """Returns origins and unit directions of the rays through all pixels, in the world, both float64 [H, W, 3]."""
         right, up, toward, position = (
             torch.tensor(np.asarray(vector, np.float64), device=device) for vector in (*self.axes, self.position)
         )
@@ -229,15 +230,15 @@ class Camera:
         return across + position, (-toward).expand_as(across)
 
     def in_world(self) -> View:
-        """Returns the camera in world coordinates, as an argument of kernels."""
+        """Returns the camera in world coordinates, as the structure that ray march kernels take."""
         right, up, toward = self.axes
         return make_view(self.position, right, up, -toward, self.pitch, self.width, self.height, self.perspective)
 
     def view(self, volume: DensityVolume) -> View:
-        """Returns the camera in the voxel coordinates of a volume, as an argument of kernels.
+        """Returns the camera in the voxel coordinates of a volume, as the structure that ray march kernels take.
 
-        An orthographic camera far from the grid is moved along its axis to just in front of it, which changes only
-        rounding errors.
+        An orthographic camera far from the volume is moved along its axis to just in front of the volume, which reduces
+        rounding errors and changes nothing else.
         """
         position = (np.asarray(self.position, np.float64) - np.asarray(volume.origin, np.float64)) / volume.voxel
         right, up, toward = self.axes

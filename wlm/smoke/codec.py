@@ -32,10 +32,10 @@ def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     """Converts a network to the contents of a file, with weights rounded to half floats.
 
     Returns:
-        The settings, the weights by name, and a hash of the weights, by which the file's source is recorded.
+        The settings, the weights by name, and a hash of the weights, which the file stores as its source.
 
     Raises:
-        WlmError: A weight is not a finite half float.
+        WlmError: A weight is not finite, or too large for a half float.
     """
     parts = {}
     digest = hashlib.blake2b(digest_size=16)
@@ -43,14 +43,14 @@ def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         with np.errstate(over="ignore"):
             parts[name] = weight.detach().float().cpu().numpy().astype(np.float16)
         if not np.isfinite(parts[name]).all():
-            raise WlmError(f"cannot write: weight {name}: expected finite half floats")
+            raise WlmError(f"weight {name}: cannot write: expected numbers that half floats can store, up to 65504")
         digest.update(parts[name].tobytes())
     settings = {"network": model.settings.model_dump(mode="json"), "summary": dict(model.summary)}
     return settings, parts, digest.hexdigest()
 
 
 def decode(artifact: Artifact) -> SmokeModel:
-    """Makes a network from a file's settings and weights, in float32 on the CPU.
+    """Makes a network, in float32 on the CPU, from the settings and weights of its file.
 
     Raises:
         WlmError: A setting is wrong.
@@ -75,12 +75,12 @@ def shipped() -> Path:
         WlmError: The file is missing.
     """
     if not _SHIPPED.is_file():
-        raise WlmError(f"{_SHIPPED}: expected the network that comes with wlm, found none: install wlm anew")
+        raise WlmError(f"{_SHIPPED}: the network that comes with wlm is missing: install wlm again")
     return _SHIPPED
 
 
 def open_network(path: str | os.PathLike[str] | None = None) -> SmokeModel:
-    """Loads a network that can be applied to smoke, whose file has the settings of the guiding maps it was trained on.
+    """Loads a trained network, and checks that its file has the settings that its guiding maps must be rendered with.
 
     Args:
         path: The file; None: the network that ships with wlm.

@@ -1,4 +1,4 @@
-"""Smoke in files: volumes and folders of frames, lightmaps as EXR, numbered results.
+"""Files of smoke: volumes, folders of frames, six-way lightmaps as EXR, and numbered results.
 
 The folder of a simulated scene contains `scene.json` and `frame_0001.npz`, `frame_0002.npz` and so on, each a volume
 that `wlm.smoke.load` reads. `simulate` writes it, and can be stopped and resumed. A folder of another program's frames
@@ -53,8 +53,8 @@ class Frames:
         scene: Scene of a folder that `simulate` wrote; None: a single volume, or another program's frames.
         files: Existing files by number, in rising order; a single volume has number 1.
         device: Device of the volumes.
-        extinction, emission: Used instead of the scene's values (without a scene: instead of 1); None: not replaced.
-        options: Options of `load` for files of other programs: trust, up, density, temperature.
+        extinction, emission: Replace the scene's extinction and emission; None: the scene's, or 1 without a scene.
+        options: Options of `load` for the files of other programs: `trust`, `up`, `density`, `temperature`.
     """
 
     path: Path
@@ -67,7 +67,7 @@ class Frames:
 
     @property
     def single(self) -> bool:
-        """Whether this is a single file instead of a folder."""
+        """Whether `path` is a single file instead of a folder."""
         return self.files.get(1) == self.path
 
     @property
@@ -81,7 +81,7 @@ class Frames:
         return CameraSettings() if self.scene is None else self.scene.camera
 
     def view(self, settings: CameraSettings, volume: DensityVolume) -> Camera:
-        """Places a camera in front of a frame; in a sequence it does not move and faces the bounding box of all frames.
+        """Places a camera in front of a frame; in a sequence it does not move, and looks at the box around all frames.
 
         Raises:
             WlmError: A frame is missing or damaged.
@@ -91,7 +91,7 @@ class Frames:
 
     @functools.cached_property
     def _box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corner and edges of the bounding box of all frames, for which each frame's file is read."""
+        """Lowest corner [3] and edges [3] of the bounding box of all frames with smoke; every file is read for it."""
         boxes = []
         for number in self.files:
             volume = replace(self, device="cpu").load(number)
@@ -115,7 +115,7 @@ class Frames:
         return None if self.scene is None else self.scene.looks(number)
 
     def load(self, number: int) -> DensityVolume:
-        """Reads a frame.
+        """Reads the volume of a frame.
 
         Raises:
             WlmError: The file is missing or damaged.
@@ -130,7 +130,7 @@ class Frames:
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
     ) -> Iterator[tuple[int, DensityVolume]]:
-        """Yields frames with their numbers; `progress` is called after each has been processed.
+        """Yields the number and the volume of each frame; calls `progress` when the caller has processed a frame.
 
         Raises:
             WlmError: A frame is missing or damaged.
@@ -150,7 +150,7 @@ def load_frames(
     device: str = "cpu",
     **options: Any,
 ) -> Frames:
-    """Opens a volume, a folder of frames of `simulate`, or a folder of numbered volumes of another program.
+    """Opens a volume, a folder of frames that `simulate` wrote, or a folder of numbered volumes of another program.
 
     Args:
         path: The file or the folder.
@@ -159,7 +159,7 @@ def load_frames(
 
     Raises:
         WlmError: The folder has no frames, frames of several sequences, or a damaged `scene.json`; or an option other
-            than trust is given for frames of `simulate`.
+            than `trust` is given for frames that `simulate` wrote.
     """
     path = Path(path)
     options = {name: value for name, value in options.items() if value is not None}
@@ -169,10 +169,10 @@ def load_frames(
     if not (path / SCENE_FILE).is_file():
         return Frames(path, None, _sequence(path), *given)
     if (name := next((name for name in options if name != "trust"), None)) is not None:
-        raise WlmError(f"{path}: expected no {name} for the frames of a scene")
+        raise WlmError(f"{path}: option {name}: applies only to files of other programs, found frames of simulate")
     frames = Frames(path, _read_scene(path), numbered(path, "frame", ".npz"), *given)
     if not frames.files:
-        raise WlmError(f"{path}: expected frames such as {frames.file(1).name}, found none")
+        raise WlmError(f"{path}: expected files of frames, such as {frames.file(1).name}, found none")
     return frames
 
 
@@ -185,14 +185,12 @@ def _sequence(folder: Path) -> dict[int, Path]:
             files = found.setdefault((match[1], match[3]), {})
             number = int(match[2])
             if number in files:
-                raise WlmError(
-                    f"{folder}: expected frames of different numbers, found {files[number].name}, {path.name}"
-                )
+                raise WlmError(f"{folder}: two frames have the same number: {files[number].name} and {path.name}")
             files[number] = path
     if len(found) != 1:
         kinds = ", ".join(f"{stem}*{suffix}" for stem, suffix in found) or f"neither {SCENE_FILE} nor any"
         raise WlmError(
-            f"{folder}: expected a folder of simulate, or one sequence of volumes such as smoke_0001.vdb, found {kinds}"
+            f"{folder}: expected frames of simulate, or one sequence of volumes such as smoke_0001.vdb, found {kinds}"
         )
     return dict(sorted(next(iter(found.values())).items()))
 
@@ -206,14 +204,15 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
         resume: Whether to continue a simulation of the same scene; otherwise frames of an earlier one are removed.
 
     Raises:
-        WlmError: The folder contains other files, belongs to another scene that is to be resumed, or cannot be written.
+        WlmError: The folder contains other files, has frames of another scene although `resume` is set, or cannot be
+            written.
     """
     folder = Path(folder)
     claim(folder, SCENE_FILE, _FORMAT)
     if resume and (folder / SCENE_FILE).is_file():
         earlier, later = _simulated(_read_scene(folder)), _simulated(scene)
         if (field := next((key for key in later if earlier.get(key) != later[key]), None)) is not None:
-            raise WlmError(f"{folder}: frames of another scene, whose {field} differs; start anew without --resume")
+            raise WlmError(f"{folder}: cannot resume: its frames have another {field}; start anew without --resume")
     with _writing(folder):
         folder.mkdir(exist_ok=True)
         if not resume:
@@ -226,14 +225,14 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
 
 
 def numbered(folder: Path, stem: str, suffix: str) -> dict[int, Path]:
-    """Returns files such as `six_0001.exr` by number, in rising order."""
+    """Returns a folder's files by number, in rising order: `six_0001.exr` has stem `six` and suffix `.exr`."""
     pattern = re.compile(rf"{re.escape(stem)}_(\d+){re.escape(suffix)}")
     files = {int(match[1]): path for path in folder.iterdir() if (match := pattern.fullmatch(path.name))}
     return dict(sorted(files.items()))
 
 
 def spread(numbers: Sequence[int], count: int | None) -> tuple[int, ...]:
-    """Returns at most `count` frames, evenly spread and including the first and the last; None: all."""
+    """Returns at most `count` frame numbers, evenly spread from the first to the last; if `count` is None, all."""
     if count is None or count >= len(numbers):
         return tuple(numbers)
     last = len(numbers) - 1
@@ -241,16 +240,15 @@ def spread(numbers: Sequence[int], count: int | None) -> tuple[int, ...]:
 
 
 class NumberedFiles:
-    """Results of a run in a folder, one file per frame, which replace those of an earlier run.
+    """A folder of results with one file per frame, which replace the files of an earlier run.
 
-    The earlier files are removed when the first new file is about to be written, so that a run that fails earlier keeps
-    them. Each file is useful on its own, so there is no index file. While a resumable run is not finished,
-    `STEM.partial` describes it.
+    The files of the earlier run are removed when the first new file is about to be written, so that a run that fails
+    before keeps them. Until a resumable run is finished, `STEM.partial` stores its settings.
 
     Attributes:
         folder: The folder.
-        partial: File that describes an unfinished run.
-        done: Numbers of the results that exist already if a run is resumed.
+        partial: File with the settings of an unfinished run.
+        done: Numbers of the frames whose results exist already, if a run is resumed.
     """
 
     def __init__(
@@ -286,21 +284,21 @@ class NumberedFiles:
             others = (path for path in sorted(self.folder.iterdir()) if path not in earlier)
             foreign = next((path for path in others if not is_passing(path.name)), None)
         if foreign is not None:
-            raise WlmError(f"{folder}: expected an empty folder or one of an earlier run, found {foreign.name}")
+            raise WlmError(f"{folder}: expected an empty folder or results of an earlier run, found {foreign.name}")
         if resume and self.partial.is_file():
             earlier = read_index(self.partial)
             if (field := next((key for key in self._run if earlier.get(key) != self._run[key]), None)) is not None:
-                raise WlmError(f"{self.partial}: of another run, whose {field} differs; start anew without --resume")
+                raise WlmError(f"{self.partial}: cannot resume a run with another {field}; start anew without --resume")
             self._cleared = True
             self.done = frozenset(numbered(self.folder, stem, suffix))
 
     def finish(self) -> None:
-        """Ends the run, which can then no longer be resumed."""
+        """Ends the run: removes `partial`, so that the run can no longer be resumed."""
         with _writing(self.folder):
             self.partial.unlink(missing_ok=True)
 
     def file(self, number: int) -> Path:
-        """Returns the file for a frame's result and removes earlier files before the first one.
+        """Returns the path of a frame's result; the first call removes the files of an earlier run.
 
         Raises:
             WlmError: The earlier files cannot be removed.
@@ -320,15 +318,15 @@ class NumberedFiles:
 
 
 def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None = None) -> None:
-    """Writes lightmaps as an EXR of half floats: a channel per direction, `transparency`, `emission` of hot smoke, and
-    `depth` as float32 if it is known; the header stores the camera and the looks (lights, colours and obstacles).
+    """Writes six-way lightmaps as an EXR file: a half float channel per direction, `transparency`, `emission` of hot
+    smoke, and `depth` as float32 if it is known. Its header stores the camera and `looks`: lights, colours, obstacles.
 
     Raises:
         ValueError: The camera is unknown.
         WlmError: The file cannot be written.
     """
     if six.camera is None:
-        raise ValueError("camera: expected that of the lightmaps, found none")
+        raise ValueError("camera: the lightmaps have no camera, which the file must store")
     planes = dict(zip(DIRECTIONS, six.lightmaps.cpu().numpy(), strict=True))
     for name, plane in ((_TRANSPARENCY, six.transparency), (EMISSION, six.emission), (_DEPTH, six.depth)):
         if plane is not None:
@@ -338,7 +336,7 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None
 
 
 def is_six_way(path: Path) -> bool:
-    """Returns whether a file is an EXR with a channel for each direction.
+    """Returns whether a file is an EXR image with a channel for each of the six directions.
 
     Raises:
         WlmError: The file is named .exr and cannot be read.
@@ -349,7 +347,7 @@ def is_six_way(path: Path) -> bool:
 
 
 def six_way_files(folder: Path) -> dict[int, Path]:
-    """Returns the six-way lightmaps in a folder by frame number; none if its EXR files are something else.
+    """Returns the files of six-way lightmaps in a folder by frame number; empty if its EXR files have other content.
 
     Raises:
         WlmError: The first EXR file cannot be read.
@@ -363,7 +361,7 @@ def six_way_files(folder: Path) -> dict[int, Path]:
 
 
 def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
-    """Reads the lightmaps of a file of `write_six_way`.
+    """Reads six-way lightmaps from a file that `write_six_way` wrote.
 
     Raises:
         WlmError: The file is missing or damaged, lacks a channel or its camera, or has a number that is not finite.
@@ -372,15 +370,15 @@ def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
 
 
 def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixWay, Looks | None]:
-    """Reads the lightmaps and, if present, the looks (lights, colours, obstacles) from a file of `write_six_way`.
+    """Reads the lightmaps that `write_six_way` wrote and, if present, the scene's lights, colours and obstacles.
 
     Raises:
-        WlmError: As for `read_six_way`, or the looks are invalid.
+        WlmError: As for `read_six_way`, or the lights, colours or obstacles are invalid.
     """
     planes, note = read_planes(path)
     for name in (*DIRECTIONS, _TRANSPARENCY):
         if name not in planes:
-            raise WlmError(f"{path}: channel {name}: missing beside {', '.join(planes)}; did bake write it?")
+            raise WlmError(f"{path}: expected a channel {name} as bake writes, found only {', '.join(planes)}")
     for name, plane in planes.items():
         if not np.isfinite(plane).all():
             raise WlmError(f"{path}: channel {name}: expected finite numbers, found NaN or infinity")
@@ -389,10 +387,10 @@ def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixW
         fields = {key: tuple(value) if isinstance(value, list) else value for key, value in note["camera"].items()}
         camera = Camera(**fields)
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise WlmError(f"{path}: header attribute wlm: camera: expected that of bake: {error}") from error
+        raise WlmError(f"{path}: header attribute wlm: expected a camera as bake writes: {error}") from error
     size = next(iter(planes.values())).shape
     if size != (camera.height, camera.width):
-        raise WlmError(f"{path}: expected the camera's {camera.height} x {camera.width} pixels, found {size}")
+        raise WlmError(f"{path}: expected {camera.height} x {camera.width} pixels, as its camera has, found {size}")
     tensors = {name: torch.from_numpy(plane).to(device) for name, plane in planes.items()}
     lightmaps = torch.stack([tensors[name] for name in DIRECTIONS])
     six = SixWay(lightmaps, tensors[_TRANSPARENCY], tensors.get(EMISSION), camera, tensors.get(_DEPTH))
@@ -403,20 +401,20 @@ def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixW
 
 @contextmanager
 def _writing(folder: Path) -> Iterator[None]:
-    """Converts errors of the file system to a WlmError that names the folder."""
+    """Converts an error of the file system to a WlmError that names the folder."""
     try:
         yield
     except OSError as error:
-        raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
+        raise WlmError(f"{folder}: cannot write into the folder: {error.strerror or error}") from error
 
 
 def _read_scene(folder: Path) -> Scene:
     path = folder / SCENE_FILE
     content = read_index(path)
     if content.get("format") != _FORMAT:
-        raise WlmError(f"{path}: expected the scene of a simulation's frames, found other content")
+        raise WlmError(f"{path}: expected a scene file that simulate wrote, found other content")
     if content.get("version") != _VERSION:
-        raise WlmError(f"{path}: version: expected {_VERSION}, found {content.get('version')}")
+        raise WlmError(f"{path}: file version: expected {_VERSION}, found {content.get('version')}")
     return check_settings(Scene, content.get("scene"), f"{path}: scene.")
 
 

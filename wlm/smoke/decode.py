@@ -1,9 +1,9 @@
-"""A trained network at run time: one image at a time, on a GPU in half floats and as a CUDA graph, on a CPU in float32.
+"""Runs a trained network on one image at a time: on a GPU in half floats as a CUDA graph, on a CPU in float32.
 
-Layers of the adapters are merged, which changes only rounding: a norm's scale and shift into the weights of the
-following 1 x 1 convolution, a block's factors beta and gamma into those of the preceding one; the channel attention
-multiplies the weights of the following convolution. The adapters run in one batch, and their heads as one convolution.
-An image is a matrix with a row of channels per pixel, so that 1 x 1 convolutions are matrix products.
+An adapter is one of the NAFBlocks (see `wlm.smoke.network.unet`) that turn features into planes. Some of its layers are
+merged, which changes only rounding: the scale and shift of a norm into the weights of the 1 x 1 convolution after it,
+and the factors beta and gamma into the convolution before them. All adapters run in one batch. An image is stored as a
+matrix with a row of channels per pixel, so that 1 x 1 convolutions are matrix products.
 """
 
 from collections.abc import Sequence
@@ -24,22 +24,22 @@ _WARMUP = 2
 
 
 class Decoder:
-    """Predicts planes from encoded guiding maps of one size.
+    """A trained network for images of one size: predicts encoded lightmaps from an encoded guiding map.
 
     Attributes:
-        height, width: H and W of the images.
+        height, width: Size of the images in pixels, H and W.
         device: Device on which it runs.
-        guide: Kind of guiding map, a key of `planes.GUIDES`.
-        half: Whether it computes in half floats.
+        guide: Kind of guiding map that it reads, a key of `planes.GUIDES`.
+        half: Whether the network computes in half floats.
     """
 
     def __init__(self, model: SmokeModel, device: str = "cpu", *, height: int, width: int, half: bool = True) -> None:
-        """Merges layers of the network with its current weights, and allocates buffers.
+        """Merges the layers of the network, with their current weights, and allocates buffers.
 
         Args:
             model: The network; it is not changed.
             device: "cpu", "cuda" or "cuda:N".
-            height, width: H and W, at least 1.
+            height, width: Size of the images in pixels, H and W, at least 1.
             half: Whether a GPU computes in half floats; a CPU always computes in float32.
 
         Raises:
@@ -47,7 +47,7 @@ class Decoder:
             WlmError: The device does not exist.
         """
         if height < 1 or width < 1:
-            raise ValueError(f"expected at least one pixel, got {height} x {width}")
+            raise ValueError(f"height, width: expected at least 1 pixel, got {height}, {width}")
         settings = model.settings
         self.device = check_device(device)
         self.height, self.width, self.guide = height, width, settings.guide
@@ -63,13 +63,13 @@ class Decoder:
         self._run = StepGraph(self._work, self.device, warmup=_WARMUP)
 
     def __call__(self, encoded: torch.Tensor) -> torch.Tensor:
-        """Predicts the planes of one image; on CUDA the call returns before the work is done.
+        """Predicts lightmaps, opacity and emission of one image; on CUDA it returns before the GPU has finished.
 
         Args:
-            encoded: [C, H, W], a guiding map from `planes.render_guide` of the kind `guide`, on the device.
+            encoded: [C, H, W] on the device, a guiding map of the kind `guide` from `planes.render_guide`.
 
         Returns:
-            float32 [8, H, W] in the order of `PLANES`, clamped to their ranges. The next call overwrites it.
+            float32 [8, H, W], encoded, in the order of `PLANES`, clamped to their ranges. The next call overwrites it.
 
         Raises:
             ValueError: The size or the device is wrong.
@@ -90,10 +90,9 @@ class Decoder:
 
 
 class _Adapters:
-    """G NAFBlocks in one batch on an image with c channels; the caller must add the constants `shift` [G, c]."""
+    """Applies G NAFBlocks to one image with c channels; the caller must add `shift` [G, c], their constant part."""
 
     def __init__(self, blocks: list[NafBlock], height: int, width: int, device: str, dtype: torch.dtype) -> None:
-        """Merges the layers of the blocks and allocates buffers."""
         channels, groups, rows, cuda = blocks[0].attend.in_features, len(blocks), height * width, device != "cpu"
         self.height, self.width, self.channels, self.groups, self.device = height, width, channels, groups, device
         self.kernels = naf_block.kernels(channels, dtype == torch.float16, cuda)
@@ -127,7 +126,7 @@ class _Adapters:
         self._project = torch.empty(groups, channels, channels, **options)
 
     def __call__(self, image: torch.Tensor) -> torch.Tensor:
-        """Runs on [1, c, H, W]; returns [G, H * W, c], which the next call overwrites."""
+        """Applies the blocks to an image [1, c, H, W]; returns [G, H * W, c], which the next call overwrites."""
         rows, channels, groups = len(self._x), self.channels, self.groups
         self._x.copy_(image[0].permute(1, 2, 0).reshape_as(self._x))
         self._launch("norm", self.lanes * rows, [to_warp(self._x), self._zero, rows], self._normed)
@@ -154,7 +153,7 @@ class _Adapters:
 
 
 class _Body:
-    """A network's U-Net, adapters and heads for images of one size."""
+    """The network up to its heads, the convolutions that make planes, for images of one size."""
 
     def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, dtype: torch.dtype) -> None:
         self.settings = settings = network.settings
@@ -175,7 +174,7 @@ class _Body:
         self.heads = torch.cat([h.weight for h in heads]).to(*options), torch.cat([h.bias for h in heads]).to(*options)
 
     def __call__(self, guide: torch.Tensor) -> torch.Tensor:
-        """Maps a guide [1, C, H, W] to the N outputs of the heads for G adapters, [G, N, H / stem, W / stem]."""
+        """Runs all heads on all adapters; returns [adapters, outputs, H / stem, W / stem] for a guide [1, C, H, W]."""
         settings, stem = self.settings, self.settings.stem
         padded = F.pad(guide, self.padding)
         x = F.pixel_unshuffle(padded, stem) if stem > 1 else padded
@@ -202,7 +201,7 @@ class _Body:
 
 
 class _Tail:
-    """Adds the heads' outputs and the filtered guide, in float32, and sets the planes to 0 far from smoke."""
+    """The network's last step: adds the heads' outputs to the filtered guide, and sets planes to 0 far from smoke."""
 
     def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, dtype: torch.dtype) -> None:
         settings = network.settings
@@ -237,16 +236,16 @@ class _Tail:
 
 
 def _weights(layer: nn.Conv2d, device: str, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns a convolution's weights, in the images' memory layout, and biases."""
+    """Returns the weights of a convolution, with channels last in memory as in the images, and its biases."""
     return layer.weight.to(device, dtype, memory_format=torch.channels_last), layer.bias.to(device, dtype)
 
 
 def _halves(parts: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Concatenates tensors so that the first halves of all come before the second halves of all."""
+    """Concatenates the first halves of all tensors, then their second halves; a NAFBlock multiplies its two halves."""
     return torch.cat([half for side in (0, 1) for half in (part.chunk(2)[side] for part in parts)])
 
 
 def _after_norm(norm: nn.Module, conv: nn.Conv2d) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns weights and biases of a 1 x 1 convolution into which the preceding norm's scale and shift are merged."""
+    """Returns the weights and biases of a 1 x 1 convolution, with the scale and shift of the norm before it merged."""
     weight = conv.weight[:, :, 0, 0]
     return weight * norm.weight[:, 0, 0], conv.bias + weight @ norm.bias[:, 0, 0]

@@ -1,6 +1,6 @@
-"""Scores of lightmaps of a network, and of other methods on the same samples.
+"""Scores of the lightmaps that a network or another method predicts for test samples.
 
-All scores are of encoded planes, that is in sRGB, like the paper's PSNR (section 5).
+All errors are measured in sRGB, as encoded for the network, like the paper's PSNR (section 5).
 """
 
 import copy
@@ -42,15 +42,15 @@ _STILL = 1e-4  # a flicker up to this, a fortieth of a level of 8 bits, counts a
 
 @dataclass(frozen=True)
 class Score(system.Report):
-    """Scores of predicted planes on a pool of samples; PSNRs are in dB, in sRGB with a peak of 1, over whole images.
+    """Scores of predicted lightmaps on samples; each PSNR is in dB, in sRGB with a peak of 1, over whole images.
 
     Attributes:
         psnr: Mean over the images of the PSNR of their six lightmaps, as in the paper.
         lowest, highest: Lowest and highest PSNR of an image.
-        planes: PSNR of each of `PLANES`, from the mean square error over all images.
+        planes: PSNR of each plane (lightmap, opacity, emission) of `PLANES`, from the mean square error of all images.
         flicker: Mean absolute change of the six lightmaps from frame to frame where smoke is visible, after warping the
-            earlier frame by the smoke's motion. It includes shadows that move differently, and new smoke.
-        reference_flicker: Flicker of the targets.
+            earlier frame by the smoke's motion. Shadows that move differently and new smoke count as flicker too.
+        reference_flicker: Flicker of the reference lightmaps.
         images: PSNR of each image: both frames of the first sample, then of the second.
     """
 
@@ -64,11 +64,11 @@ class Score(system.Report):
 
     @property
     def flicker_ratio(self) -> float:
-        """Flicker relative to that of the targets; NaN if the targets do not change."""
+        """Flicker divided by the flicker of the reference lightmaps; NaN if the reference does not change."""
         return self.flicker / self.reference_flicker if self.reference_flicker > _STILL else math.nan
 
     def to_json(self) -> dict[str, Any]:
-        """Returns the scores as JSON values, with the ratio of flickers, and planes by name."""
+        """Returns the scores and the flicker ratio as JSON values, with the PSNRs of planes by name."""
         names = ("psnr", "lowest", "highest", "flicker", "reference_flicker", "flicker_ratio")
         planes = dict(zip(PLANES, self.planes, strict=True))
         return system.plain({name: getattr(self, name) for name in names} | {"planes": planes})
@@ -76,11 +76,11 @@ class Score(system.Report):
 
 @dataclass(frozen=True)
 class Report(Score):
-    """The score of a network at run time.
+    """The score of a network as it runs in use: through its `Decoder`, one image at a time.
 
     Attributes:
         samples: Number of samples.
-        bytes: Size of the network's file.
+        bytes: Size of the network's file in bytes.
     """
 
     samples: int
@@ -99,15 +99,15 @@ def evaluate(
     file_bytes: int | None = None,
     half: bool = True,
 ) -> Report:
-    """Scores a network at run time: one image at a time through its `Decoder`.
+    """Scores a network as it runs in use: through its `Decoder`, one image at a time.
 
     Args:
         model: The network.
-        data: Samples with guiding maps of the network's kind; or settings of a test set, which is simulated and took no
-            part in training or selection; None: the settings of the network's training.
+        data: Samples with guiding maps of the network's kind; or settings by which a test set is simulated, of scenes
+            that were not used in training or for choosing a network. None: the settings of the network's training.
         device: "cpu", "cuda" or "cuda:N".
         progress: Called about twice a second.
-        file_bytes: Size of the network's file; None: `model.file_bytes()`.
+        file_bytes: Size of the network's file in bytes; None: `model.file_bytes()`.
         half: Whether a GPU computes in half floats.
 
     Raises:
@@ -120,14 +120,14 @@ def evaluate(
         settings = _with_guide(data or model.dataset, model.settings.guide)
         data = make_validation(settings, device, test=True, progress=progress)
         if not len(data):
-            raise WlmError("test set: expected frames with smoke, found none")
+            raise WlmError("test set: expected frames with smoke, found only frames without")
     pool = data.to(device)
     scores = score(_at_run_time(model, device, pool, half), pool, progress=progress)
     return Report(**vars(scores), samples=len(pool), bytes=model.file_bytes() if file_bytes is None else file_bytes)
 
 
 def of_network(network: torch.nn.Module) -> Method:
-    """Returns a `Method` that runs a network in float32 on several images at once, as validation does."""
+    """Returns the function for `score` that runs a network in float32 on several images at once."""
 
     def method(pool: Pool, part: slice) -> torch.Tensor:
         guides = pool.guides[part]
@@ -137,7 +137,7 @@ def of_network(network: torch.nn.Module) -> Method:
 
 
 def of_decoder(decoder: Decoder) -> Method:
-    """Returns a `Method` that runs a decoder on one image at a time."""
+    """Returns the function for `score` that runs a decoder on one image at a time."""
 
     def method(pool: Pool, part: slice) -> torch.Tensor:
         guides = pool.guides[part]
@@ -150,19 +150,19 @@ def of_decoder(decoder: Decoder) -> Method:
 
 @torch.no_grad()
 def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgress | None = None) -> Score:
-    """Scores a method on both frames of all samples; planes are clamped as by `decode_lightmaps`.
+    """Scores a method on both frames of all samples, after its planes are clamped as by `decode_lightmaps`.
 
     Args:
-        method: The method.
+        method: Function of a pool and a slice that predicts encoded lightmaps for these samples.
         pool: The samples, with the guiding maps that the method reads.
-        batch: Samples per call of the method.
+        batch: Number of samples per call of the method.
         progress: Called about twice a second.
 
     Raises:
         ValueError: The pool is empty, or the planes have a wrong shape.
     """
     if len(pool) == 0:
-        raise ValueError("pool: expected samples, got none")
+        raise ValueError("pool: expected at least one sample, got none")
     meter = Meter(progress, "evaluate", len(pool))
     lights = len(DIRECTIONS)
     squares, changes = [], []
@@ -171,7 +171,7 @@ def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgre
         target = pool.targets[part].float()
         predicted = method(pool, part).float()
         if predicted.shape != target.shape:
-            raise ValueError(f"planes: expected {list(target.shape)}, got {list(predicted.shape)}")
+            raise ValueError(f"predicted planes: expected shape {list(target.shape)}, got {list(predicted.shape)}")
         predicted = torch.cat([predicted[:, :, :lights].clamp(min=0.0), predicted[:, :, lights:].clamp(0.0, 1.0)], 2)
         squares.append((predicted - target).square().mean((3, 4)).flatten(0, 1))
         motion, opacity = pool.motion[part].float(), target[:, 1, OPACITY_PLANE]
@@ -204,7 +204,7 @@ class Comparison:
 
     @property
     def half_loss(self) -> float | None:
-        """PSNR in dB that is lost by computing in half floats; None if they were not scored."""
+        """PSNR in dB that is lost by computing in half floats; None if the network was not scored in half floats."""
         half = self.methods.get(HALF)
         return None if half is None else self.methods[NETWORK].psnr - half.psnr
 
@@ -223,18 +223,18 @@ def compare(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> list[Comparison]:
-    """Scores a network (and a coarse march that is its guide) on a test set at several densities and on volumes.
+    """Scores a network, and the coarse march if that is its guide, on a test set at several densities and on volumes.
 
     Args:
         model: The network.
         settings: Settings of the test set; None: those of the network's training.
-        volumes: Files for `pool_of_volume`.
-        densities: Factors of the test set's extinction.
+        volumes: Files of further volumes, each a test set of its own; see `pool_of_volume`.
+        densities: Factors by which the extinction of the test set is multiplied.
         device: "cpu", "cuda" or "cuda:N".
-        progress: Called after each set, with the network's "PSNR dB".
+        progress: Called after each test set, with the PSNR of the network as the figure "PSNR dB".
 
     Returns:
-        A comparison for each density, then for each volume.
+        One comparison for each density, then one for each volume.
 
     Raises:
         WlmError: The device does not exist, the model lacks its settings, there is not enough memory, a volume cannot
@@ -262,7 +262,7 @@ def compare(
     for name, make in sets.items():
         pool = make()
         if not len(pool):
-            raise WlmError(f"{name}: expected frames with smoke, found none")
+            raise WlmError(f"{name}: expected frames with smoke, found only frames without")
         scores = {method: score(of_pool(pool), pool) for method, of_pool in methods.items()}
         comparisons.append(Comparison(name, len(pool), scores))
         meter.report(len(comparisons), PSNR_dB=scores[NETWORK].psnr)
@@ -270,19 +270,18 @@ def compare(
 
 
 def coarse(pool: Pool, part: slice) -> torch.Tensor:
-    """A `Method` that returns the guides themselves, which must be of kind "six", a coarse march of six lights.
+    """Predicts the guiding maps themselves, for `score`; they must be of kind "six", a coarse march of six lights.
 
     Raises:
         ValueError: The pool's guides are of another kind.
     """
     six = GUIDES["six"]
     if pool.guides.shape[2] != len(six):
-        raise ValueError(f"pool: expected guides of kind six, [N, 2, {len(six)}, H, W]")
+        raise ValueError(f"pool: expected guiding maps of kind six with {len(six)} planes, got {pool.guides.shape[2]}")
     return pool.guides[part][:, :, [six.index(name) for name in PLANES]].float()
 
 
 def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> Method:
-    """Returns a `Method` that runs the network's decoder, for images of the pool's size."""
     height, width = pool.guides.shape[-2:]
     return of_decoder(Decoder(model, device, height=height, width=width, half=half))
 

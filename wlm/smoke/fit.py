@@ -1,8 +1,8 @@
 """Training of a network on samples that are simulated during the training (neural-six-way-lightmaps, section 4.4).
 
 A training has rounds. Each round simulates a pool of samples, from sequences that no other round uses, and trains on
-it. A step depends only on the seed, the round and the number of the step. A training that was stopped and resumed
-therefore gives the same weights and curves, to the bit on one device, as one that was not.
+these samples. A step depends only on the seed, the round and the number of the step. A training that was stopped and
+resumed therefore gives the same weights and curves as an uninterrupted one, to the bit on the same device.
 """
 
 import csv
@@ -47,10 +47,10 @@ class Training:
 
     Attributes:
         finished: Whether all rounds are done; otherwise the time ran out and the training can be resumed.
-        best: Validation PSNR of the saved network; NaN if none has been validated.
-        score: The last validation, or None.
-        steps, skipped: Numbers of steps, and of steps without an update.
-        seconds: Total time, earlier runs included.
+        best: Validation PSNR of the saved network in dB; NaN if none has been validated.
+        score: Scores of the last validation; None if there was none.
+        steps, skipped: Number of steps; number of these without an update because the gradient was not finite.
+        seconds: Total time in seconds, earlier runs included.
         model: The saved network, read from its file; None if there is none yet.
     """
 
@@ -77,28 +77,29 @@ def train(
     make_validation: Callable[..., Pool] | None = None,
     **overrides: Mapping[str, Any],
 ) -> Training:
-    """Trains a network and saves the version with the best validation.
+    """Trains a network and saves it as it was at its best validation.
 
-    It also writes `OUTPUT.csv`, the curves, and until it is finished `OUTPUT.partial`, the checkpoint.
+    The losses and scores over time are written as `OUTPUT.csv`. Until the training is finished, `OUTPUT.partial` is its
+    checkpoint.
 
     Args:
         profile: A profile's name, the path of a YAML file, or the profile itself.
         output: The network's file.
         seed: Seed of the initial weights, the pools and the order of samples.
         device: "cpu", "cuda" or "cuda:N".
-        minutes: Time after which the training stops with a checkpoint; None: no limit.
+        minutes: Time limit in minutes, after which the training stops with a checkpoint; None: no limit.
         resume: Whether to continue from the checkpoint, if it exists.
-        checkpoint_every: Seconds between checkpoints during the steps; 0: after every `_CHUNK` steps. There is also one
-            at the end of each round.
-        progress: Called after each simulated sequence and about every 50 steps, with "PSNR dB" of the last validation
-            and the mean "loss" since then.
-        make_pool, make_validation: Replace the functions of `network.dataset`.
-        **overrides: Settings that replace those of the profile's parts: `training={"rounds": 2}`.
+        checkpoint_every: Seconds between two checkpoints; 0: after every 50 steps. A checkpoint is also written at the
+            end of each round.
+        progress: Called after each simulated sequence and every 50 steps, with the figures "PSNR dB" of the last
+            validation and "loss", the mean of the round.
+        make_pool, make_validation: Replace the functions of these names in `network.dataset`.
+        **overrides: Replace settings of the profile: `training={"rounds": 2}`.
 
     Raises:
         WlmError: A setting is wrong, the device does not exist, the checkpoint is damaged or of another training, the
-            training to resume is finished, samples are unusable, the training diverged, or a file cannot be
-            written or is being written by another process.
+            training to resume is finished, samples are missing or not finite, the training diverged, or a file cannot
+            be written or is being written by another process.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint has been written.
     """
     profile, device = Profile.load(profile).override(overrides), check_device(device)
@@ -111,7 +112,7 @@ def train(
     with locked(output):
         checkpoint = Checkpoint(output, SmokeModel.SYSTEM, fit, source, resume=resume, every=checkpoint_every)
         if resume and not checkpoint.resumed and Path(output).exists():
-            raise WlmError(f"{output}: is finished; without --resume it is trained anew")
+            raise WlmError(f"{output}: cannot resume: the training is finished; start anew without --resume")
         meter = Meter(progress, "train", profile.training.total)
         run = _Run(profile, Path(output), device, checkpoint, meter, seed, minutes)
         make_pool, make_validation = make_pool or dataset.make_pool, make_validation or dataset.make_validation
@@ -132,7 +133,7 @@ def train(
 
 
 class _Run:
-    """State of a training: the trainer, the best network so far and the curves; restored from a checkpoint."""
+    """State of a training: the trainer, the best network so far, and losses and scores over time."""
 
     def __init__(
         self,
@@ -190,7 +191,7 @@ class _Run:
         return self.before + self.meter.seconds
 
     def begin(self, validation: Pool) -> None:
-        """Validates and saves the untrained network, the baseline of all later networks."""
+        """Validates and saves the untrained network, with which later networks are compared."""
         if self.trainer.step == 0:
             self.score = score(of_network(self.trainer.average), validation)
             self.untrained = self.best = self.score.psnr
@@ -199,7 +200,7 @@ class _Run:
             self._save_network()
 
     def do_round(self, pool: Pool) -> bool:
-        """Runs the remaining steps of a round; returns False if it runs out of time."""
+        """Runs the remaining steps of a round; returns False if the time limit ends it early."""
         number, begin = self.round, self.round * self.settings.steps
         plan = plan_round(self.settings, pool, seed=self.seed, round=number)
         if self.trainer.step == begin:
@@ -211,7 +212,7 @@ class _Run:
             if skipped > max(_LEAST_SKIPPED, _MOST_SKIPPED * self.settings.steps):
                 raise WlmError(
                     f"{self.output}: the training diverged: {skipped} steps of round {number} gave NaN or infinity; "
-                    f"expected a smaller rate than {self.settings.rate:g}"
+                    f"use a learning rate below {self.settings.rate:g}"
                 )
             self.loss = self._losses()[0]
             if self.round > number:
@@ -228,14 +229,14 @@ class _Run:
                 self.save()
 
     def end_round(self, validation: Pool) -> None:
-        """Validates, saves the network if it is the best so far, and writes curves and checkpoint."""
+        """Validates if due, saves the network if it is the best so far, and writes the scores and the checkpoint."""
         validated = self.round % self.settings.validate_every == 0 or self.round == self.settings.rounds
         if validated:
             self.score = score(of_network(self.trainer.average), validation)
             if self.score.psnr < self.untrained - _WORSE:
                 raise WlmError(
                     f"{self.output}: the training diverged: {self.score.psnr:.1f} dB after {self.trainer.step} steps,"
-                    f" {self.untrained:.1f} before the first; expected a smaller rate than {self.settings.rate:g}"
+                    f" {self.untrained:.1f} dB before the first; use a learning rate below {self.settings.rate:g}"
                 )
             # Also true if the best is NaN.
             if not self.score.psnr <= self.best:
@@ -250,7 +251,6 @@ class _Run:
         self.meter.report(self.trainer.step, PSNR_dB=psnr, loss=self.loss)
 
     def save(self) -> None:
-        """Writes the checkpoint."""
         state = {
             "clock": np.array([self.seconds, self.best, self.untrained]),
             "counts": np.array([self.best_step, self.first_skipped]),
@@ -263,7 +263,7 @@ class _Run:
         return Training(finished, self.best, self.score, step, skipped, self.seconds, self._saved())
 
     def _saved(self) -> SmokeModel | None:
-        """Loads the network of the output file; None if the file is missing or damaged, and will be replaced."""
+        """Loads the network from the output file; None if the file is missing or damaged."""
         try:
             return load(self.output, SmokeModel.SYSTEM)
         except WlmError:
@@ -281,14 +281,14 @@ class _Run:
         SmokeModel(self.trainer.average, summary).save(self.output)
 
     def _losses(self) -> list[float]:
-        """Returns means of the loss and its parts since the last row of the curves."""
+        """Returns the mean loss and the means of its parts over the steps of this round."""
         last = self.curve[-1] if len(self.curve) else np.zeros(len(self.columns))
         steps, skipped = (self.columns.index(name) for name in ("step", "skipped"))
         count = self.trainer.step - last[steps] - (self.trainer.skipped - last[skipped])
         return [float(value / count) if count else math.nan for value in self.trainer.take_losses()]
 
     def _add_to_curve(self, validated: bool) -> None:
-        """Adds the row of a round, with NaN for missing scores, and writes the curves."""
+        """Adds the losses and scores of a round (NaN: not validated) as a row, and writes all rows as the CSV file."""
         scores = [math.nan] * (len(_SCORES) + len(PLANES))
         if validated:
             scores = [*(getattr(self.score, name) for name in _SCORES), *self.score.planes]
@@ -305,7 +305,7 @@ class _Run:
 
 def _check_pool(where: str, pool: Pool) -> None:
     if len(pool) == 0:
-        raise WlmError(f"{where}: expected samples, found none")
+        raise WlmError(f"{where}: expected samples with smoke, found none")
     for tensor in fields(pool):
         # Sample by sample: a mask of the whole pool would take half as much memory again.
         finite = torch.stack([torch.isfinite(sample).all() for sample in getattr(pool, tensor.name)])

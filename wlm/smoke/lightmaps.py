@@ -1,8 +1,8 @@
-"""Six-way lightmaps of one frame, the result of each march and of the network, and their shading.
+"""Six-way lightmaps of one frame, which ray marches and the network compute, and their shading under lights.
 
 A lightmap stores the light that smoke of albedo 1 sends to the camera under one light of irradiance 4 pi from the map's
-direction: with isotropic scattering at most 1/2 under the front light and 1 under the others. All values are linear.
-Lightmaps are orthographic, the only view of a flat billboard.
+direction. With isotropic scattering it is at most 1/2 under the front light and 1 under other lights. All values are
+linear. Lightmaps are orthographic, the only view of a flat billboard.
 """
 
 import math
@@ -19,13 +19,13 @@ from wlm.smoke.transport.lights import checked_albedo, checked_colour
 
 @dataclass(frozen=True)
 class StepError:
-    """Change of a result when the step is halved.
+    """Difference between the lightmaps of two marches, of which the finer has half the step.
 
-    The error falls with the square of the step, so that about a third of this change remains in the finer result.
+    The error falls with the square of the step, so that the error of the finer one is about a third of the difference.
 
     Attributes:
         largest: Largest difference of a pixel in any lightmap.
-        rms: Root mean square of the differences over that of the lightmaps; 0 if these are black.
+        rms: Root mean square of the differences, divided by that of the lightmaps; 0 if the lightmaps are black.
         transparency: Largest difference of a pixel's transparency.
     """
 
@@ -42,10 +42,10 @@ class SixWay:
         lightmaps: float32 tensor [6, H, W], in the order of `wlm.smoke.camera.DIRECTIONS`.
         transparency: float32 tensor [H, W]; None: unknown, as in files without it.
         emission: float32 tensor [H, W], light that the smoke emits; None: the smoke is cold.
-        camera: The view; None: unknown, as for an engine's textures.
+        camera: Camera of the lightmaps; None: unknown, as for an engine's textures.
         depth: float32 tensor [H, W], distance along the ray to the smoke's surface in the world's unit, 0 where there
             is none; None: unknown.
-        error: Error of the march; None: not estimated.
+        error: Estimate of the march's error; None: not estimated.
     """
 
     lightmaps: torch.Tensor
@@ -62,12 +62,12 @@ class SixWay:
         for name in ("transparency", "emission", "depth"):
             plane = getattr(self, name)
             if plane is not None and tuple(plane.shape) != size:
-                raise ValueError(f"{name}: expected {size}, got {tuple(plane.shape)}")
+                raise ValueError(f"{name}: expected shape {size}, as the lightmaps have, got {tuple(plane.shape)}")
         if self.camera is not None and (self.camera.height, self.camera.width) != size:
-            raise ValueError(f"camera: expected {size} pixels, got {(self.camera.height, self.camera.width)}")
+            raise ValueError(f"camera: expected the size {size}, got {(self.camera.height, self.camera.width)} pixels")
 
     def __getitem__(self, direction: str) -> torch.Tensor:
-        """Returns the lightmap of a direction by its name, [H, W]."""
+        """Returns the lightmap of a direction, such as "front", [H, W]."""
         return self.lightmaps[DIRECTIONS.index(direction)]
 
     def shade(
@@ -79,7 +79,7 @@ class SixWay:
         ramp: Ramp | None = None,
         albedo: Sequence[float] = (1.0, 1.0, 1.0),
     ) -> torch.Tensor:
-        """Lights the smoke: each light adds irradiance / (4 pi) times a weighted sum of lightmaps (eq. 4 and 5).
+        """Renders the smoke: each light adds irradiance / (4 pi) times a weighted sum of lightmaps (eq. 4 and 5).
 
         Args:
             lights: Any number of directional lights.
@@ -97,7 +97,7 @@ class SixWay:
                 direction or a negative irradiance; or the albedo is invalid.
         """
         if self.camera is None and lights:
-            raise ValueError("camera: expected that of the lightmaps, found none; give it by dataclasses.replace")
+            raise ValueError("camera: the lightmaps have no camera, which lights need: set it by dataclasses.replace")
         height, width = self.lightmaps.shape[1:]
         scattered = checked_albedo(albedo) / (4 * math.pi)
         image = torch.zeros((height, width, 3), dtype=torch.float32, device=self.lightmaps.device)
@@ -111,5 +111,5 @@ class SixWay:
         if background is None:
             return image
         if self.transparency is None:
-            raise ValueError("transparency: expected that of the lightmaps, found none")
+            raise ValueError("transparency: the lightmaps have no transparency, which a background needs")
         return image + self.transparency[..., None] * torch.as_tensor(background).to(image)

@@ -1,4 +1,4 @@
-"""A trained network."""
+"""A trained network that predicts six-way lightmaps, with facts about its training."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from wlm.system import Model
 
 @dataclass(frozen=True, eq=False)
 class SmokeModel(Model):
-    """A trained network.
+    """A trained network that predicts six-way lightmaps.
 
     Attributes:
         network: The network in float32.
-        summary: Facts about the training as JSON values; "dataset" holds the settings of its samples.
+        summary: Facts about the training as JSON values; "dataset" has the settings of the training samples.
     """
 
     SYSTEM: ClassVar[str] = "smoke-network"
@@ -30,7 +30,7 @@ class SmokeModel(Model):
 
     @property
     def settings(self) -> NetworkSettings:
-        """Shape of the network."""
+        """Settings that the network was built with: its size and its kind of guiding map."""
         return self.network.settings
 
     @property
@@ -38,15 +38,15 @@ class SmokeModel(Model):
         """Settings of the samples that the network was trained on, by which its guiding maps must be made.
 
         Raises:
-            WlmError: The summary lacks them, or a setting is wrong.
+            WlmError: The summary lacks these settings, or a setting is wrong.
         """
         if "dataset" not in self.summary:
-            raise WlmError("summary.dataset: expected the settings of the network's samples, found none")
+            raise WlmError("summary.dataset: expected the settings of the network's training samples, found none")
         return check_settings(DatasetSettings, self.summary["dataset"], "summary.dataset.")
 
     def bundle(self, device: str = "cpu", **_: object) -> Bundle:
-        """Raises WlmError: a network has no textures; see `wlm.smoke.export_onnx` and `wlm.smoke.bundle`."""
-        raise WlmError("a network has no textures: export it by export_onnx, or bundle a flip book of its lightmaps")
+        """Always raises a WlmError, since a network has no textures to export; use `wlm.smoke.export_onnx`."""
+        raise WlmError("a network has no textures: export it with export_onnx, or bundle a flip book of its lightmaps")
 
 
 def parameter_count(network: nn.Module) -> int:

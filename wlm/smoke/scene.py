@@ -1,7 +1,7 @@
-"""Settings of a scene to simulate and render, a YAML file: box, air, smoke, inlets, obstacles, camera, lights.
+"""Settings of a scene to simulate and render, as in its YAML file: box, air, smoke, inlets, obstacles, camera, lights.
 
 Lengths are in metres, times in seconds, directions in the world, with +y up by default. A class is named `...Settings`
-if the object that is made from it has the plain name.
+if another class has the plain name, such as `Camera`.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _MOST_STEPS = 1_000_000  # largest number of steps per frame; typical scenes hav
 
 def _directed(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     if not math.hypot(*vector) > _SHORTEST:
-        raise PydanticCustomError("direction", "expected a direction of some length")
+        raise PydanticCustomError("direction", "expected a direction other than 0, 0, 0")
     return vector
 
 
 def _rising(path: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[float, float, float, float], ...]:
     if any(later[0] <= earlier[0] for earlier, later in itertools.pairwise(path)):
-        raise PydanticCustomError("path", "expected times that rise")
+        raise PydanticCustomError("path", "expected times that increase")
     return path
 
 
@@ -53,7 +53,7 @@ _Face = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
 
 def _stops(glow: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[float, float, float, float], ...]:
     if len(glow) == 1 or any(b[0] <= a[0] for a, b in itertools.pairwise(glow)):
-        raise PydanticCustomError("glow", "expected no stops of glow, or at least two that rise")
+        raise PydanticCustomError("glow", "expected no stops, or at least two whose emission increases")
     return glow
 
 
@@ -69,16 +69,16 @@ class _Settings(BaseModel):
 
 
 class Grid(_Settings):
-    """The box and its faces.
+    """The simulated box: its grid and its faces.
 
     Attributes:
-        cells: X, Y, Z, cells of the velocity grid.
+        cells: Numbers of cells of the velocity grid along x, y and z.
         cell: Edge of a cell in metres.
-        refine: Voxels of density along the edge of a cell; 4 in the paper.
-        origin: Corner of the box.
+        refine: Number of density voxels along the edge of a cell; 4 in the paper.
+        origin: Corner of the box with the smallest x, y and z.
         faces: Boundary condition of each face: "wall", "slip" (a wall without friction), "open" (the default), or
-            "periodic", which the opposite face must then be too. A face with an inlet is a wall for the air around the
-            inlet, and is open as a whole for the smoke.
+            "periodic", which needs a periodic opposite face. A face with an inlet is a wall for the air around the
+            inlet, but smoke can leave through the whole face.
     """
 
     cells: tuple[_Count, _Count, _Count]
@@ -92,7 +92,7 @@ class Grid(_Settings):
         for axis in "xyz":
             ends = [self.face(f"{sign}{axis}") for sign in "-+"]
             if ends.count("periodic") == 1:
-                raise PydanticCustomError("faces", "expected both faces of an axis to be periodic, or none")
+                raise PydanticCustomError("faces", "expected both faces of an axis to be periodic, or neither of them")
         return self
 
     def face(self, name: str) -> str:
@@ -101,27 +101,27 @@ class Grid(_Settings):
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Voxels of density along x, y, z."""
+        """Numbers of density voxels along x, y and z."""
         return tuple(self.refine * n for n in self.cells)
 
     @property
     def voxel(self) -> float:
-        """Edge of a voxel of density in metres."""
+        """Edge of a density voxel in metres."""
         return self.cell / self.refine
 
     @property
     def size(self) -> np.ndarray:
-        """Edges of the box in metres, float64 [3]."""
+        """Edges of the box along x, y and z in metres, float64 [3]."""
         return self.cell * np.asarray(self.cells, np.float64)
 
 
 class Air(_Settings):
-    """The air's flow.
+    """Settings of the flow of the air.
 
     Attributes:
         viscosity: Kinematic viscosity in square metres per second; 1.5e-5 for air.
         speed: Speed in metres per second that equals `lattice_speed`; null: that of the fastest inlet or obstacle.
-        lattice_speed: Cells per step. Errors grow with its square, the number of steps with its inverse.
+        lattice_speed: Speed in cells per step. Errors grow with its square, the number of steps with its inverse.
         operator, smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
     """
 
@@ -134,17 +134,17 @@ class Air(_Settings):
 
 
 class Smoke(_Settings):
-    """Motion and appearance of the smoke.
+    """Settings of the motion and appearance of the smoke.
 
     Attributes:
         extinction: Extinction per metre at density 1.
-        albedo: R, G, B, share of light that survives a scattering.
-        emission: Light emitted per metre at temperature 1.
-        dissipation, cooling: Rates of decay of density and temperature per second: exp(-rate t) remains.
+        albedo: R, G, B, share of light that survives a scattering, 0 to 1.
+        emission: Radiance emitted per metre at temperature 1.
+        dissipation, cooling: Rates of decay of density and temperature per second: a share exp(-rate t) remains.
         buoyancy: Upward acceleration at temperature 1, metres per second squared.
         weight: Downward acceleration at density 1, metres per second squared.
         up: Direction opposite to gravity.
-        scheme, storage, bricks, substeps: Advection, as for `wlm.fluid.solver.Solver`.
+        scheme, storage, bricks, substeps: Settings of the advection, as for `wlm.fluid.solver.Solver`.
         glow: Colour ramp of the emission, a list of stops (emission, R, G, B); empty: grey.
     """
 
@@ -175,7 +175,7 @@ class _Timed(_Settings):
     @model_validator(mode="after")
     def _order(self) -> _Timed:
         if self.stop is not None and self.stop <= self.start:
-            raise PydanticCustomError("stop", "expected to stop after it starts")
+            raise PydanticCustomError("stop", "expected a time after start, or null")
         return self
 
     def active(self, time: float) -> bool:
@@ -184,13 +184,13 @@ class _Timed(_Settings):
 
 
 class Inlet(_Settings):
-    """A steady inflow of air and smoke through a face.
+    """A steady inflow of air and smoke through a face of the box.
 
     Attributes:
-        face: Face of the box.
-        centre, radius: Circular opening in the face; radius null: the whole face.
-        velocity: Velocity in metres per second, into the box.
-        density, temperature: Values of the incoming smoke.
+        face: Name of the face, such as "-y".
+        centre, radius: Centre and radius in metres of a circular opening; radius null: the whole face is open.
+        velocity: Velocity of the air in metres per second; it must point into the box.
+        density, temperature: Density and temperature of the incoming smoke.
     """
 
     face: _Face
@@ -204,7 +204,7 @@ class Inlet(_Settings):
     def _inwards(self) -> Inlet:
         axis, high = divmod(FACES.index(self.face), 2)
         if not (self.velocity[axis] < 0.0 if high else self.velocity[axis] > 0.0):
-            raise PydanticCustomError("velocity", "expected a velocity into the box")
+            raise PydanticCustomError("velocity", "expected a velocity that points into the box")
         return self
 
 
@@ -212,9 +212,9 @@ class SourceSettings(_Timed):
     """A ball within the box that emits smoke.
 
     Attributes:
-        centre, radius: Centre and radius of the ball.
+        centre, radius: Centre and radius of the ball in metres.
         density, temperature: Values that are set in the ball while the source is active.
-        start, stop: Times in seconds; stop null: until the end.
+        start, stop: Times in seconds between which the source is active; stop null: until the end.
     """
 
     centre: _Vector
@@ -228,9 +228,9 @@ class ObstacleSettings(_Settings):
 
     Attributes:
         shape: "sphere", "box" or "cylinder", whose axis is y.
-        radius: Radius of a sphere; for the other shapes half the extents along x, y and z.
-        path: Keys of the centre: time, x, y, z. It moves linearly between them, and rests before and after.
-        colour: Albedo in pictures.
+        radius: Radius of a sphere in metres; for a box or cylinder half of its extents along x, y and z.
+        path: Positions (time, x, y, z) between which the centre moves linearly; before and after them it rests.
+        colour: Albedo R, G, B of the obstacle in pictures.
     """
 
     shape: Literal["sphere", "box", "cylinder"] = "sphere"
@@ -241,23 +241,23 @@ class ObstacleSettings(_Settings):
     @model_validator(mode="after")
     def _sizes(self) -> ObstacleSettings:
         if (self.shape == "sphere") == isinstance(self.radius, tuple):
-            raise PydanticCustomError("radius", "expected one radius of a sphere, three half extents of another body")
+            raise PydanticCustomError("radius", "expected one number for a sphere, three for a box or cylinder")
         return self
 
     def centre(self, time: float) -> np.ndarray:
-        """Returns the position at a time, float64 [3]."""
+        """Returns the position of the centre at a time in seconds, float64 [3]."""
         keys = np.array(self.path)
         return np.array([np.interp(time, keys[:, 0], keys[:, axis]) for axis in (1, 2, 3)])
 
     @property
     def fastest(self) -> float:
-        """Greatest speed in metres per second."""
+        """Largest speed along the path in metres per second."""
         keys = np.array(self.path)
         distance = np.linalg.norm(np.diff(keys[:, 1:], axis=0), axis=1)
         return float((distance / np.diff(keys[:, 0])).max(initial=0.0))
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the surface relative to the centre: corners float64 [V, 3], triangles int64 [F, 3]."""
+        """Returns the surface relative to the centre: corners, float64 [V, 3], and triangles, int64 [F, 3]."""
         points, triangles = {"sphere": sphere, "box": box, "cylinder": cylinder}[self.shape]()
         return points * np.asarray(self.radius), triangles
 
@@ -280,7 +280,7 @@ class CameraSettings(_Settings):
     perspective: bool = False
 
     def turned(self, degrees: float) -> CameraSettings:
-        """Returns the camera turned about `up`: the paper's references have 9 views, 10 degrees apart."""
+        """Returns the camera turned about `up` around its target; the paper uses 9 views, 10 degrees apart."""
         axis = np.array(self.up) / np.linalg.norm(self.up)
         toward, angle = np.array(self.toward), math.radians(degrees)
         along = axis * (axis @ toward)
@@ -294,24 +294,24 @@ class LightSettings(_Settings):
 
     Attributes:
         toward: Direction from the smoke to the light.
-        irradiance: R, G, B on a surface that faces the light; at 4 pi (12.57) lightmaps have their stored values.
+        irradiance: R, G, B on a surface that faces the light; lightmaps store the light for 4 pi, the default.
     """
 
     toward: _Direction
     irradiance: _Colour = (4 * math.pi,) * 3
 
     def light(self) -> Light:
-        """Returns the light."""
+        """Returns the light that `SixWay.shade` takes."""
         return Light(self.toward, self.irradiance)
 
 
 class Looks(_Settings):
-    """Settings with which a frame's smoke is rendered: lights, colours and obstacles.
+    """Settings for the picture of one frame of smoke: lights, colours and obstacles.
 
     Attributes:
-        lights, background, obstacles: As in a scene.
-        albedo, glow: As for a scene's smoke; lightmaps with light of all orders already include their albedo.
-        time: Time of the obstacles in seconds.
+        lights, background, obstacles: As in `Scene`.
+        albedo, glow: As in `Smoke`; lightmaps with light of all orders of scattering already include the albedo.
+        time: Time in seconds for which obstacles are placed on their paths.
     """
 
     lights: tuple[LightSettings, ...]
@@ -323,20 +323,20 @@ class Looks(_Settings):
 
     @property
     def ramp(self) -> Ramp | None:
-        """Colours of the emission; None: grey."""
+        """Colour ramp of the emission; None: grey."""
         return _ramp(self.glow)
 
 
 class Scene(_Settings):
-    """A scene.
+    """All settings of a scene: its simulation and its pictures.
 
     Attributes:
-        name: Shown in reports.
+        name: Name that reports show.
         grid, air, smoke: The box and its contents.
         inlets, sources, obstacles: Objects in the box.
-        camera, lights, background: Settings of pictures; the background is a linear colour.
+        camera, lights, background: Settings of pictures; the background is a linear colour R, G, B.
         frames: Number of frames.
-        rate: Frames per second; the first frame is one interval after the start.
+        rate: Frames per second; frame 1 shows the smoke 1 / rate seconds after the start.
     """
 
     name: str
@@ -358,12 +358,12 @@ class Scene(_Settings):
         if any(self.grid.face(face) == "periodic" for face in faces):
             raise PydanticCustomError("inlets", "expected inlets on faces that aren't periodic")
         if faces and all(face in faces or self.grid.face(face) != "open" for face in FACES):
-            raise PydanticCustomError("inlets", "expected an open face for the air that the inlets let in")
+            raise PydanticCustomError("inlets", "expected an open face without an inlet, for the air to leave")
         if not self.fastest <= _MOST_STEPS * self._speed_of_one_step:
             raise PydanticCustomError(
                 "steps",
-                f"expected at most {_MOST_STEPS:,} steps a frame, found a speed of {self.fastest:g} m/s over cells of "
-                f"{self.grid.cell:g} m at {self.rate:g} frames a second",
+                f"expected at most {_MOST_STEPS:,} steps per frame, found a speed of {self.fastest:g} m/s, cells of "
+                f"{self.grid.cell:g} m and {self.rate:g} frames per second",
             )
         return self
 
@@ -372,14 +372,14 @@ class Scene(_Settings):
         return frame / self.rate
 
     def looks(self, frame: int) -> Looks:
-        """Returns the settings of a frame's picture."""
+        """Returns the settings for the picture of a frame; frames count from 1."""
         parts = {"lights": self.lights, "background": self.background, "obstacles": self.obstacles}
         return Looks(**parts, albedo=self.smoke.albedo, glow=self.smoke.glow, time=self.time(frame))
 
     def scaled(self, factor: float) -> Scene:
-        """Returns the scene with its number of cells multiplied by a factor along each axis, rounded, at least one.
+        """Returns the scene with its number of cells along each axis multiplied by a factor and rounded, at least 1.
 
-        The longest axis keeps its length, the others keep theirs to half a cell.
+        The length of the longest axis stays the same; other axes change by at most half a cell.
 
         Raises:
             ValueError: The factor is not above 0.
@@ -395,7 +395,7 @@ class Scene(_Settings):
 
     @property
     def fastest(self) -> float:
-        """Speed in metres per second that equals `air.lattice_speed`; 1 if nothing moves."""
+        """Speed in metres per second that moves air by `air.lattice_speed` cells in a step; 1 if nothing moves."""
         if self.air.speed is not None:
             return self.air.speed
         speeds = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
@@ -403,12 +403,12 @@ class Scene(_Settings):
 
     @property
     def _speed_of_one_step(self) -> float:
-        """Speed in metres per second that equals `air.lattice_speed` with one air step per frame."""
+        """Speed in metres per second that would move air by `air.lattice_speed` cells if a frame had one step."""
         return self.rate * self.air.lattice_speed * self.grid.cell
 
     @property
     def steps(self) -> int:
-        """Air steps per frame: the smallest multiple of the substeps limiting `fastest` to `air.lattice_speed`."""
+        """Number of air steps per frame, a multiple of `smoke.substeps`: the fewest that obey `air.lattice_speed`."""
         least = self.fastest / self._speed_of_one_step
         return max(math.ceil(least / self.smoke.substeps - 1e-9), 1) * self.smoke.substeps
 
@@ -419,7 +419,7 @@ class Scene(_Settings):
 
 
 def load_scene(name: str | os.PathLike[str]) -> Scene:
-    """Loads `configs/smoke-NAME.yaml`, or any YAML file.
+    """Loads a scene by its name, from `configs/smoke-NAME.yaml`, or from any YAML file.
 
     Raises:
         WlmError: The scene is unknown, the file cannot be read, or a setting is wrong.
@@ -431,13 +431,13 @@ def load_scene(name: str | os.PathLike[str]) -> Scene:
 def make_camera(
     settings: CameraSettings, origin: Sequence[float] | np.ndarray, size: Sequence[float] | np.ndarray
 ) -> Camera:
-    """Places a camera in front of a box in the world, of the corner `origin` [3] and the edges `size` [3]."""
+    """Makes a camera in front of a box in the world with the lowest corner `origin` [3] and edges `size` [3]."""
     values = settings.model_dump()
     return Camera.around((origin, size), pixels=values.pop("resolution"), **values)
 
 
 def obstacle_mesh(obstacles: Sequence[ObstacleSettings], time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the surfaces of obstacles as triangles, for their pictures and shadows.
+    """Returns the surfaces of obstacles at a time in seconds as triangles, for their pictures and shadows.
 
     Returns:
         Corners float32 [V, 3] in the world, triangles int32 [F, 3], index of each triangle's obstacle int32 [F].

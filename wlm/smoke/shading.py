@@ -1,4 +1,4 @@
-"""Lights, colours of emission, and shadows of obstacles on smoke, all in linear light; `SixWay.shade` uses them."""
+"""Directional lights and the colours of emission, for the shading of smoke in linear light."""
 
 import math
 from collections.abc import Sequence
@@ -37,12 +37,12 @@ class Ramp:
 
     def __post_init__(self) -> None:
         if len(self.stops) < 2 or np.shape(self.colours) != (len(self.stops), 3):
-            raise ValueError("ramp: expected at least two stops and as many colours of R, G, B")
+            raise ValueError("ramp: expected at least two stops and a colour R, G, B for each of them")
         if not (np.isfinite(self.stops).all() and np.isfinite(self.colours).all() and (np.diff(self.stops) > 0).all()):
-            raise ValueError(f"ramp: expected finite colours and rising stops, got {self.stops}")
+            raise ValueError(f"ramp: expected finite colours and increasing finite stops, got {self.stops}")
 
     def __call__(self, emission: torch.Tensor) -> torch.Tensor:
-        """Returns colours [..., 3] of emissions of any shape."""
+        """Returns the colours [..., 3] for a tensor [...] of emissions."""
         stops = torch.tensor(self.stops, dtype=emission.dtype, device=emission.device)
         colours = torch.tensor(self.colours, dtype=emission.dtype, device=emission.device)
         after = torch.searchsorted(stops, emission.contiguous()).clamp(1, len(self.stops) - 1)
@@ -51,5 +51,5 @@ class Ramp:
 
 
 def light_axes(toward: Sequence[float] | np.ndarray) -> list[float]:
-    """Returns three orthogonal unit axes, the third of which points to a light, as 9 numbers, axis by axis."""
+    """Returns three orthogonal unit axes, of which the third points to the light, as a list of 9 numbers."""
     return Camera.look_at(toward, np.zeros(3), extent=1.0, height=1, width=1).axes.ravel().tolist()

@@ -1,4 +1,4 @@
-"""Simulation of a scene: its solver, and a folder with a volume per frame."""
+"""Simulates a scene: makes its solver, and writes a folder with a volume of smoke per frame."""
 
 import math
 import time
@@ -29,7 +29,7 @@ _RAMP = 4
 
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
-    """Builds the solver of a scene on a device, a result of `wlm.interop.check_device`.
+    """Builds the solver of a scene on a device, which `wlm.interop.check_device` must have returned.
 
     Raises:
         WlmError: There is not enough memory for air and smoke, which is checked before the allocation, or an inlet is
@@ -59,7 +59,7 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
 
 
 def volume_of(scene: Scene, solver: fluid.Solver) -> DensityVolume:
-    """Returns the solver's smoke, in the solver's memory: valid until the next step."""
+    """Returns the solver's smoke; the volume shares the solver's memory and is valid until the next step."""
     smoke, grid = scene.smoke, scene.grid
     return solver.frame(extinction=smoke.extinction, emission=smoke.emission, cell=grid.cell, origin=grid.origin)
 
@@ -82,17 +82,17 @@ def simulate(
 
     Args:
         frames: The folder, prepared by `wlm.smoke.data.open_frames`.
-        solver: Solver from `make_solver`, before its first step; None: it is made here, on `device`. Making it before
-            the folder is opened keeps earlier frames if it fails.
-        device: Result of `wlm.interop.check_device`.
+        solver: Solver from `make_solver`, before its first step; None: made on `device`. If a caller makes it before
+            opening the folder, a failure leaves earlier frames in the folder.
+        device: Device that `wlm.interop.check_device` returned.
         resume: Whether to continue from a saved state, if there is one. A state past the last requested frame is kept.
-        checkpoint_every: Seconds between two saves; 0: after every step.
-        velocity: Whether to write the air's velocity beside each frame, as motion vectors need it.
+        checkpoint_every: Seconds between two saves of the state; 0: after every step.
+        velocity: Whether to write the air's velocity beside each frame; flip books need it for motion vectors.
         progress: Called after each frame, with the figures `smoke`, the integral of the density over the box, and
             `frame s`, the seconds of the frame; and about twice a second within a frame, without figures.
 
     Returns:
-        Number of the first frame that was simulated; one more than the last frame if all existed.
+        Number of the first frame that was simulated; if all frames existed already, the number after the last frame.
 
     Raises:
         WlmError: As `make_solver`; an obstacle is too fast; the air blew up; a file is damaged or cannot be written; a
@@ -115,8 +115,8 @@ def simulate(
         done = begun // per_frame
         if saved and missing and missing[0] <= done:
             raise WlmError(
-                f"{frames.path}: expected {frames.file(missing[0]).name}, since the saved state is of frame {done},"
-                " found none; start anew without --resume"
+                f"{frames.path}: cannot resume after frame {done}: {frames.file(missing[0]).name} is missing;"
+                " start anew without --resume"
             )
         sources, meter = _sources(scene), Meter(progress, "simulate", scene.frames)
         pace = Pace(checkpoint_every)
@@ -150,7 +150,7 @@ def simulate(
 
 
 def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
-    """Advances a solver from the end of the frame before to the end of a frame; frames count from 1.
+    """Advances a solver from the previous frame to the frame with number `frame`; frames count from 1.
 
     Raises:
         WlmError: An obstacle is too fast.
@@ -161,13 +161,13 @@ def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
 
 
 def _step(scene: Scene, solver: fluid.Solver, sources: list[_Timed], frames: float) -> None:
-    """Does the smoke's step that begins at time `frames`, in frame intervals, with the sources that are active then."""
+    """Does one smoke step from the time `frames`, in frame intervals, with the sources that are active at this time."""
     solver.sources = tuple(source for source, active in sources if active(frames / scene.rate))
     solver.step()
 
 
 def _require_memory(scene: Scene, device: str) -> None:
-    """Checks, before the allocation, that air and smoke fit into the memory together."""
+    """Checks before the allocation that air and smoke fit into the free memory; raises a WlmError if not."""
     grid, smoke = scene.grid, scene.smoke
     voxel = fluid.voxel_bytes(smoke.scheme, smoke.storage, smoke.hot)
     needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + voxel * math.prod(grid.shape)
@@ -176,15 +176,14 @@ def _require_memory(scene: Scene, device: str) -> None:
     if needed > free:
         air, dense = (" x ".join(map(str, shape)) for shape in (grid.cells, grid.shape))
         raise WlmError(
-            f"{scene.name}: {air} cells of air and {dense} of smoke need {needed / 2**30:.1f} GiB on {device}: expected"
-            f" at most the {free / 2**30:.1f} GiB that are free: use fewer cells, a lower refine or storage: float16"
+            f"{scene.name}: {air} cells of air and {dense} voxels of smoke need {needed / 2**30:.1f} GiB on {device},"
+            f" but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, or storage: float16"
         )
     # A grid may also have more voxels than can be indexed.
     fluid.require_memory(grid.shape, voxel, warp_device)
 
 
 def _make_lattice(scene: Scene, device: str) -> Lattice:
-    """Builds the lattice with the conditions at its faces."""
     grid, air = scene.grid, scene.air
     domain = Domain(grid.cell, scene.step)
     lattice = Lattice(
@@ -219,7 +218,7 @@ def _buoyancy(scene: Scene) -> fluid.Buoyancy | None:
 
 
 def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlets: list[tuple[int, Inlet]]) -> None:
-    """Sets the inlets of a face; where two overlap the later one applies."""
+    """Sets the inlets of a face; where two inlets overlap, the later one applies."""
     grid = scene.grid
     across = [axis for axis in range(3) if axis != FACES.index(name) // 2]
     places = [grid.origin[axis] + grid.cell * (np.arange(grid.cells[axis]) + 0.5) for axis in across]
@@ -230,14 +229,14 @@ def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlet
         if inlet.radius is not None:
             here = np.hypot(first - inlet.centre[across[0]], second - inlet.centre[across[1]]) <= inlet.radius
         if not here.any():
-            raise WlmError(f"{scene.name}: inlets.{number}: expected a cell's centre within its radius, found none")
+            raise WlmError(f"{scene.name}: inlets.{number}: too small to cover a cell's centre: use a larger radius")
         velocity[here] = [domain.speed(v) for v in inlet.velocity]
         opened |= here
     lattice.set_inlet(name, velocity, opened)
 
 
 def _sources(scene: Scene) -> list[_Timed]:
-    """Returns the sources at inlets and within the box, in cells, each with a test whether it is active at a time."""
+    """Returns the smoke sources at inlets and in the box, in cells, each with a test whether it is active at a time."""
     sources: list[_Timed] = []
 
     def add(

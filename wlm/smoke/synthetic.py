@@ -1,4 +1,4 @@
-"""Procedural smoke for demos, benchmarks and the training of `transport.orders`."""
+"""Procedural smoke for demos, benchmarks and the fit of the weights of `transport.orders`."""
 
 import numpy as np
 import torch
@@ -17,10 +17,10 @@ _SHAPES = ("ball", "column", "shell", "fog")
 def make_plume(
     n: int = 48, *, seed: int = 1, hot: bool = True, extinction: float = 1.0, device: str = "cpu"
 ) -> DensityVolume:
-    """Makes a leaning column of billows that widens with height, in a box of edge 1.
+    """Makes smoke in a box of edge 1: a leaning column of billows that widens with height.
 
     Args:
-        n: Voxels along an edge of the box, at least 1.
+        n: Number of voxels along an edge of the box, at least 1.
         seed: Seed of the billows.
         hot: Whether the smoke has a temperature, which is highest at the bottom.
         extinction: Optical depth of density 1 across the box.
@@ -48,7 +48,7 @@ def make_plume(
 
 
 def make_billows(n: int = 48, *, seed: int = 1, extinction: float = 1.0, device: str = "cpu") -> DensityVolume:
-    """Makes a ball, a column, a shell or fog, rotated and stretched, with edges perturbed by octaves of noise.
+    """Makes smoke in the shape of a ball, column, shell or fog, rotated and stretched, with edges perturbed by noise.
 
     Args:
         n, extinction, device: As for `make_plume`.

@@ -1,1 +1,1 @@
-"""Kernels for lightmap atlases: reads of tiles and cascades, steps of tuning, and the grouping of similar triangles."""
+"""Kernels for lightmap atlases: they read tiles and cascades, fit their textures, and group similar triangles."""

@@ -1,19 +1,20 @@
-"""Reads a cascade of two textures, differentiates the read, and computes the points and losses of a tuning step
-(lightmap-uv-clustering-cascade, sections 3.3.2 and 3.3.3).
+"""Kernels of a cascade of two textures: its colours and their gradients, and the points and losses of a step
+that tunes them (lightmap-uv-clustering-cascade, sections 3.3.2 and 3.3.3).
 
-C(u) = T_p(F(T_c(u))) (eq. 7): the lookup texture T_c gives a coordinate, the triangle wave F folds it into [0, 1], the
-colour texture T_p gives the colour. Both textures are read bilinearly and clamped at their borders, see
+C(u) = T_p(F(T_c(u))) (eq. 7): the lookup texture T_c gives a coordinate, the triangle wave F folds it into [0, 1], and
+the colour texture T_p gives the colour. Both textures are read bilinearly and clamped at their borders, see
 `wlm_kernels.raster.texture`. An empty T_c means that there is none: C(u) = T_p(u).
 
 Two points of the paper are corrected or made precise. Eq. 8 has a floor in place of an absolute value, and would be -2
 or 0 everywhere; here F(x) = 2 |x/2 - floor(x/2 + 1/2)|. And F acts on the value read from T_c, as eq. 7 says, and not
-on each texel of T_c. For texels in [0, 1], the range of unsigned 16-bit numbers, both are equal and F(x) = x, so a
+on each texel of T_c. For texels in [0, 1], the range of unsigned 16-bit numbers, the two are equal and F(x) = x, so a
 decoder of a stored T_c computes no wave.
 
-A point is a coordinate u. A NaN coordinate is an empty point: it reads NaN, its loss is 0, it has no gradient.
-Gradients of textures are added by atomics: on CUDA in any order, so that the last bits change from run to run.
+A point is a coordinate u. A NaN coordinate is an empty point: its colour is NaN, its loss is 0, and it has no gradient.
+On CUDA the gradients of textures are added by atomics in any order, so that the last bits change from run to run.
 
-Read `tests/reference/cascade.py` first: eq. 7 and both losses in float64, differentiated by autograd.
+Read `tests/reference/cascade.py` first, which computes eq. 7 and the two losses in float64 and differentiates them by
+autograd.
 """
 
 import warp as wp
@@ -169,7 +170,7 @@ def _or_zero(x: float) -> float:
 
 @wp.func
 def _sign(x: float) -> float:
-    """Returns -1, 0 or 1; 0 at 0, where L1 has no slope (`wp.sign` returns 1)."""
+    """Returns the sign of x: -1, 0 or 1. At 0, where |x| has no slope, it is 0; `wp.sign` would return 1."""
     return wp.where(x > 0.0, 1.0, wp.where(x < 0.0, -1.0, 0.0))
 
 
@@ -217,30 +218,36 @@ def _pair_loss(
 
 def _check(colour, lut) -> None:
     if colour.ndim != 3 or 0 in colour.shape or colour.shape[2] != 3:
-        raise ValueError(f"colour: expected [Hp, Wp, 3], no side 0, got {tuple(colour.shape)}")
+        raise ValueError(f"colour: expected shape [height, width, 3] with sides above 0, got {tuple(colour.shape)}")
     if lut.ndim != 3 or lut.shape[2] != 2 or (lut.shape[0] == 0) != (lut.shape[1] == 0):
-        raise ValueError(f"lut: expected [Hc, Wc, 2] or [0, 0, 2], got {tuple(lut.shape)}")
+        raise ValueError(f"lut: expected shape [height, width, 2], or [0, 0, 2] for none, got {tuple(lut.shape)}")
 
 
 def sample(colour, lut, uv, out) -> None:
-    """Writes the cascade's colours C(u), float [N, 3], at points vec2 [N] (eq. 7): u right, v down, clamped to [0, 1];
-    NaN gives NaN. T_p is float [Hp, Wp, 3]; T_c is float [Hc, Wc, 2], coordinates x and y in T_p, any numbers; [0, 0,
-    2] if there is no T_c."""
+    """Writes the cascade's colour C(u) at each of N points (eq. 7).
+
+    Args:
+        colour: float [Hp, Wp, 3], the colour texture T_p.
+        lut: float [Hc, Wc, 2], the lookup texture T_c: any coordinates (x, y) in T_p; [0, 0, 2] if there is none.
+        uv: vec2 [N], coordinates (u, v), u right and v down, clamped to [0, 1]. The colour at NaN is NaN.
+        out: float [N, 3], written.
+    """
     _check(colour, lut)
     wp.launch(_sample, uv.shape, inputs=[colour, lut, uv], outputs=[out], device=colour.device)
 
 
 def sample_backward(colour, lut, uv, grad_out, grad_colour, grad_lut) -> None:
-    """Adds the gradients of the two textures of `sample` to `grad_colour` and `grad_lut`; `grad_out`, float [N, 3], is
-    the gradient of the colours."""
+    """Adds the gradients of the two textures of `sample` to `grad_colour` and `grad_lut`, which have the textures'
+    shapes. `grad_out`, float [N, 3], is the gradient of the colours at the points."""
     _check(colour, lut)
     inputs = [colour, lut, uv, grad_out]
     wp.launch(_sample_backward, uv.shape, inputs=inputs, outputs=[grad_colour, grad_lut], device=colour.device)
 
 
 def corner_points(triangle, barycentric, corner, uv) -> None:
-    """Writes coordinates vec2 [N] of points in triangles int [N], interpolated from barycentric weights of corners 0
-    and 1, vec2 [N], and coordinates of the corners, vec2 [F, 3]; NaN where the triangle is -1."""
+    """Writes the coordinates of N points to `uv`, vec2 [N]. `triangle`, int [N], is the triangle of each point, and
+    `barycentric`, vec2 [N], its weights of the corners 0 and 1; `corner`, vec2 [F, 3], has the coordinates of all F
+    triangles' corners. Points of triangle -1 are NaN."""
     wp.launch(
         _corner_points, triangle.shape, inputs=[triangle, barycentric, corner], outputs=[uv], device=triangle.device
     )
@@ -265,16 +272,19 @@ def surface_points(area, corner, distance: float, seed: int, step, triangle, bar
 
 
 def image_loss(difference, weight: float, grad) -> None:
-    """Writes the gradient of an image's loss: L1 of the colours and of the images' gradients (section 3.3.3). The loss
-    is the sum of |d| over all pixels and channels plus `weight` times the sum of |d_p - d_q| over pairs of neighbours p
-    and q, horizontal and vertical. d = `difference`, float [H, W, 3], is the image minus the reference; NaN, where
-    neither shows the mesh, counts as 0."""
+    """Writes the gradient of the loss between an image and its reference to `grad`, float [H, W, 3] (section 3.3.3).
+
+    The loss is the sum of |d| over all pixels and channels, plus `weight` times the sum of |d_p - d_q| over all pairs
+    of horizontal or vertical neighbours p and q. d is `difference`, float [H, W, 3]: the image minus the reference. It
+    is NaN in pixels where neither shows the mesh, and counts as 0 there.
+    """
     device = difference.device
     wp.launch(_image_loss, difference.shape, inputs=[difference, weight], outputs=[grad], device=device)
 
 
 def pair_loss(difference, weight: float, grad) -> None:
-    """Writes the gradient of the loss of N pairs of points: the sum of |d| plus `weight` times the sum of |d_i - d_(N +
-    i)|, where d = `difference`, float [2 N, 3]; NaN counts as 0."""
+    """Writes the gradient of the loss of N pairs of points i and N + i to `grad`, float [2 N, 3]. The loss is the sum
+    of |d| plus `weight` times the sum of |d_i - d_(N + i)|, where d is `difference`, float [2 N, 3]: colours minus
+    reference colours. NaN counts as 0."""
     size = (difference.shape[0] // 2, 3)
     wp.launch(_pair_loss, size, inputs=[difference, weight], outputs=[grad], device=difference.device)

@@ -1,10 +1,12 @@
-"""Reads lightmaps from tiles: one entry of a lookup texture, then bilinear reads of a small texture.
+"""Reads lightmaps that are stored as tiles: one entry of a lookup texture, then bilinear reads of a colour texture.
 
-Tile (i, j) of size B spans the lightmap's texel centres i B to (i + 1) B along x, and j B to (j + 1) B along y; its
-entry names its rectangle in the texture or in a second texture, which consists of blocks. The rectangle's outermost
-samples lie on the tile's borders. `decode` reads the tiles of one lightmap; `decode_shared` reads tiles that many
-sheets and states share, where light is a sum of components times the state's factors; the components' rectangles lie
-beside each other.
+A lightmap is cut into tiles of size B. Tile (i, j) spans the lightmap's texel centres i B to (i + 1) B along x, and j B
+to (j + 1) B along y. Its entry in the lookup texture gives a rectangle of the colour texture, or of a second colour
+texture that consists of blocks of 4 x 4 texels. The rectangle's outermost samples lie on the tile's borders.
+
+`decode` reads the tiles of one lightmap. `decode_shared` reads tiles that many lightmaps and lighting states share:
+light is a sum of components, each times a factor of the lighting state, and the rectangles of a tile's components lie
+beside each other (`wlm.atlas.model`).
 
 `wlm/atlas/exact.py` computes the same in float64 NumPy and is easier to read.
 """
@@ -33,8 +35,8 @@ class Axis:
 
 @wp.func
 def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
-    """Returns the index of the tile that contains a coordinate, and the position in the tile from 0 to 1; tile 0 and
-    NaN for NaN."""
+    """Returns the index of the tile in which u lies along an axis of `texels` texels and `tiles` tiles, and the
+    position in the tile from 0 to 1. If u is NaN, the index is 0 and the position NaN."""
     if not (u == u):
         return wp.vec2(0.0, u)
     x = wp.clamp(u * float(texels) - 0.5, 0.0, float(texels - 1)) / float(size)
@@ -44,7 +46,8 @@ def tile_place(u: float, texels: int, size: int, tiles: int) -> wp.vec2:
 
 @wp.func
 def axis_at(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
-    """Returns the two texels between which a position in a tile lies, along one axis, and the second texel's weight."""
+    """Returns the two texels around a position in a tile along one axis, and the weight of the second texel. `place` is
+    the position from 0 to 1; `entry` is one number of the tile in the lookup texture, see `decode`."""
     first = int(entry) >> SIDE_BITS
     last = int(entry) & _SIDE_MASK
     if last >= first_block_code:
@@ -80,7 +83,6 @@ def _decode(
     # out:
     out: wp.array1d[wp.vec3],
 ):
-    """Reads one point of a lightmap in tiles per thread."""
     i = wp.tid()
     u = uv[i]
     across = tile_place(u[0], width, size, lut.shape[1])
@@ -96,18 +98,19 @@ def _decode(
 
 
 def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None, first_block_code=16) -> None:
-    """Writes the light of one lightmap in tiles at points.
+    """Writes the light of a lightmap that is stored as tiles, at N points.
 
     Args:
-        uv: vec2 [N], u right, v down; clamped to [0, 1]. NaN reads NaN.
-        height, width: Texels of the lightmap.
-        size: B, texels along a tile.
-        lut: uint16 [ty, tx, 2], for x and y: first texel of the rectangle << 4 | number of its texels - 1.
+        uv: vec2 [N], coordinates (u, v), u right and v down, clamped to [0, 1]. The light at NaN is NaN.
+        height, width: Size of the lightmap in texels.
+        size: B, number of texels along a tile.
+        lut: uint16 [ty, tx, 2], for each tile an entry for x and one for y: (first texel of the rectangle) << 4 |
+            (number of its texels - 1).
         texels: vec3h [Hp, Wp], the colour texture.
         out: vec3 [N], written.
-        blocks: vec3h [Hb, Wb], sides multiples of 4: the second texture; None if there is none.
-        first_block_code: Entries whose low 4 bits are at least this number name the second texture, in blocks: the
-            first block << 4 | `first_block_code` + number of blocks - 1.
+        blocks: vec3h [Hb, Wb], the second colour texture, with sides that are multiples of 4; None if there is none.
+        first_block_code: An entry whose low 4 bits are at least this number refers to the second texture and counts
+            blocks of 4 texels: (first block) << 4 | (`first_block_code` + number of blocks - 1). With 16 no entry does.
     """
     inputs = [uv, height, width, size, lut, texels, texels if blocks is None else blocks, first_block_code]
     wp.launch(_decode, uv.shape, inputs=inputs, outputs=[out], device=uv.device)
@@ -115,7 +118,7 @@ def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None
 
 @wp.func
 def _bilinear_at(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y: Axis) -> wp.vec3:
-    """Reads a page bilinearly, with the rectangle shifted by `right` columns."""
+    """Reads texture `page` bilinearly at x and y, after moving both texels of x to the right by `right` texels."""
     left = right + x.low
     next = right + x.high
     top = wp.lerp(wp.vec3(pages[page, y.low, left]), wp.vec3(pages[page, y.low, next]), x.share)
@@ -125,7 +128,7 @@ def _bilinear_at(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y:
 
 @wp.func
 def _in_block(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
-    """Returns the same as `axis_at`, for a component that is a single block."""
+    """Returns the same as `axis_at`, for a rectangle of a single block: the first block of `entry`."""
     return axis_at(entry - (entry & wp.uint16(_SIDE_MASK)) + wp.uint16(first_block_code), place, first_block_code)
 
 
@@ -144,7 +147,6 @@ def _decode_shared(
     # out:
     out: wp.array1d[wp.vec3],
 ):
-    """Reads one point of shared tiles per thread."""
     i = wp.tid()
     u = uv[i]
     s = sheet[i]
@@ -189,7 +191,7 @@ def _decode_shared(
         else:
             light = _bilinear_at(texels, page, right, x, y)
         total += wp.cw_mul(factor[first + 1 + k], light)
-    # Factors have any sign.
+    # Factors may be negative, and so may the sum.
     for c in range(3):
         if total[c] < 0.0:
             total[c] = 0.0
@@ -197,22 +199,22 @@ def _decode_shared(
 
 
 def decode_shared(uv, sheet, sheets, size: int, factor, lut, texels, blocks, first_block_code: int, out) -> None:
-    """Writes the light of shared tiles at points.
+    """Writes the light of tiles that many lightmaps and lighting states share, at N points in one lighting state.
 
     Args:
-        uv: vec2 [N], u right, v down; clamped to [0, 1]. NaN reads NaN.
-        sheet: int [N], the row of each point's sheet or level in `sheets`.
-        sheets: int [S, 7]: rows and columns of texels; first row and column in the lookup texture; rows and columns of
-            tiles; one number that is ignored.
-        size: B, texels along a tile.
-        factor: vec3 [C], the factors of a state. Tiles of a mixture share a constant, followed by one factor for each
-            component.
-        lut: uint16 [ty, tx, 4], for x and y: first texel of the first component's rectangle << 4 | number of its texels
-            - 1; number of its mixture's constant; page << 12 | number of coarse components << 8 | number of components.
-            With one component and one page only the first two numbers exist, [ty, tx, 2].
-        texels: vec3h [pages, Hp, Wp]; the components of a tile follow each other along a row.
-        blocks: vec3h [pages, Hb, Wb], the second texture, in blocks of 4 x 4 texels.
-        first_block_code: As for `decode`; 16: no entry names the second texture.
+        uv: vec2 [N], coordinates (u, v), u right and v down, clamped to [0, 1]. The light at NaN is NaN.
+        sheet: int [N], for each point the row in `sheets` of its lightmap or mip level.
+        sheets: int [S, 7], for each lightmap or mip level: height and width in texels; row and column of its first tile
+            in the lookup texture; rows and columns of tiles; and one number that is ignored.
+        size: B, number of texels along a tile.
+        factor: vec3 [C], the factors of the lighting state. Each group of tiles whose light changes alike has its own
+            factors: a constant, followed by one factor for each component.
+        lut: uint16 [ty, tx, 4], for each tile the entries for x and y of its first component, as for `decode`; the
+            index of its constant in `factor`; and page << 12 | number of coarse components << 8 | number of components.
+            A coarse component is a single block. With one component and one page: [ty, tx, 2], only the entries.
+        texels: vec3h [pages, Hp, Wp], the colour texture; the components of a tile follow each other along a row.
+        blocks: vec3h [pages, Hb, Wb], the second colour texture, in blocks of 4 x 4 texels.
+        first_block_code: As for `decode`.
         out: vec3 [N], written.
     """
     inputs = [uv, sheet, sheets, size, factor, lut, texels, blocks, first_block_code]

@@ -1,11 +1,12 @@
-"""The graph of similar patches, which store the colours of triangles (lightmap-uv-clustering-cascade, section 3.2).
+"""The graph of similar patches (lightmap-uv-clustering-cascade, section 3.2). A patch stores the colours of a triangle.
 
-Lower and upper bounds of the distance (`Bounds`) decide for most pairs of patches, so that few pairs need all their
-samples compared. Bounds are in float32, with a margin larger than the rounding, and so never change a result. Patches
-are sorted by their mean colour; if two means differ by lambda or more, the patches can't be alike and are not compared.
+Two patches are alike if their distance is below a threshold, lambda. For most pairs, lower and upper bounds of the
+distance (`Bounds`) decide, so that all samples are compared for few pairs only. The bounds are float32 with a margin
+above their rounding errors, and so never change a result. Patches are sorted by mean colour: if two means differ by
+lambda or more, the patches can't be alike and are not compared.
 
-Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`): it computes the same with the whole matrix
-of distances.
+Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`), which does the same with the distances of
+all pairs.
 """
 
 import math
@@ -34,15 +35,16 @@ _MARGIN = wp.constant(4.0e-3)
 class Bounds:
     """Quantities of one patch that bound the distance Dist between two patches on one lattice, in 8-bit colour levels.
 
-    With weights w = (i, j, k) / (n - 1), which add up to 1, and the colours T of one patch and T' of the other:
+    A sample (i, j, k) of a lattice of size n has the weights w = (i, j, k) / (n - 1) of the vertices v, and the colours
+    T in one patch and T' in the other. L = sum of w_v C_v is the linear function that fits T best by least squares.
 
     - From below: the sum over v of |mean of w_v (T - T')| is at most the mean of |T - T'|.
-    - From above: with L = sum of w_v C_v, the mean of |T - T'| is at most those of |T - L|, of |T' - L'| and of w_v
-      |C_v - C'_v|, summed over the vertices v. The mean of w_v is 1/3.
+    - From above: the mean of |T - T'| is at most the sum of the means of |T - L|, of |T' - L'| and, for each vertex v,
+      of w_v |C_v - C'_v|. The mean of w_v is 1/3.
 
     Attributes:
         moment: Row v: the mean over the samples of w_v T.
-        corner: Row v: C_v, the colour at vertex v of the linear function L that fits T best by least squares.
+        corner: Row v: C_v, the colour of L at vertex v.
         residual: Mean over the samples of |T - L|, summed over the channels.
     """
 
@@ -56,11 +58,11 @@ class Rule:
     """Thresholds below which two patches are alike. A level is 1 of 255 in an 8-bit colour.
 
     Attributes:
-        colour: Largest squared distance of two patches' dominant colours, in bins of the colour histogram.
-        level: Mean difference, summed over the channels, in levels.
-        whole: `level` rounded up, for comparisons with whole numbers.
-        same: [len(SIZES)], for two patches of one size: sum of the differences of all samples and channels, in levels.
-        mixed: [len(SIZES)], the same for two sizes, of which the larger is this one, in 1 / (n - 1) of a level.
+        colour: Largest squared distance of the two dominant colours, in bins of the colour histogram.
+        level: The mean difference of the samples, summed over the channels, must be below this number of levels.
+        whole: `level` rounded up to a whole number.
+        same: [len(SIZES)], for two patches of this size: threshold of the sum of all samples' differences, in levels.
+        mixed: [len(SIZES)], the same for patches of two sizes, by the larger size n, in 1 / (n - 1) of a level.
     """
 
     colour: int
@@ -78,7 +80,7 @@ def _bounds(
     # out:
     bounds: wp.array2d[Bounds],
 ):
-    """Computes the bounds of one patch on one lattice per thread; lattices smaller than the patch's own stay unset."""
+    """Computes the `Bounds` of one patch on one lattice per thread; none for lattices smaller than the patch's own."""
     t, level = wp.tid()
     p = patches[t]
     if level < p.level:
@@ -142,7 +144,7 @@ def _along(m: wp.mat33, order: int) -> float:
 
 @wp.func
 def _near(rule: Rule, a: int, b: int) -> bool:
-    """Tests whether the dominant colours a and b are within lambda_h of each other."""
+    """Tests whether the distance of the dominant colours a and b is within the rule's threshold."""
     r = channel(a, 0) - channel(b, 0)
     g = channel(a, 1) - channel(b, 1)
     b_ = channel(a, 2) - channel(b, 2)
@@ -153,7 +155,7 @@ def _near(rule: Rule, a: int, b: int) -> bool:
 def _alike(
     samples: wp.array1d[int], patches: wp.array1d[Patch], bounds: wp.array2d[Bounds], rule: Rule, x: int, y: int
 ) -> bool:
-    """Tests whether the distance Dist of patches x and y is below lambda in any order of the vertices (eq. 3, 4)."""
+    """Tests whether patches x and y are alike: Dist is below lambda in some order of the vertices (eq. 3 and 4)."""
     a = patches[x]
     b = patches[y]
     if not _near(rule, a.colour, b.colour):
@@ -215,8 +217,7 @@ def _spans(
     low: wp.array1d[float],
     high: wp.array1d[float],
 ):
-    """Writes the lowest and highest mean colour, summed over the channels, of one patch per thread, over its own
-    lattice and all larger ones."""
+    """Writes a patch's least and greatest mean colour (sum of the channels) on its own lattice and all larger ones."""
     i = wp.tid()
     least = float(wp.inf)
     most = float(-wp.inf)
@@ -240,7 +241,6 @@ def _take(
     taken: wp.array1d[Patch],
     taken_bounds: wp.array2d[Bounds],
 ):
-    """Copies one patch and its bounds per thread."""
     i = wp.tid()
     taken[i] = patches[index[i]]
     for level in range(bounds.shape[1]):
@@ -260,7 +260,7 @@ def _edges(
     # out:
     edge: wp.array2d[wp.uint8],
 ):
-    """Finds the edges of one patch per thread; each pair is tested once, by the thread of its first patch."""
+    """Finds the edges between one patch per thread and all later patches, so that each pair is tested once."""
     a = offset + wp.tid()
     last = high[a] + rule.level + _MARGIN
     for b in range(a + 1, low.shape[0]):
@@ -289,7 +289,7 @@ def _join(
     # out:
     joined: wp.array1d[int],
 ):
-    """Finds for one node per thread the first head that it is like."""
+    """Finds for one node per thread the group that it joins; see `join`."""
     i = offset + wp.tid()
     a = nodes[i]
     margin = rule.level + _MARGIN
@@ -304,8 +304,9 @@ def _join(
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
-    """Makes the thresholds on a device from lambda (eq. 4; Dist must be less) and lambda_h (section 3.2.1, the largest
-    distance of two dominant colours), taken as the exact decimal fractions that they print as."""
+    """Makes the `Rule` on a device. Patches are alike if Dist is less than `threshold`, lambda (eq. 4), and their
+    dominant colours are at most `colour_threshold`, lambda_h, apart (section 3.2.1). The two are taken as decimal
+    fractions: 0.1 is exactly 1/10."""
     total = Fraction(str(threshold)) * 765  # three channels of 255 levels
     out = Rule()
     out.colour = math.floor((Fraction(str(colour_threshold)) * BINS) ** 2)
@@ -327,12 +328,14 @@ def bounds(samples, patches, levels: int):
 
 @dataclass(frozen=True)
 class Graph:
-    """The similarity graph (eq. 5). Its edges are computed from the patches when they are needed.
+    """The similarity graph of M patches (eq. 5), sorted by `low`. Its edges are computed when they are needed.
 
     Attributes:
-        samples, patches, bounds, rule: The samples of all patches; for M nodes, sorted by `low`.
-        low, high: float [M], least and largest mean level on any lattice; the means of two patches that are alike on
-            any lattice differ by less than lambda.
+        samples: The samples of all patches.
+        patches, bounds: The M patches, which are the graph's nodes, and their `Bounds`.
+        rule: Thresholds below which two patches are alike.
+        low, high: float [M], a patch's least and greatest mean colour on any lattice, in levels. If two patches are
+            alike, their means on the larger one's lattice differ by less than `rule.level`.
         means: float32 [M], copy of `low` in the CPU's memory.
         reach: The largest difference of `high` and `low` in any patch.
     """
@@ -351,7 +354,7 @@ class Graph:
 
 
 def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
-    """Makes the graph of some patches. Also returns the index among the patches of each of the M nodes, int64 [M]."""
+    """Makes the graph of M patches. Also returns the index in `patches` of each of its nodes, int64 [M]."""
     count, device = patches.shape[0], samples.device
     low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
     wp.launch(_spans, count, inputs=[patches, bounds], outputs=[low, high], device=device)
@@ -363,7 +366,7 @@ def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
 
 
 def part(whole: Graph, nodes: np.ndarray) -> Graph:
-    """Makes the subgraph of N nodes, int [N], ascending."""
+    """Makes the subgraph of N nodes, whose numbers `nodes`, int [N], must ascend."""
     spans = [wp.array(values.numpy()[nodes], dtype=float, device=values.device) for values in (whole.low, whole.high)]
     taken = _taken(whole.patches, whole.bounds, nodes)
     return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.reach)
@@ -379,15 +382,15 @@ def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
 
 
 def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
-    """Finds the edges between the patches `begin` to `end` - 1 and all later ones: writes 1 at both places of a pair in
-    `edge`, uint8 [M, M], which must be 0 before."""
+    """Finds the edges between the nodes `begin` to `end` - 1 and all later ones. For an edge between a and b it writes
+    1 to `edge`, uint8 [M, M], at (a, b) and at (b, a); all of `edge` must be 0 before."""
     inputs = [*graph._inputs(), graph.low, graph.high, begin]
     wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge], device=edge.device)
 
 
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
-    """Writes for the nodes at `begin` to `end` - 1 of int [N] the rank of the first head that each is like, or H for
-    none. `heads`, int [H], are ascending nodes, `head_low` the `low` of each, and `rank` the order in which heads are
-    compared."""
+    """Finds for each of the nodes `nodes[begin:end]` the first of H groups whose representative it is like, and writes
+    the group's rank to `joined`, int [N], or H if there is none. `heads`, int [H], are the representatives in ascending
+    order; `head_low` is the `low` of each, and `rank` its place in the order in which groups are tried."""
     inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
     wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)

@@ -1,23 +1,24 @@
 """Feature patches of triangles and their similarity (lightmap-uv-clustering-cascade, section 3.1, eq. 1 to 4).
 
-A patch of size n stores a triangle's colours on a triangular lattice: sample (i, j, k), i + j + k = n - 1, lies at
-the barycentrics (i, j, k) / (n - 1), and is stored at `j n - j (j - 1) / 2 + i`. On this lattice another order of the
-vertices is another order of (i, j, k), so one stored patch serves all six. Order o is the permutation p =
-`ORDERS[o]`: vertex k of a triangle goes to vertex p[k] of the other.
+A patch of size n stores a triangle's colours on a triangular lattice: sample (i, j, k), i + j + k = n - 1, lies at the
+barycentrics (i, j, k) / (n - 1), and is stored at `j n - j (j - 1) / 2 + i`. Another order of the vertices only
+permutes (i, j, k), so one stored patch serves all six orders. Order o is the permutation p = `ORDERS[o]`: vertex k of
+one triangle goes to vertex p[k] of the other.
 
-Sizes are 2, 3, 5, 9 and so on (`SIZES`), so that every lattice lies in all larger ones. A patch of one colour has
-the smallest size, whatever the triangle's, since interpolating it gives that colour everywhere.
+Sizes are 2, 3, 5, 9 and so on (`SIZES`), so that every lattice lies in all larger ones. A patch of one colour has the
+smallest size, whatever the size of the triangle, since interpolating it gives that colour everywhere.
 
 Colours have 8 bits per channel, packed as r + 256 g + 65536 b. Every decision is made in integers, so that no result
 depends on the device:
 
 - The lightmap has 16 bits per channel, vertices are in 1/65536 of a texel, and a sample's place is rounded to 1/256 of
   a texel, as texture filters of GPUs do.
-- Dist (eq. 2) is summed exactly. If two patches differ in size the smaller is interpolated linearly in the
-  triangles of its lattice, in multiples of 1 / (n - 1) of a level. That favours no vertex; with square cells the
-  result would change with the order.
+- Dist (eq. 2) is summed exactly. If two patches differ in size, the smaller one is interpolated linearly in the
+  triangles of its lattice, in multiples of 1 / (n - 1) of an 8-bit level. Triangles favour no vertex; in square cells
+  the result would depend on the order of the vertices.
 
-The paper does not define |.| of a colour: here it is the mean of the three channels', so that Dist is in [0, 1].
+The paper does not define |.| of a colour. Here it is the mean of |.| over the three channels, as fractions of 255, so
+that Dist is in [0, 1].
 
 `tests/reference/patches.py` computes the same per triangle in float64 NumPy and is easier to read.
 """
@@ -28,13 +29,13 @@ import numpy as np
 import warp as wp
 
 ORDERS = tuple(itertools.permutations(range(3)))
-"""Permutation p of each order; order 0 is the identity."""
+"""The six orders of a triangle's vertices, as permutations p; order 0 is the identity."""
 
 SIZES = (2, 3, 5, 9, 17, 33, 65, 129)
-"""Sizes of patches; sums over a larger one would need more than 32 bits."""
+"""Sizes of patches in samples along a side; sums over a larger patch would need more than 32 bits."""
 
 BINS = 32
-"""Bins of the histogram per channel (section 3.2.1)."""
+"""Number of bins of the colour histogram per channel (section 3.2.1)."""
 
 _LEVELS = wp.constant(255)
 _BIN_SHIFT = wp.constant(3)  # 256 levels in 32 bins
@@ -47,14 +48,13 @@ _HALF_BYTE = wp.constant(wp.int64(65536 * 257 // 2))
 
 @wp.struct
 class Patch:
-    """A patch without its samples.
+    """A patch, which stores the colours of a triangle, without its samples.
 
     Attributes:
         start: Index of the patch's first sample in the array of all samples.
         level: Index of the patch's size n in `SIZES`: n = 2 ** level + 1.
-        low: Lowest value of each channel, packed as a colour.
-        high: Highest value of each channel, packed as a colour.
-        colour: Bin of the dominant colour in the histogram, packed as a colour.
+        low, high: Lowest and highest value of each channel, packed as a colour.
+        colour: Histogram bin of the dominant colour, one number per channel, packed as a colour.
     """
 
     start: int
@@ -86,7 +86,7 @@ def channel(colour: int, c: int) -> int:
 
 @wp.func
 def _place(i: int, j: int, k: int, a: wp.int64, b: wp.int64, c: wp.int64, side: int) -> int:
-    """Returns a sample's position along an axis of `side` texels, in 1/256 texel, clamped to the outermost centres."""
+    """Returns a sample's position along an axis of `side` texels in 1/256 texel, clamped to the outer texel centres."""
     steps = wp.int64(i + j + k)
     last = wp.int64(side - 1) * wp.int64(65536) * steps
     at = wp.clamp(wp.int64(i) * a + wp.int64(j) * b + wp.int64(k) * c, wp.int64(0), last)
@@ -105,7 +105,6 @@ def _sample(
     patches: wp.array1d[Patch],
     bright: wp.array1d[wp.uint8],
 ):
-    """Samples the colours of one triangle per thread."""
     t = wp.tid()
     n = size_of(level[t])
     rows = lightmap.shape[0]
@@ -165,7 +164,7 @@ def _dominant(
     # out:
     patches: wp.array1d[Patch],
 ):
-    """Finds the dominant colour of one patch per thread, by a pass over its samples for each bin, in rising order."""
+    """Finds the dominant colour of one patch per thread: counts the samples in each histogram bin, in rising order."""
     t = wp.tid()
     p = patches[t]
     size = size_of(p.level)
@@ -201,8 +200,7 @@ def _difference(a: int, b: int) -> int:
 
 @wp.func
 def turned(w: wp.vec3i, order: int) -> wp.vec3i:
-    """Returns the vector w in another order, (w[p[0]], w[p[1]], w[p[2]]), where p is the permutation
-    `ORDERS[order]`."""
+    """Permutes a vector: returns (w[p[0]], w[p[1]], w[p[2]]), where p is the permutation `ORDERS[order]`."""
     if order == 0:
         return w
     if order == 1:
@@ -218,8 +216,7 @@ def turned(w: wp.vec3i, order: int) -> wp.vec3i:
 
 @wp.func
 def _inverse(order: int) -> int:
-    """Returns the index of the inverse permutation of an order; only the two rotations, 3 and 4, are not their own
-    inverse."""
+    """Returns the order with the inverse permutation: another one only for the two rotations, orders 3 and 4."""
     if order == 3:
         return 4
     if order == 4:
@@ -229,8 +226,8 @@ def _inverse(order: int) -> int:
 
 @wp.func
 def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -> wp.vec3i:
-    """Returns `2 ** level` times a patch's interpolated colour at (i, j) of the lattice of `level`, at least the
-    patch's own."""
+    """Returns the colour of a patch at (i, j) of the lattice of size 2 ** level + 1, times 2 ** level, which makes it
+    whole. The patch's own lattice must not be larger; if it is smaller, the colour is interpolated."""
     # One step of the small lattice is 2 ** shift steps of the other.
     shift = level - small.level
     size = size_of(small.level)
@@ -266,8 +263,9 @@ def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -
 
 @wp.func
 def distance_sum(samples: wp.array1d[int], large: Patch, small: Patch, order: int, limit: int) -> int:
-    """Sums the colour differences of two patches, with vertex k of the small patch on vertex p[k] of the large patch, p
-    = `ORDERS[order]`; stops once the sum exceeds `limit`."""
+    """Sums the absolute colour differences of two patches over the samples of the large one, with vertex k of the small
+    patch on vertex p[k] of the large one, p = `ORDERS[order]`; in levels, or for two sizes in 1 / (n - 1) of a level,
+    where n is the larger size. Stops early once the sum reaches `limit`."""
     steps = 1 << large.level
     size = steps + 1
     at = large.start
@@ -300,7 +298,6 @@ def _compare(
     order: wp.array1d[wp.int8],
     distance: wp.array1d[wp.float64],
 ):
-    """Compares one pair of patches per thread."""
     t = wp.tid()
     a = patches[representative[t]]
     b = patches[member[t]]
@@ -328,24 +325,24 @@ def _compare(
 
 
 def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) -> tuple:
-    """Samples the colours of triangles as patches (section 3.1).
+    """Samples the colours of F triangles as patches (section 3.1).
 
     Args:
-        lightmap: uint16 [H, W, 4]: red, green, blue, and 1 where the texel is too bright, else 0.
+        lightmap: uint16 [H, W, 4]: red, green, blue, and 1 where the texel exceeds their range (is too bright), else 0.
         corner: int64 [F, 3, 2], (x, y) of the vertices in 1/65536 of a texel from the centre of texel (0, 0).
-        level: int32 [F], index of each patch's size in `SIZES`.
-        device: Where the arrays go.
+        level: int32 [F], index in `SIZES` of the size of each triangle's patch.
+        device: Device of the results.
 
     Returns:
         The samples of all patches, int; the patches, Patch [F], still without dominant colours; and uint8 [F], 1 for
         patches that read a texel that is too bright.
 
     Raises:
-        ValueError: There are more samples than 32 bits can count.
+        ValueError: The patches have more samples than a signed 32-bit integer can count.
     """
     start = np.concatenate([[0], np.cumsum(samples_of(np.array(SIZES, np.int64))[level])])
     if start[-1] > np.iinfo(np.int32).max:
-        raise ValueError(f"level: {start[-1]} samples, expected at most {np.iinfo(np.int32).max}")
+        raise ValueError(f"level: expected patches of at most {np.iinfo(np.int32).max} samples in all, got {start[-1]}")
     samples = wp.empty(int(start[-1]), dtype=int, device=device)
     patches = wp.empty(len(level), dtype=Patch, device=device)
     bright = wp.empty(len(level), dtype=wp.uint8, device=device)
@@ -360,15 +357,15 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
 
 
 def dominant(samples, patches) -> None:
-    """Writes the dominant colour of each patch of `sample`: the most frequent of 32 x 32 x 32 histogram bins; on a tie
-    the lowest bin (section 3.2.1)."""
+    """Sets the dominant colour of each patch of `sample`: the most frequent of 32 x 32 x 32 histogram bins
+    (section 3.2.1). Of equally frequent bins it is the lowest."""
     wp.launch(_dominant, patches.shape, inputs=[samples], outputs=[patches], device=samples.device)
 
 
 def compare(samples, patches, member, representative) -> tuple[np.ndarray, np.ndarray]:
-    """Finds for each of N pairs of patches the order of vertices with the least distance Dist, on a tie the first, and
-    that distance (eq. 2 and 3). Returns the orders o, int8 [N], such that vertex k of the member maps to vertex
-    `ORDERS[o][k]` of the representative; and the distances, float64 [N], in [0, 1]."""
+    """Finds for each of N pairs of patches, `member` and `representative`, int [N], the order of vertices with the
+    least distance Dist (eq. 2 and 3), the first if several are equal. Returns the orders o, int8 [N], such that vertex
+    k of the member maps to vertex `ORDERS[o][k]` of the representative; and the distances, float64 [N], in [0, 1]."""
     device, count = samples.device, member.shape[0]
     order = wp.empty(count, dtype=wp.int8, device=device)
     distance = wp.empty(count, dtype=wp.float64, device=device)

@@ -1,16 +1,17 @@
 """Solves for the samples of tiles by weighted least squares, with one thread per tile or per channel of a tile.
 
-A tile of m x m points is interpolated from nx x ny samples. The normal equations couple a sample only with its eight
-neighbours, so they are computed from the points once, and conjugate gradients then iterate over samples.
+The light at m x m points of a tile is interpolated bilinearly from nx x ny samples. The normal equations couple a
+sample only with its eight neighbours, so they are computed from the points once, and conjugate gradients then iterate
+over samples.
 
-Arrays may have any strides; on CUDA the stride along the tiles should be 1.
+Arrays may have any strides; on CUDA the stride along the tiles should be 1, which is fastest.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
-MOST = 16  # samples along an axis
+MOST = 16  # largest number of samples along an axis
 _BLOCK = 64  # threads: small blocks let few tiles occupy a whole GPU
 
 _Row = wp.types.vector(length=MOST, dtype=float)
@@ -22,10 +23,10 @@ class Grid:
     """The grids of samples and points of a tile.
 
     Attributes:
-        points: m, points along an axis.
-        nx, ny: Samples along x and y, at most `MOST`.
-        first_x, first_y: [m], the sample before each point; 0 if there is only one sample.
-        share_x, share_y: [m], each point's weight of the next sample; 0 if there is only one sample.
+        points: m, number of points along an axis.
+        nx, ny: Number of samples along x and y, at most `MOST`.
+        first_x, first_y: int [m], index of the sample before each point along the axis; 0 if there is only one sample.
+        share_x, share_y: float [m], weight of the next sample at each point; 0 if there is only one sample.
     """
 
     points: int
@@ -39,15 +40,14 @@ class Grid:
 
 @wp.struct
 class System:
-    """The normal equations of T tiles; samples, S = nx * ny, are stored row by row.
+    """The normal equations of T tiles; the S = nx * ny samples of a tile are stored row by row.
 
     Attributes:
         own: [T, S], coefficient of a sample with itself.
         right, down: [T, S], coefficients with the next sample along x and y; 0 for the last sample.
-        cross: [T, S], coefficient with the sample to the lower right, equal to the one between the right and the lower
-            sample.
-        diagonal: [T, S], sum of the sample's row of the matrix: the points' weights times the sample's interpolation
-            weights.
+        cross: [T, S], coefficient with the sample to the lower right. The right and the lower neighbour have the same
+            coefficient with each other.
+        diagonal: [T, S], sum of a sample's coefficients with itself and all neighbours: the preconditioner.
     """
 
     own: wp.array2d[float]
@@ -245,13 +245,13 @@ def _errors(
 
 
 def gather_system(weight: wp.array, scale: wp.array, grid: Grid, system: System) -> None:
-    """Writes the normal equations to `system`, from the weights of the points' squared errors, float [T, m * m], times
-    a factor for each tile, float [T]."""
+    """Writes the normal equations of T tiles to `system`. The squared error at a point has the weight `weight`, float
+    [T, m * m], times its tile's factor `scale`, float [T]."""
     wp.launch(_system, weight.shape[0], inputs=[weight, scale, grid, system], device=weight.device, block_dim=_BLOCK)
 
 
 def gather(light: wp.array, grid: Grid, out: wp.array) -> None:
-    """Applies the transpose of interpolation: writes samples [T, 3, S] from light at points [T, 3, m * m]."""
+    """Applies the transpose of interpolation: from `light` at points, [T, 3, m * m], to samples `out`, [T, 3, S]."""
     wp.launch(_gather, light.shape[:2], inputs=[light, grid, out], device=light.device, block_dim=_BLOCK)
 
 
@@ -267,13 +267,23 @@ def solve(
     work: list[wp.array],
     out: wp.array,
 ) -> None:
-    """Solves the equations by conjugate gradients that begin at `start`, float [T, 3, S], with ridge regularisation
-    towards `start`. `work` has three arrays of the same shape."""
+    """Solves the normal equations of T tiles by conjugate gradients.
+
+    Args:
+        light: float [T, 3, m * m], the light that the samples should reproduce at the points.
+        weight, scale, grid, system: As for `gather_system`, which has written `system`.
+        ridge: Weight of the squared difference of a sample from `start`.
+        rounds: Number of iterations.
+        start: float [T, 3, S], the samples at which the iterations begin.
+        work: Three arrays of the shape of `start`, scratch memory.
+        out: float [T, 3, S], written: the samples.
+    """
     inputs = [light, weight, scale, grid, system, ridge, rounds, start, *work, out]
     wp.launch(_solve, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)
 
 
 def errors(light: wp.array, weight: wp.array, grid: Grid, samples: wp.array, out: wp.array) -> None:
-    """Writes the weighted squared errors of samples [T, 3, S] to `out`, float64 [T, 3]."""
+    """Writes the weighted squared errors of samples, float [T, 3, S], summed over each tile's points, to `out`, float64
+    [T, 3]; `light` and `weight` are as for `solve`."""
     inputs = [light, weight, grid, samples, out]
     wp.launch(_errors, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)

@@ -4,8 +4,8 @@
 Read `tests/reference/advection.py` first: it is the same step in float64 NumPy, cell by cell.
 
 - Semi-Lagrangian: rho'(x) = rho(x_d), trilinear, at the departure point x_d = x - dt u(x - dt u(x) / 2), the midpoint
-  rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. A midpoint within `REACH` of
-  the eight velocities around x is extrapolated from them.
+  rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. The velocity at a midpoint at
+  most `REACH` coarse cells outside the eight velocities around x is extrapolated from them.
 - MacCormack (Selle et al. 2008): with A a semi-Lagrangian step and A* the step back in time, rho' = A rho + (rho - A* A
   rho) / 2, clamped to the eight values that A interpolates. Second order where the field is smooth.
 
@@ -19,11 +19,11 @@ Special cases:
 a trace that leaves the domain   through an open face: 0, clean air; at a closed face: clamped to it
 a trace that ends in a solid     cut where it enters the solid, by bisection to 1/64 of its length
 a read beside a solid            solid cells are excluded, the other weights are scaled up
-a cell in a solid                0
-MacCormack with an end beside a  semi-Lagrangian there
-solid or beyond an open face
-a velocity that is not a number  reads some cell of the grid, never outside it
-more than half floats can hold   65504
+a cell in a solid                no smoke
+a MacCormack trace that ends     its cell takes a semi-Lagrangian step
+beside a solid or past a face
+a velocity that is not a number  the trace reads some cell of the grid, never memory outside it
+more than half floats can hold   clamped to 65504
 ===============================  =====================================================================
 
 A trace shorter than a coarse cell cannot jump over a wall. There are no gradients.
@@ -90,14 +90,13 @@ def fields_struct(stored: type) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """Advected fields: flat arrays [cells], both float or both half; the temperature may be empty, [0]."""
+    """The smoke: flat arrays [cells] of one type, float or half; [0] for the temperature of smoke that has none."""
 
     density: wp.array
     temperature: wp.array
 
     @functools.cached_property
     def arrays(self) -> Any:
-        """Packs the fields for kernels."""
         struct = fields_struct(self.density.dtype)()
         struct.density, struct.temperature = self.density, self.temperature
         return struct
@@ -105,16 +104,11 @@ class Fields:
 
 @functools.cache
 def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, hot: bool) -> wp.Kernel:
-    """Builds (once) a kernel that advects runs of `RUN` cells along x; with bricks, over workers x runs of a brick.
+    """Builds (once) a kernel that advects smoke; a thread computes a run: neighbouring cells along x.
 
-    Without solids the code is half as long, and without temperatures it uses fewer registers.
-
-    Args:
-        correcting: Whether it is the second half of a MacCormack step; else it is a semi-Lagrangian step.
-        stored: `wp.float32` or `wp.float16`.
-        in_bricks: Whether only listed bricks are computed.
-        solids: Whether there are solid cells.
-        hot: Whether there is a temperature.
+    With `correcting` the kernel does the second half of a MacCormack step, else a semi-Lagrangian step. Values are of
+    the type `stored`, `wp.float32` or `wp.float16`. With `in_bricks` only listed bricks are computed. Without `solids`
+    (solid cells) the code is half as long; without temperatures (`hot`) it uses fewer registers.
     """
     run = BRICK_RUN if in_bricks else RUN
     fields_type = fields_struct(stored)
@@ -138,7 +132,6 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def interpolate(field: wp.array1d[stored], at: FlatStencil) -> float:
-        """Interpolates a field trilinearly at a point."""
         i00 = at.base
         i01 = at.base + at.step[1]
         i10 = at.base + at.step[0]
@@ -151,7 +144,6 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def interpolate_beside(field: wp.array1d[stored], walls: wp.array1d[wp.uint8], box: Box, p: wp.vec3) -> float:
-        """Interpolates beside a solid: solid cells are excluded, and the other weights are scaled up."""
         at = stencil(box.n, box.periodic, p)
         total = float(0.0)
         weight = float(0.0)
@@ -166,7 +158,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def limited(field: wp.array1d[stored], at: FlatStencil, value: float) -> float:
-        """Clamps a value to the range of the values that `interpolate` reads."""
+        """Clamps a value to the range of the eight stored values around a point."""
         i00 = at.base
         i01 = at.base + at.step[1]
         i10 = at.base + at.step[0]
@@ -191,8 +183,8 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         dt: float,
         wall: wp.uint8,
     ):
-        """Returns the end of a trace from x within the domain, whether it left through an open face, and whether the
-        end is beside a solid; `wall` is the mark of the cell in which it starts."""
+        """Traces a point x back in time. Returns the end of the trace within the domain, whether the trace left the
+        domain through an open face, and whether its end is beside a solid; `wall` is the mark of the cell of x."""
         end = trace_back(box, u, around, f, x, v, dt)
         p = wp.vec3(end)
         left = bool(False)
@@ -216,7 +208,6 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def first_of_run(box: Box, bricks: Bricks, i: int, k: int) -> wp.vec3i:
-        """Returns the first cell of the i-th run of the whole domain, or of the k-th listed brick."""
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])
@@ -237,7 +228,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         decay: wp.vec2,
         out: fields_type,
     ) -> float:
-        """Computes a run of cells and returns the largest value among them."""
+        """Advects up to `run` cells along x and returns their largest density or temperature."""
         most = float(0.0)
         around = TrilinearVelocity()
         around_x = float(-2.0)
@@ -360,13 +351,14 @@ def advect(
 
     Args:
         box: The domain, see `advection_places.make_box`.
-        velocity: vec3 [coarse cells], cells per step.
+        velocity: Velocity of the air, vec3 [coarse cells], coarse cells per lattice step.
         walls: uint8 [coarse cells] from `advection_places.mark_walls`, or [0] without solids.
-        fields: The fields.
-        out: Other arrays of the same shapes and types, written.
-        dt: Number of steps.
-        decay: Factors of density and temperature, at most 1; (1, 1) in the first half of a MacCormack step.
-        bricks: The bricks to compute, listed by `relist`.
+        fields: The smoke before the step.
+        out: The smoke after the step, in other arrays of the same shapes and types.
+        dt: Duration in lattice steps.
+        decay: Factors by which density and temperature are multiplied, at most 1; (1, 1) in the first half of a
+            MacCormack step.
+        bricks: The bricks to compute, listed by `advection_places.relist`; default all cells.
     """
     _launch(box, velocity, walls, fields, None, out, dt, decay, bricks)
 
@@ -382,5 +374,8 @@ def correct(
     decay: tuple[float, float] = (1.0, 1.0),
     bricks: Bricks = DENSE,
 ) -> None:
-    """Does the second half of a MacCormack step; `predicted` is the result of `advect`, `out` a third set of arrays."""
+    """Does the second half of a MacCormack step; for the other arguments see `advect`.
+
+    `predicted` is the result of `advect` for the smoke `fields`; the result is written to a third set of arrays, `out`.
+    """
     _launch(box, velocity, walls, fields, predicted, out, dt, decay, bricks)

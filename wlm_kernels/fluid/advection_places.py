@@ -1,13 +1,13 @@
-"""Geometry of advection: the grids, solids and faces through which `advection` traces, and bricks of 8^3 cells.
+"""Geometry of the advection of smoke: grids, solids, faces of the domain, and bricks of 8^3 cells.
 
 Read `tests/reference/advection.py` first: `Domain` there has the same grids, faces and solids in NumPy.
 
 The fine grid (smoke) has `refinement` cells along each edge of a cell of the coarse grid (air). Solids are whole
 coarse cells. Each axis is periodic, or each of its two ends is open (clean air comes in) or closed.
 
-A brick is busy if a value in it exceeds the threshold, and is listed if a brick within `rings` of it is busy. Bricks
-that are not listed are 0 in every buffer. The error relative to a dense step is at most the threshold per cell and
-step, in bricks without a busy brick around them; with a threshold of 0 there is no error.
+A brick is busy if a value in it exceeds the threshold, and is listed, that is computed in the next step, if it or a
+brick at most `rings` bricks away is busy. All other bricks are 0 in every buffer. Relative to a step that computes all
+cells, the error per cell and step is at most the threshold, outside the listed bricks; at a threshold of 0 it is 0.
 """
 
 from collections.abc import Sequence
@@ -42,15 +42,15 @@ _WORKERS = 8192
 
 @wp.struct
 class Box:
-    """A domain.
+    """The domain of the smoke: sizes of its two grids, and the kinds of its faces.
 
     Attributes:
         n: Fine cells along x, y and z.
         coarse: Coarse cells along x, y and z.
-        refinement: Fine cells along an edge of a coarse one.
+        refinement: Fine cells along an edge of a coarse cell.
         voxel: Edge of a fine cell in coarse cells, 1 / refinement.
-        periodic: 1 for each periodic axis.
-        below, above: Kinds of the low and the high end of each axis.
+        periodic: 1 for each periodic axis, else 0.
+        below, above: Kind of the low and of the high end of each axis: `PERIODIC`, `OPEN` or `CLOSED`.
         bricks: Bricks along x, y and z.
     """
 
@@ -66,16 +66,17 @@ class Box:
 
 @wp.struct
 class Bricks:
-    """The bricks of a domain, on a device.
+    """Lists of the B bricks of a domain, on a device.
 
     Attributes:
         rings: Distance in bricks by which smoke may move beyond a busy brick in a step.
-        workers: Groups of threads that share the list; 0 without bricks.
-        threshold: Largest value in a brick that counts as empty.
-        busy: int [B], 1 where a value above the threshold was written since the last list.
-        active: int [B], 1 where listed.
-        listed: int [B], numbers of the active bricks in any order; their count is `count` int [1].
-        retired: int [B], bricks that were active in the previous list; their count is `retired_count` int [1].
+        workers: Groups of threads that share the listed bricks; 0: there are no bricks, all cells are computed.
+        threshold: Largest value of a brick that counts as empty.
+        busy: int [B], 1 where a value above the threshold has been written since the last `relist`.
+        active: int [B], 1 for each listed brick, else 0.
+        listed: int [B], its first `count` (int [1]) elements are the indices of the listed bricks, in any order.
+        retired: int [B], its first `retired_count` (int [1]) elements are the bricks that the last `relist` removed
+            from the list.
     """
 
     rings: int
@@ -114,7 +115,7 @@ class FlatStencil:
 
 @wp.struct
 class TrilinearVelocity:
-    """Coefficients of the trilinear polynomial through the velocities of a stencil, in the stencil's fractions."""
+    """Coefficients of the trilinear polynomial through eight velocities, in the fractions 0 to 1 between them."""
 
     c: wp.vec3
     x: wp.vec3
@@ -128,7 +129,7 @@ class TrilinearVelocity:
 
 @wp.func
 def _neighbour(i: int, n: int, periodic: int) -> int:
-    """Returns a cell within the grid for any i, even one that was converted from NaN."""
+    """Wraps or clamps an index to 0 to n - 1; the result is within the grid even for an index converted from NaN."""
     if periodic != 0:
         if i < 0:
             i = i + n
@@ -157,7 +158,6 @@ def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
 
 @wp.func
 def stencil_index(at: Stencil, k: int) -> wp.vec3i:
-    """Returns the index of the k-th of a stencil's eight cells."""
     return wp.vec3i(
         wp.where(k // 4 == 0, at.low[0], at.high[0]),
         wp.where(k // 2 % 2 == 0, at.low[1], at.high[1]),
@@ -167,7 +167,6 @@ def stencil_index(at: Stencil, k: int) -> wp.vec3i:
 
 @wp.func
 def stencil_weight(at: Stencil, k: int) -> float:
-    """Returns the trilinear weight of the k-th of a stencil's eight cells."""
     x = wp.where(k // 4 == 0, 1.0 - at.f[0], at.f[0])
     y = wp.where(k // 2 % 2 == 0, 1.0 - at.f[1], at.f[1])
     z = wp.where(k % 2 == 0, 1.0 - at.f[2], at.f[2])
@@ -176,7 +175,7 @@ def stencil_weight(at: Stencil, k: int) -> float:
 
 @wp.func
 def _pair(i: int, n: int, periodic: int):
-    """Returns the lower of the cells i and i + 1 along an axis, and the step from it to the upper."""
+    """Wraps or clamps the cells i and i + 1 of an axis; returns the first, and the second minus the first."""
     low = i
     step = int(1)
     # Cells away from the ends of the axis need no wrapping.
@@ -207,7 +206,7 @@ def _velocity(u: wp.array1d[wp.vec3], i: int) -> wp.vec3: ...
 
 @wp.func
 def fetch(u: wp.array1d[wp.vec3], n: wp.vec3i, at: Stencil) -> TrilinearVelocity:
-    """Reads the velocities of a stencil."""
+    """Reads the velocities of eight coarse cells and returns the polynomial that interpolates them."""
     row00 = (at.low[0] * n[1] + at.low[1]) * n[2]
     row01 = (at.low[0] * n[1] + at.high[1]) * n[2]
     row10 = (at.high[0] * n[1] + at.low[1]) * n[2]
@@ -248,7 +247,7 @@ def _wrap_or_clamp(x: float, n: int, periodic: int) -> float:
 
 @wp.func
 def into_domain(box: Box, x: wp.vec3) -> wp.vec3:
-    """Wraps a point along periodic axes and clamps it to the faces of the others."""
+    """Wraps a point along periodic axes, and clamps it to the domain's faces along the other axes."""
     return wp.vec3(
         _wrap_or_clamp(x[0], box.n[0], box.periodic[0]),
         _wrap_or_clamp(x[1], box.n[1], box.periodic[1]),
@@ -275,7 +274,7 @@ def beyond_open_face(box: Box, x: wp.vec3) -> bool:
 
 @wp.func
 def wall_at(box: Box, walls: wp.array1d[wp.uint8], p: wp.vec3) -> wp.uint8:
-    """Returns the mark of the coarse cell that contains a point of the domain."""
+    """Returns the mark of `mark_walls` (free, beside a solid, or solid) of the coarse cell that contains a point."""
     x = wp.clamp(int(p[0] * box.voxel), 0, box.coarse[0] - 1)
     y = wp.clamp(int(p[1] * box.voxel), 0, box.coarse[1] - 1)
     z = wp.clamp(int(p[2] * box.voxel), 0, box.coarse[2] - 1)
@@ -297,7 +296,10 @@ def is_solid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
 def trace_back(
     box: Box, u: wp.array1d[wp.vec3], around: TrilinearVelocity, f: wp.vec3, x: wp.vec3, v: wp.vec3, dt: float
 ) -> wp.vec3:
-    """Computes the departure point x - dt u(x - dt v / 2); `v` is the velocity at x, at fractions f in `around`."""
+    """Computes the departure point x - dt u(x - dt v / 2) in fine cells.
+
+    `around` has the velocities around x, f the fractions of x between them, and v = u(x) in coarse cells per step.
+    """
     fine = dt * float(box.refinement)
     half = f - 0.5 * dt * v
     least = wp.min(half[0], wp.min(half[1], half[2]))
@@ -313,7 +315,7 @@ def trace_back(
 
 @wp.func
 def clip_at_solid(box: Box, walls: wp.array1d[wp.uint8], x: wp.vec3, end: wp.vec3) -> wp.vec3:
-    """Finds the last point in the fluid, to 1/64 of the length, of a trace from x to an end in a solid."""
+    """Finds where the line from x to an end in a solid enters the solid, by bisection to 1/64 of the line's length."""
     free = wp.vec3(x)
     solid = wp.vec3(end)
     for _k in range(_HALVINGS):
@@ -330,19 +332,19 @@ def make_box(coarse: Sequence[int], refinement: int, ends: Sequence[tuple[int, i
 
     Args:
         coarse: Coarse cells along x, y and z.
-        refinement: Fine cells along an edge of a coarse one, at least 1.
+        refinement: Fine cells along an edge of a coarse cell, at least 1.
         ends: For each axis the kind of its low and its high end: `PERIODIC`, `OPEN` or `CLOSED`.
 
     Raises:
-        ValueError: The refinement is below 1, only one end of an axis is periodic, or there are 2^31 fine cells.
+        ValueError: The refinement is below 1, only one end of an axis is periodic, or there are too many fine cells.
     """
     if refinement < 1:
         raise ValueError(f"refinement: expected at least 1, got {refinement}")
     if any((low == PERIODIC) != (high == PERIODIC) for low, high in ends):
-        raise ValueError(f"ends: expected both ends of an axis periodic or neither, got {ends}")
+        raise ValueError(f"ends: expected both ends of an axis to be periodic (0), or neither, got {ends}")
     fine = [size * refinement for size in coarse]
     if fine[0] * fine[1] * fine[2] >= 2**31:
-        raise ValueError(f"coarse: expected fewer than 2^31 fine cells, got {fine}")
+        raise ValueError(f"coarse: expected fewer than 2^31 fine cells (coarse cells times refinement), got {fine}")
     box = Box()
     box.n, box.coarse, box.refinement, box.voxel = wp.vec3i(*fine), wp.vec3i(*coarse), refinement, 1.0 / refinement
     box.periodic = wp.vec3i(*(int(low == PERIODIC) for low, _ in ends))
@@ -375,23 +377,24 @@ def _mark(
 
 
 def mark_walls(box: Box, solid: wp.array, walls: wp.array) -> None:
-    """Marks each coarse cell as solid, beside a solid, or free.
+    """Marks each coarse cell as free (0), beside a solid (1), or solid (2).
 
     Args:
         box: The domain.
         solid: uint8 [coarse cells], above 0 where a cell is solid.
-        walls: uint8 [coarse cells], written.
+        walls: uint8 [coarse cells], the marks, written.
     """
     wp.launch(_mark, solid.shape[0], inputs=[box, solid], outputs=[walls], device=solid.device)
 
 
 def rings_for(cells: float) -> int:
-    """Returns how many rings of bricks a trace of a length in fine cells can reach, with one more cell for a read."""
+    """Returns the distance in bricks that smoke can cover while it moves by `cells` fine cells, including the cell
+    beyond that interpolation reads."""
     return -(-(int(cells) + 2) // BRICK)
 
 
 def make_bricks(box: Box, rings: int, threshold: float, device: str) -> Bricks:
-    """Makes the bricks of a domain, all busy and none listed; for the other arguments see `Bricks`."""
+    """Makes the bricks of a domain, all busy and none listed; for `rings` and `threshold` see `Bricks`."""
     total = box.bricks[0] * box.bricks[1] * box.bricks[2]
     bricks = Bricks()
     # The brick across a periodic face may be cut short, so that smoke reaches the one behind it.
@@ -437,7 +440,7 @@ def _list(
 
 
 def relist(box: Box, bricks: Bricks) -> None:
-    """Lists the bricks to compute in the next step and those that no longer are; then marks no brick as busy."""
+    """Lists the bricks to compute in the next step, and the bricks that this removes from the list; clears `busy`."""
     bricks.count.zero_()
     bricks.retired_count.zero_()
     wp.launch(_list, bricks.busy.shape, inputs=[box, bricks], device=bricks.busy.device)

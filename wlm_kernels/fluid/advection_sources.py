@@ -11,7 +11,7 @@ a source outside the domain     adds no smoke
 a source that adds less than    adds no smoke: half floats have 11 bits
 half floats resolve
 cells that a solid covers       their smoke is lost
-cells that a solid frees        mean of the nearest cells in the fluid coarse cells around; 0 if none
+cells that a solid frees        mean of the nearest cell of each neighbouring fluid coarse cell; 0 if none
 ==============================  ======================================================================
 """
 
@@ -38,13 +38,13 @@ _BRICK_CELLS = wp.constant(BRICK**3)
 
 @dataclass(frozen=True)
 class SourceKernels:
-    """The kernels of one storage type.
+    """The kernels for smoke stored as floats or as half floats.
 
     Attributes:
-        source: Adds or sets the smoke of a source, over the cells of a box around it.
-        cover: Empties cells that become solid and fills cells that become fluid, over coarse cells.
-        lift: Computes the acceleration of the air, over coarse cells.
-        empty: Sets retired bricks to 0, over workers times the cells of a brick.
+        source: Adds or sets the smoke of a source; a thread for each fine cell of a box around the source.
+        cover: Empties cells that become solid and fills cells that become fluid; a thread for each coarse cell.
+        lift: Computes the acceleration of the air; a thread for each coarse cell.
+        empty: Sets the retired bricks of `Bricks` to 0; a thread for each cell of a brick and each worker.
     """
 
     source: wp.Kernel
@@ -61,7 +61,7 @@ def _mark_busy(box: Box, p: wp.vec3i, value: float, bricks: Bricks):
 
 @functools.cache
 def source_kernels(stored: type) -> SourceKernels:
-    """Builds (once) the kernels for fields of `wp.float32` or `wp.float16`."""
+    """Builds (once) the kernels for smoke stored as `wp.float32` or `wp.float16`."""
     fields_type = fields_struct(stored)
 
     @wp.func
@@ -232,16 +232,17 @@ def add_source(
     fixed: bool,
     bricks: Bricks = DENSE,
 ) -> None:
-    """Adds or sets smoke in the cells whose centres are in a box or an ellipsoid; the result is at least 0.
+    """Adds or sets smoke in the cells whose centres are in a box or an ellipsoid; density and temperature stay at
+    least 0.
 
     Args:
         box: The domain.
-        walls: Marks as in `advection.advect`.
-        shape: `SPHERE` or `BOX`.
-        centre: In fine cells.
-        size: Radii or half edges in fine cells, above 0.
+        walls: The marks of solid cells, as for `advection.advect`.
+        shape: `SPHERE` (an ellipsoid along the axes) or `BOX`.
+        centre: Centre of the source in fine cells.
+        size: Radii of the ellipsoid or half edges of the box along x, y and z, in fine cells, above 0.
         value: Density and temperature to add or to set.
-        fields: The fields, modified.
+        fields: The smoke, modified.
         fixed: Whether the values are set instead of added.
         bricks: Bricks that receive smoke are marked as busy.
     """
@@ -256,12 +257,13 @@ def add_source(
 
 
 def change_solids(box: Box, before: wp.array, after: wp.array, fields: Fields, bricks: Bricks = DENSE) -> None:
-    """Empties the cells that become solid and fills the cells that become fluid.
+    """Empties the cells that become solid, and fills the cells that become fluid from their neighbours.
 
     Args:
         box: The domain.
-        before, after: uint8 [coarse cells], from `advection_places.mark_walls`.
-        fields: The fields, modified.
+        before, after: Marks of solid cells before and after the change, uint8 [coarse cells], from
+            `advection_places.mark_walls`.
+        fields: The smoke, modified.
         bricks: Bricks that receive smoke are marked as busy.
     """
     _launch("cover", before.shape[0], [box, before, after, bricks], fields.arrays, fields)
@@ -280,16 +282,16 @@ def buoyancy(
 
     Args:
         box: The domain.
-        walls: Marks as in `advection.advect`.
+        walls: The marks of solid cells, as for `advection.advect`.
         fields: The smoke.
         by_density, by_temperature: (3,), acceleration at density 1 and at temperature 1, coarse cells per step squared.
-        force: vec3 [coarse cells], written; 0 in solids.
-        bricks: Means are 0 where no brick is active.
+        force: vec3 [coarse cells], the acceleration, written; 0 in solids.
+        bricks: Cells outside the active bricks count as empty.
     """
     inputs = [box, walls, fields.arrays, wp.vec3(*by_density), wp.vec3(*by_temperature), bricks]
     _launch("lift", force.shape[0], inputs, force, fields)
 
 
 def empty_retired(box: Box, bricks: Bricks, fields: Fields) -> None:
-    """Empties the bricks that `advection_places.relist` retired; must be called for every buffer."""
+    """Sets the bricks that `advection_places.relist` removed from its list to 0; must be called for every buffer."""
     _launch("empty", bricks.workers * int(_BRICK_CELLS), [box, bricks], fields.arrays, fields)

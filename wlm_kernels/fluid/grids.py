@@ -15,7 +15,7 @@ def dense(
     # out:
     out: wp.array3d[float],
 ):
-    """Reads a NanoVDB grid of floats over a box whose first voxel is `low`."""
+    """Copies a NanoVDB grid of floats to a dense array, whose element (0, 0, 0) is the grid's voxel `low`."""
     i, j, k = wp.tid()
     out[i, j, k] = wp.volume_lookup_f(grid, low[0] + i, low[1] + j, low[2] + k)
 
@@ -29,9 +29,10 @@ def resample(
     # out:
     out: wp.array3d[float],
 ):
-    """Samples values, trilinear between voxel centres and 0 outside, at the voxel centres of another grid.
+    """Resamples the grid `values` at the voxel centres of `out`: trilinear between voxel centres, 0 outside.
 
-    Point p in voxels of `out` is point turn p + shift in voxels of `values`.
+    The matrix `turn` and the vector `shift` convert a point p of `out` to the point turn p + shift of `values`, both
+    in voxels.
     """
     i, j, k = wp.tid()
     p = turn * wp.vec3(float(i) + 0.5, float(j) + 0.5, float(k) + 0.5) + shift

@@ -3,10 +3,10 @@
 Read `tests/reference/lattice.py` first: it is the same step in float64 NumPy, cell by cell.
 
 A cell pulls the populations that arrive, f_q(x, t + 1) = f*_q(x - c_q, t), and writes the populations that leave, f*.
-At a wall at rest that closes a whole axis it pulls what it sent there itself (half-way bounce-back). The step knows no
-other boundary: no other cell reads the element that it would pull from beyond a face or out of a solid, and
-`lattice_links` writes into that element what comes back. The kernel therefore has no branch except the one that skips
-solid cells.
+At a wall at rest that closes a whole axis the cell pulls the population that it sent there itself (half-way
+bounce-back). All other boundaries are the work of `lattice_links`: no cell but this one reads the array element from
+which it would pull beyond a face or out of a solid, so the value that the boundary returns is written into that element
+after the step. The kernel therefore has no branch except the one that skips solid cells.
 
 Collision, with Kupershtokh's exact difference for a force F; the velocity of the fluid is u + F / (2 rho):
 
@@ -52,20 +52,20 @@ _SOUND2 = wp.constant(1.0 / 3.0)
 
 
 def trouble_of(key: int) -> tuple[int, int, str]:
-    """Returns the step, the cell and the cause that a key encodes."""
+    """Returns the step, the index of the cell and the cause (one of `CAUSES`) that an error's key encodes."""
     place, code = divmod(key, 4)
     step, cell = divmod(place, 1 << 31)
     return step, cell, CAUSES[code]
 
 
 def eddy_factor(smagorinsky: float) -> float:
-    """Computes 18 sqrt(2) C^2."""
+    """Computes 18 sqrt(2) C^2, the factor in Smagorinsky's eddy viscosity; C = `smagorinsky`."""
     return 18.0 * math.sqrt(2.0) * smagorinsky * smagorinsky
 
 
 @dataclass(frozen=True)
 class Spec:
-    """All settings that change the code of a step.
+    """The settings of a lattice Boltzmann step for which its kernel is specialised.
 
     Attributes:
         lattice: "D2Q9", "D3Q19" or "D3Q27".
@@ -100,7 +100,7 @@ class Spec:
 
 @functools.cache
 def _relax(spec: Spec) -> Any:
-    """Builds (once) the collision, a function from a cell's arriving scaled populations and moments to leaving ones."""
+    """Builds (once) the collision: a function from the populations that arrive at a cell to the ones that leave it."""
     velocities = lattice(spec.lattice)
     c, w, axes, flat = velocities.c, velocities.w, velocities.axes, velocities.axes == 2
     vec = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide).vec
@@ -110,7 +110,7 @@ def _relax(spec: Spec) -> Any:
 
     @wp.func
     def hermite(drho: float, j: wp.vec3, diagonal: wp.vec3, off: wp.vec3) -> vec:
-        """Returns the populations with given density, momentum and stress (as Hermite coefficients)."""
+        """Returns the populations with a given density minus 1, momentum, and stress (as Hermite coefficients)."""
         out = vec()
         rest = drho - 1.5 * (diagonal[0] + diagonal[1] + diagonal[2])
         out[0] = wp.static(w[0] * scale) * rest
@@ -174,20 +174,20 @@ def _relax(spec: Spec) -> Any:
 
 @functools.cache
 def step_kernel(spec: Spec) -> wp.Kernel:
-    """Builds (once) the kernel that does a step with the settings of a spec, over all cells.
+    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell.
 
-    Args of the kernel:
+    Args of the kernel, for N cells and Q velocities:
         n: Cells along x, y and z.
         f: [Q, N], the populations that left every cell in the last step.
         solid: uint8 [N], above 0 where a cell is solid; used if `spec.solids`.
         tau: Relaxation time, 1/2 + 3 nu.
         eddy: `eddy_factor`, used if `spec.eddies`.
-        force: Force on a cell's fluid, used if `spec.force` is "uniform".
-        forces: vec3 [N], used if it is "field".
-        parity: Index of this step's element of `clock`.
+        force: Acceleration of all cells' fluid in cells per step squared, used if `spec.force` is "uniform".
+        forces: vec3 [N], acceleration of each cell's fluid, used if `spec.force` is "field".
+        parity: 0 or 1: `clock[parity]` is the number of steps done; the step writes one more to the other element.
         clock: int [2], counts steps.
-        trouble: int64 [1], lowered to the key of the first cell with an error.
-        sums: float64 [2], set to 0 for `lattice_links`.
+        trouble: int64 [1], lowered to the key of the first cell in which the flow blew up, see `trouble_of`.
+        sums: float64 [2], set to 0, for `lattice_links.apply`.
         out: [Q, N], the populations that leave every cell in this step.
     """
     memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide), _relax(spec)

@@ -32,12 +32,12 @@ _INSIDE = wp.constant(0.5)
 
 @wp.struct
 class Bodies:
-    """Motion of bodies; element 0 represents the fluid and is 0.
+    """Motion of K rigid bodies; element k belongs to body k, and element 0 stands for the fluid and is 0.
 
     Attributes:
         velocity: vec3 [K + 1], velocity of the body's centre, cells per step.
         spin: vec3 [K + 1], angular velocity, radians per step.
-        centre: vec3 [K + 1], cells.
+        centre: vec3 [K + 1], position of the body's centre, cells.
     """
 
     velocity: wp.array1d[wp.vec3]
@@ -47,7 +47,7 @@ class Bodies:
 
 @wp.func
 def velocity_at(bodies: Bodies, k: int, x: wp.vec3) -> wp.vec3:
-    """Computes the velocity of body k at a point."""
+    """Computes the velocity of body k at a point x, both in units of cells."""
     return bodies.velocity[k] + wp.cross(bodies.spin[k], x - bodies.centre[k])
 
 
@@ -105,7 +105,7 @@ def voxelise_sphere(solid, body: int, centre, radius: float) -> None:
     Args:
         solid: uint8 [X, Y, Z], modified.
         body: The body's number, 1 to 255.
-        centre, radius: In cells.
+        centre, radius: Centre and radius of the sphere, in cells.
     """
     n = wp.vec3i(*solid.shape)
     inputs = [n, wp.uint8(body), wp.vec3(*centre), float(radius)]
@@ -120,7 +120,7 @@ def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position=(0.0, 0.0, 0.0), rot
         body: The body's number, 1 to 255.
         mesh: Mesh on the device of `solid`, made with `support_winding_number=True`.
         position: Position of the mesh's origin, in cells.
-        rotation: `wp.quat`; None: no rotation.
+        rotation: Rotation of the mesh about its origin, a `wp.quat`; None: no rotation.
         scale: Cells per unit of the mesh.
     """
     n = wp.vec3i(*solid.shape)
@@ -133,12 +133,12 @@ def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position=(0.0, 0.0, 0.0), rot
 
 @dataclass(frozen=True)
 class FluidKernels:
-    """The kernels of one lattice and storage, each over all cells.
+    """Kernels for one lattice and storage type; each has one thread per cell.
 
     Attributes:
         fields: Computes the density minus 1 and the velocity of every cell.
-        start: Sets every cell to an equilibrium.
-        neighbours: Computes the mean of the fluid around each cell that becomes fluid.
+        start: Sets every cell to the equilibrium of a given density and velocity.
+        neighbours: Computes the mean density and velocity of the fluid around each cell that becomes fluid.
         uncover: Sets each cell that becomes fluid to the equilibrium of this mean.
     """
 
@@ -150,7 +150,7 @@ class FluidKernels:
 
 @functools.cache
 def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool]) -> FluidKernels:
-    """Builds (once) the kernels that do not run at every step; the arguments are those of `memory_functions`."""
+    """Builds (once) the kernels that read and set the fluid; the arguments are those of `memory_functions`."""
     memory = memory_functions(lattice_name, storage, walls)
     gather, moments, load, store = memory.gather, memory.moments, memory.load, memory.store
     stored = STORAGES[storage][0]

@@ -8,12 +8,12 @@ pulls this population, population q of the periodic image of the cell a - c_q, i
 step the values of the links are computed from the populations f* that have just left the cells, and are then written
 into these elements. This takes two passes, since the element of one link may be read by another.
 
-- bounce: f_q = f*_opposite + term, half-way bounce-back; the term 6 w_q c_q . u carries a wall's velocity at density 1.
-- inlet: the same, which adds a mass of u per cell of the face; its term may rise from 0 in the first steps.
-- slip: the mirror image of the population that leaves the neighbour, a wall without friction.
+- bounce: f_q = f*_opposite + term, half-way bounce-back; the term is 6 w_q c_q . u at a wall of velocity u.
+- inlet: the same formula; it adds a mass of u per cell of the face. The term may rise from 0 in the first steps.
+- slip: a wall without friction: the mirror image of the population that leaves the neighbouring cell.
 - outlet: the equilibrium at the cell's own density and velocity (zero gradient). It is then shifted, by w_q times the
   same factor at all outlets, so that outflow equals inflow: mass is conserved to rounding.
-- pressure: the outlet without the shift; its density relaxes towards a given density, whose excess over 1 is the term.
+- pressure: the outlet without the shift; its density relaxes towards a given density: the term, plus 1.
 
 Velocities into the domain are set to 0 at an outlet: backflow would feed on itself.
 """
@@ -50,14 +50,14 @@ _HOLD = wp.constant(0.3)
 
 @wp.struct
 class Links:
-    """Links on a device, those of faces first.
+    """The links of the domain's faces, followed by the links of solids, on a device; arrays have room for L links.
 
     Attributes:
-        cell: int [L], the fluid cell a.
-        code: uint8 [L], the direction q + 32 times the kind.
-        term: float [L], see the module.
-        value: float [L], result of the first pass.
-        used: int [1], number of elements in use.
+        cell: int [L], index of the fluid cell a.
+        code: uint8 [L], the direction q + 32 times the kind of boundary.
+        term: float [L], the term of the boundary condition, see the module.
+        value: float [L], the population that the boundary returns, result of the first pass.
+        used: int [1], number of links.
         faces: Number of links of faces.
     """
 
@@ -71,12 +71,12 @@ class Links:
 
 @dataclass(frozen=True)
 class LinkKernels:
-    """The kernels of one lattice and storage.
+    """Kernels for one lattice and storage type; each has one thread per link.
 
     Attributes:
-        values: First pass: computes the value of each link, over the links, rounded up to `BLOCK`.
-        write: Second pass: writes these values into the populations, over the links.
-        force: Sums the force of the fluid on each body, over the links.
+        values: First pass: computes the value of each link; the number of threads is a multiple of `BLOCK`.
+        write: Second pass: writes these values into the populations.
+        force: Sums the force of the fluid on each body.
     """
 
     values: wp.Kernel
@@ -91,7 +91,7 @@ def _beyond(x: int, n: int, bounded: int) -> bool:
 
 @functools.cache
 def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
-    """Builds (once) the kernels of a lattice and a storage; `balance`: whether there is an outlet."""
+    """Builds (once) the kernels for a lattice and a storage type; `balance` tells whether an outlet conserves mass."""
     memory = memory_functions(lattice_name, storage, (False, False, False))
     load, store = memory.load, memory.store
     stored = STORAGES[storage][0]
@@ -99,7 +99,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
 
     @wp.func
     def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
-        """Returns the cell and direction from which population q of cell i comes, mirrored by a slip wall."""
+        """Returns the cell and the velocity of the population that a slip wall reflects into population q of cell i."""
         p = cell_of(n, i)
         c = t.c[q]
         x = _beyond(p[0] - c[0], n[0], bounded[0])
@@ -113,7 +113,6 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
     def outflow(
         t: Tables, n: wp.vec3i, bounded: wp.vec3i, f: wp.array2d[stored], i: int, q: int, kind: int, term: float
     ) -> float:
-        """Computes the population that an outlet sends to cell i in direction q."""
         drho = float(0.0)
         j = wp.vec3()
         for k in range(t.w.shape[0]):
@@ -287,19 +286,19 @@ def _find(
 
 
 def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, bodies: Bodies, links: Links):
-    """Lists the links of solid cells, in any order, after the links of faces; `used` is not changed.
+    """Lists the links of solid cells, in any order, after the links of faces; `links.used` is not changed.
 
     Args:
         tables: The velocity set.
-        n: Cells along x, y and z.
-        bounded: 1 for each axis that is not periodic.
-        solid: uint8 [N].
+        n: Cells along x, y and z; N in all.
+        bounded: 1 for each axis that is not periodic, else 0.
+        solid: uint8 [N], number of the body of each cell, 0 for fluid.
         bodies: Motion of the bodies.
         links: The links, modified.
 
     Returns:
-        Number of the solids' links, int [1], which may exceed the size of the arrays; speed of the fastest surface,
-        float [1].
+        Number of the solids' links, int [1], which may exceed the room in the arrays: the other links are then missing;
+        speed of the fastest point of a surface in cells per step, float [1].
     """
     count, fastest = (wp.zeros(1, dtype=dtype, device=solid.device) for dtype in (int, float))
     inputs = [tables, n, bounded, solid, bodies, links]
@@ -320,20 +319,21 @@ def apply(
     f: wp.array,
     sums: wp.array,
 ) -> None:
-    """Runs both passes over the links from element `first` on.
+    """Applies the boundary conditions after a step: runs both passes over the links from index `first` on.
 
     Args:
-        kernels: Kernels of the lattice and storage of `f`.
-        tables: The velocity set.
-        n: Cells along x, y and z.
-        bounded: 1 for each axis that is not periodic.
-        first: 0, or the first link of a solid.
+        kernels: Kernels for the lattice and storage type of `f`.
+        tables: The velocity set, with Q velocities.
+        n: Cells along x, y and z; N in all.
+        bounded: 1 for each axis that is not periodic, else 0.
+        first: 0 for all links, or the index of the first link of a solid for solids alone.
         links: The links; `value` is modified.
-        solid: uint8 [N], or [0] if no cell is solid.
+        solid: uint8 [N], number of the body of each cell, or [0] if no cell is solid.
         clock: int [2], see `lattice.step_kernel`.
         rise: Inlets reach their full velocity after 1 / rise steps.
         f: [Q, N], the populations that have just left the cells, modified.
-        sums: float64 [2], 0 before: net mass through all links without the shift, and sum of the outlets' weights.
+        sums: float64 [2], 0 at the call; receives the net mass that all links add before the outlets' shift, and the
+            sum of the weights w_q of outlet links.
     """
     size, device = links.cell.shape[0] - first, f.device
     if size <= 0:

@@ -24,13 +24,13 @@ STORAGES = {"float32": (wp.float32, 1.0), "float16": (wp.float16, HALF_SCALE)}
 
 @dataclass(frozen=True)
 class VelocitySet:
-    """A set of velocities.
+    """A set of Q lattice velocities with their weights.
 
     Attributes:
         name: "D2Q9", "D3Q19" or "D3Q27".
-        axes: 2 or 3; the plane of two axes is x, y.
-        c: The velocities, cells per step.
-        w: The weights.
+        axes: Number of dimensions, 2 (in the plane of x and y) or 3.
+        c: The Q velocities, cells per step.
+        w: The weight of each velocity.
     """
 
     name: str
@@ -40,7 +40,10 @@ class VelocitySet:
 
 
 def _make(name: str, axes: int, weights: tuple[float, ...]) -> VelocitySet:
-    """Makes a set of velocities of components -1, 0 and 1 whose squared length has an entry in `weights`."""
+    """Makes the set of all velocities with components -1, 0 and 1 whose squared length is below len(weights).
+
+    A velocity of squared length k has the weight weights[k].
+    """
     signs = itertools.product(*[(-1, 0, 1) if a < axes else (0,) for a in range(3)])
     half = [c for c in signs if c > (0, 0, 0) and sum(map(abs, c)) < len(weights)]
     half.sort(key=lambda c: (sum(map(abs, c)), c))
@@ -58,7 +61,7 @@ LATTICES = {
 
 
 def lattice(name: str) -> VelocitySet:
-    """Returns one of `LATTICES`.
+    """Returns the velocity set of a name in `LATTICES`, such as "D3Q19".
 
     Raises:
         ValueError: The name is unknown.
@@ -70,12 +73,12 @@ def lattice(name: str) -> VelocitySet:
 
 @wp.struct
 class Tables:
-    """A set of velocities for kernels that index directions.
+    """A velocity set in arrays, for kernels that index its Q velocities.
 
     Attributes:
-        c: vec3i [Q].
-        w: float [Q].
-        index: int [27], the direction of (cx, cy, cz) at 9 (cx + 1) + 3 (cy + 1) + cz + 1.
+        c: vec3i [Q], the velocities.
+        w: float [Q], their weights.
+        index: int [27], the number q of the velocity (x, y, z) at index 9 (x + 1) + 3 (y + 1) + z + 1.
     """
 
     c: wp.array1d[wp.vec3i]
@@ -85,7 +88,7 @@ class Tables:
 
 @functools.cache
 def tables(name: str, device: str) -> Tables:
-    """Returns the tables of a lattice on a device; they are made once."""
+    """Copies (once) the velocity set of a lattice to a device."""
     velocities = lattice(name)
     index = [0] * 27
     for q, (x, y, z) in enumerate(velocities.c):
@@ -106,7 +109,7 @@ def opposite(q: int) -> int:
 
 @wp.func
 def cell_of(n: wp.vec3i, i: int) -> wp.vec3i:
-    """Returns the coordinates of cell i."""
+    """Returns the coordinates of the cell with index i in a domain of n cells along x, y and z."""
     # Two divisions instead of four: a remainder is a division too. Signed divisions take twice as long.
     row = int(wp.uint32(i) // wp.uint32(n[2]))
     x = int(wp.uint32(row) // wp.uint32(n[1]))
@@ -135,15 +138,15 @@ def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
 
 @wp.func
 def owned(n: wp.vec3i, bounded: wp.vec3i, walled: wp.vec3i, p: wp.vec3i) -> bool:
-    """Tests if a population that leaves a cell towards p is stored in its own element; else a link writes it."""
+    """Tests whether a population that leaves a cell towards cell p is stored; if not, `lattice_links` writes there."""
     return crosses(n, walled, p) or not crosses(n, bounded, p)
 
 
 @wp.func
 def equilibrium(w: float, c: wp.vec3i, drho: float, u: wp.vec3) -> float:
-    """Computes the second-order equilibrium minus its weight, f_eq - w; `drho` is rho - 1.
+    """Computes f_eq - w: the second-order equilibrium population of a velocity c, minus the velocity's weight w.
 
-    f_eq = w rho (1 + 3 c.u + 9/2 (c.u)^2 - 3/2 u.u)
+    f_eq = w rho (1 + 3 c.u + 9/2 (c.u)^2 - 3/2 u.u), where rho = 1 + `drho` is the density and u the fluid's velocity.
     """
     cu = wp.dot(wp.vec3(float(c[0]), float(c[1]), float(c[2])), u)
     return w * (drho + (1.0 + drho) * (3.0 * cu + 4.5 * cu * cu - 1.5 * wp.dot(u, u)))
@@ -155,7 +158,7 @@ NARROW = 2**31 - 1
 
 @dataclass(frozen=True)
 class MemoryFunctions:
-    """`wp.func`s on populations in memory, of one lattice and storage.
+    """`wp.func`s that read and write populations in memory, for one lattice of Q velocities and one storage type.
 
     Attributes:
         vec: vec of Q floats.
@@ -179,14 +182,14 @@ class MemoryFunctions:
 def memory_functions(
     lattice_name: str, storage: str, walls: tuple[bool, bool, bool], wide: bool = True
 ) -> MemoryFunctions:
-    """Builds (once) the functions of a lattice and a storage.
+    """Builds (once) the functions for a lattice and a storage type.
 
     Args:
         lattice_name: One of `LATTICES`.
         storage: One of `STORAGES`; scaled numbers are multiplied by its scale.
         walls: For each axis whether walls at rest close it.
-        wide: Whether elements are indexed in 64 bits, which adds a sixth to a step's instructions; otherwise there may
-            be at most `NARROW` populations.
+        wide: Whether populations are indexed in 64 bits, which adds a sixth to a step's instructions; otherwise there
+            may be at most `NARROW` of them.
 
     Raises:
         ValueError: The lattice or the storage is unknown.

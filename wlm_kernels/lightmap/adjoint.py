@@ -18,7 +18,7 @@ from wlm_kernels.lightmap.features import Maps, Offsets
 
 @wp.func
 def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
-    """Returns the linear weights of the two texels read along an axis; 0 for texels outside the 4-texel `block`."""
+    """Returns the weights 1 - f and f of two texels along an axis; 0 for a texel outside the 4-texel block `block`."""
     a = wp.where(first // 4 == block, 1.0 - f, 0.0)
     b = wp.where(second // 4 == block, f, 0.0)
     return wp.vec2(a, b)
@@ -26,9 +26,9 @@ def corner_weights(first: int, second: int, f: float, block: int) -> wp.vec2:
 
 _Spread = wp.types.vector(8, float)
 
-# A warp's lanes add their samples' numbers together, so that neighbours in memory are added at once: 8 lanes the
-# endpoints of one sample's block, then of the next one's. With a lane for each sample there would be as many requests
-# to memory as numbers, rather than one for four.
+# The lanes of a warp share their additions, so that neighbours in memory are added at once: 8 lanes add the endpoints
+# of one sample's block, then of another sample's. If each lane added its own sample, there would be one request to
+# memory for each number, rather than one for four.
 
 
 @wp.func_native("""
@@ -48,7 +48,7 @@ _Spread = wp.types.vector(8, float)
 #endif
 """)
 def _spread_texels(g: wp.vec4) -> _Spread:
-    """Redistributes g over a warp: number r for lane l is channel l % 4 of the g of lane 4 r + l / 8."""
+    """Redistributes g over a warp: component r of lane l's result is component l % 4 of g in lane 4 r + l / 8."""
 
 
 @wp.func_native("""
@@ -68,7 +68,8 @@ def _spread_texels(g: wp.vec4) -> _Spread:
 #endif
 """)
 def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: float, g: _Spread):
-    """Adds a * g to sums at .. at + 3 and b * g to the next 4; nothing if at < 0. All lanes of a warp must call it."""
+    """Adds a * g to the sums with the indices `at` to `at` + 3, and b * g to the next four; nothing if `at` < 0. All
+    lanes of a warp must call it together; their g comes from `_spread_texels`."""
 
 
 @wp.func_native("""
@@ -94,7 +95,8 @@ def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: f
 #endif
 """)
 def _add_cells(acc: wp.array2d[wp.int64], early: wp.vec2i, late: wp.vec2i, ft: float, v: wp.vec4):
-    """Adds v, two channels for each of two texels, to rows `early` and `late` by weight; all warp lanes call it."""
+    """Adds two channels of each of two texels, `v`, to the texels' sums in two rows of a plane: times 1 - ft at the
+    indices `early`, times ft at `late`. All lanes of a warp must call it together."""
 
 
 @wp.func
@@ -104,7 +106,8 @@ def _spread_none(g: wp.vec4) -> wp.vec4:
 
 @functools.cache
 def _adders(device_kind: str) -> tuple[Any, ...]:
-    """Returns `add` of a number, the type of sums, `add_endpoints` of a block, and what prepares its g."""
+    """Returns a function that adds a number, the type of the sums, a function that adds the gradient g to a block's two
+    endpoints, and a function that prepares g for it."""
     if device_kind == "cuda":
         # Fixed point with steps of 2^-40, about 1e-12; a sum beyond 8e6 would overflow.
 
@@ -130,14 +133,8 @@ def _adders(device_kind: str) -> tuple[Any, ...]:
 
 @functools.cache
 def scatters(device_kind: str) -> tuple[Any, Any, Any, Any]:
-    """Builds (once) the adjoints of sampling F_uv, F_uvt, and the planes F_ut and F_vt.
-
-    Args:
-        device_kind: "cpu" or "cuda".
-
-    Returns:
-        Three `wp.func`s in this order, and the scalar type of the gradient sums.
-    """
+    """Builds (once) for "cpu" or "cuda" the functions that add a sample's gradients to the gradient sums of the feature
+    maps. Returns a `wp.func` for F_uv, one for F_uvt, one for the planes F_ut and F_vt, and the type of the sums."""
     add, scalar, add_endpoints, spread = _adders(device_kind)
 
     @wp.func

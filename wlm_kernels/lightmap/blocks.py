@@ -46,7 +46,7 @@ def endpoint_with_bit(v: wp.vec4, bit: float) -> wp.vec4:
 
 @wp.func
 def endpoint_byte(e: wp.vec4) -> wp.vec4:
-    """Returns the stored bytes of an endpoint as floats 0..255, with the shared lowest bit that has less error."""
+    """Returns the stored bytes of an endpoint as floats 0 to 255, with the shared lowest bit that gives less error."""
     v = wp.vec4(
         wp.clamp(e[0], 0.0, 1.0) * 255.0,
         wp.clamp(e[1], 0.0, 1.0) * 255.0,
@@ -103,7 +103,7 @@ def ste_mix(e0: wp.vec4, e1: wp.vec4, w: float, quantised: int) -> wp.vec4:
 def texel(
     endpoints: wp.array4d[wp.vec4], weights: wp.array3d[float], s: int, y: int, x: int, quantised: int
 ) -> wp.vec4:
-    """Returns the texel (y, x) of slice s of a map in training."""
+    """Returns the texel (y, x) of slice s of a map in training, from its endpoints and weights."""
     e0 = ste_endpoint(endpoints[s, y // 4, x // 4, 0], quantised)
     e1 = ste_endpoint(endpoints[s, y // 4, x // 4, 1], quantised)
     return ste_mix(e0, e1, ste_weight(weights[s, y, x], quantised), quantised)
@@ -116,7 +116,7 @@ def bits7(word: wp.uint64, at: int) -> float:
 
 @wp.func
 def stored_texel(blocks: wp.array4d[wp.uint64], s: int, y: int, x: int) -> wp.vec4:
-    """Returns the texel (y, x) of slice s of a stored map: BC7 mode 6, in [0, 1]."""
+    """Decodes the texel (y, x) of slice s of a map that is stored as BC7 mode 6 blocks; channels are in [0, 1]."""
     low = blocks[s, y // 4, x // 4, 0]
     high = blocks[s, y // 4, x // 4, 1]
     p0 = float(int(wp.rshift(low, wp.uint64(63))))
@@ -196,12 +196,12 @@ def _quantise(
 
 
 def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:
-    """Writes a whole map from its endpoints and weights (eq. 8).
+    """Writes all texels of a map, S slices of H x W texels, from its endpoints and weights (eq. 8).
 
     Args:
         endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
         weights: float [S, H, W], in [0, 1].
-        out: vec4 [S, H, W].
+        out: vec4 [S, H, W], written.
         quantised: Whether endpoints and weights are rounded to the levels of BC7 mode 6.
     """
     inputs = [endpoints, weights, int(quantised)]
@@ -209,11 +209,13 @@ def reconstruct(endpoints, weights, out, quantised: bool = False) -> None:
 
 
 def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weights, quantised: bool = False) -> None:
-    """The adjoint of `reconstruct`, which takes clamping and rounding as identity; results are the same in every run.
+    """Computes gradients from the gradient of a result of `reconstruct`; clamping and rounding count as the identity.
+
+    The gradients are the same in every run.
 
     Args:
         endpoints, weights, quantised: As for `reconstruct`.
-        grad_out: vec4 [S, H, W].
+        grad_out: vec4 [S, H, W], gradient of the result.
         grad_endpoints: vec4 [S, H/4, W/4, 2], written.
         grad_weights: float [S, H, W], written.
     """
@@ -223,13 +225,13 @@ def reconstruct_backward(endpoints, weights, grad_out, grad_endpoints, grad_weig
 
 
 def quantise(endpoints, weights, bytes_out, index_out) -> None:
-    """Writes the integers that the file stores for endpoints and weights.
+    """Writes the integers that the file stores for the endpoints and weights of S slices of H x W texels.
 
     Args:
-        endpoints: vec4 [S, H/4, W/4, 2].
-        weights: float [S, H, W].
-        bytes_out: vec4ub [S, H/4, W/4, 2], each endpoint's bytes with their shared lowest bit.
-        index_out: uint8 [S, H, W], 0 to 15.
+        endpoints: vec4 [S, H/4, W/4, 2], in [0, 1].
+        weights: float [S, H, W], in [0, 1].
+        bytes_out: vec4ub [S, H/4, W/4, 2], written: each endpoint's bytes with their shared lowest bit.
+        index_out: uint8 [S, H, W], written: each weight's index, 0 to 15.
     """
     wp.launch(
         _quantise,

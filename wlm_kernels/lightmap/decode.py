@@ -1,11 +1,11 @@
 """Decodes tiles of a lightmap over time from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
 
 `exact_kernels` evaluates one texel per thread, in the same order of operations as training. `StripKernels` is faster,
-for use at run time: what all texels of a frame share is computed once (F_uvt interpolated between two slices, and for
+for use at run time: it computes once what all texels of a frame share (F_uvt interpolated between two slices, and for
 each column the contribution of F_ut and the encoded time to the first layer), and a thread decodes four texels, so that
 each weight is loaded once for four texels.
 
-Read `wlm/lightmap/exact.py` first; it contains the same decode in NumPy.
+Read `wlm/lightmap/exact.py` first; it contains the same decode in NumPy. `features` describes the maps F_uv to F_vt.
 """
 
 import functools
@@ -23,7 +23,8 @@ from wlm_kernels.shared_exponent import pack_rgb9e5
 
 @wp.struct
 class Stored:
-    """Feature maps of N tiles as stored, with S slices in F_uvt. For static tiles all arrays but `uv` are empty."""
+    """The stored feature maps of N tiles (see `features`), with S slices in F_uvt. In static tiles all arrays but `uv`
+    are empty."""
 
     uv: wp.array4d[wp.uint64]  # [N, 32, 32, 2]
     uvt: wp.array4d[wp.uint64]  # [N * S, R/4, R/4, 2]
@@ -35,7 +36,7 @@ class Stored:
 
 @wp.struct
 class TimeState:
-    """A time, and for each tile what turns its network's output y into colour: (shift + spread y) scale."""
+    """A time, and numbers that convert the output y of each tile's network to colour: (shift + spread y) scale."""
 
     tau: float
     encoding: wp.vec4
@@ -123,7 +124,7 @@ def finish_byte(c: float, inverse_peak: float) -> wp.uint8:
 
 @wp.func
 def bytes_over(colour: wp.vec3, inverse_bound: float) -> wp.uint32:
-    """Packs colour * `inverse_bound` to 8-bit RGBA with R in the lowest byte; alpha is 255."""
+    """Packs colour * `inverse_bound`, clamped to [0, 1], as 8-bit RGBA with R in the lowest byte; alpha is 255."""
     r = finish_byte(colour[0], inverse_bound)
     g = finish_byte(colour[1], inverse_bound)
     b = finish_byte(colour[2], inverse_bound)
@@ -132,7 +133,7 @@ def bytes_over(colour: wp.vec3, inverse_bound: float) -> wp.uint32:
 
 @wp.func
 def finish_bytes(time: TimeState, n: int, y: wp.vec3) -> wp.uint32:
-    """Converts the network's output y to 8-bit RGBA: gamma-space colour relative to the tile's bound; alpha is 255."""
+    """Converts the network's output y to 8-bit RGBA: gamma-space colour / the tile's largest colour; alpha is 255."""
     return bytes_over(finish_colour(time, n, y), time.inverse_peak[n])
 
 
@@ -149,18 +150,18 @@ def finish_words(shared: bool) -> Any:
 
 @functools.cache
 def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any, Any]:
-    """Builds (once) the kernels that decode whole tiles, one texel per thread.
+    """Builds (once) three kernels that decode whole tiles, one texel per thread.
 
     Args:
-        temporal: Whether the tiles have temporal maps.
+        temporal: Whether the tiles have the temporal maps F_uvt, F_ut and F_vt.
         hidden: H, width of the hidden layers.
         gelu: One of `mlp.GELUS`.
 
     Returns:
-        Kernels with a thread for each texel of n tiles. Their inputs are `Stored`, the networks hidden vecH [N, I + H +
-        2] and output vec3 [N, H + 1] with I inputs, `TimeState`, places int [N] (index of each tile in `TimeState`) and
-        tiles int [n], the tiles to decode. Their output is [n, 128, 128]: linear radiance as vec3; 8-bit colour as
-        uint32, RGBA from the lowest byte; or linear radiance as uint32, RGB9E5.
+        Kernels that write, in this order, linear radiance as vec3; gamma-space colour as uint32, 8-bit RGBA from the
+        lowest byte; and linear radiance as uint32, RGB9E5. Their inputs are `Stored`; hidden layers, vecH
+        [N, I + H + 2] with I inputs; output layers, vec3 [N, H + 1]; `TimeState`; int [N], the index of each tile in
+        `TimeState`; and int [n], the tiles to decode. Their output is [n, 128, 128].
     """
     inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
     centred = 12 if temporal else 4
@@ -229,7 +230,7 @@ def frame_volume(
     # out:
     volume: wp.array3d[wp.vec4],
 ):
-    """Writes F_uvt, interpolated at one time and centred, to `volume` [N, R, R]."""
+    """Writes F_uvt at the time `tau` to `volume` [N, R, R], scaled as an input of the network; see `features`."""
     n, y, x = wp.tid()
     t = cell(tau, stored.slices)
     ft = fraction(tau, stored.slices)
@@ -241,12 +242,8 @@ def frame_volume(
 
 @dataclass(frozen=True)
 class StripKernels:
-    """Kernels of the fast decoder for one hidden width; see `decode`.
-
-    Attributes:
-        hidden: H, width of the hidden layers.
-        vec_hidden: vec of H floats.
-    """
+    """Kernels of the fast decoder for networks with H = `hidden` units in each hidden layer; see `decode`. `vec_hidden`
+    is Warp's type of a vector of H floats."""
 
     hidden: int
     vec_hidden: Any
@@ -266,19 +263,19 @@ class StripKernels:
         tiles: wp.array,
         out: wp.array,
     ) -> None:
-        """Decodes tiles at one time to 32 bits per texel.
+        """Decodes n of N tiles at one time to 32 bits per texel.
 
         Args:
-            stored: Dynamic tiles.
+            stored: The N tiles, all with temporal maps.
             hidden: vecH [N, I + H + 2], hidden layers with H units and I inputs, see `wlm_kernels.mlp`.
             output: vec3 [N, H + 1], output layers.
-            time: The time, and the coefficients of the tiles.
-            volume: vec4 [N, R, R], scratch memory.
-            columns: float [N, H, 128], scratch memory.
-            rows: vec2 [N, 128], scratch memory.
+            time: The time, and the numbers that convert the networks' outputs to colour.
+            volume: vec4 [N, R, R], scratch memory: F_uvt of all N tiles.
+            columns: float [N, H, 128], scratch memory: each column's part of the first layer.
+            rows: vec2 [N, 128], scratch memory: F_vt of each row.
             places: int [N], index of each tile in `time`.
-            tiles: int [n], the tiles to decode. Scratch memory is filled for all N tiles.
-            out: uint32 [n, 128, 128]: colour in 8 bits, RGBA from the lowest byte, or radiance as RGB9E5.
+            tiles: int [n], the tiles to decode.
+            out: uint32 [n, 128, 128], written: colour as 8-bit RGBA from the lowest byte, or radiance as RGB9E5.
         """
         device = out.device
         wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
@@ -301,7 +298,8 @@ class StripKernels:
 
 @wp.func
 def centred_texel(a: wp.vec4, b: wp.vec4, high: wp.uint64, i: int) -> wp.vec4:
-    """Returns texel i of a BC7 block, centred for the network; a, b: endpoint bytes; `high`: indices of texels."""
+    """Returns texel i of a BC7 block, scaled as an input of the network. `a` and `b` are the bytes of the block's
+    endpoints; `high` is its upper half, which contains the texels' indices."""
     index = int(wp.rshift(high, wp.uint64(4 * i)) & wp.uint64(15))
     if i == 0:
         index = int(wp.rshift(high, wp.uint64(1)) & wp.uint64(7))
@@ -333,7 +331,7 @@ STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 r
 
 @functools.cache
 def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
-    """Builds (once) the fast decoder of dynamic tiles for one hidden width.
+    """Builds (once) the fast decoder of tiles with temporal maps, for networks of one hidden width.
 
     Args:
         hidden: H, width of the hidden layers.
@@ -355,7 +353,8 @@ def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
         columns: wp.array3d[float],
         rows: wp.array2d[wp.vec2],
     ):
-        """Writes to `columns` what F_ut and time add to the first layer in each column; to `rows` F_vt of each row."""
+        """Writes to `columns` what F_ut, the time and the bias add to the first layer in each column, and to `rows`
+        F_vt of each row, scaled as an input of the network."""
         n, i = wp.tid()
         p = (float(i) + 0.5) / 128.0
         ut = stored_plane_at(stored.ut, n, p, time.tau, stored.periodic)
@@ -384,7 +383,7 @@ def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
         # out:
         out: wp.array3d[wp.uint32],
     ):
-        """Kernel: one thread decodes a column of four texels of a block; the threads of a warp are neighbours in x."""
+        """Decodes a column of four texels per thread; the threads of a warp are neighbours in x."""
         i, block, x = wp.tid()
         n = tiles[i]
         place = places[n]

@@ -1,11 +1,12 @@
 """Kernel functions that evaluate a lightmap's feature maps in training and draw random training samples.
 
-A tile has the maps F_uv, F_uvt, F_ut, F_vt and an MLP (neural-dynamic-gi, eq. 5 and table 1). The inputs of the MLP
-are, in order, 4 channels of F_uv, 4 of F_uvt, 2 of F_ut, 2 of F_vt and 4 of the encoded time; tiles without temporal
-maps use F_uv alone. Features v in [0, 1] enter as (v - 1/2) sqrt(12): mean 0 and variance 1 where v is uniform.
+A tile has the maps F_uv, F_uvt, F_ut and F_vt over its coordinates u and v and the time t, and an MLP
+(neural-dynamic-gi, eq. 5 and table 1). The MLP's inputs are, in order, 4 channels of F_uv, 4 of F_uvt, 2 of F_ut, 2 of
+F_vt and 4 of the encoded time; tiles without temporal maps use F_uv alone. A feature v in [0, 1] is scaled to (v - 1/2)
+sqrt(12): mean 0 and variance 1 where v is uniform.
 
-`step` is the training step that calls these functions; `gather` converts its sums to gradients; `adjoint` contains the
-hand-written adjoints of sampling; `decode` decodes tiles from their stored bytes.
+`step` is the training step that calls these functions; `gather` converts its sums to gradients; `adjoint` adds the
+maps' gradients; `decode` decodes tiles from their stored bytes.
 
 Read first: `train_features` in `tests/reference/temporal.py`.
 """
@@ -22,7 +23,8 @@ CENTRE = wp.constant(3.4641016151377544)  # sqrt(12)
 
 @wp.struct
 class Maps:
-    """The feature maps of N tiles, with S slices in F_uvt. For static tiles all arrays but the first two are empty."""
+    """The feature maps of N tiles (see the module), with S slices in F_uvt. In static tiles all arrays but the first
+    two are empty."""
 
     uv_endpoints: wp.array4d[wp.vec4]  # [N, 32, 32, 2]
     uv_weights: wp.array3d[float]  # [N, 128, 128]
@@ -46,7 +48,7 @@ class Offsets:
 
 @wp.func
 def ste_byte(v: float, quantised: int) -> float:
-    """Returns v clamped to [0, 1], or if quantised rounded to a byte / 255; `scatter_plane` has derivative 1."""
+    """Returns v clamped to [0, 1], or if quantised a multiple of 1/255. The adjoint treats the derivative as 1."""
     c = wp.clamp(v, 0.0, 1.0)
     if quantised == 0:
         return c
@@ -114,7 +116,7 @@ class Batch:
     weight: wp.array2d[wp.vec3]  # [N, T] weight of the squared error of each channel
     number: wp.array1d[int]  # [N] number of the tile in its lightmap
     scale: wp.array2d[wp.vec3]  # [N, T] divisor of the colours at each time
-    control: wp.array1d[int]  # [0] step
+    control: wp.array1d[int]  # [0] number of the step
     slices: int  # S of F_uvt
     gamma: float
     inverse_range: wp.array2d[float]  # [N, T] 1 / the squared range of radiance; 0 where there is none
@@ -134,7 +136,7 @@ def draw_state(batch: Batch, n: int, b: int, samples: int) -> wp.uint32:
 
 @wp.struct
 class Sample:
-    """A random sample of a tile."""
+    """A random training sample of a tile."""
 
     flat: int  # index of its texel
     k: int  # stored time

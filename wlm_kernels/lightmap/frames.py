@@ -1,8 +1,8 @@
-"""Decodes tiles that are stored as frames: BC7 blocks of any mode, whose values lie between two colours per frame.
+"""Decodes tiles that are stored as frames, one for each time: BC7 blocks of any mode.
 
-Blocks are uint64 `[N T, 32, 32, 2]` for N tiles at T times, the T frames of a tile one after another. The last axis is
-the low and the high half of a block's 16 little-endian bytes. The tables of BC7 are arrays, which
-`wlm.formats.bc7_modes` defines and describes.
+A block's values 0 to 1 stand for the range between two colours that are stored for each frame. Blocks are uint64
+`[N T, 32, 32, 2]` for N tiles at T times, the T frames of a tile one after another. The last axis is the low and the
+high half of a block's 16 little-endian bytes. `wlm.formats.bc7_modes` defines and describes the tables of BC7.
 """
 
 import warp as wp
@@ -50,7 +50,8 @@ def bits_of(low: wp.uint64, high: wp.uint64, at: int, count: int) -> int:
 def share_of(
     low: wp.uint64, high: wp.uint64, tables: Tables, at: int, count: int, texel: int, first: int, second: int
 ) -> int:
-    """Returns the weight of a texel's endpoint 1, in 64ths, from indices of `count` bits that begin at bit `at`."""
+    """Returns the weight of a texel's second endpoint, in 64ths. Indices have `count` bits and begin at bit `at`; the
+    indices of the anchor texels 0, `first` and `second` have one bit less."""
     start = at + count * texel
     width = count
     if texel > 0:
@@ -66,7 +67,7 @@ def share_of(
 
 @wp.func
 def end_of(value: int, count: int, lowest: int) -> int:
-    """Expands a channel of an endpoint to a byte; `lowest` is its P bit, or -1 without one."""
+    """Expands a channel of an endpoint, `count` bits, to a byte; `lowest` is the P bit to append, -1 for none."""
     v = value
     n = count
     if lowest >= 0:
@@ -83,7 +84,7 @@ def mixed(a: int, b: int, share: int) -> int:
 
 @wp.func
 def block_texel(low: wp.uint64, high: wp.uint64, tables: Tables, texel: int) -> wp.vec3:
-    """Decodes the R, G and B bytes of a texel of a block; blocks of the reserved mode are black."""
+    """Decodes the red, green and blue of a texel of a block, 0 to 255; blocks of the reserved mode are black."""
     mode = int(0)
     while mode < 8 and bits_of(low, high, mode, 1) == 0:
         mode += 1
@@ -161,7 +162,7 @@ def power(colour: wp.vec3, exponent: float) -> wp.vec3:
 
 @wp.func
 def frame_radiance(stored: StoredFrames, early: int, late: int, share: float, n: int, y: int, x: int) -> wp.vec3:
-    """Interpolates a texel's linear radiance between two frames; `share` weights the later."""
+    """Interpolates a texel's linear radiance between two frames; `share` is the weight of the later frame."""
     light = power(frame_colour(stored, n * stored.times + early, y, x), stored.gamma)
     if share > 0.0:
         other = power(frame_colour(stored, n * stored.times + late, y, x), stored.gamma)
@@ -221,7 +222,7 @@ def _decode_shared(
 
 
 KERNELS = (_decode_radiance, _decode_bytes, _decode_shared)
-"""All kernels: to radiance, to 8 bits and to RGB9E5."""
+"""The kernels that decode to radiance, to 8-bit RGBA and to RGB9E5."""
 
 
 def decode(stored: StoredFrames, early: int, late: int, share: float, tiles, out, inverse_bounds=None) -> None:
@@ -229,11 +230,11 @@ def decode(stored: StoredFrames, early: int, late: int, share: float, tiles, out
 
     Args:
         stored: The frames.
-        early, late, share: Indices of the two frames around the time, and the weight of the second one in [0, 1).
+        early, late, share: Indices of the two frames around the time, and the weight of the later one, 0 to below 1.
         tiles: int [n], the tiles to decode.
-        out: [n, 128, 128], written: linear radiance as vec3 or as uint32 of RGB9E5; with `inverse_bounds` colour in
-            gamma space relative to the bound, uint32, RGBA from the lowest byte, alpha 255.
-        inverse_bounds: float [N], 1 / the bound of each tile; 0 for a black one.
+        out: [n, 128, 128], written: linear radiance as vec3 or as uint32 of RGB9E5; with `inverse_bounds` gamma-space
+            colour / the tile's bound, as uint32 of 8-bit RGBA from the lowest byte, alpha 255.
+        inverse_bounds: float [N], 1 / the bound (largest colour) of each tile; 0 for a black tile.
     """
     inputs = [stored, early, late, share, tiles]
     if inverse_bounds is not None:

@@ -37,7 +37,7 @@ def _gather_maps_cpu(
 
 @wp.struct
 class Adam:
-    """Adam's settings and moments of one array of parameters."""
+    """Settings of the optimiser Adam, and its moments of one array of parameters."""
 
     decay: wp.vec2  # of the gradients and of their squares
     epsilon: float
@@ -47,7 +47,8 @@ class Adam:
 
 @wp.func
 def moved(adam: Adam, i: int, value: float, grad: float, rate: float, corrections: wp.vec2) -> float:
-    """Returns a parameter after an Adam step t. `corrections`: 1 - decay[0]^t and sqrt(1 - decay[1]^t)."""
+    """Returns parameter i, now `value`, after Adam's step t, and updates its moments. `corrections` are 1 - decay[0]^t
+    and sqrt(1 - decay[1]^t), since the moments began at 0."""
     first = adam.decay[0] * adam.first[i] + (1.0 - adam.decay[0]) * grad
     second = adam.decay[1] * adam.second[i] + (1.0 - adam.decay[1]) * grad * grad
     adam.first[i] = first
@@ -159,7 +160,7 @@ def gather_maps(acc: wp.array, parameters: wp.array, grad: wp.array, base: int =
     """Converts the maps' sums from `StepKernels.launch` on the CPU into gradients, and sets the sums to 0.
 
     Args:
-        acc: float [lanes, M], sums for the M parameters of the maps; set to 0.
+        acc: float [lanes, M], sums for the M parameters of the maps, a row for each CPU thread (lane); set to 0.
         parameters: float [M], the maps; clamped to [0, 1].
         grad: float [M], written.
         base, count: First index and number of parameters that this launch converts; default all.
@@ -183,13 +184,13 @@ def gather_net(
     """Converts the networks' sums on the CPU into gradients, and advances the schedule of learning rates by one step.
 
     Args:
-        partial, partial_out, loss: The networks' sums as float [P, ...], of P lanes; set to 0.
+        partial, partial_out, loss: Sums of P threads for hidden and output layers and losses, float [P, ...]; set to 0.
         schedule: vec3 [steps], whose first component is the factor on the initial learning rates at each step.
         first_rates: The initial learning rates of the maps and of the networks.
-        control: int [1], the step; increased.
-        grad, grad_out: float, the networks' gradients, written.
+        control: int [1], number of the step; increased by 1.
+        grad, grad_out: float, written: gradients of the hidden and output layers.
         mean_loss: float [N], running mean of each tile's loss, updated.
-        rates: float [2], the learning rates of this step, written.
+        rates: float [2], written: the learning rates of the maps and of the networks at this step.
     """
     wp.launch(
         _gather_net,
@@ -216,13 +217,13 @@ def update_maps(
     Args:
         schedule: vec3 [steps]: the factor on the initial learning rates, and Adam's two corrections, see `moved`.
         first_rates: The initial learning rates of the maps and of the networks.
-        control: int [1], the step.
-        move: Whether the maps are updated; they are clamped in any case.
-        acc: int64 [1, M], the sums; set to 0.
+        control: int [1], number of the step.
+        move: Whether Adam updates the maps; they are clamped in any case.
+        acc: int64 [1, M], the sums in steps of 2^-40; set to 0.
         adam: State of the optimiser, updated.
         parameters: float [M], the maps; clamped to [0, 1], then updated.
         grad: float [M], written.
-        rates: float [4], the learning rates and the corrections of this step, written.
+        rates: float [4], written: the learning rates of maps and networks at this step, and Adam's two corrections.
     """
     wp.launch(
         _update_maps,
@@ -247,16 +248,16 @@ def update_net(
     grad: wp.array,
     grad_out: wp.array,
 ) -> None:
-    """Converts the networks' sums into gradients and updates the networks with Adam: ends a step's update.
+    """Converts the networks' sums on a GPU into gradients and updates the networks with Adam: ends a step's update.
 
     Args:
-        partial, partial_out, loss: The networks' sums as float [P, ...], of P blocks.
+        partial, partial_out, loss: Sums of P thread blocks for hidden and output layers and losses, float [P, ...].
         rates: As `update_maps` wrote them.
         adam, adam_out: States of the optimisers of hidden and output layers, updated.
-        hidden, output: float, the networks, updated.
+        hidden, output: float, the hidden and output layers, updated.
         mean_loss: float [N], running mean of each tile's loss, updated.
-        control: int [1], the step; increased.
-        grad, grad_out: float, the networks' gradients, written.
+        control: int [1], number of the step; increased by 1.
+        grad, grad_out: float, written: gradients of the hidden and output layers.
     """
     wp.launch(
         _update_net,

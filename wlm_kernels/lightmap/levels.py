@@ -17,7 +17,7 @@ def _half(value: float) -> float:
 
 @wp.func
 def _column_on_levels(values: wp.array3d[float], n: int, first: int, rows: int, j: int, out: wp.array3d[float]):
-    """Rounds the weights into one unit (column j), and copies the bias in the row after them."""
+    """Rounds the `rows` weights of unit j (column j, from row `first`), and copies its bias, which follows them."""
     most = float(0.0)
     for i in range(rows):
         most = wp.max(most, wp.abs(values[n, first + i, j]))
@@ -51,7 +51,7 @@ def _put_on_levels(
 
 
 def put_on_levels(hidden: wp.array, output: wp.array, hidden_out: wp.array, output_out: wp.array) -> None:
-    """Rounds the weights of N networks to 8-bit levels; biases are copied unchanged.
+    """Rounds the weights of N networks to 8-bit levels, -127 to 127 times a scale for each unit; copies the biases.
 
     Args:
         hidden: float [N, I + H + 2, H], hidden layers with I inputs and H units, see `wlm_kernels.mlp`.

@@ -1,4 +1,4 @@
-"""Decodes dynamic tiles whose networks have 32 hidden units or more on a GPU's matrix units (tensor cores).
+"""Decodes tiles with temporal maps and at least 32 hidden units on a GPU's matrix units (tensor cores).
 
 Activations and weights are half floats, sums are float32, and GELU is its tanh approximation with the GPU's tanh
 instruction. A thread decodes eight texels of a column one after another, so that a block of threads loads its tile's
@@ -41,7 +41,7 @@ def _frame_planes(
     ut: wp.array2d[wp.vec2],
     vt: wp.array2d[wp.vec2],
 ):
-    """Writes F_ut and F_vt, interpolated at one time and centred, to `ut` and `vt` [N, 128]."""
+    """Writes F_ut and F_vt at the time `tau` to `ut` and `vt` [N, 128], scaled as inputs of the network."""
     n, i = wp.tid()
     p = (float(i) + 0.5) / 128.0
     half = wp.vec2(0.5)
@@ -51,7 +51,7 @@ def _frame_planes(
 
 @dataclass(frozen=True)
 class MatrixKernels:
-    """Kernels of the decoder for one hidden width; see `decode`."""
+    """Kernels of the decoder for networks of one hidden width; see `decode`."""
 
     hidden: int
     _decode: Any
@@ -69,18 +69,12 @@ class MatrixKernels:
         tiles: wp.array,
         out: wp.array,
     ) -> None:
-        """Decodes tiles at one time to 32 bits per texel, on CUDA.
+        """Decodes n of N tiles at one time to 32 bits per texel, on CUDA.
 
         Args:
-            stored: Dynamic tiles.
-            hidden: vecH [N, I + H + 2], half floats: hidden layers with H units and I inputs, see `wlm_kernels.mlp`.
-            output: vec3 [N, H + 1], half floats: output layers.
-            time: The time, and the coefficients of the tiles.
-            volume: vec4 [N, R, R], scratch memory.
-            ut, vt: vec2 [N, 128], scratch memory.
-            places: int [N], index of each tile in `time`.
-            tiles: int [n], the tiles to decode. Scratch memory is filled for all N tiles.
-            out: uint32 [n, 128, 128]: colour in 8 bits, RGBA from the lowest byte, or radiance as RGB9E5.
+            hidden, output: Hidden and output layers as for `StripKernels.decode`, but of half floats.
+            ut, vt: vec2 [N, 128], scratch memory: F_ut and F_vt of all N tiles.
+            stored, time, volume, places, tiles, out: As for `StripKernels.decode`.
         """
         device = out.device
         wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
@@ -97,17 +91,17 @@ class MatrixKernels:
 
 @functools.cache
 def matrix_kernels(hidden: int, shared: bool = False) -> MatrixKernels:
-    """Builds (once) the decoder for one hidden width.
+    """Builds (once) the decoder for networks of one hidden width.
 
     Args:
-        hidden: H, a multiple of 16.
+        hidden: H, width of the hidden layers, a multiple of 16.
         shared: Whether to write RGB9E5 instead of 8-bit RGBA.
 
     Raises:
         ValueError: The width is not a multiple of 16.
     """
     if hidden % _STEP or hidden < _STEP:
-        raise ValueError(f"hidden: expected a multiple of {_STEP}, got {hidden}")
+        raise ValueError(f"hidden: expected a width that is a multiple of {_STEP} units, got {hidden}")
     vec_in, vec_hidden = wp.types.vector(TEMPORAL_INPUTS, float), wp.types.vector(hidden, float)
     finish = finish_words(shared)
     constants = {"H": hidden, "NT": hidden // 8, "KT": hidden // _STEP}

@@ -24,10 +24,10 @@ def fits_matrix_units(inputs: int, hidden: int) -> bool:
 def matrix_network(inputs: int, hidden: int, gelu: str) -> Any:
     """Builds (once) the `wp.func` that runs a network forward and backward for `BLOCK` samples of one tile.
 
-    Its arguments are the networks `hidden` [N, I + H + 2] and `output` [N, H + 1], see `wlm_kernels.mlp`, and the
-    number `n` of the block's network; the inputs `f`, the `target` and the `weight` of the channels of each sample;
-    `share`, the factor of every squared error; `row`, the row of the outputs that the block fills; and the outputs,
-    written: `partial` [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
+    The function's arguments are the layers of all networks, `hidden` [N, I + H + 2] and `output` [N, H + 1], see
+    `wlm_kernels.mlp`; the number `n` of the tile's network; each sample's inputs `f`, `target` and `weight` of the
+    channels; `share`, a factor on every squared error; `row`, the number of this block of samples; and the results,
+    written for each block: `partial` [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
 
     It returns the gradient of the inputs of each sample, followed by the error of the output.
 

@@ -1,7 +1,7 @@
 """Interpolates linear radiance between the decoded tiles of two stored times.
 
-8-bit tiles are uint32 [n, 128 * 128], RGBA with R in the lowest byte. Each tile has its own bound: radiance is (byte /
-255 * bound) ** gamma.
+8-bit tiles are uint32 [n, 128 * 128], RGBA with R in the lowest byte. Each tile has its own bound, the colour of byte
+255: radiance is (byte / 255 * bound) ** gamma.
 
 `wlm.lightmap.decode.SheetDecoder.tiles_8bit` computes the same on the host.
 """
@@ -20,7 +20,7 @@ def byte_at(word: wp.uint32, c: int) -> float:
 
 @wp.func
 def with_byte(word: wp.uint32, c: int, share: float) -> wp.uint32:
-    """Sets channel c of an RGBA word to the fraction `share` of 255 and returns the word."""
+    """Sets channel c of an RGBA word, which must be 0, to the byte of 255 * `share`, and returns the word."""
     return word | wp.lshift(wp.uint32(int(wp.clamp(share, 0.0, 1.0) * 255.0 + 0.5)), wp.uint32(8 * c))
 
 
@@ -74,21 +74,16 @@ def blend(early, late, early_inverse, late_inverse, share: float, gamma: float, 
 
     Args:
         early, late: uint32 [n, 128 * 128], the tiles at two stored times.
-        early_inverse, late_inverse: float [n], 1 / the bound of each tile at these times; 0 for a black tile.
+        early_inverse, late_inverse: float [n], 1 / the bound (colour of byte 255) of each tile; 0 for a black tile.
         share: Weight of the later time, 0 to 1.
-        gamma: Gamma of the colours.
-        out: uint32 [n, 128 * 128], written; the bound of a tile is the larger of its two bounds.
+        gamma: Exponent that converts colours to radiance.
+        out: uint32 [n, 128 * 128], written; the bound of a tile is the larger of its bounds at the two times.
     """
     inputs = [early, late, early_inverse, late_inverse, share, gamma]
     wp.launch(_blend, out.shape, inputs=inputs, outputs=[out], device=out.device)
 
 
 def blend_shared(early, late, share: float, out) -> None:
-    """Interpolates between RGB9E5 texels of two times in linear radiance (neural-dynamic-gi, eq. 2).
-
-    Args:
-        early, late: uint32 [n], texels at two stored times.
-        share: Share of the later time, 0 to 1.
-        out: uint32 [n], written.
-    """
+    """Interpolates between RGB9E5 texels of two stored times, uint32 [n], in linear radiance (neural-dynamic-gi, eq.
+    2). `share` is the weight of the later time, 0 to 1; the result is written to `out`, uint32 [n]."""
     wp.launch(_blend_shared, out.shape, inputs=[early, late, share], outputs=[out], device=out.device)

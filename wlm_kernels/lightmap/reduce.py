@@ -31,9 +31,10 @@ def reload():
 def block_reduction(net: mlp.MlpKernels) -> Any:
     """Builds the `wp.func` that sums the gradients of a network over a block of `BLOCK` samples, on CUDA.
 
-    Its arguments are, for each sample, the inputs `f`, `h1`, `h2` of the three layers, the gradients `d1`, `d2`, `d3`
-    of the layers' outputs before activation, and the loss `value`; `row`, the row of the outputs that the block fills;
-    and the outputs, written: `partial` [rows * (I + H + 2), H], `partial_out` [rows * (H + 1), 3] and `loss` [rows].
+    The function's arguments are, for each sample, the inputs `f`, `h1`, `h2` of the three layers, the gradients `d1`,
+    `d2`, `d3` of the layers' outputs before activation, and the loss `value`; `row`, the number of this block of
+    samples; and the sums, written for each block: `partial` [rows * (I + H + 2), H] for I inputs and H units,
+    `partial_out` [rows * (H + 1), 3] and `loss` [rows].
     """
     inputs, hidden = net.inputs, net.hidden
 

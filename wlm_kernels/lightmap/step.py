@@ -65,7 +65,7 @@ class StepKernels:
     _step: Any
 
     def load(self, device: str) -> None:
-        """Compiles the training step for a device before its first launch."""
+        """Compiles the training step for a device, which would otherwise happen at the first launch."""
         self._step.module.load(wp.get_device(device))
 
     def launch(
@@ -86,18 +86,18 @@ class StepKernels:
         """Draws B samples of each of N tiles, and sums their losses and gradients.
 
         Args:
-            maps: The parameters.
-            offsets: Positions of their gradients in `acc`.
+            maps: The maps, whose M parameters are trained.
+            offsets: Positions of the gradients of each map in `acc`.
             hidden: vecH [N, I + H + 2], the hidden layers, see `wlm_kernels.mlp`.
             output: vec3 [N, H + 1], the output layers.
             batch: The training data.
             samples: B; on CUDA a multiple of `BLOCK`.
-            acc: [lanes, M], added to: gradient sums of the maps' M parameters; int64 on CUDA (one lane), float on the
-                CPU.
-            partial: float [P, N, I + H + 2, H]: written on CUDA, one P per block; added to on the CPU, one P per lane.
-            partial_out: float [P, N, H + 1, 3], written or added to like `partial`.
-            loss: float [P, N], like `partial`: sum of weighted squared errors over samples and channels / (3 B).
-            base, count: The launch takes samples base to base + count - 1 of each tile, on the CPU; default all.
+            acc: [lanes, M], gradients of the maps, added to: int64 of one lane on CUDA, float of a lane per CPU thread.
+            partial: float [P, N, I + H + 2, H], gradients of the hidden layers: on CUDA of P blocks of `BLOCK` samples,
+                written; on the CPU of P lanes, added to.
+            partial_out: float [P, N, H + 1, 3], gradients of the output layers, like `partial`.
+            loss: float [P, N], sums of weighted squared errors over samples and channels / (3 B), like `partial`.
+            base, count: On the CPU the launch takes samples `base` to `base` + `count` - 1 of each tile; default all.
         """
         tiles = hidden.shape[0]
         span = samples if count is None else count

@@ -1,7 +1,4 @@
-"""Assembles decoded tiles into one RGB9E5 texture with mips.
-
-See `wlm.lightmap.runtime_texture.MapDecoder`.
-"""
+"""Assembles decoded tiles into one RGB9E5 texture with mips, for `wlm.lightmap.runtime_texture.MapDecoder`."""
 
 import warp as wp
 
@@ -77,11 +74,11 @@ def _fill(
 
 
 def place(tiles, corners, texture) -> None:
-    """Copies decoded tiles into the texture of the map.
+    """Copies decoded tiles into the texture of a lightmap.
 
     Args:
         tiles: uint32 [n, 128, 128], RGB9E5.
-        corners: vec2i [n], row and column of each tile's first texel; texels outside the map are left out.
+        corners: vec2i [n], row and column of each tile's first texel; texels outside the texture are left out.
         texture: uint32 [H, W], changed.
     """
     wp.launch(_place, tiles.shape, inputs=[tiles, corners], outputs=[texture], device=texture.device)
@@ -92,7 +89,7 @@ def paint(colours, corners, side: int, texture) -> None:
 
     Args:
         colours: vec3 [n], radiance.
-        corners: vec2i [n], row and column of each tile's first texel.
+        corners: vec2i [n], row and column of each tile's first texel; texels outside the texture are left out.
         side: Texels along a side of a tile.
         texture: uint32 [H, W], changed.
     """
@@ -112,11 +109,6 @@ def halve(fine, weight, coarse) -> None:
 
 
 def fill(target, source, texture) -> None:
-    """Copies texels within a texture: fills gaps between charts with the light of other texels.
-
-    Args:
-        target: vec2i [G], row and column of the texels that are filled.
-        source: vec2i [G], row and column of the texels to copy from; none of them is a target.
-        texture: uint32 [H, W], changed.
-    """
+    """Copies G texels within a texture, uint32 [H, W], to fill gaps between charts with the light of other texels.
+    `source` and `target`, vec2i [G], are rows and columns; no source may be a target."""
     wp.launch(_fill, target.shape, inputs=[target, source], outputs=[texture], device=texture.device)

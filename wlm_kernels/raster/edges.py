@@ -1,6 +1,7 @@
 """Edge functions of triangles in homogeneous coordinates, and their exact signs.
 
-`wlm_kernels.raster.rasterize` defines them. Read `tests/reference/raster.py` first; it computes coverage with integers.
+`wlm_kernels.raster.rasterize` defines edge functions. Read `tests/reference/raster.py` first, which decides in integers
+which pixels a triangle covers.
 """
 
 import warp as wp
@@ -26,12 +27,13 @@ vec12d = wp.types.vector(length=12, dtype=wp.float64)
 
 @wp.struct
 class Frame:
-    """Pixel centres: that of column i, row j is (x, y, w) = ((x + 2 i) H, (y + y_step j) W, scale W H), in integers.
+    """The pixel centres of an image, in integers: the centre of the pixel in column i and row j is the homogeneous
+    point (x, y, w) = ((x + 2 i) height, (y + y_step j) width, scale * width * height).
 
     Attributes:
-        height, width: H, W.
-        x: x of column 0.
-        y, y_step: y of row 0, and its change from row to row.
+        height, width: Size of the image in pixels.
+        x: Value of x for column 0.
+        y, y_step: Value of y for row 0, and its change from row to row.
         scale: 1 where coordinates run from -1 to 1, 2 where they run from 0 to 1.
     """
 
@@ -45,7 +47,7 @@ class Frame:
 
 @wp.struct
 class Corners:
-    """The corners (x, y, w) of a triangle, and their z."""
+    """The homogeneous corners (x, y, w) of a triangle, and the z of each corner."""
 
     a: wp.vec3d
     b: wp.vec3d
@@ -55,7 +57,7 @@ class Corners:
 
 @wp.struct
 class Box:
-    """Pixels [left, right] x [top, bottom]; empty where left > right or top > bottom."""
+    """The pixels from column `left` to `right` and row `top` to `bottom`; none where left > right or top > bottom."""
 
     left: int
     right: int
@@ -65,12 +67,13 @@ class Box:
 
 @wp.struct
 class Edges:
-    """The three edge functions, E = x X + y Y + c for X = frame.x + 2 i, Y = frame.y + y_step j, positive inside.
+    """The three edge functions of a triangle, E = x X + y Y + c, positive inside. In pixel column i and row j, X is
+    frame.x + 2 i and Y is frame.y + y_step j.
 
     Attributes:
         x, y, c: Coefficients; component i belongs to the edge opposite corner i.
         limit: Bound of the rounding error of each edge function; set by `edges_of`.
-        sign: Sign of the determinant of the corners; 0: covers nothing.
+        sign: Sign of the determinant of the corners; 0 if the triangle covers nothing.
     """
 
     x: wp.vec3d
@@ -115,10 +118,10 @@ def finite(k: Corners) -> bool:
 
 @wp.func
 def exact_sign(p: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.float64:
-    """Returns the exact sign of det[p, v, w], for p of integers up to 2^29 or of float32s, and v, w of float32s.
+    """Returns the exact sign of det[p, v, w]; v and w are float32 numbers, p float32 numbers or integers up to 2^29.
 
-    A product v_a w_b fits 48 bits, each half of it times p_c fits 53: twelve exact terms. They are added as an
-    expansion, a sum of float64s that don't overlap; its last component that isn't zero has the sign.
+    A product v_a w_b fits 48 bits, and each half of it times p_c fits a float64: twelve exact terms. They are added as
+    an expansion, a sum of float64 numbers that don't overlap; its last component that isn't zero has the sign.
     """
     sums = vec12d()
     count = int(0)
@@ -149,7 +152,7 @@ def exact_sign(p: wp.vec3d, v: wp.vec3d, w: wp.vec3d) -> wp.float64:
 
 @wp.func
 def centre(frame: Frame, row: int, column: int) -> wp.vec3d:
-    """Returns the pixel centre P, with integer components."""
+    """Returns the homogeneous centre P of a pixel, with integer components."""
     return wp.vec3d(
         wp.float64((frame.x + 2 * column) * frame.height),
         wp.float64((frame.y + frame.y_step * row) * frame.width),
@@ -159,7 +162,7 @@ def centre(frame: Frame, row: int, column: int) -> wp.vec3d:
 
 @wp.func
 def functions(k: Corners, frame: Frame, sign: wp.float64) -> Edges:
-    """Computes the edge functions in float64; products of float32s are exact, so a coefficient is rounded once."""
+    """Computes edge functions in float64. Products of float32 numbers are exact, so a coefficient is rounded once."""
     out = Edges()
     n0 = sign * wp.cross(k.b, k.c)
     n1 = sign * wp.cross(k.c, k.a)
@@ -175,7 +178,7 @@ def functions(k: Corners, frame: Frame, sign: wp.float64) -> Edges:
 
 @wp.func
 def edges_of(k: Corners, frame: Frame, cull: int) -> Edges:
-    """Computes edge functions, positive inside, with rounding bounds; sign 0 if the triangle covers nothing."""
+    """Computes edge functions, positive inside, with rounding bounds; `sign` is 0 if the triangle covers nothing."""
     n = wp.cross(k.b, k.c)
     d = wp.dot(k.a, n)
     size = wp.abs(k.a[0] * n[0]) + wp.abs(k.a[1] * n[1]) + wp.abs(k.a[2] * n[2])
@@ -194,7 +197,7 @@ def edges_of(k: Corners, frame: Frame, cull: int) -> Edges:
 
 @wp.func
 def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
-    """Returns whether a pixel's centre lies inside the triangle; exact, with the top-left rule on edges."""
+    """Returns whether a pixel's centre lies inside the triangle: exact, with the top-left rule for points on edges."""
     p = centre(frame, row, column)
     v = k.b
     w = k.c
@@ -214,9 +217,9 @@ def covers(e: Edges, k: Corners, frame: Frame, row: int, column: int) -> bool:
 
 @wp.func
 def _extent(k: Corners, axis: int):
-    """Returns the least and greatest x / w (axis 0) or y / w of the triangle's part in front of the viewer.
+    """Returns the least and greatest x / w (axis 0) or y / w (axis 1) of a triangle's part before the viewer (w > 0).
 
-    An edge that crosses w = 0 goes to an infinity of one sign. Without such a part the least is above the greatest.
+    An edge that crosses w = 0 extends to plus or minus infinity. If no part has w > 0, the least is above the greatest.
     """
     low = wp.float64(wp.inf)
     high = wp.float64(-wp.inf)
@@ -239,13 +242,13 @@ def _extent(k: Corners, axis: int):
 
 @wp.func
 def first_pixel(place: wp.float64, count: int) -> int:
-    """Returns the first pixel at or after a position in pixels, 0 to count."""
+    """Returns the first of `count` pixels at or after a position in pixels; `count` if there is none."""
     return int(wp.clamp(wp.ceil(place - _SLACK), _ZERO, wp.float64(count)))
 
 
 @wp.func
 def last_pixel(place: wp.float64, count: int) -> int:
-    """Returns the last pixel at or before a position in pixels, -1 to count - 1."""
+    """Returns the last of `count` pixels at or before a position in pixels; -1 if there is none."""
     return int(wp.clamp(wp.floor(place + _SLACK), -_ONE, wp.float64(count - 1)))
 
 
@@ -272,7 +275,7 @@ def box_of(k: Corners, frame: Frame) -> Box:
 
 @wp.func
 def edges_at(k: Corners, frame: Frame, row: int, column: int):
-    """Returns the edge functions at a covered pixel, made positive, and their derivatives by X and Y."""
+    """Returns the edge functions at a covered pixel, made positive, and their derivatives by X and Y; see `Edges`."""
     e = functions(k, frame, _ONE)
     x = wp.float64(frame.x + 2 * column)
     y = wp.float64(frame.y + frame.y_step * row)
@@ -289,14 +292,14 @@ def total_of(v: wp.vec3d) -> wp.float64:
 
 
 def frame(height: int, width: int, space: str) -> Frame:
-    """Creates the `Frame` of an image of the given size in pixels, in `space` "clip" or "uv".
+    """Creates the `Frame` of an image of the given size in pixels, for positions in the space "clip" or "uv".
 
     Raises:
-        ValueError: A size is out of range.
+        ValueError: The height or the width is not from 1 to `MOST_PIXELS`.
     """
     for name, size in (("height", height), ("width", width)):
         if not 1 <= size <= MOST_PIXELS:
-            raise ValueError(f"{name}: expected 1 to {MOST_PIXELS}, got {size}")
+            raise ValueError(f"{name}: expected 1 to {MOST_PIXELS} pixels, got {size}")
     out = Frame()
     out.height, out.width = height, width
     if space == "uv":
@@ -309,4 +312,4 @@ def frame(height: int, width: int, space: str) -> Frame:
 def check_position(position, space: str) -> None:
     columns = 2 if space == "uv" else 4
     if position.ndim != 2 or position.shape[1] != columns:
-        raise ValueError(f"position: expected [V, {columns}] in {space} space, got {tuple(position.shape)}")
+        raise ValueError(f"position: expected shape [any, {columns}] in {space} space, got {tuple(position.shape)}")

@@ -1,8 +1,8 @@
-"""Interpolation of attributes at each pixel's surface point, and backward passes to attributes and positions.
+"""Interpolates vertex attributes at each pixel's surface point, and computes gradients of attributes and positions.
 
-`wlm_kernels.raster.rasterize` defines barycentrics. Visibility is a constant to all gradients.
+`wlm_kernels.raster.rasterize` defines barycentrics. Gradients take the visible triangle of each pixel as fixed.
 
-Read `wlm/ops/plain.py` first (`corner_weights`): barycentrics in torch, differentiated by autograd.
+Read `wlm/ops/plain.py` first (`corner_weights`), which computes barycentrics in torch, differentiated by autograd.
 """
 
 import warp as wp
@@ -34,7 +34,6 @@ def _rasterize_backward(
     # out:
     grad: wp.array2d[float],
 ):
-    """Adds the gradients of one pixel's barycentrics to its triangle's corners; one pixel per thread."""
     row, column = wp.tid()
     t = visible[row, column]
     if not _readable(triangle, t, position.shape[0]):
@@ -74,7 +73,6 @@ def _interpolate(
     # out:
     out: wp.array3d[float],
 ):
-    """Interpolates the attributes at one pixel per thread."""
     row, column = wp.tid()
     t = visible[row, column]
     if not _readable(triangle, t, attribute.shape[0]):
@@ -102,7 +100,6 @@ def _interpolate_backward(
     grad_attribute: wp.array2d[float],
     grad_barycentric: wp.array2d[wp.vec2],
 ):
-    """Computes the gradients of one pixel's attributes and barycentrics; one pixel per thread."""
     row, column = wp.tid()
     t = visible[row, column]
     grad_u = float(0.0)
@@ -126,15 +123,15 @@ def _interpolate_backward(
 
 
 def rasterize_backward(position, triangle, visible, grad_barycentric, grad, space: str = "clip") -> None:
-    """Backward pass from a raster's barycentrics to the positions; z has no gradient.
+    """Computes the gradient of positions from the gradient of a raster's barycentrics; z has no gradient.
 
     On CUDA pixels are summed in any order, so that the last bits change from run to run.
 
     Args:
-        position: float [V, 4], or [V, 2] in UV space.
-        triangle: int [F, 3].
+        position: float [V, 4], clip coordinates x, y, z, w of V vertices; or in UV space float [V, 2], u and v.
+        triangle: int [F, 3], the vertices of each triangle.
         visible: int [H, W], the visible triangle of each pixel.
-        grad_barycentric: vec2 [H, W].
+        grad_barycentric: vec2 [H, W], gradient of the weights of corners 0 and 1.
         grad: Shaped like `position`; the gradient is added to it.
         space: "clip" or "uv", as for `Rasterizer`.
     """
@@ -149,10 +146,10 @@ def interpolate(attribute, triangle, visible, barycentric, out) -> None:
     The result is 0 and has no gradient in uncovered pixels, and where the triangle or one of its corners doesn't exist.
 
     Args:
-        attribute: float [V, C].
-        triangle: int [F, 3], rows of `attribute`; the indices may differ from those of the positions.
+        attribute: float [V, C], rows of C attributes.
+        triangle: int [F, 3], the row of `attribute` of each corner; may differ from the triangles of the positions.
         visible: int [H, W], the visible triangle of each pixel.
-        barycentric: vec2 [H, W], weights of its corners 0 and 1.
+        barycentric: vec2 [H, W], weights of corners 0 and 1 of the visible triangle.
         out: float [H, W, C], written.
     """
     inputs = [attribute, triangle, visible, barycentric]
@@ -160,15 +157,15 @@ def interpolate(attribute, triangle, visible, barycentric, out) -> None:
 
 
 def interpolate_backward(attribute, triangle, visible, barycentric, grad_out, grad_attribute, grad_barycentric) -> None:
-    """Backward pass of `interpolate`: gradients of the attributes and of the barycentrics.
+    """Computes the gradients of attributes and barycentrics from the gradient of a result of `interpolate`.
 
     On CUDA pixels are added to `grad_attribute` in any order, so that the last bits change from run to run.
 
     Args:
         attribute, triangle, visible, barycentric: Arguments of `interpolate`.
-        grad_out: float [H, W, C].
-        grad_attribute: float [V, C], added to; of shape [0, 0]: not computed.
-        grad_barycentric: vec2 [H, W], written; of shape [0, 0]: not computed.
+        grad_out: float [H, W, C], gradient of the result.
+        grad_attribute: float [V, C], to which the gradient is added; of shape [0, 0] if it is not wanted.
+        grad_barycentric: vec2 [H, W], written; of shape [0, 0] if it is not wanted.
     """
     inputs = [attribute, triangle, visible, barycentric, grad_out]
     outputs = [grad_attribute, grad_barycentric]

@@ -1,25 +1,25 @@
-"""Rasterization in clip space or UV space: the visible triangle at each pixel centre, the barycentrics, the depth.
+"""Rasterization in clip space or UV space: the visible triangle at each pixel centre, its barycentrics and its depth.
 
-A pixel centre P and a corner v are homogeneous, (x, y, w). The edge function of corner i, E_i = det[P, v_j, v_k], is
-linear in the pixel; P lies in the part of the triangle that is in front of the viewer (w > 0) where all three have the
-sign of det[v_0, v_1, v_2], and E_i / (E_0 + E_1 + E_2) are the barycentrics of the point seen there. Nothing is divided
-by w, so a triangle that reaches behind the viewer needs no clipping; there is no near and no far plane.
+A pixel centre P and a corner v are homogeneous points (x, y, w). The edge function of corner i, E_i = det[P, v_j, v_k],
+is linear in the pixel. P shows the part of the triangle in front of the viewer (w > 0) where all three edge functions
+have the sign of det[v_0, v_1, v_2]; E_i / (E_0 + E_1 + E_2) are the barycentrics of the point seen there. Nothing is
+divided by w, so a triangle that reaches behind the viewer needs no clipping; there is no near and no far plane.
 
-Coverage is decided without rounding. Where float64 can't decide the sign of an edge function it is computed exactly,
-and where it is exactly zero the pixel counts as moved by an infinitesimal step to the right, and by an infinitely
-smaller one down: the top-left rule, for both windings. So a pixel on an edge or a corner that triangles share is
-covered by exactly one of those that surround it, also where they use different vertices at equal positions.
+Coverage is decided without rounding. Where float64 can't decide the sign of an edge function, it is computed exactly.
+Where it is exactly zero, the pixel counts as moved to the right by an infinitesimal step, and down by an infinitely
+smaller one: the top-left rule, for both windings. So of the triangles around a shared edge or corner exactly one covers
+a pixel on it, even if they have different vertices at equal positions.
 
-The visible triangle is a minimum over 64-bit keys, depth first and then number: the same on every run.
+The visible triangle has the least 64-bit key, of the depth and then the triangle's number: the same in every run.
 
-Row 0 is the top row of the image. In clip space y points up, pixel (row j, column i) of H x W has its centre at
-x/w = (2 i + 1) / W - 1, y/w = 1 - (2 j + 1) / H, and of the triangles over a pixel the one of least z/w wins. In UV
-space, glTF's, v points down, the centre is u = (i + 1/2) / W, v = (j + 1/2) / H, and the least number wins.
+Row 0 is the top row of the image. In clip space y points up, pixel (row j, column i) of H x W has its centre at x/w =
+(2 i + 1) / W - 1, y/w = 1 - (2 j + 1) / H, and the triangle with the least z/w is visible. In UV space v points down,
+as in glTF, the centre is u = (i + 1/2) / W, v = (j + 1/2) / H, and the triangle with the least number is visible.
 
 A triangle covers nothing if a corner isn't finite or doesn't exist, or if it has no area.
 
-Edge functions are in `edges`; interpolation and backward passes in `gradient`. Read `wlm/ops/plain.py` first
-(`rasterize`): the same by solving for the corners' weights at each pixel.
+Edge functions are in `edges`; interpolation and gradients in `gradient`. Read `wlm/ops/plain.py` first (`rasterize`),
+which solves for the corners' weights at each pixel instead.
 """
 
 import math
@@ -75,7 +75,7 @@ def _draw(
     keys: wp.array2d[wp.int64],
     coverage: wp.array2d[int],
 ):
-    """Draws the part of a triangle in a box: updates the depth keys and coverage counts of its pixels."""
+    """Draws the part of a triangle in a box of pixels: updates the pixels' depth keys and coverage counts."""
     e = edges_of(k, frame, cull)
     if e.sign == _ZERO:
         return
@@ -147,10 +147,10 @@ def _draw_small(
     queue: wp.array1d[int],
     starts: wp.array1d[wp.int64],
 ):
-    """Handles one triangle per thread: draws a small one, and queues a larger one as tiles for `_draw_tiles`.
+    """Draws one small triangle per thread; puts a larger one into a queue, cut into tiles of pixels for `_draw_tiles`.
 
-    `queued` is unit * (number of triangles) + (number of tiles). One atomic addition changes both, so that `starts`,
-    the first tile of each queued triangle, is ascending.
+    `queued` counts triangles and tiles in one number, triangles * unit + tiles. One atomic addition changes the two, so
+    that `starts`, the number of each queued triangle's first tile, is ascending.
     """
     t = wp.tid()
     if not has_corners(triangle, t, position.shape[0]):
@@ -188,7 +188,7 @@ def _draw_tiles(
     keys: wp.array2d[wp.int64],
     coverage: wp.array2d[int],
 ):
-    """Draws the tiles of queued triangles, one per thread at a time; thread i takes tiles i, i + sharers, ..."""
+    """Draws the tiles of queued triangles: thread i draws the tiles i, i + sharers, i + 2 sharers and so on."""
     item = wp.int64(wp.tid())
     count = int(queued[0] / unit)
     items = queued[0] % unit
@@ -228,7 +228,7 @@ def _resolve(
     depth: wp.array2d[float],
     derivative: wp.array2d[wp.vec4],
 ):
-    """Computes one pixel of the results from its depth key; one pixel per thread."""
+    """Computes the results of one pixel per thread from its depth key."""
     row, column = wp.tid()
     key = keys[row, column]
     if key == _EMPTY:
@@ -270,13 +270,13 @@ class Raster:
     """The visible surface point of each pixel.
 
     Attributes:
-        triangle: int [H, W], number of the visible triangle, -1: none.
+        triangle: int [H, W], number of the visible triangle; -1 if there is none.
         barycentric: vec2 [H, W], weights of its corners 0 and 1, perspective-correct, in [0, 1]; corner 2 has 1 minus
             their sum. 0 where there is no triangle, like the attributes below.
         depth: float [H, W], z / w.
-        derivative: vec4 [H, W], derivatives of the weights per pixel: du/dx, du/dy, dv/dx, dv/dy, x to the right and y
-            down; None: not computed.
-        coverage: int [H, W], number of triangles that cover the pixel's centre, hidden ones too; None: not computed.
+        derivative: vec4 [H, W], derivatives of the weights (u, v) per pixel: du/dx, du/dy, dv/dx, dv/dy, with x to the
+            right and y down; None if they are not computed.
+        coverage: int [H, W], number of triangles, also hidden ones, over the pixel's centre; None if not computed.
     """
 
     triangle: Any
@@ -289,22 +289,22 @@ class Raster:
 class Rasterizer:
     """Draws the same triangles many times. Buffers are allocated once: `run` may be captured in a CUDA graph.
 
-    Besides the result it stores 8 bytes per pixel and 12 per triangle: tiles of triangles are counted, not stored.
+    Besides the result it allocates 8 bytes per pixel and 12 bytes per triangle.
 
     Args:
-        triangle: int [F, 3], numbers of corners.
-        height, width: Size of the image, 1 to `MOST_PIXELS`.
-        space: "clip" or "uv", see the module.
-        cull: Whether to leave out clockwise triangles: on the screen in clip space, in a frame with v up in UV space.
+        triangle: int [F, 3], the vertices of each triangle.
+        height, width: Size of the image, 1 to `MOST_PIXELS` pixels.
+        space: Space of the positions, "clip" or "uv"; see the module.
+        cull: Whether to leave out clockwise triangles: as seen on the screen in clip space, and with v up in UV space.
         derivative, coverage: Whether to compute these attributes of `Raster`.
-        split: Maximum pixels in the box of a triangle drawn by one thread; None: 64 on CUDA, no limit on the CPU.
-        empty: Allocates a buffer, `empty(shape, dtype=...)` on the triangles' device; default Warp's.
+        split: Most pixels in the bounding box of a triangle that one thread draws; None: 64 on CUDA, any on the CPU.
+        empty: Function that allocates a buffer, `empty(shape, dtype=...)`, on the triangles' device; None: Warp's.
 
     Attributes:
         raster: `Raster`, the output of `run`.
 
     Raises:
-        ValueError: An argument is wrong, or the number of tiles of all triangles can exceed the counter's range.
+        ValueError: An argument is wrong, or there are too many triangles for an image of this size.
     """
 
     def __init__(
@@ -321,9 +321,9 @@ class Rasterizer:
         empty: Callable[..., Any] | None = None,
     ) -> None:
         if space not in SPACES:
-            raise ValueError(f"space: expected one of {', '.join(SPACES)}, got {space!r}")
+            raise ValueError(f"space: expected {' or '.join(SPACES)}, got {space!r}")
         if triangle.ndim != 2 or triangle.shape[1] != 3:
-            raise ValueError(f"triangle: expected [F, 3], got {tuple(triangle.shape)}")
+            raise ValueError(f"triangle: expected shape [triangles, 3], got {tuple(triangle.shape)}")
         device, count = triangle.device, triangle.shape[0]
         empty = empty or (lambda shape, dtype: wp.empty(shape, dtype=dtype, device=device))
         self._triangle = triangle
@@ -336,7 +336,7 @@ class Rasterizer:
         self._names = (1 << bits) - 1
         self._unit = 1 << (62 - bits)
         if max(1, count) * math.ceil(height / _TILE) * math.ceil(width / _TILE) >= self._unit:
-            raise ValueError(f"triangle: {count} are too many for {height} x {width} pixels")
+            raise ValueError(f"triangle: {count} triangles are too many for {height} x {width} pixels; draw fewer")
         size = (height, width)
         none = empty((0, 0), dtype=int)
         self._keys = empty(size, dtype=wp.int64)
@@ -357,10 +357,10 @@ class Rasterizer:
         """Draws the triangles with their corners at the given positions.
 
         Args:
-            position: float [V, 4], clip coordinates x, y, z, w; or in UV space float [V, 2], u and v.
+            position: float [V, 4], clip coordinates x, y, z, w of V vertices; or in UV space float [V, 2], u and v.
 
         Returns:
-            `raster`, overwritten by the next run.
+            The attribute `raster`, which the next run overwrites.
 
         Raises:
             ValueError: `position` has a wrong shape for the space.

@@ -28,11 +28,11 @@ def _first_hit(
 
 
 def first_hit(mesh: wp.Mesh, origin: wp.array, direction: wp.array, distance: wp.array, front: wp.array) -> None:
-    """Casts rays from all points in all directions.
+    """Casts rays from P points in D directions.
 
     Args:
         mesh: The triangles.
-        origin: vec3 [P].
+        origin: vec3 [P], the points.
         direction: vec3 [D], of unit length, the same for all points.
         distance: float [P, D], written: distance to the first triangle; infinite if there is none.
         front: int8 [P, D], written: 1 for a front face (corners counter-clockwise), -1 for a back face, 0 for none.

@@ -1,7 +1,7 @@
 """Bilinear and nearest texture reads, and their backward pass (lightmap-uv-clustering-cascade, section 3.3.2).
 
-u points right and v down, row 0 is v = 0; texel i of n has its centre at (i + 1/2) / n. The boundary mode
-defines coordinates outside [0, 1]:
+u points right and v down, row 0 is at v = 0; texel i of n has its centre at (i + 1/2) / n. The boundary mode
+says what coordinates outside [0, 1] read:
 
     clamp   the nearest texel of the border;
     wrap    the texture repeated;
@@ -9,12 +9,12 @@ defines coordinates outside [0, 1]:
             1/2)|. Eq. 8 of the paper has a floor in place of the absolute value, which makes it -2 or 0 everywhere.
 
 Coordinates are float32, but weights are computed in float64: at 4,096 texels float32 would leave them 12 bits. A
-coordinate that is NaN, or infinite and not clamped, reads NaN; it neither has nor passes on a gradient.
+coordinate that is NaN, or infinite and not clamped, reads NaN; it has no gradient, and adds none to the texture.
 
-`axis_at`, `read`, `read_slope` and `add` serve other kernels that read textures; one `Axis` for u and one for
-v serve all channels, forward and backward.
+Other kernels read textures with `axis_at`, `read`, `read_slope` and `add`. One `Axis` for u and one for v suffice for
+all channels and their gradients.
 
-Read `wlm/ops/plain.py` first (`texture`), which uses torch's `grid_sample`.
+Read `wlm/ops/plain.py` first (`texture`), which does the same with torch's `grid_sample`.
 """
 
 import warp as wp
@@ -30,10 +30,10 @@ _NEAREST = wp.constant(FILTERS.index("nearest"))
 
 @wp.struct
 class Axis:
-    """A coordinate's two texels along one axis, and their weights.
+    """The two texels that a coordinate reads along one axis, and their weights.
 
     Attributes:
-        low, high: Indices of the texels on both sides of the coordinate, equal at a border; always in the texture.
+        low, high: Indices of the texels on the two sides of the coordinate, equal at a border; always in the texture.
         weight: Weight of texel `high`, in [0, 1]; `low` has 1 - weight. NaN if the coordinate reads NaN.
         slope: Derivative of `weight` by the coordinate.
     """
@@ -46,7 +46,7 @@ class Axis:
 
 @wp.func
 def triangle_wave(x: float) -> float:
-    """Evaluates the triangle wave of the boundary "mirror" exactly: |x| in [-1, 1], period 2. NaN if x isn't finite."""
+    """Evaluates the triangle wave of boundary "mirror" exactly: |x| in [-1, 1], period 2; NaN if x isn't finite."""
     t = wp.float64(x)
     half = wp.float64(0.5)
     return float(wp.abs(t - wp.float64(2.0) * wp.floor(half * t + half)))
@@ -54,7 +54,8 @@ def triangle_wave(x: float) -> float:
 
 @wp.func
 def triangle_wave_slope(x: float) -> float:
-    """Returns the wave's slope: 1 where it rises and in valleys, -1 where it falls and on peaks; 0 for NaN."""
+    """Returns the slope of `triangle_wave`: 1 where it rises or in valleys, -1 where it falls or on peaks; 0 for
+    NaN."""
     if not wp.isfinite(x):
         return 0.0
     t = wp.float64(x)
@@ -123,7 +124,7 @@ def read(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> float:
 
 @wp.func
 def read_slope(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> wp.vec2:
-    """Returns the derivatives of the sampled channel c by u and by v."""
+    """Returns the derivatives by u and by v of channel c, sampled at the coordinates (x, y)."""
     if wp.isnan(x.weight) or wp.isnan(y.weight):
         return wp.vec2()
     top_left = texture[y.low, x.low, c]
@@ -137,7 +138,7 @@ def read_slope(texture: wp.array3d[float], x: Axis, y: Axis, c: int) -> wp.vec2:
 
 @wp.func
 def add(grad: wp.array3d[float], x: Axis, y: Axis, c: int, g: float):
-    """Adds the gradient g of a result of `read` to the gradients of the texels that it read."""
+    """Adds the gradient g of a result of `read` to the gradients of the texels that `read` has used."""
     if wp.isnan(x.weight) or wp.isnan(y.weight):
         return
     top = (1.0 - y.weight) * g
@@ -161,7 +162,6 @@ def _sample(
     # out:
     out: wp.array2d[float],
 ):
-    """Samples the texture at one point per thread."""
     i = wp.tid()
     x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
     y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
@@ -181,7 +181,6 @@ def _sample_backward(
     grad_texture: wp.array3d[float],
     grad_uv: wp.array1d[wp.vec2],
 ):
-    """Adds one point's gradient to the texture and writes the gradient of uv; one point per thread."""
     i = wp.tid()
     x = axis_at(uv[i][0], texture.shape[1], filter, boundary)
     y = axis_at(uv[i][1], texture.shape[0], filter, boundary)
@@ -203,29 +202,29 @@ def codes(filter: str, boundary: str) -> tuple[int, int]:
     """Returns the integer codes by which kernels know a filter and a boundary mode.
 
     Args:
-        filter: "linear", between the four nearest texels, or "nearest".
+        filter: "linear" interpolates between the four nearest texels; "nearest" reads the nearest one.
         boundary: "clamp", "wrap" or "mirror", see the module.
 
     Raises:
-        ValueError: An unknown name.
+        ValueError: The filter or the boundary mode is unknown.
     """
     for name, value, names in (("filter", filter, FILTERS), ("boundary", boundary, BOUNDARIES)):
         if value not in names:
-            raise ValueError(f"{name}: expected one of {', '.join(names)}, got {value!r}")
+            raise ValueError(f"{name}: expected {' or '.join(names)}, got {value!r}")
     return FILTERS.index(filter), BOUNDARIES.index(boundary)
 
 
 def _check(texture) -> None:
     if texture.ndim != 3 or 0 in texture.shape:
-        raise ValueError(f"texture: expected [H, W, C], none of them 0, got {tuple(texture.shape)}")
+        raise ValueError(f"texture: expected shape [height, width, channels], each above 0, got {tuple(texture.shape)}")
 
 
 def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp") -> None:
-    """Reads a texture at any coordinates.
+    """Reads a texture at N points with any coordinates.
 
     Args:
         texture: float [H, W, C].
-        uv: vec2 [N].
+        uv: vec2 [N], coordinates (u, v).
         out: float [N, C], written.
         filter, boundary: Names, see `codes`.
     """
@@ -237,15 +236,16 @@ def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp")
 def sample_backward(
     texture, uv, grad_out, grad_texture, grad_uv, *, filter: str = "linear", boundary: str = "clamp"
 ) -> None:
-    """Backward pass of `sample`. The gradient of uv is the slope between its texels, 0 at a clamped border.
+    """Computes the gradients of the texture and of uv from the gradient of a result of `sample`.
 
-    On CUDA samples are added to `grad_texture` in any order, so that the last bits change from run to run.
+    The gradient of a coordinate is the slope between the texels that it reads, 0 at a clamped border. On CUDA samples
+    are added to `grad_texture` in any order, so that the last bits change from run to run.
 
     Args:
         texture, uv, filter, boundary: Arguments of `sample`.
-        grad_out: float [N, C].
-        grad_texture: float [H, W, C], added to; of shape [0, 0, 0]: not computed.
-        grad_uv: vec2 [N], written; of shape [0]: not computed.
+        grad_out: float [N, C], gradient of the result.
+        grad_texture: float [H, W, C], to which the gradient is added; of shape [0, 0, 0] if it is not wanted.
+        grad_uv: vec2 [N], written; of shape [0] if it is not wanted.
     """
     _check(texture)
     inputs = [texture, uv, *codes(filter, boundary), grad_out]

@@ -33,9 +33,11 @@ _Several = wp.types.vector(length=int(_AT_ONCE), dtype=float)
 
 @wp.struct
 class Lattice:
-    """A lattice with nodes at `origin` plus `low` plus multiples of `gap` along the rows of `axes`, in voxels.
+    """A lattice of points, in voxels: node (0, 0, 0) is at `origin` plus `low`, and neighbouring nodes are `gap` apart;
+    `low` and `gap` are measured along the rows of `axes`.
 
-    A point light also has its `place` and the `radius` within which its irradiance is constant.
+    The lattice of a point light has `point` = 1, the light's position `place`, and the `radius` within which its
+    irradiance is constant.
     """
 
     axes: wp.mat33
@@ -49,7 +51,6 @@ class Lattice:
 
 @wp.func
 def axis(lattice: Lattice, n: int) -> wp.vec3:
-    """Returns the direction of an axis of the lattice."""
     return wp.vec3(lattice.axes[n, 0], lattice.axes[n, 1], lattice.axes[n, 2])
 
 
@@ -113,7 +114,7 @@ def _measure(smoke_type: Any, pairs: int) -> wp.Kernel:
         # out:
         gaps: wp.array4d[float],
     ):
-        """Computes the optical depth between a node and its neighbour along the axis of each pair of lights."""
+        """Computes the optical depth from a node to the next node along the axis of each pair of opposite lights."""
         i, j, k = wp.tid()
         begin = _node(lattice, i, j, k)
         size = size_of(smoke.density)
@@ -144,7 +145,6 @@ def _reach(smoke_type: Any) -> wp.Kernel:
         # out:
         nodes: wp.array3d[wp.vec2],
     ):
-        """Computes the optical depth from a node to a point light."""
         i, j, k = wp.tid()
         p = _node(lattice, i, j, k)
         away = wp.length(lattice.place - p)
@@ -164,7 +164,7 @@ def _reach(smoke_type: Any) -> wp.Kernel:
 
 
 def parts_of(length: float, step: float) -> int:
-    """Returns the number of equal parts into which a length is divided so that none exceeds a step; at least 1."""
+    """Returns the smallest number of equal parts of a length that are no longer than `step`; at least 1."""
     return max(math.ceil(length / step - _ROUNDING), 1)
 
 
@@ -182,10 +182,10 @@ def make_lattice(
         axes: The three axes, orthogonal and of length 1.
         spacing: Largest distance between nodes in voxels; at least a quarter of a voxel is used.
         origin: Origin of the lattice's coordinates, in voxels.
-        most: Largest number of gaps between nodes; the spacing grows until there are no more.
+        most: Largest number of lattice cells; the spacing is enlarged until there are at most that many.
 
     Returns:
-        The lattice, and its nodes along each axis.
+        The lattice, and the number of nodes along each axis.
     """
     extents = [sum((n + 1) * abs(a) for n, a in zip(shape, row, strict=True)) for row in axes]
     spacing = max(spacing, _LEAST_SPACING)
@@ -203,16 +203,16 @@ def make_lattice(
 
 
 def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, light_step: float) -> wp.array:
-    """Computes the optical depths from the nodes to pairs of lights at infinity.
+    """Computes the optical depths from the nodes to one or two pairs of opposite lights at infinity.
 
     Args:
         medium: The smoke.
-        lattice, counts: From `make_lattice`.
-        pairs: Pairs of opposite lights: 1 along the first axis, 2 along the first and the second.
+        lattice, counts: The results of `make_lattice`.
+        pairs: 1: lights at both ends of the lattice's first axis; 2: also at both ends of its second axis.
         light_step: Longest step between two nodes, in voxels.
 
     Returns:
-        vec2 [X, Y, Z, pairs], depths to the light at the end of an axis and to the opposite light.
+        vec2 [X, Y, Z, pairs] for each node: depths to the light at the axis's end and to the light at its start.
     """
     parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
     gaps, nodes = medium.buffer((*counts, pairs), float), medium.buffer((*counts, pairs), wp.vec2)
@@ -223,7 +223,7 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
 
 
 def spacing_of(march: March) -> tuple[float, float]:
-    """Returns the largest distance between nodes, and the longest step between them."""
+    """Returns the largest distance between nodes of the lattice, and the longest step between them, in voxels."""
     spacing = march.step if march.spacing is None else march.spacing
     return spacing, spacing if march.light_step is None else march.light_step
 

@@ -1,10 +1,10 @@
-"""Multiple scattering by diffusion on a coarse grid: extinguished light, its fluence, and a camera's image of it.
+"""Multiple scattering in smoke by diffusion on a coarse grid, and the scattered light that a camera sees.
 
 In a cell of extinction s and albedo a the fluence f obeys -div(D grad f) + (1 - a) s f = a q. The source q is the
 direct light that the cell absorbs or scatters, D = 1 / (3 s + |grad f| / f) limits the flux (Wilson's sum), and half of
-the fluence leaves at the box's faces (Marshak's condition). Rounds of red-black successive over-relaxation solve it,
-each with D computed from the previous fluence. Grids go from coarse to fine: the coarsest has a few cells, between
-which light spreads within one round; each finer grid starts from the interpolated result of the coarser one.
+the fluence leaves at the box's faces (Marshak's condition). The equation is solved by red-black successive
+over-relaxation in rounds, each with D from the fluence of the previous round, on grids from coarse to fine. On the
+coarsest grid light reaches all cells within a round; a finer grid starts from the coarser grid's interpolated result.
 
 Lengths are in voxels; cell (0, 0, 0) begins at the grid's corner.
 """
@@ -54,7 +54,7 @@ def _reach(
     # out:
     reach: wp.array4d[float],
 ):
-    """Computes D of a cell by central differences of the fluence; beyond the box it is that of the nearest cell."""
+    """Computes the diffusion coefficient D of a cell; beyond the box the fluence is that of the nearest cell."""
     n, i, j, k = wp.tid()
     nx = light.shape[1]
     ny = light.shape[2]
@@ -71,13 +71,14 @@ def _reach(
 
 @wp.func
 def _flow(one: float, other: float, size: float) -> float:
-    """Computes the flow between two cells with the given D, per volume and per difference of their fluences."""
+    """Computes the flow of light between two cells `size` voxels apart, whose diffusion coefficients D are `one` and
+    `other`, per volume and per difference of their fluences."""
     return 2.0 * one * other / ((one + other) * size * size)
 
 
 @wp.func
 def _exchange(own: float, reach: wp.array4d[float], n: int, i: int, j: int, k: int, size: float) -> float:
-    """Computes the flow to a neighbouring cell, or the loss through a face of the box, per volume and fluence."""
+    """Computes the flow of light to cell (i, j, k), or the loss if this is beyond the box, per volume and fluence."""
     if i < 0 or i >= reach.shape[1] or j < 0 or j >= reach.shape[2] or k < 0 or k >= reach.shape[3]:
         return 1.0 / (size * (2.0 + 0.5 * size / own))
     return _flow(own, reach[n, i, j, k], size)
@@ -94,7 +95,7 @@ def _couple(
     # out:
     flows: wp.array4d[wp.vec4],
 ):
-    """Computes a cell's flows to the next cells along x, y and z (0 at the box's faces) and 1 over its total loss."""
+    """Computes a cell's flows to the next cells along x, y and z, and 1 over its loss by absorption and all flows."""
     n, i, j, k = wp.tid()
     own = reach[n, i, j, k]
     x = _exchange(own, reach, n, i + 1, j, k, cell[0])
@@ -122,7 +123,7 @@ def _relax(
     # out:
     light: wp.array4d[float],
 ):
-    """Relaxes the cells of one colour, red or black; in `light` the `each` albedos of a source are adjacent."""
+    """Relaxes the red or the black cells (`colour` 0 or 1); `light` has an entry for each source and each albedo."""
     n, i, j, half = wp.tid()
     k = 2 * half + ((i + j + colour) & 1)
     if k >= light.shape[3]:
@@ -145,7 +146,7 @@ def _relax(
 
 @wp.func
 def _overlap(cell: int, cells: int, fine: int, fines: int) -> float:
-    """Computes the share of a cell that one of the finer cells covers, along an axis."""
+    """Computes the share of a cell of a coarse grid that a cell of the finer grid covers, along one axis."""
     each = float(fines) / float(cells)
     low = wp.max(float(cell) * each, float(fine))
     high = wp.min(float(cell + 1) * each, float(fine + 1))
@@ -159,7 +160,6 @@ def _coarsen(
     # out:
     out: wp.array4d[float],
 ):
-    """Averages values over larger cells."""
     n, i, j, k = wp.tid()
     nx = fine.shape[1]
     ny = fine.shape[2]
@@ -176,7 +176,7 @@ def _coarsen(
 
 @wp.func
 def _place(cell: int, cells: int, coarse: int) -> float:
-    """Converts a cell's centre to units of coarser cells, whose first centre is at 0."""
+    """Converts the centre of a cell of a fine grid to the index of a cell of a coarse grid, with a fraction."""
     return (float(cell) + 0.5) * float(coarse) / float(cells) - 0.5
 
 
@@ -187,7 +187,6 @@ def _refine(
     # out:
     out: wp.array4d[float],
 ):
-    """Interpolates trilinearly between the centres of larger cells."""
     n, i, j, k = wp.tid()
     x = _place(i, out.shape[1], coarse.shape[1])
     y = _place(j, out.shape[2], coarse.shape[2])
@@ -202,11 +201,11 @@ def spread(
 
     Args:
         medium: The smoke, which allocates buffers.
-        extinction: float [X, Y, Z], per voxel.
+        extinction: float [X, Y, Z], extinction per voxel of each cell of the coarse grid.
         source: float [L, X, Y, Z], the source q of each of L lights.
-        cell: Edges of a cell.
-        albedos, each: Each source is solved for the first `each` of the albedos.
-        light: float [L * each, X, Y, Z], written: the fluence f.
+        cell: Edges of a cell in voxels.
+        albedos, each: The equation is solved for the first `each` of the three albedos, 1 to 3.
+        light: float [L * each, X, Y, Z], written: the fluence f of each light, for each albedo.
     """
     device = light.device
     grids = [(extinction.reshape((1, *extinction.shape)), source, cell)]
@@ -239,7 +238,6 @@ def _relax_rounds(
     light: wp.array,
     rounds: int,
 ) -> None:
-    """Runs rounds of over-relaxation on one grid, which start from the fluence in `light` and overwrite it."""
     reach, flows = medium.buffer(light.shape, float), medium.buffer(light.shape, wp.vec4)
     halves = (*light.shape[:3], (light.shape[3] + 1) // 2)
     extinction = thickness.reshape(thickness.shape[1:])
@@ -254,7 +252,6 @@ def _relax_rounds(
 
 @wp.func
 def _splat(place: wp.vec3, cell: wp.vec3, light: float, out: wp.array3d[float]):
-    """Adds light to the eight cells around a position, or to the outermost cells for a position near a face."""
     q = wp.cw_div(place, cell) - wp.vec3(0.5, 0.5, 0.5)
     i = int(wp.floor(q[0]))
     j = int(wp.floor(q[1]))
@@ -286,7 +283,6 @@ def _shoot(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        """Traces one ray from a point light and adds the light that smoke extinguishes to the cells along it."""
         n = wp.tid()
         height = 1.0 - (2.0 * float(n) + 1.0) / float(_RAYS)
         around = float(n) * _TURN
@@ -338,7 +334,6 @@ def _stop(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        """Computes the direct light that a cell extinguishes from a light at infinity, per volume."""
         i, j, k = wp.tid()
         total = float(0.0)
         for x in range(parts[0]):
@@ -370,7 +365,6 @@ def _gather(smoke_type: Any) -> wp.Kernel:
         out: wp.array4d[float],
         thin: wp.array2d[float],
     ):
-        """Computes the light that smoke of albedo 1 in a fluence sends to a pixel, and its part from thin cells."""
         n, row, column = wp.tid()
         r = begin(view, row, column, smoke, march.step, 0.5)
         total = float(0.0)
@@ -403,10 +397,10 @@ def shoot(
         medium: The smoke.
         place: Position of the light, in voxels.
         radius: Distance in voxels within which the irradiance is constant.
-        step: Longest step along the light's rays.
-        cell: Edges of a cell.
-        power: Power of the light.
-        out: float [X, Y, Z], a number per cell, added to.
+        step: Longest step along the light's rays, in voxels.
+        cell: Edges of a cell in voxels.
+        power: Power of the light, which all its rays together carry at their start.
+        out: float [X, Y, Z], the light extinguished in each cell, added to.
     """
     _shoot(medium, _RAYS, [place, radius, step, cell, power / _RAYS], [out])
 
@@ -417,9 +411,9 @@ def stop(medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: 
     Args:
         medium: The smoke.
         depths: Result of `depth_lattice.reach`.
-        cell: Edges of a cell.
-        step: Distance between the samples of a cell, of which there are at most four along an axis.
-        out: float [X, Y, Z], written: per volume.
+        cell: Edges of a cell in voxels.
+        step: Largest distance in voxels between samples in a cell, unless this needs more than four along an axis.
+        out: float [X, Y, Z], written: the extinguished light per volume.
     """
     lattice, nodes = depths
     parts = wp.vec3i(*(max(1, min(_PARTS, math.ceil(edge / step))) for edge in cell))
@@ -429,13 +423,14 @@ def stop(medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: 
 def gather(
     medium: Medium, view: View, march: March, cell: wp.vec3, light: wp.array, out: wp.array, thin: wp.array
 ) -> None:
-    """Computes the light that smoke of albedo 1 in a fluence sends to a camera.
+    """Computes the light that smoke of albedo 1 scatters to a camera from a given fluence.
 
     Args:
-        medium, view: As for the other marches.
-        march: Its step and cutoff.
-        cell: Edges of a cell.
-        light: float [N, X, Y, Z], fluences; at least one.
+        medium: The smoke.
+        view: The camera, [H, W] pixels.
+        march: Only its step and cutoff are used.
+        cell: Edges of a cell in voxels.
+        light: float [N, X, Y, Z], N fluences, at least one.
         out: float [2, N, H, W], written: all light, and the light from thin smoke, where each sample is weighted by the
             transparency that a cell of its density has.
         thin: float [H, W], written: the opacity of thin smoke, weighted in the same way.

@@ -8,13 +8,8 @@ Extinction per voxel is `extinction * density`. A step has the density of its sa
 A light is given by the direction towards it and has irradiance 4 pi, so that an isotropic phase function is 1 instead
 of 1 / (4 pi).
 
-Every march of a camera ray is the same loop; a kernel adds only what it accumulates:
-
-    r = begin(view, row, column, smoke, step, offset)
-    while r.done < r.count:
-        r = look(r, smoke)                  # r.place, r.sigma, r.x; r.t is the transparency before the step
-        ...
-        r = pass_step(r, cutoff)
+Every march of a camera ray calls `begin` and then, while `r.done < r.count`, `look`, which sets the ray's place, sigma
+and x, and then `pass_step`. Kernels differ only in what they add up between `look` and `pass_step`.
 
 None of these marches has a gradient; `single_scatter` has one. Read `tests/reference/marching.py` first: it is the same
 in float64 NumPy, without shared work between pixels.
@@ -46,12 +41,12 @@ _PATTERNS = wp.constant(64)  # number of patterns of the gradient noise, a power
 
 @functools.cache
 def smoke_struct(dtype: Any, in_bricks: bool) -> Any:
-    """Builds (once) the struct by which kernels take smoke.
+    """Builds (once) the struct in which kernels take smoke.
 
     Args:
         dtype: Type of the densities, `wp.float32` or `wp.float16`.
-        in_bricks: Whether the occupancy of bricks is known. Without it `bricks` is an integer without a meaning, so
-            that marches contain no test of bricks.
+        in_bricks: Whether it is known which bricks of 8^3 voxels contain smoke. If not, `bricks` is a meaningless
+            integer, so that marches contain no test of bricks.
     """
 
     @wp.struct
@@ -75,7 +70,7 @@ class Medium:
         temperature: Array of the density's shape and type; None: the smoke emits no light.
         emission: Light emitted per voxel at temperature 1.
         empty: Function that allocates buffers on the density's device; None: Warp's own allocator.
-        bricks: Occupancy of bricks, from `in_bricks`; None: marches sample every voxel.
+        bricks: Which bricks of 8^3 voxels contain smoke, a result of `occupied`; None: marches sample every voxel.
     """
 
     density: wp.array
@@ -87,27 +82,26 @@ class Medium:
 
     @property
     def device(self) -> wp.Device:
-        """Device of the density."""
         return self.density.device
 
     def buffer(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Allocates an uninitialised buffer."""
+        """Allocates an uninitialised buffer on the device of the density."""
         if self.empty is None:
             return wp.empty(shape, dtype=dtype, device=self.device)
         return self.empty(shape, dtype)
 
     def in_bricks(self) -> "Medium":
-        """Returns the same smoke with the occupancy of its bricks. Skipping empty bricks changes no result."""
+        """Returns the same smoke with `bricks`, so that marches skip empty bricks, which changes no result."""
         return replace(self, bricks=occupied(self))
 
     @property
     def smoke_type(self) -> Any:
-        """Type of `smoke`, by which kernels are specialised."""
+        """Type of the struct `smoke`: kernels are compiled for each such type."""
         return smoke_struct(self.density.dtype, self.bricks is not None)
 
     @functools.cached_property
     def smoke(self) -> Any:
-        """Packs the smoke for kernels; cold smoke has its density in place of a temperature, and emission 0."""
+        """The struct in which kernels take the smoke; without a temperature the density takes its place, emission 0."""
         smoke = self.smoke_type()
         smoke.density, smoke.extinction = self.density, float(self.extinction)
         smoke.temperature, smoke.emission = self.density, 0.0
@@ -125,11 +119,12 @@ def for_smoke(build: Callable[..., wp.Kernel]) -> Callable[..., None]:
     and a kernel for another type of smoke would read other memory.
 
     Args:
-        build: Builds a kernel for `Medium.smoke_type` and further variants; called once for each.
+        build: Builds a kernel for a `Medium.smoke_type`, and for further compile-time arguments; called once for each
+            combination.
 
     Returns:
-        A function of the medium, the size of the launch, the arguments after the smoke, the outputs, and the variants.
-        Its attribute `build` is the cached function.
+        A function of the medium, the size of the launch, the kernel's inputs after the smoke, its outputs, and the
+        further arguments of `build`. Its attribute `build` is `build` with a cache.
     """
     build = functools.cache(build)
 
@@ -145,9 +140,9 @@ def for_smoke(build: Callable[..., wp.Kernel]) -> Callable[..., None]:
 class View:
     """A camera, in voxels. Row 0 is the top row; rays go through pixel centres.
 
-    `pitch` is the edge of a pixel in voxels for an orthographic view, at distance 1 in perspective. `origin` is the
-    image's centre in the camera's plane, or the eye; smoke behind it is not visible. `voxel` is the edge of a voxel in
-    the unit of depths. Depths are measured from `moved` voxels behind the origin.
+    `origin` is the eye in perspective, or the image's centre in the plane of an orthographic camera; smoke behind it is
+    not visible. `pitch` is the edge of a pixel in voxels, in perspective at distance 1. `voxel` is the edge of a voxel
+    in the unit of depth images. Depths are measured from a point or plane `moved` voxels behind the origin.
     """
 
     origin: wp.vec3
@@ -164,7 +159,7 @@ class View:
 
 @wp.struct
 class MarchParameters:
-    """`March` in the form for kernels. `spacing` and `light_step` are used on the host, to build lattices."""
+    """The settings of `March` that kernels use, in the form for kernels."""
 
     step: float
     jitter: float
@@ -176,11 +171,11 @@ class MarchParameters:
 
 @wp.struct
 class Ray:
-    """A ray, its `count` equal steps of `length`, the first of which begins at distance `first`, and the current step.
+    """A camera ray in voxels, divided into `count` steps of `length` from distance `first` on, and its current step.
 
-    For the current step, number `done`, `offset` is the position of its sample as a share of the step, `distance` and
-    `place` locate the sample, `sigma` is its extinction, and `x` is the step's optical depth. `tau` and `t` are the
-    optical depth and the transparency of the ray before the step.
+    `done` is the number of the current step, and `offset` the position of the sample in each step, 0 to 1. The sample
+    of the current step is at `distance` along the ray, at the point `place`, and has the extinction `sigma` per voxel;
+    `x` is the optical depth of the step. `tau` and `t` are the ray's optical depth and transparency before the step.
     """
 
     origin: wp.vec3
@@ -200,7 +195,7 @@ class Ray:
 
 @wp.func
 def ray(view: View, row: int, column: int) -> Ray:
-    """Makes the ray of a pixel, without steps."""
+    """Makes the ray of a pixel; `steps_along` divides it into steps."""
     u = (float(column) + 0.5 - 0.5 * float(view.width)) * view.pitch
     v = (0.5 * float(view.height) - float(row) - 0.5) * view.pitch
     r = Ray()
@@ -215,7 +210,7 @@ def ray(view: View, row: int, column: int) -> Ray:
 
 @wp.func
 def clip(size: wp.vec3, origin: wp.vec3, direction: wp.vec3) -> wp.vec2:
-    """Finds the first and last distance along a ray at which there may be smoke; first > last if the ray misses it."""
+    """Finds the first and last distance along a ray at which smoke may be; first > last if the ray misses the grid."""
     first = float(-_NEVER)
     last = float(_NEVER)
     for axis in range(3):
@@ -237,7 +232,7 @@ def size_of(density: wp.array3d[Any]) -> wp.vec3:
 
 @wp.func
 def steps_along(size: wp.vec3, origin: wp.vec3, direction: wp.vec3, step: float) -> Ray:
-    """Divides the part of a ray in front of the origin and within the smoke into equal steps up to `step`."""
+    """Divides the part of a ray in front of its origin and within the grid into equal steps, no longer than `step`."""
     r = Ray()
     r.origin = origin
     r.direction = direction
@@ -307,13 +302,13 @@ def _in_brick(density: wp.array3d[Any], bricks: int, p: wp.vec3) -> float:
 
 @wp.func
 def sample(smoke: Any, p: wp.vec3) -> float:
-    """Computes `density_at`, with an early return in an empty brick. `p` lies at most half a voxel outside the grid."""
+    """Interpolates density at p, at most half a voxel outside the grid; returns 0 at once in a brick known as empty."""
     return _in_brick(smoke.density, smoke.bricks, p)
 
 
 @wp.func
 def between_nodes(nodes: wp.array3d[Any], q: wp.vec3):
-    """Interpolates an array trilinearly, with element (i, j, k) at q = (i, j, k) and constant beyond its ends."""
+    """Interpolates an array trilinearly at the index q, which may have fractions; q is clamped to the array."""
     x = wp.clamp(q[0], 0.0, float(nodes.shape[0] - 1))
     y = wp.clamp(q[1], 0.0, float(nodes.shape[1] - 1))
     z = wp.clamp(q[2], 0.0, float(nodes.shape[2] - 1))
@@ -353,7 +348,7 @@ def phase(g: float, cosine: float) -> float:
 
 @wp.func
 def noise(row: int, column: int, seed: int) -> float:
-    """Computes interleaved gradient noise in [0, 1) (Jimenez 2014); its sum over a few pixels varies little."""
+    """Computes interleaved gradient noise in [0, 1) (Jimenez 2014), whose mean over a few pixels is near 1/2."""
     pattern = float(seed & (_PATTERNS - 1))
     x = float(column) + 5.588238 * pattern
     y = float(row) + 5.588238 * pattern
@@ -365,7 +360,7 @@ def noise(row: int, column: int, seed: int) -> float:
 
 @wp.func
 def begin(view: View, row: int, column: int, smoke: Any, step: float, offset: float) -> Ray:
-    """Makes the ray of a pixel before its first step through the smoke; an offset of 1/2 is the middle of each step."""
+    """Makes the ray of a pixel, before its first step; it samples each step at `offset` of its length, 0 to 1."""
     r = ray(view, row, column)
     r = steps_along(size_of(smoke.density), r.origin, r.direction, step)
     r.offset = offset
@@ -375,14 +370,14 @@ def begin(view: View, row: int, column: int, smoke: Any, step: float, offset: fl
 
 @wp.func
 def begin_jittered(view: View, row: int, column: int, smoke: Any, march: MarchParameters) -> Ray:
-    """Calls `begin` with samples shifted by gradient noise."""
+    """Makes the ray of a pixel like `begin`, with samples shifted by gradient noise."""
     offset = 0.5 + march.jitter * (noise(row, column, march.seed) - 0.5)
     return begin(view, row, column, smoke, march.step, offset)
 
 
 @wp.func
 def look(r: Ray, smoke: Any) -> Ray:
-    """Samples the current step."""
+    """Samples the smoke in the ray's current step: sets the step's `distance`, `place`, `sigma` and `x`."""
     r.distance = r.first + (float(r.done) + r.offset) * r.length
     r.place = r.origin + r.distance * r.direction
     r.sigma = smoke.extinction * sample(smoke, r.place)
@@ -404,7 +399,8 @@ def pass_step(r: Ray, cutoff: float) -> Ray:
 
 @wp.func
 def surface(depth: float, r: Ray, view: View, threshold: float) -> float:
-    """Finds the distance to the first sample above the density threshold; `depth` is the result so far, 0: none."""
+    """Returns the depth of the first sample whose extinction exceeds the threshold; `depth` is the result of the
+    earlier steps, 0 if there was none."""
     if depth == 0.0 and r.sigma > threshold:
         return (r.distance + view.moved) * view.voxel
     return depth
@@ -412,13 +408,13 @@ def surface(depth: float, r: Ray, view: View, threshold: float) -> float:
 
 @wp.func
 def emitted(r: Ray, smoke: Any) -> float:
-    """Computes the light that a step emits and that reaches the camera; fire without smoke emits too."""
+    """Computes the light that a step emits and that reaches the camera; air without smoke emits too where it is hot."""
     return r.t * mean_transparency(r.x) * smoke.emission * r.length * density_at(smoke.temperature, r.place)
 
 
 @wp.func
 def optical_depth(smoke: Any, p: wp.vec3, toward: wp.vec3, step: float) -> float:
-    """Computes the optical depth from p out of the smoke in equal steps up to `step`, sampled at the middle (eq. 3)."""
+    """Computes the optical depth (eq. 3) from p out of the grid, with samples in the middles of steps up to `step`."""
     r = steps_along(size_of(smoke.density), p, toward, step)
     tau = float(0.0)
     for n in range(r.count):
@@ -428,7 +424,7 @@ def optical_depth(smoke: Any, p: wp.vec3, toward: wp.vec3, step: float) -> float
 
 @wp.func
 def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int) -> wp.vec3:
-    """Computes a node's position; the first and last nodes along each axis lie on the border of the smoke."""
+    """Computes a node's position in voxels; the outermost nodes lie half a voxel outside the grid of size `size`."""
     return wp.vec3(
         float(i) * (size[0] + 1.0) / float(nodes.shape[0] - 1) - 0.5,
         float(j) * (size[1] + 1.0) / float(nodes.shape[1] - 1) - 0.5,
@@ -437,14 +433,14 @@ def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int)
 
 
 def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
-    """Computes the number of nodes along each axis for a spacing of at most a step, or a voxel if that is more."""
+    """Computes the nodes along each axis for a spacing of at most `step` voxels; a step below 1 counts as 1."""
     # Each node marches to its lights separately, so the work grows with the fourth power of the resolution.
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 
 
 @functools.cache
 def occupied_kernel(dtype: Any) -> wp.Kernel:
-    """Builds (once) the kernel for densities of a type, `wp.float32` or `wp.float16`."""
+    """Builds (once) the first kernel of `occupied`, for densities of type `wp.float32` or `wp.float16`."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def rows(
@@ -453,7 +449,6 @@ def occupied_kernel(dtype: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[wp.uint8],
     ):
-        """Tests whether a row of voxels as long as a brick, plus one voxel at either end, contains smoke."""
         i, j, c = wp.tid()
         smoke = wp.uint8(0)
         for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):
@@ -481,10 +476,10 @@ def _bricks_of_rows(
 
 
 def occupied(medium: Medium) -> wp.array:
-    """Finds the bricks in which a sample may read smoke.
+    """Finds the bricks of 8^3 voxels in which an interpolated density may be above 0.
 
     Returns:
-        uint8 [X / 8, Y / 8, Z / 8], rounded up, 1 where there is smoke within reach.
+        uint8 [X / 8, Y / 8, Z / 8], rounded up: 1 where the brick, or a voxel next to it, has smoke; else 0.
     """
     density = medium.density
     shape = tuple(-(-n // BRICK) for n in density.shape)
@@ -507,7 +502,7 @@ def make_view(
     voxel: float = 1.0,
     moved: float = 0.0,
 ) -> View:
-    """Makes a `View`; the three directions are orthogonal and of length 1."""
+    """Makes a `View`; `right`, `up` and `forward` are orthogonal and of length 1."""
     view = View()
     view.origin, view.right, view.up, view.forward = (wp.vec3(*map(float, v)) for v in (origin, right, up, forward))
     view.pitch, view.width, view.height, view.perspective = float(pitch), width, height, int(perspective)
@@ -516,13 +511,12 @@ def make_view(
 
 
 def require_orthographic(view: View, what: str) -> None:
-    """Raises ValueError if a camera is in perspective."""
+    """Raises ValueError if a camera is in perspective; `what` names, in the plural, the images that need another."""
     if view.perspective:
-        raise ValueError(f"{what} need an orthographic camera")
+        raise ValueError(f"{what} need an orthographic camera, got one in perspective")
 
 
 def parameters(march: March) -> MarchParameters:
-    """Packs the settings of a march for kernels."""
     values = MarchParameters()
     values.step, values.jitter, values.threshold = float(march.step), float(march.jitter), float(march.threshold)
     values.g, values.cutoff = float(march.g), float(march.cutoff)

@@ -43,7 +43,7 @@ _SLAB_BYTES = 2**28  # memory of the four optical depths of a slab
 
 @wp.struct
 class _Slab:
-    """A slab of planes of samples across the view, `gap` apart; sample n lies at distance `start + (n + 1/2) gap`."""
+    """A slab: `planes` planes of samples, parallel to the image; plane n is `start + (n + 1/2) gap` voxels away."""
 
     start: float
     gap: float
@@ -52,8 +52,8 @@ class _Slab:
 
 @wp.struct
 class _Depths:
-    """Optical depths of a slab's samples to each light, [planes, H, W], and of the rays before and behind the camera's
-    plane, [H, W]."""
+    """Optical depths: from each sample of a slab to the lights at the four sides, [planes, H, W]; and along each
+    pixel's ray behind and in front of the camera's plane, [H, W]."""
 
     right: wp.array3d[float]
     left: wp.array3d[float]
@@ -65,7 +65,7 @@ class _Depths:
 
 @wp.func
 def _thickness(smoke: Any, span: wp.vec2, p: wp.vec3, direction: wp.vec3, s: float, h: float) -> float:
-    """Computes the optical depth of a step of length h with its sample at distance s, 0 outside the smoke's span."""
+    """Computes the optical depth of a step of length h, sampled at distance s; 0 if s is outside the range `span`."""
     if s > span[0] and s < span[1]:
         return smoke.extinction * sample(smoke, p + s * direction) * h
     return 0.0
@@ -107,7 +107,7 @@ def _sweep(smoke_type: Any) -> wp.Kernel:
         # out:
         tau: wp.array3d[float],
     ):
-        """Sums optical depths to a side: 0 right, 1 left, 2 top, 3 bottom. A thread processes one row or column."""
+        """Sums optical depths towards a side (0 right, 1 left, 2 top, 3 bottom), in one row or column per thread."""
         plane, line = wp.tid()
         s = slab.start + (float(plane) + 0.5) * slab.gap
         u = (float(line) + 0.5 - 0.5 * float(view.width)) * view.pitch
@@ -209,7 +209,7 @@ def _gather(smoke_type: Any) -> wp.Kernel:
 
 
 def _extent(shape, origin, direction) -> tuple[float, float]:
-    """Computes the least and greatest distance of the smoke's corners along a direction."""
+    """Returns the least and the greatest distance of the grid's corners from `origin` along a direction, in voxels."""
     start = sum(-0.5 * d - o * d for o, d in zip(origin, direction, strict=True))
     spans = [(n + 1) * d for n, d in zip(shape, direction, strict=True)]
     return start + sum(min(s, 0.0) for s in spans), start + sum(max(s, 0.0) for s in spans)
@@ -224,8 +224,8 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     Args:
         medium: The smoke, of albedo 1.
         view: An orthographic camera, [H, W] pixels.
-        march: Its g and its step, along rays and to the lights; samples lie in the middles of the steps. The error
-            falls with the square of the step where the density is smooth.
+        march: Only its g and its step are used, the step both along rays and towards the lights; samples lie in the
+            middles of the steps. The error falls with the square of the step where the density is smooth.
         out: float [8, H, W], written: light that reaches the camera from smoke lit from the right, left, top, bottom,
             front and back, each light of irradiance 4 pi; the transparency; the emission.
 

@@ -1,9 +1,9 @@
 """Marches along camera rays in equal steps: guiding maps, six-way lightmaps, lights from any direction, and motion.
 
-Each march is the loop of `march` with its own sums. Pixels share the optical depths to the lights, which are known at
-the nodes of a lattice (`depth_lattice`). Read `tests/reference/marching.py` first: `guide` is algorithm 1 of
-neural-six-way-lightmaps in 20 lines, `lit` is the light of one source without shared work. `motion` is `_loop` of
-`tests/smoke/test_motion.py`, pixel by pixel.
+All marches have the loop that `march` describes; they differ in what they sum. The optical depths to the lights are
+computed once, at the nodes of a lattice (`depth_lattice`), and used by all pixels. Read `tests/reference/marching.py`
+first: `guide` is algorithm 1 of neural-six-way-lightmaps in 20 lines, and `lit` the light of one source. `_loop` of
+`tests/smoke/test_motion.py` computes `motion` pixel by pixel.
 """
 
 from collections.abc import Sequence
@@ -121,10 +121,11 @@ def guide_nodes(medium: Medium, up: Sequence[float], step: float) -> wp.array:
     Args:
         medium: The smoke.
         up: Direction to the top, of length 1.
-        step: Largest distance between nodes (at least a voxel is used) and longest step of their marches, in voxels.
+        step: Largest distance between nodes (at least a voxel is used) and longest step of a march from a node, both
+            in voxels.
 
     Returns:
-        vec2 [A, B, C], to the top and to the bottom; the outermost nodes lie half a voxel outside the grid.
+        vec2 [A, B, C], the depths to the top and to the bottom at each node; see `march.node_position`.
     """
     nodes = medium.buffer(nodes_along(medium.density.shape, step), wp.vec2)
     _guide_nodes(medium, nodes.shape, [wp.vec3(*map(float, up)), step], [nodes])
@@ -134,19 +135,20 @@ def guide_nodes(medium: Medium, up: Sequence[float], step: float) -> wp.array:
 def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bool = True) -> None:
     """Computes a guiding map (algorithm 1): smoke lit from the front, top and bottom, its transparency and its depth.
 
-    The paper's algorithm lacks the step h in a step's share of the light (line 9); here each step is integrated
-    exactly. The paper's side lights, along the cross product of the view and the world's z, would be to the left and
-    right where z points up; ours are along the camera's own up and down. The jitter is a random number per pixel.
+    Line 9 of the paper's algorithm lacks the step length h as a factor of the light; here each step is integrated
+    exactly. The paper's two lights from the sides, along the cross product of the view and the world's z, would be at
+    the left and the right where z points up; here they are above and below the camera. Each pixel's samples are shifted
+    by a random number, the jitter.
 
     Args:
         medium: The smoke, of albedo 1.
         view: The camera, [H, W] pixels.
-        march: Settings; its step is also that of the marches to the lights. The cutoff's error is at most the cutoff in
-            transparency and 2.5 times the cutoff in light (for g = 0).
+        march: Settings; its step is also the step towards the lights. Its cutoff causes an error of at most the cutoff
+            in transparency, and 2.5 times the cutoff in light (for g = 0).
         out: float [3, H, W], written: scattered light under lights of irradiance 4 pi; transparency; distance from the
             camera to the first sample denser than the threshold, 0 if there is none.
-        shared: Whether pixels share the marches to the top and the bottom, on a lattice with a node per step (per
-            voxel for smaller steps); otherwise each sample marches to them.
+        shared: Whether the depths to the top and the bottom are interpolated from `guide_nodes`; otherwise each sample
+            marches to the lights itself, which is slower and more exact.
     """
     nodes = guide_nodes(medium, view.up, march.step) if shared else medium.buffer((0, 0, 0), wp.vec2)
     _guide(medium, out.shape[1:], [nodes, view, parameters(march)], [out], shared)
@@ -154,7 +156,6 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
 
 @wp.func
 def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
-    """Interpolates depths to the right, left, top and bottom bilinearly between the nodes of plane k."""
     sides = wp.vec4()
     for pair in range(2):
         a = wp.lerp(nodes[i, j, k, pair], nodes[i, j + 1, k, pair], fy)
@@ -227,17 +228,18 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
 def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     """Computes six-way lightmaps, transparency, emission and depth by one march in large steps.
 
-    The lights of an orthographic camera follow its axes. The depths to the four lights from the sides are known at the
-    nodes of one lattice along these axes, and a ray runs along its third axis. The other two lights need no march: the
-    light from the front comes and returns along the ray, (1 - T^2) / 2 in total for the ray's transparency T; the light
-    from the back passes all smoke of the ray wherever it is scattered, -T ln T. Both are exact for any step; only T has
-    the error of its step. For steps shorter than a brick's edge, marches skip empty bricks, which changes no result.
+    The six lights lie along the axes of the orthographic camera. The optical depths to the four lights at the sides are
+    computed at the nodes of a lattice along these axes; rays run along the lattice's third axis. The other two lights
+    need no march: of the light from the front, which comes and returns along the ray, a ray of transparency T scatters
+    (1 - T^2) / 2 in total; of the light from the back, which passes all smoke of the ray wherever it is scattered,
+    -T ln T. Given T, both are exact for any step. For steps shorter than a brick's edge, 8 voxels, marches skip empty
+    bricks, which changes no result.
 
     Args:
         medium: The smoke, of albedo 1.
         view: An orthographic camera, [H, W] pixels.
-        march: Settings, as for `bake_coarse`. The cutoff's error is below 1e-3 in every plane for the default cutoff.
-        out: float [9, H, W], written: `PLANES`, each light of irradiance 4 pi.
+        march: Settings. The default cutoff causes an error below 1e-3 in every plane.
+        out: float [9, H, W], written: the images `PLANES`, each light of irradiance 4 pi.
 
     Raises:
         ValueError: The camera is in perspective.
@@ -324,7 +326,7 @@ def _unlit(smoke_type: Any) -> wp.Kernel:
 def light(
     medium: Medium, view: View, depths: tuple[Lattice, wp.array], march: March, shadow: float, out: wp.array
 ) -> None:
-    """Computes smoke of albedo 1 under a light from any direction and the opposite light, or under a point light.
+    """Renders smoke of albedo 1 under a light from any direction and under the opposite light, or under a point light.
 
     Args:
         medium: The smoke.
@@ -332,15 +334,15 @@ def light(
         depths: Result of `depth_lattice.reach`.
         march: Settings.
         shadow: Ratio of extinction towards the light to extinction along the camera's rays; 1 is physical.
-        out: float [2, H, W], written: light scattered once, of irradiance 4 pi, from the light and from the opposite
-            light. For a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
+        out: float [2, H, W], written: light scattered once, from the light and from the opposite light, each of
+            irradiance 4 pi. For a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
     """
     lattice, nodes = depths
     _light(medium, out.shape[1:], [nodes, view, lattice, parameters(march), shadow], [out])
 
 
 def unlit(medium: Medium, view: View, march: March, out: wp.array) -> None:
-    """Computes a camera's view of unlit smoke: `UNLIT_PLANES`, float [3, H, W], written; arguments as for `light`."""
+    """Renders unlit smoke: writes the images `UNLIT_PLANES` to `out`, float [3, H, W]; arguments as for `light`."""
     _unlit(medium, out.shape[1:], [view, parameters(march)], [out])
 
 
@@ -392,16 +394,17 @@ def _motion(smoke_type: Any) -> wp.Kernel:
 
 
 def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: March, out: wp.array) -> None:
-    """Computes by how many pixels the smoke of each pixel has moved since the frame before.
+    """Computes by how many pixels the smoke that each pixel shows has moved since the previous frame.
 
-    A step's weight is the opacity that it adds, (1 - exp(-sigma h)) times the transparency of the smoke in front of it.
+    The result is the mean motion along the pixel's ray. Each step has the weight of the opacity that it adds:
+    (1 - exp(-sigma h)) times the transparency of the smoke in front of it.
 
     Args:
         medium: The smoke of the later frame.
         view: An orthographic camera, [H, W] pixels, the same for both frames.
-        velocity: vec3 [A, B, C], velocity of the air over the same box, with any number of cells: trilinear between
-            their centres, constant beyond the outermost centres.
-        reach: Voxels that a velocity of 1 moves between the frames.
+        velocity: vec3 [A, B, C], velocity of the air over the box of the smoke, with any number of cells: trilinear
+            between their centres, constant beyond the outermost centres.
+        reach: Distance in voxels that smoke with a velocity of 1 moves between the frames.
         march: Only its step and cutoff are used; samples lie in the middles of the steps.
         out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.
 

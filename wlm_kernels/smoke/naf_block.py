@@ -1,6 +1,6 @@
 """Parts of a NAFBlock other than its matrix products, for one image stored as rows of channels, one row per pixel.
 
-`kernels` builds and caches them for a number of channels and a number type; sums are always float32. There are no
+`kernels` builds them for a number of channels and for float32 or half floats; sums are always float32. There are no
 gradients: networks are trained in torch. Read `NafBlock` of `wlm/smoke/network/unet.py` first, the block in torch.
 """
 
@@ -29,12 +29,12 @@ _PER_LANE = 4
     return value;
 """)
 def lane_sum(value: float, count: int) -> float:
-    """Sums a value over the `count` threads of a group, a power of 2 up to a warp; on a CPU the value itself."""
+    """Sums a value over a group of `count` threads, a power of 2 up to 32; on a CPU returns the value itself."""
     ...
 
 
 def lanes(channels: int, cuda: bool) -> int:
-    """Returns the number of threads per row of channels: a power of 2 up to a warp on a GPU, 1 on a CPU."""
+    """Returns the number of threads that share the channels of a pixel: a power of 2 up to 32 on a GPU, 1 on a CPU."""
     if not cuda:
         return 1
     count = -(-channels // _PER_LANE)
@@ -43,7 +43,9 @@ def lanes(channels: int, cuda: bool) -> int:
 
 @dataclass(frozen=True)
 class NafKernels:
-    """The kernels of a number type T. Each entry begins with the launch size; L threads share a row of C or c channels.
+    """The kernels for numbers of type T (float32 or half). Each description begins with the launch size.
+
+    P pixels of G images (for `gate` one image of H x W pixels) have rows of C channels, which L threads share.
 
     Attributes:
         norm: [P L]: adds a shift to each row, subtracts the mean and divides by the standard deviation. In: x T [P, C],
@@ -51,9 +53,10 @@ class NafKernels:
         gate: [ceil(H / STRIP), W, C]: a depthwise 3 x 3 convolution with zeros outside; then the product of the first
             half of the channels with the second. In: x T [H, W, 2 C], weights float [9, 2 C],
             biases float [2 C]. Out: T [H, W, C].
-        attend: [G c L]: weights of a product multiplied by the factors of the channel attention. In: means float [G c],
-            weights float [G, c, c] and biases float [G, c] of the attention, weights float [G, c, c], from input to
-            output. Out: T [G, c, c].
+        attend: [G c L]: scales the weights of a matrix product of c channels by channel attention: by a factor for each
+            input channel, a linear function of all channels' means. In: means float [G c], weights float [G, c, c] and
+            biases float [G, c] of the attention, weights of the product float [G, c, c], from input to output.
+            Out: T [G, c, c].
     """
 
     norm: wp.Kernel
@@ -63,7 +66,7 @@ class NafKernels:
 
 @functools.cache
 def kernels(channels: int, half: bool, cuda: bool) -> NafKernels:
-    """Builds (once) the kernels for rows of `channels`, of half floats or float32, for a GPU or a CPU."""
+    """Builds (once) the kernels for pixels with `channels` channels of half floats or float32, for a GPU or a CPU."""
     number: Any = wp.float16 if half else wp.float32
     count = lanes(channels, cuda)
     each = -(-channels // count)

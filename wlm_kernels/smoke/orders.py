@@ -1,9 +1,10 @@
 """Light of all orders of scattering, predicted per pixel from light scattered once and from diffusion.
 
-At albedo a the light is a S + a^2 R, where S was scattered once. R is a weighted sum of features of a pixel: S, S
-under the opposite light, opacity, R by diffusion, and the parts of the last two that come from thin smoke. The weights
-are a polynomial in the cosine between light and camera and in the smoke's depth, and are linear between the albedos for
-which they were fitted.
+At albedo a the light of a pixel is a S + a^2 R, where S is the light scattered once at albedo 1. R is predicted as a
+weighted sum of features of the pixel: S, S under the opposite light, opacity, the diffusion solver's estimate of R, and
+the parts of the last two that come from thin smoke. Each weight is a polynomial in the cosine of the angle between
+light and camera and in the logarithm of the smoke's optical depth. Weights were fitted for several albedos, and are
+interpolated linearly between them.
 """
 
 from collections.abc import Sequence
@@ -104,7 +105,7 @@ def _write_mixes(
     # out:
     out: wp.array[float],
 ):
-    """Computes the result of `mixes` in one thread; the depth is scaled from the range of the fit to -1 to 1."""
+    """Computes the polynomial's terms in one thread; the depth is scaled from the range of the fit to -1 to 1."""
     at = (2.0 * depth[0] - known[0] - known[1]) / (known[1] - known[0])
     m = _mixes(cosine, wp.clamp(at, -1.0, 1.0))
     for n in range(MIXES):
@@ -121,7 +122,6 @@ def _weigh(
     # out:
     out: wp.array3d[float],
 ):
-    """Computes weights of a light's features at an albedo, interpolated between two fitted albedos."""
     light, a, feature = wp.tid()
     total = float(0.0)
     for n in range(MIXES):
@@ -172,12 +172,12 @@ def features(
     thin: wp.array,
     out: wp.array,
 ) -> None:
-    """Computes the features of one light.
+    """Computes the features of each pixel under one light, at A albedos, from which R is predicted.
 
     Args:
-        single, opposite: float [H, W], light scattered once, of the light and of the opposite light.
-        diffused, from_thin: float [A, H, W], R by diffusion at A albedos, and the part of it from thin smoke.
-        transparency: float [H, W].
+        single, opposite: float [H, W], light scattered once under the light, and under the opposite light.
+        diffused, from_thin: float [A, H, W], R by diffusion at A albedos, and the part of this from thin smoke.
+        transparency: float [H, W], transparency of the smoke.
         thin: float [H, W], opacity of thin smoke.
         out: float [A, FEATURES, H, W], written.
     """
@@ -186,11 +186,11 @@ def features(
 
 
 def mixes(depth: wp.array, known: wp.array, cosine: float, out: wp.array) -> None:
-    """Computes the terms of the polynomial that gives the weights of a light.
+    """Computes the terms of the polynomial that gives the features' weights for a light.
 
     Args:
         depth: float [1], logarithm of the smoke's mean optical depth.
-        known: float [2], range of the depth in the fit; depths outside are clamped to it.
+        known: float [2], the smallest and the largest such depth in the fit; `depth` is clamped to this range.
         cosine: Cosine of the angle between the directions to the light and to the camera.
         out: float [MIXES], written.
     """
@@ -212,20 +212,21 @@ def light(
     buffer: wp.array,
     out: wp.array,
 ) -> None:
-    """Computes the light of all orders, for each light separately.
+    """Computes the light of all orders of scattering, for each of L lights separately.
 
     Args:
-        single, opposite: float [L, H, W].
-        diffused, from_thin: float [L, A, H, W], R by diffusion at one to three albedos, and the part from thin smoke.
-        transparency: float [H, W].
+        single, opposite: float [L, H, W], light scattered once under each light, and under its opposite light.
+        diffused, from_thin: float [L, A, H, W], R by diffusion at A albedos, one to three, and the part of this from
+            thin smoke.
+        transparency: float [H, W], transparency of the smoke.
         thin: float [H, W], opacity of thin smoke.
-        weights: float [N, MIXES, FEATURES], at N albedos.
-        mixed: float [L, MIXES], results of `mixes`.
+        weights: float [N, MIXES, FEATURES], fitted coefficients of the polynomials at N albedos.
+        mixed: float [L, MIXES], the terms that `mixes` computes for each light.
         albedos: The A albedos.
         nodes: For each albedo the index of the fitted albedo below it, and the fraction of the way to the next one.
-        places: Index of the albedo of each colour channel.
-        buffer: float [L, A, FEATURES], written.
-        out: float [L, H, W, 3], written.
+        places: For each colour channel the index of its albedo among the A albedos.
+        buffer: float [L, A, FEATURES], scratch memory, receives the weights of the features.
+        out: float [L, H, W, 3], written: the light in R, G and B.
     """
     fill = [0] * (3 - len(albedos))
     before, shares = wp.vec3i(*(n for n, _ in nodes), *fill), wp.vec3(*(share for _, share in nodes), *fill)

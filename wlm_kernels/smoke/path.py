@@ -1,12 +1,12 @@
 """A path tracer of volumes: light of every order of scattering in a density grid, without bias.
 
 Free paths are sampled by delta tracking, transmittances by ratio tracking (Novak et al. 2018, "Monte Carlo methods for
-volumetric light transport simulation", sections 5.1 and 5.2). Both use a majorant per brick; a ray draws an optical
-depth once and uses it up brick by brick. Where a density is needed, one of the eight voxels around the position is
-drawn by its weight: both kinds of tracking need only the mean, which is that of `density_at`. At each scattering every
-light is sampled (next event estimation). The sky is sampled too, and is also reached by paths that leave the smoke; the
-balance heuristic weights the two. Emission is gathered along free paths: each tentative collision counts for e /
-majorant.
+volumetric light transport simulation", sections 5.1 and 5.2). Both use a majorant per brick, an upper bound of the
+extinction; a ray draws an optical depth once and uses it up brick by brick. Where a density is needed, one of the eight
+voxels around the position is drawn with the probability of its trilinear weight: both kinds of tracking only need the
+mean to be the interpolated density. At each scattering every light is sampled (next event estimation), and so is the
+sky. The sky is also reached by paths that leave the smoke; the balance heuristic weights its two estimates. Emission is
+gathered along free paths: at each tentative collision the emission there, divided by the majorant, is added.
 
 Units are those of `march`. Random numbers belong to a pixel, so that the result depends on the seed alone. Read
 `scattered_twice` of `tests/reference/transport.py` first: the second order by quadrature.
@@ -35,11 +35,11 @@ _TENTH_BIT = wp.constant(1.0 / 1024.0)
 
 @wp.struct
 class PathLight:
-    """A light, in voxels.
+    """A light at infinity (`point` = 0) or a point light (1); lengths are in voxels.
 
     `place` is the direction to a light at infinity, of length 1, or the position of a point light. `colour` is the
-    irradiance over 4 pi, for a point light at a distance of one voxel. Within `radius` of a point light its irradiance
-    is constant.
+    irradiance divided by 4 pi, for a point light the irradiance at a distance of one voxel. Within the distance
+    `radius` of a point light the irradiance is constant.
     """
 
     place: wp.vec3
@@ -50,8 +50,9 @@ class PathLight:
 
 @wp.struct
 class PathSettings:
-    """`albedo` R, G, B; radiance of the `sky`, the same from all directions; paths end after `highest` scatterings; the
-    first `kept` orders have separate planes."""
+    """Settings of the paths: `albedo` R, G, B; radiance of the `sky`, the same from all directions; g of the phase
+    function; number of `samples` of a pixel; `key` of the random numbers. Paths end after `highest` scatterings. Light
+    of the orders 0 to `kept` is written to separate images."""
 
     albedo: wp.vec3
     sky: wp.vec3
@@ -64,8 +65,6 @@ class PathSettings:
 
 @wp.struct
 class _Grid:
-    """Majorants per brick of `edge` voxels; the bricks begin at `low` and reach `size` voxels from there."""
-
     bounds: wp.array3d[float]
     edge: float
     low: wp.vec3
@@ -74,7 +73,7 @@ class _Grid:
 
 @wp.struct
 class _Flight:
-    """Distance at which a free path ends, whether it hit smoke, emission gathered, and the next random state."""
+    """A free path: the distance t of its end, whether it hit smoke there, and the emission that it gathered."""
 
     t: float
     hit: int
@@ -84,7 +83,7 @@ class _Flight:
 
 @wp.struct
 class _Passed:
-    """Share of light that passes, and the next random state."""
+    """The share of the light that passes along a ray, 0 to 1, and the next random state."""
 
     share: float
     random: wp.uint64
@@ -92,10 +91,10 @@ class _Passed:
 
 @wp.struct
 class _Path:
-    """A path: position, direction, weight, order of scattering, and the next random state.
+    """A path: position p in voxels, direction d, weight `through` (R, G, B), order of scattering, next random state.
 
-    `chance` is the probability per solid angle with which the direction was sampled; 0 for the camera's direction, for
-    which no light was sampled.
+    `chance` is the probability per solid angle with which the direction was sampled; 0 for the ray from the camera,
+    before whose start no light was sampled.
     """
 
     p: wp.vec3
@@ -131,13 +130,13 @@ def bits(random: wp.uint64) -> wp.uint32:
 
 @wp.func
 def uniform(random: wp.uint64) -> float:
-    """Generates a number of 24 bits in [0, 1)."""
+    """Returns the random number in [0, 1), with 24 bits, of a random state."""
     return float(bits(random) >> wp.uint32(8)) * (1.0 / 16777216.0)
 
 
 @wp.func
 def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
-    """Samples the Henyey-Greenstein phase function for a path along d."""
+    """Samples the new direction of a path along d by the Henyey-Greenstein phase function; u and v are in [0, 1)."""
     cosine = 1.0 - 2.0 * u
     if wp.abs(g) > 1.0e-3:
         share = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)
@@ -156,9 +155,10 @@ def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
 
 @wp.struct
 class _Walk:
-    """A ray's walk through bricks: in `cell` from distance `t` to `border`; the walk ends at `end`.
+    """Where a ray is on its way through bricks: it crosses brick `cell` from distance `t` to distance `border`.
 
-    `leave` has the distances at which the ray leaves the brick along each axis, `across` those through one brick.
+    It ends at distance `end`. `leave` has the distance at which the ray leaves the brick along each axis, `across` the
+    length of its way through a whole brick along each axis, and `most` is the majorant of the brick.
     """
 
     cell: wp.vec3i
@@ -172,7 +172,6 @@ class _Walk:
 
 @wp.func
 def _border(cell: int, count: int, edge: float, p: float, d: float) -> float:
-    """Computes the distance at which a ray leaves a brick along one axis; the outermost bricks have no outer border."""
     if d > 1.0e-9 and cell < count - 1:
         return (float(cell + 1) * edge - p) / d
     if d < -1.0e-9 and cell > 0:
@@ -182,7 +181,6 @@ def _border(cell: int, count: int, edge: float, p: float, d: float) -> float:
 
 @wp.func
 def _enter(grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
-    """Finds the brick in which a ray from p begins; the walk is empty if the ray misses the smoke up to its limit."""
     w = _Walk()
     q = p - grid.low
     span = clip(grid.size, q, d)
@@ -200,13 +198,11 @@ def _enter(grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
 
 @wp.func
 def _further(cell: int, count: int, leave: float, across: float) -> float:
-    """Computes the distance at which a ray leaves the brick that it has just entered along an axis."""
     return wp.where(cell > 0 and cell < count - 1, leave + across, _NEVER)
 
 
 @wp.func
 def _onward(w: _Walk, bounds: wp.array3d[float], d: wp.vec3) -> _Walk:
-    """Advances the walk to the next brick, or to its end."""
     w.t = w.border
     if w.t < w.end:
         if w.leave[0] <= w.leave[1] and w.leave[0] <= w.leave[2]:
@@ -225,7 +221,7 @@ def _onward(w: _Walk, bounds: wp.array3d[float], d: wp.vec3) -> _Walk:
 
 @wp.func
 def drawn(density: wp.array3d[Any], p: wp.vec3, random: wp.uint64) -> float:
-    """Draws one of the voxels around a position and returns its density, whose mean is `density_at`."""
+    """Returns the density of a random one of the eight voxels around p; the mean is the interpolated density."""
     x = bits(random)
     i = int(wp.floor(p[0] + (float(x & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
     j = int(wp.floor(p[1] + (float((x >> wp.uint32(10)) & wp.uint32(1023)) - 511.5) * _TENTH_BIT))
@@ -237,7 +233,7 @@ def drawn(density: wp.array3d[Any], p: wp.vec3, random: wp.uint64) -> float:
 
 @wp.func
 def _fly(smoke: Any, grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float, random: wp.uint64) -> _Flight:
-    """Samples a free path by delta tracking, up to a limit."""
+    """Samples a free path from p along d by delta tracking, up to a distance of `limit` voxels."""
     f = _Flight()
     glow = float(0.0)
     random = following(random)
@@ -269,7 +265,7 @@ def _fly(smoke: Any, grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float, random: 
 
 @wp.func
 def _passed(smoke: Any, grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float, random: wp.uint64) -> _Passed:
-    """Estimates the share of light that passes along a ray up to a limit, by ratio tracking."""
+    """Estimates the share of light that passes from p along d, by ratio tracking, up to `limit` voxels."""
     f = _Passed()
     share = float(1.0)
     random = following(random)
@@ -306,8 +302,6 @@ def _add(out: wp.array3d[wp.vec3], plane: int, row: int, column: int, light: wp.
 
 @wp.struct
 class _Scene:
-    """The surroundings of paths: bricks of the smoke, camera, lights, and the mesh of obstacles in voxels."""
-
     grid: _Grid
     view: View
     lights: wp.array1d[PathLight]
@@ -373,11 +367,9 @@ def _coarser(
 
 @for_smoke
 def _trace(smoke_type: Any, solid: bool) -> wp.Kernel:
-    """Builds the kernel for a type of smoke; `solid` tells whether there are obstacles."""
 
     @wp.func
     def free(mesh: wp.uint64, p: wp.vec3, d: wp.vec3) -> float:
-        """Finds the distance to the first obstacle along a ray; `_NEVER` if there is none."""
         if wp.static(solid):
             found = wp.mesh_query_ray(mesh, p, d, _NEVER)
             return wp.where(found.result, found.t, _NEVER)
@@ -428,8 +420,8 @@ def _trace(smoke_type: Any, solid: bool) -> wp.Kernel:
     def connect(
         smoke: smoke_type, s: _Scene, path: _Path, base: int, row: int, column: int, out: wp.array3d[wp.vec3]
     ) -> wp.uint64:
-        """Adds the light of each light and of the sky that is scattered at the end of a path; returns the next random
-        state."""
+        """Samples every light and the sky at a path's last scattering, and adds to each one's image the light that is
+        scattered there along the path to the camera. Returns the next random state."""
         planes = s.settings.kept + 2
         count = s.lights.shape[0]
         plane = wp.min(path.order, planes - 1)
@@ -522,8 +514,8 @@ def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float |
     """Makes lights for `trace`.
 
     Args:
-        lights: For each light its direction of length 1 or its position, its colour, and the radius of a point light
-            or None for a light at infinity; in voxels, as in `PathLight`.
+        lights: For each light its direction (of length 1) or position in voxels, its colour as in `PathLight`, and the
+            radius of a point light in voxels or None for a light at infinity.
     """
     made = []
     for place, colour, radius in lights:
@@ -536,10 +528,10 @@ def make_lights(lights: Sequence[tuple[Sequence[float], Sequence[float], float |
 
 @dataclass(frozen=True)
 class Majorants:
-    """The largest extinction per voxel that a sample in each brick can read, for the part of the grid with smoke.
+    """Upper bounds of the extinction per voxel in bricks, for the part of the grid that has smoke.
 
-    `most` is float [X, Y, Z], a number per brick of `edge` voxels. The first brick begins at `low`; the bricks extend
-    `size` voxels from there. There is no smoke outside them.
+    `most` is float [X, Y, Z], the bound of each brick of `edge` voxels along an axis. The first brick begins at voxel
+    `low`, and the bricks extend over `size` voxels. There is no smoke outside them.
     """
 
     most: wp.array
@@ -549,11 +541,11 @@ class Majorants:
 
 
 def bounds(medium: Medium, densest: float) -> Majorants:
-    """Computes majorants, for bricks through which the optical depth of the densest smoke is about one.
+    """Computes majorants, in bricks so large that the densest smoke has an optical depth of about one in them.
 
     Args:
         medium: The smoke.
-        densest: Its largest extinction per voxel.
+        densest: The smoke's largest extinction per voxel.
     """
     density, device, edge = medium.density, medium.device, BRICK
     most = medium.buffer(tuple(-(-n // edge) for n in density.shape), float)
@@ -572,7 +564,7 @@ def bounds(medium: Medium, densest: float) -> Majorants:
 
 
 def _filled(there: np.ndarray) -> tuple[list[int], list[int]]:
-    """Finds the smallest box around the true cells: its first cell, and one past its last; one cell if none is true."""
+    """Returns the first cell of the smallest box around all true cells, and the cell after its last."""
     begin, end = [], []
     for axis in range(3):
         found = np.flatnonzero(there.any(tuple(other for other in range(3) if other != axis)))
@@ -592,20 +584,20 @@ def trace(
     parts: int,
     out: wp.array,
 ) -> None:
-    """Traces some of the equal parts into which the paths of each pixel are divided.
+    """Traces the paths of each pixel, or some of the equal parts into which they are divided.
 
     Args:
         medium: The smoke.
         view: The camera, [H, W] pixels; paths go through pixel centres.
-        majorants: From `bounds`.
+        majorants: The result of `bounds`.
         lights: `PathLight` [L]; L may be 0.
-        mesh: Mesh of obstacles in voxels, which absorb all light; 0: none.
+        mesh: Id of a mesh of obstacles in voxels, which absorb all light; 0: none.
         settings: Settings of the paths.
         first: Index of the first part to trace.
         parts: Number of parts in total.
-        out: vec3 [P * (L + 2) * (settings.kept + 2), H, W], added to: for each of P parts each light, the sky and the
-            emission; for each of these the light of order 0, 1 and so on, and last the light of all orders above
-            `settings.kept`. The sum over all parts is the mean over all samples.
+        out: vec3 [P * (L + 2) * (settings.kept + 2), H, W], light in R, G, B, added to: for each of the P parts to
+            trace, for each of the L lights, the sky and the emission, the light of each order from 0 to `settings.kept`
+            and the light of all higher orders. The sum over all parts is the mean over all samples.
     """
     traced = out.shape[0] // ((lights.shape[0] + 2) * (settings.kept + 2))
     # With fewer threads than keep a GPU busy, more paths per thread would not be faster.

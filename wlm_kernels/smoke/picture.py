@@ -1,4 +1,4 @@
-"""Pictures of smoke from separate images of each light, composited over solid obstacles.
+"""Pictures of smoke: images of the smoke under each light are summed and composited over solid obstacles.
 
 No data is read back to the host. All light is linear. `wlm.smoke.lightmaps.SixWay.shade` and
 `wlm.smoke.transport.lighting.LitSmoke.compose` are the same in torch, without obstacles.
@@ -19,9 +19,9 @@ class Solids:
 
     Attributes:
         points: vec3 [V], corners in the world.
-        triangles: int32 [F, 3].
+        triangles: int32 [F, 3], indices of each triangle's corners.
         owner: int32 [F], index of each triangle's obstacle.
-        colours: vec3, albedo of each obstacle.
+        colours: vec3 [obstacles], albedo of each obstacle.
     """
 
     points: wp.array
@@ -32,13 +32,13 @@ class Solids:
 
 @dataclass(frozen=True)
 class Lamps:
-    """Lights on a device; without lights the arrays have one unused element.
+    """L lights on a device; without lights the arrays have one unused element.
 
     Attributes:
         count: Number of lights.
         toward: vec3 [L], directions to the lights in the world, of length 1; 0 for a point light, which does not light
             obstacles.
-        irradiance: vec3 [L]; the intensity of a point light.
+        irradiance: vec3 [L], irradiance of each light in R, G, B; of a point light its intensity.
         visibility: float [L, H, W], share of each light that reaches the smoke.
     """
 
@@ -187,7 +187,7 @@ def _compose(
 
 
 def clip_points(solids: Solids, view: View, clip: wp.array) -> None:
-    """Transforms corners to clip space, vec4 [V], for a camera in the world; NaN where they must not be drawn."""
+    """Writes the obstacles' corners in clip space, vec4 [V]; a corner that must not be drawn becomes NaN."""
     wp.launch(_clip, solids.points.shape, [solids.points, view], [clip], device=clip.device)
 
 
@@ -201,7 +201,7 @@ def light_solids(
     light: wp.array,
     depth: wp.array,
 ) -> None:
-    """Lights the obstacles that are visible in pixels; they cast no shadows on each other.
+    """Computes the light that obstacles reflect to each pixel; obstacles cast no shadows on each other.
 
     Args:
         solids: The obstacles.
@@ -217,12 +217,12 @@ def light_solids(
 
 
 def glow_of(emission: wp.array, ramp: tuple[wp.array, wp.array] | None, glow: wp.array) -> None:
-    """Colours an emission.
+    """Converts the emission of each pixel to a colour by a colour ramp.
 
     Args:
         emission: float [H, W].
-        ramp: Stops float [S] and their colours vec3 [S]; None: grey.
-        glow: vec3 [H, W], written.
+        ramp: Emission at each of S stops, float [S], and the colours there, vec3 [S]; None: grey.
+        glow: vec3 [H, W], the emitted light in R, G, B, written.
     """
     # Without a ramp, the kernel gets arrays that it does not read.
     stops, colours = ramp or (emission.flatten(), glow.flatten())
@@ -242,12 +242,13 @@ def compose(
     """Composites the smoke's light over obstacles and a background.
 
     Args:
-        planes: vec3 [L, H, W], the smoke under each light at an irradiance, or intensity, of 4 pi.
-        transparency: float [H, W].
+        planes: vec3 [L, H, W], the light of the smoke under each light at an irradiance, or intensity, of 4 pi.
+        transparency: float [H, W], transparency of the smoke.
         glow: vec3 [H, W], light that the smoke emits; None: it is cold.
         lamps: The lights.
         background: R, G, B of the background, linear.
-        solids: The smoke's surface float [H, W], and the light and depth from `light_solids`; None: no obstacles.
+        solids: Depth of the smoke's surface, float [H, W], and the light and the depth of obstacles from
+            `light_solids`; None: no obstacles.
         image: vec3 [H, W], written.
     """
     inputs = [planes, transparency, image if glow is None else glow, int(glow is not None), lamps.count]

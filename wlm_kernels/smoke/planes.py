@@ -1,8 +1,8 @@
 """Encoding of the network's input and decoding of its output, each in one pass over the image.
 
-`encode_six` turns the planes of the coarse march into the guide, `decode` the network's planes into light. `kernels`
-builds and caches, for a number type, the kernels that add the outputs of the network's heads and a filter of the guide
-where smoke is near; sums are always float32. There are no gradients: networks are trained in torch.
+`encode_six` converts the images of the coarse march (`marches.coarse_six_way`) into the network's input, the guide;
+`decode` converts the network's output into light. `kernels` builds the kernels that add, near smoke, the outputs of the
+network's heads and a filtered guide; sums are always float32. There are no gradients: networks are trained in torch.
 Read first: `encode_guide`, `encode_lightmaps` and `decode_lightmaps` of `wlm/smoke/network/planes.py` for the
 encodings, and `_wanted` of `tests/kernels/test_six_planes.py`, which is `compose` in a few lines of torch.
 """
@@ -51,7 +51,7 @@ _TRANSPARENCY, _EMISSION = (marches.PLANES.index(name) for name in ("transparenc
 #endif
 """)
 def _load(weights: wp.array1d[Taps], i: int) -> Taps:
-    """Loads the weights at an index; the array must begin at a multiple of 16 bytes."""
+    """Loads element i; the array must begin at a multiple of 16 bytes, so that the GPU loads it at once."""
     ...
 
 
@@ -65,7 +65,7 @@ def _srgb(linear: float) -> float:
 
 @wp.func
 def _linear(code: float) -> float:
-    """Inverts `_srgb`; values below 0 count as 0."""
+    """Decodes sRGB values to linear light, the inverse of `_srgb`; values below 0 count as 0."""
     if code <= FOOT_CODE:
         return wp.max(code, 0.0) / 12.92
     return wp.pow((code + 0.055) / 1.055, 2.4)
@@ -107,14 +107,14 @@ def _encode_six(
 
 
 def encode_six(planes: wp.array, near: float, far: float, hot: bool, out: wp.array) -> None:
-    """Encodes the planes of the coarse march for the network.
+    """Encodes the images of the coarse march as the network's input.
 
     Args:
-        planes: float [9, H, W], of `marches.PLANES`.
-        near, far: Distances at which the smoke begins and ends, near < far.
-        hot: Whether the smoke emits light; otherwise that plane is 0.
-        out: float [9, H, W], written: six lights in sRGB; emission e as e / (1 + e) in sRGB; opacity; depth as a
-            share of the span, 1 at its near end, 0 where there is no surface. NaN stays NaN.
+        planes: float [9, H, W], the images `marches.PLANES`.
+        near, far: Distances at which the smoke begins and ends, near < far, in the unit of the depth image.
+        hot: Whether the smoke emits light; otherwise the emission is written as 0.
+        out: float [9, H, W], written: six lights in sRGB; emission e as e / (1 + e) in sRGB; opacity; depth, from 1 at
+            distance `near` to 0 at distance `far`, and 0 where there is no surface. NaN stays NaN.
     """
     inputs = [planes, far, far - near, hot]
     wp.launch(_encode_six, planes.shape[1:], inputs=inputs, outputs=[out], device=planes.device)
@@ -138,30 +138,33 @@ def _decode(
 
 
 def decode(planes: wp.array, out: wp.array) -> None:
-    """Decodes the network's planes into light.
+    """Decodes the network's output into light.
 
     Args:
-        planes: float [PLANES, H, W]: the lights and the emission e as e / (1 + e) in sRGB, the opacity before it.
-        out: float [PLANES, H, W], written: six lights, transparency, emission up to the largest half float. Values
-            outside a plane's range are clamped to it; NaN stays NaN.
+        planes: float [PLANES, H, W]: six lights in sRGB; opacity; emission e as e / (1 + e) in sRGB.
+        out: float [PLANES, H, W], written: six lights, transparency, and emission, at most the largest half float.
+            Values outside the range of an image are clamped to it; NaN stays NaN.
     """
     wp.launch(_decode, planes.shape[1:], inputs=[planes], outputs=[out], device=planes.device)
 
 
 @dataclass(frozen=True)
 class PlaneKernels:
-    """The kernels of a number type T, each with its launch size. The guide is T [C, H, W]; opacity and depth are last.
+    """The kernels for numbers of type T (float32 or half). Each description begins with the launch size.
+
+    The guide is the network's input, C images T [C, H, W]; opacity and depth are the last two.
 
     Attributes:
-        lanes: L, threads of `near` that share a block.
-        near: [blocks L]: whether there is smoke in each block of reach x reach pixels. In: the guide. Out: int
-            [ceil(H / reach), ceil(W / reach)], 0 or 1. A NaN is no smoke.
-        compose: [ceil(H / STRIP), W]: the planes, clamped to their ranges, and 0 where neither a block nor one of its
-            eight neighbours has smoke; elsewhere NaN stays NaN. In: T [G, ceil(H / stem), ceil(W / stem), N] or
-            larger, N outputs of heads from each of G groups; the guide; weights Taps [c edge edge] of a filter of its
-            first c planes, from column to row within each, aligned to 16 bytes, with zeros outside the image; for
-            each plane the group and the first of its stem x stem outputs, int [PLANES, 2]; stem; `near`. Out: float
-            [PLANES, H, W].
+        lanes: Number of threads L of `near` that share a block.
+        near: [blocks L]: finds whether there is smoke in each block of reach x reach pixels. In: the guide.
+            Out: int [ceil(H / reach), ceil(W / reach)], 0 or 1. A NaN is no smoke.
+        compose: [ceil(H / STRIP), W]: adds the heads' outputs and the filtered guide, and clamps each image to its
+            range. The result is 0 where neither a block nor one of its eight neighbours has smoke; elsewhere NaN stays
+            NaN. In: the N outputs of the heads of each of G groups, T [G, ceil(H / stem), ceil(W / stem), N] or larger,
+            where an output pixel has stem x stem pixels of the image; the guide; weights Taps [c edge edge] of a filter
+            of the guide's first c images, column by column for each image, aligned to 16 bytes, with zeros outside the
+            image; for each image its group and the first of its stem x stem outputs, int [PLANES, 2]; stem; the result
+            of `near`. Out: float [PLANES, H, W].
     """
 
     lanes: int
@@ -174,18 +177,18 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
     """Builds (once) the kernels for half floats or float32, on a GPU or a CPU.
 
     Args:
-        edge: Pixels along the edge of the filter, odd, at most 15.
-        reach: Pixels along the edge of a block, a power of 2 from STRIP to a warp's threads.
-        half: Whether T is half floats.
-        cuda: Whether for a GPU.
+        edge: Edge of the filter in pixels, odd, at most 15.
+        reach: Edge of a block in pixels: 4, 8, 16 or 32.
+        half: Whether the numbers T are half floats; else they are float32.
+        cuda: Whether the kernels run on a GPU.
 
     Raises:
         ValueError: The edge or the reach is out of its range.
     """
     if edge not in range(1, 16, 2):
-        raise ValueError(f"edge: expected an odd number, at most 15, got {edge}")
+        raise ValueError(f"edge: expected an odd number of pixels from 1 to 15, got {edge}")
     if reach not in (4, 8, 16, 32):
-        raise ValueError(f"reach: expected 4, 8, 16 or 32, got {reach}")
+        raise ValueError(f"reach: expected 4, 8, 16 or 32 pixels, got {reach}")
     number: Any = wp.float16 if half else wp.float32
     # Neighbouring threads read neighbouring pixels. With one thread per block, neighbouring threads would read pixels a
     # block's width apart; maxima by atomics would need another launch that clears them.

@@ -10,15 +10,15 @@ class March:
     """Settings of a march; lengths are in voxels.
 
     Attributes:
-        step: h, longest step along a ray.
-        spacing: Largest distance between the nodes of a lattice of optical depths to the lights; None: `step`. Used by
-            marches that have such a lattice, as is `light_step`.
-        light_step: Longest step between two nodes; None: `spacing`.
+        step: Longest step along a ray.
+        spacing: Largest distance between nodes, the points at which optical depths to the lights are computed; None:
+            `step`. Only used by marches that compute them at nodes, as is `light_step`.
+        light_step: Longest step of the march from node to node; None: `spacing`.
         jitter: Range of the random shift of a pixel's samples, in steps: 0 (samples in the middles of steps) to 1.
         seed: Seed of the jitter, any integer.
         threshold: Extinction per voxel above which smoke has a surface; the depth is the distance to it.
         g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
-        cutoff: A ray ends where its transparency falls below this.
+        cutoff: Transparency below which a ray ends.
 
     Raises:
         ValueError: A setting is out of its range.

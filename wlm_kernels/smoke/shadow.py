@@ -1,8 +1,9 @@
-"""Shadows of obstacles on the surface of smoke, by a shadow map (section 4.5): bounds, map and look-up, four launches.
+"""Shadows of obstacles on the surface of smoke, by a shadow map (neural-six-way-lightmaps, section 4.5).
 
 The map is square and is rendered from the light; it covers the obstacles and two texels on each side, so that its
 border is empty. No data is read back to the host, so that a CUDA graph can capture everything. Lengths are in the
-world's unit and relative to the first corner of the first triangle, so that float32 suffices wherever the scene is.
+world's unit; positions are relative to the first corner of the first triangle, so that float32 also suffices for a
+scene far from the world's origin.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ _SMALLEST = wp.constant(1.0e-9)
 
 @wp.struct
 class _Map:
-    """The position and size of the map, in the light's axes."""
+    """The square that a shadow map covers, in the light's axes: its centre, half its edge, and the edge of a texel."""
 
     middle: wp.vec3
     half: float
@@ -51,7 +52,7 @@ def _place(bounds: wp.array(dtype=float), resolution: float) -> _Map:
 
 @wp.func
 def _on_map(m: _Map, resolution: float, p: wp.vec3) -> wp.vec3:
-    """Computes column, row and height towards the light of a point in its axes; texel centres are at integers."""
+    """Converts a point in the light's axes to the map's column, row (integers at texel centres) and height."""
     column = (p[0] - m.middle[0]) / m.texel + 0.5 * resolution - 0.5
     row = (m.middle[1] - p[1]) / m.texel + 0.5 * resolution - 0.5
     return wp.vec3(column, row, p[2])
@@ -189,17 +190,17 @@ def visibility(
     resolution: int = RESOLUTION,
     bias: float = -1.0,
 ) -> None:
-    """Computes the share of a directional light that reaches the smoke's surface past obstacles.
+    """Computes for each pixel the share of a directional light that obstacles let through to the smoke's surface.
 
-    Each pixel is looked up at the depth of its smoke's surface alone, bilinearly between four texels of the map.
+    The shadow map is looked up only at the surface of the smoke, not inside, bilinearly between four texels.
 
     Args:
         points: vec3 [V], corners of the obstacles in the world.
-        triangles: int32 [F, 3], rows of the points; at least one.
+        triangles: int32 [F, 3], indices of each triangle's corners in `points`; at least one triangle.
         axes: 9 numbers, rows of a rotation to axes of which the third points to the light.
         view: The camera in the world; its `voxel` and `moved` are not used.
         depth: float [H, W], distance along the rays to the surface; 0: no surface, which counts as lit.
-        out: float [H, W], written: in [0, 1].
+        out: float [H, W], written: the share of the light, 0 to 1.
         empty: Allocates buffers.
         resolution: Texels along the map's edge, at least 8.
         bias: Distance in the world's unit by which an obstacle must be nearer to the light to shadow the surface; below

@@ -7,12 +7,13 @@ x_n = sigma(p_n) h and T_n = exp(-x_0 - ... - x_(n-1)) (neural-six-way-lightmaps
     emitted                 sum_n T_n (1 - exp(-x_n)) / x_n h e(p_n)
     depth                   sum_n x_n
 
-where tau_l, the optical depth from a point to a light, is marched from the nodes of a lattice that all rays share, and
-is linear between nodes. The derivatives are exact: steps depend only on the geometry, and a ray ends early only where
-its transparency is 0 in float32. `wlm.ops.plain.march` is the same in torch.
+where tau_l, the optical depth from a point to light l, is computed at the nodes of a lattice, which all rays use, and
+interpolated linearly between them. The derivatives are exact: steps depend only on the geometry, and a ray ends early
+only where its transparency is 0 in float32. `wlm.ops.plain.march` is the same in torch.
 
-Adjoints run from a ray's end to its start, so that the light behind a sample is a running sum. They add to the density,
-the emission and the nodes by atomics: on CUDA in any order, so that the last bits vary from run to run.
+Adjoints run from a ray's end to its start, so that the light behind a sample is a running sum. They are added to the
+gradients of the density, the emission and the nodes by atomic additions: on CUDA in any order, so that the last bits
+vary from run to run.
 """
 
 from typing import Any
@@ -43,7 +44,6 @@ class _Cell:
 
 @wp.func
 def _cell(q: wp.vec3, counts: wp.vec3i) -> _Cell:
-    """Finds the eight grid values around q; value (i, j, k) is at q = (i, j, k)."""
     cell = _Cell()
     for axis in range(3):
         i = int(wp.floor(q[axis]))
@@ -268,8 +268,8 @@ def depths_backward(toward, step: float, grad_nodes, grad_density) -> None:
 
     Args:
         toward, step: Arguments of `depths`.
-        grad_nodes: float [L, A, B, C].
-        grad_density: float [X, Y, Z], added to.
+        grad_nodes: float [L, A, B, C], gradient of the loss with respect to the nodes.
+        grad_density: float [X, Y, Z], the gradient with respect to the density is added to it.
     """
     inputs = [toward, step * _SLACK, grad_nodes]
     wp.launch(_depths_backward, grad_nodes.shape, inputs=inputs, outputs=[grad_density], device=grad_density.device)
@@ -281,11 +281,11 @@ def march(density, emission, nodes, origin, direction, step: float, scattered, e
     Args:
         density: float [X, Y, Z], extinction per voxel, at least 0.
         emission: vec3 [X, Y, Z], radiance emitted per voxel; shape [0, 0, 0]: no emission.
-        nodes: float [L, A, B, C] from `depths`; L may be 0.
-        origin, direction: vec3 [R], in voxels; directions of length 1.
+        nodes: float [L, A, B, C], the result of `depths` for L lights; L may be 0.
+        origin, direction: vec3 [R], the origin of each of R rays in voxels, and its direction, of length 1.
         step: The longest step, in voxels.
-        scattered: float [R, L], written.
-        emitted: vec3 [R], written.
+        scattered: float [R, L], written: light scattered once to each ray, from each light.
+        emitted: vec3 [R], written: light emitted to each ray.
         depth: float [R], written: optical depth along each ray, up to where it is opaque.
         count: int [R], written: number of samples of each ray, up to where it is opaque.
     """
@@ -314,12 +314,10 @@ def march_backward(
 
     Args:
         density, emission, nodes, origin, direction, step, depth, count: Arguments and results of `march`.
-        grad_scattered: float [R, L].
-        grad_emitted: vec3 [R].
-        grad_depth: float [R].
-        grad_density: float [X, Y, Z], added to.
-        grad_emission: vec3 [X, Y, Z], added to; shape [0, 0, 0]: not computed.
-        grad_nodes: float [L, A, B, C], added to.
+        grad_scattered, grad_emitted, grad_depth: float [R, L], vec3 [R], float [R]: gradients of the loss with respect
+            to the results of `march`.
+        grad_density, grad_emission, grad_nodes: Float [X, Y, Z], vec3 [X, Y, Z], float [L, A, B, C]: the gradients with
+            respect to the inputs are added to them. With `grad_emission` of shape [0, 0, 0] it is not computed.
     """
     inputs = [density, emission, nodes, origin, direction, step * _SLACK, depth, count]
     inputs += [grad_scattered, grad_emitted, grad_depth]

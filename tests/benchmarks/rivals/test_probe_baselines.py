@@ -248,7 +248,7 @@ def test_at_bytes_keeps_the_size_and_uses_it(name):
         assert result.name == name and result.bytes <= budget
     errors = [_error(values, result.decoded) for result in results]
     assert errors[0] > errors[1] >= errors[2]
-    with pytest.raises(WlmError, match=f"{name}: nothing fits into 20 bytes for 150 probes"):
+    with pytest.raises(WlmError, match=f"{name}: no settings fit 150 probes into 20 bytes"):
         at_bytes(name, position, values, 20)
 
 

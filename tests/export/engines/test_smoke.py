@@ -70,7 +70,7 @@ def test_what_cannot_be_exported(frames, tmp_path, monkeypatch):
     book, out = random_book(frames), tmp_path / "deep" / "out"
 
     bare = [dataclasses.replace(frame, transparency=None, emission=None) for frame in frames]
-    assert "jet: has no opacity" in error_of(export_smoke, random_book(bare), out, "three", name="jet")
+    assert "jet: the flip book has no opacity" in error_of(export_smoke, random_book(bare), out, "three", name="jet")
     o3de = dataclasses.replace(book, layout="o3de")
     assert "layout: expected unity for unreal" in error_of(export_smoke, o3de, out, "unreal")
     broken = dataclasses.replace(book, second=book.second * np.float32("nan"))

@@ -326,7 +326,7 @@ def test_what_is_no_shader_of_ours():
     for text, words in (
         ("#pragma once\n", "expected ifdef"),
         ("mat4 f() { return x; }", "expected"),
-        ("float f() { return 1.0 $ 2.0; }", "expected a word"),
+        ("float f() { return 1.0 $ 2.0; }", "expected a token"),
         ("float f() { return ; ", "expected"),
     ):
         with pytest.raises(ValueError, match=words):

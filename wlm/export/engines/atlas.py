@@ -1,7 +1,8 @@
 """Kits of compressed lightmaps for engines: textures, the mesh, and a material that reads the textures.
 
-Materials read the lightmaps at their own resolution: a kit has no mips. A kit of one lightmap has the files `atlas.*`,
-and one of shared tiles has `scene.*` with a component that sets the objects' rectangles and states.
+Materials read the lightmaps at their own resolution: a kit has no mips. A kit of one lightmap has the files `atlas.*`.
+A kit of a scene with several lightmaps has the files `scene.*` and a component that sets each object's rectangle
+in its lightmap and its lighting state.
 """
 
 from pathlib import Path
@@ -41,8 +42,8 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
         Entries for the folder's index: shader and textures.
 
     Raises:
-        WlmError: The colours are ASTC, which the engine's kit can't load, the engine can't read the UV set, or a
-            texture is larger than the engine accepts.
+        WlmError: The colours are ASTC blocks, which the engine's kit can't load, the engine can't read the UV set, or
+            a texture is larger than the engine accepts.
     """
     if bundle.model.mips:
         bundle = make_bundle(bundle.model.without_mips())
@@ -61,7 +62,7 @@ def _write_textures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]
     for name, texture in bundle.textures.items():
         if texture.fmt not in DXGI_FORMATS:
             raise WlmError(
-                f"{bundle.name}: cannot export for {engine}: there is no DDS of ASTC; compress with --colour bc6h"
+                f"{bundle.name}: cannot export for {engine}: a DDS file cannot hold ASTC; compress with --colour bc6h"
             )
         if texture.image is not None and (texture.width % BLOCK_SIDE or texture.height % BLOCK_SIDE):
             # Direct3D and browsers refuse blocks that don't fill their texture.
@@ -101,7 +102,7 @@ def _texts(bundle: Bundle, engine: str, entries: dict[str, Any]) -> dict[str, st
     elif engine == "godot":
         if shared and uv_set > 1:
             raise WlmError(
-                f"{bundle.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1, the light is at {uv_set}"
+                f"{bundle.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1, not TEXCOORD_{uv_set}"
             )
         marks = {"SHADER": godot_uniforms(bundle.shader), "UV": "UV2" if uv_set else "UV"}
         texts = {f"{kind}.gdshader": filled(f"godot_{kind}.gdshader", **marks)}

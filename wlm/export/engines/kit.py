@@ -14,7 +14,7 @@ ENGINES = ("three", "godot", "unity", "unreal")
 
 README_FILE = "README.md"
 
-# Texels along a side of a picture that the editor imports, or that WebGL2 has on most machines.
+# Most texels along a side of a picture that the editor imports, or that WebGL2 supports on most machines.
 _MOST_SIDE = {"unreal": 8192, "godot": 16384, "unity": 16384, "three": 16384}
 
 _MARK = re.compile(r"@(\w+)@")
@@ -24,7 +24,7 @@ _SAMPLER = re.compile(
 
 
 def filled(asset: str, **parts: str) -> str:
-    """Reads a template from `assets` and replaces its marks `@NAME@`.
+    """Reads a template from `assets` and replaces its marks `@NAME@` by `parts`.
 
     Raises:
         KeyError: A mark of the template is not among `parts`.
@@ -43,7 +43,7 @@ def check_sides(name: str, engine: str, file: str, pixels: np.ndarray) -> None:
     """Checks that an engine accepts the size of a picture [H, W, C]; `name` is the model's name for messages.
 
     Raises:
-        WlmError: It is too large.
+        WlmError: The picture is too large.
     """
     height, width = pixels.shape[:2]
     if max(height, width) > _MOST_SIDE[engine]:
@@ -52,7 +52,7 @@ def check_sides(name: str, engine: str, file: str, pixels: np.ndarray) -> None:
 
 
 def picture_entry(file: str, pixels: np.ndarray, layers: int = 0) -> dict[str, Any]:
-    """Returns the index entry of a picture [H, W, C] in place of a texture; array layers are stacked vertically."""
+    """Returns the index entry of a picture [H, W, C] that replaces a texture, whose layers are stacked vertically."""
     return {"file": file, "width": pixels.shape[1], "height": pixels.shape[0], "layers": layers}
 
 

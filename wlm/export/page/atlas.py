@@ -38,11 +38,11 @@ def atlas_page(
     """
     model = load(paths[0], "atlas")
     if model.method == "shared":
-        raise WlmError(f"{model.name}: the page shows one lightmap, found {len(model.sheets) * len(model.states)}")
+        raise WlmError(f"{model.name}: expected a model of one lightmap, found {len(model.sheets) * len(model.states)}")
     mesh, (height, width) = model.scene.sheets[0], model.sheets[0].size
     colours, blocks = model.texels[0], model.block_texels[0] if model.colour == "mixed" else model.texels[0]
     triangles = mesh.triangle[mesh.active]
-    # One vertex a corner: new UVs are of corners.
+    # Each corner becomes a vertex, since the new UVs belong to corners.
     corners = triangles.reshape(-1)
     position, uv = mesh.position[corners].astype(np.float32), mesh.uv[corners].astype(np.float32)
     drawn = Geometry(position, np.arange(len(corners), dtype=np.uint32).reshape(-1, 3), uv)

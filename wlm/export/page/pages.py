@@ -50,7 +50,7 @@ def make_page(
     Args:
         files: One `.wlm` of lightmaps over time, lightmaps of meshes or probes; or six-way lightmaps of smoke, one EXR
             a frame, or their folder.
-        mesh: Mesh file of the scene; for lightmaps over time it needs their UVs.
+        mesh: Mesh file of the scene. To show lightmaps over time, it must have the UVs of the lightmaps.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Name of the array to read from an original probe file with several arrays.
         hours: Largest number of original lightmaps in the page, at evenly spread times.
@@ -63,9 +63,9 @@ def make_page(
     """
     kind, paths = content_of(files)
     if kind == "smoke":
-        raise WlmError(f"{paths[0]}: a network has no picture of its own; expected the lightmaps that it predicts")
+        raise WlmError(f"{paths[0]}: a smoke network has no picture of its own; expected lightmaps predicted by it")
     if kind not in _PAGES:
-        raise WlmError(f"{paths[0]}: expected a .wlm or six-way EXRs; wlm view shows inputs too")
+        raise WlmError(f"{paths[0]}: expected a .wlm file or six-way EXRs; wlm view shows inputs of a compression too")
     module, function = _PAGES[kind]
     make = getattr(import_module(module), function)
     known = signature(make).parameters

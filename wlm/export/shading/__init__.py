@@ -1,4 +1,4 @@
-"""Translation of the systems' GLSL into other shading languages."""
+"""Translates the GLSL of exported models into other shading languages."""
 
 from wlm.export.shading.node import custom_node
 from wlm.export.shading.translation import ENDINGS, LANGUAGES, check_language, translate

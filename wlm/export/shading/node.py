@@ -20,11 +20,11 @@ _SIZE = """\
 def custom_node(
     text: str, function: str, arguments: str, layers: Mapping[str, tuple[int, int]] | None = None
 ) -> tuple[str, list[str]]:
-    """Writes one of our shaders as the code of a Custom node: a structure of functions, and a call of one of them.
+    """Writes a shader of this package as the code of a Custom node: a structure of functions, and a call of one.
 
     The functions exist only within the node, so a project needs no shader folder and no C++. The node's textures are
     parameters of each function that reads them. Integer textures become float textures, which hold their numbers
-    exactly, and the layers of arrays are stacked from top to bottom, since Unreal imports neither.
+    exactly, and the layers of arrays are stacked vertically: Unreal imports neither integer textures nor arrays.
 
     Args:
         text: GLSL of this package; its uniforms are inputs of the node, too.
@@ -36,7 +36,7 @@ def custom_node(
         The code, and the names of the textures and uniforms that must be inputs of the node.
 
     Raises:
-        ValueError: The text uses GLSL outside the subset.
+        ValueError: The text uses GLSL that `wlm.export.shading.tree` cannot parse.
     """
     return _NodeWriter(text, layers or {}).node(function, arguments)
 
@@ -86,7 +86,7 @@ class _NodeWriter(HlslWriter):
         self.functions = self.shader.functions
 
     def used(self, name: str) -> list[str]:
-        """Returns the names of textures and uniforms that a function and its callees read, and of the used sampler."""
+        """Returns the names of textures, uniforms and the sampler that a function and its callees read."""
         if name not in self.uses:
             nodes = list(nodes_of(self.functions[name].body))
             names = {each.text for each in nodes if each.kind == "name"}

@@ -34,8 +34,7 @@ class _Macro:
 
 
 def read_words(text: str, defined: Iterable[str] = ()) -> list[Word]:
-    """Splits GLSL into tokens; expands macros, those in `defined` with the value 1, and evaluates conditional
-    directives.
+    """Splits GLSL into tokens, expands macros and evaluates conditional directives; macros in `defined` are set to 1.
 
     Raises:
         ValueError: An unsupported directive, or a character that is not part of GLSL.
@@ -84,7 +83,7 @@ def _split(line: str, blank: bool) -> Iterator[Word]:
             continue
         match = _WORD.match(line, at)
         if match is None:
-            raise ValueError(f"GLSL: expected a word, got {line[at:]!r}")
+            raise ValueError(f"GLSL: expected a token, got {line[at:]!r}")
         kind = next(name for name in ("comment", "number", "name", "mark") if match[name] is not None)
         yield Word(kind, match[0], first, first and blank)
         at, first = match.end(), False

@@ -34,11 +34,11 @@ def check_language(language: str) -> None:
 
 
 def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
-    """Translates one of our shaders.
+    """Translates a shader of this package to another language.
 
     GLSL is not changed, except for macros and precisions at its head; conditional directives are left to the including
-    shader. In the other languages macros are expanded, which a comment at the head states. They have functions of the
-    same names, textures of the same names, and one sampler, linear and clamped to the edge.
+    shader. In the other languages macros are expanded, which a comment at the head states. Functions and textures keep
+    their names, and one sampler, linear and clamped to the edge, reads all filtered textures.
 
     Args:
         text: GLSL of this package, in the subset of the language that `wlm.export.shading.tree` parses.
@@ -47,7 +47,7 @@ def translate(text: str, language: str, defined: Iterable[str] = ()) -> str:
 
     Raises:
         WlmError: Unknown language.
-        ValueError: The text uses GLSL outside the subset.
+        ValueError: The text uses GLSL that `wlm.export.shading.tree` cannot parse.
     """
     check_language(language)
     if not language.startswith("glsl"):

@@ -316,6 +316,6 @@ def read_shader(words: list[Word]) -> Shader:
     """Parses the tokens of a shader.
 
     Raises:
-        ValueError: The text uses GLSL outside the subset.
+        ValueError: The text uses GLSL that this parser does not support.
     """
     return _Reader(words).shader()

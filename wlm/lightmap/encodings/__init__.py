@@ -7,7 +7,7 @@ from wlm.lightmap.encodings.maps import Maps
 from wlm.lightmap.tiles import TileKind
 
 ENCODINGS: tuple[Encoding, ...] = (Maps(), Frames(), Constant())
-"""All encodings. Empty tiles have none."""
+"""All encodings; empty tiles are not stored and have no encoding."""
 
 _BY_KIND = {kind: encoding for encoding in ENCODINGS for kind in encoding.kinds}
 

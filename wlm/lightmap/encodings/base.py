@@ -29,7 +29,7 @@ class DeviceTiles(ABC):
         self._row_of = {int(number): row for row, number in enumerate(numbers)}
 
     def among(self, numbers: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-        """Finds the tiles of this encoding among `numbers`: indices in `numbers` and `self.numbers`, int32 [k]."""
+        """Finds the tiles of this encoding in `numbers`; returns their indices there and in `self.numbers`, int32."""
         pairs = [(i, self._row_of[number]) for i, number in enumerate(numbers) if number in self._row_of]
         places, rows = np.array(pairs, np.int32).reshape(-1, 2).T
         return places, np.ascontiguousarray(rows)
@@ -43,7 +43,7 @@ class DeviceTiles(ABC):
 
     @abstractmethod
     def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
-        """Decodes tiles `rows` (indices into `numbers`, [k]) to radiance, float32 [k, 128, 128, 3]; gaps stay empty."""
+        """Decodes tiles to radiance, float32 [k, 128, 128, 3]; `rows` [k] indexes `numbers`; gaps are not filled."""
 
     @abstractmethod
     def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
@@ -55,7 +55,7 @@ class Encoding(ABC):
 
     Attributes:
         kinds: The kinds of tiles that are stored in this way.
-        codes: For each of these kinds, its code in the tables of `wlm.lightmap.bundle.hour_tables`.
+        codes: The number of each of these kinds in the shader's tables, see `wlm.lightmap.bundle.hour_tables`.
     """
 
     kinds: ClassVar[tuple[TileKind, ...]]
@@ -66,7 +66,7 @@ class Encoding(ABC):
         return 0
 
     def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
-        """Returns a tile's maps and network, or its frames, as byte arrays that a packer compresses separately."""
+        """Returns a tile's maps and network, or its frames, as byte arrays, each of which is compressed on its own."""
         return []
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:  # noqa: B027
@@ -81,7 +81,7 @@ class Encoding(ABC):
         """Uploads a sheet's tiles of this encoding to a device; returns an empty list if the sheet has none.
 
         Args:
-            sheet: The arrays.
+            sheet: The arrays of the sheet.
             device: As `wlm.interop.check_device` returns it.
             gelu: GELU variant of the networks, see `wlm_kernels.mlp`.
         """
@@ -98,8 +98,8 @@ class Encoding(ABC):
     def fill_records(self, sheet: SheetModel, times: Sequence[float], records: np.ndarray) -> None:
         """Writes the records of all tiles of this encoding into the shader's tables, one table for each given time.
 
-        `times` are stored times, or any times if the networks can evaluate them. `records`, float32 [times, tiles,
-        fours, 4], is written; the first number of each record is already set.
+        `times` are stored times, or any times if the model interpolates with the network. `records`, float32 [times,
+        tiles, rows, 4], is written; each tile has a record of `record_fours` rows, whose first number is already set.
         """
 
 
@@ -122,7 +122,7 @@ def side_by_side(images: np.ndarray, fmt: str, height: int, width: int) -> dict[
         height, width: Size of an image in texels.
 
     Returns:
-        The arguments of `Texture`.
+        The keyword arguments of `Texture`.
     """
     across = columns(len(images), height, width)
     missing = -len(images) % across

@@ -1,7 +1,7 @@
 """Encoding of tiles as frames: plain BC7 at each time, for tiles where a network would not be smaller.
 
-The texels of a frame are levels from 0 to 1 between the tile's least and greatest colour at that time, per channel, in
-gamma space:
+A frame stores a level from 0 to 1 for each channel of each texel, between the tile's least and greatest colour at the
+frame's time, in gamma space:
 
     colour = least + level (greatest - least),     radiance = colour ** gamma
 
@@ -32,7 +32,7 @@ from wlm.texels import REACH
 from wlm_kernels.lightmap import frames as frame_kernels
 
 EXTRA = "frames"
-"""The extra with the encoder."""
+"""Name of the extra (`pip install 'wlm[frames]'`) that installs the BC7 encoder."""
 
 _ENCODER = "ispc_texcomp"
 _RANGE_BYTES = 2 * 3 * 2  # two half floats for each channel of a frame
@@ -79,7 +79,7 @@ def choose_frames(
 
 
 def needed_blocks(mask: np.ndarray, number: int) -> np.ndarray:
-    """Returns the blocks of a tile that filtered reads touch: within `REACH` of a mask [H, W], bool [32, 32]."""
+    """Returns which 4x4 blocks of a tile a filter may read, bool [32, 32]: those within `REACH` of the mask [H, W]."""
     y, x = TileGrid.of(*mask.shape).origin(number)
     near = np.zeros((TILE + 2 * REACH, TILE + 2 * REACH), bool)
     part = mask[max(y - REACH, 0) : y + TILE + REACH, max(x - REACH, 0) : x + TILE + REACH]
@@ -100,11 +100,11 @@ def clear_unneeded(blocks: np.ndarray, needed: np.ndarray) -> np.ndarray:
 
 
 def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Encodes the frames of a tile.
+    """Encodes the frames of a tile at T times.
 
     Args:
         colour: float32 [T, 128, 128, 3], in gamma space, gaps filled.
-        valid: bool [128, 128].
+        valid: bool [128, 128], true where a texel of the tile is valid.
         needed: bool [32, 32], from `needed_blocks`.
 
     Returns:
@@ -144,7 +144,7 @@ class FrameTiles(DeviceTiles):
         """Uploads the frames of a sheet."""
         super().__init__(sheet.numbers(TileKind.FRAMES))
         if not len(self.numbers):
-            raise WlmError(f"{sheet.name}: expected at least one tile of frames, found none")
+            raise WlmError(f"{sheet.name}: expected at least one tile that is stored as frames, found none")
         self._axis, self._device = sheet.axis, device
         self._greatest = sheet.ranges[:, :, 1].astype(np.float32).max(2)
         ends = sheet.ranges.astype(np.float32).reshape(-1, 2, 3)
@@ -171,7 +171,7 @@ class FrameTiles(DeviceTiles):
         """Decodes tiles with one kernel launch, which a CUDA graph can capture.
 
         Args:
-            time: A stored time, or a time between two, whose radiance is then interpolated (eq. 2).
+            time: A stored time, or a time between two, whose radiance is then interpolated (neural-dynamic-gi, eq. 2).
             rows: int [k], indices into `numbers`.
             out: [k, 128, 128]: radiance, vec3 or uint32 (RGB9E5); with `inverse_bounds` 8-bit colour, uint32 (RGBA).
             inverse_bounds: float [n], 1 / the bound of each tile.
@@ -202,7 +202,7 @@ class Frames(Encoding):
     def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
         blocks, needed = sheet.frames[sheet.row(number)], needed_blocks(sheet.mask, number)
         if not np.array_equal(blocks, clear_unneeded(blocks, needed)):
-            raise WlmError(f"frames: tile {number}: expected black blocks where no read reaches, found others")
+            raise WlmError(f"frames: tile {number}: expected black BC7 blocks where no filter reads, found others")
         kept = blocks[:, needed]
         _check_modes(kept, number)
         # The times of a block come one after another: they resemble each other more than neighbouring blocks do.

@@ -1,4 +1,4 @@
-"""Encoding of tiles as feature maps and a network: static (F_uv alone), dynamic (F_uv, F_uvt, F_ut and F_vt).
+"""Encoding of tiles as feature maps and a network; static tiles have F_uv, dynamic tiles F_uv, F_uvt, F_ut and F_vt.
 
 In the file each tile is one zstd frame (`wlm.lightmap.codec`). Before packing, the blocks of BC7 mode 6 are split into
 bytes that a general packer models well: eight bytes with the endpoints, and eight with the indices. The fit sets texels
@@ -39,7 +39,7 @@ _MAPS, _TEMPORAL = 4, 12  # network inputs from textures, of static and of dynam
 
 
 def tile_bytes(profile: Profile, temporal: bool) -> int:
-    """Returns the bytes of the maps and the network of one tile before packing, as in table 3 of the paper."""
+    """Returns the bytes of the maps and the network of one tile before packing (neural-dynamic-gi, table 3)."""
     inputs, hidden = profile.inputs(temporal), profile.hidden
     if profile.net_bits == 16:
         size = TILE * TILE + 2 * mlp.parameter_count(inputs, hidden)
@@ -71,7 +71,7 @@ class Reads:
 
     @classmethod
     def of(cls, used: np.ndarray, axis: TimeAxis, resolution: int, slices: int, columns: int, rows: int) -> Reads:
-        """Finds what the valid texels (`used`, bool [128, 128]) of a tile read; the last arguments are map sizes."""
+        """Finds what the valid texels (`used`, bool [128, 128]) of a tile read from maps of the given sizes."""
         centres = (np.arange(TILE) + 0.5) / TILE
         across = _cells(centres, resolution).astype(np.int64)
         along = _cells(centres, columns)
@@ -91,7 +91,7 @@ class Reads:
 
 
 def _cells(places: np.ndarray, count: int, periodic: bool = False) -> np.ndarray:
-    """Returns which of an axis's `count` texels a linear filter reads at each place in [0, 1], bool [places, count]."""
+    """Returns which of an axis's `count` texels a linear filter reads at positions in [0, 1], bool [places, count]."""
     x = np.asarray(places, np.float64) * count - 0.5
     first, last = np.floor(x - _SLACK), np.floor(x + _SLACK) + 1
     cells = np.zeros((len(x), count), bool)
@@ -124,7 +124,7 @@ def _by_block(texels: np.ndarray) -> np.ndarray:
 
 
 def _cleared(blocks: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Zeroes the texels of BC7 blocks, uint8 [n, 16], that are not `used`, bool [n, 16]."""
+    """Returns BC7 blocks, uint8 [n, 16], in which the texels that are not `used`, bool [n, 16], are set to zero."""
     ends, indices = _unpacked(blocks)
     ends, indices = ends * used.any(1)[:, None, None], indices * used
     # The first index of a block is below 8, which fixes the order of its endpoints; if it is unused, they are sorted.
@@ -138,7 +138,7 @@ def _cleared(blocks: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: bool) -> None:
-    """Raises WlmError unless maps from a trainer are BC7 mode 6 and its networks are on the settings' weight levels."""
+    """Raises WlmError unless a trainer's maps are BC7 mode 6 and its weights are exact in the profile's `net_bits`."""
     for name in ("uv", "uvt") if dynamic else ("uv",):
         _unpacked(parts[name].reshape(-1, BLOCK_BYTES))
     if profile.net_bits == 8:
@@ -151,7 +151,7 @@ def _unpacked(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     try:
         return unpack_mode6(blocks)
     except WlmError as error:
-        raise WlmError("maps: expected blocks of BC7 mode 6, found others") from error
+        raise WlmError("maps: expected BC7 blocks of mode 6, found another mode") from error
 
 
 def _split_blocks(blocks: np.ndarray) -> list[np.ndarray]:
@@ -159,17 +159,17 @@ def _split_blocks(blocks: np.ndarray) -> list[np.ndarray]:
     # The P bit of the first endpoint is the top bit of the first byte; that of the second is with the indices.
     low, high = np.ascontiguousarray(blocks).reshape(-1, BLOCK_BYTES).view("<u8").T
     if ((low & _LOW_7) != _MODE_6).any():
-        raise WlmError("maps: expected blocks of BC7 mode 6, found others")
+        raise WlmError("maps: expected BC7 blocks of mode 6, found another mode")
     ends = ((low[:, None] >> _END_SHIFTS) & _LOW_7).astype(np.uint8)
     ends[:, 0] |= (low >> _LAST_BIT).astype(np.uint8) << 7
     return [ends, np.ascontiguousarray(high).view(np.uint8).reshape(-1, 8)]
 
 
 def _join_blocks(data: np.ndarray) -> np.ndarray:
-    """Inverts `_split_blocks`: returns the blocks, uint8 [n, 16], of its bytes, uint8 [16 n]."""
+    """Inverts `_split_blocks`: converts its bytes, uint8 [16 n], to BC7 blocks, uint8 [n, 16]."""
     ends, indices = data.reshape(2, -1, 8)
     if (ends[:, 1:] > 127).any():
-        raise ValueError("expected endpoints of 7 bits")
+        raise ValueError("expected endpoints of 7 bits, found larger values")
     words = np.empty((len(ends), 2), "<u8")
     wide = ends.astype(np.uint64)
     words[:, 0] = _MODE_6 | (wide[:, 0] >> np.uint64(7)) << _LAST_BIT
@@ -192,14 +192,14 @@ def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
         step = most.astype(np.float32) / np.float32(LEVELS)
         q = np.rint(np.divide(weights, step, out=np.zeros(weights.shape, np.float32), where=step > 0))
         if not np.array_equal((q * step).astype(np.float16), weights):
-            raise WlmError("net: expected weights on 8-bit levels, found others")
+            raise WlmError("net: expected weights that 8 bits store exactly, found others")
         whole.append(q.astype(np.int8).ravel())
         halves += [most, bias]
     return np.concatenate([np.concatenate(whole).view(np.uint8), _apart(np.concatenate(halves))])
 
 
 def unpack_network(data: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
-    """Inverts `pack_network`: returns the network, float16 [P], of its bytes."""
+    """Inverts `pack_network`: converts its bytes to the network's parameters, float16 [P]."""
     shapes = (inputs, hidden), (hidden, hidden), (hidden, 3)
     count = sum(rows * units for rows, units in shapes)
     whole, halves = data[:count].view(np.int8), _together(data[count:])
@@ -227,7 +227,7 @@ def _apart(halves: np.ndarray) -> np.ndarray:
 
 
 def _together(data: np.ndarray) -> np.ndarray:
-    """Inverts `_apart`: returns the half floats of its bytes."""
+    """Inverts `_apart`: converts its bytes to half floats."""
     return np.ascontiguousarray(data.reshape(2, -1).T).view("<f2").ravel()
 
 
@@ -285,7 +285,7 @@ class MapTiles(DeviceTiles):
         return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
 
     def state(self, time: float, state: decode_kernels.TimeState | None = None) -> decode_kernels.TimeState:
-        """Returns what the decode kernels need for one time; `state` is overwritten, and None allocates a new one."""
+        """Returns what the decode kernels need for one time; it overwrites `state`, or allocates it if it is None."""
         before, after, share = self._axis.neighbours(time)
         if state is None:
             state = decode_kernels.TimeState()
@@ -304,7 +304,7 @@ class MapTiles(DeviceTiles):
         Args:
             state: From `state`.
             rows: int [k], indices into `numbers`.
-            form: Output: 0 for radiance (vec3), 1 for 8 bits, 2 for RGB9E5 (uint32).
+            form: Output: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for RGB9E5 (uint32).
             out: [k, 128, 128], written.
         """
         inputs = [*self.arguments, state, self.places, rows]
@@ -336,7 +336,7 @@ class MapTiles(DeviceTiles):
 
 
 def fours(profile: Profile) -> int:
-    """Returns the number of groups of four that hold one value per hidden unit; the last is padded with zeros."""
+    """Returns how many groups of four floats hold one float per hidden unit; the last group is padded with zeros."""
     return -(-profile.hidden // 4)
 
 
@@ -369,7 +369,7 @@ def shader_networks(sheet: SheetModel) -> np.ndarray:
 
 
 def network_starts(sheet: SheetModel) -> np.ndarray:
-    """Returns the index of the first row of each network in `shader_networks`, int [N_m]."""
+    """Returns each network's first row in `shader_networks`, int [N_m], in the order of the tiles."""
     wide = fours(sheet.profile)
     sizes = [
         np.full(len(nets), (sheet.profile.inputs(temporal) + 4 * wide + 2) * wide + 4 * wide + 1)
@@ -379,7 +379,7 @@ def network_starts(sheet: SheetModel) -> np.ndarray:
 
 
 def image_rows(sheet: SheetModel) -> np.ndarray:
-    """Returns the index of each mapped tile's image in the textures, where dynamic tiles come first, int [N_m]."""
+    """Returns the image of each tile with maps in the textures, where dynamic tiles come first, int [N_m]."""
     static = sheet.kind[sheet.mapped] == TileKind.STATIC
     rows = np.empty(len(static), int)
     rows[np.argsort(static, kind="stable")] = np.arange(len(static))

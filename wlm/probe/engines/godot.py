@@ -2,10 +2,10 @@
 
 Godot finds the tetrahedron of probes around a moving object with a tree of planes, and mixes the light of its four
 corners by barycentric weights (`lightmap_tap_sh_light`, servers/rendering). On a lattice the tree and the tetrahedra
-are simple: planes between the cells down to one cell, and within a cell the planes x = y, y = z and x = z, which cut it
-into six tetrahedra (Kuhn 1960). Tetrahedra of neighbouring cells meet face to face, so that the light is continuous.
-Planes through the faces of Delaunay tetrahedra between scattered probes would cut many others: the tree has 20 nodes
-for each tetrahedron, and Godot's own takes minutes for 2,000 probes.
+are simple: planes between the cells split the lattice down to single cells, and the planes x = y, y = z and x = z cut
+a cell into six tetrahedra (Kuhn 1960). Tetrahedra of neighbouring cells meet face to face, so that the light is
+continuous. For scattered probes, planes through the faces of Delaunay tetrahedra would cut many other tetrahedra: such
+a tree has 20 nodes for each tetrahedron, and Godot takes minutes to build it for 2,000 probes.
 """
 
 import math
@@ -28,9 +28,9 @@ _LARGEST = float(np.finfo(np.float32).max)
 _ABOUT = (
     "Assign light.lmbake to the property Light Data of a LightmapGI node that is where it was when the probes were "
     "baked, or at the scene's origin. Meshes with the global illumination mode Dynamic get light within the probes' "
-    "box. If a bake was given as --original, light.lmbake has its textures and meshes and replaces it. Otherwise it "
-    "has none, and the probes are on a lattice: low is its lowest corner, size the side of a cell, cells their number "
-    "along x, y, z."
+    "box. If a bake was given as --original, light.lmbake has its textures and meshes and replaces it. Otherwise "
+    "light.lmbake has no textures, and the probes are on a lattice: low is its lowest corner, size the side of a cell, "
+    "cells the number of cells along x, y, z."
 )
 
 # The six tetrahedra of a cell: paths from its lowest corner along the axes in this order.
@@ -49,15 +49,15 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model of L2 spherical harmonics in RGB as a bake of Godot 4, `light.lmbake`.
+    """Writes a model of second-order spherical harmonics in three colours as a bake of Godot 4, `light.lmbake`.
 
-    If `original` is the `.lmbake` that was compressed, its light is replaced. Otherwise the bake has probes at the
-    corners of cubic cells that fill the probes' box, 1 to 64 `cells` along its longest side (None: 24). If the method
-    needs positions and the model stores none, they are read from `original`.
+    If `original` is the `.lmbake` that was compressed, a copy of it gets the model's light. Otherwise the bake has
+    probes at the corners of cubic cells that fill the probes' box, 1 to 64 `cells` along its longest side (None: 24).
+    If the decoder needs the probes' positions and the model stores none, they are read from `original`.
 
     Raises:
-        WlmError: The number of coefficients differs, the cells are out of range or given with a bake, the bake has
-            other probes, the light exceeds float32, or the device does not exist.
+        WlmError: A probe has other than 9 coefficients, `cells` is out of range or given with an `.lmbake`, the
+            `.lmbake` has other probes, the light exceeds float32, or the device does not exist.
     """
     model = bundle.model
     bake = original if original is not None and Path(original).suffix.lower() == ".lmbake" else None
@@ -68,7 +68,7 @@ def write_kit(
         points, count = lattice.corners(), lattice.count
         values = _godot(model.name, lattice.light(points))
         if not np.abs(points).max() < _LARGEST:
-            raise WlmError(f"{model.name}: cannot export: the probes' box is too large for floats")
+            raise WlmError(f"{model.name}: cannot export: the probes' box is too large for 32-bit floats")
         tetrahedra = tetrahedra_of(count)
         content = lmbake_bytes(points, values, tetrahedra, *tree_of(lattice.low, lattice.size, count))
         info = {
@@ -79,9 +79,9 @@ def write_kit(
         }
     else:
         if cells is not None:
-            raise WlmError(f"cells: expected none with {bake}, whose probes have positions")
+            raise WlmError(f"cells: expected none with {bake}: the light goes to the probes of this bake")
         if model.outputs != NUMBERS:
-            raise WlmError(f"{model.name}: expected L2 in RGB, {NUMBERS} numbers per probe, got {model.outputs}")
+            raise WlmError(f"{model.name}: expected {NUMBERS} numbers per probe (RGB SH, L0-L2), got {model.outputs}")
         places = positions_of(model, bake)
         content = relit(bake, _godot(model.name, model.decoder(device, position=places).decode_probes()))
     (folder / BAKE_FILE).write_bytes(content)
@@ -89,7 +89,7 @@ def write_kit(
 
 
 def tetrahedra_of(count: np.ndarray) -> np.ndarray:
-    """Returns six tetrahedra for each of C cells, as corners int32 [6 C, 4]; `count` has the cells along x, y and z."""
+    """Returns six tetrahedra for each of C cells, as corner indices int32 [6 C, 4]; `count`: cells along x, y, z."""
     nx, ny, _ = (int(n) + 1 for n in count)
     step = np.array([1, nx, nx * ny])
     z, y, x = (axis.ravel() for axis in np.meshgrid(*(np.arange(n) for n in count[::-1]), indexing="ij"))
@@ -114,7 +114,7 @@ def tree_of(low: np.ndarray, size: float, count: np.ndarray) -> tuple[np.ndarray
     made = 0
 
     def place(begin: tuple[int, ...], end: tuple[int, ...]) -> int:
-        """Builds the nodes of the tree for a block of cells and returns the block's root."""
+        """Builds the part of the tree for the cells from `begin` to `end`; returns the index of its root."""
         nonlocal made
         sides = [last - first for first, last in zip(begin, end, strict=True)]
         axis = sides.index(max(sides))
@@ -142,5 +142,5 @@ def tree_of(low: np.ndarray, size: float, count: np.ndarray) -> tuple[np.ndarray
 def _godot(name: str, values: np.ndarray) -> np.ndarray:
     light = from_canonical(values.reshape(len(values), -1, 3), "godot")
     if not np.abs(light).max() < _LARGEST:
-        raise WlmError(f"{name}: expected light that floats hold, got {np.abs(light).max():.3g}")
+        raise WlmError(f"{name}: expected light within the range of float32, got {np.abs(light).max():.3g}")
     return light.astype(np.float32)

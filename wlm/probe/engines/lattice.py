@@ -12,19 +12,19 @@ CELLS = 24
 """Default number of cells along the longest side of the box."""
 
 NUMBERS = 27
-"""Numbers of a probe with L2 spherical harmonics in RGB."""
+"""Numbers of a probe with second-order spherical harmonics in three colours."""
 
 _ROWS = 65536  # points decoded at a time
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """A lattice of cells over a model's probes.
+    """A lattice of cubic cells over the bounding box of a model's probes.
 
     Attributes:
         decoder: Decoder of the model.
         low: float64 [3], lowest corner.
-        size: Side of a cell.
+        size: Side of a cell, in the unit of the probes' positions.
         count: int [3], cells along x, y and z.
     """
 
@@ -55,18 +55,18 @@ def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | 
     """Makes a lattice of cubic cells that covers the box of a model's probes and has the same centre.
 
     Args:
-        model: A model of L2 spherical harmonics in RGB.
+        model: A model of second-order spherical harmonics in three colours.
         cells: Cells along the longest side of the box, 1 to `most`.
         most: Largest number of cells along a side in the engine's format.
-        position: [N, 3], positions of the model's own probes, if the method needs them and the file stores none.
+        position: [N, 3], positions of the model's probes, if the decoder needs them and the model stores none.
         device: Where the light is decoded.
 
     Raises:
-        WlmError: The number of coefficients differs, the cells are out of range, the device does not exist, or the
-            method needs positions and none are known.
+        WlmError: A probe has other than 9 coefficients, `cells` is out of range, the device does not exist, or the
+            decoder needs the probes' positions and none are known.
     """
     if model.outputs != NUMBERS:
-        raise WlmError(f"{model.name}: expected L2 in RGB, {NUMBERS} numbers per probe, got {model.outputs}")
+        raise WlmError(f"{model.name}: expected {NUMBERS} numbers per probe (RGB SH, L0-L2), got {model.outputs}")
     if not 1 <= cells <= most:
         raise WlmError(f"cells: expected 1 to {most} along the longest side, got {cells}")
     span = model.extent * model.size

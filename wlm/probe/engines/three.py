@@ -72,14 +72,14 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model of L2 spherical harmonics in RGB for three.js: `grid.ktx2`, `grid.json`, and the loader `grid.js`.
+    """Writes a model of second-order spherical harmonics for three.js: `grid.ktx2`, `grid.json`, and loader `grid.js`.
 
     The grid's probes are at the centres of cubic cells that fill the probes' box, 1 to 256 `cells` along its longest
-    side, with light in half floats. `original` is the file that was compressed, if the method needs positions and the
-    model stores none.
+    side, with light in half floats. `original` is the file that was compressed; it is required if the decoder needs
+    the probes' positions and the model stores none.
 
     Raises:
-        WlmError: The number of coefficients differs, the cells are out of range, the light exceeds half floats, or the
+        WlmError: A probe has other than 9 coefficients, `cells` is out of range, the light exceeds half floats, or the
             device does not exist.
     """
     model = bundle.model
@@ -88,7 +88,7 @@ def write_kit(
     box = np.stack([low, low + count * size])
     values = lattice.light(lattice.centres())
     if not np.abs(values).max() <= np.finfo(np.float16).max:
-        raise WlmError(f"{model.name}: expected light within half floats, got {np.abs(values).max():.3g}")
+        raise WlmError(f"{model.name}: expected light within the range of half floats, got {np.abs(values).max():.3g}")
     texels = pack(values, count)
     document = {
         "format": FORMAT,
@@ -108,8 +108,7 @@ def write_kit(
 
 
 def pack(values: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Packs the values of probes, [nz * ny * nx, 27] in the order of `Lattice.centres`, to float16 [7 (nz + 2), ny, nx,
-    4]."""
+    """Packs probes, [nz * ny * nx, 27] as `Lattice.centres`, to the texels, float16 [7 (nz + 2), ny, nx, 4]."""
     nx, ny, nz = (int(n) for n in count)
     padded = np.zeros((nz, ny, nx, 4 * _PARTS), "<f2")
     padded[..., :NUMBERS] = np.asarray(values).reshape(nz, ny, nx, NUMBERS)

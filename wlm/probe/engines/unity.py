@@ -1,8 +1,8 @@
 """Exports light to Unity: the numbers of `SphericalHarmonicsL2` in JSON, and a component that applies them to a scene.
 
 Unity creates `LightProbes` only by baking, but scripts may replace the baked light, `LightProbes.bakedProbes`. Before a
-bake, the component places a `LightProbeGroup` at the model's positions; after it, it gives each of the scene's probes
-the light of the model's probe there. `sh[channel, coefficient]` follows the convention "unity".
+bake, the component places a `LightProbeGroup` at the model's positions; after the bake, it gives each of the
+scene's probes the light of the model's probe at its place. `sh[channel, coefficient]` follows the convention "unity".
 """
 
 import os
@@ -177,18 +177,18 @@ def write_kit(
     """Writes a model's probes for Unity: `WlmLightProbes.cs`, and `probes.json`, which it reads.
 
     Unity is left-handed: importers mirror a glTF scene along x or z, and `mirror` is this axis, or None for a scene
-    that came from Unity. The positions are those of `original`, the compressed file, or if None those stored with the
-    model.
+    that came from Unity. The positions are read from `original`, the file that was compressed; if it is None, the
+    stored positions are used.
 
     Raises:
-        WlmError: The numbers are not spherical harmonics of up to L2, there are more than 131,072 probes, the axis does
+        WlmError: The numbers are not spherical harmonics of order 0 to 2, there are over 131,072 probes, the axis does
             not exist, the positions are unknown or of other probes, a number exceeds float32, or the device does not
             exist.
     """
     model, position = bundle.model, positions_of(bundle.model, original)
     coefficients = sh_count(model.outputs)
     if coefficients is None or coefficients > _L2:
-        raise WlmError(f"{model.name}: expected L0, L1 or L2 in RGB, got {model.outputs} numbers a probe")
+        raise WlmError(f"{model.name}: expected 3, 12 or 27 numbers per probe (RGB SH, up to L2), got {model.outputs}")
     if model.probes > _MOST_PROBES:
         raise WlmError(f"{model.name}: expected at most {_MOST_PROBES} probes, got {model.probes}")
     if mirror is not None and mirror not in tuple(_AXES):
@@ -201,7 +201,7 @@ def write_kit(
         place[:, _AXES.index(mirror)] *= -1.0
         light[:, _ODD[mirror]] *= -1.0
     if not max(np.abs(place).max(), np.abs(light).max()) < np.finfo(np.float32).max:
-        raise WlmError(f"{model.name}: expected positions and light that floats hold")
+        raise WlmError(f"{model.name}: expected positions and light within the range of float32")
     document = {
         "format": FORMAT,
         "version": _VERSION,

@@ -1,9 +1,10 @@
-"""Exports light to Unreal, packed like the bricks of its volumetric lightmap: 28 bytes per probe of L2 in RGB.
+"""Exports light to Unreal, packed like the bricks of its volumetric lightmap: 28 bytes per probe.
 
-A texel of a brick has the ambient colour, the coefficient L00, as R11G11B10F, and each other coefficient in 8 bits, as
-a ratio to the ambient colour and to the range that light can have: coefficients 1 to 4 and 5 to 8 of red, green and
-blue in six RGBA textures (VolumetricLightmapShared.ush, without sky occlusion and shadowing). Only Unreal itself can
-build such bricks, so the export has seven volume textures over a lattice, and functions for materials that read them.
+A texel of a brick has the ambient colour, the coefficient L00, as R11G11B10F, and the other 8 coefficients in 8 bits,
+divided by the ambient colour and by the largest ratio that light can have to it. Coefficients 1 to 4 and 5 to 8 of red,
+green and blue are in six RGBA textures (VolumetricLightmapShared.ush, without sky occlusion and shadowing). Only Unreal
+itself can build such bricks, so the export has seven volume textures over a lattice, and functions for materials that
+read them.
 """
 
 import os
@@ -115,14 +116,14 @@ def write_kit(
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Writes a model of L2 in RGB as volume textures in Unreal's packing, and their reader `WlmProbes.usf`.
+    """Writes second-order spherical harmonics as volume textures in Unreal's packing, and a reader, `WlmProbes.usf`.
 
     Probes are at the centres of cubic cells that fill the probes' box, 1 to 128 `cells` along its longest side. A
     coefficient beyond the bound of non-negative light is clamped, and a negative ambient colour becomes 0. `original`
-    is the file that was compressed, if the method needs positions and the model stores none.
+    is the file that was compressed, required if the decoder needs positions and the model stores none.
 
     Raises:
-        WlmError: The number of coefficients differs, the cells are out of range, the light exceeds 11-bit floats, or
+        WlmError: A probe has other than 9 coefficients, `cells` is out of range, the light exceeds 11-bit floats, or
             the device does not exist.
     """
     model = bundle.model

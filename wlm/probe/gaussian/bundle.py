@@ -36,7 +36,7 @@ _ABOUT = {
 
 
 def gaussian_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
-    """Returns the GPU form of a model of Gaussians; `decoder` computes the reference values.
+    """Returns the shader, buffers and examples for a model of Gaussians; `decoder` computes the examples' light.
 
     Raises:
         WlmError: The probes' box exceeds float32.
@@ -74,7 +74,7 @@ def _gaussian_words(model: ProbeModel, content: Gaussians) -> np.ndarray:
     with np.errstate(over="ignore"):
         head = np.array([*model.origin, model.extent, *model.size, content.gain, CUT], "<f4")
     if not (np.isfinite(head).all() and head[3] > 0):
-        raise WlmError(f"{model.name}: cannot export: the probes' box is too large or too small for floats")
+        raise WlmError(f"{model.name}: cannot export: the probes' box is too large or too small for float32")
     numbers = np.concatenate([content.bounds[0], content.steps]).astype("<f4")
     count = np.array([content.count], "<u4")
     return np.concatenate([head.view("<u4"), count, numbers.view("<u4"), codes.reshape(-1).view("<u4")])
@@ -94,8 +94,7 @@ def _network_words(content: Gaussians) -> np.ndarray:
 
 
 def _reference_positions(model: ProbeModel, content: Gaussians) -> np.ndarray:
-    """Returns points for the reference, float64 [M, 3]: some Gaussians' centres, evenly spaced by index, and one
-    outside."""
+    """Returns points to decode as examples, float64 [M, 3]: some Gaussians' centres, and a point outside the box."""
     chosen = np.unique(np.linspace(0, content.count - 1, min(content.count, _REFERENCES)).astype(int))
     inside = content.rows()[chosen, CENTRE].astype(np.float64)
     return model.origin + model.extent * np.concatenate([inside, model.size[None] + 0.25])

@@ -1,4 +1,4 @@
-"""Reads and writes Gaussians in files: the integers of `WholeNumbers`, and the steps as the upper halves of float32."""
+"""Reads and writes Gaussians in files: quantised integers, and the upper 16 bits of each float32 quantisation step."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,12 +13,12 @@ _MOST, _MOST_LOG = 1e38, 40.0
 
 
 def settings(content: Gaussians) -> dict[str, Any]:
-    """Returns the settings, by name, on which the sizes of the parts depend."""
+    """Returns settings for the file's header: the number of stored Gaussians, and of those that the fit dropped."""
     return {"count": content.count, "dropped": content.dropped}
 
 
 def table(profile: Profile, outputs: int, count: int) -> dict[str, Part]:
-    """Returns the types and shapes, by name, of the parts that store `count` Gaussians."""
+    """Returns the types and shapes, by name, of the arrays that store `count` Gaussians."""
     channels = 9 + profile.latent
     weights = sum(rows * columns for rows, columns in layer_shapes(profile.latent, profile.hidden, outputs))
     return {
@@ -31,10 +31,10 @@ def table(profile: Profile, outputs: int, count: int) -> dict[str, Part]:
 
 
 def parts(content: Gaussians) -> dict[str, np.ndarray]:
-    """Returns the parts by name; Gaussians are stored channel by channel, minus the lowest number of each channel."""
+    """Returns the arrays by name; Gaussians are stored channel by channel, minus the lowest number of each channel."""
     whole = content.whole
     if whole is None:
-        raise ValueError("expected quantised Gaussians, as a fit returns them")
+        raise ValueError("expected Gaussians quantised to integers, as `compress` returns them")
     lowest = whole.gaussians.min(0)
     steps = np.concatenate([whole.step, whole.net_step]).astype(np.float32)
     return {
@@ -47,7 +47,7 @@ def parts(content: Gaussians) -> dict[str, np.ndarray]:
 
 
 def content(profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Gaussians:
-    """Builds the Gaussians and their network from checked parts.
+    """Builds the Gaussians and their network from a file's arrays; `dropped`: number of Gaussians that the fit dropped.
 
     Raises:
         ValueError: The numbers contradict each other, or exceed what a decoder can compute in float32.
@@ -57,7 +57,7 @@ def content(profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dr
     layers = np.split(stored["network"].astype(np.int64), np.cumsum([rows * columns for rows, columns in shapes])[:-1])
     steps = (stored["steps"].astype(np.uint32) << 16).view(np.float32).astype(np.float64)
     if not (np.isfinite(steps).all() and (steps > 0).all()):
-        raise ValueError("part steps: expected positive numbers")
+        raise ValueError("part steps: expected finite quantisation steps above 0")
     whole = WholeNumbers(
         gaussians=stored["gaussians"].T.astype(np.int64) + stored["lowest"],
         step=steps[: 9 + latent],
@@ -93,5 +93,5 @@ def _checked(content: Gaussians) -> Gaussians:
     first *= np.concatenate([np.maximum(sums, 1.0), np.ones(4)])[:, None]
     most = max(first.sum(0).max(), content.gain * third.sum(0).max())
     if not most <= np.finfo(np.float32).max:
-        raise ValueError("parts network, gaussians and gain: expected values that float32 holds")
+        raise ValueError("parts network, gaussians and gain: expected light within the range of float32")
     return content

@@ -18,8 +18,8 @@ class Points:
     """Points on a device, in the order in which decoding them is fastest.
 
     Attributes:
-        x: vec3 [M], normalised, along a Z-curve.
-        order: int [M], index of each point in the input.
+        x: vec3 [M], the points relative to the probes' box, sorted along a Z-curve (Morton order).
+        order: int [M], index in the input of each point of `x`.
         out: float [M, D], written by `GaussianDecoder.run`.
     """
 
@@ -40,7 +40,7 @@ class GaussianDecoder(Decoder):
     """A model of Gaussians on a device, with a list of the Gaussians that reach each cube of a grid.
 
     Attributes:
-        pairs: Number of entries in all lists together.
+        pairs: Total number of entries in these lists.
     """
 
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
@@ -75,7 +75,7 @@ class GaussianDecoder(Decoder):
         self.launch(points.x, points.out)
 
     def launch(self, x: wp.array, out: wp.array) -> None:
-        """Decodes normalised points vec3 [M] into float [M, D]; on CUDA the work is queued, not awaited."""
+        """Decodes vec3 [M], points relative to the probes' box, into float [M, D]; on CUDA it is only queued."""
         if x.shape[0]:
             self._kernels.launch(self._rows, self._shapes, self._cubes, CUT, self._net, self._gain, x, out)
 
@@ -94,7 +94,7 @@ class GaussianDecoder(Decoder):
 
 
 class GaussianLight:
-    """Light of Gaussians at positions that a volume requests, decoded on demand; a `wlm.probe.volume.light.Light`."""
+    """Decodes the light of Gaussians at positions that a volume requests; implements `wlm.probe.volume.light.Light`."""
 
     def __init__(self, decoder: GaussianDecoder, position: np.ndarray) -> None:
         self._decoder = decoder

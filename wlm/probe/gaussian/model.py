@@ -40,7 +40,7 @@ CUT = 3.0
 """Radius of a Gaussian's support in standard deviations."""
 
 LARGEST = (1 << 24) - 1
-"""Largest magnitude of a whole number of the network."""
+"""Largest magnitude of an integer of the quantised network."""
 
 _FARTHEST = 3e38  # bounds beyond this are clamped, and refused when a file is read
 _SHORTEST = 1e-12  # length of a quaternion that has a direction
@@ -55,7 +55,7 @@ class WholeNumbers:
         gaussians: int64 [K, 9 + L]: 3 numbers of the centre, 3 of the scale's logarithm, 3 of the rotation, and L of
             the latent.
         step: float64 [9 + L], the step of each column of `gaussians`.
-        net: The three layers, int64 [I + 1, O] each, as `layer_shapes` describes them.
+        net: The three layers, int64 [I + 1, O] for I inputs, the biases and O outputs, see `layer_shapes`.
         net_step: float64 [L + 6], a step for each row of the first layer, one for the second layer and one for the
             third.
     """
@@ -83,7 +83,7 @@ class WholeNumbers:
         turn = self.gaussians[:, STORED_ROTATION] * self.step[STORED_ROTATION]
         square = np.square(turn).sum(1, keepdims=True)
         if (high - low).max() > CODES or not (square <= 1.0).all():
-            raise ValueError("part gaussians: expected 16-bit ranges and rotations of at most half a turn")
+            raise ValueError("part gaussians: expected channels within 16 bits, and rotations of at most half a turn")
         code = self.gaussians - low
         quaternion = np.concatenate([1.0 - square, 2.0 * turn], 1) / (1.0 + square)
         turned = np.rint((quaternion + 1.0) * (0.5 * CODES))
@@ -178,8 +178,7 @@ def gaussian_bytes(count: int, latent: int, hidden: int, outputs: int) -> int:
 
 
 def layer_shapes(latent: int, hidden: int, outputs: int) -> list[tuple[int, int]]:
-    """Returns the shapes of the layers: a row of weights for each input and a row of biases; a column for each
-    output."""
+    """Returns the shapes of the layers: a row for each input and one of biases, a column for each output."""
     return [(latent + 4, hidden), (hidden + 1, hidden), (hidden + 1, outputs)]
 
 
@@ -193,7 +192,7 @@ def check_outputs(name: str, latent: int, hidden: int, outputs: int, device: str
     if device != "cpu" and outputs > most:
         raise WlmError(
             f"{name}: expected at most {most} numbers a probe on CUDA with latent {latent} and hidden "
-            f"{hidden}, found {outputs}; the CPU takes more"
+            f"{hidden}, found {outputs}; the CPU has no limit"
         )
 
 

@@ -1,10 +1,10 @@
 """Quantises a fit for its file: integers with steps as coarse as an error budget allows.
 
 Numbers that are rounded later compensate for the rounding of earlier ones. The latents are fitted again to the rounded
-Gaussians, so that their sums at the probes stay; each layer of the network is fitted to the original inputs of the next
-layer, the last layer to the probes. Within a matrix, rows are rounded one by one, and later rows compensate for the
-rounding error of each row (Frantar et al., OPTQ: Accurate Quantization for Generative Pre-trained Transformers, 2023).
-Steps are chosen so that a bit reduces the error by about the same amount in each group of numbers.
+Gaussians, so that their weighted sums at the probes hardly change; each layer of the network is fitted to the original
+inputs of the next layer, the last layer to the probes. Within a matrix, rows are rounded one by one, and later rows
+compensate for the rounding error of each row (Frantar et al., OPTQ: Accurate Quantization for Generative Pre-trained
+Transformers, 2023). Steps are chosen so that one more bit reduces the error about equally in each group of numbers.
 """
 
 import math
@@ -42,10 +42,10 @@ _FAINT = 1e-10  # share of the squared range below which an error counts as floa
 # Factors of the groups' natural steps with which one bit less costs about the same error in each group; the best
 # factors of the sets `livingroom` and `city` are within a third of these.
 _SHARES = np.array([0.033, 0.0141, 0.0105, 0.0226, 0.0151, 0.06, 0.168, 0.037])
-_NEAR = 0.85  # share of the allowed growth that ends the search
+_NEAR = 0.85  # the search ends at this share of the allowed growth of the error
 _TRIES = 8
 _FINEST = 1 / 64  # of the natural steps, where no tried step is fine enough
-_AGAIN, _LESS = 3, 0.7  # attempts, and the factor of the allowed growth where the other probes lost more
+_AGAIN, _LESS = 3, 0.7  # attempts, and the factor of the allowed growth if probes that were left out lost more
 _OF_LATENTS, _OF_LAYERS = 1e-4, 1e-5  # ridge of the least squares, as a share of the mean square
 
 
@@ -54,12 +54,12 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
 
     Args:
         model: The fit, whose Gaussians have no whole numbers yet.
-        position: float64 [N, 3], of the live probes.
-        values: float32 [N, D].
+        position: float64 [N, 3], positions of the live probes.
+        values: float32 [N, D], the numbers of these probes.
         device: Device on which results are compared with the fit.
 
     Returns:
-        The coarsest model found that loses at most `DROP`, or a model with fine steps if there is none.
+        The coarsest model found that loses at most `DROP` dB; if none does, a model with fine steps.
     """
     content = model.content
     assert isinstance(content, Gaussians)
@@ -106,15 +106,15 @@ class _Steps(NamedTuple):
 
 
 class _Sums(NamedTuple):
-    """The weights of Gaussians [K, 9] at the probes, float64 [N, K]; None, to save memory, with more than `_TOGETHER`
-    Gaussians."""
+    """K Gaussians, `rows` [K, 9], and their weights at the N probes, float64 [N, K]. To save memory, they are None if
+    there are more than `_TOGETHER` Gaussians."""
 
     rows: np.ndarray
     weight: torch.Tensor | None = None
     square: np.ndarray | None = None
-    """weight^T weight."""
+    """weight^T weight, float64 [K, K]."""
     feed: np.ndarray | None = None
-    """`_feed` of `square`."""
+    """Result of `_feed` for `square`."""
 
 
 class _Search:
@@ -165,7 +165,7 @@ class _Search:
         return self._rounded(_Steps(*(self._natural() * _FINEST)))[0]
 
     def _natural(self) -> np.ndarray:
-        """Returns steps, float64 [8], with which all groups of numbers add about the same error."""
+        """Returns the fields of `_Steps`, float64 [8], with which all groups of numbers add about the same error."""
         rows, (first, second, third) = self._rows, self._layers
         latents = first[: len(self._of_latent)]
         slender = np.expm1(np.ptp(rows[:, STORED_SCALE], axis=1))
@@ -259,14 +259,13 @@ def _fitted(square: np.ndarray, right: np.ndarray, before: np.ndarray, share: fl
 
 
 def _feed(square: np.ndarray, share: float) -> np.ndarray:
-    """Returns the upper Cholesky factor of the inverse of a matrix, to whose diagonal a ridge was added."""
+    """Returns the upper Cholesky factor of the inverse of a matrix plus a ridge, with which `_fed` corrects rows."""
     inverse = linalg.inv(square + _ridge(square, share) * np.eye(len(square)))
     return linalg.cholesky(0.5 * (inverse + inverse.T))
 
 
 def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
-    """Rounds numbers [I, O] row by row to integers of at most `most`; each row compensates for the rounding of earlier
-    rows."""
+    """Rounds numbers [I, O] row by row to integers of at most `most`; later rows compensate for the rounding error."""
     numbers, whole = numbers.copy(), np.empty_like(numbers)
     for row in range(len(numbers)):
         whole[row] = np.clip(np.rint(numbers[row] / step[row]), -most, most)
@@ -285,7 +284,7 @@ def _with_one(inputs: torch.Tensor) -> torch.Tensor:
 
 
 def _positive(numbers: np.ndarray) -> np.ndarray:
-    """Replaces numbers below a thousandth of the largest number by that thousandth."""
+    """Replaces numbers below a thousandth of the largest number by the largest number."""
     most = float(numbers.max()) or 1.0
     return np.where(numbers > 1e-3 * most, numbers, most)
 

@@ -21,19 +21,19 @@ from wlm_kernels.probe.network import CPU_LANES
 from wlm_kernels.probe.step import GROUP, Optimiser
 
 CODE_BITS, CENTRE_BITS = 10, 16
-"""Bits of a code in training: of scale, rotation and latent, and of a centre."""
+"""Bits of a code in training: of scales, rotations and latents, and of centres."""
 
 FINAL_RATE = 1e-3
-"""Last learning rates as a share of the first; the schedule is half a cosine."""
+"""Final learning rate as a share of the initial one; it falls along half a cosine."""
 
 _QUANTISE_FROM, _FREEZE_FROM = 5 / 6, 11 / 12  # share of the steps at which the second and the third stage begin
 _FIRST_LATENT = 0.1  # standard deviation of the first latents
 _PRUNE = 1e-4  # largest change by dropped Gaussians, as a share of the range of the decoded numbers
 _STATE = ("rows", "net", "moments", "net_moments", "bounds", "control", "loss")
-_NEIGHBOURS = 9  # probes whose spread is the local spread of one of them
+_NEIGHBOURS = 9  # probes over which the local spread of a probe is taken, itself included
 _PIECE = 4096  # probes per piece
-_ROUNDS = 4  # of k-means where the draw follows detail, which more rounds would undo
-_PLAIN_ROUNDS = 20  # of k-means where the draw is uniform
+_ROUNDS = 4  # rounds of k-means if centres are denser where light varies; more rounds would undo that
+_PLAIN_ROUNDS = 20  # rounds of k-means if the initial centres are drawn uniformly
 _FLOOR = 0.05  # smallest local spread, as a share of the mean
 _SMALLEST = 1e-4  # smallest first scale, as a share of the box
 _BOX_MARGIN = 1e-6  # of the unit cube, so that rounding does not lose a probe at the edge of its group's box
@@ -51,15 +51,15 @@ class Trainer:
         steps: Number of steps of the whole fit.
         count: K, number of Gaussians.
         needed: bool [K], false where a Gaussian is dropped; all true before the last stage.
-        dropped_change: Largest change of any probe's number that dropping Gaussians causes.
+        dropped_change: Largest change of a number of a probe that results from dropping Gaussians.
     """
 
     def __init__(self, x: np.ndarray, values: np.ndarray, profile: Profile, seed: int, device: str) -> None:
         """Starts a fit.
 
         Args:
-            x: float32 [N, 3], normalised positions of the live probes.
-            values: float32 [N, D].
+            x: float32 [N, 3], positions of the live probes relative to their box, in [0, 1].
+            values: float32 [N, D], the numbers of these probes.
             profile: The settings.
             seed: Seed of the fit; the same seed gives the same result on one device.
             device: "cpu" or "cuda:N".
@@ -172,7 +172,7 @@ class Trainer:
                 self._stages[stage]()
 
     def _enter(self, stage: int) -> None:
-        """Starts a stage: sets the range of the codes, or fixes the Gaussians."""
+        """Starts a stage: 1 sets the range of the codes; 2 fixes the Gaussians and drops those that no probe needs."""
         t = self._tensors
         if stage == 1:
             t["bounds"].copy_(torch.stack([t["rows"].amin(0), t["rows"].amax(0)]))
@@ -182,7 +182,7 @@ class Trainer:
         self._entered = stage
 
     def finish(self) -> None:
-        """Runs the starts of stages that a short fit did not reach, so that the Gaussians are rounded to codes."""
+        """Starts the stages that a short fit did not reach, so that the Gaussians are rounded to codes."""
         with interop.stream(self.device):
             while self._entered < 2:
                 self._enter(self._entered + 1)
@@ -208,7 +208,7 @@ class Trainer:
         if move:
             self._make_shapes(quantised=stage > 0)
         if not self._cuda:
-            # The CPU's two lanes add to these arrays.
+            # The two threads on the CPU add to these arrays.
             t["partial"].zero_()
             t["loss"].zero_()
         if move:
@@ -237,7 +237,7 @@ class Trainer:
         self._share(self._groups.x.shape[0], lambda *lane: self._step_kernels.features(*args, *lane))
 
     def _share(self, total: int, work) -> None:
-        """Calls `work` for all rows: in one call on CUDA, in two halves on two threads on the CPU."""
+        """Calls `work` for all `total` items: once on CUDA, for two halves on two threads on the CPU."""
         if self._cuda:
             work()
             return
@@ -246,9 +246,8 @@ class Trainer:
         list(self._pool.map(lambda lane: work(*lane), lanes))
 
     def _prune(self) -> None:
-        """Drops Gaussians without which no decoded number changes by more than the limit. Gaussians are dropped in the
-        order of an upper bound of their influence on the probes, as many as together stay within the limit. One
-        Gaussian is always kept."""
+        """Drops as many Gaussians as possible while no decoded number changes by more than `_PRUNE` of the range of all
+        numbers. The Gaussians with the least influence on the probes go first; at least one is kept."""
         t, latent = self._tensors, self._tensors["used"][:, LATENT]
         # With a gradient of one in one channel, the first sum of the latent is the sum of the Gaussian's weights.
         t["grad_f"].zero_()
@@ -283,7 +282,7 @@ class Trainer:
         self.needed[order[:low].cpu().numpy()] = False
 
     def _decoded(self) -> torch.Tensor:
-        """Returns the network's normalised output for the probes' sums of latents, float32 [N, D]."""
+        """Returns the network's output at all probes before it is scaled to the probes' numbers, float32 [N, D]."""
         parts = self._tensors["net"].split([rows * columns for rows, columns in self._layers])
         first, second, third = (part.view(shape) for part, shape in zip(parts, self._layers, strict=True))
         x = wp.to_torch(self._groups.x)[: self._probes]
@@ -297,7 +296,7 @@ class Trainer:
         return float(self._tensors["loss"].sum()) * self._unit if self.step else math.nan
 
     def quantised(self) -> Gaussians:
-        """Returns the fit with 16-bit codes, but without integers for a file. The network's last layer yields the
+        """Returns the fit with 16-bit codes, but without the integers for a file. The network's last layer yields the
         probes' numbers divided by `gain`, the largest weight of this layer."""
         d = self._outputs
         t = {key: self._tensors[key].cpu().numpy().astype(np.float64) for key in ("used", "bounds", "net")}
@@ -332,7 +331,7 @@ class Trainer:
         """
         result = {key: self._tensors[key].cpu().numpy().copy() for key in _STATE}
         if not all(map(all_finite, result.values())):
-            raise WlmError(f"the fit diverged; expected smaller rates than those of {self._name}")
+            raise WlmError(f"the fit diverged; use smaller learning rates than {self._name}")
         return result | {"kept": self.needed.copy(), "entered": np.array(self._entered)}
 
     def table(self, step: int) -> dict[str, Part]:
@@ -354,7 +353,7 @@ class Trainer:
         done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         state = check_parts(state, self.table(int(done[0])))
         if not state["kept"].any() or (state["bounds"][0] > state["bounds"][1]).any():
-            raise ValueError("parts kept, bounds: expected a Gaussian, and no lowest value above its highest")
+            raise ValueError("parts kept, bounds: expected a kept Gaussian, and lowest values at most the highest")
         for key in _STATE:
             self._tensors[key].copy_(torch.from_numpy(np.array(state[key])))
         self.needed, self._entered = np.array(state["kept"]), int(state["entered"])
@@ -365,7 +364,7 @@ class Trainer:
                 self._features()
 
     def close(self) -> None:
-        """Ends the CPU's threads and frees the graphs, which reference the trainer."""
+        """Ends the CPU's threads and frees the CUDA graphs, which hold references to the trainer."""
         self._stages = []
         if self._pool is not None:
             self._pool.shutdown()
@@ -401,8 +400,8 @@ def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns how much the light varies around each probe.
 
     Args:
-        x: [N, 3].
-        values: [N, D].
+        x: [N, 3], positions of the probes.
+        values: [N, D], the numbers of these probes.
 
     Returns:
         float64 [N], positive: the standard deviation over each probe and its eight nearest, plus a small floor.
@@ -422,8 +421,8 @@ def first_gaussians(
     section 3.2).
 
     Args:
-        x: float32 [N, 3], normalised positions.
-        values: float32 [N, D].
+        x: float32 [N, 3], positions of the probes relative to their box, in [0, 1].
+        values: float32 [N, D], the numbers of these probes.
         count: Number of Gaussians; reduced to the number of distinct positions.
         detail, first_scale: See `wlm.probe.model.Profile`.
         random: Source of random numbers.

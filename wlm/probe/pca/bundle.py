@@ -87,7 +87,7 @@ void wlm_probe_sh(int probe, out vec3 sh[{coefficients}])
 
 
 def component_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
-    """Returns the GPU form of a model of principal components; `decoder` computes the reference values."""
+    """Returns the shader, buffers and examples for a model of principal components; `decoder` decodes the examples."""
     content = model.content
     values = decoder.decode_probes()[model.live]
     chosen = np.unique(np.linspace(0, len(values) - 1, min(len(values), _REFERENCES)).astype(int))

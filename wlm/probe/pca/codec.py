@@ -13,12 +13,12 @@ _MOST_LOG = 88.0  # the exponential still fits float32
 
 
 def settings(content: Components) -> dict[str, Any]:
-    """Returns the settings, by name, on which the sizes of the parts depend."""
+    """Returns the setting for the file's header: the number of components."""
     return {"count": content.count}
 
 
 def table(live: int, outputs: int, count: int) -> dict[str, Part]:
-    """Returns the types and shapes, by name, of the parts that store `live` probes in `count` components.
+    """Returns the types and shapes, by name, of the arrays that store `live` probes in `count` components.
 
     Raises:
         ValueError: There are more components than numbers of a probe.
@@ -33,12 +33,12 @@ def table(live: int, outputs: int, count: int) -> dict[str, Part]:
 
 
 def parts(content: Components) -> dict[str, np.ndarray]:
-    """Returns the parts by name; codes are stored column by column."""
+    """Returns the arrays by name; codes are stored column by column."""
     return {"code": content.code.T, "bounds": content.bounds, "basis": content.basis}
 
 
 def content(profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Components:
-    """Builds the principal components from checked parts.
+    """Builds the principal components from a file's arrays; `dropped` is not used.
 
     Raises:
         ValueError: The numbers exceed what a decoder can compute in float32.
@@ -47,7 +47,7 @@ def content(profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dr
     most = np.maximum(np.abs(bounds[0]), np.abs(bounds[0] + 255.0 * bounds[1]))
     largest = float(np.abs(stored["basis"].astype(np.float64)).max(initial=0.0)) if stored["basis"].size else 1.0
     if (bounds[1] < 0).any() or most[0] > _MOST_LOG:
-        raise ValueError(f"part bounds: expected steps of at least 0, and logarithms within {_MOST_LOG:g}")
+        raise ValueError(f"part bounds: expected steps of at least 0, and log magnitudes within {_MOST_LOG:g}")
     if not np.exp(most[0]) * most[1:].sum() * largest <= np.finfo(np.float32).max:
-        raise ValueError("parts bounds and basis: expected values that float32 holds")
+        raise ValueError("parts bounds and basis: expected light within the range of float32")
     return Components(outputs, np.ascontiguousarray(stored["code"].T), stored["bounds"], stored["basis"])

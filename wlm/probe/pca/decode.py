@@ -12,11 +12,11 @@ from wlm.probe.volume.light import at_probes
 from wlm.probe.volume.walk import settle
 from wlm_kernels.probe.components import decode_components
 
-_BUDGET = 1024  # blocks that the volume decodes per frame; it is awaited
+_BUDGET = 1024  # blocks that the volume decodes per frame; many, since all are awaited
 
 
 class ComponentDecoder(Decoder):
-    """A model of principal components on a device, where it stays packed; also a `wlm.probe.volume.light.Light`.
+    """A model of principal components on a device, stored packed; implements `wlm.probe.volume.light.Light`.
 
     Attributes:
         count: Number of probes, N.

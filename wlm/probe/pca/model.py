@@ -19,7 +19,7 @@ from wlm.probe.decode import Decoder
 from wlm.probe.model import Content, GpuForm, ProbeModel
 
 ENOUGH = 0.02
-"""Error that needs no further component: RMS over the probes of the error over the probe's own norm."""
+"""Relative error at which no component is added: RMS over all probes of the error divided by the probe's norm."""
 
 _LEVELS = 255
 
@@ -68,7 +68,7 @@ def component_bytes(live: int, outputs: int, count: int, *, identity: bool) -> i
 
 
 def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[Components, float]:
-    """Compresses live probes in as few components as reach the error `ENOUGH`.
+    """Compresses live probes with the fewest components whose relative error is at most `ENOUGH`.
 
     Args:
         values: float32 [V, D], numbers of live probes; no row is zero.

@@ -26,7 +26,7 @@ _ABOUT = {
 
 
 def volume_bundle(volume: Volume) -> Bundle:
-    """Returns the GPU buffers and shader of a volume, as filled around the viewer of its last update.
+    """Returns the GPU buffers and shader of a volume in its state after the last update.
 
     Raises:
         WlmError: The volume has no block yet.

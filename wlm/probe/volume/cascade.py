@@ -2,12 +2,12 @@
 
 It implements gaussian-probe-compression, section 3.4; docs/probe.md lists the departures. Blocks are stored in the rows
 of one array, the pool, which is also a cache: a block that left its window stays until its row is needed. A block
-without a probe near it is never queued, takes no memory and is missing when light is read. Light is read from the
+without a probe near it is never decoded, takes no memory and is missing when light is read. Light is read from the
 finest level that has a block there, as `wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights`
 describes the light of a block.
 
 Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is one
-graph.
+CUDA graph.
 """
 
 import itertools
@@ -29,16 +29,16 @@ from wlm_kernels.probe import volume_frame as frame_kernels
 from wlm_kernels.probe import volume_weights
 
 RATIOS = (1, 2, 4, 16)
-"""Sides of the levels' blocks over the finest."""
+"""Side of the blocks of each level, divided by the side of the finest blocks."""
 
 SIDE = 32
-"""Blocks along an axis of a window."""
+"""Blocks along an axis of a window, the cube of blocks around the viewer at each level."""
 
 BUDGET = 64
-"""Blocks decoded per frame."""
+"""Largest number of blocks decoded per frame."""
 
 ROWS = 32768
-"""Rows of the pool."""
+"""Number of blocks that memory is allocated for."""
 
 _LONGEST = 64  # largest side of a window: 262,144 blocks per level
 _SMALLEST = 1e-30  # smallest side of a block: float32 holds it and its inverse
@@ -50,12 +50,12 @@ class FrameStats:
     """The work that one frame did, in numbers of blocks and probes.
 
     Attributes:
-        entered: Blocks that entered a window, empty ones included.
-        queued: Entered blocks that were queued.
-        dropped: Blocks that left their window while they waited.
-        updated: Blocks decoded and written, at most the budget.
-        cached: Blocks that entered a window and were still in the pool.
-        left: Blocks that still wait.
+        entered: Blocks that entered a window, the cube of blocks around the viewer at each level, empty ones included.
+        queued: Entered blocks that have to be decoded.
+        dropped: Queued blocks that left their window before they were decoded.
+        updated: Blocks decoded and written, at most `Volume.budget`.
+        cached: Blocks that entered a window and were still in memory from earlier frames.
+        left: Queued blocks that still wait to be decoded.
         probes: Probes decoded; a probe counts once for each block that it contributes to.
         seconds: Duration of the frame in seconds, until the device has finished.
     """
@@ -86,8 +86,7 @@ class Reading:
 
 
 class State(NamedTuple):
-    """Copies of the device's arrays that `wlm_kernels.probe.volume` describes; bases are block coordinates from the
-    index's `start`."""
+    """Copies of device arrays (see `wlm_kernels.probe.volume`); `bases` are block coordinates minus `index.start`."""
 
     pool: np.ndarray
     pages: np.ndarray
@@ -105,8 +104,8 @@ class Volume:
         numbers: int64 [V], indices of the live probes.
         normal: float32 [N, 3], unit surface normals of all probes, 0 for a probe on no surface; None if unknown.
         sizes: Side of a block at each level, in the unit of the positions.
-        side: Blocks along an axis of a window.
-        budget: Blocks decoded per frame.
+        side: Blocks along an axis of a window, the cube of blocks around the viewer at each level.
+        budget: Largest number of blocks decoded per frame.
         channels: Numbers per probe, D.
         device: "cpu" or "cuda:N".
     """
@@ -220,7 +219,7 @@ class Volume:
 
     @property
     def memory_bytes(self) -> int:
-        """The bytes of device memory of the volume and its index, without the light; constant."""
+        """The bytes of device memory of the volume and its index, without its light source; they never change."""
         return sum(array.capacity for array in self._arrays)
 
     @property
@@ -231,7 +230,7 @@ class Volume:
             ValueError: There was no update.
         """
         if self._viewpoint is None:
-            raise ValueError("viewpoint: expected one update at least")
+            raise ValueError("viewpoint: there is none before the first call of `update`")
         return self._viewpoint.copy()
 
     @property
@@ -261,7 +260,7 @@ class Volume:
         at = viewpoint / self._size[:, None] - self.index.start
         if np.abs(at).max() > _FARTHEST:
             limit = _FARTHEST * self.sizes[0]
-            raise WlmError(f"viewpoint: expected at most {limit:g} from the probes, got {viewpoint.tolist()}")
+            raise WlmError(f"viewpoint: expected a point within {limit:g} of the probes, got {viewpoint.tolist()}")
         base = np.floor(at + 0.5).astype(np.int64) - self.side // 2
         kept = np.maximum(self.side - np.abs(base - self._base), 0).prod(1).sum() if self._viewpoint is not None else 0
         self._viewpoint, self._base = viewpoint, base
@@ -289,7 +288,7 @@ class Volume:
         frame_kernels.combine(work, self._read_light, self._pool)
 
     def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
-        """Returns the light at points, as `wlm_kernels.probe.volume.read` describes, in float32 relative to the viewer.
+        """Interpolates the light at points in float32 relative to the viewer, see `wlm_kernels.probe.volume.read`.
 
         Args:
             points: [M, 3], in the unit of the positions. No block covers a point that is NaN or infinite.
@@ -304,7 +303,7 @@ class Volume:
         """
         points = np.asarray(points, np.float64)
         if self._viewpoint is None or points.ndim != 2 or points.shape[1] != 3:
-            raise ValueError(f"read: expected points [M, 3] after an update, got {points.shape}")
+            raise ValueError(f"read: expected points [M, 3] and a call of `update` before, got points {points.shape}")
         # The difference is computed in float64, so that a viewer far from the origin loses nothing.
         with np.errstate(over="ignore"):
             relative = (points - self._viewpoint).astype(np.float32)
@@ -369,4 +368,4 @@ def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, r
     if not 1 <= budget <= 1024:
         raise WlmError(f"volume budget: expected 1 to 1024 blocks a frame, got {budget}")
     if rows < budget:
-        raise WlmError(f"volume rows: expected at least the budget of {budget}, got {rows}")
+        raise WlmError(f"volume rows: expected at least the budget of {budget} blocks, got {rows}")

@@ -62,7 +62,7 @@ class BlockIndex:
         if position.ndim != 2 or position.shape[1] != 3:
             raise ValueError(f"position: expected [N, 3], got {position.shape}")
         if not (np.abs(position) <= _FARTHEST).all():
-            raise ValueError(f"position: expected numbers of at most {_FARTHEST:g}, got NaN or more")
+            raise ValueError(f"position: expected numbers of at most {_FARTHEST:g}, got NaN or a larger number")
         if not 0.0 < side < np.inf:
             raise ValueError(f"side: expected a positive number, got {side}")
         self.count = len(position)
@@ -99,7 +99,7 @@ def finest_side(position: np.ndarray) -> float:
     """Returns a side for the finest blocks: at most 1.25 times the median distance of probes to their nearest
     neighbours.
 
-    The light is linear between blocks, so that reproducing the probes takes more blocks than probes. Probes scattered
+    The light is linear between blocks, so more blocks than probes are needed to reproduce the probes. Probes scattered
     over surfaces have at least two blocks each at this side. Probes on a lattice have fewer; for them the side is
     reduced in steps of a fifth until there are two blocks per probe.
 
@@ -118,7 +118,7 @@ def finest_side(position: np.ndarray) -> float:
     with np.errstate(over="ignore", under="ignore"):
         side = _SHARE * float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
     if not 0.0 < side < np.inf:
-        raise WlmError(f"positions: expected distances that float64 holds, got a median of {side:g}")
+        raise WlmError(f"positions: expected distances within the range of float64, got a median of {side:g}")
     for _ in range(_SHRINKS):
         index = BlockIndex(places, side, (1,))
         if len(index.block) >= _EACH * len(places):
@@ -128,7 +128,7 @@ def finest_side(position: np.ndarray) -> float:
 
 
 def _near(cell: np.ndarray, place: np.ndarray, ratio: int) -> np.ndarray:
-    """Returns the Morton keys of a level's blocks that have at least the smallest weight at a probe."""
+    """Returns the Morton keys of a level's blocks whose weight at some probe is at least `_LEAST`."""
     # Distances in sides from the centre of block 0, as integer and fraction; the index of a cell is exact.
     half = cell // ratio - 1
     whole = half >> 1

@@ -40,7 +40,7 @@ def walk(
         volume: A volume in any state; the walk continues from there.
         path: [F, 3], viewpoints, in the unit of the probes' positions.
         original: [N, D], original light of all probes.
-        samples: Largest number of probes to read per frame near the viewer, and of as many farther away.
+        samples: Largest number of probes to read per frame near the viewer; as many are read farther away.
         progress: Called about twice a second, with the number of finished frames.
 
     Returns:
@@ -49,12 +49,12 @@ def walk(
         - `frames`, their number.
         - `mean`, `p95` and `max` over the frames: of `updated`, blocks decoded; `probes`, probes decoded; `left`,
           blocks that still wait; and `update_ms`, the duration of a frame.
-        - The same over the frames that have near samples, None without any: of `rmse`, RMS difference between the
-          reading and the light that fills the volume, where a point that no block covers counts as 0; and `rms`, RMS of
-          that light. `mean` and `min` of `coverage`, the fraction of near samples that blocks of any level cover.
-        - In dB over all frames' samples, None without any; the peak is the range of the original: `psnr` of the near
-          readings against the original, `light_psnr` of the light that fills the volume at the same samples, and
-          `far_psnr` of the readings farther away.
+        - `mean`, `p95` and `max` over the frames that have near samples, or None: of `rmse`, the RMS difference between
+          the light read and the light that fills the volume, where a point that no block covers counts as 0; and of
+          `rms`, the RMS of the filling light. `mean` and `min` of `coverage`, the share of near samples in a block.
+        - PSNRs in dB over the samples of all frames, or None; the peak is the range of the original light: `psnr` of
+          the near readings against the original, `light_psnr` of the light that fills the volume at the same samples,
+          and `far_psnr` of the readings farther away.
 
     Raises:
         WlmError: A viewpoint is not finite, or too far away.
@@ -62,7 +62,7 @@ def walk(
     """
     path, original = np.asarray(path, np.float64), np.asarray(original)
     if path.ndim != 2 or path.shape[1] != 3 or len(path) == 0 or samples < 1:
-        raise ValueError(f"walk: expected viewpoints [F, 3] and samples, got {path.shape} and {samples}")
+        raise ValueError(f"walk: expected viewpoints [F, 3] and 1 or more samples, got {path.shape} and {samples}")
     if original.shape != (len(volume.position), volume.channels):
         raise ValueError(f"original: expected {[len(volume.position), volume.channels]}, got {list(original.shape)}")
     position, truth = volume.position[volume.numbers], original[volume.numbers].astype(np.float64)
@@ -166,8 +166,7 @@ def _statistics(values: Sequence[float]) -> dict[str, float] | None:
 
 
 def loop_frames(position: np.ndarray, step: float) -> int:
-    """Returns the number of frames in which the loop of `camera_path`, y up, closes with a step in the unit of
-    positions."""
+    """Returns the number of frames of the loop of `camera_path`, y up, for a viewer who moves by `step` per frame."""
     # Ramanujan's circumference of an ellipse, within 0.1% up to an aspect ratio of 3.
     a, b = _LOOP * np.ptp(np.asarray(position, np.float64), axis=0)[[0, 2]]
     around = math.pi * (3 * (a + b) - math.sqrt((3 * a + b) * (a + 3 * b)))

@@ -1,8 +1,8 @@
-"""Flip books: textures of six-way lightmaps with the frames in rows of cells from the top left.
+"""Flip books: textures with one cell per frame of six-way lightmaps, row by row from the top left.
 
 EXR stores half floats. PNG and TGA store 8 bits per channel, linear in 0 to 1: import them without sRGB decoding. Light
-is premultiplied by the opacity: it is added to the background times 1 - alpha.
-`wlm.smoke.camera.LAYOUTS` lists the channels.
+is premultiplied by the opacity: a picture is this light plus the background times 1 - alpha.
+`wlm.smoke.camera.LAYOUTS` lists the content of the channels.
 """
 
 import io
@@ -40,12 +40,12 @@ _BARE, _LIT = 0.999, 0.05  # least transparency without smoke; largest mean ligh
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame to render.
+    """A frame of six-way lightmaps, and the scene's settings for its picture.
 
     Attributes:
         number: Number of the frame.
         six: Lightmaps with their camera; if there are obstacles, also with their depth.
-        looks: Lights, colours and obstacles of the scene; None: there is no scene.
+        looks: Lights, colours and obstacles of the scene; None: unknown.
     """
 
     number: int
@@ -56,12 +56,12 @@ class Shot:
 def read_shots(
     files: Mapping[int, Path], device: str = "cpu", count: int | None = None, progress: OnProgress | None = None
 ) -> Iterator[Shot]:
-    """Reads lightmaps that `bake` or `predict` wrote, one frame after the other.
+    """Yields the frames of lightmaps that `bake` or `predict` wrote, one after the other.
 
     Args:
-        files: EXR files by number.
+        files: EXR files by frame number.
         device: Device of the lightmaps.
-        count: Largest number of frames, evenly spread; None: all.
+        count: Largest number of frames, which are evenly spread over all; None: all frames.
         progress: Called after each frame.
 
     Raises:
@@ -76,20 +76,20 @@ def read_shots(
 
 @dataclass(frozen=True, eq=False)
 class Book:
-    """A flip book.
+    """A flip book: two textures of six-way lightmaps and optionally one of motion vectors, with a cell per frame.
 
     Attributes:
-        first, second: float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4].
-        motion: float32 [..., 3] of the same size, see `wlm.smoke.flipbook.motion`; or None.
-        layout: One of `wlm.smoke.camera.LAYOUTS`.
-        rows, columns, count: Numbers of rows and columns of cells, and of frames.
+        first, second: The lightmaps, float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4].
+        motion: Motion vectors, float32 [..., 3] of the same size, see `wlm.smoke.flipbook.motion`; None: no motion.
+        layout: Name of the order of the channels, one of `wlm.smoke.camera.LAYOUTS`.
+        rows, columns, count: Number of rows of cells, of columns of cells, and of frames.
         size: Height and width of a frame in pixels, without padding.
-        padding: Pixels around a frame.
+        padding: Width in pixels of the border around each frame.
         gain: Factor by which light is multiplied in the textures.
-        hot: Whether a texture has a channel of emission.
+        hot: Whether a texture has a channel for emission.
         scale: Largest motion that the texture can store, as a share of a frame's size; None: no motion.
         rate: Frames per second.
-        extent: Height of the view in the world's unit.
+        extent: Height in world units of the region that a frame shows.
         ramp: Colour of the emission; None: grey.
     """
 
@@ -117,14 +117,14 @@ class Book:
 
     @property
     def channels(self) -> dict[str, tuple[str, ...]]:
-        """Content of each texture's channels."""
+        """Content of the channels of each texture, such as "right" or "alpha"."""
         first, second = LAYOUTS[self.layout]
         named = {"first": first, "second": second, "motion": ("right", "up")}
         return {name: named[name][: page.shape[2]] for name, page in self.pages.items()}
 
     @property
     def levels(self) -> int:
-        """Index of the coarsest mip level at which frames do not show their neighbours."""
+        """Index of the coarsest mip level at which no frame shows parts of neighbouring frames."""
         return mip_levels(*self.size, self.padding)
 
 
@@ -139,20 +139,20 @@ def pack_book(
     rate: float | None = None,
     progress: OnProgress | None = None,
 ) -> Book:
-    """Packs frames into textures.
+    """Packs frames into the textures of a flip book.
 
-    The last channel is omitted if no frame has it: without emission the second texture has three channels. Cells
+    A texture whose last channel is missing in all frames has three channels, as the second one without emission. Cells
     without a frame are black, with alpha 0.
 
     Args:
         shots: The frames, at least one, of one size.
-        layout: One of `wlm.smoke.camera.LAYOUTS`.
+        layout: Name of the order of the channels, one of `wlm.smoke.camera.LAYOUTS`.
         columns: Largest number of columns; None: such that the texture is nearest to a square.
-        gain: Factor of the light; None: the largest with which 8 bits clip no light.
-        padding: Pixels around each frame that repeat its border, so that filters and mips do not show neighbours.
-        air: Frames from `wlm.smoke.flipbook.motion.open_motion`, for a texture of motion; None: no motion.
+        gain: Factor of the light; None: the largest with which no light is above 1.
+        padding: Pixels around each frame that repeat its border, so that filters and mips do not mix frames.
+        air: Frames with velocities, from `wlm.smoke.flipbook.motion.open_motion`, for motion vectors; None: no motion.
         rate: Frames per second; None: that of the scene, or `RATE`.
-        progress: Called after each frame of motion.
+        progress: Called after the motion of each frame has been computed.
 
     Raises:
         ValueError: The frames have several sizes, the layout is unknown, or a number is out of its range.
@@ -160,11 +160,11 @@ def pack_book(
     """
     frames = [shot.six for shot in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
-        raise ValueError("expected lightmaps of one size")
+        raise ValueError("shots: expected lightmaps of one size, got several sizes")
     if layout not in LAYOUTS:
         raise ValueError(f"layout: expected one of {', '.join(LAYOUTS)}, got {layout!r}")
     if padding < 0:
-        raise ValueError(f"padding: expected at least 0, got {padding}")
+        raise ValueError(f"padding: expected at least 0 pixels, got {padding}")
     gain = _brightest_gain(frames) if gain is None else gain
     if not 0 < gain < np.inf:
         raise ValueError(f"gain: expected a number above 0, got {gain}")
@@ -201,7 +201,7 @@ def pack_book(
 
 
 def _rate(shots: Sequence[Shot]) -> float:
-    """Returns frames per second, from the times of a scene's first and last frame."""
+    """Returns the frames per second, from the times of the first and the last frame, or `RATE` without a scene."""
     first, last = shots[0].looks, shots[-1].looks
     if first is None or last is None or not last.time > first.time:
         return RATE
@@ -209,14 +209,13 @@ def _rate(shots: Sequence[Shot]) -> float:
 
 
 def _brightest_gain(frames: Sequence[SixWay]) -> float:
-    """Returns the gain that scales the brightest light of the frames to 1; 1 if all frames are black."""
     planes = [plane for six in frames for plane in (six.lightmaps, six.emission) if plane is not None]
     brightest = max(float(plane.max()) for plane in planes)
     return 1.0 / brightest if brightest > 0 else 1.0
 
 
 def _channels(frames: Sequence[SixWay], layout: str) -> tuple[tuple[str, ...], ...]:
-    """Returns the channels of the two textures; the last channel is omitted if no frame has it."""
+    """Returns the names of the two textures' channels, without a last channel that no frame has."""
     planes = {ALPHA: "transparency", EMISSION: "emission"}
     absent = [name for name, plane in planes.items() if all(getattr(frame, plane) is None for frame in frames)]
     return tuple(names[:-1] if names[-1] in absent else names for names in LAYOUTS[layout])
@@ -232,7 +231,7 @@ def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:
 
 
 def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int, empty: float = 0.0) -> np.ndarray:
-    """Lays pictures [N, H, W, C] out in cells of one texture, each with `padding` pixels that repeat its border."""
+    """Lays pictures [N, H, W, C] out in cells with borders of `padding` pixels; cells without picture are `empty`."""
     _count, height, width, channels = frames.shape
     page = np.full((rows, height + 2 * padding, columns, width + 2 * padding, channels), empty, np.float32)
     around = [(0, 0), (padding, padding), (padding, padding), (0, 0)]
@@ -242,14 +241,14 @@ def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int, empty: fl
 
 
 def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, tuple[str, ...]], int]:
-    """Writes the textures of a flip book beside `output`: NAME_1, NAME_2 and NAME_motion, each atomically.
+    """Writes the textures of a flip book to files NAME_1, NAME_2 and, with motion, NAME_motion, each atomically.
 
     Args:
         book: The flip book.
-        output: A path that ends in .exr, .png or .tga; its folder must exist.
+        output: Path in an existing folder: NAME with the suffix .exr, .png or .tga of all files.
 
     Returns:
-        The channels of each file, and the number of values above the range of the files, which were clipped.
+        The names of the channels of each file, and the number of values that were clipped to the range of the files.
 
     Raises:
         WlmError: The suffix is wrong, a number is not finite, or a file cannot be written.
@@ -283,13 +282,13 @@ def read_flipbook(
     straight: bool = False,
     device: str = "cpu",
 ) -> list[SixWay]:
-    """Reads the frames of a flip book of any program; their camera is unknown and taken to be in front.
+    """Reads the frames of a flip book of any program; the unknown camera is taken to be in front of the smoke.
 
     Args:
-        paths: The files, .exr, .png or .tga (8 bits per channel, linear): two of the layout, and optionally one with
-            the opacity in its alpha or first channel.
-        layout: One of `LAYOUTS`.
-        rows, columns: Numbers of rows and columns of cells, all of which are read.
+        paths: The files, .exr, .png or .tga (8 bits per channel, linear): the two of the layout, and optionally a third
+            with the opacity in its alpha or first channel.
+        layout: Name of the order of the channels, one of `LAYOUTS`.
+        rows, columns: Number of rows and of columns of cells; all cells are read.
         straight: Whether the files have straight (unpremultiplied) alpha; the result is premultiplied.
         device: Device of the frames.
 
@@ -302,14 +301,14 @@ def read_flipbook(
     """
     where = ", ".join(map(str, paths))
     if len(paths) not in (2, 3):
-        raise WlmError(f"{where}: expected two textures, and possibly one of opacity, got {len(paths)}")
+        raise WlmError(f"{where}: expected two textures, or three with one of opacity, got {len(paths)}")
     pages = [_read(path, grey=number == 2) for number, path in enumerate(paths)]
     if any(page.shape[:2] != pages[0].shape[:2] for page in pages):
         raise WlmError(f"{where}: expected textures of one size, found {[page.shape[:2] for page in pages]}")
     height, width = pages[0].shape[0] // rows, pages[0].shape[1] // columns
     if pages[0].shape[:2] != (rows * height, columns * width) or not (height and width):
         size = f"{pages[0].shape[0]} x {pages[0].shape[1]}"
-        raise WlmError(f"{where}: expected {rows} x {columns} cells of whole pixels, found {size}")
+        raise WlmError(f"{where}: expected sides that divide into {rows} rows and {columns} columns, found {size}")
     planes: dict[str, torch.Tensor] = {}
     named = [*LAYOUTS[layout], (ALPHA,)]
     if len(pages) == 3:
@@ -320,13 +319,13 @@ def read_flipbook(
         planes |= dict(zip(names, cells, strict=False))
     missing = [name for name in DIRECTIONS if name not in planes]
     if missing:
-        raise WlmError(f"{where}: layout {layout}: expected channels for {', '.join(missing)}")
+        raise WlmError(f"{where}: layout {layout}: expected channels for {', '.join(missing)}, found none")
     camera = Camera.look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), extent=1.0, height=height, width=width)
     maps = torch.stack([planes[name] for name in DIRECTIONS], 1)
     alpha, glow = planes.get(ALPHA), planes.get(EMISSION)
     if straight:
         if alpha is None:
-            raise WlmError(f"{where}: expected opacity, in an alpha channel or a third texture, for straight alpha")
+            raise WlmError(f"{where}: expected an alpha channel or a third texture for straight alpha, found none")
         maps, glow = maps * alpha[:, None], None if glow is None else glow * alpha
     absent = [None] * len(maps)
     parts = (maps, absent if alpha is None else 1.0 - alpha, absent if glow is None else glow)
@@ -334,7 +333,7 @@ def read_flipbook(
 
 
 def is_straight(frames: Sequence[SixWay]) -> bool:
-    """Returns whether there is light where there is no smoke, which suggests straight alpha; False without opacity."""
+    """Returns whether pixels without smoke have light, a sign of straight alpha; False if there is no opacity."""
     bare = [frame.lightmaps.amax(0)[frame.transparency > _BARE] for frame in frames if frame.transparency is not None]
     light = torch.cat(bare) if bare else torch.zeros(0)
     return len(light) > 0 and float(light.mean()) > _LIT
@@ -352,7 +351,7 @@ def _read(path: str | os.PathLike[str], *, grey: bool) -> np.ndarray:
         with Image.open(io.BytesIO(data), formats=[_suffix(path)[1:].upper()]) as image:
             modes = (*_MODES, *_GREY) if grey else _MODES
             if image.mode not in modes:
-                raise WlmError(f"{path}: expected {' or '.join(modes)} of 8 bits, found {image.mode}")
+                raise WlmError(f"{path}: expected {' or '.join(modes)} with 8 bits per channel, found {image.mode}")
             floats = 4 * image.width * image.height * len(image.getbands())
             check_growth(str(path), len(data), floats, PICTURE_GROWTH)
             pixels = np.asarray(image).astype(np.float32) / np.float32(255.0)

@@ -193,7 +193,7 @@ def billboard_shader(book: Book) -> str:
 
 
 def _glow(ramp: Ramp | None) -> str:
-    """Returns the code of an emission's colour, a chain of mixes between the stops of a ramp."""
+    """Returns shader code that computes the colour of the emission from the stops of a colour ramp."""
     lines = ["float emission = wlm_smoke_emission(first, second);"]
     if ramp is None:
         lines.append("return vec3(emission, emission, emission);")
@@ -211,7 +211,7 @@ def _colour(colour: tuple[float, float, float]) -> str:
 
 
 def _number(number: float) -> str:
-    """Returns a number as a float literal of GLSL ES, in brackets below 0."""
+    """Returns a number as a float literal of GLSL ES; negative numbers are in brackets."""
     text = f"{number:.9g}"
     text = text if "." in text or "e" in text else f"{text}.0"
     return f"({text})" if number < 0 else text

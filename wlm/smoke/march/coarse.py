@@ -1,8 +1,8 @@
 """Marches in large steps: the paper's guiding maps (section 4.2), and six-way lightmaps at the same cost.
 
-The paper marches in steps of 10 voxels for the sum of three lights, and a network recovers six lightmaps from it. The
-same march can compute six separate lightmaps. The errors are those of the steps along the rays, of the interpolation
-between the nodes of the lattice, and of the steps to the lights, all of which are settings of `March`.
+The paper marches in steps of 10 voxels for the sum of three lights, and a network computes six lightmaps from this sum.
+The same march can compute the six lightmaps separately. Errors come from the step along the rays, from the step to the
+lights, and from interpolation on the lattice that stores optical depths to the lights; `March` sets these three sizes.
 """
 
 from dataclasses import dataclass, replace
@@ -28,9 +28,9 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
     Args:
         volume: The smoke.
         camera: Orthographic.
-        march: Settings. Steps below 8 voxels skip empty bricks, which changes no result. Nodes of the light lattice are
-            at least a quarter of a voxel apart, and farther where there would be more than 2^28 of them; a node takes
-            24 bytes. The jitter is gradient noise with 64 different seeds.
+        march: Settings. Nodes of the lattice that stores optical depths to the lights are at least a quarter of a voxel
+            apart, and farther apart if there would be more than 2^28 nodes; a node takes 24 bytes. There are 64
+            different seeds of the jitter, which is gradient noise.
 
     Returns:
         Lightmaps, transparency, emission of hot smoke, and depth, on the smoke's device.
@@ -44,7 +44,7 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
 
 
 def coarse_march(volume: DensityVolume, seed: int = 0) -> March:
-    """Returns a march in steps of 1/130 of the smoke's longest edge."""
+    """Returns settings of a march in steps of 1/130 of the smoke's longest edge, with a seed for its jitter."""
     return March(max(volume.shape) / _STEPS, seed=seed)
 
 
@@ -55,11 +55,11 @@ def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.T
 
 @dataclass(frozen=True, eq=False)
 class Guide:
-    """A guiding map of H x W pixels (algorithm 1).
+    """A guiding map of H x W pixels (algorithm 1): a cheap picture of smoke, from which a network predicts lightmaps.
 
     Attributes:
         maps: float32 tensor [3, H, W] on the smoke's device: light, transparency, depth.
-        camera: The view.
+        camera: Camera of the maps.
     """
 
     maps: torch.Tensor
@@ -67,17 +67,17 @@ class Guide:
 
     @property
     def light(self) -> torch.Tensor:
-        """[H, W], light scattered to the camera under lights from the front, top and bottom of irradiance 4 pi."""
+        """Light scattered to the camera, [H, W], from three lights of irradiance 4 pi: at the front, top and bottom."""
         return self.maps[0]
 
     @property
     def transparency(self) -> torch.Tensor:
-        """[H, W], in [0, 1]: 1 where there is no smoke."""
+        """Transparency of the smoke, 0 to 1, [H, W]: 1 where there is no smoke."""
         return self.maps[1]
 
     @property
     def depth(self) -> torch.Tensor:
-        """[H, W], distance along the ray to the smoke in the world's unit, 0 where there is none."""
+        """Distance along the ray to the smoke in world units, [H, W]: 0 where there is no smoke."""
         return self.maps[2]
 
 
@@ -88,7 +88,7 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
         volume: The smoke.
         camera: Orthographic or in perspective. If it is inside the smoke, the light from the front starts there.
         march: Settings without `spacing` and `light_step`, which equal the step.
-        shared: Whether pixels share marches to the lights, on a lattice with a node per step, which is much faster;
+        shared: Whether pixels share the marches to the lights, on a lattice with a node per step, which is much faster;
             light is then interpolated between nodes.
 
     Returns:
@@ -99,11 +99,11 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
     """
     for name in ("spacing", "light_step"):
         if getattr(march, name) is not None:
-            raise ValueError(f"{name}: expected none for the paper's guiding map, got {getattr(march, name)}")
+            raise ValueError(f"{name}: expected None, a guiding map uses the step, got {getattr(march, name)}")
     return Guide(run(marches.guide, volume, camera, (3,), march, shared=shared), camera)
 
 
 def with_surface(six: SixWay, volume: DensityVolume, looks: Looks | None) -> SixWay:
-    """Returns lightmaps with the depth of the smoke's surface if a scene has obstacles, else without a depth."""
+    """Returns lightmaps with the depth of the smoke's surface if `looks` has obstacles, else without a depth."""
     obstacles = looks is not None and looks.obstacles
     return replace(six, depth=guide(volume, six.camera, _SURFACE).depth if obstacles else None)

@@ -31,7 +31,7 @@ def bake(
         camera: Orthographic. Smoke behind its plane or outside the image is not visible but casts shadows.
         step: Longest step, in voxels, along rays and to the lights. Samples lie in the middles of the steps.
         g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
-        supersample: Number of rays along a pixel's edge, which are averaged; 1: the ray through the centre.
+        supersample: Number n of rays along a pixel's edge, whose n x n results are averaged; 1: only the centre.
         estimate: Whether to estimate the error by a second march with twice the step, which adds half of the work.
 
     Returns:
@@ -41,7 +41,7 @@ def bake(
         ValueError: A setting is out of its range, or the camera is in perspective.
     """
     if supersample < 1:
-        raise ValueError(f"supersample: expected at least 1, got {supersample}")
+        raise ValueError(f"supersample: expected at least 1 ray along a pixel's edge, got {supersample}")
     with stream(device_name(volume.device)):
         fine = _planes(volume, camera, March(step=step, g=g), supersample)
         error = None
@@ -59,6 +59,6 @@ def bake(
 
 
 def _planes(volume: DensityVolume, camera: Camera, march: March, supersample: int) -> torch.Tensor:
-    """Returns lightmaps, transparency and emission, [8, H, W]."""
+    """Returns the six lightmaps, the transparency and the emission, [8, H, W]."""
     out = run(march_six.six_way, volume, camera.finer(supersample), (8,), march)
     return out if supersample == 1 else torch.nn.functional.avg_pool2d(out[None], supersample)[0]

@@ -1,4 +1,4 @@
-"""Launches of ray marches over a volume, on its device and in torch's memory, also as CUDA graphs."""
+"""Launches ray march kernels on a volume of smoke, with results as torch tensors, also as CUDA graphs."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,10 +20,10 @@ def run(
     *arguments: Any,
     **options: Any,
 ) -> torch.Tensor:
-    """Runs a function of `wlm_kernels.smoke` as `launch(medium, view, *arguments, out, **options)`.
+    """Runs a march, a function of `wlm_kernels.smoke`: `launch(medium, view, *arguments, out, **options)`.
 
     Returns:
-        `out`, float32 [*planes, H, W] on the smoke's device.
+        The result that the march writes into `out`, float32 [*planes, H, W] on the smoke's device.
     """
     with stream(device_name(volume.device)):
         size = (*planes, camera.height, camera.width)
@@ -33,7 +33,7 @@ def run(
 
 
 def medium_of(volume: DensityVolume) -> Medium:
-    """Returns the smoke as an argument of kernels; must be called inside `wlm.interop.stream`."""
+    """Returns the smoke as the structure that march kernels take; must be called inside `wlm.interop.stream`."""
     density, temperature = volume.arrays()
     factors = (volume.extinction * volume.voxel, temperature, volume.emission * volume.voxel)
     return Medium(density, *factors, empty=torch_memory(volume.device))
@@ -43,14 +43,14 @@ _Made = TypeVar("_Made")
 
 
 class VolumeGraph(Generic[_Made]):
-    """A function of smoke that is captured as a CUDA graph and replayed; on the CPU it is called.
+    """A function of a smoke volume that a GPU replays as a CUDA graph; on the CPU the function is called each time.
 
-    The function reads a copy of the smoke, since a solver alternates between two buffers. Each call overwrites the
-    result of the previous call.
+    The function reads a copy of the smoke, since a graph has fixed addresses and a solver alternates between two
+    buffers. Each call overwrites the result of the previous call.
     """
 
     def __init__(self, work: Callable[[DensityVolume], _Made], device: str, warmup: int = 2) -> None:
-        """Prepares a function that does not wait for the device; it is called `warmup` times before the capture."""
+        """Prepares `work`, which must not wait for the GPU; it is called `warmup` times before it is captured."""
         self._work = work
         self._device = device
         self._volume: DensityVolume | None = None
@@ -61,14 +61,14 @@ class VolumeGraph(Generic[_Made]):
         """Returns the function's result for a volume.
 
         Raises:
-            ValueError: The volume's shape, position or factors differ from those of the first call.
+            ValueError: The volume's shape, type, position, extinction or emission differs from the first call's.
         """
         with stream(self._device):
             if self._volume is None:
                 heat = None if volume.temperature is None else torch.empty_like(volume.temperature)
                 self._volume = replace(volume, density=torch.empty_like(volume.density), temperature=heat)
             if _kind(volume) != _kind(self._volume):
-                raise ValueError(f"volume: expected {_kind(self._volume)} as before, got {_kind(volume)}")
+                raise ValueError(f"volume: expected {_kind(self._volume)}, as in the first call, got {_kind(volume)}")
             self._volume.density.copy_(volume.density)
             if volume.temperature is not None:
                 self._volume.temperature.copy_(volume.temperature)

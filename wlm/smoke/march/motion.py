@@ -1,9 +1,9 @@
-"""Motion of smoke across the image between two frames, from the solver's velocities, and files of these velocities.
+"""Motion of smoke across the image between two frames, from the velocities of the air, and files of the velocities.
 
 The paper's temporal loss estimates this optical flow from images (neural-six-way-lightmaps, eq. 9).
 
-`velocity_0001.npz` beside a frame has `velocity`, float16 [A, B, C, 3] on cells over the smoke's box: the velocity of
-the air that carried the smoke to that frame, in lengths of the world per frame.
+`velocity_0001.npz` beside frame 1 has `velocity`, float16 [A, B, C, 3] on cells over the smoke's box: the velocity of
+the air that carried the smoke to this frame, in world units per frame.
 """
 
 import math
@@ -28,7 +28,7 @@ _CUTOFF = 1e-3  # transparency of a ray at which it ends
 def motion(
     volume: DensityVolume, velocity: wp.array, camera: Camera, *, reach: float, step: float = 2.0
 ) -> torch.Tensor:
-    """Projects the air's motion into the image, weighted by the visibility of the smoke that it carries.
+    """Computes how far the smoke in each pixel has moved across the image since the earlier frame.
 
     A pixel shows smoke at many depths with different motions: the result is their mean, in which hidden smoke has
     little weight. Motion of light without motion of smoke, such as that of a shadow's edge, is not included.
@@ -38,9 +38,9 @@ def motion(
         velocity: vec3 [A, B, C] on the smoke's device, velocity of the air over the volume's box in cells of any size,
             as `Solver.velocity`.
         camera: Orthographic, the same for both frames.
-        reach: Lengths of the world that a velocity of 1 moves between the frames: for a solver, the edge of a cell
-            times the steps of its lattice.
-        step: Longest step, in voxels.
+        reach: Distance in world units that a velocity of 1 moves between the frames: for a solver, the edge of a cell
+            times the number of air steps.
+        step: Longest step of the march in voxels.
 
     Returns:
         float32 [2, H, W]: pixels to the right and down by which the smoke of a pixel has moved since the earlier frame;
@@ -62,25 +62,25 @@ _LARGEST = 3 * 320**3  # numbers
 
 
 def velocity_file(folder: Path, number: int) -> Path:
-    """Returns the file of a frame's velocity."""
+    """Returns the path of the file with a frame's velocities, which may not exist."""
     return folder / f"{_NAME}_{number:04d}.npz"
 
 
 def write_velocity(path: Path, velocity: wp.array, reach: float) -> None:
-    """Writes a velocity, vec3 [A, B, C], atomically; `reach` is in lengths of the world per frame of a velocity of 1.
+    """Writes the velocities of a frame, vec3 [A, B, C], times `reach`, which converts them to world units per frame.
 
     Raises:
         WlmError: The file cannot be written, or there are more cells than `read_velocity` accepts.
     """
     if 3 * velocity.size > _LARGEST:
-        raise WlmError(f"{path}: expected at most {_LARGEST // 3} cells of air, found {velocity.size}")
+        raise WlmError(f"{path}: expected at most {_LARGEST // 3} cells of air, got {velocity.size}")
     values = (reach * velocity.numpy()).astype(np.float16)
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **{_NAME: values})
 
 
 def read_velocity(path: Path) -> np.ndarray:
-    """Reads a velocity, float32 [A, B, C, 3].
+    """Reads the velocities of a frame in world units per frame, float32 [A, B, C, 3].
 
     Raises:
         WlmError: The file is missing, damaged or has other content.

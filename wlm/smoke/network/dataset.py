@@ -1,12 +1,12 @@
 """Samples that are simulated on the device during a training (neural-six-way-lightmaps, sections 4.4 and 5).
 
-The paper stores 25,200 images of 14 sequences. Here nothing is stored: a pool is a function of its settings, a seed and
-a round. Scenes are drawn at random, simulated, and rendered from several sides. A sample consists of two successive
-frames, each with its guiding map and its lightmaps, and the motion between them. Images show only smoke: obstacles
-shape it but are not rendered (section 5).
+The paper stores 25,200 images of 14 sequences. Here nothing is stored: the samples of a round depend only on
+settings, seed and round. Scenes are drawn at random, simulated, and rendered from several sides. A sample has two
+successive frames, each with its guiding map and its lightmaps, and the motion between the frames. Images show only
+smoke: obstacles shape the smoke but are not rendered (section 5).
 
-Lengths are shares of the box, so that a smaller grid gives the same images. A trained network's guiding maps must be
-made with its own `DatasetSettings.look`.
+Lengths are shares of the box's edge, so that a smaller grid gives the same images. The guiding maps of a trained
+network must be made with `DatasetSettings.look` of the settings that it was trained with.
 """
 
 import os
@@ -72,12 +72,14 @@ def make_validation(
     scale: float = 1.0,
     progress: OnProgress | None = None,
 ) -> Pool:
-    """Makes samples of sequences that no round uses, each pair from all fixed views.
+    """Makes the samples of the validation or the test set; each pair of frames is rendered from all fixed views.
+
+    No training round uses the sequences of these sets.
 
     Args:
         settings, device, progress: As for `make_pool`.
-        test: Whether to use `test_seed`, which takes no part in model selection.
-        scale: Factor of the extinction of the same smoke, 0.5 and 2 in the paper's ablation.
+        test: Whether to make the test set, by `test_seed`, instead of the validation set.
+        scale: Factor by which the extinction of the smoke is multiplied; 0.5 and 2 in the paper's ablation.
 
     Raises:
         WlmError: As for `make_pool`.
@@ -94,17 +96,17 @@ def pool_of_volume(
     extinction: float | None = None,
     emission: float = 1.0,
 ) -> Pool:
-    """Makes samples of any volume, one from each fixed view, to test a network on other smoke.
+    """Makes samples of a volume from a file, one from each fixed view, to test a network on other smoke.
 
     Args:
         path: A `.npz`, `.nvdb` or `.vdb` volume for `load_volume`.
-        settings: Views and march; the volume's longest edge counts as the box's edge.
+        settings: Settings of views and marches; lengths in them are shares of the volume's longest edge.
         device: "cpu", "cuda" or "cuda:N".
         extinction: Extinction at density 1 per unit of length; None: such that dense smoke is as opaque as in training.
         emission: Emission at temperature 1 per unit of length.
 
     Returns:
-        The samples. The two frames of a sample are equal; the motion and the sequence are 0.
+        The samples. The two frames of a sample are the same, and their motion and sequence number are 0.
 
     Raises:
         WlmError: As for `load_volume`; or the volume is empty and no extinction is given.
@@ -113,7 +115,7 @@ def pool_of_volume(
     if extinction is None:
         density = volume.density[volume.density > 0]
         if not len(density):
-            raise WlmError(f"{path}: density: is zero everywhere, so that no extinction can be chosen")
+            raise WlmError(f"{path}: density is zero everywhere, so no extinction can be chosen from it")
         edge = volume.voxel * max(volume.shape)
         extinction = settings.extinction / (edge * float(np.quantile(density.float().cpu().numpy(), _BRIGHT)))
     volume = replace(volume, extinction=extinction)
@@ -128,14 +130,14 @@ def pool_of_volume(
 
 
 def fixed_cameras(settings: DatasetSettings, origin: Sequence[float] | np.ndarray, size: np.ndarray) -> list[Camera]:
-    """Returns the cameras of the fixed views of a box, all of one extent."""
+    """Returns the cameras of the fixed views of a box with corner `origin` [3] and edges `size` [3] in the world."""
     first = CameraSettings(extent=_EXTENT * float(np.max(size)), resolution=settings.resolution)
     turns = settings.arc / settings.views * np.arange(settings.views)
     return [make_camera(first.turned(float(turn)), origin, size) for turn in turns]
 
 
 class _Shot(NamedTuple):
-    """A view of a frame pair: camera, factor of the extinction, seed of the first frame's jitter."""
+    """A view of a pair of frames: camera, factor of the extinction, and seed of the jitter in the first frame."""
 
     camera: Camera
     scale: float
@@ -143,7 +145,7 @@ class _Shot(NamedTuple):
 
 
 class _Maker:
-    """Makes the pools of a training, validation or test set."""
+    """Simulates and renders the samples of a training, validation or test set."""
 
     def __init__(self, settings: DatasetSettings, seed: int, validation: bool, device: str, scale: float = 1.0) -> None:
         self._settings, self._seed, self._validation, self._scale = settings, seed, validation, scale
@@ -163,7 +165,7 @@ class _Maker:
         return Pool(*(torch.cat([getattr(pool, field.name) for pool in pools]) for field in fields(Pool)))
 
     def _sequence(self, number: int) -> tuple[Pool, int, int]:
-        """Returns a sequence's samples, and the numbers of unstable scenes skipped for it and of samples dropped."""
+        """Returns the samples of a sequence, and how many unstable scenes and almost empty samples were left out."""
         for attempt in range(ATTEMPTS):
             index = number * ATTEMPTS + attempt
             settings = self._sequence_settings(index)
@@ -189,10 +191,9 @@ class _Maker:
             kept_at_random = random.random(len(covered)) < self._settings.kept_empty
             keep = np.flatnonzero((covered > self._settings.least_coverage) | kept_at_random)
             return pool.take(torch.from_numpy(keep).to(pool.device)), attempt, len(pool) - len(keep)
-        raise WlmError(f"{ATTEMPTS} scenes in a row were unstable, the last with: {problem}")
+        raise WlmError(f"{ATTEMPTS} random scenes in a row were unstable, the last with the problem: {problem}")
 
     def _sequence_settings(self, index: int) -> DatasetSettings:
-        """Returns the settings with a random number of cells for a training sequence."""
         settings = self._settings
         if settings.least_cells is None or self._validation:
             return settings
@@ -203,7 +204,7 @@ class _Maker:
     def _render(
         self, settings: DatasetSettings, scene: Scene, solver: Solver, random: np.random.Generator
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Simulates a scene and renders its pairs; returns guides, targets and motion of a `Pool`."""
+        """Simulates a scene and renders its pairs of frames; returns the guides, targets and motion of a `Pool`."""
         simulation = _Simulation(scene, solver)
         views = settings.views if self._validation else settings.views_a_frame
         size = (settings.frames * views, 2)
@@ -232,7 +233,7 @@ class _Maker:
         return guides, targets, moved
 
     def _shots(self, scene: Scene, random: np.random.Generator) -> list[_Shot]:
-        """Returns the views of a pair: all fixed ones in validation, otherwise random ones around the smoke."""
+        """Returns the views of a pair of frames: in validation all fixed views, in training random views."""
         settings = self._settings
         if self._validation:
             seeds = random.integers(2**30, size=settings.views)
@@ -266,7 +267,7 @@ class _Simulation:
         self._graph: wp.Graph | None = None
 
     def advance(self, steps: int) -> None:
-        """Advances by a number of air steps, which must be a multiple of the steps in one CUDA graph."""
+        """Advances the smoke by `steps` air steps, which must be a multiple of the steps in one CUDA graph."""
         for _ in range(steps // self._period):
             now = self._done * self._seconds
             active = tuple(source for source, is_active in self._sources if is_active(now))

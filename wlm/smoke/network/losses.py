@@ -17,14 +17,14 @@ _VISIBLE = 0.01  # opacity above which a change counts
 
 
 def warp(earlier: torch.Tensor, motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Warps an earlier frame onto a later one.
+    """Moves the pixels of earlier frames along a motion, so that they are comparable with the later frames.
 
     Args:
-        earlier: [N, C, H, W].
+        earlier: Frames [N, C, H, W].
         motion: [N, 2, H, W], as `Pool.motion`.
 
     Returns:
-        The warped frame, and a mask [N, 1, H, W], 1 where the frame was read inside the image.
+        The moved frames [N, C, H, W], and a mask [N, 1, H, W]: 1 where the motion starts inside the image, else 0.
     """
     height, width = earlier.shape[-2:]
     motion = motion.to(earlier.dtype)
@@ -38,10 +38,10 @@ def warp(earlier: torch.Tensor, motion: torch.Tensor) -> tuple[torch.Tensor, tor
 
 
 class _Bilinear(torch.autograd.Function):
-    """Samples images [N, C, H, W] at rows and columns [N, H', W'] inside the image: [N, C, H', W'].
+    """Samples images [N, C, H, W] bilinearly at given rows and columns [N, H', W']; returns [N, C, H', W'].
 
-    Several pixels can read the same pixel. On a GPU, torch's gradient sums these in any order, so that trainings do not
-    repeat to the bit; this gradient sums integers. There is no gradient with respect to rows and columns.
+    Several pixels can read the same pixel. On a GPU, torch's gradient adds up in any order, so that a training would
+    not repeat to the bit; this gradient adds integers instead. Rows and columns get no gradient.
     """
 
     @staticmethod
@@ -83,12 +83,12 @@ def _spread(index: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
 
 
 def residual(frames: torch.Tensor, motion: torch.Tensor, opacity: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Sums the change between two frames that the motion does not explain, L1.
+    """Sums the absolute change between two frames that the motion does not explain.
 
     Args:
-        frames: [N, 2, P, H, W], the earlier first.
+        frames: [N, 2, P, H, W]: N pairs of frames, the earlier first, of P planes.
         motion: [N, 2, H, W], as `Pool.motion`.
-        opacity: [N, H, W] of the later frame. Only visible smoke that was inside the image before is counted.
+        opacity: [N, H, W] of the later frame. Only visible smoke that was inside the earlier image is counted.
 
     Returns:
         The sum of the absolute change, and the number of values summed.
@@ -99,16 +99,17 @@ def residual(frames: torch.Tensor, motion: torch.Tensor, opacity: torch.Tensor) 
 
 
 def temporal(predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor) -> torch.Tensor:
-    """Computes the temporal loss: L1 between the changes of prediction and target along the motion (in place of eq. 9).
+    """Computes the temporal loss (in place of eq. 9): how differently prediction and target change along the motion.
 
-    Warping is linear, so that the difference of the two changes is the change of the error and takes one warp.
+    It is the mean absolute difference of the two changes. Since warping is linear, this equals the change of the error,
+    prediction minus target, which takes only one warp.
 
     Args:
-        predicted, target: [N, 2, P, H, W], the first P of `PLANES`, opacity among them.
+        predicted, target: [N, 2, P, H, W]: N pairs of frames of the first P of `PLANES`, which include the opacity.
         motion: [N, 2, H, W], as `Pool.motion`.
 
     Returns:
-        The mean over visible smoke that was inside the image before; 0 where there is none.
+        The mean over visible smoke that was inside the earlier image; 0 if there is none.
     """
     total, count = residual(predicted.float() - target.float(), motion, target[:, 1, OPACITY_PLANE])
     return total / count.clamp(min=1.0)
@@ -117,15 +118,15 @@ def temporal(predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor
 def losses(
     predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor, weight: float
 ) -> dict[str, torch.Tensor]:
-    """Computes the losses (eq. 10).
+    """Computes the training losses (eq. 10).
 
     Args:
-        predicted, target: [N, K, 8, H, W], encoded; K = 2 frames for the temporal loss.
-        motion: [N, 2, H, W], for the temporal loss.
-        weight: Weight of the temporal loss; 0: it is not computed.
+        predicted, target: [N, K, 8, H, W], encoded: K frames of N samples; the temporal loss needs K = 2.
+        motion: [N, 2, H, W], as `Pool.motion`; only for the temporal loss.
+        weight: Weight of the temporal loss; 0: the temporal loss is not computed.
 
     Returns:
-        The weighted sum `loss` and the unweighted parts `mse` and, if it has a weight, `temporal`.
+        The weighted sum `loss`, and its unweighted parts `mse` and, unless the weight is 0, `temporal`.
     """
     predicted, target = predicted.float(), target.float()
     parts = {"mse": F.mse_loss(predicted, target)}

@@ -20,22 +20,22 @@ _OPSET = 20
 def export_onnx(model: SmokeModel, path: str | os.PathLike[str], *, height: int = 512, width: int = 512) -> int:
     """Writes a network as ONNX for one image size: `guide` [1, C, H, W] to `lightmaps` [1, 8, H, W], float32.
 
-    Both are encoded planes, as defined in `wlm.smoke.network.planes`; the lightmaps are not clamped.
+    Guide and lightmaps are encoded as in `wlm.smoke.network.planes`; the lightmaps are not clamped to their ranges.
 
     Args:
         model: The network.
         path: The file, which is written atomically.
-        height, width: H and W.
+        height, width: Size of the images in pixels, H and W.
 
     Returns:
-        The size of the file, bytes.
+        The size of the file in bytes.
 
     Raises:
         ValueError: A size is below 1.
         WlmError: The extra `onnx` is not installed, or the file cannot be written.
     """
     if height < 1 or width < 1:
-        raise ValueError(f"expected at least one pixel, got {height} x {width}")
+        raise ValueError(f"height, width: expected at least 1 pixel, got {height}, {width}")
     for package in ("onnx", "onnxscript"):
         need(package, "onnx")
     # A copy: the exporter modifies the network that it traces.

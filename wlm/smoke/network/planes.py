@@ -1,4 +1,4 @@
-"""Encoding of guiding maps and lightmaps for the network: planes in sRGB, of about the same range."""
+"""Encoding of guiding maps and lightmaps for the network: light in sRGB, and all planes with values of about 0 to 1."""
 
 import torch
 
@@ -28,7 +28,7 @@ VISIBLE = 0.05
 
 
 def to_srgb(linear: torch.Tensor) -> torch.Tensor:
-    """Encodes linear light by sRGB's curve, continued above 1; values below 0 count as 0."""
+    """Encodes linear light by the sRGB curve, which is continued above 1; values below 0 count as 0."""
     # Clamped away from 0, where the power's slope is infinite and would turn a gradient into NaN.
     curve = 1.055 * linear.clamp(min=FOOT) ** (1 / 2.4) - 0.055
     return torch.where(linear <= FOOT, 12.92 * linear.clamp(min=0.0), curve)
@@ -37,11 +37,11 @@ def to_srgb(linear: torch.Tensor) -> torch.Tensor:
 def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
     """Returns the distances from the camera at which the bounding sphere of the volume's box begins and ends.
 
-    A camera that turns about the box's centre has the same span in all positions, so that depths are comparable.
+    A camera that turns about the box's centre has the same distances in all positions, so that depths are comparable.
     Distances are measured along the axis of an orthographic camera, or from the eye of a perspective camera.
 
     Returns:
-        Near and far in the world's unit, near < far; near is below 0 where the camera is within the sphere.
+        Near and far distance in world units; the near distance is negative if the camera is inside the sphere.
     """
     away = torch.as_tensor(camera.position, dtype=torch.float64) - torch.as_tensor(volume.centre)
     if camera.perspective:
@@ -57,13 +57,13 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
 
     Args:
         maps: [..., 3, H, W]: light, transparency, depth, as `guide` gives them.
-        near, far: From `span`.
+        near, far: Distances from `span`.
 
     Returns:
-        [..., 3, H, W]: light in sRGB; opacity; depth as a share of the span, 1 at its near end, 0 without a surface.
+        [..., 3, H, W]: light in sRGB; opacity; depth, from 1 at `near` to 0 at `far`, and 0 without a surface.
 
     Raises:
-        ValueError: The number of planes is wrong, or the span has no length.
+        ValueError: The number of planes is wrong, or `near` is not less than `far`.
     """
     if maps.ndim < 3 or maps.shape[-3] != 3:
         raise ValueError(f"maps: expected [..., 3, H, W], got {tuple(maps.shape)}")
@@ -79,16 +79,17 @@ def _check_span(near: float, far: float) -> None:
 
 
 def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March) -> torch.Tensor:
-    """Renders and encodes a guiding map.
+    """Renders a guiding map of smoke and encodes it for the network.
 
     Args:
         volume: The smoke.
         camera: Orthographic.
-        kind: One of `GUIDES`.
+        kind: Kind of the guiding map, a key of `GUIDES`.
         march: Settings, as for `guide` if the kind is "paper", else as for `bake_coarse`.
 
     Returns:
-        float32 [C, H, W], the planes of `GUIDES`, 0 where there is no smoke, except emission of fire without smoke.
+        float32 [C, H, W], the planes that `GUIDES` lists; 0 where there is no smoke, except emission of fire without
+        smoke.
 
     Raises:
         ValueError: The kind is unknown, or the camera is in perspective.
@@ -107,29 +108,29 @@ def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March)
 
 
 def encode_lightmaps(six: SixWay) -> torch.Tensor:
-    """Encodes lightmaps for the network.
+    """Encodes six-way lightmaps, opacity and emission as planes for the network.
 
     Returns:
         [8, H, W] in the order of `PLANES`: six lightmaps in sRGB, opacity, and emission e as e / (1 + e) in sRGB, 0
         where the smoke is cold.
 
     Raises:
-        ValueError: The transparency is unknown.
+        ValueError: The lightmaps have no transparency.
     """
     if six.transparency is None:
-        raise ValueError("six: expected lightmaps with transparency")
+        raise ValueError("six: expected lightmaps with transparency, got none")
     transparency = six.transparency
     glow = torch.zeros_like(transparency) if six.emission is None else six.emission.clamp(min=0.0)
     return torch.cat([to_srgb(six.lightmaps), torch.stack([1.0 - transparency, to_srgb(glow / (1.0 + glow))])])
 
 
 def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera | None = None) -> SixWay:
-    """Inverts `encode_lightmaps`, in float32 and without a gradient; each plane is clamped to its range.
+    """Converts planes of `encode_lightmaps` back to lightmaps, in float32 without a gradient, clamped to their ranges.
 
     Args:
-        planes: [8, H, W].
+        planes: [8, H, W] in the order of `PLANES`.
         hot: Whether the smoke emits light; False: the result has no emission.
-        camera: The view of the lightmaps; None: unknown.
+        camera: Camera of the lightmaps; None: unknown.
 
     Raises:
         ValueError: The number of planes is wrong.

@@ -1,4 +1,4 @@
-"""The samples of a training round, a validation or a test."""
+"""Container of the samples of a training round, a validation set or a test set."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """N samples on one device, each of two successive frames, the earlier first; floats are half precision.
+    """N samples on one device, each with two successive frames, the earlier first; all floats are half floats.
 
     Attributes:
-        guides: [N, 2, C, H, W], encoded guiding maps of a kind in `GUIDES`.
-        targets: [N, 2, 8, H, W], encoded lightmaps, `PLANES`.
+        guides: [N, 2, C, H, W], encoded guiding maps with the C planes of their kind in `GUIDES`.
+        targets: [N, 2, 8, H, W], encoded reference lightmaps, in the order of `PLANES`.
         motion: [N, 2, H, W], pixels to the right and down by which the smoke in the later frame has moved since the
             earlier frame.
-        sequence: int [N], number of the sequence of each sample; sets are split by sequences, never by frames.
+        sequence: int [N], number of the simulated sequence that each sample is from; sets share no sequence.
     """
 
     guides: torch.Tensor
@@ -30,7 +30,7 @@ class Pool:
         count, size = len(self.guides), tuple(self.guides.shape[-2:])
         channels = self.guides.shape[2] if self.guides.ndim == 5 else 0
         if channels not in map(len, GUIDES.values()):
-            raise ValueError(f"guides: expected [N, 2, C, H, W] of one of GUIDES, got {list(self.guides.shape)}")
+            raise ValueError(f"guides: expected [N, 2, C, H, W] of a kind in GUIDES, got {list(self.guides.shape)}")
         shapes = {
             "guides": (count, 2, channels, *size),
             "targets": (count, 2, len(PLANES), *size),
@@ -39,7 +39,7 @@ class Pool:
         }
         for name, shape in shapes.items():
             if tuple(getattr(self, name).shape) != shape:
-                raise ValueError(f"{name}: expected {list(shape)}, got {list(getattr(self, name).shape)}")
+                raise ValueError(f"{name}: expected shape {list(shape)}, got {list(getattr(self, name).shape)}")
 
     def __len__(self) -> int:
         return len(self.guides)
@@ -50,11 +50,11 @@ class Pool:
         return self.guides.device
 
     def covered(self) -> torch.Tensor:
-        """Returns for each sample the share of the image that shows smoke, [N], in the frame where it is smaller."""
+        """Returns the share of pixels that show smoke, 0 to 1, [N]: of a sample's two frames the smaller share."""
         return (self.targets[:, :, OPACITY_PLANE] > VISIBLE).float().mean((-2, -1)).amin(1)
 
     def take(self, which: torch.Tensor) -> Pool:
-        """Returns some of the samples, selected by an index or a mask."""
+        """Returns the samples that an index tensor or a mask [N] selects."""
         return Pool(*(getattr(self, field.name)[which] for field in fields(self)))
 
     def to(self, device: str | torch.device) -> Pool:

@@ -1,4 +1,4 @@
-"""Six-way lightmaps of smoke by a trained network: guiding map, network, gate and decoding in one call.
+"""Predicts six-way lightmaps of smoke by a trained network: guiding map, network, gate and decoding in one call.
 
 A network may be worse than its guiding map: for smoke that is smoother, coarser or finer than in its training, the map
 has little noise to remove. Each image therefore has a gate, which is computed from a second guiding map with a ninth of
@@ -31,14 +31,14 @@ _SIZES = 4  # number of image sizes whose buffers are kept
 
 
 class SmokePredictor:
-    """A network at run time, with guiding maps made as in its training.
+    """Predicts lightmaps by a trained network, from guiding maps that are made as in its training.
 
-    Buffers are kept for the last few image sizes.
+    Buffers for the last four image sizes are kept.
 
     Attributes:
         device: Device on which it runs.
-        share: Gate of the last image's lightmaps, a tensor of one number: 0 is the guide, 1 the network. None: there
-            was no image yet, or the guide has no lightmaps, so that there is no gate.
+        share: Weight of the network in the last image's lightmaps, a tensor of one number from 0 (only the guiding map)
+            to 1 (only the network). None: there was no image yet, or the guiding map has no lightmaps to blend with.
     """
 
     def __init__(self, model: SmokeModel | str | os.PathLike[str] | None = None, device: str = "cpu") -> None:
@@ -59,7 +59,7 @@ class SmokePredictor:
         self._decoders: dict[tuple[int, int], Decoder] = {}
 
     def __call__(self, smoke: DensityVolume, camera: Camera, seed: int = 0) -> SixWay:
-        """Predicts lightmaps.
+        """Predicts six-way lightmaps of smoke.
 
         Args:
             smoke: The smoke, on any device.
@@ -92,7 +92,7 @@ class SmokePredictor:
     def _gated(
         self, guide: torch.Tensor, planes: torch.Tensor, smoke: DensityVolume, camera: Camera, march: March
     ) -> torch.Tensor:
-        """Blends the predicted planes [8, H, W] with the guide by the gate; returns encoded planes [8, H, W]."""
+        """Blends predicted planes [8, H, W] with the guide, by weights from a second guide with different noise."""
         size = [n // _APART - (n - n // _APART) % 2 for n in (camera.height, camera.width)]
         if min(size) < 1:
             self.share = torch.zeros((), device=guide.device)
@@ -112,14 +112,14 @@ class SmokePredictor:
         return torch.lerp(guide, planes, torch.cat(shares)[:, None, None])
 
     def note(self) -> str | None:
-        """Returns a message if the gate of the last image was below a half."""
+        """Returns a message if the network had a weight below a half in the last image, otherwise None."""
         if self.share is None or (share := float(self.share)) >= _HALF:
             return None
         return f"the network has a weight of {share:.0%}: on this smoke its guide, the coarse march, is as accurate"
 
 
 def _as_planes(guide: torch.Tensor) -> torch.Tensor:
-    """Returns a guiding map of kind "six" in the order of `PLANES`: without depth, opacity before emission."""
+    """Returns the planes of a guiding map of kind "six" in the order of `PLANES`, without its depth."""
     of = dict(zip(GUIDES["six"], guide, strict=True))
     return torch.stack([of[name] for name in PLANES])
 

@@ -21,10 +21,10 @@ _CROSSING = (0.9, 1.6)  # seconds in which it crosses the box
 
 
 class Tilted(ObstacleSettings):
-    """An obstacle whose y axis is rotated to another direction.
+    """An obstacle that is rotated so that its y axis has another direction.
 
     Attributes:
-        axis: The direction, of any length except 0.
+        axis: Direction of its y axis in the world, of any length except 0.
     """
 
     axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
@@ -39,7 +39,7 @@ class Tilted(ObstacleSettings):
 
 
 def generator(validation: bool, *numbers: int) -> np.random.Generator:
-    """Returns the random generator that the numbers identify; validation and training have different ones."""
+    """Returns a random generator seeded by the numbers; validation and training never share a generator."""
     return np.random.default_rng([int(validation), *numbers])
 
 
@@ -47,13 +47,13 @@ def draw_scene(settings: DatasetSettings, seed: int, index: int, *, validation: 
     """Draws a random scene; the same arguments give the same scene.
 
     Args:
-        settings: Grids, times and probabilities.
+        settings: Settings of the samples, of which grid, times and probabilities are used.
         seed: Seed of a set of scenes, at least 0.
         index: Number of the scene in its set, at least 0.
         validation: Whether the set is not used in training.
 
     Returns:
-        The scene; its frame interval is that between the two frames of a pair.
+        The scene. Its frames are as far apart in time as the two frames of a pair.
     """
     random = generator(validation, seed, index, 0)
     if random.random() < settings.hot:
@@ -96,7 +96,7 @@ def _place(random: np.random.Generator, low: tuple, high: tuple) -> tuple[float,
 
 
 def _jet(random: np.random.Generator) -> dict[str, Any]:
-    """Returns settings of a jet from the floor, upright or leaning."""
+    """Returns scene settings of one or two jets from the floor, upright or leaning, sometimes with wind."""
     inlets = []
     for number in range(1 + (random.random() < 0.3)):
         speed = SPEED * (1.0 if number == 0 else random.uniform(0.5, 1.0))
@@ -123,7 +123,6 @@ def _jet(random: np.random.Generator) -> dict[str, Any]:
 
 
 def _flame(random: np.random.Generator) -> dict[str, Any]:
-    """Returns settings of a hot jet."""
     parts = _jet(random)
     inlets = tuple(inlet.model_copy(update={"temperature": float(inlet.density > 0.0)}) for inlet in parts["inlets"])
     smoke = {"buoyancy": random.uniform(0.5, 2.0), "cooling": random.uniform(1.0, 3.0)}
@@ -131,7 +130,7 @@ def _flame(random: np.random.Generator) -> dict[str, Any]:
 
 
 def _plume(random: np.random.Generator) -> dict[str, Any]:
-    """Returns settings of a sphere of constant density and temperature, from which smoke rises."""
+    """Returns scene settings of a sphere of constant density and temperature, from which smoke rises."""
     sphere = SourceSettings(
         centre=_place(random, (0.35, 0.1, 0.35), (0.65, 0.16, 0.65)),
         radius=EDGE * _log(random, *_RADIUS),
@@ -143,7 +142,7 @@ def _plume(random: np.random.Generator) -> dict[str, Any]:
 
 
 def _burst(random: np.random.Generator) -> dict[str, Any]:
-    """Returns settings of spheres that emit hot smoke for a short time."""
+    """Returns scene settings of spheres that emit hot smoke for a short time."""
     spheres = [
         SourceSettings(
             centre=_place(random, (0.32, 0.12, 0.32), (0.68, 0.3, 0.68)),
@@ -173,7 +172,7 @@ def _obstacle(random: np.random.Generator) -> Tilted:
 
 
 def _moving(random: np.random.Generator, obstacle: Tilted, begin: float) -> Tilted:
-    """Returns the obstacle on a path through the box, from one side to the other."""
+    """Returns the obstacle with a path through the box; it moves after about the time `begin`, in box crossings."""
     _, *middle = obstacle.path[0]
     around = random.uniform(0.0, 2 * np.pi)
     half = 0.36 * EDGE * np.array([np.cos(around), 0.0, np.sin(around)])

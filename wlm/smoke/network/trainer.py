@@ -22,16 +22,16 @@ _MIRRORED = {"right": "left", "left": "right"}  # planes that a mirror exchanges
 
 
 class Trainer:
-    """A network in training: its weights, their running mean, and Adam.
+    """A network in training: its weights, the running mean of the weights, and the Adam optimiser.
 
     Attributes:
         network: The network in training, on the device.
-        average: The running mean of its weights, which is validated and saved.
-        step: Number of steps done, skipped steps included.
+        average: The network with the running mean of the weights, which is validated and saved.
+        step: Number of steps done, including those whose update was skipped.
     """
 
     def __init__(self, network: NetworkSettings, settings: TrainSettings, *, seed: int, device: str) -> None:
-        """Starts at step 0; a seed gives the same initial weights on all devices."""
+        """Makes an untrained network; a seed gives the same initial weights on all devices."""
         self.settings, self.device, self.step = settings, device, 0
         self._cuda = device != "cpu"
         with torch.random.fork_rng(devices=[]):
@@ -59,11 +59,11 @@ class Trainer:
 
     @property
     def skipped(self) -> int:
-        """Number of steps without an update because their gradient was not finite; waits for the device."""
+        """Number of steps without an update because their gradient was not finite; reading it waits for the GPU."""
         return int(self._skipped)
 
     def take_losses(self) -> list[float]:
-        """Returns sums of the loss and its parts since the last `clear_losses`; waits for the device."""
+        """Returns the sums of the loss and of its parts over the steps since `clear_losses`; waits for the GPU."""
         return self._sums.tolist()
 
     def clear_losses(self) -> None:
@@ -71,11 +71,11 @@ class Trainer:
         self._sums.zero_()
 
     def run(self, pool: Pool, plan: Plan) -> None:
-        """Runs steps.
+        """Runs the training steps of a plan.
 
         Args:
             pool: The samples, on any device.
-            plan: Rows of the result of `plan_round`, one per step.
+            plan: A part of the result of `plan_round`: the samples of each step.
         """
         # Deterministic kernels, so that a seed gives one result.
         flags = {"enabled": True, "benchmark": False, "deterministic": True, "allow_tf32": self.settings.half}
@@ -94,7 +94,7 @@ class Trainer:
                 self.step += 1
 
     def _gather(self, pool: Pool, plan: Plan, i: int) -> tuple[torch.Tensor, ...]:
-        """Returns a step's batch: guides [N, K, C, H, W], targets [N, K, 8, H, W], motion [N, 2, H, W], all float32."""
+        """Returns step i's batch, float32: guides [N, K, C, H, W], targets [N, K, 8, H, W] and motion [N, 2, H, W]."""
         samples, flips = plan.samples[i], plan.flips[i].to(self.device)
         frames = [slice(None)] * len(samples)
         if not self.settings.temporal:
@@ -115,7 +115,6 @@ class Trainer:
         return guides, targets, torch.where(flip, self._sign * motion.flip(-1), motion)
 
     def _work(self) -> None:
-        """Does one step on the batch in `_batch`, without waiting for the device."""
         guides, targets, motion = self._batch
         for weight in self._weights:
             weight.grad = None
@@ -137,7 +136,7 @@ class Trainer:
             self._skipped.add_(~finite)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns everything that the next step depends on."""
+        """Returns everything that the next step depends on, as arrays by name, for a checkpoint."""
         tensors = {"step": torch.tensor(self.step), "sums": self._sums, "skipped": self._skipped}
         for kind, network in (("network", self.network), ("average", self.average)):
             tensors |= {f"{kind}.{name}": value for name, value in network.state_dict().items()}
@@ -147,7 +146,7 @@ class Trainer:
         return {name: np.array(value.detach().cpu().numpy(), order="C") for name, value in tensors.items()}
 
     def table(self, step: int) -> dict[str, Part]:
-        """Returns the type, shape and range of each array of a `state` after a number of steps."""
+        """Returns the expected type, shape and range of each array of `state` after `step` steps."""
         table = {
             "step": Part(np.int64, (), least=step, most=step),
             "sums": Part(np.float32, tuple(self._sums.shape)),
@@ -166,10 +165,10 @@ class Trainer:
 
     @torch.no_grad()
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores a `state`.
+        """Restores what `state` returned.
 
         Raises:
-            ValueError: A part is missing, has a wrong shape or is out of its range; the trainer is unchanged.
+            ValueError: An array is missing, has a wrong shape or is out of its range; the trainer is unchanged.
         """
         done = check_part(state, "step", Part(np.int64, (), least=0, most=self.settings.total))
         state = check_parts(state, self.table(int(done)))
@@ -189,19 +188,19 @@ class Trainer:
 
 
 def _mirrored(planes: tuple[str, ...], device: str) -> torch.Tensor:
-    """Returns for each plane the index of the plane that takes its place when the image is mirrored."""
+    """Returns for each plane the index of the plane that replaces it when images are mirrored left to right."""
     return torch.tensor([planes.index(_MIRRORED.get(name, name)) for name in planes], device=device)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The samples of some steps, one row per step.
+    """The samples that some training steps use, B samples per step.
 
     Attributes:
-        samples: int [steps, B], indices of a pool.
-        frames: int [steps, B], the frame of a sample, 0 or 1, for steps on single frames.
+        samples: int [steps, B], indices of samples in a pool.
+        frames: int [steps, B], which of a sample's two frames is used, 0 or 1; ignored with a temporal loss.
         flips: bool [steps, B], whether a sample is mirrored left to right.
-        corners: int [steps, B, 2], row and column of the crop's corner; None: no crops.
+        corners: int [steps, B, 2], row and column of the top left pixel of the crop; None: whole images.
     """
 
     samples: torch.Tensor
@@ -210,18 +209,18 @@ class Plan:
     corners: torch.Tensor | None
 
     def part(self, begin: int, end: int) -> Plan:
-        """Returns the plan of some of the steps."""
+        """Returns the plan of the steps from `begin` up to, but not including, `end`."""
         corners = None if self.corners is None else self.corners[begin:end]
         return Plan(self.samples[begin:end], self.frames[begin:end], self.flips[begin:end], corners)
 
 
 def plan_round(settings: TrainSettings, pool: Pool, *, seed: int, round: int) -> Plan:
-    """Draws the samples of a round's steps in random order; each is used once before any is repeated.
+    """Draws the samples of all steps of a round in random order; each is used once before any is used again.
 
     Args:
         settings: Settings of the training.
         pool: The samples.
-        seed, round: Seed of the order.
+        seed, round: Numbers on which the random order depends.
 
     Raises:
         ValueError: The samples are smaller than the crops.
@@ -237,14 +236,14 @@ def plan_round(settings: TrainSettings, pool: Pool, *, seed: int, round: int) ->
     if settings.crop is not None:
         image = np.array(pool.targets.shape[-2:])
         if (image < settings.crop).any():
-            raise ValueError(f"crop: expected at most {min(image)} pixels, which the samples have, got {settings.crop}")
+            raise ValueError(f"crop: expected at most the samples' {min(image)} pixels, got {settings.crop}")
         draws = random.random((settings.steps, size, 3))
         corners = torch.from_numpy(_corners(pool, order, draws, image, settings.crop))
     return Plan(torch.from_numpy(order), torch.from_numpy(frames), torch.from_numpy(flips), corners)
 
 
 def _corners(pool: Pool, samples: np.ndarray, draws: np.ndarray, image: np.ndarray, crop: int) -> np.ndarray:
-    """Returns corners int [..., 2] of crops around a random block with smoke; `draws` [..., 3] are in [0, 1)."""
+    """Returns the corners, int [..., 2], of crops with smoke, chosen by random numbers `draws` [..., 3] in [0, 1)."""
     blocks = []
     for targets in pool.targets:
         opacity = targets[:, OPACITY_PLANE].amax(0, keepdim=True).float()

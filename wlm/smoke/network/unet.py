@@ -1,13 +1,13 @@
 """The network that turns a guiding map into six-way lightmaps (neural-six-way-lightmaps, section 4.3).
 
 A U-Net (Ronneberger et al. 2015; two 3 x 3 convolutions per level, max pooling) computes features. Adapters turn these
-into planes: each is a NAFBlock (Chen et al. 2022), either one for each two opposite planes or one for all. A NAFBlock's
-only nonlinearity is the product of the two halves of its channels; its channel attention multiplies by a linear map of
-the channels' means over the whole image.
+into planes: each is a NAFBlock (Chen et al. 2022), either one for each pair of planes or one for all planes. The only
+nonlinearity of a NAFBlock is the product of the two halves of its channels; its channel attention multiplies them by a
+linear map of the channels' means over the whole image.
 
 Two properties are built in rather than learned:
 
-- Opacity and light differ little from the guide's, except for the noise of its jitter. The output is therefore a
+- Opacity and light differ little from those of the guide, except for the noise of its jitter. The output is therefore a
   learned filter of the guide's planes, initialised by a least squares fit, plus the U-Net's output, initialised to 0.
 - Far from smoke all planes are 0. Outputs are multiplied by a mask, which is 1 within 8 to 16 pixels of smoke in the
   guide: the guide's large steps can miss a wisp in one pixel and hit it in the next.
@@ -21,7 +21,7 @@ from wlm.smoke.network.planes import GUIDES, PLANES
 from wlm.smoke.network.settings import NetworkSettings
 
 ADAPTERS = (("front", "back"), ("right", "left"), ("top", "bottom"), ("opacity", "emission"))
-"""The planes of each adapter."""
+"""Planes of each adapter, the NAFBlock that computes them."""
 
 REACH = 8
 """Smallest distance in pixels from smoke in the guide within which lightmaps may differ from 0."""
@@ -45,7 +45,7 @@ _START = {
 
 
 class ChannelNorm(nn.Module):
-    """Layer norm over the channels of each pixel, [N, C, H, W]; torch's own needs the channels contiguous in memory."""
+    """Layer norm over the channels of each pixel, [N, C, H, W]; torch's norm needs channels contiguous in memory."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -65,7 +65,7 @@ def _normalised(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class _Norm(torch.autograd.Function):
-    """The norm with a hand-written backward pass; autograd's differentiates the variance and stores twice as much."""
+    """Channel norm with a hand-written backward pass, which stores half as much as that of autograd."""
 
     @staticmethod
     def forward(ctx, x, weight, bias):
@@ -85,9 +85,9 @@ class _Norm(torch.autograd.Function):
 
 
 class NafBlock(nn.Module):
-    """Adds two corrections to its input, one that mixes neighbouring pixels and one that mixes channels.
+    """Network layers that add two corrections to their input: one mixes neighbouring pixels, one mixes channels.
 
-    Both start at 0. The block has 7 c^2 + 33 c parameters for c channels.
+    Before training both corrections are 0. The block has 7 c^2 + 33 c parameters for c channels.
     """
 
     def __init__(self, channels: int) -> None:
@@ -116,13 +116,13 @@ class NafBlock(nn.Module):
 
 
 def support(opacity: torch.Tensor) -> torch.Tensor:
-    """Returns the mask of where smoke may be: within `REACH` to twice `REACH` pixels of smoke in the guide.
+    """Returns the mask of pixels whose planes may differ from 0: within 8 to 16 pixels of smoke in the guiding map.
 
     Args:
-        opacity: [N, 1, H, W] of the guide.
+        opacity: [N, 1, H, W], opacity of the guiding map.
 
     Returns:
-        [N, 1, H, W], 0 or 1, in the opacity's type.
+        [N, 1, H, W], 0 or 1, in the type of `opacity`.
     """
     height, width = opacity.shape[-2:]
     coarse = F.max_pool2d(opacity, REACH, ceil_mode=True)
@@ -133,11 +133,11 @@ def support(opacity: torch.Tensor) -> torch.Tensor:
 class SixWayNetwork(nn.Module):
     """Maps encoded guiding maps to encoded lightmaps, at any resolution.
 
-    Outputs are not clamped, so that there is a gradient everywhere; `decode_lightmaps` clamps them.
+    Outputs are not clamped to their ranges, so that there is a gradient everywhere; `decode_lightmaps` clamps them.
 
     Attributes:
-        groups: The planes of each adapter.
-        names: The planes of all adapters, in order.
+        groups: Names of the planes that each adapter computes.
+        names: Names of the planes of all adapters, in order.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:
@@ -166,7 +166,7 @@ class SixWayNetwork(nn.Module):
             nn.init.zeros_(head.bias)
 
     def features(self, guide: torch.Tensor) -> torch.Tensor:
-        """Returns the U-Net's output, [N, C, H / stem, W / stem], of a guide with sides that `multiple` divides."""
+        """Returns the U-Net's features, [N, C, H / stem, W / stem]; H and W must be multiples of `multiple`."""
         x = F.pixel_unshuffle(guide, self.settings.stem) if self.settings.stem > 1 else guide
         x = x.contiguous(memory_format=torch.channels_last)
         skips = []
@@ -179,13 +179,13 @@ class SixWayNetwork(nn.Module):
         return x
 
     def forward(self, guide: torch.Tensor) -> torch.Tensor:
-        """Predicts the planes.
+        """Predicts encoded lightmaps, opacity and emission.
 
         Args:
-            guide: [N, C, H, W], encoded, of the kind in the settings.
+            guide: [N, C, H, W], encoded guiding maps of the kind that the settings name.
 
         Returns:
-            [N, 8, H, W] in the order of `PLANES`, in the guide's type.
+            [N, 8, H, W] in the order of `PLANES`, in the type of `guide`.
         """
         height, width = guide.shape[-2:]
         multiple = self.settings.multiple
@@ -200,7 +200,7 @@ class SixWayNetwork(nn.Module):
 
 
 def _twice(before: int, after: int) -> nn.Sequential:
-    """Makes two convolutions with ReLU that keep the scale of activations."""
+    """Makes two 3 x 3 convolutions with ReLU, initialised such that activations keep their scale."""
     layers = []
     for inputs in (before, after):
         convolution = nn.Conv2d(inputs, after, 3, padding=1)

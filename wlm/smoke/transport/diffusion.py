@@ -1,8 +1,8 @@
 """Multiple scattering by diffusion: accurate inside thick smoke, and approximate elsewhere.
 
 Deep in smoke light has been scattered so often that it diffuses (Stam 1995, "Multiple scattering as a diffusion
-process"). A coarse grid resolves this light; light that was scattered once, and the extinction along camera rays, keep
-the resolution of the smoke.
+process"). A coarse grid is enough for this light. Light that was scattered once, and the extinction along camera rays,
+are computed at the resolution of the smoke.
 """
 
 import math
@@ -28,7 +28,7 @@ _FADE = 0.25  # distance from the box, in edges of the box, over which diffusion
 
 
 def share_of(light: AnyLight, volume: DensityVolume) -> float:
-    """Returns the weight of diffusion for a light: 1 for a point light in the smoke's box, falling to 0 outside."""
+    """Returns the share of a light's result that diffusion gives: 1 for a point light in the box, 0 far outside."""
     if not isinstance(light, PointLight):
         return 0.0
     place = in_voxels(light, volume)[0]
@@ -37,16 +37,16 @@ def share_of(light: AnyLight, volume: DensityVolume) -> float:
 
 
 class Spreading:
-    """Diffusion of several lights, whose sources are added during a march."""
+    """Computes the diffusion of several lights, which are added one by one when a march has their optical depths."""
 
     def __init__(self, scene: Marching, volume: DensityVolume, lights: Sequence[AnyLight]) -> None:
-        """Averages the smoke to the coarse grid; no light has been added yet."""
+        """Averages the smoke over the cells of the coarse grid; no light has been added yet."""
         self._scene, self._volume, self._lights = scene, volume, tuple(lights)
         self._coarse = CoarseSmoke(volume)
         self._source = torch.zeros(len(lights), *self._coarse.extinction.shape, device=volume.device)
 
     def add(self, number: int, depths: Depths) -> None:
-        """Adds a light: the direct light that each coarse cell extinguishes becomes the source of its diffusion."""
+        """Adds light `number`: the direct light that each coarse cell extinguishes is the source of its diffusion."""
         light, out = self._lights[number], self._source[number]
         if isinstance(light, PointLight):
             place, _, radius = in_voxels(light, self._volume)
@@ -55,15 +55,15 @@ class Spreading:
             self._coarse.lit(self._scene, depths, out)
 
     def render(self, albedos: Sequence[float]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Computes the light that reaches the camera, for lights of irradiance, or intensity, 4 pi.
+        """Computes the light that was scattered more than once and reaches the camera.
 
         Args:
-            albedos: Any number of albedos.
+            albedos: A albedos, any number.
 
         Returns:
-            Light of L lights that was scattered more than once, divided by the squared albedo, for A albedos, float32
-            [2, L, A, H, W]: all light, and its part from thin smoke; and the opacity of thin smoke, float32 [H, W]. See
-            `CoarseSmoke.render`.
+            The light divided by the squared albedo, float32 [2, L, A, H, W], for L lights of irradiance 4 pi (point
+            lights: intensity): all light, and its part from thin smoke. Also the opacity of thin smoke, float32 [H, W];
+            see `CoarseSmoke.render`.
         """
         size = (self._scene.view.height, self._scene.view.width)
         made = torch.empty(2, len(self._lights), len(albedos), *size, device=self._source.device)
@@ -81,12 +81,12 @@ class Spreading:
 
 
 def thrown_by_fire(scene: Marching, volume: DensityVolume, albedos: Sequence[float]) -> torch.Tensor:
-    """Computes the emitted light that hot smoke scatters to a camera, [A, H, W] for A albedos.
+    """Computes the light that hot smoke emits and scatters to a camera, [A, H, W] for A albedos.
 
     Args:
         scene: A march through the smoke.
         volume: The smoke.
-        albedos: One to three albedos.
+        albedos: A albedos, one to three.
     """
     coarse = CoarseSmoke(volume)
     source = coarse.mean(volume.temperature).mul_(4.0 * math.pi * volume.emission * volume.voxel)
@@ -100,7 +100,7 @@ class CoarseSmoke:
     Attributes:
         medium: The smoke at full resolution.
         extinction: float32 tensor [X, Y, Z], mean extinction per voxel of each cell.
-        edges: Edges of a cell in voxels.
+        edges: Edges of a cell along x, y and z in voxels.
     """
 
     def __init__(self, volume: DensityVolume, cells: int = CELLS) -> None:
@@ -112,7 +112,7 @@ class CoarseSmoke:
         self.extinction = self.mean(volume.density).mul_(volume.extinction * volume.voxel)
 
     def mean(self, voxels: torch.Tensor) -> torch.Tensor:
-        """Returns means of voxels over the cells, float32 [X, Y, Z]."""
+        """Returns the mean of a voxel grid over each coarse cell, float32 [X, Y, Z]."""
         mean = voxels.float()
         for count in self._counts:
             # Each product moves its axis to the end, so that after three the order is restored.
@@ -120,14 +120,14 @@ class CoarseSmoke:
         return mean.contiguous()
 
     def spread(self, source: torch.Tensor, albedos: Sequence[float]) -> torch.Tensor:
-        """Solves for the fluence of light that was scattered at least once.
+        """Computes the fluence, the light from all directions, of light that was scattered at least once, by diffusion.
 
         Args:
             source: float32 tensor [L, X, Y, Z], direct light of L lights that each cell extinguishes, per volume.
-            albedos: One to three albedos.
+            albedos: A albedos, one to three.
 
         Returns:
-            float32 tensor [L * A, X, Y, Z], for A albedos; the albedos of each source are adjacent.
+            float32 tensor [L * A, X, Y, Z]: all albedos of the first light, then all of the second, and so on.
         """
         light = torch.empty(len(source) * len(albedos), *self.extinction.shape, device=source.device)
         if not len(light):
@@ -142,11 +142,11 @@ class CoarseSmoke:
 
         Args:
             scene: The march.
-            light: float32 tensor [N, X, Y, Z], fluences.
+            light: float32 tensor [N, X, Y, Z], N fluences from `spread`.
 
         Returns:
-            float32 [2, N, H, W], all light and the light from thin smoke, where a sample is weighted by the
-            transparency that a cell of its density has; and the opacity of thin smoke, float32 [H, W].
+            All light and the light from thin smoke, float32 [2, N, H, W], and the opacity of thin smoke, float32 [H,
+            W]. For thin smoke each sample is weighted by the transparency of a whole cell of its density.
         """
         size = (scene.view.height, scene.view.width)
         out, thin = torch.empty(2, len(light), *size, device=light.device), torch.zeros(size, device=light.device)
@@ -161,13 +161,13 @@ class CoarseSmoke:
         Args:
             scene: A march through the smoke.
             depths: Optical depths to the light, from `scene.reach`.
-            out: float32 tensor [X, Y, Z], written.
+            out: float32 tensor [X, Y, Z] for the result.
         """
         cell = wp.vec3(*self.edges)
         diffusion.stop(scene.medium, depths, cell, scene.march.step, to_warp(out))
 
     def around(self, scene: Marching, place: Sequence[float], radius: float, out: torch.Tensor) -> None:
-        """Adds the direct light of a point light that each cell extinguishes.
+        """Adds to `out` the direct light that each cell extinguishes from a point light.
 
         Args:
             scene: A march through the smoke.
@@ -182,7 +182,7 @@ class CoarseSmoke:
 
 
 def _shares(voxels: int, cells: int, device: torch.device) -> torch.Tensor:
-    """Returns the weight of each voxel in each cell's mean along an axis, [voxels, cells]."""
+    """Returns the weight of each voxel in the mean of each cell along one axis, [voxels, cells]."""
     low = torch.arange(voxels, device=device)[:, None]
     first = torch.arange(cells, device=device) * (voxels / cells)
     over = torch.minimum(low + 1.0, first + voxels / cells) - torch.maximum(low.float(), first)

@@ -1,6 +1,6 @@
-"""Fit of the weights of `orders` to path-traced light of random smoke, cameras and lights, by least squares.
+"""Fits the weights of `transport.orders` to path-traced light of random smoke, cameras and lights, by least squares.
 
-References may be noisy as long as they have no bias: the least squares solution is that of their mean."""
+The traced light may be noisy as long as it has no bias: least squares fits its mean."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -42,10 +42,10 @@ def draw_view(
     """Draws random smoke, a camera and lights, which depend only on the seed and the number.
 
     Args:
-        seed, number: At least 0.
-        pixels: H and W.
+        seed, number: Seed and number of the view, at least 0.
+        pixels: Height and width of the image in pixels.
         lights: Number of lights.
-        cells: Voxels along an edge; None: random, 40 to 64.
+        cells: Number of voxels along an edge of the smoke's box; None: random, 40 to 64.
     """
     random = np.random.default_rng([seed, number])
     extinction = float(np.exp(random.uniform(np.log(_THIN), np.log(_THICK))))
@@ -57,7 +57,7 @@ def draw_view(
 
 
 def draw_lesson(seed: int, number: int, *, lights: int = 4) -> tuple[DensityVolume, Camera, tuple]:
-    """Draws a view for the fit, with more kinds of smoke than `draw_view`; arguments as for `draw_view`."""
+    """Draws smoke, a camera and lights for the fit, like `draw_view` but of more kinds and sizes."""
     random = np.random.default_rng([seed, number])
     extinction = float(np.exp(random.uniform(np.log(_THINNEST), np.log(_THICKEST))))
     n, pixels = int(random.choice(_ALL_SIZES)), int(random.choice(_PIXELS))
@@ -74,7 +74,7 @@ def draw_lesson(seed: int, number: int, *, lights: int = 4) -> tuple[DensityVolu
 
 
 def _any_smoke(random: np.random.Generator, n: int) -> torch.Tensor:
-    """Returns density [n, n, n] of a random kind."""
+    """Returns the density [n, n, n] of smoke of a random kind and seed."""
     seed = int(random.integers(2**31))
     made = make_billows(n, seed=seed) if random.random() < 0.5 else make_plume(n, seed=seed, hot=False)
     return made.density
@@ -83,7 +83,6 @@ def _any_smoke(random: np.random.Generator, n: int) -> torch.Tensor:
 def _seen(
     volume: DensityVolume, random: np.random.Generator, pixels: int, lights: int
 ) -> tuple[DensityVolume, Camera, tuple]:
-    """Returns a volume rotated at random, a random camera, and random lights."""
     density = volume.density.permute(tuple(int(i) for i in random.permutation(3)))
     density = density.flip([axis for axis in range(3) if random.random() < 0.5]).contiguous()
     volume = replace(volume, density=density)
@@ -94,18 +93,18 @@ def _seen(
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """One light of a view: inputs of the prediction, and path-traced light at each of the A `ALBEDOS`, [A, H, W]."""
+    """Data of the fit for one light: inputs of the prediction, and path-traced light [A, H, W] at the A `ALBEDOS`."""
 
     inputs: Inputs
     light: torch.Tensor
 
     def multiple(self) -> torch.Tensor:
-        """Returns R, light scattered more than once divided by the squared albedo, [A, H, W]."""
+        """Returns R of `transport.orders`: light scattered more than once divided by the squared albedo, [A, H, W]."""
         albedo = torch.tensor(ALBEDOS).to(self.light)[:, None, None]
         return (self.light - albedo * self.inputs.single[0]) / albedo**2
 
     def weights(self) -> torch.Tensor:
-        """Returns weights of squared errors of R that approximate errors in sRGB, [A, H, W]."""
+        """Returns the weights, [A, H, W], with which squared errors of `multiple` approximate errors in sRGB."""
         albedo = torch.tensor(ALBEDOS).to(self.light)[:, None, None]
         seen = self.inputs.transparency < 1.0 - _CLEAR
         near = F.avg_pool2d(self.light[None], 3, 1, 1, count_include_pad=False)[0]
@@ -115,11 +114,11 @@ class Lesson:
 def make_lessons(
     view: tuple[DensityVolume, Camera, tuple], *, samples: int, seed: int, device: str = "cpu"
 ) -> list[Lesson]:
-    """Traces a view, a result of `draw_view`, and computes the inputs of each of its lights.
+    """Traces paths for the lights of a view and computes the inputs of the prediction, for one lesson per light.
 
     Args:
-        view: Smoke, camera and directional lights of irradiance 4 pi.
-        samples: Paths per pixel.
+        view: Result of `draw_view`: smoke, camera and directional lights of irradiance 4 pi.
+        samples: Number of paths per pixel.
         seed: Seed of the paths.
         device: "cpu" or "cuda:N".
     """
@@ -133,11 +132,11 @@ def make_lessons(
 
 
 def fit_orders(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) -> OrdersModel:
-    """Fits the weights.
+    """Fits the weights of the prediction to path-traced light and returns them as a model.
 
     Args:
-        lessons: At least one lesson.
-        pixels: Number of random pixels per lesson.
+        lessons: Data of the fit, at least one lesson.
+        pixels: Number of random pixels used of each lesson.
         seed: Seed of these pixels.
     """
     device, size = lessons[0].light.device, FEATURES * MIXES
@@ -174,14 +173,14 @@ def learn(
     device: str = "cpu",
     report: Callable[[int], None] | None = None,
 ) -> OrdersModel:
-    """Draws smoke, traces its light and fits the weights; those that ship with wlm are from 2000 views.
+    """Draws random smoke, traces its light and fits the weights; the weights that ship with wlm are from 2000 views.
 
     Args:
         views: Number of views, with four lights each.
-        samples: Paths per pixel.
+        samples: Number of paths per pixel.
         seed: Seed of the views and their paths.
         device: "cpu" or "cuda:N".
-        report: Called with the number of each view.
+        report: Called with the number of each view, from 0, before it is traced.
     """
     lessons = []
     for number in range(views):
@@ -192,6 +191,6 @@ def learn(
 
 
 def psnr(light: torch.Tensor, reference: torch.Tensor) -> float:
-    """Returns the PSNR in sRGB with a peak of 1, in dB."""
+    """Returns the PSNR in dB of two linear images, computed in sRGB with a peak of 1."""
     error = (to_srgb(light) - to_srgb(reference)).double().square().mean()
     return -10.0 * math.log10(max(float(error), 1e-12))

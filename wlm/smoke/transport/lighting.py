@@ -1,7 +1,7 @@
 """Smoke under lights from any direction and point lights: one march per light, instead of weighted lightmaps.
 
-Six weighted lightmaps have an error for lights between the axes. The same march with its lattice turned towards a light
-has only the error of its step. `wlm.smoke.transport.orders` computes light of all orders from such planes.
+Six weighted lightmaps have an error for lights between their axes. A march whose lattice of optical depths is turned
+towards a light has only the error of its step. `wlm.smoke.transport.orders` adds multiple scattering to these results.
 """
 
 import math
@@ -28,20 +28,20 @@ _CLOSE, _FINEST = 0.1, 0.25  # optical depth per step, and least step in voxels
 
 @dataclass(frozen=True, eq=False)
 class LitSmoke:
-    """Smoke of albedo 1 under each of L lights alone; H x W pixels, linear.
+    """Linear images, H x W pixels, of smoke of albedo 1 under each of L lights alone.
 
     Attributes:
         lights: The lights.
-        planes: float32 tensor [L, H, W], light scattered once, of a light of irradiance 4 pi or a point light of
-            intensity 4 pi.
+        planes: float32 tensor [L, H, W], light scattered once under a light of irradiance 4 pi (point light: of
+            intensity 4 pi).
         opposite: Like `planes`, but under a light from the opposite direction; 0 for a point light.
         transparency: float32 tensor [H, W].
         emission: float32 tensor [H, W]; None: the smoke is cold.
-        depth: float32 tensor [H, W], distance along the ray to the smoke's surface in the world's unit, 0: none.
-        camera: The view.
-        march: Settings of the march.
-        thrown: float32 tensor [H, W, 3], emitted light that the smoke scatters to the camera, before the emission's
-            colour is applied; None: the smoke is cold, or only light scattered once is computed.
+        depth: float32 tensor [H, W], distance along the ray to the smoke's surface in world units; 0: no surface.
+        camera: Camera of the images.
+        march: Settings of the march that computed them.
+        thrown: float32 tensor [H, W, 3], light that the smoke emits and scatters to the camera, not yet multiplied by
+            the colour of the emission; None: the smoke is cold, or this light was not computed.
     """
 
     lights: tuple[AnyLight, ...]
@@ -61,7 +61,7 @@ class LitSmoke:
         background: torch.Tensor | Sequence[float] | None = None,
         ramp: Ramp | None = None,
     ) -> torch.Tensor:
-        """Returns the picture: the light of all lights, scattered once, plus the emission.
+        """Returns the picture of the smoke: light of all lights, scattered once, plus the emission.
 
         Args:
             albedo: R, G, B, share of light that survives a scattering, 0 to 1.
@@ -84,7 +84,7 @@ class LitSmoke:
         background: torch.Tensor | Sequence[float] | None = None,
         ramp: Ramp | None = None,
     ) -> torch.Tensor:
-        """Combines images [L, H, W, 3] of each light, the emission and a background into one picture, as `shade`."""
+        """Adds up images [L, H, W, 3] of L lights, the emission and a background; returns a picture as `shade` does."""
         image = torch.zeros((*self.transparency.shape, 3), dtype=torch.float32, device=planes.device)
         for light, plane in zip(self.lights, planes, strict=True):
             colour = light.irradiance if isinstance(light, Light) else light.intensity
@@ -104,15 +104,16 @@ class LitSmoke:
 
 
 def _add(image: torch.Tensor, planes: torch.Tensor, colour: Sequence[float] | np.ndarray) -> torch.Tensor:
-    """Adds planes [H, W, 3] times a colour, without a copy to the device, which would wait for the device."""
+    """Adds planes [H, W, 3] times a colour to an image, without a copy of the colour to the GPU, which would wait."""
     for channel, value in enumerate(colour):
         image[..., channel].add_(planes[..., channel], alpha=float(value))
     return image
 
 
 def fine_march(volume: DensityVolume, g: float = 0.0) -> March:
-    """Returns a march with an error of about 0.5%: in steps of a voxel or of a tenth of optical depth in the densest
-    smoke, but at least a quarter of a voxel.
+    """Returns settings of a march with an error of about 0.5%.
+
+    Its step is at most a voxel, and at most an optical depth of 0.1 in the densest smoke, but at least 1/4 voxel.
     """
     densest = float(volume.density.max()) * volume.extinction * volume.voxel
     return March(step=min(max(_CLOSE / max(densest, 1e-30), _FINEST), 1.0), jitter=0.0, g=g)
@@ -126,21 +127,21 @@ def light_smoke(
     *,
     shadow: float = 1.0,
 ) -> LitSmoke:
-    """Computes single scattering by a march to each light.
+    """Computes light that was scattered once, by a separate march for each light.
 
     Args:
         volume: The smoke.
         camera: Any camera, outside the smoke or inside.
         lights: Any number of lights.
-        march: Settings of the march; None: `fine_march`.
-        shadow: Extinction on the ways to the lights relative to that along the camera's rays; 1 is physical, a smaller
-            value approximates an octave of multiple scattering.
+        march: Settings of the marches; None: those of `fine_march`.
+        shadow: Factor of the extinction on the ways to the lights; 1 is physical, a smaller value approximates an
+            octave of multiple scattering.
 
     Returns:
         The light on the smoke's device.
 
     Raises:
-        ValueError: A light has no direction, or its colour is wrong.
+        ValueError: A light has a direction of length 0, or a negative or infinite colour.
     """
     march = fine_march(volume) if march is None else march
     with marching(volume, camera, march, shadow) as scene:
@@ -153,7 +154,7 @@ Depths = tuple[depth_lattice.Lattice, wp.array]
 
 @dataclass(frozen=True, eq=False)
 class Marching:
-    """A march through one volume from one view, for any number of lights; bricks with smoke are found only once."""
+    """A prepared march from a camera through a volume, for any number of lights: empty bricks are found only once."""
 
     medium: Medium
     view: View
@@ -161,15 +162,15 @@ class Marching:
     shadow: float
 
     def reach(self, place: Sequence[float], radius: float | None) -> Depths:
-        """Computes optical depths to a light, see `depth_lattice.reach`."""
+        """Computes the optical depths from the smoke to a light; arguments as for `depth_lattice.reach`."""
         return depth_lattice.reach(self.medium, place, radius, self.march)
 
     def light(self, depths: Depths, out: torch.Tensor) -> None:
-        """Computes single scattering, see `marches.light`; `out` is float32 [2, H, W], for a point light [1, H, W]."""
+        """Computes light scattered once into `out`, float32 [1 or 2, H, W]: from the light and the opposite light."""
         marches.light(self.medium, self.view, depths, self.march, self.shadow, to_warp(out))
 
     def unlit(self) -> torch.Tensor:
-        """Returns transparency, emission and depth, [3, H, W]."""
+        """Returns the planes that need no light: transparency, emission and depth, [3, H, W]."""
         size = (len(marches.UNLIT_PLANES), self.view.height, self.view.width)
         out = torch.empty(size, device=wp.device_to_torch(self.medium.density.device))
         marches.unlit(self.medium, self.view, self.march, to_warp(out))
@@ -190,7 +191,7 @@ def light_in(
     lights: Sequence[AnyLight],
     visit: Callable[[int, Depths], None] | None = None,
 ) -> LitSmoke:
-    """Runs `light_smoke` in a prepared march; `visit` gets the index of each light and the optical depths to it."""
+    """Does the work of `light_smoke` in a prepared march; calls `visit` with each light's index and optical depths."""
     planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
     for n, light in enumerate(lights):
         place, _, radius = in_voxels(light, volume)

@@ -18,7 +18,7 @@ class PointLight:
     """A point light, inside the smoke or outside.
 
     Attributes:
-        position: Position in the world.
+        position: Position in world units.
         intensity: R, G, B per solid angle; the irradiance at a distance r is intensity / r^2.
         radius: Distance in the world's unit within which the irradiance is constant. 0: unbounded irradiance, with
             which a path tracer has unbounded noise if the light is inside the smoke.
@@ -32,7 +32,7 @@ class PointLight:
         if np.shape(self.position) != (3,) or not np.isfinite(self.position).all():
             raise ValueError(f"position: expected three finite numbers, got {self.position}")
         if not 0 <= self.radius < math.inf:
-            raise ValueError(f"radius: expected at least 0, got {self.radius}")
+            raise ValueError(f"radius: expected a finite length of at least 0, got {self.radius}")
         checked_colour("intensity", self.intensity)
 
 
@@ -41,10 +41,10 @@ AnyLight = Light | PointLight
 
 
 def sky_lights(radiance: Sequence[float], count: int = 12) -> tuple[Light, ...]:
-    """Returns evenly spread directional lights that approximate a sky of constant radiance all around.
+    """Returns evenly spread directional lights that approximate a sky with the same radiance in all directions.
 
     Args:
-        radiance: R, G, B.
+        radiance: Radiance of the sky, R, G, B.
         count: Number of lights, even and at least 2.
 
     Raises:
@@ -56,7 +56,7 @@ def sky_lights(radiance: Sequence[float], count: int = 12) -> tuple[Light, ...]:
 
 
 def half_sphere(count: int) -> np.ndarray:
-    """Returns directions on a half sphere that are evenly spread together with their opposites, float64 [count, 3]."""
+    """Returns directions, float64 [count, 3], that together with their opposites are evenly spread over the sphere."""
     k = np.arange(count) + 0.5
     height, turn = 1.0 - k / count, np.pi * (1.0 + 5.0**0.5) * k
     across = np.sqrt(1.0 - height**2)
@@ -67,11 +67,11 @@ def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
     """Checks that a colour is three numbers of at least 0 and returns it as float64 [3].
 
     Raises:
-        ValueError: They are something else.
+        ValueError: The colour has a negative number, a number above 1e12, or another shape.
     """
     values = np.asarray(colour, np.float64)
     if values.shape != (3,) or not ((values >= 0) & (values <= _BRIGHTEST)).all():
-        raise ValueError(f"{name}: expected three numbers of 0 to {_BRIGHTEST:g}, got {colour}")
+        raise ValueError(f"{name}: expected three numbers from 0 to {_BRIGHTEST:g}, got {colour}")
     return values
 
 
@@ -79,18 +79,18 @@ def checked_albedo(albedo: Sequence[float]) -> np.ndarray:
     """Checks that an albedo is three numbers from 0 to 1 and returns it as float64 [3].
 
     Raises:
-        ValueError: They are something else.
+        ValueError: The albedo has a number outside 0 to 1, or another shape.
     """
     colour = checked_colour("albedo", albedo)
     if not (colour <= 1).all():
-        raise ValueError(f"albedo: expected three numbers of 0 to 1, got {tuple(albedo)}")
+        raise ValueError(f"albedo: expected three numbers from 0 to 1, got {tuple(albedo)}")
     return colour
 
 
 def in_voxels(light: AnyLight, volume: DensityVolume) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Returns a light in a volume's voxels: direction or position, irradiance over 4 pi, and a point light's radius.
+    """Returns a light in a volume's voxel coordinates: direction or position, irradiance / (4 pi), and radius.
 
-    The irradiance of a point light is given at a distance of one voxel; the radius of a light at infinity is None.
+    The irradiance of a point light is that at a distance of one voxel. The radius of a directional light is None.
 
     Raises:
         ValueError: A direction has length 0, or a colour is not three numbers of at least 0.

@@ -1,13 +1,13 @@
 """Light of all orders of scattering, predicted from light scattered once and from diffusion.
 
-Multiply scattered light diffuses, except at the smoke's edges, where it leaves, and in thin parts. The difference can
-be predicted per pixel from light scattered once, under the light and under an opposite one, from opacity, and from the
-share of light and opacity that comes from thin smoke. R, all light except the first order, is a weighted sum of such
-features. The weights depend on the angle between light and camera and on the smoke's mean depth, and were fitted to
-path-traced light by least squares (`learning`).
+At albedo a all light is a S + a^2 R(a), where S is light scattered once at albedo 1. R is the light scattered more than
+once, divided by a^2.
 
-At albedo a all light is a S + a^2 R(a), where S is light scattered once at albedo 1. Weights are fitted at `ALBEDOS`
-and interpolated linearly in between."""
+Light scattered many times diffuses, except at the smoke's edges, where it leaves, and in thin parts. R is therefore
+predicted per pixel as a weighted sum of features: light from diffusion, light scattered once from the light and from
+the opposite direction, opacity, and the shares of light and opacity from thin smoke. The weights depend on the angle
+between light and camera and on the smoke's mean optical depth. They were fitted to path-traced light by least squares
+(`learning`) at `ALBEDOS`, and are interpolated linearly in between."""
 
 import functools
 import os
@@ -42,16 +42,16 @@ _SHORTEST = 0.25  # voxels; shorter steps do not improve the result
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Inputs of the prediction for L lights of irradiance 4 pi (of a point light: at the smoke's centre).
+    """Inputs of the prediction for L lights, each with irradiance 4 pi (a point light: at the smoke's centre).
 
     Attributes:
-        single: float32 tensor [L, H, W], S, light scattered once.
-        opposite: float32 tensor [L, H, W], the same under lights from the opposite directions.
-        diffused: float32 tensor [L, A, H, W], R by diffusion: light scattered more than once divided by the squared
-            albedo.
+        single: float32 tensor [L, H, W], light scattered once at albedo 1.
+        opposite: float32 tensor [L, H, W], like `single`, but under lights from the opposite directions.
+        diffused: float32 tensor [L, A, H, W], light scattered more than once, computed by diffusion, divided by the
+            squared albedo.
         from_thin: float32 tensor [L, A, H, W], the part of `diffused` from thin smoke.
-        albedos: The A albedos.
-        transparency: float32 tensor [H, W].
+        albedos: The A albedos of `diffused`.
+        transparency: float32 tensor [H, W], transparency of the smoke.
         thin: float32 tensor [H, W], opacity of thin smoke.
         cosines: Cosines of the angles between the directions to the lights and to the camera.
         depth: float32 tensor [1], logarithm of the smoke's mean optical depth along rays, weighted by opacity.
@@ -68,7 +68,7 @@ class Inputs:
     depth: torch.Tensor
 
     def features(self, light: int) -> torch.Tensor:
-        """Returns the features of one light, float32 [A, FEATURES, H, W]."""
+        """Returns the features of one light for the weighted sum, float32 [A, FEATURES, H, W]."""
         size = (len(self.albedos), FEATURES, *self.transparency.shape)
         out = torch.empty(size, device=self.transparency.device)
         of_light = (part[light] for part in (self.single, self.opposite, self.diffused, self.from_thin))
@@ -77,17 +77,17 @@ class Inputs:
         return out
 
     def by_diffusion(self, albedo: float) -> torch.Tensor:
-        """Returns light scattered once plus diffusion at one of the albedos, [L, H, W]."""
+        """Returns all light, [L, H, W], by diffusion without fitted weights, at an albedo that is one of `albedos`."""
         return albedo * self.single + albedo**2 * self.diffused[:, self.albedos.index(albedo)]
 
     def of(self, light: int) -> "Inputs":
-        """Returns the inputs of one light."""
+        """Returns the inputs of the light with index `light` alone."""
         names = ("single", "opposite", "diffused", "from_thin")
         planes = {name: getattr(self, name)[light : light + 1] for name in names}
         return replace(self, **planes, cosines=self.cosines[light : light + 1])
 
     def at(self, albedo: float) -> "Inputs":
-        """Returns the inputs at one of the albedos."""
+        """Returns the inputs at `albedo` alone, which must be one of `albedos`."""
         n = self.albedos.index(albedo)
         planes = {name: getattr(self, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
         return replace(self, **planes, albedos=(albedo,))
@@ -96,8 +96,8 @@ class Inputs:
 def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
     """Returns the settings of the march that computes the inputs of the prediction.
 
-    Its step is 1/130 of the smoke's longest edge, at least a quarter of a voxel. The nodes of its lattice have the same
-    spacing, but at least a voxel, or 1/64 of the edge if that is less.
+    Its step is 1/130 of the smoke's longest edge, but at least a quarter of a voxel. The nodes of its lattice are one
+    step apart, but at least the smaller of a voxel and 1/64 of the edge.
     """
     edge = max(volume.shape)
     step = max(_SHORTEST, edge / _STEPS)
@@ -107,17 +107,17 @@ def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
 def make_inputs(
     volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight], albedos: Sequence[float], march: March
 ) -> tuple[LitSmoke, Inputs]:
-    """Computes single scattering and diffusion; to be called inside `wlm.interop.stream`.
+    """Computes light scattered once and light by diffusion; to be called inside `wlm.interop.stream`.
 
     Args:
         volume: The smoke.
         camera: Any camera.
         lights: Any number of lights.
         albedos: Any number of albedos.
-        march: Settings with g = 0.
+        march: Settings of the march, with g = 0.
 
     Returns:
-        The smoke lit by single scattering, and the inputs of the prediction.
+        Images of the light scattered once, and the inputs of the prediction.
     """
     ways = [aim(light, volume) for light in lights]
     with marching(volume, camera, march) as scene:
@@ -164,16 +164,16 @@ class OrdersModel:
     """Fitted weights of the prediction.
 
     Attributes:
-        weights: float32 tensor [A, MIXES, FEATURES], for each of `ALBEDOS` and each product of powers of the cosine
-            between light and camera and of the depth.
-        known: float32 tensor [2], least and greatest depth in the fit, as in `Inputs`.
+        weights: float32 tensor [A, MIXES, FEATURES]: weights of the features, for each of the A `ALBEDOS` as a
+            polynomial with MIXES terms in the cosine between light and camera and in the depth of `Inputs`.
+        known: float32 tensor [2], smallest and largest depth in the fit.
     """
 
     weights: torch.Tensor
     known: torch.Tensor
 
     def to(self, device: torch.device | str) -> "OrdersModel":
-        """Returns the model on a device; the copy is cached."""
+        """Returns the model with its tensors on a device; the copy is cached."""
         device = torch.device(device)
         if self.weights.device == device:
             return self
@@ -186,7 +186,7 @@ class OrdersModel:
         return {}
 
     def mixes(self, inputs: Inputs) -> torch.Tensor:
-        """Returns the terms of the polynomial in cosine and depth for each light, float32 [L, MIXES]."""
+        """Returns the terms of the weights' polynomial in cosine and depth for each light, float32 [L, MIXES]."""
         out = torch.empty(len(inputs.cosines), MIXES, device=inputs.depth.device)
         depth, known = to_warp(inputs.depth), to_warp(self.known)
         for cosine, row in zip(inputs.cosines, out, strict=True):
@@ -194,10 +194,10 @@ class OrdersModel:
         return out
 
     def light(self, inputs: Inputs, albedo: Sequence[float]) -> torch.Tensor:
-        """Returns light of all orders for each light of irradiance 4 pi, float32 [L, H, W, 3].
+        """Predicts light of all orders of scattering for L lights of irradiance 4 pi, float32 [L, H, W, 3].
 
         Args:
-            inputs: Inputs of the lights at each channel's albedo.
+            inputs: Inputs of the lights; their albedos must include those of all channels.
             albedo: R, G, B, 0 to 1.
         """
         places = [inputs.albedos.index(float(value)) for value in checked_albedo(albedo)]
@@ -220,23 +220,23 @@ class OrdersModel:
             WlmError: The suffix is wrong, or the file cannot be written.
         """
         if Path(path).suffix.lower() != ".npz":
-            raise WlmError(f"{path}: expected a name that ends in .npz")
+            raise WlmError(f"{path}: expected a file name that ends in .npz")
         with atomic_path(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, weights=self.weights.cpu().numpy(), range=self.known.cpu().numpy())
 
 
 def _between(albedo: float) -> tuple[int, float]:
-    """Returns the index in `ALBEDOS` before an albedo and its share of the way to the next; clamped at the ends."""
+    """Returns the index of the last of `ALBEDOS` below an albedo, and the share of the way to the next, 0 to 1."""
     at = min(max(albedo, ALBEDOS[0]), ALBEDOS[-1])
     before = int(np.searchsorted(ALBEDOS, at, side="right").clip(1, len(ALBEDOS) - 1)) - 1
     return before, (at - ALBEDOS[before]) / (ALBEDOS[before + 1] - ALBEDOS[before])
 
 
 def load_orders(path: str | os.PathLike[str] | None = None) -> OrdersModel:
-    """Reads a model that `OrdersModel.save` wrote.
+    """Reads the weights that `OrdersModel.save` wrote.
 
     Args:
-        path: The file; None: the model that ships with wlm.
+        path: The file; None: the weights that ship with wlm.
 
     Raises:
         WlmError: The file is missing, damaged or of another kind.
@@ -248,17 +248,18 @@ def load_orders(path: str | os.PathLike[str] | None = None) -> OrdersModel:
         if array.dtype != np.float32 or array.shape != shape or not np.isfinite(array).all():
             raise WlmError(f"{path}: {name}: expected finite float32 {shape}, found {array.dtype} {array.shape}")
     if not arrays["range"][0] < arrays["range"][1]:
-        raise WlmError(f"{path}: range: expected the least depth before the greatest, found {arrays['range'].tolist()}")
+        raise WlmError(f"{path}: range: expected two increasing numbers, found {arrays['range'].tolist()}")
     return OrdersModel(*(torch.from_numpy(arrays[name]) for name in _SHAPES))
 
 
 @dataclass(frozen=True, eq=False)
 class ScatteredSmoke:
-    """Smoke under lights, with light of all orders.
+    """Images of smoke under L lights, with light of all orders of scattering.
 
     Attributes:
-        lit: Light scattered once.
-        planes: float32 tensor [L, H, W, 3], light of all orders for each light of irradiance or intensity 4 pi.
+        lit: Images with light scattered once.
+        planes: float32 tensor [L, H, W, 3], light of all orders under each light of irradiance 4 pi (point light: of
+            intensity 4 pi).
     """
 
     lit: LitSmoke
@@ -288,13 +289,13 @@ def scatter(
         lights: Any number of lights, which are predicted separately: point lights in the smoke's box by diffusion
             alone, point lights far outside as if their rays were parallel.
         albedo: R, G, B, share of light that survives a scattering, 0 to 1.
-        march: Settings; None: `orders_march`. With g other than 0, light scattered once has this phase function, and
+        march: Settings; None: those of `orders_march`. If g is not 0, light scattered once has its phase function, and
             multiple scattering is that of isotropic smoke whose extinction is reduced by the share g^2 of light that is
             not deflected (delta-Eddington: Joseph, Wiscombe and Weinman 1976); the error grows with |g|.
         model: The weights; None: those that ship with wlm.
 
     Raises:
-        ValueError: The albedo is wrong.
+        ValueError: The albedo is not three numbers from 0 to 1.
         WlmError: The weights that ship with wlm cannot be read.
     """
     colour = checked_albedo(albedo)

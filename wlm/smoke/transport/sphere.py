@@ -34,7 +34,7 @@ def bake_sphere(
         volume: The smoke.
         camera: Orthographic.
         lights: Number of directions of the fit, even and at least 12.
-        march: March to each light; None: in steps of a voxel without jitter, or `orders_march` for light of all orders.
+        march: Settings of the marches; None: steps of a voxel without jitter, or `orders_march` if there is an albedo.
         albedo: None: light scattered once, of albedo 1, as in other lightmaps. A number of 0 to 1: light of all orders
             at this albedo, predicted by `scatter`.
 
@@ -45,7 +45,7 @@ def bake_sphere(
         ValueError: The camera is in perspective, or the number of lights or the albedo is wrong.
     """
     if camera.perspective:
-        raise ValueError("camera: expected an orthographic one for six-way lightmaps")
+        raise ValueError("camera: expected an orthographic camera for six-way lightmaps, got a perspective camera")
     if lights < 12 or lights % 2:
         raise ValueError(f"lights: expected an even number of at least 12, got {lights}")
     if march is None:
@@ -72,7 +72,7 @@ def _sums(weigh: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
 
 
 def _not_negative(gram: torch.Tensor, sums: torch.Tensor) -> torch.Tensor:
-    """Solves non-negative least squares from normal equations [6, 6] and [6, H, W] by accelerated descent."""
+    """Solves non-negative least squares per pixel, with normal equations [6, 6] and right-hand sides [6, H, W]."""
     step = 1.0 / float(torch.linalg.eigvalsh(gram.double())[-1])
     right = sums.flatten(1)
     maps = torch.linalg.solve(gram, right).clamp(min=0.0)

@@ -31,19 +31,19 @@ _DENSEST = 1e4  # largest optical depth of a voxel; in denser smoke paths would 
 
 @dataclass(frozen=True, eq=False)
 class Transport:
-    """Light that smoke sends to a camera; H x W pixels, S sources, linear.
+    """Linear light that smoke sends to a camera with H x W pixels, from S light sources separately.
 
     Attributes:
         planes: float32 tensor [S, orders + 2, H, W, 3]: for each source the light that was scattered 0, 1, ... `orders`
             times, and last the light that was scattered more often. If the albedo is multiplied by a, the light of
             order n is multiplied by a^n.
         sources: Names of the sources: "light 1" and so on, "sky" and "emission".
-        noise: float32 tensor [S, H, W, 3], standard error of each source's sum over its planes.
-        total_noise: float32 tensor [H, W, 3], standard error of `total`; since sources share paths, it exceeds the root
-            of the sum of squares of `noise`.
-        albedo: R, G, B.
-        camera: The view.
-        samples: Paths per pixel.
+        noise: float32 tensor [S, H, W, 3], standard error of the sum of all planes of each source.
+        total_noise: float32 tensor [H, W, 3], standard error of `total`, larger than for sources with independent
+            paths, since sources share their paths.
+        albedo: Albedo of the smoke, R, G, B.
+        camera: Camera of the images.
+        samples: Number of paths per pixel.
     """
 
     planes: torch.Tensor
@@ -91,16 +91,16 @@ def trace(
     Args:
         volume: The smoke; emission of hot smoke is a light source too.
         camera: Any camera, outside the smoke or inside. Paths go through pixel centres, like rays of a march.
-        lights: Any number of lights; their `visibility` is not used.
+        lights: Any number of lights.
         sky: R, G, B, radiance from all directions, also visible behind the smoke; None: black.
         albedo: R, G, B, share of light that survives a scattering, 0 to 1.
         g: Mean cosine of the Henyey-Greenstein phase function, between -1 and 1.
-        samples: Paths per pixel, at least 1. The noise of a single path is unknown and given as infinite.
+        samples: Number of paths per pixel, at least 1. With 1 the noise is unknown and returned as infinite.
         orders: Number of orders of scattering with separate planes.
-        highest: Scatterings after which a path ends; 1 is single scattering.
+        highest: Number of scatterings after which a path ends; 1 is single scattering.
         obstacles: Corners [V, 3] in the world and triangles [F, 3] that absorb all light; None: none.
         seed: An integer of at least 0; the same seed gives the same result on one kind of device.
-        progress: Called during the work.
+        progress: Called after each of up to 16 parts of the paths.
 
     Returns:
         The light on the smoke's device.
@@ -110,7 +110,7 @@ def trace(
         WlmError: The smoke is too dense, or the planes do not fit into the memory.
     """
     if not -1 < g < 1:
-        raise ValueError(f"g: expected a number within -1 and 1, got {g}")
+        raise ValueError(f"g: expected a number between -1 and 1, got {g}")
     for name, value, least in (
         ("samples", samples, 1),
         ("orders", orders, 0),
@@ -125,7 +125,7 @@ def trace(
         medium = medium_of(volume)
         densest = float(volume.density.max()) * medium.extinction
         if not densest <= _DENSEST:
-            raise WlmError(f"expected voxels of an optical depth of at most {_DENSEST:g}, found one of {densest:.4g}")
+            raise WlmError(f"smoke: expected optical depths of at most {_DENSEST:g} per voxel, found {densest:.4g}")
         majorants = path.bounds(medium, densest)
         lamps = path.make_lights([in_voxels(light, volume) for light in lights])
         lamps = wp.array(lamps, dtype=path.PathLight, device=device)
@@ -165,19 +165,19 @@ def trace(
 
 
 def _require(planes: int, sources: int, view: View, parts: int, at_once: int, device: str) -> None:
-    """Checks that the planes fit into the memory before a path is traced."""
+    """Checks before the tracing that the planes fit into the free memory; raises a WlmError otherwise."""
     # The traced parts, their sum, the selected planes and their sums; the means and their spread.
     needed = 12 * view.height * view.width * (planes * (at_once + 3) + 3 * sources * parts)
     free = free_memory(wp.get_device(device))
     if needed > free:
         raise WlmError(
-            f"orders: {planes} planes of {view.height} x {view.width} pixels need {needed / 2**30:.1f} GiB on {device}:"
-            f" expected at most the {free / 2**30:.1f} GiB that are free: use fewer orders or pixels"
+            f"orders: {planes} planes of {view.height} x {view.width} pixels need {needed / 2**30:.1f} GiB on {device},"
+            f" but only {free / 2**30:.1f} GiB are free: use fewer orders or pixels"
         )
 
 
 def _noise(means: torch.Tensor, samples: int) -> torch.Tensor:
-    """Returns the standard error [...] of the sum of the P parts [P, ...] into which the samples are divided."""
+    """Returns the standard error [...] of the sum of P images [P, ...], each from a part of the samples."""
     parts = len(means)
     if parts == 1:
         return torch.full_like(means[0], math.inf)
@@ -190,9 +190,9 @@ def _noise(means: torch.Tensor, samples: int) -> torch.Tensor:
 def _mesh(obstacles: tuple[np.ndarray, np.ndarray], volume: DensityVolume, device: str) -> wp.Mesh:
     corners, triangles = (np.asarray(part) for part in obstacles)
     if corners.ndim != 2 or corners.shape[1] != 3 or not np.isfinite(corners).all():
-        raise ValueError(f"obstacles: expected finite corners [V, 3], got {corners.shape}")
+        raise ValueError(f"obstacles: expected corners [V, 3] of finite numbers, got shape {corners.shape}")
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.min() < 0 or triangles.max() >= len(corners):
-        raise ValueError(f"obstacles: expected triangles [F, 3] of {len(corners)} corners, got {triangles.shape}")
+        raise ValueError(f"obstacles: expected triangles [F, 3], indices below {len(corners)}, got {triangles.shape}")
     points = (corners - np.asarray(volume.origin)) / volume.voxel
     return wp.Mesh(
         wp.array(points.astype(np.float32), dtype=wp.vec3, device=device),
