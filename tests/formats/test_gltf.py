@@ -212,7 +212,7 @@ WRONG = [
     (["accessors", 0, "byteOffset", 4], "accessors[0]: needs 64 bytes"),
     (["accessors", 0, "componentType", 5124], "accessors[0]: expected a componentType"),
     (["accessors", 0, "bufferView", 5], "bufferViews[5]: the file has 3 bufferViews"),
-    (["accessors", 1, "count", 4], "TEXCOORD_0: expected 5, like POSITION, found 4"),
+    (["accessors", 1, "count", 4], "TEXCOORD_0: expected 5 UVs, like POSITION, found 4"),
     (["accessors", 2, "count", 5], "expected three corners per triangle, found 5"),
     (["accessors", 2, "componentType", 5122], "indices: expected unsigned integers"),
     (["accessors", 0, "sparse", {"count": 1}], "malformed glTF: the field 'indices' is missing"),

@@ -51,7 +51,7 @@ _Lights = Annotated[
     ),
 ]
 _Mask = Annotated[
-    Path | None, typer.Option(metavar="PNG", help="Mask: texels in charts are not black; default from the triangles.")
+    Path | None, typer.Option(metavar="PNG", help="PNG, not black where charts are; default from the triangles.")
 ]
 _UvSet = Annotated[
     int | None, typer.Option("--uv-set", min=0, help="The lightmap UVs are TEXCOORD_n; default 1 if present, else 0.")
@@ -60,7 +60,7 @@ _Node = Annotated[str | None, typer.Option(help="Node that the lightmap belongs 
 _Encoding = Annotated[str | None, typer.Option(help="Encoding of a PNG: linear, srgb, rgbm, dldr or rgbe.")]
 _Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is at v = 1 instead of v = 0.")]
 _Views = Annotated[
-    int | None, typer.Option(min=1, max=4096, help=f"Number of cameras outside, and again inside; default {_VIEWS}.")
+    int | None, typer.Option(min=1, max=4096, help=f"Cameras outside the scene, and as many inside; default {_VIEWS}.")
 ]
 _Resolution = Annotated[
     int | None, typer.Option(min=16, max=16384, help=f"Edge of a square view in pixels; default {_RESOLUTION}.")
@@ -148,7 +148,7 @@ def decode(
     state: Annotated[float, typer.Option(min=0.0, help="Number of the state; a fraction mixes two states.")] = 0.0,
     view: Annotated[
         int | None,
-        typer.Option(min=0, help="Draw the scene from this camera, counted from 0, outside ones first."),
+        typer.Option(min=0, help="Draw the view of this camera of wlm evaluate, counted from 0."),
     ] = None,
     views: _Views = None,
     resolution: _Resolution = None,

@@ -31,7 +31,7 @@ Trust = Annotated[
     bool,
     typer.Option("--trust", help="Trust the input file: it may name files in other folders and have any size."),
 ]
-Profile = Annotated[str, typer.Option(metavar="NAME|FILE.yaml", help="Named settings (a profile), or a YAML file.")]
+Profile = Annotated[str, typer.Option(metavar="NAME|FILE.yaml", help="Name of a settings profile, or a YAML file.")]
 Engine = Annotated[
     Literal["three", "godot", "unity", "unreal"] | None,
     typer.Option(help="Write a kit for this engine. Default: textures, buffers and a shader for any program."),

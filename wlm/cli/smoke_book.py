@@ -128,7 +128,7 @@ def flipbook(
     mips: Annotated[
         int | None,
         typer.Option(
-            min=1, max=6, help="Mip levels that padding keeps apart from other frames; default: 1 pixel, in files 0."
+            min=1, max=6, help="Mip levels without bleeding between frames; default: 1 pixel of padding, 0 in files."
         ),
     ] = None,
     motion: Annotated[

@@ -158,7 +158,7 @@ def check_white(white: float) -> None:
 def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str, *others: str) -> Callable[[int], Path]:
     """Checks the output and returns a function that gives the path of the file for a frame number.
 
-    With `single` the output is a file with one of the suffixes, otherwise a folder of files STEM_NUMBER and `suffix`.
+    With `single` the output is a file with one of the suffixes, otherwise a folder of files such as light_0001.png.
     """
     from wlm.smoke.data import NumberedFiles
 

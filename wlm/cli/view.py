@@ -51,7 +51,7 @@ def view(
     ] = None,
     up: Up = "y",
     rate: Annotated[float, typer.Option(help="Frames per second of an animation or of smoke.")] = 24.0,
-    frames: Annotated[int | None, typer.Option(help="Number of pictures; default all frames, else 48.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of pictures; default 48, or all frames of smoke.")] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the window in pixels.")] = "1280x720",
     screenshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write a picture; needs no display.")
@@ -60,7 +60,7 @@ def view(
         Path | None, typer.Option(metavar="OUT.gif", help="Write an animation, .gif or .webp; needs no display.")
     ] = None,
 ) -> None:
-    """Show lightmaps, probes or smoke in a window; with --original beside the original and the error."""
+    """Show lightmaps, probes or smoke in a window; with --original, beside the original and the error."""
     pixels = _size(size)
     values = _values(sliders or ())
     if not 0 < rate <= 1000:

@@ -198,7 +198,7 @@ def _number(bits: np.ndarray) -> np.ndarray:
 
 
 def _shares(bits: np.ndarray, at: int, count: int, anchors: np.ndarray) -> np.ndarray:
-    """Returns the interpolation weights of n blocks, [n, 16]. Their indices, of `count` bits, begin at bit `at`."""
+    """Returns the interpolation weights of n blocks, [n, 16], whose indices of `count` bits begin at bit `at`."""
     texel = np.arange(16)
     short = (texel == 0) | (texel == anchors[:, :1]) | (texel == anchors[:, 1:])
     start = at + count * texel - (np.cumsum(short, axis=1) - short)

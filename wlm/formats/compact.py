@@ -60,7 +60,7 @@ def parse_compact(where: object, mapped: bytes | memoryview) -> tuple[str, int, 
     version, number = (begin[3] & 15, begin[3] >> 4) if len(begin) == 4 else (_VERSION, 0)
     if version != _VERSION or number >= len(SYSTEMS):
         raise WlmError(
-            f"{where}: artifact version {version} of system {number}: expected version {_VERSION}, below {len(SYSTEMS)}"
+            f"{where}: expected artifact version {_VERSION} of {' or '.join(SYSTEMS)}, found {version}, system {number}"
         )
     if len(view) < _START:
         raise WlmError(f"{where}: the artifact is cut short: expected {_START} bytes, found {len(view)}")

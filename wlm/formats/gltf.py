@@ -308,7 +308,7 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
             local = _floats(document, attributes["NORMAL"], "VEC3")
             if len(local) <= each.row.max():
                 raise WlmError(
-                    f"{document.path}: {each.name}: NORMAL: expected at least {each.row.max() + 1}, found {len(local)}"
+                    f"{document.path}: {each.name}: expected {each.row.max() + 1} normals or more, found {len(local)}"
                 )
             # Normals transform by the cofactor matrix: the inverse transpose times the determinant. It exists for a
             # scale of 0, too.
@@ -405,7 +405,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
             for number, name in sorted(sets.items()):
                 values = floats(attributes[name], "VEC2")
                 if len(values) != len(local):
-                    raise WlmError(f"{where}: {name}: expected {len(local)}, like POSITION, found {len(values)}")
+                    raise WlmError(f"{where}: {name}: expected {len(local)} UVs, like POSITION, found {len(values)}")
                 uv[number] = values[row]
             primitives.append(
                 GltfPrimitive(

@@ -124,7 +124,7 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
     """Reads the meshes that use a bake's lightmaps, and their rectangles.
 
     Raises:
-        WlmError: The file is missing, is not a bake, is damaged, or has other values than such meshes.
+        WlmError: The file is missing, is not a bake, is damaged, or its list of meshes has values of other types.
     """
     reader = _reader(path)
     names, external = _open(reader)

@@ -109,7 +109,7 @@ def write_ktx2(
     if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
         raise ValueError(f"expected a width and a height of 1 to {_MAX_SIDE} texels, got {width}x{height}")
     if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in _CHANNELS):
-        raise ValueError(f"depth: expected 0 to {_MAX_DEPTH}, or 0 for a format of blocks, got {depth} for {fmt}")
+        raise ValueError(f"depth: expected 0 to {_MAX_DEPTH}, and 0 for a format of blocks, got {depth} for {fmt}")
     most = 0 if depth else max(width, height).bit_length() - 1
     if not 0 <= mips <= most:
         raise ValueError(f"mips: expected 0 to {most}, got {mips}")

@@ -113,5 +113,5 @@ def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure:
     """
     if large > max(sure, growth * small):
         raise WlmError(
-            f"{where}: expected at most {growth} times its {small} compressed bytes, found a full size of {large}"
+            f"{where}: expected at most {growth} times its {small} compressed bytes, found {large} unpacked bytes"
         )

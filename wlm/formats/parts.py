@@ -16,7 +16,7 @@ _PIECE = 1 << 20  # numbers checked at once, which bounds the memory of masks
 
 @dataclass(frozen=True)
 class Part:
-    """The requirements for one part: an array of a file.
+    """The requirements for one array of a file, called a part.
 
     Attributes:
         dtype: NumPy type, or the allowed types.
