@@ -45,7 +45,7 @@ def read_npz(
     # A malicious file can make zipfile and NumPy raise nearly any exception: NumPy parses the header as Python.
     with damaged(f"{path}: cannot read the arrays", Exception), open_file(path, "the arrays") as file:
         if os.fstat(file.fileno()).st_size > VOLUME_BYTES:
-            raise WlmError(f"{path}: cannot read the arrays: expected at most {VOLUME_BYTES} bytes")
+            raise WlmError(f"{path}: cannot read the arrays: expected a file of at most {VOLUME_BYTES} bytes")
         if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
             raise WlmError(f"{path}: expected a .npz file, which names its arrays, found a .npy file of one array")
         with zipfile.ZipFile(file) as archive:
