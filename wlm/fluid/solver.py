@@ -236,8 +236,8 @@ class Solver:
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
             raise ValueError(
-                f"steps: in a CUDA graph, expected multiples of {self.period} in it and before it (at least one), "
-                f"substeps a multiple of {self.lattice.period}, and obstacles at rest, got {steps} after {self._done}"
+                f"steps: expected a multiple of {self.period} in a CUDA graph and before it, at least one before it, "
+                f"substeps a multiple of {self.lattice.period}, and obstacles at rest; got {steps} after {self._done}"
             )
         for _ in range(steps):
             if not capturing:
