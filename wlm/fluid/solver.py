@@ -171,7 +171,7 @@ class Solver:
         self._decay = (math.exp(-dissipation * substeps), math.exp(-cooling * substeps))
         if storage == "float16" and any(0.0 < 1.0 - factor < LEAST_HALF_LOSS for factor in self._decay):
             least = f"0, or a loss of at least {LEAST_HALF_LOSS:.2g} of the value per solver step"
-            raise ValueError(f"dissipation, cooling: with storage float16 expected {least}, got less")
+            raise ValueError(f"dissipation, cooling: with float16 expected {least}, got less")
         if len(obstacles) > 255:
             raise ValueError(f"obstacles: expected at most 255, got {len(obstacles)}")
         if not temperature and (cooling or (buoyancy and buoyancy.lift) or any(s.temperature for s in sources)):
