@@ -253,4 +253,4 @@ def test_a_batch_with_a_number_that_is_none(path):
     for number in ("9" * 5000, "٣", "-1", ""):
         tensors = {f"running.{number}.loss": np.zeros(1, np.float32)}
         write_artifact(path, artifact.system, artifact.settings, tensors, artifact.source)
-        refused(KEPT["lightmap-running"](), path, "expected one of a finished or a running batch")
+        refused(KEPT["lightmap-running"](), path, "is of neither a finished nor a running batch")

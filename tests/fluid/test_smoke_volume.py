@@ -230,7 +230,7 @@ def test_wrong_files(tmp_path: Path):
         ("a.abc", "expected a name that ends in .npz, .nvdb, .vdb, found .abc"),
         ("a.npz", "No such file"),
         ("b.npz", "cannot read the arrays"),
-        ("c.npz", "expected a .npz file of several arrays"),
+        ("c.npz", "expected a .npz file, which names its arrays"),
     ):
         with pytest.raises(WlmError, match=message):
             load_volume(tmp_path / name)
