@@ -254,8 +254,8 @@ class Lattice:
         engine = self._engine
         if self.device.is_cuda and self.device.is_capturing:
             if not self._begun or steps % PERIOD or engine.done % PERIOD:
-                found = f"got {steps} after {engine.done}"
-                raise ValueError(f"steps: in a CUDA graph, expected multiples of {PERIOD} in it and before it, {found}")
+                found = f"got {steps} in it and {engine.done} before it"
+                raise ValueError(f"steps: expected a multiple of {PERIOD} in a CUDA graph and before it, {found}")
             engine.run(steps)
             return
         self._prepare()

@@ -84,7 +84,7 @@ class Trajectory:
 
     @property
     def moves(self) -> bool:
-        """Whether the positions differ."""
+        """Whether an obstacle on this path moves, that is whether the positions differ."""
         return bool((self.positions != self.positions[0]).any())
 
     def at(self, time: float) -> np.ndarray:

@@ -171,7 +171,7 @@ class Solver:
         self._decay = (math.exp(-dissipation * substeps), math.exp(-cooling * substeps))
         if storage == "float16" and any(0.0 < 1.0 - factor < LEAST_HALF_LOSS for factor in self._decay):
             least = f"0, or a loss of at least {LEAST_HALF_LOSS:.2g} of the value per solver step"
-            raise ValueError(f"dissipation, cooling: with storage float16 expected {least}, got less")
+            raise ValueError(f"dissipation, cooling: with float16 expected {least}, got less")
         if len(obstacles) > 255:
             raise ValueError(f"obstacles: expected at most 255, got {len(obstacles)}")
         if not temperature and (cooling or (buoyancy and buoyancy.lift) or any(s.temperature for s in sources)):
@@ -236,8 +236,8 @@ class Solver:
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
             raise ValueError(
-                f"steps: in a CUDA graph, expected multiples of {self.period} in it and before it (at least one), "
-                f"substeps a multiple of {self.lattice.period}, and obstacles at rest, got {steps} after {self._done}"
+                f"steps: expected a multiple of {self.period} in a CUDA graph and before it, at least one before it, "
+                f"substeps a multiple of {self.lattice.period}, and obstacles at rest; got {steps} after {self._done}"
             )
         for _ in range(steps):
             if not capturing:
