@@ -107,7 +107,7 @@ def test_nanovdb_that_claims_too_much(tmp_path: Path):
         (tiles, "its root claims 1073741824 tiles"),
         (far, "expected a box of at most"),
         (old, "expected version 32 of NanoVDB's grids, found 28"),
-        (nvdb_file(bomb * 50, codec=1, size=len(whole)), "once unpacked, found another number"),
+        (nvdb_file(bomb * 50, codec=1, size=len(whole)), "after decompression, found another number"),
         (nvdb_file(whole, codec=9), "expected a codec from 0 to 2, found 9"),
         (raw_grid(smoke(), "float")[:632] + struct.pack("<2I", 2, 6) + whole[640:], r"found density \(vec3f\): export"),
     ):

@@ -260,7 +260,10 @@ BARE = [{"primitives": [{"attributes": {"POSITION": 0}}]}]
         ({"buffers": [{"byteLength": 60, "uri": "../" * 9 + "dev/zero"}]}, "buffers[0].uri: expected a file within"),
         ({"buffers": [{"byteLength": 60, "uri": "pipe"}]}, "expected a file, found a folder, a device or a pipe"),
         ({"buffers": [{"byteLength": 61, "uri": "in.bin"}]}, "expected 61 bytes, found 60"),
-        ({"buffers": [{"byteLength": 60, "uri": f"{'./' * i}in.bin"} for i in range(99)]}, "a file other than that of"),
+        (
+            {"buffers": [{"byteLength": 60, "uri": f"{'./' * i}in.bin"} for i in range(99)]},
+            "expected another file, since buffers[0] already names",
+        ),
         ({"buffers": [{"byteLength": 60, "uri": "\ud800"}]}, "a.gltf: "),
         (
             {
@@ -474,7 +477,7 @@ def test_a_grid_whose_box_is_far_larger_than_what_it_stores(tmp_path):
     path = write(tmp_path / "a.nvdb", gzip.decompress((FILES / "bbox-700.nvdb.gz").read_bytes()))
     with little_memory():
         message = refused(load_volume, path)
-    assert "expected a box of at most 20623360 voxels from a grid of 322240 bytes" in message
+    assert "expected a box of at most 20623360 voxels, found [[0, 0, 0], [699, 699, 699]]" in message
 
 
 def test_a_compressed_grid_that_unpacks_to_far_more(tmp_path):
@@ -483,6 +486,7 @@ def test_a_compressed_grid_that_unpacks_to_far_more(tmp_path):
     header = struct.pack("<QIHH", 0x304244566F6E614E, 32 << 21, 1, 1)
     grid = bytearray(176)
     struct.pack_into("<2Q", grid, 0, 200 << 20, 200 * len(body))
+    struct.pack_into("<I", grid, 32, 1)  # a grid of floats
     struct.pack_into("<I", grid, 136, 1)  # of the name, which is empty
     path = write(tmp_path / "a.nvdb", header + grid + b"\0" + 200 * body)
     with little_memory():

@@ -175,8 +175,14 @@ def test_scaling_keeps_one_cell(tmp_path):
         ({"obstacles": [SPHERE | {"path": [[0, 0, 0, 0], [0, 1, 1, 1]]}]}, "0.path: expected times that increase"),
         ({"obstacles": [SPHERE | {"shape": "box"}]}, "obstacles.0.radius: expected one number for a sphere, three"),
         ({"inlets": [{"face": "up", "velocity": [0, 1, 0]}]}, "inlets.0.face"),
-        ({"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]}, "inlets.0.velocity: expected a velocity that points into"),
-        ({"inlets": [{"face": "-x", "velocity": [0, 1, 0]}]}, "inlets.0.velocity: expected a velocity that points into"),
+        (
+            {"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]},
+            "inlets.0.velocity: expected a velocity that points into",
+        ),
+        (
+            {"inlets": [{"face": "-x", "velocity": [0, 1, 0]}]},
+            "inlets.0.velocity: expected a velocity that points into",
+        ),
         ({"grid": {"cells": [4, 4, 4], "cell": 1, "faces": dict.fromkeys(FACES, "wall")}}, "expected an open face"),
         (
             {"grid": {"cells": [4, 4, 4], "cell": 1, "faces": {"-y": "periodic", "+y": "periodic"}}},

@@ -1,9 +1,9 @@
-"""Grids of a file: which of them is the smoke, and all on one lattice of cubic voxels along the axes.
+"""Chooses the grids of smoke in a file, and brings them to one lattice of cubic voxels along the axes.
 
-A grid has a map from its voxels to the world. A grid whose voxels are cubes along the axes, in any order and direction,
-is only permuted and flipped. Other grids, with longer, rotated or sheared voxels, are resampled: linearly between the
-centres of their voxels, at cubic voxels of their shortest edge. The box then grows by the voxels that the interpolated
-smoke reaches.
+A grid has a transform from its voxels to the world. A grid whose voxels are cubes along the world's axes, in any order
+and direction, is only permuted and flipped. All other grids, with oblong, rotated or sheared voxels, are resampled
+trilinearly at cubic voxels, whose edge is the shortest edge of the grid's voxels. The box then grows by the voxels that
+the interpolated smoke reaches.
 """
 
 import math
@@ -34,12 +34,12 @@ _APART = 1e-4  # offset in voxels up to which the voxels of two grids coincide
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A grid over the box of its active voxels.
+    """The values of a file's grid in the box of its active voxels.
 
     Attributes:
-        name: Name in messages.
+        name: Name in error messages.
         values: float32 tensor [X, Y, Z].
-        matrix: float64 [4, 4], from the indices of voxel centres, 0 for the first of the box, to the world.
+        matrix: float64 [4, 4], transform of an index of `values` to the centre of this voxel in the world.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cubic voxels along the axes.
+    """A grid of cubic voxels along the world's axes.
 
     Attributes:
         voxel: Edge of a voxel, in the world's unit.
@@ -129,16 +129,15 @@ def is_level_set(grid: VdbGrid, group: str) -> bool:
 
 
 def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lattice, list[torch.Tensor]]:
-    """Puts grids on one lattice of at most `most` voxels, aligned with the first grid, over the bounding box of all
-    grids.
+    """Brings grids to one lattice, which covers all of them and has the voxels of the first grid, if these are cubic.
 
-    `up` is "x", "y" or "z", the axis of the grids' world that becomes +y.
+    `most` is the largest number of voxels; `up` is "x", "y" or "z", the axis of the grids' world that becomes +y.
 
     Returns:
         The lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
 
     Raises:
-        WlmError: A map has no volume, or the lattice has too many voxels.
+        WlmError: A grid's transform cannot be inverted, or the lattice has too many voxels.
     """
     turned = [(grid, _turned(grid, up)) for grid in grids]
     first, matrix = turned[0]
@@ -149,13 +148,13 @@ def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lat
     ends = [_ends(grid, matrix, 0.0 if same else 0.5) for (grid, matrix), same in zip(turned, kept, strict=True)]
     farthest = float(np.abs(ends).max()) / voxel
     if not farthest <= _FARTHEST:
-        raise WlmError(f"{first.name}: expected a box within {_FARTHEST} voxels of the origin, found {farthest:.4g}")
+        raise WlmError(f"{first.name}: expected voxel coordinates up to {_FARTHEST}, found {farthest:.4g}")
     low = np.floor(np.min([(begin - corner) / voxel for begin, _ in ends], axis=0) + _APART)
     high = np.ceil(np.max([(end - corner) / voxel for _, end in ends], axis=0) - _APART)
     size = [max(int(n), 1) for n in high - low]
     if math.prod(size) > most:
         raise WlmError(
-            f"{first.name}: expected at most {most} cubic voxels of the grid's shortest edge, {voxel:.4g}, "
+            f"{first.name}: expected at most {most} cubic voxels with the grid's shortest edge, {voxel:.4g}, "
             f"found {' x '.join(map(str, size))}"
         )
     lattice = Lattice(voxel, tuple(map(float, corner + low * voxel)), tuple(size))
@@ -163,7 +162,7 @@ def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lat
 
 
 def _turned(grid: Grid, up: str) -> np.ndarray:
-    """Returns the map from the corners of a grid's voxels, instead of their centres, to the rotated world, [4, 4]."""
+    """Returns the transform [4, 4] of the corners of a grid's voxels to the world in which +y is up."""
     matrix = np.eye(4)
     matrix[:3, :3] = UPS[up]
     matrix = matrix @ grid.matrix
@@ -171,25 +170,24 @@ def _turned(grid: Grid, up: str) -> np.ndarray:
     edges = np.linalg.norm(matrix[:3, :3], axis=0)
     # Edges are scaled to length 1, so that the test does not depend on the size of a voxel.
     if not (np.isfinite(edges).all() and edges.all() and abs(np.linalg.det(matrix[:3, :3] / edges)) > _FLAT):
-        raise WlmError(f"{grid.name}: expected a map to the world that keeps a volume, found {grid.matrix.tolist()}")
+        raise WlmError(f"{grid.name}: expected an invertible transform to the world, found {grid.matrix.tolist()}")
     return matrix
 
 
 def _ends(grid: Grid, matrix: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the low and the high corner in the world, [3] each, of a grid's box enlarged by `margin` voxels."""
     box = np.stack(np.meshgrid(*[(-margin, n + margin) for n in grid.values.shape], indexing="ij"), -1).reshape(8, 3)
     corners = box @ matrix[:3, :3].T + matrix[:3, 3]
     return corners.min(0), corners.max(0)
 
 
 def _between(voxel: float, origin: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the map from corners of a lattice's voxels to those of a grid: linear part [3, 3] and shift [3]."""
+    """Returns the matrix [3, 3] and shift [3] that map corners of a lattice's voxels to corners of a grid's voxels."""
     turn = np.linalg.inv(matrix[:3, :3])
     return turn * voxel, turn @ (origin - matrix[:3, 3])
 
 
 def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Whether each voxel of the lattice is a voxel of the grid."""
+    """Returns whether a transform of `_between` maps voxels exactly to voxels, so that no resampling is needed."""
     turn, shift = between
     axes = np.abs(turn).round()
     straight = np.abs(np.abs(turn) - axes).max() <= _CUBIC and (axes.sum(0) == 1).all() and (axes.sum(1) == 1).all()
@@ -197,7 +195,6 @@ def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
 
 
 def _on(lattice: Lattice, grid: Grid, matrix: np.ndarray) -> torch.Tensor:
-    """Returns a grid's values on the lattice."""
     turn, shift = _between(lattice.voxel, np.asarray(lattice.origin), matrix)
     if not _is_kept((turn, shift)):
         return _resampled(lattice, grid.values, turn, shift)

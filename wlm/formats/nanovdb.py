@@ -82,12 +82,12 @@ class NanoVdbFile:
     def _list(self) -> Iterator[_Entry]:
         cursor = Cursor(self._data)
         if not len(self._data):
-            raise ValueError("it is empty")
+            raise ValueError("the file is empty")
         while cursor.at < len(self._data):
             begin = cursor.at
             magic, early, count, codec, late = cursor.unpack("<8sI2HI")
             if magic[:7] != b"NanoVDB" or magic[7:] not in b"012":
-                raise ValueError("NanoVDB signature not found")
+                raise ValueError(f"expected the signature of NanoVDB at byte {begin}, found {magic!r}")
             # Raw grids of early versions have the signature of files, but a checksum where files have the version.
             if magic[7:] == b"1" or (magic[7:] == b"0" and early >> 21 != _VERSION == late >> 21):
                 yield self._raw(cursor, begin)
@@ -100,7 +100,7 @@ class NanoVdbFile:
                 meta = cursor.take(_META)
                 (length,) = struct.unpack_from("<I", meta, 136)
                 if not 0 < length <= _LONGEST_NAME:
-                    raise ValueError(f"expected a name of at most {_LONGEST_NAME} bytes, found {length}")
+                    raise ValueError(f"expected a grid's name of 1 to {_LONGEST_NAME} bytes, found {length} bytes")
                 metas.append((meta, cursor.take(length)[:-1].decode("utf-8", "replace")))
             for meta, name in metas:
                 size, packed = struct.unpack_from("<2Q", meta)
@@ -133,12 +133,12 @@ def _unpacked(data: bytes, size: int, codec: int) -> bytes:
             # The limit of zlib must not be 0, which it reads as none.
             pieces.append(zlib.decompressobj().decompress(piece, left + 1))
         else:
-            raise ValueError(f"expected {size} bytes once unpacked, found more")
+            raise ValueError(f"expected {size} bytes after decompression, found more")
         left -= len(pieces[-1])
         if left < 0 or not length:
             break
     if left:
-        raise ValueError(f"expected {size} bytes once unpacked, found another number")
+        raise ValueError(f"expected {size} bytes after decompression, found another number")
     return b"".join(pieces)
 
 

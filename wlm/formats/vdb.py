@@ -134,7 +134,7 @@ class VdbFile:
         cursor = Cursor(self._data)
         magic, version = cursor.unpack("<qI")
         if magic != _MAGIC:
-            raise WlmError(f"{self._where}: expected an OpenVDB file, found another")
+            raise WlmError(f"{self._where}: expected an OpenVDB file, found other content")
         if not _OLDEST <= version <= _NEWEST:
             raise WlmError(
                 f"{self._where}: expected version {_OLDEST} to {_NEWEST} of OpenVDB's files, found {version}"
@@ -169,7 +169,7 @@ class VdbFile:
 
 
 class Cursor:
-    """A read position in bytes, or in a file (`wlm.formats.reading.FileBytes`)."""
+    """A position in bytes, or in a file (`wlm.formats.reading.FileBytes`), from which values are read."""
 
     def __init__(self, data: Any, at: int = 0) -> None:
         self.data, self.at = data, at
@@ -178,7 +178,7 @@ class Cursor:
         """Moves past the next bytes, which must exist."""
         end = self.at + count
         if not 0 <= self.at <= end <= len(self.data):
-            raise ValueError(f"it ends before its byte {end}")
+            raise ValueError(f"the file ends before byte {end}")
         self.at = end
 
     def take(self, count: int) -> bytes:
@@ -225,7 +225,7 @@ class _Tree:
         self._corners: list[np.ndarray] = []  # the corners of leaves
         self._masks: list[bytes] = []
         if cursor.unpack("<I") != (1,):
-            raise ValueError("expected a tree of one buffer")
+            raise ValueError("expected a tree with one value buffer per leaf, found another number")
         self.background = np.float32(cursor.unpack(self._one)[0])
         tiles, children = cursor.unpack("<II")
         kind = np.dtype([("corner", "<i4", 3), ("value", self._one), ("active", "u1")])
@@ -338,7 +338,7 @@ class _Tree:
             elif packed > 0:
                 piece = zlib.decompressobj().decompress(piece, size + 1)
             if len(piece) != size:
-                raise ValueError(f"expected {size} bytes once unpacked, found another number")
+                raise ValueError(f"expected {size} bytes after decompression, found at least {len(piece)}")
         else:
             piece = cursor.take(size)
         return np.frombuffer(piece, self._many).astype(np.float32)
