@@ -504,7 +504,7 @@ def test_json_whose_values_take_far_more_than_its_text(tmp_path, text):
 
 @pytest.mark.parametrize("number", ["1" + "0" * 400, str(2**64), str(-(2**63) - 1)])
 def test_integers_of_json_fit_arrays(tmp_path, number):
-    text = '{"lightmaps": [{"time_hours": %s, "file": "a.exr"}]}' % number
+    text = f'{{"lightmaps": [{{"time_hours": {number}, "file": "a.exr"}}]}}'
     for read in (lightmap.load, load_probes, read_gltf, read_runs):
         assert "expected integers within 64 bits" in refused(read, write(tmp_path / "set.json", text))
 

@@ -1,6 +1,7 @@
 """Reading of `.npz` files, named arrays in a ZIP file, whose headers are checked before they are inflated.
 
-Members are stored or deflated, as NumPy writes them: zipfile bounds the output of no other method. Arrays above `wlm.formats.scratch.IN_MEMORY` are mapped from an unnamed temporary file.
+Members must be stored or deflated, as NumPy writes them: zipfile bounds the output of no other method. Arrays above
+`wlm.formats.scratch.IN_MEMORY` are mapped from an unnamed temporary file.
 """
 
 import io
