@@ -130,7 +130,7 @@ class Budget:
     """Work or memory that the read of one file may still take; all loops of the read spend from it beforehand."""
 
     def __init__(self, where: str, most: int, unit: str) -> None:
-        """Starts with `most` of a unit. `where` names the file, and `unit` what is counted, such as "bytes of names"."""
+        """Starts with `most` of a unit; `where` names the file, and `unit` is plural, like "bytes of names"."""
         self._where, self._most, self._unit, self._left = where, most, unit, most
 
     def spend(self, amount: int) -> None:
