@@ -20,8 +20,8 @@ import numpy as np
 from PIL.PngImagePlugin import PngImageFile
 
 from wlm.errors import WlmError
-from wlm.formats.exr import MAGIC as EXR_MAGIC
-from wlm.formats.exr import float_planes, read_part
+from wlm.formats.exr import float_pixels, read_part
+from wlm.formats.exr_header import MAGIC as EXR_MAGIC
 from wlm.formats.light import read_light
 from wlm.formats.limits import IMAGE_BYTES, PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
 from wlm.formats.mask import DAMAGED_PICTURE
@@ -58,7 +58,7 @@ def _read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
     names = tuple(sorted(channels, key=lambda name: (_FIRST.index(name) if name in _FIRST else len(_FIRST), name)))
     if not names:
         raise WlmError(f"{path}: expected channels, found none")
-    return np.stack(float_planes(path, channels, names), axis=-1), names
+    return float_pixels(path, channels, names), names
 
 
 def _read_png(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:

@@ -4,7 +4,7 @@ import contextlib
 import io
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,8 @@ import OpenEXR
 
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_path
-from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
-from wlm.formats.reading import open_file
+from wlm.formats.exr_header import check_header
 from wlm.formats.stderr import captured_stderr
-
-MAGIC = b"\x76\x2f\x31\x01"
-"""The first bytes of an EXR file."""
-
-_SAMPLE_BYTES = 2  # of a half float: the library's header does not distinguish half and float
 
 HALF_MAX = 65504.0
 """The largest finite half float."""
@@ -47,25 +41,41 @@ def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
     if any(name not in channels for name in _COLOUR):
         raise WlmError(f"{path}: expected channels R,G,B or R,G,B,A, found {','.join(channels) or 'none'}")
     names = (*_COLOUR, _ALPHA) if _ALPHA in channels else _COLOUR
-    return np.stack(float_planes(path, channels, names), axis=-1), names
+    return float_pixels(path, channels, names), names
 
 
-def float_planes(path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]) -> list[np.ndarray]:
-    """Returns the pixels of the channels `names` of an EXR part, float32 [H, W] each.
+def float_pixels(path: str | os.PathLike[str], channels: Mapping[str, Any], names: Sequence[str]) -> np.ndarray:
+    """Returns the pixels of the channels `names` of an EXR part, float32 [H, W, C].
+
+    Raises:
+        WlmError: See `float_planes`.
+    """
+    pixels = np.zeros(0, np.float32)
+    for index, plane in enumerate(float_planes(path, channels, names)):
+        if not index:
+            pixels = np.empty((*plane.shape, len(names)), np.float32)
+        pixels[..., index] = plane
+    return pixels
+
+
+def float_planes(
+    path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]
+) -> Iterator[np.ndarray]:
+    """Yields the pixels of the channels `names` of an EXR part, float32 [H, W] each.
 
     Raises:
         WlmError: A channel is neither half nor float, or has another shape than the first.
     """
-    planes: list[np.ndarray] = []
+    shape = None
     for name in names:
         pixels = channels[name].pixels
         if pixels is None or pixels.dtype not in (np.float16, np.float32):
             content = "no pixels" if pixels is None else pixels.dtype
             raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
-        if planes and pixels.shape != planes[0].shape:
-            raise WlmError(f"{path}: channel {name}: expected {planes[0].shape} pixels, found {pixels.shape}")
-        planes.append(pixels.astype(np.float32, copy=False))
-    return planes
+        shape = pixels.shape if shape is None else shape
+        if pixels.shape != shape:
+            raise WlmError(f"{path}: channel {name}: expected {shape} pixels, found {pixels.shape}")
+        yield pixels.astype(np.float32, copy=False)
 
 
 def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True) -> None:
@@ -149,15 +159,12 @@ def read_part(path: str | os.PathLike[str]) -> OpenEXR.Part:
     Raises:
         WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data.
     """
-    size = _check_magic(path)
-    file, complaints = _open(path, size)
+    file, complaints = _open(path)
     parts = file.parts if file is not None else []
     if not parts:
         raise WlmError(f"{path}: the EXR file is cut short or damaged: {complaints or 'no pixels found'}")
     if len(parts) > 1:
         raise WlmError(f"{path}: expected an EXR file of one part, found {len(parts)}")
-    if parts[0].type() in (OpenEXR.deepscanline, OpenEXR.deeptile):
-        raise WlmError(f"{path}: expected a flat EXR picture, found deep data")
     return parts[0]
 
 
@@ -165,19 +172,10 @@ def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]
     """Reads the width, height and channel names of the first part of an EXR file, without its pixels.
 
     Raises:
-        WlmError: The file is missing, is not an EXR file, or its header is damaged or exceeds the limits.
+        WlmError: See `wlm.formats.exr_header.check_header`.
     """
-    size = _check_magic(path)
-    with _captured_chatter() as chatter:
-        try:
-            parts = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts
-            _check_size(path, size, parts)
-            first, last = (np.asarray(corner).tolist() for corner in parts[0].header["dataWindow"])
-            names = tuple(channel.name for channel in parts[0].header["channels"])
-        except (RuntimeError, ValueError, LookupError, MemoryError) as error:
-            found = chatter.text or one_line(error)
-            raise WlmError(f"{path}: the EXR file is cut short or damaged: {found}") from error
-    return last[0] - first[0] + 1, last[1] - first[1] + 1, names
+    part = check_header(path)[0]
+    return part.width, part.height, part.channels
 
 
 def write_part(
@@ -215,33 +213,12 @@ def write_part(
             raise WlmError(f"{path}: cannot write: {reason}; is the disk full?") from error
 
 
-def _check_magic(path: str | os.PathLike[str]) -> int:
-    """Checks the magic number of an EXR file and returns the file size in bytes."""
-    with open_file(path, "the EXR file") as file:
-        magic, size = file.read(len(MAGIC)), os.fstat(file.fileno()).st_size
-    if magic != MAGIC:
-        raise WlmError(f"{path}: expected an EXR file, found other content")
-    return size
-
-
-def _check_size(path: str | os.PathLike[str], held: int, parts: list[OpenEXR.Part]) -> None:
-    """Raises an error if the header claims more pixels than the limits or the file size allow."""
-    total = 0
-    for part in parts:
-        first, last = (np.asarray(corner).tolist() for corner in part.header["dataWindow"])
-        width, height = (end - begin + 1 for begin, end in zip(first, last, strict=True))
-        check_sides(str(path), width, height)
-        total += width * height * _SAMPLE_BYTES * len(part.header["channels"])
-    check_growth(str(path), held, total, PICTURE_GROWTH, PICTURE_BYTES)
-
-
-def _open(path: str | os.PathLike[str], size: int) -> tuple["OpenEXR.File | None", str]:
+def _open(path: str | os.PathLike[str]) -> tuple["OpenEXR.File | None", str]:
     """Returns the opened file and the library's messages; on failure the file is None or has no parts."""
+    check_header(path)
     with _captured_chatter() as chatter:
         try:
             # Channels are kept separate, since joined ones have other names in RGB, RGBA and layered files.
-            # The header is checked first, since the library allocates the claimed size before it reads a pixel.
-            _check_size(path, size, OpenEXR.File(str(path), separate_channels=True, header_only=True).parts)
             file = OpenEXR.File(str(path), separate_channels=True)
         except (RuntimeError, ValueError, MemoryError) as error:
             return None, chatter.text or one_line(error)
