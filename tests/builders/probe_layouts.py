@@ -57,7 +57,7 @@ def three_scene() -> dict[str, Any]:
     return {"metadata": {"version": 4.6, "type": "Object", "generator": "Object3D.toJSON"}, "object": scene}
 
 
-def unity_text(rectangles: bool = False) -> str:
+def unity_text(rectangles: bool = False, count: int = COUNT) -> str:
     """A text asset of `LightProbes`, and with `rectangles` a `LightingDataAsset` of two renderers before it."""
     position, light = unity_numbers()
     head = "%YAML 1.1\n%TAG !u! tag:unity3d.com,2011:\n"
@@ -69,9 +69,9 @@ def unity_text(rectangles: bool = False) -> str:
             lines += [f"    lightmapST: {place}", "    lightmapSTDynamic: {x: 1, y: 1, z: 0, w: 0}"]
         lines += ["  m_LightmappedRendererDataIDs: []"]
     lines += ["--- !u!258 &25800000", "LightProbes:", "  m_Name: LightProbes", "  m_Data:", "    m_ProbeSets: []"]
-    lines += ["    m_Positions:", *("    - {x: %.9g, y: %.9g, z: %.9g}" % tuple(place) for place in position)]
+    lines += ["    m_Positions:", *(f"    - {{x: {x:.9g}, y: {y:.9g}, z: {z:.9g}}}" for x, y, z in position[:count])]
     lines += ["    m_NonTetrahedralizedProbeSetIndexMap: {}", "  m_BakedCoefficients:"]
-    for probe in light.reshape(COUNT, 27):
+    for probe in light.reshape(COUNT, 27)[:count]:
         lines += [f"  {' ' if i else '-'} sh[{i:2d}]: {number:.9g}" for i, number in enumerate(probe)]
     return head + "\n".join([*lines, "  m_BakedLightOcclusion: []", ""])
 

@@ -13,6 +13,7 @@ from wlm.formats.unity_asset import read_lighting_data
 from wlm.inspection.files import inspect_file
 from wlm.probe.conventions import from_canonical
 from wlm.probe.data import from_arrays, load, load_positions
+from wlm.probe.sphere import basis, fibonacci_sphere
 
 JSON = probe_layouts.json_files()
 TABLES = probe_layouts.tables()
@@ -55,7 +56,7 @@ def test_tables(tmp_path, name):
         ("", "expected columns of a position and of light"),
         ("1,2,3\n", "expected columns of a position and of light"),
         ("1,2,3,4\n1,2,3\n", "not a table of numbers"),
-        ("1;2;3;0,5\n", "found 0,5"),
+        ("1;2;3;0,5\n", "found 1, 2, 3, 0,5"),
         ("name,light\nhall,3\n", "expected columns x, y, z and sh0, sh1 ... or r0, g0, b0 ..., found name, light"),
         ("x,y,z,r0,g0\n1,2,3,4,5\n", "expected columns x, y, z and sh0"),
         ("x,y,z,sh0,sh0\n1,2,3,4,5\n", "expected columns x, y, z and sh0"),
@@ -142,9 +143,7 @@ def test_the_first_coefficient_against_the_others():
     probes = synthetic(200)
     light = probes.values.reshape(200, 9, 3)
     assert from_arrays(probes.position, light).warnings == ()
-    # Light from one direction reaches the bound: numbers of radiance exceed it once they are divided by Unity's factors.
-    from wlm.probe.sphere import basis, fibonacci_sphere
-
+    # Light from one direction reaches the bound, and exceeds it after division by Unity's factors.
     beam = basis(fibonacci_sphere(200), 9)[..., None] * [1.0, 0.9, 0.8]
     assert from_arrays(probes.position, beam).warnings == ()
     assert from_arrays(probes.position, from_canonical(beam, "unity"), convention="unity").warnings == ()

@@ -2,8 +2,8 @@
 
 Engines store the numbers of a probe coefficient by coefficient (r0 g0 b0 r1 ...) or channel by channel (r0 r1 ... g0
 ...). Light is not negative, which bounds each band: by the addition theorem, the root of the sum of squares of the
-coefficients of band l is at most sqrt(2l + 1) times the first coefficient. Numbers in another order or convention exceed
-the bound, or have channels that do not resemble each other.
+coefficients of band l is at most sqrt(2l + 1) times the first coefficient. Numbers in another order or convention
+exceed the bound, or have channels that do not resemble each other.
 """
 
 import numpy as np
