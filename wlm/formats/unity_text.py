@@ -21,7 +21,7 @@ _NUMBERS = 27  # of a probe: nine for each colour channel
 def objects(data: bytes) -> list[tuple[str, bytes]]:
     """Returns the type and the text of each object of an asset."""
     starts = list(_OBJECT.finditer(data))
-    ends = [*(start.start() for start in starts[1:]), len(data)]
+    ends = [*(start.start() for start in starts), len(data)][1:]
     return [(start[1].decode(), data[start.end() : end]) for start, end in zip(starts, ends, strict=True)]
 
 

@@ -54,7 +54,7 @@ def read_table(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
         WlmError: The file is missing, too large, not a table of numbers, or its columns are unknown.
     """
     with damaged(f"{path}: not a table of numbers", ValueError, MemoryError), open_file(path, "the probes") as file:
-        if file.seek(0, 2) > JSON_BYTES:
+        if (size := file.seek(0, 2)) > JSON_BYTES:
             raise WlmError(f"{path}: expected at most {JSON_BYTES} bytes")
         file.seek(0)
         first, skipped = b"", 0
@@ -74,11 +74,11 @@ def read_table(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
         if not names and len(cells) < 4:
             raise WlmError(f"{path}: expected columns of a position and of light, found {len(cells)} columns")
         file.seek(0)
+        # NumPy allocates as many rows as are allowed; a number and a mark take two bytes.
+        most, skip = min(PROBES, size // (2 * len(cells))) + 1, skipped * bool(names)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of a table without lines
-            rows = np.loadtxt(
-                file, delimiter=mark, skiprows=skipped * bool(names), ndmin=2, max_rows=PROBES + 1, encoding="utf-8-sig"
-            )
+            rows = np.loadtxt(file, delimiter=mark, skiprows=skip, ndmin=2, max_rows=most, encoding="utf-8-sig")
     if not names:
         return rows[:, :3], rows[:, 3:], ""
     if not rows.size:
