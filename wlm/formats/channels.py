@@ -2,20 +2,7 @@
 
 Here p is a stored colour value in [0, 1], a the stored alpha, and L the sRGB curve to linear light (IEC 61966-2-1):
 
-==========  ========================  ==================================================================
-encoding    light                     where it is used
-==========  ========================  ==================================================================
-linear      p                         data textures, the lightmap exporter of three.js
-srgb        L(p)                      pictures, lightmaps of low range
-rgbm        34.4932 a^2.2 L(p)        Unity, linear colour space (`DecodeLightmapRGBM`); 5^2.2
-rgbm:M:g    (M a p)^g                 others: RGBM16 is rgbm:16:1, PlayCanvas rgbm:8:2; g is 1 if left out
-rgbd        p^2.2 / a                 Babylon.js; 0 where a is 0
-rgbd:M:g    M p^g / (255 a)           others: three.js rgbd:256:1; g is 1 if left out
-dldr        4.5948 L(p)               Unity (`DecodeLightmapDoubleLDR`); 2^2.2
-rgbe        255 p 2^(255 a - 136)     Radiance's numbers as RGBA; 0 where a is 0
-layer:NAME  stored                    the layer NAME of an EXR file that has several
-==========  ========================  ==================================================================
-"""
+==========  ========================  ==========================================================="""
 
 import os
 
