@@ -9,6 +9,7 @@ import OpenEXR
 import pytest
 from builders.checks import error_of
 
+from tests.builders.exr import exr_header
 from wlm.errors import WlmError
 from wlm.formats.channels import read_channels, read_encoded
 from wlm.formats.exr import HALF_MAX, read_every_channel, read_exr, read_header, read_planes, write_exr, write_planes
@@ -298,7 +299,7 @@ def test_a_file_cut_anywhere_is_refused_in_silence(tmp_path, kind, capfd):
 
 def test_lines_of_others_on_stderr_pass(tmp_path, capfd, monkeypatch):
     path = tmp_path / "a.exr"
-    path.write_bytes(b"\x76\x2f\x31\x01")
+    path.write_bytes(exr_header())
     opened = OpenEXR.File
 
     def chatty(*args, **kwargs):

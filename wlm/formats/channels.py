@@ -9,8 +9,8 @@ import os
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.exr import MAGIC as EXR_MAGIC
 from wlm.formats.exr import read_every_channel, read_exr
+from wlm.formats.exr_header import MAGIC as EXR_MAGIC
 from wlm.formats.levels import HEAD, KINDS, level_kind, read_levels
 from wlm.formats.light import read_light
 from wlm.formats.reading import open_file

@@ -17,15 +17,9 @@ import OpenEXR
 
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_path
-from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
+from wlm.formats.exr_header import check_header
 from wlm.formats.primaries import ACES_AP0, CIE_XYZ, REC709, to_rec709
-from wlm.formats.reading import open_file
 from wlm.formats.stderr import captured_stderr
-
-MAGIC = b"\x76\x2f\x31\x01"
-"""The first bytes of an EXR file."""
-
-_SAMPLE_BYTES = 2  # of a half float: the library's header does not distinguish half and float
 
 HALF_MAX = 65504.0
 """The largest finite half float."""
@@ -163,16 +157,17 @@ def _light_channels(
 
 def _pixels(path: str | os.PathLike[str], channels: _Channels, names: Sequence[str], notes: list[str]) -> np.ndarray:
     """Returns the pixels of channels over the display window, float32 [H, W, C]."""
-    planes: dict[str, np.ndarray] = {}
-    for name in names:
-        if name not in planes:
-            part, channel = channels[name]
-            (plane,) = float_planes(path, {name: channel}, [name])
-            planes[name] = _framed(f"{path}: channel {name}", part, plane, notes)
-    shapes = {plane.shape for plane in planes.values()}
-    if len(shapes) > 1:
-        raise WlmError(f"{path}: expected channels of one size, found {' and '.join(map(str, sorted(shapes)[:2]))}")
-    return np.stack([planes[name] for name in names], axis=-1)
+    pixels = np.zeros(0, np.float32)
+    for index, name in enumerate(names):
+        part, channel = channels[name]
+        (plane,) = float_planes(path, {name: channel}, [name])
+        plane = _framed(f"{path}: channel {name}", part, plane, notes)
+        if not index:
+            pixels = np.empty((*plane.shape, len(names)), np.float32)
+        if plane.shape != pixels.shape[:2]:
+            raise WlmError(f"{path}: channel {name}: expected {pixels.shape[:2]} pixels, found {plane.shape}")
+        pixels[..., index] = plane
+    return pixels
 
 
 def _framed(where: str, part: OpenEXR.Part, plane: np.ndarray, notes: list[str]) -> np.ndarray:
@@ -227,22 +222,24 @@ def _chromaticities(path: str | os.PathLike[str], header: Mapping[str, Any], not
     return ACES_AP0 if header.get("acesImageContainerFlag") else REC709
 
 
-def float_planes(path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]) -> list[np.ndarray]:
-    """Returns the pixels of the channels `names` of an EXR part, float32 [H, W] each.
+def float_planes(
+    path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]
+) -> Iterator[np.ndarray]:
+    """Yields the pixels of the channels `names` of an EXR part, float32 [H, W] each.
 
     Raises:
         WlmError: A channel is neither half nor float, or has another shape than the first.
     """
-    planes: list[np.ndarray] = []
+    shape = None
     for name in names:
         pixels = channels[name].pixels
         if pixels is None or pixels.dtype not in (np.float16, np.float32):
             content = "no pixels" if pixels is None else pixels.dtype
             raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
-        if planes and pixels.shape != planes[0].shape:
-            raise WlmError(f"{path}: channel {name}: expected {planes[0].shape} pixels, found {pixels.shape}")
-        planes.append(pixels.astype(np.float32, copy=False))
-    return planes
+        shape = pixels.shape if shape is None else shape
+        if pixels.shape != shape:
+            raise WlmError(f"{path}: channel {name}: expected {shape} pixels, found {pixels.shape}")
+        yield pixels.astype(np.float32, copy=False)
 
 
 def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True) -> None:
@@ -334,13 +331,10 @@ def read_part(path: str | os.PathLike[str]) -> OpenEXR.Part:
 
 def _flat_parts(path: str | os.PathLike[str]) -> list[OpenEXR.Part]:
     """Reads all parts of an EXR file. Raises `WlmError` as `read_part` does, but for several parts."""
-    size = _check_magic(path)
-    file, complaints = _open(path, size)
+    file, complaints = _open(path)
     parts = file.parts if file is not None else []
     if not parts or complaints:
         raise WlmError(f"{path}: the EXR file is cut short or damaged: {complaints or 'no pixels found'}")
-    if any(part.type() in (OpenEXR.deepscanline, OpenEXR.deeptile) for part in parts):
-        raise WlmError(f"{path}: expected a flat EXR picture, found deep data")
     return list(parts)
 
 
@@ -350,20 +344,10 @@ def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]
     In a file of several parts, a name begins with that of its part.
 
     Raises:
-        WlmError: The file is missing, is not an EXR file, or its header is damaged or exceeds the limits.
+        WlmError: See `wlm.formats.exr_header.check_header`.
     """
-    size = _check_magic(path)
-    with _captured_chatter() as chatter:
-        try:
-            parts = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts
-            _check_size(path, size, parts)
-            width, height = _window(parts[0], "displayWindow")[2:]
-            names = [(part.name(), channel.name) for part in parts for channel in part.header["channels"]]
-        except (RuntimeError, ValueError, LookupError, MemoryError) as error:
-            found = chatter.text or one_line(error)
-            raise WlmError(f"{path}: the EXR file is cut short or damaged: {found}") from error
-    several = len(parts) > 1
-    return width, height, tuple(f"{part}.{name}" if several else name for part, name in names)
+    parts = check_header(path)
+    return *parts[0].size, tuple(name for part in parts for name in part.full_names(len(parts) > 1))
 
 
 def write_part(
@@ -401,35 +385,12 @@ def write_part(
             raise WlmError(f"{path}: cannot write: {reason}; is the disk full?") from error
 
 
-def _check_magic(path: str | os.PathLike[str]) -> int:
-    """Checks the magic number of an EXR file and returns the file size in bytes."""
-    with open_file(path, "the EXR file") as file:
-        magic, size = file.read(len(MAGIC)), os.fstat(file.fileno()).st_size
-    if magic != MAGIC:
-        raise WlmError(f"{path}: expected an EXR file, found other content")
-    return size
-
-
-def _check_size(path: str | os.PathLike[str], held: int, parts: list[OpenEXR.Part]) -> None:
-    """Raises an error if the header claims more pixels than the limits or the file size allow."""
-    total = 0
-    for part in parts:
-        texels = 0
-        for window in ("dataWindow", "displayWindow"):
-            width, height = _window(part, window)[2:]
-            check_sides(str(path), width, height)
-            texels = max(texels, width * height)
-        total += texels * _SAMPLE_BYTES * len(part.header["channels"])
-    check_growth(str(path), held, total, PICTURE_GROWTH, PICTURE_BYTES)
-
-
-def _open(path: str | os.PathLike[str], size: int) -> tuple["OpenEXR.File | None", str]:
+def _open(path: str | os.PathLike[str]) -> tuple["OpenEXR.File | None", str]:
     """Returns the opened file and the library's messages; on failure the file is None or has no parts."""
+    check_header(path)
     with _captured_chatter() as chatter:
         try:
             # Channels are kept separate, since joined ones have other names in RGB, RGBA and layered files.
-            # The header is checked first, since the library allocates the claimed size before it reads a pixel.
-            _check_size(path, size, OpenEXR.File(str(path), separate_channels=True, header_only=True).parts)
             file = OpenEXR.File(str(path), separate_channels=True)
         except (RuntimeError, ValueError, MemoryError) as error:
             return None, chatter.text or one_line(error)

@@ -7,8 +7,8 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats import dds, ktx2, pfm, radiance, tiff
-from wlm.formats.exr import MAGIC as EXR_MAGIC
 from wlm.formats.exr import read_exr
+from wlm.formats.exr_header import MAGIC as EXR_MAGIC
 from wlm.formats.reading import open_file
 
 SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds", ".pfm", ".tif", ".tiff")

@@ -54,10 +54,10 @@ PICTURE_TEXELS = 1 << 28
 """Most texels of a lightmap file: 16384 x 16384, the largest texture of most GPUs."""
 
 PICTURE_GROWTH = 2048
-"""Largest expansion of a lightmap file to half floats. Black pixels expand 950 times under ZIP."""
+"""Largest expansion of a lightmap file. Black pixels expand 950 times under ZIP."""
 
 PICTURE_BYTES = 256 << 20
-"""Bytes of half floats that are allowed for any size of file: 6000 x 6000 black texels under any compression."""
+"""Decoded bytes that are allowed for any size of file: 6000 x 6000 black texels of half floats."""
 
 IMAGE_BYTES = 2 << 30
 """Largest PNG or TGA: 16384 x 16384 texels of 8 bytes."""

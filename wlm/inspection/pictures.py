@@ -10,7 +10,7 @@ from wlm.errors import WlmError
 from wlm.formats import dds, ktx2, radiance
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import HALF_MAX, read_header
-from wlm.formats.exr import MAGIC as EXR_MAGIC
+from wlm.formats.exr_header import MAGIC as EXR_MAGIC
 from wlm.formats.light import read_light
 from wlm.formats.limits import check_sides
 from wlm.formats.reading import open_file
