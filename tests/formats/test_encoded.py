@@ -41,7 +41,6 @@ def test_every_encoding(tmp_path, encoding):
     expected = [[EXPECTED[encoding](float(p), float(texel[3])) for p in texel[:3]] for texel in BYTES[0]]
     assert light.dtype == np.float32
     np.testing.assert_allclose(light[0], expected, rtol=1e-5)
-    np.testing.assert_array_equal(read_encoded("inside.glb: image 0", encoding, data=path.read_bytes()), light)
     assert {name.split(":")[0] for name in EXPECTED} == set(ENCODINGS)
 
 

@@ -54,16 +54,13 @@ def read_channels(
     return *(read_every_channel(path, notes, light) if head.startswith(EXR_MAGIC) else read_light(path, notes)), False
 
 
-def read_encoded(
-    path: str | os.PathLike[str], encoding: str, notes: list[str] | None = None, data: bytes | None = None
-) -> np.ndarray:
+def read_encoded(path: str | os.PathLike[str], encoding: str, notes: list[str] | None = None) -> np.ndarray:
     """Reads the light of a picture by an encoding of the module's table: linear, float32 [H, W, 3], the top row first.
 
     Args:
-        path: The file, or the words that name it in messages.
+        path: The file.
         encoding: The encoding, such as "srgb" or "rgbm:16:1".
         notes: Each assumption, and each doubt about the encoding, adds a line.
-        data: The content of the picture, if it is not a file, such as an image inside a glTF file.
 
     Raises:
         WlmError: The encoding is unknown; the file is missing, damaged or not a picture of integers; or it lacks the
@@ -73,16 +70,13 @@ def read_encoded(
     name, largest, gamma = parse_encoding(encoding)
     if name == _LAYER:
         return read_exr(path, notes, encoding.removeprefix(_LAYER))[0][..., :3]
-    if data is None:
-        with open_file(path, "the lightmap") as file:
-            kind = level_kind(path, file.read(HEAD))
-    else:
-        kind = level_kind(path, data[:HEAD])
+    with open_file(path, "the lightmap") as file:
+        kind = level_kind(path, file.read(HEAD))
     if kind is None:
         raise WlmError(
             f"{path}: encoding: expected a {KINDS} of integers; other formats define their encoding themselves"
         )
-    pixels, names = read_levels(path, kind, notes, data)
+    pixels, names = read_levels(path, kind, notes)
     if name in _ALPHA and "A" not in names:
         raise WlmError(f"{path}: encoding {name}: expected a picture with alpha, found {''.join(names)}")
     colour, alpha = (pixels[..., :-1], pixels[..., -1:]) if "A" in names else (pixels, None)

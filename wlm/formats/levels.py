@@ -21,6 +21,9 @@ from wlm.formats.limits import IMAGE_BYTES, PICTURE_BYTES, PICTURE_GROWTH, check
 from wlm.formats.mask import DAMAGED_PICTURE
 from wlm.formats.reading import damaged, read_file
 
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tga")
+"""Suffixes of pictures that are always of integers."""
+
 KINDS = "PNG, JPEG, WebP, TGA or TIFF"
 """Names of the formats, for messages."""
 
@@ -49,16 +52,13 @@ def level_kind(path: str | os.PathLike[str], head: bytes) -> str | None:
     return "TGA" if os.fspath(path).lower().endswith(".tga") else None
 
 
-def read_levels(
-    path: str | os.PathLike[str], kind: str, notes: list[str], data: bytes | None = None
-) -> tuple[np.ndarray, tuple[str, ...]]:
+def read_levels(path: str | os.PathLike[str], kind: str, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads a picture of integers.
 
     Args:
-        path: The file, or the words that name it in messages.
+        path: The file.
         kind: Its kind, of `level_kind`.
         notes: A line is added if the file states an orientation, which is ignored.
-        data: Its content, if it is not a file, such as an image inside a glTF file.
 
     Returns:
         The levels, float32 [H, W, C] in [0, 1], the top row first, and the names of the channels: L, or R, G and B,
@@ -67,10 +67,10 @@ def read_levels(
     Raises:
         WlmError: The file is missing, damaged, animated, or not of grey, of RGB or of a palette.
     """
-    data = read_file(path, IMAGE_BYTES, f"the {kind}") if data is None else data
     if kind == "TIFF":
-        pixels, names = tiff.read_tiff(path, data)
+        pixels, names = tiff.read_tiff(path)
     else:
+        data = read_file(path, IMAGE_BYTES, f"the {kind}")
         # `Image.open` would try the readers of other formats, too.
         with damaged(f"{path}: cannot read the {kind}", *DAMAGED_PICTURE), _READERS[kind](io.BytesIO(data)) as image:
             check_sides(str(path), image.width, image.height)

@@ -1,7 +1,7 @@
 """Reading of pictures of light from bakers and engines, recognised by their content, whatever their suffix."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -86,3 +86,19 @@ def read_light(path: str | os.PathLike[str], notes: _Notes | None = None) -> tup
     elif os.fspath(path).lower().endswith(".tga"):
         found = f"a TGA{_STATE_IT}"
     raise WlmError(f"{path}: expected a lightmap, {EXPECTED}, found {found}")
+
+
+def noted(labels: Sequence[str], notes: Sequence[Sequence[str]]) -> list[str]:
+    """Returns the notes about several files, one line for each text: the first file that has it, and how many more do.
+
+    Args:
+        labels: The name of each file.
+        notes: The lines about each file, as `read_light` adds them.
+    """
+    found: dict[str, list[str]] = {}
+    for label, lines in zip(labels, notes, strict=True):
+        for line in lines:
+            found.setdefault(line, []).append(label)
+    return [
+        f"{names[0]}{f' and {len(names) - 1} more' if len(names) > 1 else ''}: {line}" for line, names in found.items()
+    ]

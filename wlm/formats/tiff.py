@@ -58,7 +58,7 @@ def tags_of(path: str | os.PathLike[str], data: bytes) -> dict[str, int]:
     return found
 
 
-def read_tiff(path: str | os.PathLike[str], data: bytes | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
+def read_tiff(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the first image of a TIFF of grey or RGB, with alpha or without.
 
     Returns:
@@ -69,7 +69,7 @@ def read_tiff(path: str | os.PathLike[str], data: bytes | None = None) -> tuple[
         WlmError: The file is missing, damaged, of another photometric interpretation or number format, or the package
             imagecodecs is missing.
     """
-    data = read_file(path, IMAGE_BYTES, "the TIFF") if data is None else data
+    data = read_file(path, IMAGE_BYTES, "the TIFF")
     tags = tags_of(path, data)
     samples, colours = tags["samples"], 3 if tags["photometric"] == _RGB else 1
     if tags["photometric"] not in (_GREY, _RGB) or not colours <= samples <= _MOST_SAMPLES:
