@@ -170,7 +170,7 @@ def doubts(light: np.ndarray) -> list[str]:
     used = light[::step, ::step].reshape(-1, 3)
     with np.errstate(invalid="ignore"):
         used = used[(used > 0).any(-1) & np.isfinite(used).all(-1)]
-    if not len(used):
+    if not len(used) or used.min() == used.max():
         return []
     brightest, middle = float(used.max()), float(np.median(used.max(-1)))
     found = []

@@ -30,7 +30,7 @@ Encoding = Annotated[
     str | None,
     typer.Option(
         metavar="ENCODING",
-        help="What light a PNG, JPEG, WebP, TGA or TIFF of integers stores: linear, srgb, rgbm (of Unity in linear "
+        help="Encoding of light in a PNG, JPEG, WebP, TGA or TIFF of integers: linear, srgb, rgbm (of Unity in linear "
         "colour space), rgbm:RANGE:GAMMA, that is (RANGE x alpha x colour)^GAMMA, rgbd (of Babylon.js), "
         "rgbd:RANGE:GAMMA, dldr or rgbe; or layer:NAME, the layer of an EXR that has several.",
     ),
