@@ -499,7 +499,7 @@ def test_a_compressed_grid_that_unpacks_to_far_more(tmp_path):
 def test_json_whose_values_take_far_more_than_its_text(tmp_path, text):
     with little_memory():
         line = refused(load_probes, write(tmp_path / "a.json", text))
-    assert line.endswith("bytes of values in JSON, the limit for its size, found more")
+    assert line.endswith("bytes of values in JSON for its size, found more")
 
 
 @pytest.mark.parametrize("number", ["1" + "0" * 400, str(2**64), str(-(2**63) - 1)])

@@ -367,8 +367,8 @@ def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int
 def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
     primitives = []
     cache: dict[tuple[int, str], np.ndarray] = {}  # primitives often share their accessors
-    hint = "" if document.trust else " (trust=True, --trust on the command line, lifts the limit for the size)"
-    budget = Budget(document.path, document.most, f"drawn corners and vertices{hint}")
+    hint = "; trust=True (--trust on the command line) lifts the limit for files from a trusted author"
+    budget = Budget(document.path, document.most, "drawn corners and vertices", "" if document.trust else hint)
 
     def floats(number: int, kind: str) -> np.ndarray:
         if (number, kind) not in cache:
