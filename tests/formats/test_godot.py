@@ -224,7 +224,7 @@ def test_a_long_name_counts_at_each_use(tmp_path):
     # The main resource starts that much later.
     place = struct.unpack_from("<Q", content, content.index(b"local://0\0") + 10)[0]
     moved = content.replace(struct.pack("<Q", place), struct.pack("<Q", place + len(long) - len(name)), 1)
-    data = compress(moved[:at] + long + moved[at + len(name) :], 1 << 20)
+    data = compress(b"RSRC" + moved[:at] + long + moved[at + len(name) :], 1 << 20)
     (tmp_path / "a.lmbake").write_bytes(data)
     assert len(data) < 10_000
     tracemalloc.start()
@@ -239,5 +239,5 @@ def test_many_small_values_in_few_bytes(tmp_path, value):
     writer = Writer()
     many = 4_000_000
     content = writer.file([("x", writer.u32(30, many) + value * many)], magic=b"")
-    (tmp_path / "a.lmbake").write_bytes(compress(content, 1 << 20))
+    (tmp_path / "a.lmbake").write_bytes(compress(b"RSRC" + content, 1 << 20))
     assert "bytes of names and values for the size of the file" in error_of(read_lmbake, tmp_path / "a.lmbake")

@@ -371,7 +371,7 @@ def test_a_set_names_files_of_its_folder(tmp_path):
         ({"entries": [{"time_hours": 0, "file": "x" * 1000}]}, "cannot read the lightmap"),
         (
             {"entries": [{"time_hours": 0, "file": "set.json"}]},
-            "expected a lightmap, EXR, Radiance (.hdr), KTX2 or DDS, found other",
+            "expected a lightmap, EXR, Radiance (.hdr), PFM, TIFF of floats, KTX2 or DDS, found other",
         ),
     ],
 )

@@ -26,11 +26,11 @@ from wlm.atlas.matching import chart_map, choose_mesh, fits_flipped, named, repl
 from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
 from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf, reported
-from wlm.formats.light import read_light
+from wlm.formats.light import noted, read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.meshes import SUFFIXES, read_mesh
 from wlm.ops.indoors import Indoors, indoors
-from wlm.texels import fill_gaps, repair
+from wlm.texels import doubts, fill_gaps, repair
 
 _FLAT = 1e-12  # ratio of area to longest side squared below which float64 can't distinguish the area from 0
 _FACES = 6  # faces of a cube
@@ -218,7 +218,8 @@ def load(
     placed = None if listing.objects is None else _placed(str(path), readers, listing)
     sheets, objects, used = [], [], set()
     for number, files in enumerate(listing.sheets):
-        lightmaps, mask, names = _read_lightmaps(listing, files, trust)
+        notes: list[str] = []
+        lightmaps, mask, names = _read_lightmaps(listing, files, trust, notes)
         label = files.name or Path(files.files[0]).stem
         if placed is None:
             chosen, warnings = choose_mesh(str(path), label, readers, uv_set, lightmaps[0])
@@ -230,7 +231,7 @@ def load(
         if not chosen:
             raise WlmError(f"{listing.path}: sheets[{number}]: no triangle of the mesh is lit by it")
         used |= {(each.node, each.primitive) for each in chosen}
-        warnings = skipped * alone + warnings
+        warnings = skipped * alone + notes + warnings
         sheets.append(_checked(str(path), label, chosen, uv_set, lightmaps, mask, names, warnings))
     rest = [] if alone else [each for each in primitives if (each.node, each.primitive) not in used]
     blocker = np.concatenate([np.empty((0, 3, 3)), *(each.position[each.triangle] for each in rest)])
@@ -440,13 +441,20 @@ def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitiv
 
 
 def _read_lightmaps(
-    listing: Listing, files: SheetFiles, trust: bool
+    listing: Listing, files: SheetFiles, trust: bool, warnings: list[str]
 ) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask, or None. Also returns the names of their files."""
+    """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask, or None. Also returns the names of their files;
+    assumptions and doubts are added to `warnings`."""
     lightmaps: list[np.ndarray] = []
+    notes: list[list[str]] = []
     names = [str(listing.file(name, trust)) for name in files.files]
     for path in names:
-        light = read_light(path)[0] if files.encoding is None else read_encoded(path, files.encoding)
+        notes.append([])
+        if files.encoding is None:
+            light = read_light(path, notes[-1])[0]
+            notes[-1] += doubts(light[..., :3])
+        else:
+            light = read_encoded(path, files.encoding, notes[-1])
         light = np.array(light[:: -1 if files.flip else 1, :, :3], np.float32, order="C")
         if files.intensity != 1.0:
             with np.errstate(invalid="ignore", over="ignore"):  # an overflow is repaired like an infinity in the file
@@ -455,6 +463,7 @@ def _read_lightmaps(
             size, first = ("x".join(map(str, each.shape[1::-1])) for each in (light, lightmaps[0]))
             raise WlmError(f"{path}: expected {first} texels, the size of the sheet's first lightmap, found {size}")
         lightmaps.append(light)
+    warnings += noted(names, notes)
     stack = np.stack(lightmaps) if len(lightmaps) > 1 else lightmaps[0][None]
     mask_path = None if files.mask is None else listing.file(files.mask, trust)
     mask = None if mask_path is None else read_mask(mask_path, names[0], stack.shape[1:3])

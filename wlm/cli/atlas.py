@@ -22,6 +22,7 @@ from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
     Device,
+    Encoding,
     Engine,
     ExactShader,
     ModelFile,
@@ -46,8 +47,8 @@ _Lights = Annotated[
     Path | None,
     typer.Argument(
         metavar="LIGHTMAPS",
-        help="Lightmap (EXR, HDR, KTX2, DDS, PNG), a folder of them, a .lmbake, or a .json that lists them; default "
-        "those that the mesh's materials name.",
+        help="Lightmap (EXR, HDR, PFM, TIFF, KTX2, DDS, or a PNG with --encoding), a folder of them, a .lmbake, or a "
+        ".json that lists them; default those that the mesh's materials name.",
     ),
 ]
 _Mask = Annotated[
@@ -57,7 +58,6 @@ _UvSet = Annotated[
     int | None, typer.Option("--uv-set", min=0, help="The lightmap UVs are TEXCOORD_n; default 1 if present, else 0.")
 ]
 _Node = Annotated[str | None, typer.Option(help="Node that the lightmap belongs to; default the one that fits best.")]
-_Encoding = Annotated[str | None, typer.Option(help="Encoding of a PNG: linear, srgb, rgbm, dldr or rgbe.")]
 _Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is at v = 1 instead of v = 0.")]
 _Views = Annotated[
     int | None, typer.Option(min=1, max=4096, help=f"Cameras outside the scene, and as many inside; default {_VIEWS}.")
@@ -78,7 +78,7 @@ def compress(
     mask: _Mask = None,
     uv_set: _UvSet = None,
     node: _Node = None,
-    encoding: _Encoding = None,
+    encoding: Encoding = None,
     flip: _Flip = False,
     seed: Seed = 0,
     device: Device = "cpu",
@@ -114,7 +114,7 @@ def evaluate(
     mask: _Mask = None,
     uv_set: _UvSet = None,
     node: _Node = None,
-    encoding: _Encoding = None,
+    encoding: Encoding = None,
     flip: _Flip = False,
     device: Device = "cpu",
     trust: Trust = False,

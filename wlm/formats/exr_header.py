@@ -27,15 +27,20 @@ class ExrHeader:
     """The header of a part.
 
     Attributes:
-        width, height: Size of the data window.
+        size: Width and height of the display window.
         channels: Names of the channels, in the order of the file.
         attributes: Type and value of each attribute, as stored.
     """
 
-    width: int
-    height: int
+    size: tuple[int, int]
     channels: tuple[str, ...]
     attributes: dict[str, tuple[str, bytes]]
+
+    def full_names(self, several: bool) -> tuple[str, ...]:
+        """Returns the names of the channels, which begin with the name of the part if the file has `several`."""
+        part = self.attributes.get("name", ("", b""))[1].decode("utf-8", "replace")
+        prefix = f"{part}." if several else ""
+        return tuple(name if name.startswith(prefix) else prefix + name for name in self.channels)
 
 
 def check_header(path: str | os.PathLike[str]) -> list[ExrHeader]:
@@ -60,7 +65,7 @@ def check_header(path: str | os.PathLike[str]) -> list[ExrHeader]:
                 raise WlmError(f"{path}: expected a flat EXR picture, found deep data")
             part, each = _part(path, attributes, _FIELDS - fields)
             fields += len(attributes) + len(part.channels)
-            total += part.width * part.height * each
+            total += each
             parts.append(part)
             if not flags & _MULTIPART:
                 break
@@ -87,12 +92,15 @@ def _attributes(data: bytes, at: int, most: int) -> tuple[dict[str, tuple[str, b
 
 
 def _part(path: str | os.PathLike[str], attributes: dict[str, tuple[str, bytes]], most: int) -> tuple[ExrHeader, int]:
-    """Returns the header of a part, and the bytes of a pixel."""
-    left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"][1])
-    width, height = right - left + 1, bottom - top + 1
-    if min(width, height) < 1:
-        raise ValueError(f"expected a data window of at least one pixel, found {width} x {height}")
-    check_sides(str(path), width, height)
+    """Returns the header of a part, and the bytes of its pixels over the larger of its windows."""
+    texels = 0
+    for name in ("dataWindow", "displayWindow"):
+        left, top, right, bottom = struct.unpack("<4i", attributes.get(name, attributes["dataWindow"])[1])
+        width, height = right - left + 1, bottom - top + 1
+        if min(width, height) < 1:
+            raise ValueError(f"{name}: expected at least one pixel, found {width} x {height}")
+        check_sides(str(path), width, height)
+        texels = max(texels, width * height)
     listed, at, names, each = attributes["channels"][1], 0, [], 0
     while end := listed.index(0, at) - at:
         names.append(listed[at : at + end].decode("utf-8", "replace"))
@@ -101,4 +109,4 @@ def _part(path: str | os.PathLike[str], attributes: dict[str, tuple[str, bytes]]
         at += end + 17  # the type, a flag with three bytes of padding, and the sampling along x and y
         if len(names) > most:
             raise ValueError(f"expected at most {_FIELDS} attributes and channels, found more")
-    return ExrHeader(width, height, tuple(names), attributes), each
+    return ExrHeader((width, height), tuple(names), attributes), texels * each

@@ -15,6 +15,7 @@ from wlm.formats.limits import INDEX_BYTES, INTEGER, JSON_GROWTH, SURE_JSON, Bud
 # Windows lacks the first two, and no file name blocks there. The last one disables newline translation.
 _FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
 
+_POINTER = b"version https://git-lfs"  # the first bytes of the text that stands for a file which was not fetched
 _MANY_DIGITS = re.compile(rb"\d{19}")
 _LONGEST_INTEGER = 40  # characters
 
@@ -42,6 +43,11 @@ def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise WlmError(f"{path}: cannot read {what}: expected a file, found a folder, a device or a pipe")
         with os.fdopen(handle, "rb", closefd=False) as file:
+            if file.read(len(_POINTER)) == _POINTER:
+                raise WlmError(
+                    f"{path}: cannot read {what}: found a pointer of Git LFS: run git lfs pull to fetch the file"
+                )
+            file.seek(0)
             yield file
     except OSError as error:
         raise WlmError(f"{path}: cannot read {what}: {error.strerror or error}") from error
