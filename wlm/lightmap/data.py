@@ -33,6 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats.channels import read_channels, read_encoded
 from wlm.formats.light import noted, read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, Budget, check_growth
 from wlm.formats.mask import read_mask
