@@ -46,6 +46,11 @@ _OF_VERTICES = ("CESIUM_primitive_outline", "EXT_mesh_primitive_edge_visibility"
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "EXT_texture_")
 
 
+def image_type(data: bytes) -> str | None:
+    """Returns the MIME type of an image that a glTF file may hold, by its first bytes; None for other content."""
+    return next((kind for head, kind in _IMAGE_TYPES.items() if re.match(head, data, re.DOTALL)), None)
+
+
 @dataclass(frozen=True, eq=False)
 class Replacement:
     """New vertices and triangles of a primitive.
@@ -106,11 +111,11 @@ def encode_glb(
         raise ValueError("replacements: expected at most one for each primitive")
     with reported(document.path):
         tree = _Tree(document)
-        for node in sorted({node for node, _ in keys}):
-            primitives = tree.own_mesh(node)["primitives"]
-            for each in replacements:
-                if each.primitive.node == node:
-                    tree.replace(primitives[each.primitive.primitive], each, uv_set)
+        meshes: dict[int, dict] = {}
+        for each in sorted(replacements, key=lambda each: each.primitive.node):
+            node = each.primitive.node
+            meshes[node] = meshes[node] if node in meshes else tree.own_mesh(node)
+            tree.replace(meshes[node]["primitives"][each.primitive.primitive], each, uv_set)
         tree.embed_images()
         tree.drop_unused()
     return _pack(document.path if path is None else path, tree.content, tree.payloads)
@@ -150,7 +155,8 @@ class _Tree:
             primitive["attributes"].setdefault(f"TEXCOORD_{number}", uv)
         # Index 65535 would restart the primitive.
         component, name = (_UINT16, "<u2") if len(new.gather) < 65536 else (_UINT32, "<u4")
-        corners = np.ascontiguousarray(new.triangle, name).reshape(-1, 1)
+        triangle = new.triangle[:, ::-1] if new.primitive.mirrored else new.triangle  # as the file has them
+        corners = np.ascontiguousarray(triangle, name).reshape(-1, 1)
         primitive["indices"] = self._accessor(corners.view(np.uint8), component, "SCALAR", _INDICES)
         primitive["mode"] = TRIANGLES
         for name in _OF_VERTICES:
@@ -169,7 +175,7 @@ class _Tree:
                 data = read_file(file, MESH_BYTES, where)
             except WlmError:
                 continue
-            kind = next((kind for head, kind in _IMAGE_TYPES.items() if re.match(head, data, re.DOTALL)), None)
+            kind = image_type(data)
             if kind is None:
                 continue
             del image["uri"]
