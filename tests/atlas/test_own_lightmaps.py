@@ -16,17 +16,18 @@ from wlm.atlas.data import from_arrays, load
 from wlm.atlas.stored import store, with_uvs
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf import parse_gltf, read_gltf
+from wlm.inspection import inspect
 
 SIDE = 64
 POSITION, TRIANGLE, UV = box((0, 0, 0), (1, 1, 1))
 PNG_8, EXR = "images of 8 bits are read as", "a.exr"
 
 
-def light(uv: np.ndarray = UV, dilated: bool = False) -> np.ndarray:
+def light(uv: np.ndarray = UV, dilated: bool = False, rows: float = 2.0) -> np.ndarray:
     """A light in [0, 1] that is smooth in each chart of UVs; black gaps, or that of the nearest texel."""
     sheet = from_arrays(POSITION, TRIANGLE, uv, np.ones((SIDE, SIDE, 3))).sheets[0]
     row, column = np.mgrid[:SIDE, :SIDE] / SIDE
-    level = 0.1 + 0.9 * ((np.floor(3 * column) + 3 * np.floor(2 * row)) * 0.618 % 1.0)
+    level = 0.1 + 0.9 * ((np.floor(3 * column) + 3 * np.floor(rows * row)) * 0.618 % 1.0)
     values = (level * (0.9 + 0.1 * np.sin(5 * column)))[..., None] * [1.0, 0.8, 0.6]
     values = values if dilated else values * sheet.mask[..., None]
     return values.astype(np.float16).astype(np.float32)
@@ -300,8 +301,10 @@ def test_uvs_that_the_light_does_not_fit(tmp_path, dilated):
     assert doubts(OTHER, UV) == [] and doubts(UV) == []
     assert "the light is smoother in the charts of TEXCOORD_0 (--uv-set 0)" in doubts(UV, OTHER)[0]
     assert "of its UVs scaled by 1.33 and 1.33 than in those of TEXCOORD_0" in doubts(0.75 * UV)[0]
-    assert "its UVs, about scaled by 1.6" in doubts(UV * [0.6, 1.0] + [0.35, 0.0])[0]
-    assert "TEXCOORD_0 (--uv-set 0) with the lightmap upside down (--flip)" in doubts(UV * [1, -1] + [0, 1], OTHER)[0]
+    assert "its UVs, about scaled by 1." in doubts(UV * [0.6, 1.0] + [0.35, 0.0])[0]
+    low = UV * [1, 0.6]
+    write_exr(tmp_path / "b.exr", light(low, dilated, 2 / 0.6))
+    assert "TEXCOORD_0 (--uv-set 0) with the lightmap upside down (--flip)" in doubts([0, 1] + low * [1, -1], OTHER)[0]
 
 
 def test_rectangles_counted_from_the_other_side(tmp_path):
@@ -429,3 +432,17 @@ def test_lightmaps_are_bounded_together(tmp_path, monkeypatch):
     path = write_scene(tmp_path / "a.gltf", things, {"images": [{"uri": EXR}], "textures": [{"source": 0}]})
     assert "its lightmaps: expected at most" in error_of(load, path)
     assert len(load(path, trust=True).sheets) == 4
+
+
+def test_what_inspect_says_of_them(tmp_path):
+    """The command that it prints reads them as they are; a picture beside the mesh is no second lightmap."""
+    path = writers_scene(tmp_path, "MX")
+    (found,) = inspect(tmp_path)
+    assert found.path == path and found.command == f"wlm compress {path} -o OUT.wlm"
+    assert "with 1 lightmap of MX_lightmap" in found.what
+    (found,) = inspect(scene(tmp_path, moz()))
+    assert "TEXCOORD_1 is read (see --uv-set)" in found.problems[0]
+    (found,) = inspect(scene(tmp_path, {"occlusionTexture": {"index": 0}}))
+    assert "or with that of a material slot (--slot occlusion)" in found.what and not found.command
+    (found,) = inspect(scene(tmp_path, moz(index=7)))
+    assert not found.command and "textures[7]" in found.problems[0]
