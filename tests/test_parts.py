@@ -203,7 +203,7 @@ def test_a_few_bytes_that_claim_a_large_atlas(path):
     mask = np.full(1 << 23, 255, np.uint8)
     frame = np.frombuffer(compress(mask.tobytes()), np.uint8)
     rewrite(path, {"sizes": [[8192, 8192]], "parts": {"mask": [1 << 23]}}, {"mask": frame})
-    refused(kept, path, "at most 65536 texels for each of the 1 of its textures, found 8192x8192")
+    refused(kept, path, "at most 65536 texels per stored texel, of which there are 1, found 8192x8192")
 
 
 def test_a_few_bytes_that_claim_a_large_network(path):
@@ -253,4 +253,4 @@ def test_a_batch_with_a_number_that_is_none(path):
     for number in ("9" * 5000, "٣", "-1", ""):
         tensors = {f"running.{number}.loss": np.zeros(1, np.float32)}
         write_artifact(path, artifact.system, artifact.settings, tensors, artifact.source)
-        refused(KEPT["lightmap-running"](), path, "expected one of a finished or a running batch")
+        refused(KEPT["lightmap-running"](), path, "is of neither a finished nor a running batch")

@@ -13,7 +13,7 @@ and viewers of models read bundles: the raw folder and the engine kits of `wlm.e
     smoke     first, second, motion, depth
 
 `valid` is R8_UNORM and 255 inside charts. The textures of smoke are R8G8B8A8_UNORM. A texture or buffer that a model
-has no use for is left out. Of the documents they read these keys, among others:
+has no use for is left out. From a bundle's `document` they read these keys, among others:
 
     lightmap  width, height, times, period, interpolation, time_axis, tau, slices, record, hour_fours, tile_columns,
               tile_size, hidden, gamma, tiles; images: by texture name the size [width, height] of one tile's image and
@@ -110,11 +110,11 @@ class Bundle:
         reference: Arrays that a reader of the bundle should reproduce, by name: for a lightmap `frame`, float32
             [H, W, 3] linear RGB at the first stored time.
         files: Further files by name, such as the mesh of an atlas.
-        parts: Bundles of the members of a collection by name, such as the layers of a lightmap, each read by itself.
-            Empty for a single item.
+        parts: Bundles of the members of a collection by name, such as the layers of a lightmap; empty for a bundle that
+            is no collection.
         exact: Name of the macro with which the shader fetches texels and interpolates in floats instead of using the
             texture filter; empty if the shader has no such variant.
-        model: The model itself, for kits that sample it at other positions than the stored ones: grids of probes.
+        model: The model itself, for engine kits that decode it at positions of their own, such as a grid of probes.
     """
 
     system: str

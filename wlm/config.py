@@ -33,7 +33,7 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
     try:
         text = read_file(path, SETTINGS_BYTES, "the settings").decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise WlmError(f"{path}: expected YAML in UTF-8, found another byte at {error.start}") from error
+        raise WlmError(f"{path}: expected YAML in UTF-8, found an invalid byte at position {error.start}") from error
     try:
         values = yaml.load(text, _Loader)
     except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
@@ -83,18 +83,13 @@ def profile_path(system: str, name: str) -> Path:
 
 
 def profile_names(system: str) -> list[str]:
-    """Lists the names of a system's profiles, sorted.
-
-    Args:
-        system: First part of the file names, the attribute `FILES` of the settings.
-    """
+    """Returns the sorted names of a system's profiles; `system` is the first part of the names of their files."""
     prefix = f"{system}-"
     files = {file.stem for folder in _profile_folders() for file in folder.glob(f"{prefix}*.yaml")}
     return sorted(stem.removeprefix(prefix) for stem in files)
 
 
 def _profile_folders() -> Iterator[Path]:
-    """Yields the folders that contain profiles: the checkout's, then the one installed with the package."""
     root = Path(__file__).resolve().parents[1]
     # An installed package is in site-packages; only a checkout has a pyproject.toml beside the package.
     if (root / "pyproject.toml").is_file() and (root / "configs").is_dir():
@@ -186,7 +181,7 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
 
 
 def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
-    """Lists the known keys of the mapping at a location, or only the most similar one."""
+    """Returns the known keys of the mapping that has an unknown key, or only the known key that is most similar."""
     model: Any = cls
     for part in location[:-1]:
         field = model.model_fields.get(part)
@@ -204,7 +199,7 @@ def _shown(value: object) -> str:
 
 
 class _Short(reprlib.Repr):
-    """Formats a value for a message, like `repr`, but only its beginning if it is long."""
+    """Formats a value for an error message like `repr`, and cuts it short if it is long."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -49,7 +49,7 @@ def check_device(name: str) -> str:
 
 
 def device_name(device: torch.device) -> str:
-    """Returns the name of a tensor's device in the form of `check_device` and `stream`."""
+    """Returns the name of a tensor's device, "cpu" or "cuda:N", which Warp accepts too."""
     return "cpu" if device.type == "cpu" else f"cuda:{device.index or 0}"
 
 
@@ -75,7 +75,7 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
 
     Args:
         tensor: A tensor of any strides; trailing dimensions that become a vector or matrix must be contiguous.
-        dtype: The Warp type of an element, a vector or matrix type for example; default the tensor's scalar.
+        dtype: The Warp type of an element, a vector or matrix type for example; default the tensor's number type.
 
     Returns:
         An array that shares the tensor's memory and keeps it alive.
@@ -88,7 +88,7 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
     try:
         return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
     except (RuntimeError, TypeError) as error:
-        raise ValueError(f"tensor {tuple(tensor.shape)} of {tensor.dtype} as {dtype}: {error}") from error
+        raise ValueError(f"cannot use a tensor {tuple(tensor.shape)} of {tensor.dtype} as {dtype}: {error}") from error
 
 
 @contextmanager
@@ -171,7 +171,7 @@ class StepGraph:
 
     @property
     def captured(self) -> bool:
-        """Whether later calls replay a graph."""
+        """Whether the step has been captured, so that further calls replay a graph."""
         return self._graph is not None
 
     def __call__(self) -> None:
@@ -204,7 +204,7 @@ class StepGraph:
 
 @cache
 def _side_stream(device: str) -> tuple[torch.cuda.Stream, wp.Stream]:
-    """Creates the single side stream of a device: torch's allocator keeps a pool of memory for every stream."""
+    """Creates (once) the stream of a device for graphs; torch's allocator keeps separate memory for every stream."""
     # Warp looks up a stream's device in a table created at initialisation, and this may be the first Warp call.
     wp.init()
     side = torch.cuda.Stream(device)
@@ -213,8 +213,6 @@ def _side_stream(device: str) -> tuple[torch.cuda.Stream, wp.Stream]:
 
 @cache
 def warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
-    """Returns the Warp object of a torch stream, the same object at every use.
-
-    If a second wrapper of a stream were deleted, Warp would unregister the stream and could not capture on it.
-    """
+    """Returns the Warp object of a torch stream, the same object at every use: if a second object were deleted, Warp
+    would forget the stream and could not capture a graph on it."""
     return wp.stream_from_torch(stream)

@@ -1,6 +1,6 @@
-"""Code that the four systems share: settings by name, progress, reports, headers of files, save and load.
+"""Code that the lightmap, atlas, probe and smoke systems share: settings, progress, reports, save and load of models.
 
-The mathematics is not shared. It is in the modules of each system:
+The mathematics is not shared. Each system, a package of `wlm`, has these modules:
 
     data.py        the checked input               `load`, `from_arrays`
     model.py       settings and arrays             `Profile`, the model
@@ -50,7 +50,7 @@ Name = Annotated[str, AfterValidator(_printable)]
 
 
 class Settings(BaseModel):
-    """Settings of a fit, loaded by name: the base of each system's `Profile`.
+    """Settings of the compression, which can be loaded by name: the base of each system's `Profile`.
 
     The docstring under a field becomes its description, from which the command line makes an option's help.
 
@@ -97,7 +97,7 @@ class Settings(BaseModel):
 
 @dataclass(frozen=True)
 class Progress:
-    """The state of long work.
+    """How far a long computation has come.
 
     Attributes:
         stage: Name of the current stage in a word or two, such as "fit" or "cluster".
@@ -137,13 +137,13 @@ class Meter:
         return time.perf_counter() - self._start
 
     def due(self, done: int) -> bool:
-        """Returns whether a report is due, for callers whose figures take time to compute."""
+        """Returns whether it is time for a report, for callers that must compute its values first."""
         if self._progress is None:
             return False
         return done >= self._total > 0 or time.perf_counter() - self._last >= self._every
 
     def report(self, done: int, **figures: float) -> None:
-        """Reports at once. An underscore in the name of a figure stands for a space: `PSNR_dB=41.2`."""
+        """Reports now, with measured values. An underscore in a name stands for a space: `PSNR_dB=41.2`."""
         if self._progress is None:
             return
         self._last = time.perf_counter()
@@ -152,7 +152,7 @@ class Meter:
 
 
 class Report:
-    """Base of a system's report, which is a frozen dataclass."""
+    """Base class of the systems' reports, for example of compression errors; a report is a frozen dataclass."""
 
     def to_json(self) -> dict[str, Any]:
         """Returns the attributes as JSON values by name; NaN and infinity become None."""
@@ -240,7 +240,6 @@ class Model:
         return _module(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
     def _encoded(self) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-        """Returns the settings, the parts and the source hash that `save` writes."""
         return _module(self.SYSTEM, "codec").encode(self)
 
 
@@ -289,5 +288,4 @@ def _package(path: str | os.PathLike[str], artifact: Artifact) -> str:
 
 
 def _module(system: str, name: str) -> Any:
-    """Imports a module of a system's package."""
     return import_module(f"{_PACKAGES[system]}.{name}")

@@ -88,10 +88,10 @@ def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the texels within `REACH` of a valid one, and the nearest valid one of each, for a mask bool [H, W].
+    """Finds the invalid texels within `REACH` texels of a valid one, and the valid texel that is nearest to each.
 
-    Among equally near texels it is the first in reading order, so that every decoder (host, shader, web page) uses the
-    same one.
+    `mask` is bool [H, W], true where a texel is valid. Of several equally near texels the first in reading order is
+    taken, so that all decoders (Python, shader, web page) take the same one.
 
     Returns:
         Row and column of each such texel, int [G, 2], in reading order, and row and column of its nearest valid texel.
@@ -111,13 +111,14 @@ def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def nearest_valid(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Finds the valid texel that is nearest to each texel of a lightmap (Euclidean distance), itself where it is valid.
 
-    Within `REACH` the result equals `near_gaps`; at larger distances any of several equally near texels is chosen.
+    Up to a distance of `REACH` texels the result equals that of `near_gaps`; at larger distances any of several equally
+    near texels is chosen.
 
     Args:
         mask: bool [H, W], true where a texel is valid; at least one is.
 
     Returns:
-        Its row and its column, int32 [H, W] each: `image[rows, columns]` is the image with its gaps filled.
+        Row and column of the nearest valid texel, int32 [H, W] each: `image[rows, columns]` has its gaps filled.
     """
     rows, columns = _nearest_in_strips(mask) or _nearest(mask)
     target, source = near_gaps(mask)
@@ -130,7 +131,7 @@ def _nearest(mask: np.ndarray) -> np.ndarray:
 
 
 def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Computes `_nearest` in threads, on overlapping strips of rows; None if the overlap may be too small."""
+    """Finds nearest valid texels by threads, on overlapping strips of rows; None if strips may overlap too little."""
     height, width = mask.shape
     rows, columns = (np.empty(mask.shape, np.int32) for _ in range(2))
 

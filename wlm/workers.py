@@ -170,7 +170,7 @@ class Processes(Workers):
             self._end(number, _PATIENCE)
 
     def kill(self, number: int) -> None:
-        """Kills one process immediately, like the system when it runs out of memory."""
+        """Kills one process immediately, as the operating system does when memory runs out."""
         self._processes[number].kill()
 
     def _start(self, number: int) -> None:
@@ -242,7 +242,7 @@ class Actors(Workers):
         try:
             import ray
         except ImportError as error:
-            raise WlmError('cluster: expected Ray, of the extra "cluster" (pip install "wlm[cluster]")') from error
+            raise WlmError('cluster: expected the package Ray, found none: pip install "wlm[cluster]"') from error
         self._ray, self._mine = ray, not ray.is_initialized()
         if self._mine:
             _connect(ray, address)
@@ -250,7 +250,7 @@ class Actors(Workers):
         room = int(ray.cluster_resources().get(resource, 0.0) // each)
         if not room:
             self._leave()
-            raise WlmError(f"cluster {address}: expected {each:g} {resource} for a worker, found less")
+            raise WlmError(f"cluster {address}: expected at least {each:g} {resource} for a worker, found fewer")
         self.count = min(most, count or room)
         options = {"num_gpus": share.get("GPU", 0), "num_cpus": share.get("CPU", 1)}
         self._make, self._arguments = ray.remote(make).options(**options), arguments
@@ -348,7 +348,6 @@ def _sendable(error: Exception) -> Exception:
 
 
 def _reason(code: int, errors: IO[bytes]) -> str:
-    """Returns the reason why a process ended, as one line."""
     with suppress(OSError, ValueError):
         size = errors.seek(0, os.SEEK_END)
         errors.seek(max(0, size - _TOLD))

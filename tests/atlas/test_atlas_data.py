@@ -180,7 +180,7 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
         ({"triangle": TRIANGLE * 1.0}, "triangle: expected numbers [N, 3], got float64"),
         ({"triangle": TRIANGLE + 1}, "triangle: expected vertices 0 to 3, found 1 to 4"),
         ({"lightmap": _lightmap()[..., :2]}, "expected a lightmap [H, W, 3]"),
-        ({"mask": _chart()[:3]}, "expected a mask of (6, 8), got (3, 8)"),
+        ({"mask": _chart()[:3]}, "expected a mask of the lightmap's (6, 8) texels, got (3, 8)"),
         ({"mask": np.zeros((HEIGHT, WIDTH))}, "thing: mask: the mask is empty"),
         (
             {"position": _with(POSITION, (3, 1), np.nan)},

@@ -237,7 +237,7 @@ def test_wrong_settings():
         ({"profile": "none"}, "profile 'none' of atlas"),
         ({"budget": 0.0}, "budget: expected"),
         ({"bugdet": 0.1}, "unknown key 'bugdet'; did you mean 'budget'"),
-        ({"profile": "paper", "budget": 0.1}, "budget: profiles of the cascade state their sizes"),
+        ({"profile": "paper", "budget": 0.1}, "budget: a profile of the cascade states the sizes"),
     ):
         with pytest.raises(WlmError, match=line):
             compress(sheet(), **arguments)

@@ -341,7 +341,7 @@ def test_entries():
     assert entries.dtype == np.uint16
     np.testing.assert_array_equal(np.stack(unpack_entries(entries, NO_BLOCKS)[:2]), np.stack([first, size]))
     for wrong in ((first - 1, size), (first + 1, size), (first, size - 1), (first, size + 1)):
-        with pytest.raises(ValueError, match="an entry beyond a texture of 4096 texels or a tile of 16"):
+        with pytest.raises(ValueError, match="an entry lies beyond 4096 texels or blocks"):
             pack_entries(*wrong)
 
 

@@ -325,18 +325,18 @@ def test_what_a_list_of_lightmaps_says_wrong(tmp_path):
         return error_of(load, path, lists)
 
     assert "no material has a lightmap (MOZ_lightmap, " in error_of(load, path)
-    assert "sheets: expected 2 files each, one a state, found [1]" in told(states=["a", "b"])
-    assert "objects[0].sheet: expected below 1, found 3" in told(objects=[{"node": "left", "sheet": 3}])
+    assert "sheets: expected 2 files in each, one per state, found [1]" in told(states=["a", "b"])
+    assert "objects[0].sheet: expected 0 to 0, found 3" in told(objects=[{"node": "left", "sheet": 3}])
     assert "node: expected one of left, right, found 'top'" in told(objects=[{"node": "top", "sheet": 0}])
     twice = [{"node": "left", "sheet": 0}, {"node": "left", "sheet": 0, "scale_offset": [1, 1, 0.5, 0]}]
     assert "left is given two lightmaps" in told(objects=twice)
-    assert "sheets[0]: no triangle reads it" in told(objects=[])
+    assert "sheets[0]: no triangle of the mesh is lit by it" in told(objects=[])
     godot = {"convention": "godot", "objects": [{"path": "a", "uv_scale": [1, 2]}]}
     assert "objects[0].uv_scale: expected 4 numbers, found [1, 2]" in told(**godot)
     lists.write_text(json.dumps({"lightmaps": [{"time_hours": 6, "file": "day.exr"}], "mesh": "scene.glb"}))
     assert read_listing(lists).states == ("6 h",)
     write_exr(tmp_path / "small.exr", lights(0)[0][:20])
-    assert "small.exr: expected 48x48 texels as the sheet's other lightmaps, found 48x20" in told(
+    assert "small.exr: expected 48x48 texels, the size of the sheet's first lightmap, found 48x20" in told(
         sheets=[{"files": ["day.exr", "small.exr"]}]
     )
 

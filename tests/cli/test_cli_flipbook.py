@@ -118,9 +118,9 @@ def test_straight_light_with_a_texture_of_opacity(straight, tmp_path):
     first, second, opacity = straight
     words = ["smoke", "shade", first, "--with", second, "--with", opacity, "--from", "o3de", "--cells", "2x2", "-o"]
     call(*words, tmp_path / "white")
-    assert "is it straight (--straight)?" in call.stderr
+    assert "if its alpha is not premultiplied, give --straight" in call.stderr
     call(*words, tmp_path / "out", "--straight", "--background", "0,0,1")
-    assert "is it straight" not in call.stderr
+    assert "give --straight" not in call.stderr
     np.testing.assert_allclose(light_of(tmp_path / "out" / "shade_0001.png")[0, 0], [0, 0, 1], atol=1e-6)
     found = next(each for each in inspect(tmp_path) if each.path == first)
     # The printed command is accepted: without the third texture the book can be repacked, not shaded.
@@ -156,8 +156,8 @@ def test_wrong_options_are_one_line(baked, tmp_path):
         ([*book, "--layout", "godot"], "--layout"),
         ([*book, "--rate", 0], "--rate: expected a number above 0, got 0"),
         ([*book, "--gain", "nan"], "--gain: expected a number above 0, got nan"),
-        ([*textures, "--engine", "three"], "--engine: expected a folder as the output"),
-        ([*textures, "--shader", "wgsl"], "--shader: expected a folder as the output"),
+        ([*textures, "--engine", "three"], "--engine needs a folder as the output"),
+        ([*textures, "--shader", "wgsl"], "--shader needs a folder as the output"),
         ([*textures[:-1], tmp_path / "a.jpg"], "ends in .exr or .png or .tga"),
     ):
         assert call(*words, code=2) == "" and line in call.stderr.splitlines()[-1]

@@ -150,7 +150,7 @@ def test_evaluate_against_another_set(fitted, tmp_path):
     probes = synthetic(PROBES, dead=DEAD)
     save_probes(tmp_path / "a.npz", probes.position, 2.0 * probes.values)
     call("evaluate", fitted, tmp_path / "a.npz")
-    assert f"warning: {tmp_path / 'a.npz'}: not the input of {fitted}" in call.stderr
+    assert f"warning: {tmp_path / 'a.npz'}: not the input that {fitted} was made from" in call.stderr
     other = synthetic(PROBES, seed=3, dead=DEAD)
     save_probes(tmp_path / "b.npz", other.position, other.values)
     assert f"expected the positions of its own {PROBES} probes" in fails("evaluate", fitted, tmp_path / "b.npz")

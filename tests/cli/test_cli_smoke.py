@@ -209,7 +209,7 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
     assert "--light: irradiance.0: expected greater than or equal to 0" in fails(*shaded, "--light", "0,0,1:-1")
     assert "--rule" in fails(*shaded, "--rule", "cubed")
     for smoke in (volume, frames, tmp_path):
-        assert "with wlm smoke bake or predict" in fails("smoke", "shade", smoke, "-o", tmp_path / "x")
+        assert "wlm smoke bake or predict makes them" in fails("smoke", "shade", smoke, "-o", tmp_path / "x")
     assert os.listdir(tmp_path) == []
 
 

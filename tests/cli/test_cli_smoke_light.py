@@ -75,7 +75,7 @@ def test_frames_keep_their_obstacles_and_lights(tmp_path):
         (("--point", "0,0,0:-1"), "--point"),
         (("--sky", "1,-1,1"), "--sky"),
         (("--white", "0"), "--white"),
-        (("--samples", "4", "--background", "1,1,1"), "--background: expected none"),
+        (("--samples", "4", "--background", "1,1,1"), "--background cannot be used with --samples"),
     ],
 )
 def test_wrong_options_are_one_line(volume, tmp_path, words, message):

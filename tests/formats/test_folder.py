@@ -106,7 +106,7 @@ def test_folders_of_others_are_refused(tmp_path):
     for content in (None, "[]", "{", '{"format": "wlm-other"}'):
         if content is not None:
             (folder / INDEX).write_text(content)
-        with pytest.raises(WlmError, match="full: expected an empty folder or one of an earlier output, found other"):
+        with pytest.raises(WlmError, match="full: expected an empty folder or an earlier output, found other"):
             claim(folder, INDEX, FORMAT)
     with pytest.raises(WlmError, match="a.txt: cannot write there: Not a directory"):
         claim(folder / "a.txt", INDEX, FORMAT)

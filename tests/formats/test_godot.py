@@ -201,8 +201,12 @@ def test_other_damage_has_its_own_line(tmp_path):
     assert "expected a reference of kind 0 to 3, found 4" in message(tmp_path, writer.file([("x", writer.u32(24, 4))]))
     data = writer.file([("x", writer.u32(3, 1234))])
     at = data.index(writer.u32(3, 1234)) - 4
-    assert "expected a name below 3, found 3" in message(tmp_path, data[:at] + writer.u32(3) + data[at + 4 :])
+    assert "expected an index of a name below 3, found 3" in message(
+        tmp_path, data[:at] + writer.u32(3) + data[at + 4 :]
+    )
     table = data.index(b"local://0\0") + len(b"local://0\0")
     assert "cut short or damaged" in message(tmp_path, data[:table] + b"\xff" * 8 + data[table + 8 :])
     at = data.index(writer.u32(1) + writer.text("local://0"))
-    assert "at least one resource inside" in message(tmp_path, data[:at] + writer.u32(0) + data[at + 4 :])
+    assert "contains no resource: expected at least one" in message(
+        tmp_path, data[:at] + writer.u32(0) + data[at + 4 :]
+    )

@@ -35,7 +35,7 @@ def test_a_full_disk_is_one_line(folder, portable, monkeypatch):
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:
-        with pytest.raises(WlmError, match=r"^set.json: 8,000 bytes in .+ \(TMPDIR\): File too large$") as error:
+        with pytest.raises(WlmError, match=r"^set.json: needs 8,000 bytes in .+ \(TMPDIR\): File too large$") as error:
             scratch.room((2000,), np.float32, "set.json")
         assert str(folder) in str(error.value)
         assert len(scratch.room((1000,), np.float32, "set.json")) == 1000

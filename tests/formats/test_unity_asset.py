@@ -68,11 +68,14 @@ def cut(item, size):
     ("objects", "said"),
     [
         ([("Texture2D", None, b"", "<")], "found neither"),
-        ([probes(PLACES, SH[:1])], "light for each of 2 probes, found that of 1"),
+        ([probes(PLACES, SH[:1])], "light for each of 2 probes, found light for 1"),
         ([cut(probes(PLACES, SH), -1)], "damaged, or UnityPy cannot read its version.*: expected 216 bytes"),
         ([("LightProbes", node("LightProbes", "Base"), b"", "<")], "m_BakedCoefficients is missing"),
         ([("LightProbes", None, b"", "<")], "does not contain the layout of its objects"),
-        ([("LightingDataAsset", unity_assets.LIGHTING, struct.pack("<2i", 0, -1), "<")], "array of -1 values"),
+        (
+            [("LightingDataAsset", unity_assets.LIGHTING, struct.pack("<2i", 0, -1), "<")],
+            "an array of 0 or more values, found -1",
+        ),
     ],
 )
 def test_others_are_refused(unity, objects, said):
@@ -120,7 +123,7 @@ def test_a_reader_that_ends_is_told(tmp_path, monkeypatch):
         ("import os; os.abort()", "UnityPy crashed"),
         ("raise EOFError('no more')", "EOFError: no more"),
         ("print('[]')", "found neither"),
-        ('print(\'[["LightProbes", [], 60, 8, "<"]]\')', "an object of 8 bytes at 60 in a file of 64"),
+        ('print(\'[["LightProbes", [], 60, 8, "<"]]\')', "an object of 8 bytes at 60 exceeds the file of 64 bytes"),
     ):
         child.write_text(program)
         with pytest.raises(WlmError, match=said):

@@ -20,5 +20,5 @@ def test_damaged_frames_are_refused():
 
 
 def test_frame_of_another_size_is_refused():
-    with pytest.raises(ValueError, match="expected 4999 bytes, found a frame of 5000"):
+    with pytest.raises(ValueError, match="expected a frame of 4999 decompressed bytes, found 5000"):
         decompress(compress(bytes(5000)), 4999, "tile")

@@ -169,14 +169,14 @@ def test_everything_is_one_list(device: str):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([0, 0, 0], [1, -1, 1]), "expected two corners of a box"),
-        (([0, 0, 0], [1, np.nan, 1]), "expected two corners of a box"),
-        (([0, 0], [1, 1]), "expected two corners of a box"),
+        (([0, 0, 0], [1, -1, 1]), "expected a lowest and a highest corner"),
+        (([0, 0, 0], [1, np.nan, 1]), "expected a lowest and a highest corner"),
+        (([0, 0], [1, 1]), "expected a lowest and a highest corner"),
         (([0, 0, 0], [1, 1, 1], 0.0), "size: expected a positive number, got 0.0"),
         (([0, 0, 0], [1, 1, 1], np.inf), "size: expected a positive number, got inf"),
         (([0, 0, 0], [1, 1, 1], 1e-4), r"makes 10+ cubes, expected at most 1073741823"),
         # Three Gaussians over half of what is allowed each.
-        (([0, 0, 0], [1, 1, 1], 1 / 800), "makes 1536000000 pairs to test, expected at most 1073741823"),
+        (([0, 0, 0], [1, 1, 1], 1 / 800), r"makes 1536000000 pairs \(cube, Gaussian\), expected at most 1073741823"),
     ],
 )
 def test_wrong_arguments(arguments: tuple, message: str):

@@ -420,8 +420,8 @@ def test_unknown_parts_are_refused(tmp_path, part):
     checkpoint.add_finished(0, {"uv": np.zeros(4, np.uint8)})
     settings = read_artifact(checkpoint.path).settings
     write_artifact(checkpoint.path, checkpoint.system, settings, {part: np.zeros(4, np.uint8)}, lightmaps.source)
-    with pytest.raises(WlmError, match="expected one of a finished or a running batch"):
+    with pytest.raises(WlmError, match="is of neither a finished nor a running batch"):
         open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
     write_artifact(checkpoint.path, checkpoint.system, {}, {}, lightmaps.source)
-    with pytest.raises(WlmError, match="does not state its fit"):
+    with pytest.raises(WlmError, match="does not state the inputs of its fit"):
         open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)

@@ -144,7 +144,7 @@ def test_wrong_files(tmp_path: Path):
     # The header alone states the size; the rest of the file is as before.
     header = b"IHDR" + struct.pack(">2I", 9400, 9400) + whole[24:29]
     paths[0].write_bytes(whole[:12] + header + struct.pack(">I", zlib.crc32(header)) + whole[33:])
-    refused(f"a_1.png: expected at most 2048 times its {len(whole)} bytes once unpacked")
+    refused(f"a_1.png: expected at most 2048 times its {len(whole)} compressed bytes")
     for path in paths:
         Image.new("RGB", (9, 6)).save(path)
     refused("layout o3de-tlrb: expected channels for bottom", "o3de-tlrb")

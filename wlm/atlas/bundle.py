@@ -43,9 +43,9 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
         device: "cpu" or "cuda:N", where the lightmap for comparison is decoded.
 
     Returns:
-        A bundle with the texture `colour`; the textures `lut` and `blocks` where the model has them; the textures
-        `sheets` and `factors` for shared tiles; the file `mesh.glb`; and, to compare with, the decoded `lightmap` of
-        the first sheet in the first state, float32 [H, W, 3].
+        A bundle with the texture `colour`; the textures `lut` and `blocks` where the model has them; for a model of
+        several lightmaps the textures `sheets` and `factors`; the file `mesh.glb`; and, to test a renderer against, the
+        first lightmap as decoded, `lightmap`, float32 [H, W, 3].
 
     Raises:
         WlmError: A texture has more texels along a side than GPUs take, there is no such device, or the stored
@@ -81,8 +81,9 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
 
 
 def sheet_texels(model: AtlasModel) -> np.ndarray:
-    """Makes the texture `sheets`, uint16 [rows, 2, 4]. A row's first texel has the width and height and the x and y of
-    its first entry in the lookup texture; the second has the tiles in x and y, the next smaller level's row, and 0."""
+    """Makes the texture `sheets`, uint16 [rows, 2, 4]: one row per lightmap layout (sheet) or mip level. The first
+    texel of a row has width and height in texels, then x and y of the first entry in the lookup texture; the second has
+    the tiles in x and y, the row of the next smaller mip level (0 if none), and 0."""
     table = model.table()
     texels = np.zeros((len(table), 2, 4), "<u2")
     texels[:, 0] = table[:, [1, 0, 3, 2]]
@@ -91,7 +92,7 @@ def sheet_texels(model: AtlasModel) -> np.ndarray:
 
 
 def _colour(model: AtlasModel, layered: bool) -> Texture:
-    """Makes the colour texture T_p; for the colour "mixed" it is the texture whose tiles are not stored as blocks."""
+    """Makes the colour texture T_p. For the colour "mixed", which has two colour textures, it is the one in RGB9E5."""
     layers = len(model.texels) if layered else 0
     format = TEXELS if model.colour == "mixed" else model.colour
     if format == "half":
@@ -111,7 +112,6 @@ def _texture(data: np.ndarray, format: str, texels: np.ndarray, layers: int) -> 
 
 
 def _lookup(model: AtlasModel) -> Texture:
-    """Makes the lookup texture T_c: of integers if the model has tiles, of coordinates for the method "cascade"."""
     numbers = model.lut.shape[2]
     format = "R16G16B16A16_UINT" if numbers == 4 else "R16G16_UNORM" if model.method == "cascade" else "R16G16_UINT"
     return Texture.from_texels(np.ascontiguousarray(model.lut, "<u2"), format)

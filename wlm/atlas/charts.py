@@ -6,8 +6,9 @@ from scipy.sparse.csgraph import connected_components
 
 
 def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Numbers the corners of the triangles, int32 [F, 3] from 0. Equal position [V, 3] and UV [V, 2] give an equal
-    number. A file splits vertices where any attribute differs, a normal for example; a lightmap has no seam there."""
+    """Numbers the corners of the triangles, int32 [F, 3] from 0: corners with the same position [V, 3] and UV [V, 2]
+    get the same number. A file also splits vertices where another attribute differs, such as a normal, though the
+    lightmap has no seam there."""
     # Adding 0 turns -0 into 0, which has other bits.
     values = np.ascontiguousarray(np.concatenate([position, uv], 1, dtype=np.float64) + 0.0)
     row = values.view([("", np.float64)] * values.shape[1])[:, 0]
@@ -16,8 +17,8 @@ def welded(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray) -> np.nda
 
 def charts(corner: np.ndarray, active: np.ndarray | None = None) -> np.ndarray:
     """Numbers the charts, int32 [F] from 0, in the order of their first triangles; -1 for a triangle that isn't active.
-    `corner`, int [F, 3], is from `welded`. Triangles that share an edge are in one chart; sharing a corner is not
-    enough."""
+    `corner`, int [F, 3], is the result of `welded`. Triangles that share an edge are in one chart; sharing a corner is
+    not enough."""
     corner = np.asarray(corner)
     count = len(corner)
     out = np.full(count, -1, np.int32)

@@ -2,9 +2,10 @@
 
 Parts: `colour` (half [pages, Hp, Wp, 3], uint32 [pages, Hp, Wp] for RGB9E5, or uint8 [1, B, 16] where T_p is stored as
 blocks), `mesh` (uint8, a `.glb` file), `mask` (uint8, the bits of all masks) and, where the model has them, `lut`
-(uint16 [Hc, Wc, 2 or 4]), `blocks` (uint8 [pages, B, 16], the second texture of "mixed"), `factor` (float32
-[M, C, 3]), `sheets` (int32 [rows, 7], `AtlasModel.table`) and `uv` (uint16 [F, 3, 2], new UVs times 65,535). Each is a
-zstd frame where that is smaller.
+(uint16 [Hc, Wc, 2 or 4]), `blocks` (uint8 [pages, B, 16], the second colour texture of the format "mixed"), `factor`
+(float32 [M, C, 3], factors of tiles that M lightmaps share), `sheets` (int32 [rows, 7], the places of lightmaps in
+`lut`, from `AtlasModel.table`) and `uv` (uint16 [F, 3, 2], new UVs times 65,535). A part is compressed with zstd if
+that saves bytes.
 """
 
 import math
@@ -59,7 +60,7 @@ class _Object(Header):
 
 
 class _Header(Header):
-    """The settings of a file. All sizes are (rows, columns); `sizes` has the sizes of the lightmaps in texels."""
+    """The settings of a file. All sizes are rows and columns in texels; `sizes` has one for each sheet (UV layout)."""
 
     name: Name
     method: Literal["tiles", "cascade", "plain", "shared"]
@@ -80,15 +81,15 @@ class _Header(Header):
 
 
 def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Returns the settings, the parts and the source hash of a model's file, without times, so that one seed gives one
-    file.
+    """Returns the settings, the arrays (parts) and the source hash for a model's file. Times are left out, so that
+    compressing twice with one seed gives equal files.
 
     Raises:
         ValueError: The model stores no triangles, or its UVs are not rounded to 16 bits.
     """
     stored = model.stored
     if stored is None:
-        raise ValueError(f"{model.name}: expected a model with the triangles of its scene")
+        raise ValueError(f"{model.name}: expected a model that stores the triangles of its scene, found none")
     settings = {
         "name": model.name,
         "method": model.method,
@@ -109,7 +110,7 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     }
     parts = {"colour": model.texels, "lut": model.lut, "factor": model.factor}
     if not np.array_equal(snapped(model.uv), model.uv):
-        raise ValueError(f"{model.name}: expected new UVs of 16 bits")
+        raise ValueError(f"{model.name}: expected new UVs that are rounded to 16 bits, found other values")
     parts["uv"] = np.rint(model.uv * LUT_STEPS).astype(np.uint16)
     if model.colour in colour.BLOCK_CODECS:
         parts["colour"] = model.blocks
@@ -128,18 +129,18 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
 
 def sizes(model: AtlasModel) -> tuple[int, int]:
-    """Returns two numbers of bytes: a model's file, and the triangles and masks in it."""
+    """Returns the bytes of a model's whole file, and the bytes of the triangles and masks in it."""
     settings, parts, source = encode(model)
     whole = sum(memoryview(part).nbytes for part in encode_artifact(model.SYSTEM, settings, parts, source))
     return whole, sum(parts[name].nbytes for name in _GEOMETRY)
 
 
 def decode(artifact: Artifact) -> AtlasModel:
-    """Reconstructs the model of an artifact, bit for bit as it was written.
+    """Reconstructs an atlas model from a file's content, exactly as it was written.
 
     Raises:
-        WlmError: A setting is wrong, a block isn't one of its format, the triangles are damaged, or a package that
-            decodes blocks is missing.
+        WlmError: A setting is wrong, a block's bits are invalid in its format, the triangles are damaged, or the
+            package that decodes blocks isn't installed.
         ValueError, LookupError, TypeError, AttributeError: The parts don't match the settings.
     """
     header = check_settings(_Header, artifact.settings, "setting ")
@@ -189,24 +190,23 @@ def decode(artifact: Artifact) -> AtlasModel:
 
 
 def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]:
-    """Returns the parts after checking their types and shapes against the settings."""
     shared, method = header.method == "shared", header.method
     texels, second = tuple(header.texels), header.block_texels
     if len(header.sizes) != len(header.sheets):
         raise ValueError(f"setting sizes: expected {len(header.sheets)}, one for each sheet, found {len(header.sizes)}")
     height, width = header.sizes[0]
     if not (shared or len(header.sheets) == len(header.states) == 1):
-        raise ValueError("setting sheets: expected one sheet and one state, or shared tiles")
+        raise ValueError(f"setting sheets: expected one sheet and one state for method {method}, found more")
     if {each.sheet for each in header.objects} != set(range(len(header.sheets))):
-        raise ValueError(f"setting objects: expected a node for each of {len(header.sheets)} sheets")
+        raise ValueError(f"setting objects: expected at least one object for each of the {len(header.sheets)} sheets")
     if header.separate and not shared:
-        raise ValueError("setting separate: expected shared tiles")
+        raise ValueError(f"setting separate: expected method shared, found {method}")
     if (second is None) == (header.colour == "mixed") or any(side % BLOCK_SIDE for side in second or ()):
-        raise ValueError("setting block_texels: expected multiples of 4 with colour mixed, and none without")
+        raise ValueError("setting block_texels: expected multiples of 4 if colour is mixed, none otherwise")
     if header.colour == "mixed" and method in ("cascade", "plain"):
-        raise ValueError(f"setting colour: expected one texture for method {method}, found mixed")
+        raise ValueError(f"setting colour: method {method} has one colour texture, found mixed, which has two")
     if shared and header.colour not in ("rgb9e5", "mixed"):
-        raise ValueError(f"setting colour: expected rgb9e5 or mixed for shared tiles, found {header.colour}")
+        raise ValueError(f"setting colour: expected rgb9e5 or mixed for method shared, found {header.colour}")
     pages = None if shared else 1
     grid = math.prod(colour.block_grid(*texels))
     colours = {
@@ -235,26 +235,26 @@ def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]
     }
     parts = check_parts(unpack_parts(artifact.tensors, header.parts, table), table)
     if not parts["colour"].size or (method == "cascade" and not parts["lut"].size):
-        raise ValueError("part colour, part lut: expected textures, found an empty one")
+        raise ValueError("part colour, part lut: expected textures, found one without texels")
     if shared and not all(parts[name].size for name in ("lut", "factor", "sheets")):
-        raise ValueError("part lut, part factor, part sheets: expected all of them for shared tiles")
+        raise ValueError("expected parts lut, factor and sheets for method shared, found one missing or empty")
     if shared and parts["lut"].shape[2] not in (SHORT_ENTRY, ENTRY):
-        raise ValueError(f"part lut: expected entries of 2 or 4 numbers, found {parts['lut'].shape[2]}")
+        raise ValueError(f"part lut: expected 2 or 4 numbers per entry, found {parts['lut'].shape[2]}")
     return parts
 
 
 def _masks(header: _Header, bits: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Unpacks the masks of all sheets, each bool [H, W]."""
     whole = np.unpackbits(bits).astype(bool)
     ends = np.cumsum([0, *(math.prod(size) for size in header.sizes)])
     masks = tuple(whole[a:b].reshape(size) for a, b, size in zip(ends, ends[1:], header.sizes, strict=False))
     if not all(mask.any() for mask in masks):
-        raise ValueError("part mask: expected a texel of a chart in each sheet")
+        raise ValueError("part mask: expected at least one texel of a chart in each sheet, found none")
     return masks
 
 
 def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
-    """Reads where each sheet and level lies in the lookup texture, without checking that it lies inside the texture."""
+    """Reads from `table` where the tiles of each sheet or mip level lie in the lookup texture, even if outside of
+    it."""
     if header.method != "shared":
         (size,), (name,) = header.sizes, header.sheets
         grid = tile_counts(*size, header.profile.tile) if header.method == "tiles" else (0, 0)
@@ -262,29 +262,27 @@ def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
     count, states = len(header.sheets), len(header.states) if header.separate else 1
     stride, rest = divmod(len(table), states)
     if rest or stride < count:
-        raise ValueError(f"part sheets: expected {count} and levels for each state, found {len(table)}")
+        raise ValueError(
+            f"part sheets: expected rows for {count} sheets and their mip levels, equally many in "
+            f"{states} states, found {len(table)} rows"
+        )
     names, places = (list(header.sheets) + [""] * (stride - count)) * states, []
     for number, row in enumerate(table.tolist()):
         smaller, first = row[6], number // stride * stride
         if smaller and not max(number, first + count - 1) < smaller < first + stride:
-            raise ValueError(f"part sheets: {row}: expected a level after it")
+            raise ValueError(f"part sheets: row {number}: its next mip level must be a later row, found {smaller}")
         if smaller:
             names[smaller] = names[number]
         place = SheetPlace(names[number], *row)
         if min(place.size) < 1 or (number - first < count and list(place.size) != header.sizes[number - first]):
-            raise ValueError(f"part sheets: {row}: expected the size of the sheet")
+            raise ValueError(f"part sheets: row {number}: expected the size of its sheet, found {place.size}")
         if (place.rows, place.columns) != tile_counts(*place.size, header.profile.tile):
-            raise ValueError(f"part sheets: {row}: expected the tiles of its size")
+            raise ValueError(f"part sheets: row {number}: the numbers of tiles don't fit the size of the lightmap")
         places.append(place)
     return places
 
 
 def _check_tiles(model: AtlasModel) -> None:
-    """Checks that tiles lie within the colour textures, and sheets within the lookup texture.
-
-    Raises:
-        ValueError: A tile or sheet lies outside.
-    """
     pages, texels, second = len(model.texels), model.texels.shape[1:3], model.block_texels.shape[1:3]
     if model.method in ("tiles", "shared"):
         code = model.first_block_code
@@ -293,15 +291,15 @@ def _check_tiles(model: AtlasModel) -> None:
             raise ValueError(f"part colour: expected at most {most} texels along a side, found {max(texels)}")
         first, size, of_blocks = unpack_entries(model.lut[..., :2], code)
         if (of_blocks[..., 0] != of_blocks[..., 1]).any():
-            raise ValueError("part lut: a tile is of both textures")
+            raise ValueError("part lut: a tile is measured in blocks along one axis and in texels along the other")
         in_second = of_blocks[..., 0] & (model.colour == "mixed")
         count, page = np.ones(in_second.shape, np.int64), np.zeros(in_second.shape, np.int64)
         if model.method == "shared":
             _, _, component, count, page, _, coarse = unpack_tiles(model.lut, code)
             if (coarse > np.where(in_second, count, 0)).any():
-                raise ValueError("part lut: expected coarse components of tiles of blocks alone, at most all of them")
+                raise ValueError("part lut: a tile has more coarse components than components in blocks")
             if (component + count >= model.factor.shape[1]).any():
-                raise ValueError("part lut: a tile reaches beyond the factors")
+                raise ValueError("part lut: a tile names a factor that doesn't exist")
             size = np.where(count[..., None] > 0, extent(size, count, coarse), size)
         beyond = ((first + size) > np.where(in_second[..., None], second[::-1], texels[::-1])).any(-1)
         beyond |= page >= np.where(in_second, len(model.block_texels), pages)

@@ -1,9 +1,9 @@
 """Formats of the stored colour texture: half floats, RGB9E5, and the block formats of GPUs, BC6H and ASTC HDR 4x4.
 
-RGB9E5 takes 32 bits a texel, and all GPUs filter it; half floats take 64 on desktop GPUs, which support them with four
-channels but not with three. Both block formats take 16 bytes for 4x4 texels, 8 bits per texel. For ASTC 4x4
-lightmap-uv-clustering-cascade, section 4.4, counts 6 bits per texel; the format takes 8, and so does our count. ASTC
-needs the optional packages of the extra `atlas`.
+RGB9E5 takes 32 bits a texel, and all GPUs filter it; half floats take 64, since desktop GPUs support them with four
+channels but not with three. Both block formats take 16 bytes for 4x4 texels, 8 bits per texel.
+(lightmap-uv-clustering-cascade, section 4.4, counts 6 bits per texel for ASTC 4x4; the format takes 8, as we count.)
+ASTC needs the optional packages of the extra `atlas`.
 
 Half floats represent the decoded texels of every format exactly.
 """
@@ -43,7 +43,7 @@ def quantise(
     `blocks` of `AtlasModel`. BC6H weights the squared errors of texels with `weight` [H, W].
 
     Raises:
-        WlmError: A package is missing; the line names the extra.
+        WlmError: An optional package isn't installed; the message names the extra.
     """
     if colour in BLOCK_CODECS:
         blocks, decoded = encode(texels, colour, weight, device)
@@ -55,11 +55,11 @@ def quantise(
 
 
 def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Tensor:
-    """Returns the samples of T tiles as they decode after they are stored, float32 [T, ny, nx, 3], at least 0; for
-    block formats ny and nx are multiples of 4. Rounding to half floats is too small to matter and left out.
+    """Returns the samples of T tiles after encoding and decoding, float32 [T, ny, nx, 3], at least 0; for block formats
+    ny and nx are multiples of 4. For half floats, whose rounding is too small to matter, samples stay as they are.
 
     Raises:
-        WlmError: A package is missing; the line names the extra.
+        WlmError: An optional package isn't installed; the message names the extra.
     """
     if colour == "half":
         return samples
@@ -111,7 +111,7 @@ def encode(
 
     Raises:
         ValueError: A texel is NaN.
-        WlmError: A package is missing; the line names the extra.
+        WlmError: An optional package isn't installed; the message names the extra.
     """
     light = _on(texels, device)
     if count := int(light.isnan().any(2).sum()):
@@ -136,7 +136,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
 
     Raises:
         ValueError: The number of blocks does not fit height and width.
-        WlmError: A block isn't one of the format; or a package is missing, and the line names the extra.
+        WlmError: A block's bits are invalid in the format, or an optional package isn't installed.
     """
     rows, columns = block_grid(height, width)
     if blocks.dtype != np.uint8 or blocks.shape != (rows * columns, 16) or not blocks.size:
@@ -151,12 +151,11 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
     broken = ~np.isfinite(texels).all(axis=2)
     if broken.any():
         row, column = np.argwhere(broken)[0] // BLOCK_SIDE
-        raise WlmError(f"{codec}: expected blocks of the format, found none in row {row}, column {column}")
+        raise WlmError(f"{codec}: the block in row {row}, column {column} is invalid")
     return texels
 
 
 def _on(values: np.ndarray | torch.Tensor, device: str) -> torch.Tensor:
-    """Copies an array or tensor to a tensor on the device; an array may have negative strides or be read-only."""
     return (
         values.to(device) if isinstance(values, torch.Tensor) else torch.tensor(np.ascontiguousarray(values)).to(device)
     )

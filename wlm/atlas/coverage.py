@@ -1,7 +1,7 @@
 """Finds the texels of a lightmap that a mesh's UV triangles touch or cover, exactly and in bounded memory.
 
-Texel (row, column) is the square [column, column + 1] x [row, row + 1] of UVs times (W, H), its centre in the middle.
-Each triangle is cut into the rows of texels that it meets, with one span of texels per row.
+In UVs times width and height of the lightmap, texel (row, column) is the square from (column, row) to (column + 1, row
++ 1). Each triangle is cut into the rows of texels that it meets, with one span of texels per row.
 """
 
 from collections.abc import Iterator
@@ -13,8 +13,8 @@ _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 
 
 def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Finds the texels whose square intersects some triangle's inside, bool [height, width]. UVs are float64 [V, 2] in
-    [0, 1]; each triangle has an area. A triangle that ends exactly at a texel's side doesn't touch that texel."""
+    """Finds the texels whose square overlaps a triangle, bool [height, width]. UVs are float64 [V, 2] in [0, 1]; each
+    triangle has an area above 0. A triangle that ends exactly at a texel's side doesn't touch that texel."""
     change = np.zeros((height, width + 1), np.int32)
     for corner, row in _rows(uv, triangle, height, width, centres=False):
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -55,8 +55,7 @@ def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, de
 def _centre_spans(
     uv: np.ndarray, triangle: np.ndarray, height: int, width: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yields rows and their spans, int64 [N] each: the texels first <= column < stop have their centre in a
-    triangle."""
+    """Yields rows and their spans, int64 [N] each: texels first <= column < stop have their centre in a triangle."""
     for corner, row in _rows(uv, triangle, height, width, centres=True):
         y = row + 0.5
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
@@ -74,7 +73,8 @@ def _centre_spans(
 def _rows(
     uv: np.ndarray, triangle: np.ndarray, height: int, width: int, centres: bool
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yields, in pieces of bounded size, triangles' corners [N, 3, 2] in texels and the rows [N] that they may meet."""
+    """Yields, in pieces of bounded size, the corners of triangles, [N, 3, 2] in texels, and a row of texels that each
+    may meet, [N]."""
     texel = uv * (width, height)
     v = texel[:, 1][triangle]  # [F, 3]
     if centres:

@@ -58,13 +58,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Placed:
-    """A node that is lit by a sheet.
+    """A node of the mesh file whose light is in a sheet (a UV layout with its lightmaps).
 
     Attributes:
-        node: The node's number in the document.
+        node: The node's number in the mesh file.
         label: The node's name.
         sheet: Number of the sheet.
-        scale_offset: The node's rectangle in the sheet, v down: UV times the first two numbers, plus the last two.
+        scale_offset: The node's rectangle in the sheet, v downwards: UV times the first two numbers, plus the last two.
     """
 
     node: int
@@ -198,22 +198,21 @@ def load(
     Args:
         mesh_path: A `.glb`, `.gltf`, `.obj` or `.ply` file.
         lights_path: One lightmap (EXR, Radiance, KTX2, DDS: see `wlm.formats.light`; or PNG), row 0 at v = 0 of glTF
-            and v = 1 of other formats; or a list of lightmaps, a folder of them or a bake, see `wlm.atlas.listing`;
-            None: the lightmaps that the glTF file names itself, see `wlm.atlas.materials`.
+            and v = 1 of other formats; or a list of lightmaps, a folder of them or a Godot bake, see
+            `wlm.atlas.listing`; None: the lightmaps that the glTF file names itself, see `wlm.atlas.materials`.
         mask_path: With one lightmap, a PNG of its size; a texel belongs to a chart where any colour channel is above
             0. None derives it from the triangles.
-        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None takes that of the list, else 1, where engines and viewers
-            look for them, if any primitive has it, else 0. Formats other than glTF have only 0.
+        uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None: the set that a list of lightmaps names; without one, 1,
+            where engines look for lightmap UVs, if any primitive has it; else 0. Formats other than glTF have only 0.
         node: If there is one lightmap, the node that it belongs to: the node's name, its mesh's name or its number.
         encoding: If there is one lightmap, a PNG's encoding, one of `wlm.formats.channels.ENCODINGS`; None: no PNG. For
             the glTF file's own lightmaps, that of images of 8 bits; None: that of their extension.
         flip: If there is one lightmap, whether its top row is at v = 1 of glTF.
         slot: "occlusion" or "emissive": the slot of the materials that holds the lightmaps.
-        trust: Whether files may name files outside their folder, and expand to huge data (`wlm.formats.limits`).
+        trust: Whether files may name files outside their folder, and decompress to huge data (`wlm.formats.limits`).
 
     Raises:
-        WlmError: One line that names the file and the field: the input contradicts itself, or a file is missing or
-            damaged.
+        WlmError: The input contradicts itself, or a file is missing or damaged; the message names file and field.
     """
     path = Path(mesh_path)
     document, primitives, metres = _read_triangles(path, trust)
@@ -222,7 +221,7 @@ def load(
         given = {"mask": mask_path, "node": node, "encoding": lights_path and encoding, "flip": flip or None}
         for name, value in given.items():
             if value is not None:
-                raise WlmError(f"{name}: only allowed with a single lightmap; a list of lightmaps states it")
+                raise WlmError(f"{name}: can't be given with a list of lightmaps; state it in the list")
     if slot is not None and lights_path is not None:
         raise WlmError("slot: only allowed without lightmaps beside the mesh: it reads those of its materials")
     sets = {number for each in primitives for number in each.uv}
@@ -282,7 +281,7 @@ def load(
             keys = {(each.node, each.primitive) for each in chosen}
             pairs = [(each, _base(places, each, number)) for each in readers if (each.node, each.primitive) in keys]
         if not pairs:
-            raise WlmError(f"{listing.path}: sheets[{number}]: no triangle reads it")
+            raise WlmError(f"{listing.path}: sheets[{number}]: no triangle of the mesh is lit by it")
         objects += [place for _, place in pairs]
         for each, _ in pairs:
             other = owner.setdefault((each.node, each.primitive), number)
@@ -334,10 +333,10 @@ def from_arrays(
     light = np.asarray(lightmap)
     light = light[None] if light.ndim == 3 else light
     if light.ndim != 4 or light.shape[3] != 3 or 0 in light.shape:
-        raise WlmError(f"{name}: expected a lightmap [H, W, 3], none of them 0, got {np.shape(lightmap)}")
+        raise WlmError(f"{name}: expected a lightmap [H, W, 3] with at least one texel, got {np.shape(lightmap)}")
     valid = None if mask is None else np.array(mask).astype(bool)
     if valid is not None and valid.shape != light.shape[1:3]:
-        raise WlmError(f"{name}: expected a mask of {light.shape[1:3]}, got {valid.shape}")
+        raise WlmError(f"{name}: expected a mask of the lightmap's {light.shape[1:3]} texels, got {valid.shape}")
     mesh = _compact(name, name, np.asarray(position), np.asarray(triangle), np.asarray(uv))
     document, primitives = document_from_meshes([mesh], name)
     with np.errstate(over="ignore"):  # float64 beyond float32 becomes infinity and is repaired as infinity
@@ -354,14 +353,14 @@ def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> Lightmapped
     """Joins several scenes into one that has all their sheets.
 
     Args:
-        scenes: At least one, in the same space and with equally many states. The first names the states.
+        scenes: At least one, in the same space and with equally many states, whose names are taken from the first.
         name: The name of the new scene.
 
     Raises:
         WlmError: The numbers of states differ.
     """
     if len({len(scene.states) for scene in scenes}) != 1:
-        raise WlmError(f"{name}: expected scenes with the same number of states")
+        raise WlmError(f"{name}: expected scenes with the same number of states, got different numbers")
     sheets = [sheet for scene in scenes for sheet in scene.sheets]
     meshes = [(sheet.name, sheet.position, sheet.triangle, sheet.uv) for sheet in sheets]
     document, primitives = document_from_meshes(meshes, name)
@@ -382,8 +381,8 @@ def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> Lightmapped
 def place_objects(
     where: str, primitives: list[GltfPrimitive], uv_set: int, objects: Sequence[Placed], masks: Sequence[np.ndarray]
 ) -> tuple[tuple[Sheet, ...], np.ndarray]:
-    """Makes a model's sheets, without lightmaps, from the triangles in its file. Also returns the triangles of all
-    nodes that read no sheet, float64 [B, 3, 3].
+    """Makes a model's sheets, without lightmaps, from the triangles in its file. Also returns the corners of all B
+    triangles that no sheet lights, float64 [B, 3, 3].
 
     Raises:
         WlmError: A sheet has no triangle, or the triangles can't be read.
@@ -401,7 +400,7 @@ def place_objects(
             if uv_set in each.uv
         ]
         if not chosen:
-            raise WlmError(f"{where}: sheet {number}: no triangle reads it")
+            raise WlmError(f"{where}: sheet {number}: no triangle of the mesh is lit by it")
         used |= {(each.node, each.primitive) for each in chosen}
         lightmaps = np.empty((0, *mask.shape, 3), np.float32)
         sheets.append(_checked(where, f"sheet {number}", chosen, uv_set, lightmaps, mask, [where]))
@@ -547,7 +546,6 @@ def _alternatives(pairs: Sequence[tuple[GltfPrimitive, Placed]], uv_set: int) ->
 
 
 def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitive:
-    """Transforms the UVs of a primitive into its rectangle in the sheet."""
     sx, sy, x, y = place.scale_offset
     if place.scale_offset == _WHOLE:
         return primitive
@@ -573,7 +571,7 @@ def _read_lightmaps(
                 light *= np.float32(files.intensity)
         if lightmaps and light.shape != lightmaps[0].shape:
             shape, first = ("x".join(map(str, each.shape[1::-1])) for each in (light, lightmaps[0]))
-            raise WlmError(f"{label}: expected {first} texels as the sheet's other lightmaps, found {shape}")
+            raise WlmError(f"{label}: expected {first} texels, the size of the sheet's first lightmap, found {shape}")
         lightmaps.append(light)
     stack = np.stack(lightmaps) if len(lightmaps) > 1 else lightmaps[0][None]
     mask_path = None if files.mask is None else listing.file(files.mask, trust)
@@ -637,7 +635,7 @@ def _checked_light(
     mask: np.ndarray | None,
     names: Sequence[str],
 ) -> tuple[np.ndarray, list[str]]:
-    """Makes or checks the mask and repairs the lightmaps in place. Returns the mask and the warnings."""
+    """Makes the mask if it is None, else checks it, and repairs the lightmaps in place. Returns mask and warnings."""
     warnings = []
     height, width = lightmaps.shape[1:3]
     if max(height, width) == _FACES * min(height, width):
@@ -743,7 +741,6 @@ def _count(number: int, singular: str, plural: str | None = None) -> str:
 
 
 def _hash(sheets: Sequence[Sheet]) -> str:
-    """Hashes the sheets to 16 hexadecimal digits, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     for sheet in sheets:
         for array in (sheet.position, sheet.triangle, sheet.uv, sheet.lightmaps, sheet.mask):

@@ -16,7 +16,7 @@ _TEXELS_AT_ONCE = 1 << 24
 
 
 class Decoder:
-    """A model on a device that returns light at points. It is a `wlm.atlas.evaluation.Sampler`.
+    """A model on a device that returns light at points of the scene, for example for `wlm.atlas.evaluation.compare`.
 
     Attributes:
         model: The model.
@@ -51,10 +51,11 @@ class Decoder:
         return wp.array(np.ascontiguousarray(texels), dtype=wp.vec3h, device=self.device)
 
     def factors(self, state: float) -> np.ndarray:
-        """Returns the factors of shared tiles in a state, float32 [C, 3]; a state such as 0.5 is interpolated.
+        """Returns the factors by which shared tiles sum their components in a state, float32 [C, 3]. They are
+        interpolated for a state such as 0.5, between the first two.
 
         Raises:
-            ValueError: The state is below 0 or above the last.
+            ValueError: The state is below 0 or above the number of the last one.
         """
         last = len(self.model.states) - 1
         if not 0 <= state <= last:
@@ -70,11 +71,11 @@ class Decoder:
         state: float = 0.0,
         lod: torch.Tensor | None = None,
     ) -> torch.Tensor:
-        """Returns light at UVs, as a shader reads it.
+        """Returns light at UVs, the same that the model's shader returns.
 
         Args:
-            uv: float32 [N, 2] on the decoder's device: the model's new UVs if it has any, else the UVs of the sheets.
-            sheet: The sheet's number from 0, int [N], or one for all points.
+            uv: float32 [N, 2] on the decoder's device: the model's new UVs if it has any, else the lightmap UVs.
+            sheet: Number of each point's sheet (UV layout), from 0: int [N], or one for all points.
             state: 0 to the number of states - 1; fractions lie between two states.
             lod: float32 [N], base-2 logarithm of texels per pixel, for a model with mips; None: full resolution.
 
@@ -85,11 +86,11 @@ class Decoder:
             ValueError: No such state, or the model has no mips.
         """
         if lod is not None and not self.model.mips:
-            raise ValueError("lod: expected a model with mips")
+            raise ValueError("lod: expected a model with mips, or None")
         if self.model.method == "shared":
             return self._read_shared(uv, sheet, state, lod)
         if state != 0:
-            raise ValueError(f"state: expected 0 to 0, got {state}")
+            raise ValueError(f"state: expected 0 for a model of one state, got {state}")
         uv = uv.contiguous()
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
         if len(uv):
@@ -117,8 +118,7 @@ class Decoder:
     def _read_shared(
         self, uv: torch.Tensor, sheet: torch.Tensor | int, state: float, lod: torch.Tensor | None
     ) -> torch.Tensor:
-        """Returns light, float32 [N, 3], from tiles that all lightmaps share or from separate tiles for each
-        lightmap."""
+        """Returns light, float32 [N, 3], from tiles that all states share or from each state's separate tiles."""
         factors, stride = self.factors(state), self.model.stride
         if not isinstance(sheet, torch.Tensor):
             sheet = torch.full((len(uv),), sheet, dtype=torch.int32, device=uv.device)
@@ -134,7 +134,8 @@ class Decoder:
     def _read_rows(
         self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, lod: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Returns light, float32 [N, 3], for rows of the table of sheets, given the factors of a state."""
+        """Returns light, float32 [N, 3], at UVs of sheets or mip levels; `row`, int [N], has their rows in
+        `AtlasModel.table`."""
         if lod is not None:
             return self._between(uv, row.long(), factors, (lod - MIP_OCTAVES + 1).clamp(0.0, 32.0))
         uv, row = uv.contiguous(), row.int().contiguous()
@@ -162,14 +163,14 @@ class Decoder:
         return below + share * (self._read_rows(uv, far, factors) - below)
 
     def texels(self, sheet: Sheet, number: int = 0, state: float = 0.0) -> torch.Tensor:
-        """Decodes the K texels of a sheet's mask as `lightmap` does: float32 [K, 3] on the device, row by row.
+        """Decodes only the K texels in a sheet's mask, row by row: float32 [K, 3] on the device.
 
         Raises:
             WlmError: The sheet's size differs from that in the model.
         """
         height, width = sheet.mask.shape
         if (height, width) != self.model.sheets[number].size:
-            raise WlmError(f"{sheet.name}: expected the sheet that the model was made of")
+            raise WlmError(f"{sheet.name}: expected the sheet that the model was made of, found another size")
         if len(self._corner):
             return torch.from_numpy(self._under_new_uvs(sheet)[sheet.mask]).to(self.device)
         step, parts = max(1, _TEXELS_AT_ONCE // width), []
@@ -184,7 +185,7 @@ class Decoder:
         """Decodes a lightmap in its original layout.
 
         Args:
-            sheet: The sheet's number, from 0.
+            sheet: Number of the sheet (UV layout), from 0.
             state: As for `read`.
 
         Returns:

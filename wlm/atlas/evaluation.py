@@ -79,21 +79,21 @@ class Score(system.Report):
 
     Attributes:
         name: The scene's name.
-        views: Number of views that show a sheet.
+        views: Number of views that show a surface with a lightmap.
         pixels: Number of covered pixels in all views.
-        peak: Range of the reference in the covered pixels, for PSNR and SSIM; mean over the states.
-        peaks: The range for each state.
-        brightest: Maximum of the reference in the covered pixels, in any state.
+        peak: Maximum minus minimum of the original in the covered pixels, for PSNR and SSIM; mean over the states.
+        peaks: The same for each state.
+        brightest: Maximum of the original's light in the covered pixels, in any state.
         psnr: dB, the mean over states and views.
         psnr_by_state: dB, means over the views.
         around_psnr, inside_psnr: The same as `psnr`, for cameras around the scene and for cameras inside.
-        inside_views: Number of views from inside that show a sheet.
+        inside_views: Number of views from inside that show such a surface.
         eye_height: Height of the cameras inside the scene above the ground, in the scene's unit; NaN if there are none.
         psnr_worst: dB, of the worst view and state.
         worst_view: Number of the camera of that worst view; -1 if there is no view or no peak.
         one_minus_ssim: 1 minus the mean SSIM of each view's covered pixels, averaged over views and states. The window
             is a Gaussian of 11 pixels, sigma 1.5; pixels nearer than 5 to the picture's edge are left out. In both
-            pictures, uncovered pixels take the reference's nearest covered value.
+            pictures, uncovered pixels take the original's nearest covered value.
         seam_error: Mean absolute error of the covered pixels within 2 pixels of a chart's border, over all views.
         rest_error: Mean absolute error of all other pixels.
         seam_ratio: `seam_error` over `rest_error`: 1 where seams are no worse than other pixels.
@@ -131,7 +131,7 @@ class Report(Score):
 
     Attributes:
         method: The model's method.
-        profile: Name of its settings.
+        profile: Name of the settings of the compression.
         bytes: Size of the model's file in bytes.
         geometry_bytes: Bytes of the triangles and masks in the file.
         gpu_bytes: Bytes of the model's textures and tables on a GPU.
@@ -157,7 +157,7 @@ def evaluate(
 ) -> Report:
     """Compares a model with the original lightmaps of the scene; options are those of `compare`.
 
-    Errors at seams are taken along the borders of charts: of the new UVs, or of the old UVs if the mesh keeps them.
+    Seams are the borders of charts in the model's new UVs, or in the original UVs if the mesh keeps them.
 
     Raises:
         WlmError: There is no such device, or the model was made from another scene.
@@ -192,7 +192,7 @@ def compare(
     labels: Mapping[str, Labels] | None = None,
     progress: OnProgress | None = None,
 ) -> dict[str, Score]:
-    """Compares any decoders with the original lightmaps. Each view is rendered twice, for all decoders together.
+    """Compares any decoders with the original lightmaps. Each view is rendered twice, for all decoders at once.
 
     Args:
         scene: The scene with its original lightmaps.
@@ -201,9 +201,9 @@ def compare(
             `VIEWS`, or `SHARED_VIEWS` for several lightmaps.
         resolution: Pixels along a side of a view, 1 to 16,384. None: `RESOLUTION` or `SHARED_RESOLUTION`.
         device: "cpu" or "cuda:N", where the decoders are called.
-        labels: Functions that number charts or tiles, by names of decoders: seams lie where the number changes. For
-            other decoders, seams are the borders of the lightmaps' charts. Outlines in front of other surfaces are no
-            seams.
+        labels: By the name of a decoder, a function from points to numbers of charts or tiles: its seams lie where the
+            number changes. For other decoders, seams are the borders of the lightmaps' charts. Outlines in front of
+            other surfaces are no seams.
         progress: Called with the number of views done.
 
     Returns:
@@ -211,8 +211,8 @@ def compare(
 
     Raises:
         WlmError: There is no such device, or a decoder gives NaN or infinity.
-        ValueError: The resolution is out of range, a decoder's colours or labels have the wrong shape, or labels name
-            no decoder.
+        ValueError: The resolution is out of range, a decoder's colours or labels have the wrong shape, or a name in
+            `labels` isn't in `decoders`.
     """
     device, labels = check_device(device), dict(labels or {})
     unknown = sorted(labels.keys() - decoders.keys())
@@ -258,8 +258,8 @@ def compare(
 
 
 def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Labels:
-    """Makes a function for `labels` of `compare` that numbers the charts of a model's own UVs, for points on the
-    device."""
+    """Makes a function for `labels` of `compare`: from points on the device to their charts' numbers in a model's new
+    UVs."""
     (sheet,) = scene.sheets
     corner = np.arange(3 * len(model.uv)).reshape(-1, 3)
     corner = welded(sheet.position[sheet.triangle].reshape(-1, 3), model.uv.reshape(-1, 2), corner)
@@ -268,7 +268,7 @@ def chart_labels(model: AtlasModel, scene: LightmappedScene, device: str) -> Lab
 
 
 def _chart_numbers(scene: LightmappedScene) -> np.ndarray:
-    """Numbers the charts of the scene's triangles, int64 [F], differently in each sheet."""
+    """Returns the number of each triangle's chart, int64 [F]; charts of different sheets have different numbers."""
     result, count = np.full(len(scene.triangles.triangle), -1, np.int64), 0
     first = 0
     for sheet in scene.sheets:
@@ -318,8 +318,8 @@ def _peaks(
     resolution: int,
     device: str,
 ) -> tuple[list[float], float]:
-    """Returns the range of the reference over all views for each state (see the module), and the reference's maximum.
-    Rendering each view twice is cheaper than storing all views."""
+    """Returns the range of the original light over all views for each state, as the module's docstring defines it, and
+    the maximum over all states. Rendering each view twice is cheaper than storing all views."""
     states = range(len(scene.states))
     low, high = [math.inf] * len(states), [-math.inf] * len(states)
     count = torch.zeros((len(states), _BINS), dtype=torch.float64)
@@ -343,7 +343,6 @@ def _peaks(
 
 
 def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedScene, name: str) -> torch.Tensor:
-    """Calls the decoder and returns its checked colours, float64 [N, 3]."""
     colour, count = decoder(points, state), len(points)
     if colour.shape != (count, 3):
         raise ValueError(f"{name}: expected colours [{count}, 3], got {tuple(colour.shape)}")
@@ -354,10 +353,9 @@ def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedSce
 
 
 def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
-    """Calls the labels' function and returns its checked numbers, int64 [N]."""
     label, count = labels(points), len(points)
     if label.shape != (count,) or label.is_floating_point():
-        raise ValueError(f"{name}: expected labels, integers [{count}], got {label.dtype} {tuple(label.shape)}")
+        raise ValueError(f"{name}: expected labels as integers [{count}], got {label.dtype} {tuple(label.shape)}")
     return label.long()
 
 
@@ -415,7 +413,6 @@ def _ratio(a: float, b: float) -> float:
 
 
 def _mean(values: Sequence[float]) -> float:
-    """Returns the mean of the numbers that aren't NaN; NaN if there are none."""
     known = [value for value in values if not math.isnan(value)]
     return fmean(known) if known else math.nan
 
@@ -444,9 +441,9 @@ def _texel_errors(
 
 
 def _near_border(visible: torch.Tensor, label: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """Finds the pixels within 2 pixels of a border, bool [h, w]. `visible` has a triangle's number or -1 at each
-    pixel. A border lies between triangles with different labels that share a corner in space: a number of `place`,
-    int [F, 3]."""
+    """Finds the pixels within 2 pixels of a border, bool [h, w]. `visible` has a triangle's number or -1 at each pixel.
+    A border lies between triangles with different labels and a corner in common; `place`, int [F, 3], numbers the
+    corners, equally where they coincide."""
     border = torch.zeros(visible.shape, dtype=torch.bool, device=visible.device)
     for axis in (0, 1):
         count = visible.shape[axis] - 1
@@ -466,8 +463,8 @@ class _View:
     """One view's pictures of the original lightmaps, to be compared with those of decoders."""
 
     def __init__(self, hit: torch.Tensor, target: torch.Tensor, peak: float, exposure: float, flip: bool) -> None:
-        """Makes pictures of the original's light [N, 3] at the covered pixels [h, w]; `flip`: whether to compute
-        FLIP."""
+        """Makes pictures of the original's light [N, 3] at the covered pixels `hit`, bool [h, w]. If `flip`, `errors`
+        computes FLIP too."""
         whole = hit.cpu().numpy()
         # SSIM reads half a window around a covered pixel.
         rows, columns = (np.flatnonzero(whole.any(axis=axis)) for axis in (1, 0))
@@ -478,14 +475,14 @@ class _View:
         self._light, self._screen = self._pictures(target)
 
     def errors(self, light: torch.Tensor) -> tuple[float, float, float]:
-        """Returns a decoder's SSIM, NaN without a peak; the MSE as displayed on a screen; and FLIP, or NaN."""
+        """Returns a decoder's SSIM (NaN if the original is constant), MSE as displayed on a screen, and FLIP (or
+        NaN)."""
         picture, screen = self._pictures(light)
         similarity = ssim(self._light, picture, self._hit, self._peak) if self._peak > 0.0 else math.nan
         return similarity, *picture_error(self._screen, screen, self._hit, self._flip)
 
     def _pictures(self, light: torch.Tensor) -> np.ndarray:
-        """Returns light [N, 3] as pictures, linear and as displayed, float64 [2, h, w, 3]; uncovered pixels are
-        black."""
+        """Returns light [N, 3] as pictures, linear and as displayed, float64 [2, h, w, 3]; the rest is black."""
         values = light.cpu().numpy().astype(np.float64)
         pictures = np.zeros((2, *self._hit.shape, 3))
         pictures[:, self._hit] = values, to_srgb(values * self._exposure)

@@ -8,17 +8,17 @@ from wlm.atlas.model import BLOCK_SIDE, LUT_STEPS, AtlasModel, coarse_place, unp
 def decode64(model: AtlasModel, uv: np.ndarray, sheet: np.ndarray | int = 0, state: int = 0) -> np.ndarray:
     """Returns light at points (lightmap-uv-clustering-cascade, eq. 7; for shared tiles see `wlm.atlas.model`).
 
-    Light may jump where tiles meet, so a point that float32 rounds into the neighbouring tile differs by that jump.
+    Light may jump where tiles meet, so a float32 decoder may differ where it rounds a point into the neighbouring tile.
 
     Args:
         model: The model.
         uv: [N, 2], finite: the model's new UVs if it has any, else the UVs of the sheets; clamped to [0, 1].
-        sheet: int [N], or one number for all points: a sheet or mip level, a row of `AtlasModel.table` for the first
-            state.
+        sheet: int [N], or one number for all points: number of the sheet or mip level, its row in `AtlasModel.table`
+            for the first state.
         state: The number of the state.
 
     Returns:
-        float64 [N, 3].
+        Light, float64 [N, 3].
     """
     uv = np.asarray(uv, np.float64).clip(0.0, 1.0)
     if model.method in ("tiles", "shared"):
@@ -67,8 +67,8 @@ def _bilinear(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
 def _between(
     texels: np.ndarray, page: np.ndarray, first: np.ndarray, last: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
-    """Reads pages [pages, H, W, C] bilinearly at `place` [N, 2], in texels from texel 0's centre, clamped to
-    first..last."""
+    """Reads pages [pages, H, W, C] bilinearly at `place` [N, 2], in texels from texel 0's centre, clamped to the texels
+    from `first` to `last`."""
     low = np.clip(np.floor(place).astype(np.int64), first, last)
     high = np.minimum(low + 1, last)
     share = (place - low)[:, :, None]

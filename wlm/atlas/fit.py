@@ -44,7 +44,7 @@ from wlm.texels import check_size
 
 _CELLS_AT_ONCE = 1 << 24
 _FEWER_VIEWS = 4  # one view of the comparison with a plain lightmap per this number of the profile's views
-_NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take: expected more"
+_NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take; give more"
 _PACKAGES = {"cascade": "uvunwrap", "astc": "astc_encoder"}  # packages of the extra, by method and colour
 
 
@@ -173,8 +173,8 @@ def with_fallback(
     scene: LightmappedScene, grid: FineGrid, model: AtlasModel | None, profile: Profile, weight: torch.Tensor | None
 ) -> AtlasModel:
     """Returns the model, or a plain smaller lightmap if one of at most as many bits has no larger weighted error.
-    `weight`, float64 [2 H, 2 W], has the weights of cells, quarters of texels. Without a model the smaller lightmap has
-    as many bits as the budget allows, but at least one texel or block."""
+    `weight`, float64 [2 H, 2 W], has the weights of errors in quarters of texels (cells). Without a model the smaller
+    lightmap has as many bits as the budget allows, but at least one texel or block."""
     (sheet,), device = scene.sheets, grid.device
     height, width = sheet.mask.shape
     bits = profile.budget * sheet.mask.size * SOURCE_BITS if model is None else model.bits

@@ -1,6 +1,6 @@
 """Lists of a scene's lightmaps: the files of each sheet, and the objects that each sheet lights.
 
-docs/atlas.md shows the JSON file. A sheet is one layout of charts and has a file for each state; its other fields are
+docs/atlas.md shows the JSON format. A sheet is one layout of charts and has a file for each state; its other fields are
 arguments of `wlm.atlas.load`. An object is a node, named by its name, its mesh's name or its number; it reads the sheet
 at UV * (scale x, y) + (offset x, y). Without `objects` every sheet is assigned to the mesh that it fits (`matching`).
 `convention` states how the rectangles are written: v runs down in glTF and Godot, up in Unity, whose glTF exporters
@@ -40,7 +40,7 @@ _NO_LIGHTMAP = (-1, 65534, 65535)
 
 
 class SheetFiles(BaseModel):
-    """The files of a sheet; the module's docstring explains the fields."""
+    """The files of a sheet (a UV layout): a lightmap for each state and a mask; other fields as in `wlm.atlas.load`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -53,7 +53,7 @@ class SheetFiles(BaseModel):
 
 
 class ObjectPlace(BaseModel):
-    """A node and its rectangle in a sheet, v down: UV times the first two numbers, plus the last two."""
+    """A node and its rectangle in a sheet, v downwards: UV times the first two numbers, plus the last two."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -74,7 +74,7 @@ class _Content(BaseModel):
 
 @dataclass(frozen=True, eq=False)
 class Listing:
-    """A list of lightmaps from any source that the module's docstring names.
+    """The lightmaps of a scene and the objects that they light, from a JSON file, bake, folder or glTF file.
 
     Attributes:
         path: The file that names the lightmaps.
@@ -82,7 +82,7 @@ class Listing:
         sheets: The files of each sheet.
         objects: Nodes and their rectangles; None: every sheet is assigned to the mesh that it fits.
         uv_set: n of the glTF attribute `TEXCOORD_n`; None: 1 if the mesh has TEXCOORD_1, else 0.
-        direct: Whether the caller gave the paths of files; false if they come from a file.
+        direct: Whether the caller gave the paths of lightmaps; false if a file names them.
         held: The bytes of pictures that the file holds itself, by their names in `sheets`.
         tiles: For each sheet its UDIM tile, 1001 + u + 10 v (v up); empty if the files are not named by tiles.
         notes: Assumptions, one line each.
@@ -119,7 +119,7 @@ class Listing:
         """Returns the path of a file that the list names.
 
         Raises:
-            WlmError: The path lies outside the list's folder, and the list isn't trusted.
+            WlmError: The path lies outside the list's folder, and `trust` is false.
         """
         if self.direct:
             return Path(name)
@@ -127,8 +127,8 @@ class Listing:
 
 
 def is_listing(path: str | os.PathLike[str] | None) -> bool:
-    """Tests whether a path is a list of lightmaps and not one lightmap. None, for the file's own lightmaps, is a
-    list."""
+    """Tests whether a path names several lightmaps: a folder, a JSON file or a Godot bake. True also for None, which
+    stands for the lightmaps that the glTF file names itself."""
     return path is None or os.path.isdir(path) or os.fspath(path).lower().endswith((".json", ".lmbake"))
 
 
@@ -160,7 +160,7 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
         return _from_bake(str(path))
     content = read_json_file(path, "the list of lightmaps", INDEX_BYTES)
     if not isinstance(content, dict):
-        raise WlmError(f"{path}: expected an object with sheets, found other JSON")
+        raise WlmError(f"{path}: expected a JSON object with the key sheets, found other JSON")
     if "lightmaps" in content and "sheets" not in content:
         return _from_set(str(path), content)
     convention, unlit = content.get("convention", "gltf"), 0
@@ -173,10 +173,10 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
     counts = {len(sheet.files) for sheet in checked.sheets}
     states = checked.states or [str(i) for i in range(len(checked.sheets[0].files))]
     if counts != {len(states)}:
-        raise WlmError(f"{path}: sheets: expected {len(states)} files each, one a state, found {sorted(counts)}")
+        raise WlmError(f"{path}: sheets: expected {len(states)} files in each, one per state, found {sorted(counts)}")
     for i, each in enumerate(checked.objects or ()):
         if each.sheet >= len(checked.sheets):
-            raise WlmError(f"{path}: objects[{i}].sheet: expected below {len(checked.sheets)}, found {each.sheet}")
+            raise WlmError(f"{path}: objects[{i}].sheet: expected 0 to {len(checked.sheets) - 1}, found {each.sheet}")
     objects = None if checked.objects is None else tuple(checked.objects)
     line = f"{path}: {unlit} objects without a lightmap (their number is -1, 65534 or 65535): they only hide others"
     sheets, notes = tuple(checked.sheets), (line,) * (unlit > 0)
@@ -189,8 +189,8 @@ def has_lightmap(number: Any) -> bool:
 
 
 def _object(entry: Any, convention: str, where: str) -> Any:
-    """Converts an object's rectangle from an engine's convention to ours; other input is kept and fails later
-    checks."""
+    """Converts an object's rectangle from an engine's convention to UV * scale + offset with v downwards; malformed
+    input is kept, since later checks report it."""
     if not isinstance(entry, dict):
         return entry
     entry = dict(entry)
@@ -231,14 +231,15 @@ def numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
 
 
 def _from_bake(path: str) -> Listing:
-    """Reads a list from Godot's `.lmbake`: one texture of one slice, and the rectangles of the nodes that use it."""
+    """Reads one lightmap and its nodes' rectangles from Godot's `.lmbake`, which must have one texture with one
+    slice."""
     bake = read_users(path)
     slices = {user.slice for user in bake.users}
     if len(bake.textures) != 1 or bake.directional or slices != {0}:
         raise WlmError(
-            f"{path}: expected one texture of one slice without directions, found {len(bake.textures)} and "
-            f"{len(slices)} slices{' with directions' if bake.directional else ''}: cut the stack, and list the "
-            "parts in JSON"
+            f"{path}: expected one texture of one slice without directions, found "
+            f"{len(bake.textures)} textures and {len(slices)} slices{' with directions' if bake.directional else ''}: "
+            "save each slice as a file, and list the files in JSON"
         )
     sheet = SheetFiles(files=[bake.textures[0].replace("\\", "/").rsplit("/", 1)[-1]])
     objects = tuple(_godot_place(user) for user in bake.users)
@@ -251,7 +252,6 @@ def _godot_place(user: GodotUser) -> ObjectPlace:
 
 
 def _from_folder(where: str, folder: Path) -> Listing:
-    """Lists every lightmap file in a folder."""
     try:
         names = sorted(entry.name for entry in folder.iterdir() if entry.is_file() and entry.name[0] != ".")
     except OSError as error:
@@ -274,10 +274,10 @@ def _from_set(path: str, content: dict[str, Any]) -> Listing:
     fields = ("time_hours", "file")
     entries = entries if isinstance(entries, list) else [None]
     if not all(isinstance(each, dict) and set(fields) <= set(each) for each in entries):
-        raise WlmError(f"{path}: lightmaps: expected a list of objects with time_hours and file")
+        raise WlmError(f"{path}: lightmaps: expected a list of objects, each with time_hours and file")
     states = [f"{float(each['time_hours']):g} h" for each in entries if isinstance(each["time_hours"], int | float)]
     mask, files = content.get("mask"), [each["file"] for each in entries]
     sheet = check_settings(SheetFiles, {"files": files, "mask": mask}, f"{path}: lightmaps: ")
     if len(states) != len(files):
-        raise WlmError(f"{path}: lightmaps: expected a number as each time_hours")
+        raise WlmError(f"{path}: lightmaps: expected a number for each time_hours, found other values")
     return Listing(path, tuple(states), (sheet,), None, None)

@@ -1,4 +1,5 @@
-"""Finds from a lightmap's own light which mesh it was baked for, whether it is upside down, and which texels are stray.
+"""Finds from a lightmap's own light which mesh it was baked for, whether it is upside down, and which texels are stray:
+invalid, or far too bright for their place.
 
 Within a chart light is smooth except at the edges of shadows; it is not smooth across gaps, other charts and values
 that a baker leaves between charts. So the mean difference between neighbouring texels of one chart is smallest with the
@@ -129,9 +130,9 @@ def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height
 
 
 def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
-    """Returns the mean difference, in octaves, between neighbouring texels of one chart (`chart_map`); infinity if
-    there are no such texels. NaN and infinity count as differences. A large lightmap is sampled in evenly spread bands
-    of rows with `_LOOKED_AT` texels in all."""
+    """Returns the mean difference, in octaves (factors of 2), between neighbouring texels of one chart (`chart_map`);
+    infinity without such texels. NaN and infinity count as large differences. A large lightmap is sampled in evenly
+    spread bands of rows with `_LOOKED_AT` texels in all."""
     bands = _bands(*chart.shape)
     with np.errstate(invalid="ignore"):
         greys = [lightmap[band].astype(np.float64).mean(axis=2) for band in bands]
@@ -288,7 +289,6 @@ def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) 
 
 
 def _joined(primitives: Sequence[GltfPrimitive], uv_set: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Joins primitives to one mesh; returns its positions, UVs and triangles."""
     first = np.cumsum([0, *(len(each.position) for each in primitives)])
     triangle = [each.triangle + start for each, start in zip(primitives, first[:-1], strict=True)]
     uv = np.concatenate([each.uv[uv_set] for each in primitives]).astype(np.float64)

@@ -4,17 +4,17 @@ A lightmap is read through a lookup texture (lightmap-uv-clustering-cascade, eq.
 the lookup texture, T_p the colour texture, and F depends on the method:
 
     tiles    A point lies in a tile of the lightmap. The tile's entry of T_c, read without a filter, names a rectangle
-             of T_p; relative position in the tile is relative position in the rectangle. Our method.
+             of T_p; a point has the same relative position in the tile and in the rectangle. Our method.
     cascade  T_c, read bilinearly at new UVs in which triangles share texels, gives a coordinate, which a triangle wave
              folds into [0, 1] (eq. 8). The paper's method.
     plain    No lookup texture: the lightmap at a lower resolution, or under new UVs.
-    shared   The lightmaps of several sheets or states share tiles. A tile has a few components, K rectangles of one
-             size beside each other in T_p, and a mixture. Light in state m is
+    shared   The lightmaps of several sheets (UV layouts) or states (hours, light layers) share tiles. A tile has K
+             components, rectangles of one size beside each other in T_p. Light in state m is
 
                  C_m(u) = f[m, first] + sum_k f[m, first + 1 + k] T_p[page](place by T_c, k rectangles to the right),
 
              with f a constant and a factor of each component, for each state and channel; negative sums become 0.
-             Tiles whose light changes alike share a mixture (`shared.mixture`). Between two states f is interpolated
+             Tiles whose light changes alike share these numbers f, a mixture. Between two states f is interpolated
              linearly. In block-compressed tiles the last components may be *coarse*: each is a single block of 4 x 4
              texels. Where states have little in common, a sheet has *separate* tiles with one component in each
              state, and light is interpolated linearly between two states.
@@ -86,74 +86,75 @@ _BUDGET, _SHARED_BUDGET = 0.17, 0.05
 
 
 class Profile(Settings):
-    """Settings of a compression."""
+    """Settings of a compression of lightmaps to an atlas."""
 
     FILES: ClassVar[str] = "atlas"
 
     method: Literal["tiles", "cascade"] = "tiles"
-    """Method, tiles or cascade. Several sheets or states always share tiles."""
+    """Method, tiles or cascade. Several lightmaps need tiles, which they then share."""
     colour: Literal["half", "rgb9e5", "bc6h", "astc", "mixed"] = "half"
-    """Format of the colour texture T_p; for tiles also mixed, an RGB9E5 and a BC6H texture of which each tile uses one.
-    Shared tiles are rgb9e5 or mixed."""
+    """Format of the colour texture T_p; for tiles also mixed: an RGB9E5 and a BC6H texture; each tile uses one of them.
+    Several lightmaps or mips need rgb9e5 or mixed."""
     budget: float | None = Field(None, gt=0.0, le=2.0)
     """For tiles: bits of the textures as a fraction of those of all lightmaps at 48 bits per texel. It is 1 - CR of
     eq. 9; None: 0.17 for one lightmap, 0.05 for several."""
     tile: int = Field(7, ge=3, le=15)
-    """For tiles: texels of the lightmap along a tile. A tile has up to one sample more per axis, and with
-    these it keeps every texel."""
+    """For tiles: texels of the lightmap along a tile. A tile has up to one sample more per axis, enough to
+    keep every texel."""
     views: int = Field(64, ge=1, le=4096)
-    """Random views of the scene from around, and as many from inside; a texel counts by the pixels that show it."""
+    """Number of random views around the scene, and of as many inside; a texel weighs more if more pixels show it."""
     unseen: float = Field(0.05, gt=0.0, le=1.0)
     """For one lightmap: weight of texels that no view shows, as a fraction of the mean weight."""
     border: float = Field(16.0, gt=0.0, le=100.0)
-    """For one lightmap: factor on the weight within a texel of a chart's border, where an error is a seam."""
+    """For one lightmap: factor on the weight within a texel of a chart's border, where errors show as seams."""
     relative: float = Field(0.0, ge=0.0, le=1.0)
-    """For one lightmap: share of the weight that applies to the relative error; the rest applies to the error in
-    linear light."""
+    """For one lightmap: 0 minimises the error in linear light, 1 the relative error, which counts more in dark places;
+    values between mix both."""
     mips: bool = False
-    """Store smaller levels, within the budget, for surfaces that are far away; the model then has shared tiles."""
+    """Store mip levels, within the budget, for surfaces that are far away; needs colour rgb9e5 or mixed."""
     fallback: bool = True
-    """For one lightmap: replace the result by a plain smaller lightmap of as many bits if its error is no larger."""
+    """For one lightmap: store a plain smaller lightmap of as many bits instead if the error of that is no larger."""
     threshold: float = Field(0.03, ge=0.0, le=1.0)
-    """For the cascade: lambda of eq. 4; 0 shares no triangles."""
+    """For the cascade: lambda of eq. 4, the largest difference of triangles that share texels; 0: none share."""
     colour_threshold: float = Field(0.09, ge=0.0, le=2.0)
-    """For the cascade: lambda_h of section 3.2.1."""
+    """For the cascade: lambda_h of section 3.2.1, the largest difference in colour of triangles that share texels."""
     max_radiance: float | None = Field(2.0, gt=0.0)
-    """For the cascade: triangles with a brighter texel are not shared, and lambda and lambda_h are fractions of it
+    """For the cascade: triangles with brighter texels share none, and both thresholds are fractions of this radiance
     (section 4.1.1); None: the brightest texel of the charts, which treats dark and bright lightmaps alike."""
     scale: float = Field(0.5, gt=0.0, le=1.0)
-    """For the cascade: epsilon, the scale of the repacked lightmap (section 3.3.1)."""
+    """For the cascade: epsilon, texels of the repacked lightmap per original texel along a side (section 3.3.1)."""
     colour_scale: float = Field(0.4, gt=0.0, le=1.0)
-    """For the cascade: epsilon_p, sides of T_p over those of the repacked lightmap."""
+    """For the cascade: epsilon_p, the colour texture T_p's sides as a fraction of the repacked lightmap's sides."""
     lut_scale: float = Field(0.7, ge=0.0, le=1.0)
-    """For the cascade: epsilon_c, the same for T_c; 0: no T_c, method "plain"."""
+    """For the cascade: epsilon_c, the lookup texture T_c's sides as a fraction of the same sides; 0: no T_c."""
     space: Literal["views", "uv"] = "views"
-    """For the cascade: T_p and T_c are tuned in random views, or in UV space at points of the surface of the mesh."""
+    """For the cascade: tune both textures by the error in random views, or (uv) at random points of the mesh."""
     steps: int = Field(5000, ge=0)
-    """For the cascade: steps of Adam."""
+    """For the cascade: number of optimiser steps (Adam)."""
     colour_rate: float = Field(5e-4, gt=0.0, lt=1.0)
-    """For the cascade: initial learning rate of T_p, in units of the lightmap's mean."""
+    """For the cascade: initial learning rate of the colour texture, in units of the lightmap's mean."""
     lut_rate: float = Field(5e-5, gt=0.0, lt=1.0)
-    """For the cascade: initial learning rate of T_c."""
+    """For the cascade: initial learning rate of the lookup texture, in units of T_p's sides."""
     final_rate: float = Field(1.0, gt=0.0, le=1.0)
     """For the cascade: learning rates of the last step as a fraction of the initial ones."""
     resolution: int = Field(2048, ge=16, le=8192)
-    """For the cascade: pixels along a side of a view."""
+    """For the cascade: pixels along a side of a view from which the textures are tuned."""
     gradient: float = Field(1.0, ge=0.0)
-    """For the cascade: weight of the image gradients' L1 in the loss beside the colours' L1 (section 3.3.3)."""
+    """For the cascade: weight of errors of image gradients in the loss; errors of colours weigh 1 (section 3.3.3)."""
 
     def override(self, values: Mapping[str, Any], prefix: str = "") -> Self:
-        """Returns the profile with some settings replaced, as `wlm.system.Settings.override`.
+        """Returns the profile with new `values` of settings, by name; None changes nothing. Error messages begin with
+        `prefix`.
 
         Raises:
-            WlmError: A setting is unknown or out of range, or the cascade, which has neither, is given a budget or
-                "mixed".
+            WlmError: A setting is unknown or out of range; or the method is cascade and a budget or the colour "mixed"
+                is given, which it can't have.
         """
         if (values.get("method") or self.method) == "cascade":
             if values.get("budget") is not None:
                 raise WlmError(
-                    f"{prefix}budget: profiles of the cascade state their sizes; expected a profile of tiles, or no "
-                    "budget"
+                    f"{prefix}budget: a profile of the cascade states the sizes of its textures; choose a profile of "
+                    "tiles, or give no budget"
                 )
             if (values.get("colour") or self.colour) == "mixed":
                 raise WlmError(f"{prefix}colour: expected half, rgb9e5, bc6h or astc for a cascade, found mixed")
@@ -163,13 +164,13 @@ class Profile(Settings):
         """Returns the profile with its budget filled in, and the method to use.
 
         Args:
-            lightmaps: Number of lightmaps, sheets times states.
+            lightmaps: Number of lightmaps, UV layouts (sheets) times states.
 
         Returns:
             The settings, with a budget unless the method is the cascade; and "tiles", "cascade" or "shared".
 
         Raises:
-            WlmError: The method or colour can't have several lightmaps.
+            WlmError: The method or colour can't be used for several lightmaps or mips.
         """
         budget = self.budget or (_BUDGET if lightmaps == 1 else _SHARED_BUDGET)
         filled = self.model_copy(update={"budget": budget if self.method == "tiles" else None})
@@ -184,14 +185,14 @@ class Profile(Settings):
 
 @dataclass(frozen=True)
 class SheetPlace:
-    """The place of a sheet, or of a mip level of a sheet, in the lookup texture T_c.
+    """The place of a sheet (a UV layout with its lightmaps), or of its mip level, in the lookup texture T_c.
 
     Attributes:
         name: The sheet's name.
         height, width: Size of the sheet's lightmaps in texels.
         row, column: Place of the sheet's first entry in T_c.
         rows, columns: Rows and columns of tiles; 0 if the method has no tiles.
-        smaller: Row in `AtlasModel.table` of the next smaller level; 0 if there is none.
+        smaller: Row in `AtlasModel.table` of the next smaller mip level; 0 if there is none.
     """
 
     name: str
@@ -215,30 +216,32 @@ _MOST_SHARE = 65536
 
 @dataclass(frozen=True, eq=False)
 class AtlasModel(Model):
-    """Compressed lightmaps: S sheets in M states.
+    """Compressed lightmaps: S sheets (UV layouts of charts), each with a lightmap for each of M states.
 
     Attributes:
         name: The scene's name.
-        source: `LightmappedScene.source`.
+        source: Hash of the scene, `LightmappedScene.source`.
         profile: The settings of the compression.
         method: "tiles", "cascade", "plain" or "shared", see the module; "plain" also if the profile's method was no
             better. All except "shared" have one sheet and one state.
         colour: Format of T_p, as in `Profile`; "plain" is never "mixed".
         states: Names of the states.
-        sheets: The places of the sheets.
-        texels: half [pages, Hp, Wp, 3], T_p as decoded, finite, not negative. For "mixed" the texture in RGB9E5.
+        sheets: The places of the sheets in T_c.
+        texels: half [pages, Hp, Wp, 3], T_p as decoded, finite, not negative. For "mixed" the first texture, in RGB9E5.
         lut: uint16 [Hc, Wc, 2 or 4], T_c: `pack_entries` for "tiles", coordinates in units of 1 / `LUT_STEPS` for
-            "cascade", `pack_tiles` or their first two numbers for "shared"; [0, 0, 2] for "plain".
-        blocks: uint8 [pages, B, 16], blocks of T_p, row by row; for "mixed" of its second texture; [0, 0, 16] for none.
-        block_texels: half [pages, Hb, Wb, 3], multiples of 4, the second texture of "mixed"; [0, 0, 0, 3] for none.
-        factor: float32 [M, C, 3], finite, of any sign, for "shared": the constant of each mixture, then the factors of
-            its components; else [0, 0, 3].
-        levels: For "shared" with mips, the smaller levels of all sheets: a quarter of a sheet's sides, then halves.
-        later: For "shared" with separate tiles, the sheets and levels of the second state, then of the third and so on.
-        uv: float32 [F, 3, 2] in [0, 1], `snapped`, the corners' new UVs; [0, 3, 2] if the mesh keeps its UVs.
-        stored: The scene's triangles and masks; None for a model without a file.
+            "cascade", `pack_tiles`, or its first two numbers, for "shared"; [0, 0, 2] for "plain".
+        blocks: uint8 [pages, B, 16], blocks of T_p, row by row; for "mixed" of its second texture; else [0, 0, 16].
+        block_texels: half [pages, Hb, Wb, 3], multiples of 4, the decoded second texture of "mixed"; else [0, 0, 0, 3].
+        factor: float32 [M, C, 3], finite, of any sign, for "shared": for each group of tiles that share them, a
+            constant and then the components' factors; else [0, 0, 3].
+        levels: For "shared" with mips, the mip levels of all sheets: a quarter of a sheet's sides, then an eighth, and
+            so on.
+        later: For "shared" with separate tiles for each state, the sheets and mip levels of the second state, then of
+            the third and so on.
+        uv: float32 [F, 3, 2] in [0, 1], rounded by `snapped`, the corners' new UVs; [0, 3, 2] if there are none.
+        stored: The scene's triangles and masks; None for a model that can't be saved.
         report: Facts about the compression for the user: "seconds" by stage (not saved, since they differ from run to
-            run), groups, and the reason why the method is plain.
+            run), numbers of groups and tiles, and why the method is plain.
     """
 
     SYSTEM: ClassVar[str] = "atlas"
@@ -268,18 +271,18 @@ class AtlasModel(Model):
 
     @property
     def stride(self) -> int:
-        """The number of rows of `table` from a sheet in one state to the same sheet in the next; 0: all states use one
-        row."""
+        """The number of rows of `table` per state if each state has separate tiles; 0 if states share tiles and
+        rows."""
         return len(self.sheets) + len(self.levels) if self.later else 0
 
     @property
     def mips(self) -> bool:
-        """Whether the model has smaller levels."""
+        """Whether the model has mip levels."""
         return bool(self.levels)
 
     @property
     def first_block_code(self) -> int:
-        """The result of the function `first_block_code` for the entries of the lookup texture T_c."""
+        """The smallest size code with which an entry of T_c names blocks, from the function `first_block_code`."""
         return first_block_code(self.colour)
 
     @property
@@ -301,7 +304,7 @@ class AtlasModel(Model):
 
     @property
     def compression_ratio(self) -> float:
-        """CR of eq. 9 over all lightmaps: 1 minus the ratio of bits on a GPU to source bits."""
+        """CR of eq. 9 over all lightmaps: 1 minus `bits` / `source_bits`."""
         return 1.0 - self.bits / self.source_bits
 
     @cached_property
@@ -317,8 +320,8 @@ class AtlasModel(Model):
 
     def table(self) -> np.ndarray:
         """Makes the table of sheets for kernels and shaders, int32 [rows, 7]: rows and columns of texels, the first row
-        and column in T_c, rows and columns of tiles, and the row number of the next smaller level. Sheets come first,
-        then mip levels; with separate tiles the sheets and levels are repeated for each state."""
+        and column in T_c, rows and columns of tiles, and the row number of the next smaller mip level. Sheets come
+        first, then mip levels; if each state has separate tiles, sheets and levels are repeated for each state."""
         rows = [(s.height, s.width, s.row, s.column, s.rows, s.columns, s.smaller) for s in self.rows]
         return np.array(rows, np.int32)
 
@@ -330,8 +333,8 @@ class AtlasModel(Model):
 
 
 def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
-    """Checks that the lightmap's size is plausible for the number of stored texels and entries, since a file of a few
-    bytes must not claim gigabytes.
+    """Checks that a lightmap's height and width are plausible for the numbers of texels of T_p and entries of T_c,
+    since a file of a few bytes must not claim gigabytes.
 
     Raises:
         WlmError: The lightmap exceeds the limits of `wlm.texels.check_size`; or it has more than 2^24 texels and also
@@ -341,7 +344,7 @@ def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
     stored = texels + entries
     if math.prod(size) > max(_FREE_TEXELS, _MOST_SHARE * stored):
         raise WlmError(
-            f"size: expected a lightmap of at most {_MOST_SHARE} texels for each of the {stored} of its textures, "
+            f"size: expected a lightmap of at most {_MOST_SHARE} texels per stored texel, of which there are {stored}, "
             f"found {size[1]}x{size[0]}"
         )
 
@@ -358,8 +361,8 @@ def tile_counts(height: int, width: int, tile: int) -> tuple[int, int]:
 
 
 def first_block_code(colour: str) -> int:
-    """Returns the smallest size code with which an entry of the lookup texture names blocks; `NO_BLOCKS` if none
-    does."""
+    """Returns the smallest size code with which an entry of the lookup texture names compressed blocks instead of
+    texels; `NO_BLOCKS` if no entry does."""
     return {"mixed": FIRST_BLOCK_CODE, "bc6h": 0, "astc": 0}.get(colour, NO_BLOCKS)
 
 
@@ -369,15 +372,15 @@ def pack_entries(
     """Encodes entries of the lookup texture T_c for the method "tiles".
 
     Args:
-        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`, or 4 `MOST_SIZE` for blocks.
+        first: int [..., 2], x and y of the rectangle's first texel, below `MOST_SIZE`, for blocks 4 times that.
         size: int [..., 2], the rectangle's texels along x and y, 1 to 16.
-        blocks: bool [...], true for entries that name blocks, whose first texel and size are multiples of 4. Sizes of
-            other entries are at most `code`.
-        code: `first_block_code`.
+        blocks: bool [...], true for entries that name compressed blocks, whose first texel and size are multiples of 4.
+            Sizes of other entries are at most `code`.
+        code: Result of `first_block_code`.
 
     Returns:
-        uint16 [..., 2]: the first texel shifted left by 4, plus the size minus 1. For blocks, place and size are in
-        blocks, and `code` is added.
+        uint16 [..., 2]: the first texel shifted left by 4, plus the size minus 1. For blocks, both are in blocks
+        instead of texels, and `code` is added.
 
     Raises:
         ValueError: A number is out of range.
@@ -385,17 +388,17 @@ def pack_entries(
     first, size, blocks = np.asarray(first), np.asarray(size), np.asarray(blocks)[..., None]
     most = np.where(blocks, 1 << SIDE_BITS, code)
     if (np.where(blocks, first | size, 0) % BLOCK_SIDE).any() or (blocks.any() and (size > most).any()):
-        raise ValueError("an entry that isn't of whole blocks, or beyond the sizes beside them")
+        raise ValueError("an entry of blocks isn't in multiples of 4 texels, or an entry exceeds its largest size")
     steps = np.where(blocks, code + size // BLOCK_SIDE, size) - 1
     first = np.where(blocks, first // BLOCK_SIDE, first)
     if (first < 0).any() or (first >= MOST_SIZE).any() or (size < 1).any() or (size > 1 << SIDE_BITS).any():
-        raise ValueError(f"an entry beyond a texture of {MOST_SIZE} texels or a tile of {1 << SIDE_BITS}")
+        raise ValueError(f"an entry lies beyond {MOST_SIZE} texels or blocks, or its size isn't 1 to {1 << SIDE_BITS}")
     return ((first << SIDE_BITS) + steps).astype(np.uint16)
 
 
 def unpack_entries(lut: np.ndarray, code: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Decodes the result of `pack_entries`. Returns first texels and sizes, int64 [..., 2] each, and whether entries
-    name blocks, bool [..., 2], equal along both axes in a valid file."""
+    name compressed blocks, bool [..., 2]; in a valid file both axes agree."""
     lut = np.asarray(lut).astype(np.int64)
     first, size = lut >> SIDE_BITS, (lut & ((1 << SIDE_BITS) - 1)) + 1
     blocks = size > code
@@ -411,14 +414,14 @@ def pack_tiles(
     blocks: np.ndarray | bool = False,
     coarse: np.ndarray | int = 0,
 ) -> np.ndarray:
-    """Encodes entries of the lookup texture T_c for shared tiles.
+    """Encodes entries of the lookup texture T_c for tiles that several lightmaps share, as sums of components.
 
     Args:
         first, size, blocks: As for `pack_entries`: the rectangle of the first component.
-        component: int [...], number of the mixture's constant among the factors, below 65,536.
+        component: int [...], index in `AtlasModel.factor` of the tile's constant, before its factors; below 65,536.
         count: int [...], number of components, 0 to 255; 0: the tile is black.
         page: int [...], number of the page of T_p, below `MOST_PAGES`.
-        coarse: int [...], number of coarse components, one block each, 0 to `MOST_COARSE`; 0 for tiles in texels.
+        coarse: int [...], number of components stored as one block each, 0 to `MOST_COARSE`; 0 without blocks.
 
     Returns:
         uint16 [..., 4].
@@ -429,8 +432,8 @@ def pack_tiles(
 
 
 def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
-    """Decodes the result of `pack_tiles`, or of `pack_entries` as tiles with one component. Returns the arguments of
-    `pack_tiles` in their order: int64, except `blocks`, which is bool [...]."""
+    """Decodes the result of `pack_tiles`, or that of `pack_entries`, whose tiles have one component. Returns the
+    arguments of `pack_tiles` in their order: int64, except `blocks`, which is bool [...]."""
     first, size, blocks = unpack_entries(lut[..., :SHORT_ENTRY], code)
     if lut.shape[-1] == SHORT_ENTRY:
         zeros = np.zeros(lut.shape[:-1], np.int64)
@@ -442,14 +445,14 @@ def unpack_tiles(lut: np.ndarray, code: int) -> tuple[np.ndarray, ...]:
 
 
 def coarse_place(size: np.ndarray, whole: np.ndarray, number: np.ndarray | int) -> np.ndarray:
-    """Returns the place of a coarse component of a tile, int [..., 2], in texels from the tile's first texel. Coarse
-    components are stacked in columns to the right of the tile's `whole` other components, each of the given size."""
+    """Returns where a coarse component of a tile (one stored as a single block) lies, int [..., 2], in texels from the
+    tile's first texel. The `whole` full components, of `size` texels each, come first, side by side; the coarse ones,
+    numbered from 0 by `number`, are stacked in columns to their right."""
     column, row = np.divmod(number, np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * whole + BLOCK_SIDE * column, BLOCK_SIDE * row], -1)
 
 
 def extent(size: np.ndarray, count: np.ndarray, coarse: np.ndarray | int) -> np.ndarray:
-    """Returns the texels along x and y that all components of a tile take, int [..., 2]; arguments as in
-    `pack_tiles`."""
+    """Returns the texels along x and y of all components of a tile, int [..., 2]; arguments as in `pack_tiles`."""
     columns = -(-coarse // np.maximum(size[..., 1] // BLOCK_SIDE, 1))
     return np.stack([size[..., 0] * (count - coarse) + BLOCK_SIDE * columns, size[..., 1]], -1)

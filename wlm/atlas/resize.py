@@ -15,8 +15,8 @@ _PULL = 1e-4
 
 
 def fitting_size(height: int, width: int, budget: float, block: tuple[int, int], bits: float) -> tuple[int, int] | None:
-    """Returns the largest rows and columns, with the aspect ratio of height and width and at most as large, whose whole
-    blocks fit a budget of bits at `bits` per texel; None if not even one block fits."""
+    """Returns the largest rows and columns, at most `height` and `width` and in their ratio, at which a lightmap takes
+    at most `budget` bits. It is counted in whole blocks of `block` texels, at `bits` per texel. None if none fits."""
     longest = max(height, width)
     for side in range(longest, 0, -1):
         rows, columns = (max(1, round(side * size / longest)) for size in (height, width))
@@ -56,8 +56,7 @@ def _along(matrix: sparse.csr_matrix, image: torch.Tensor) -> torch.Tensor:
 
 
 def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
-    """Minimises the squared error at the mask's texels by conjugate gradients from `start`; returns an image [h, w,
-    3]."""
+    """Minimises the squared error at the mask's texels by conjugate gradients from `start`; returns [h, w, 3]."""
     rows, columns = (_bilinear(new, old) for new, old in zip(mask.shape, start.shape[:2], strict=True))
     turned_rows, turned_columns = rows.T.tocsr(), columns.T.tocsr()
 

@@ -114,7 +114,6 @@ _WHAT = {
 
 
 def _one_lightmap(model: AtlasModel) -> str:
-    """Returns the GLSL for a model with one lightmap, where the sizes of lightmap and tiles are constants."""
     height, width = model.sheets[0].size
     tiles, cascade, mixed = model.method == "tiles", model.method == "cascade", model.colour == "mixed"
     kinds = ["plain", *(["mixed"] if mixed else []), model.method]
@@ -290,7 +289,6 @@ _FUNCTIONS = {"wlm_scene": ("vec2 uv", "uv"), "wlm_scene_grad": ("vec2 uv, vec2 
 
 
 def _shared(model: AtlasModel) -> str:
-    """Returns the GLSL for shared tiles, with a function of an object's rectangle, sheet and state."""
     height, width = model.texels.shape[1:3]
     kinds = {"sheets": "usampler2D", "lut": "usampler2D", "factors": "sampler2D", "colour": "sampler2DArray"}
     mixed = model.colour == "mixed"

@@ -1,4 +1,4 @@
-"""Stages of a compression: each is reported when it begins and timed, and long stages are saved in a checkpoint."""
+"""Stages of a compression: each is timed and reported as it begins, and long stages are saved in a checkpoint."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +12,7 @@ from wlm.system import Meter, OnProgress
 class Stages:
     """Reports and times the stages of a compression.
 
-    A checkpoint keeps the long stages of a method as batches, numbered in their order.
+    A checkpoint saves the results of long stages as batches, numbered in order.
 
     Attributes:
         device: "cpu" or "cuda:N".

@@ -17,9 +17,9 @@ from wlm.formats.gltf_writer import Replacement, encode_glb
 
 @dataclass(frozen=True, eq=False)
 class StoredScene:
-    """Triangles and masks of a scene: the bytes of a `.glb` file; the nodes that are lit by the sheets; n of their UV
-    set `TEXCOORD_n`; whether positions are known to be in metres; whether the other nodes hide what is behind them; and
-    for each sheet its mask, bool [H, W], true where a texel belongs to a chart."""
+    """Triangles and masks of a scene: the bytes of a `.glb` file; the nodes that the sheets light; the number n of
+    their UV set `TEXCOORD_n`; whether positions are in metres; whether other nodes hide what is behind them; and a mask
+    for each sheet, bool [H, W], true where a texel belongs to a chart."""
 
     glb: bytes
     objects: tuple[Placed, ...]
@@ -33,7 +33,7 @@ def store(scene: LightmappedScene) -> StoredScene:
     """Encodes the triangles and masks of a scene.
 
     Raises:
-        WlmError: A part of the document that isn't drawn is malformed.
+        WlmError: A part of the glTF document is malformed.
     """
     content = copy.deepcopy(scene.document.content)
     for each in scene.objects:
@@ -50,12 +50,12 @@ def restore(model: AtlasModel) -> LightmappedScene:
     """Reconstructs the scene, without lightmaps, from which a model was made.
 
     Raises:
-        WlmError: The document is damaged, or doesn't have the triangles of the model.
+        WlmError: The stored glTF file is damaged, or has other triangles than the model.
         ValueError: The model stores no triangles.
     """
     stored = model.stored
     if stored is None:
-        raise ValueError(f"{model.name}: expected a model with the triangles of its scene")
+        raise ValueError(f"{model.name}: expected a model that stores the triangles of its scene, found none")
     document, primitives = parse_gltf(model.name, stored.glb)
     sheets, blocker = place_objects(model.name, primitives, stored.uv_set, stored.objects, stored.masks)
     sheets = tuple(replace(sheet, name=place.name) for sheet, place in zip(sheets, model.sheets, strict=True))
@@ -66,7 +66,7 @@ def restore(model: AtlasModel) -> LightmappedScene:
 
 def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
     """Makes the mesh for an engine. Returns the bytes of the stored `.glb`, with an additional UV set if the model has
-    new UVs, and n of the `TEXCOORD_n` at which the model is read."""
+    new UVs, and n of the UV set `TEXCOORD_n` for which the model is made."""
     if not len(model.uv):
         return model.stored.glb, model.stored.uv_set
     return with_uvs(model.scene, model.uv)
@@ -74,7 +74,7 @@ def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
 
 def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int]:
     """Encodes a scene of one sheet with an additional UV set, the corners' new UVs [F, 3, 2], numbered after the last
-    existing set. Returns the bytes of a `.glb` file, and n of the new `TEXCOORD_n`.
+    existing set. Returns the bytes of a `.glb` file, and n of the new UV set `TEXCOORD_n`.
 
     Raises:
         ValueError: The shape is wrong, or a UV isn't finite.

@@ -60,9 +60,9 @@ def visible_uv(
         device: "cpu" or "cuda:N".
 
     Yields:
-        For each camera, on the device: int32 [h, w], the visible triangle with a sheet, -1 for none; float32 [h, w, 2],
-        barycentric weights of the triangle's corners 0 and 1 (all three add up to 1); float32 [h, w, 2], UVs. Weights
-        and UVs are 0 in uncovered pixels.
+        For each camera, on the device: int32 [h, w], number of the visible triangle, -1 for none or one without a
+            lightmap; float32 [h, w, 2], barycentric weights of the triangle's corners 0 and 1 (all three add up to 1);
+            float32 [h, w, 2], UVs. Weights and UVs are 0 in uncovered pixels.
 
     Raises:
         WlmError: There is no such device.
@@ -108,8 +108,7 @@ def visibility(
         device: "cpu" or "cuda:N".
 
     Returns:
-        float64 [height, width] on the device, the pixels of all views whose UVs lie in each cell; a UV of 1 is in the
-        last cell.
+        float64 [height, width] on the device, pixels of all views whose UVs lie in each cell; a UV of 1 is in the last.
 
     Raises:
         WlmError: There is no such device.
@@ -138,8 +137,8 @@ def texel_triangles(sheet: Sheet, height: int, width: int, device: str) -> tuple
         device: "cpu" or "cuda:N".
 
     Returns:
-        On the device: int64 [height, width], the number of the triangle in the sheet, the first of several, -1 for
-        none; float32 [height, width, 2], the barycentric weights of its corners 0 and 1.
+        On the device: int64 [height, width], the number of the triangle in the sheet (the first if there are several,
+        -1 for none); float32 [height, width, 2], the barycentric weights of its corners 0 and 1.
     """
     active = torch.tensor(np.flatnonzero(sheet.active), device=device)
     raster = ops_raster.rasterize_uv(

@@ -22,7 +22,7 @@ _SAMPLES = 1 << 22  # texels from which the percentile is estimated
 
 
 class FineGrid:
-    """A grid of cells over a sheet, each a quarter of a texel, and maps over the grid, computed when first used."""
+    """A grid over a sheet whose cells are quarters of texels, and properties of the cells, computed when first used."""
 
     def __init__(self, sheet: Sheet, device: str) -> None:
         self.sheet, self.device = sheet, device
@@ -66,7 +66,6 @@ class FineGrid:
 
 
 def _quarters(texels: torch.Tensor) -> torch.Tensor:
-    """Repeats each texel as 2 x 2 cells."""
     return texels.repeat_interleave(2, 0).repeat_interleave(2, 1)
 
 
@@ -78,9 +77,9 @@ def _largest(values: torch.Tensor) -> torch.Tensor:
 
 
 def weights(scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int) -> torch.Tensor:
-    """Returns the weight of each cell of a scene's only sheet, float64 [2 H, 2 W] on the grid's device: `spread` of the
-    number of pixels that show it in random views. Views from inside count as much as views from around the scene. At
-    least one weight is above 0."""
+    """Returns the weight of each cell of a scene's only sheet, float64 [2 H, 2 W] on the grid's device: computed by
+    `spread` from the number of pixels that show it in random views. Views from inside count as much as views from
+    around the scene. At least one weight is above 0."""
     count, shape = profile.views, (grid.height, grid.width, grid.device)
     views = scene_views(scene, count, seed)
     around, inside = (visibility(scene, each, RESOLUTION, *shape) for each in (views[:count], views[count:]))
@@ -97,9 +96,9 @@ def spread(
     relative: float = 0.0,
     mean: float | None = None,
 ) -> torch.Tensor:
-    """Turns pixel counts of cells, float64 [2 H, 2 W], into weights: cells that no view shows get a small weight, and
-    cells at borders of charts a larger weight, as `Profile` says. `mean` is the mean count of a cell, which scales the
-    weight of cells that no view shows; None: the mean over this sheet."""
+    """Turns pixel counts of cells (quarters of texels), float64 [2 H, 2 W], into weights. The weight `unseen` times the
+    mean is added in every cell, weights near a chart's border are multiplied by `border`, and `relative` is the share
+    that counts relative errors. `mean` is the mean count of a cell; None: computed from this sheet."""
     # A texel is also read at its centre, and a small triangle may contain that centre but no quarter's.
     used = grid.covered | grid.texels | (visible > 0)
     if not used.any():  # the mesh is smaller than a cell, and no pixel shows it

@@ -1,4 +1,4 @@
-"""The verbs for lightmaps of meshes: compress, evaluate, decode, export, info."""
+"""The commands for lightmaps of meshes: compress, evaluate, decode, export, info."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -51,10 +51,10 @@ _Lights = Annotated[
     ),
 ]
 _Mask = Annotated[
-    Path | None, typer.Option(metavar="PNG", help="Texels that belong to charts; default derived from the triangles.")
+    Path | None, typer.Option(metavar="PNG", help="PNG, not black where charts are; default from the triangles.")
 ]
 _UvSet = Annotated[
-    int | None, typer.Option("--uv-set", min=0, help="Number n of the lightmap UVs TEXCOORD_n; default 1, else 0.")
+    int | None, typer.Option("--uv-set", min=0, help="The lightmap UVs are TEXCOORD_n; default 1 if present, else 0.")
 ]
 _Node = Annotated[str | None, typer.Option(help="Node that the lightmap belongs to; default the one that fits best.")]
 _Encoding = Annotated[str | None, typer.Option(help="Encoding of a PNG: linear, srgb, rgbm, dldr or rgbe.")]
@@ -62,12 +62,12 @@ _Slot = Annotated[
     str | None,
     typer.Option(help="Material slot whose textures are the lightmaps, without LIGHTMAPS: occlusion or emissive."),
 ]
-_Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is v = 1.")]
+_Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is at v = 1 instead of v = 0.")]
 _Views = Annotated[
-    int | None, typer.Option(min=1, max=4096, help=f"Cameras around the scene, and as many inside; default {_VIEWS}.")
+    int | None, typer.Option(min=1, max=4096, help=f"Cameras outside the scene, and as many inside; default {_VIEWS}.")
 ]
 _Resolution = Annotated[
-    int | None, typer.Option(min=16, max=16384, help=f"Edge of a view in pixels; default {_RESOLUTION}.")
+    int | None, typer.Option(min=16, max=16384, help=f"Edge of a square view in pixels; default {_RESOLUTION}.")
 ]
 
 
@@ -154,13 +154,13 @@ def decode(
     state: Annotated[float, typer.Option(min=0.0, help="Number of the state; a fraction mixes two states.")] = 0.0,
     view: Annotated[
         int | None,
-        typer.Option(min=0, help="Draw the scene from this camera of wlm evaluate; cameras inside come last."),
+        typer.Option(min=0, help="Draw the view of this camera of wlm evaluate, counted from 0."),
     ] = None,
     views: _Views = None,
     resolution: _Resolution = None,
     device: Device = "cpu",
 ) -> None:
-    """Decode a lightmap in its original layout, or draw a view of the scene. The inputs are not needed."""
+    """Decode a lightmap in its original layout, or draw a view of the scene. The original files are not needed."""
     check_output(output, ".exr", ".png")
     if view is None:
         if output.suffix.lower() == ".png":
@@ -211,7 +211,7 @@ def export(
     exact: ExactShader = False,
     device: Device = "cpu",
 ) -> None:
-    """Write the lightmaps for an engine: textures, the mesh and a shader, or with --engine a mesh with its material."""
+    """Write the lightmaps for an engine: textures, the mesh and a shader, or with --engine a mesh and a material."""
     models.export(file, output, engine, shader, exact, device)
 
 

@@ -9,11 +9,11 @@ from wlm.cli.console import check_output, exclusive, note, note_start, quiet_war
 from wlm.cli.options import Device, Resume, Trust, output_option
 
 app = typer.Typer(
-    help="Make inputs by path tracing: lightmaps and probes with Mitsuba (extra `bake`), six-way lightmaps without."
+    help="Make inputs by path tracing: lightmaps and probes (by Mitsuba, extra `bake`), six-way lightmaps of smoke."
 )
 
 _Scene = Annotated[
-    Path, typer.Argument(metavar="SCENE.yaml", help="Settings: a glTF file, its lights by hour, the resolution.")
+    Path, typer.Argument(metavar="SCENE.yaml", help="YAML settings: a glTF file, its lights by hour, the resolution.")
 ]
 
 
@@ -21,7 +21,7 @@ _Scene = Annotated[
 @exclusive
 def lightmaps(
     scene: _Scene,
-    output: Annotated[Path, output_option("DIR", "The folder of the set.")],
+    output: Annotated[Path, output_option("DIR", "Folder to write the set to.")],
     directional: Annotated[
         bool,
         typer.Option("--directional", help="Also bake the main direction of the light, a layer like Unity's comp_dir."),
@@ -92,7 +92,7 @@ def probes(
 @exclusive
 def sixway(
     scene: Annotated[
-        Path, typer.Argument(metavar="SCENE.yaml", help="Settings: the smoke, the camera, the number of samples.")
+        Path, typer.Argument(metavar="SCENE.yaml", help="YAML settings: smoke, camera, number of samples.")
     ],
     output: Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")],
     device: Device = "cpu",
@@ -101,7 +101,7 @@ def sixway(
 ) -> None:
     """Bake six-way lightmaps with all orders of scattering by path tracing; needs no extra.
 
-    wlm smoke bake makes lightmaps of single scattering without noise.
+    For single scattering alone, wlm smoke bake makes lightmaps without noise.
     """
     quiet_warp()
     from wlm.bake.sixway import bake_sixway, load_sixway

@@ -90,8 +90,8 @@ def show_facts(title: str, facts: Mapping[str, Any]) -> None:
 
     Args:
         title: Title of the table.
-        facts: JSON values by name; underscores in names become spaces. A mapping becomes a section of the table, with
-            the names of its entries behind its own.
+        facts: JSON values by name; underscores in names become spaces. A mapping becomes a section of the table, in
+            which each line has the name of the mapping and that of an entry.
     """
     rows = table(title, ["", "value"])
     for name, value in facts.items():
@@ -106,7 +106,7 @@ def show_facts(title: str, facts: Mapping[str, Any]) -> None:
 
 
 def show_files(title: Path, paths: Iterable[Path]) -> None:
-    """Prints a table of written files, by their paths in the folder `title` where they are inside it."""
+    """Prints a table of written files; paths of files in the folder `title` are relative to it."""
     rows = table(str(title), ["file", "bytes"])
     for path in paths:
         shown = path.relative_to(title) if path.is_relative_to(title) else path
@@ -260,11 +260,11 @@ def running(
     Args:
         what: Name of the work in a word or two.
         checkpoint: The file that keeps an interrupted run; None: Ctrl-C and SIGTERM end the work at once.
-        unit: Name of a step.
+        unit: Name of a step, for messages, such as "frame".
         whole: Whether a signal waits for the end of a step; False for steps that write their results by themselves.
 
     Yields:
-        A callback for the work. If a signal stops the work after the first call, a line says how to continue.
+        A function to call with a `Progress`. If a signal stops the work later, a line says how to continue.
     """
     last: Any = None
     hold = checkpoint is not None and whole

@@ -1,4 +1,4 @@
-"""The verbs for lightmaps over time: compress, evaluate, decode, export, info."""
+"""The commands for lightmaps over time: compress, evaluate, decode, export, info."""
 
 import math
 from pathlib import Path
@@ -47,14 +47,16 @@ if TYPE_CHECKING:
 _Set = Annotated[
     Path,
     typer.Argument(
-        metavar="SET", help="A set.json, a folder of lightmaps (.exr, .hdr, .ktx2, .dds), or folders of Unity's states."
+        metavar="SET", help="A set.json, a folder of lightmaps (.exr, .hdr, .ktx2, .dds), or folders of Unity bakes."
     ),
 ]
 _Times = Annotated[
-    str | None, typer.Option(help="Times of the lightmaps in order: numbers and start:stop:step, separated by commas.")
+    str | None, typer.Option(help="Times of the lightmaps in order, such as 0,6.5,12 or 0:24:1 (start:stop:step).")
 ]
-_Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default the mask of the set.')]
-_Period = Annotated[float | None, typer.Option(help="Length of the day; default the length that the set states.")]
+_Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as set.json states.')]
+_Period = Annotated[
+    float | None, typer.Option(help="Length of the day, in the times' unit; default as set.json states.")
+]
 _Layers = Annotated[
     str | None, typer.Option(metavar="NAMES", help="Layers of the set to read, separated by commas; default all.")
 ]
@@ -127,9 +129,7 @@ def evaluate(
     file: ModelFile,
     set_path: _Set,
     json_path: ReportFile = None,
-    views: Annotated[
-        int, typer.Option(min=0, help="Number of rendered views of the set's mesh to score, if it names one.")
-    ] = 50,
+    views: Annotated[int, typer.Option(min=0, help="Number of rendered views to score, if the set names a mesh.")] = 50,
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
@@ -163,11 +163,11 @@ def evaluate(
 
 def decode(
     file: ModelFile,
-    time: Annotated[float, typer.Option(help="Time in the unit of the set, stored or between stored times.")],
+    time: Annotated[float, typer.Option(help="Time to decode, in the unit of the set; may be between stored times.")],
     output: Annotated[Path, output_option("FRAME.exr", "The EXR to write.")],
     texture: Annotated[
         Path | None,
-        typer.Option(metavar="MAP.dds", help="Also write a texture as renderers sample it: RGB9E5 texels with mips."),
+        typer.Option(metavar="MAP.dds", help="Also write the decoded light as a DDS texture: RGB9E5 with mips."),
     ] = None,
     layer: Annotated[
         str | None, typer.Option(metavar="NAME", help="Layer to decode; default the first layer of radiance.")
@@ -294,7 +294,7 @@ def _cells(report: "Report | SheetReport", columns: Any) -> list[str]:
 
 
 def _show_where_shown(report: "Report") -> None:
-    """Prints the table of `wlm.lightmap.view_scores.ShownScore`; columns without any score are left out."""
+    """Prints the scores of the light as a renderer shows it; columns without any score are left out."""
     columns = [
         column for column in _SHOWN if any(math.isfinite(getattr(own, column[1])) for own in report.sheets.values())
     ]
@@ -309,16 +309,16 @@ def _note_worst(report: "SheetReport") -> None:
     """Prints the tile, time and view with the lowest scores, and how many tiles have no score."""
     if report.worst_tile is not None:
         worst = report.worst_tile
-        note(f"worst: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
-    for what, worst in (("filtered read", report.worst_seen), ("between times", report.worst_between)):
+        note(f"worst PSNR: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+    for what, worst in (("filtered read", report.worst_seen), ("between stored times", report.worst_between)):
         if worst is not None:
-            note(f"worst {what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+            note(f"worst PSNR, {what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
     if (worst := report.worst_view) is not None:
         place = f"camera {worst['view']} at {worst['time']:g}"
         note(f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, {place}")
     reasons = ", ".join(f"{count} {reason}" for reason, count in report.not_scored.items() if count)
     if reasons:
-        note(f"tiles times times without a score: {reasons}")
+        note(f"tiles without a score, counted at each time: {reasons}")
     if report.format_limited:
         psnr = number(report.psnr_unlimited, ".2f")
-        note(f"{len(report.format_limited)} scored tiles span few steps of half float; without them PSNR is {psnr} dB")
+        note(f"{len(report.format_limited)} scored tiles span few half-float values; PSNR of the others: {psnr} dB")

@@ -40,7 +40,7 @@ def fit(
         output: The `.wlm` to write.
         profile: Name of the profile or path of a YAML file.
         settings: Settings that replace those of the profile, by name.
-        seed, device, resume, every: Values of `--seed`, `--device`, `--resume` and `--checkpoint-every`.
+        seed, device, resume, every: Values of the options `--seed`, `--device`, `--resume` and `--checkpoint-every`.
         options: Further options of `compress`.
 
     Returns:
@@ -76,7 +76,7 @@ def export(
     device: str,
     **options: Any,
 ) -> None:
-    """Exports a model to a folder and lists the written files. Options that are None are not passed on.
+    """Exports a model to a folder and lists the written files. `options` that are None are left out.
 
     Raises:
         WlmError: An option has no meaning for the engine, or the folder cannot be written.
@@ -96,7 +96,7 @@ def export(
 def describe(
     file: Path, system: str, device: str | None, as_json: bool, facts: Callable[[Any], Mapping[str, Any]]
 ) -> Any:
-    """Shows what a file of a system contains: its settings, its sizes, and the facts of its system; returns the model.
+    """Shows what a file of a system contains: settings, sizes and the given facts; returns the model.
 
     `facts` returns the facts of a model as JSON values by name. With a device, the memory that the model needs there is
     shown.

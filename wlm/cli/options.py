@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 import typer
 
 Device = Annotated[str, typer.Option(help='Device to compute on: "cpu", "cuda" or "cuda:N".')]
-Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed; one seed gives one result on one device.")]
-Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run with the same output.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Random seed; fixes the result on one device.")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run that wrote to the same output.")]
 CheckpointEvery = Annotated[
     float,
     typer.Option(
@@ -29,9 +29,9 @@ Up = Annotated[Literal["y", "z"], typer.Option(help="Axis of the scene that poin
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Trust = Annotated[
     bool,
-    typer.Option("--trust", help="Trust the input: it may name files in other folders and have any size."),
+    typer.Option("--trust", help="Trust the input file: it may name files in other folders and have any size."),
 ]
-Profile = Annotated[str, typer.Option(metavar="NAME|FILE.yaml", help="Profile, or a YAML file of settings.")]
+Profile = Annotated[str, typer.Option(metavar="NAME|FILE.yaml", help="Name of a settings profile, or a YAML file.")]
 Engine = Annotated[
     Literal["three", "godot", "unity", "unreal"] | None,
     typer.Option(help="Write a kit for this engine. Default: textures, buffers and a shader for any program."),
@@ -41,10 +41,10 @@ ShaderLanguage = Annotated[
     typer.Option(help="Language of the shader without --engine; default glsl."),
 ]
 ExactShader = Annotated[
-    bool, typer.Option("--exact", help="Without --engine: the shader interpolates in floats, not by the texture unit.")
+    bool, typer.Option("--exact", help="Without --engine: a shader that filters texels in 32-bit floats itself.")
 ]
 ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="Compressed file that wlm compress wrote.")]
-Key = Annotated[str | None, typer.Option(help="Array to read from a probe file with several, such as an hour.")]
+Key = Annotated[str | None, typer.Option(help="Name of the array to read, if a probe file has several, such as hours.")]
 
 
 def output_option(metavar: str, help_text: str) -> Any:

@@ -1,4 +1,4 @@
-"""The verbs for light probes: compress, evaluate, decode, export, info."""
+"""The commands for light probes: compress, evaluate, decode, export, info."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -46,7 +46,7 @@ _Probes = Annotated[
 ]
 _CONVENTIONS = "threejs, godot, unreal or unity"
 _Convention = Annotated[
-    str | None, typer.Option(help=f"SH convention of PROBES: {_CONVENTIONS}; default as the file states.")
+    str | None, typer.Option(help=f"SH convention of PROBES: {_CONVENTIONS}; default the file's own.")
 ]
 _At = Annotated[
     Path | None,
@@ -101,10 +101,10 @@ def evaluate(
     probes_path: _Probes,
     json_path: ReportFile = None,
     volume: Annotated[
-        bool, typer.Option("--volume", help="Also score the light sampled from the cascaded volume along a walk.")
+        bool, typer.Option("--volume", help="Also score the volume that wlm probe volume writes, along a path.")
     ] = False,
     views: Annotated[
-        int, typer.Option(help="Number of pictures of balls, and of --mesh, under the light to score; 0 for none.")
+        int, typer.Option(help="Number of rendered pictures of lit balls (or --mesh) to score; 0 for none.")
     ] = 0,
     mesh: SceneFile = None,
     key: Key = None,
@@ -126,7 +126,7 @@ def evaluate(
         size = file.stat().st_size
         report = evaluate(model, probes, device=device, progress=progress, file_bytes=size)
     if not probes.source.startswith(model.source):
-        note(f"warning: {probes_path}: not the input of {file}; another key, convention or file?")
+        note(f"warning: {probes_path}: not the input that {file} was made from; check the file, --key and --convention")
     pictures = score_pictures(model, probes, views, mesh, device) if views or mesh is not None else []
     walks = score_walks(model, probes, device) if volume else {}
     if json_path is not None:
@@ -148,10 +148,10 @@ def decode(
     original: _At = None,
     device: Device = "cpu",
 ) -> None:
-    """Decode the light at the stored positions or at others.
+    """Decode the light at the stored positions, or at the positions in another file.
 
-    If the given positions have the number and the bounding box of the file's probes, they count as these probes, in
-    order, and dead probes decode to zero. At other positions no probe is dead.
+    Given positions of the same number and bounding box as the compressed probes are taken for these probes, in order.
+    Then probes without light (dead probes, such as those in walls) decode to zero.
     """
     check_output(output, ".npz", ".json")
     quiet_warp()
@@ -181,20 +181,20 @@ def export(
         Path | None,
         typer.Option(
             metavar="PROBES",
-            help="File with the positions of the probes, for a FILE.wlm that stores none; for Godot also the bake of "
-            "which all other content is kept.",
+            help="File with the positions of the probes, if FILE.wlm stores none; for Godot the .lmbake to copy with "
+            "the new light.",
         ),
     ] = None,
     cells: Annotated[
         int | None,
-        typer.Option(help="Cells of the grid of three, godot or unreal along the longest side; default 24."),
+        typer.Option(help="With --engine three, godot or unreal: grid cells along the longest side; default 24."),
     ] = None,
     mirror: Annotated[
-        Literal["x", "y", "z"] | None, typer.Option(help="Axis to flip for the left-handed unity; default none.")
+        Literal["x", "y", "z"] | None, typer.Option(help="With --engine unity: axis to flip, as Unity is left-handed.")
     ] = None,
     device: Device = "cpu",
 ) -> None:
-    """Write light probes for an engine: buffers and a shader, or with --engine a grid or probes in its own format."""
+    """Write light probes for an engine: buffers and a shader, or with --engine a grid or probes that it can load."""
     options = {"original": original, "cells": cells, "mirror": mirror}
     models.export(file, output, engine, shader, exact, device, **options)
 

@@ -38,14 +38,14 @@ def volume(
         typer.Option(metavar="X Y Z", help="Position of the viewer; default the centre of the probes."),
     ] = None,
     block: Annotated[
-        float | None, typer.Option(help="Side of the finest blocks; default from the spacing of the probes.")
+        float | None, typer.Option(help="Side of the finest blocks in world units; default by the probes' spacing.")
     ] = None,
     key: Key = None,
     device: Device = "cpu",
 ) -> None:
-    """Write the cascaded volume around a viewer: buffers and an index, with a shader that reads them.
+    """Write a volume of light around a viewer, coarser farther away: buffers, an index, and a shader that reads them.
 
-    Normals of PROBES keep light from passing through walls. wlm evaluate --volume scores walks through the scene.
+    Normals of PROBES keep light from passing through walls. wlm evaluate --volume scores such a volume.
     """
     quiet_warp()
     import numpy as np

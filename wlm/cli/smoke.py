@@ -60,7 +60,7 @@ _WARM = 2  # first frames of `run`, which compile kernels and are not timed if t
 app = typer.Typer(help="Smoke: simulation, six-way lightmaps, and pictures.")
 
 _SceneName = Annotated[
-    str, typer.Argument(metavar="SCENE", help="jet-sphere, jet-moving, explosion, chimney, or a YAML file.")
+    str, typer.Argument(metavar="SCENE", help="Scene: jet-sphere, jet-moving, explosion, chimney, or a YAML file.")
 ]
 _SceneFrames = Annotated[int | None, typer.Option(min=1, max=9999, help="Number of frames; default the scene's.")]
 _SceneScale = Annotated[
@@ -68,7 +68,7 @@ _SceneScale = Annotated[
 ]
 _Albedo = Annotated[
     str | None,
-    typer.Option(metavar="R,G,B", help="Single scattering albedo, three numbers or one; default the scene's."),
+    typer.Option(metavar="R,G,B", help="Single scattering albedo, one number or three; default the scene's."),
 ]
 _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")]
 _Lightmaps = Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")]
@@ -157,9 +157,9 @@ def bake(
     frames are kept when the command is stopped; repeat it with --resume to make the others.
     """
     if fit == "sphere" and supersample > 1:
-        raise WlmError("--supersample: expected 1 with --fit sphere")
+        raise WlmError(f"--supersample: expected 1 with --fit sphere, got {supersample}")
     if albedo is not None and fit == "axes":
-        raise WlmError("--albedo: expected --fit sphere: lightmaps of the axes have single scattering only")
+        raise WlmError("--albedo needs --fit sphere: with --fit axes lightmaps have single scattering only")
     quiet_warp()
     from wlm.smoke.march.fine import bake
 
@@ -194,7 +194,7 @@ def predict(
     make the others.
     """
     if coarse and network is not None:
-        raise WlmError("--coarse: expected no --network beside it")
+        raise WlmError("--coarse: expected no --network, since --coarse uses no network")
     quiet_warp()
     from wlm.smoke.codec import open_network
     from wlm.smoke.march.coarse import bake_coarse, coarse_march
@@ -213,7 +213,7 @@ def predict(
 
 
 def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Returns a function that predicts lightmaps with a network; it prints a note if the network changes little."""
+    """Returns a function that predicts lightmaps with a network; the first call may print the predictor's note."""
     from wlm.smoke.network.prediction import SmokePredictor
 
     predictor, first = SmokePredictor(model, device), True
@@ -264,12 +264,12 @@ def light(
 ) -> None:
     """Draw lit smoke: by a ray march towards each light, with predicted multiple scattering, or by path tracing.
 
-    Without --light, --point and --sky the lights are those of the scene, or else one from 1,1,1. The march replaces a
+    Without --light, --point and --sky the lights of the scene are used, or else one from 1,1,1. The march replaces a
     sky by twelve lights, and draws a scene's obstacles with their shadows. Path tracing is unbiased and prints its
     noise; obstacles then absorb all light, fire emits grey light, and the background is black or the sky.
     """
     if samples is not None and background is not None:
-        raise WlmError("--background: expected none with --samples: a traced picture shows only the sky")
+        raise WlmError("--background cannot be used with --samples: behind traced smoke is only --sky")
     colour, around = _given_albedo(albedo), None if sky is None else vector("--sky", sky)
     behind = around if background is None else vector("--background", background)
     check_white(white)
@@ -342,7 +342,7 @@ def run(
     orders: Annotated[
         Literal["all", "single"] | None,
         typer.Option(
-            help="Orders of scattering: all, or single by six-way lightmaps. Default all, or single with --network."
+            help="Scattering: all orders, or single by six-way lightmaps; default all, with --network single."
         ),
     ] = None,
     albedo: _Albedo = None,
@@ -360,7 +360,7 @@ def run(
     """
     check_white(white)
     if orders == "all" and network is not None:
-        raise WlmError("--network: expected --orders single: it makes six-way lightmaps")
+        raise WlmError("--network: expected --orders single, since the network makes six-way lightmaps")
     colour = _given_albedo(albedo)
     film_file = output.suffix.lower() == ".mp4"
     if film_file:
@@ -423,14 +423,12 @@ def _checked(option: str, make: Callable[..., Any], *values: Any) -> Any:
 
 
 def _sky_lights(radiance: tuple[float, float, float]) -> "tuple[Light, ...]":
-    """Returns the lights that approximate the sky of `--sky`."""
     from wlm.smoke.transport.lights import sky_lights
 
     return _checked("--sky", sky_lights, radiance)
 
 
 def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":
-    """Parses the lights given by `--light` and `--point`."""
     from wlm.smoke.camera import unit
     from wlm.smoke.shading import Light
     from wlm.smoke.transport.lights import PointLight, checked_colour

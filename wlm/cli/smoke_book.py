@@ -35,11 +35,11 @@ _With = Annotated[
     typer.Option("--with", metavar="TEXTURE", help="Second texture of a flip book; repeat for an opacity texture."),
 ]
 _Cells = Annotated[
-    str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Cells of the flip book given by --with, such as 8x8.")
+    str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Cells of the flip book (see --with), such as 8x8.")
 ]
 _Layout = Literal["unity", "o3de", "o3de-tlrb", "embergen"]
 _From = Annotated[
-    _Layout | None, typer.Option("--from", help="Layout of the flip book given by --with; default unity.")
+    _Layout | None, typer.Option("--from", help="Order of the channels in the given flip book; default unity.")
 ]
 _Straight = Annotated[
     bool, typer.Option("--straight", help="The flip book given by --with has straight (not premultiplied) alpha.")
@@ -62,7 +62,7 @@ def shade(
     background: Background = None,
     white: White = 1.0,
     rule: Annotated[
-        Literal["squared", "absolute", "normalised"], typer.Option(help="Weights of the lightmaps under a light.")
+        Literal["squared", "absolute", "normalised"], typer.Option(help="How a light's direction weights the maps.")
     ] = "squared",
     textures: _With = None,
     cells: _Cells = None,
@@ -72,8 +72,8 @@ def shade(
 ) -> None:
     """Light six-way lightmaps into PNGs; a folder of frames also gets the scene's obstacles and a contact sheet.
 
-    Without --light the lights are those of the scene, or else one from 1,1,1. With the default irradiance, 4 pi, light
-    along an axis shows that axis's lightmap unchanged.
+    Without --light the lights of the scene are used, or else one from 1,1,1. With the default irradiance, 4 pi, a
+    light along an axis shows the lightmap of this axis unchanged.
     """
     check_white(white)
     lights = [_light(text) for text in light or ()]
@@ -115,7 +115,7 @@ def flipbook(
     engine: Engine = None,
     shader: ShaderLanguage = None,
     layout: Annotated[_Layout, typer.Option(help="Order of the channels in the two textures.")] = "unity",
-    count: Annotated[int | None, typer.Option(min=1, max=4096, help="Frames, evenly spread; default all.")] = None,
+    count: Annotated[int | None, typer.Option(min=1, max=4096, help="Number of frames to pack; default all.")] = None,
     gain: Annotated[
         float | None,
         typer.Option(help="Factor on the light; default 1 in an .exr, else the largest that does not clip."),
@@ -128,11 +128,11 @@ def flipbook(
     mips: Annotated[
         int | None,
         typer.Option(
-            min=1, max=6, help="Mip levels without neighbouring frames, by padding; default padding: 1, in files 0."
+            min=1, max=6, help="Mip levels without bleeding between frames; default: 1 pixel of padding, 0 in files."
         ),
     ] = None,
     motion: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Frames of simulate --velocity, for a texture of motion.")
+        Path | None, typer.Option(metavar="DIR", help="Folder of simulate --velocity, to add a motion texture.")
     ] = None,
     device: Device = "cpu",
 ) -> None:
@@ -145,7 +145,7 @@ def flipbook(
         check_output(output, *_TEXTURES)
         for option, given in (("engine", engine), ("shader", shader)):
             if given is not None:
-                raise WlmError(f"--{option}: expected a folder as the output, got {output}")
+                raise WlmError(f"--{option} needs a folder as the output, got the file {output}")
         gain = 1.0 if gain is None and output.suffix.lower() == ".exr" else gain
     quiet_warp()
     from wlm.smoke.flipbook.book import pack_book, write_book
@@ -153,7 +153,7 @@ def flipbook(
 
     _, read = _source(lightmaps, textures, cells, source_layout, straight, device)
     if motion is not None and textures:
-        raise WlmError("--motion: expected lightmaps of bake or predict: the camera of a flip book is unknown")
+        raise WlmError("--motion needs lightmaps of bake or predict, since a flip book does not state its camera")
     for option, value in (("gain", gain), ("rate", rate)):
         if value is not None and not 0 < value < float("inf"):
             raise WlmError(f"--{option}: expected a number above 0, got {value}")
@@ -209,9 +209,7 @@ def _source(
                 raise WlmError(f"--{option}: has no meaning without --with, the second texture of a flip book")
         files = {1: lightmaps} if lightmaps.suffix.lower() == ".exr" else six_way_files(lightmaps)
         if not files:
-            raise WlmError(
-                f"{lightmaps}: expected six-way lightmaps: make them of smoke with wlm smoke bake or predict"
-            )
+            raise WlmError(f"{lightmaps}: expected six-way lightmaps; wlm smoke bake or predict makes them of smoke")
         return not lightmaps.is_dir(), partial(read_shots, files, device)
     rows, cross, columns = (cells or "").partition("x")
     if not (cross and rows.isdecimal() and columns.isdecimal() and 0 < int(rows) <= 64 and 0 < int(columns) <= 64):
@@ -219,7 +217,7 @@ def _source(
     options = {"rows": int(rows), "columns": int(columns), "straight": straight, "device": device}
     frames = read_flipbook((lightmaps, *textures), layout or "unity", **options)
     if not straight and is_straight(frames):
-        note(f"{lightmaps}: light where there is no smoke: is it straight (--straight)?")
+        note(f"{lightmaps}: has colour where opacity is 0; if its alpha is not premultiplied, give --straight")
 
     def shots(count: int | None, progress: "OnProgress") -> "Iterable[Shot]":
         return [Shot(n, frames[n - 1]) for n in spread(range(1, len(frames) + 1), count)]

@@ -45,11 +45,11 @@ def register(app: typer.Typer) -> None:
 @with_settings("wlm.smoke:Profile")
 @exclusive
 def train(
-    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="fast, paper, or a YAML file.")],
+    profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Settings: fast, paper, or a YAML file.")],
     output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
     settings: dict[str, Any],
     minutes: Annotated[
-        float | None, typer.Option(min=0.0, help="Time after which the training stops and can be resumed.")
+        float | None, typer.Option(min=0.0, help="Minutes after which the training stops; --resume continues.")
     ] = None,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
@@ -98,7 +98,7 @@ def export_onnx(
     ] = None,
     resolution: Annotated[int, typer.Option(min=1, max=16384, help="Edge of the square image in pixels.")] = 512,
 ) -> None:
-    """Write a network as ONNX: encoded guiding maps to encoded lightmaps of one size, in float32."""
+    """Write a network as ONNX: from encoded guiding maps to encoded lightmaps, of a fixed size, in float32."""
     check_output(output, ".onnx")
     quiet_warp()
     from wlm.smoke.codec import open_network, shipped
@@ -119,7 +119,7 @@ def evaluate(
     ] = None,
     resolution: Annotated[int, typer.Option(min=8, max=4096, help="Edge of the images in pixels.")] = 512,
     cells: Annotated[
-        int | None, typer.Option(min=16, max=512, help="Edge of the test simulation in cells; default as trained.")
+        int | None, typer.Option(min=16, max=512, help="Cells along an edge of the test volume; default as trained.")
     ] = None,
     json_path: ReportFile = None,
     device: Device = "cpu",

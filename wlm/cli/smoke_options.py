@@ -36,7 +36,7 @@ Input = Annotated[
 
 @dataclass(frozen=True)
 class SmokeOptions:
-    """Options of a volume, its camera and the device, for all commands `with_smoke`."""
+    """Options of a volume, its camera and the device, for the commands marked by `with_smoke`."""
 
     resolution: Annotated[
         int | None, typer.Option(min=1, max=16384, help="Height of the image in pixels; default the scene's, or 512.")
@@ -156,9 +156,9 @@ def check_white(white: float) -> None:
 
 
 def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str, *others: str) -> Callable[[int], Path]:
-    """Checks the output (a file, or a folder for several frames). Returns a function from frame to file path.
+    """Checks the output and returns a function that gives the path of the file for a frame number.
 
-    The frames in a folder have the first suffix.
+    With `single` the output is a file with one of the suffixes, otherwise a folder of files such as light_0001.png.
     """
     from wlm.smoke.data import NumberedFiles
 
@@ -171,7 +171,7 @@ def outputs(smoke: Path, single: bool, output: Path, stem: str, suffix: str, *ot
 
 def _check_folder(smoke: Path, output: Path) -> None:
     if output.resolve() == smoke.resolve():
-        raise WlmError(f"{output}: expected another folder than that of the frames")
+        raise WlmError(f"{output}: expected another folder than that of the frames, which are the input")
 
 
 def write_lightmaps(
@@ -202,7 +202,7 @@ def write_lightmaps(
     files = None
     if frames.single:
         if resume:
-            raise WlmError(f"--resume: expected a folder of frames, {frames.path} is one volume")
+            raise WlmError(f"--resume: expected a folder of frames, but {frames.path} is one volume")
         check_output(output, ".exr")
     else:
         _check_folder(frames.path, output)

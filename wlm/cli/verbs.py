@@ -1,8 +1,8 @@
 """Commands that work on files of every system: `wlm compress`, `evaluate`, `decode`, `export` and `info`.
 
-Such a verb is one command. The kind of its first argument chooses the system, and the function of the verb's name in
-`wlm.cli.<system>` does the work. Each of these functions has its own options; a system without the function may name
-an alternative in its mapping `INSTEAD`.
+Such a command is called a verb here. The kind of file of its first argument chooses the system, and the function of
+the verb's name in `wlm.cli.<system>` does the work. Each of these functions has its own options; a module without the
+function may name another command in its mapping `INSTEAD`.
 """
 
 import inspect
@@ -56,7 +56,7 @@ def register(
     """Adds a verb to the command line.
 
     `metavar`, `argument_help` and `help_text` are what `--help` shows without a file. `detect` returns the system of a
-    file, or raises WlmError with the next step if there is none.
+    file, or raises a WlmError that says what to do if the file has none.
     """
 
     def general(

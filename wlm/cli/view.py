@@ -27,7 +27,7 @@ def view(
     original: Original = None,
     key: Key = None,
     view: Annotated[
-        str | None, typer.Option(help="View: light or tiles; for probes: balls, gaussians or volume.")
+        str | None, typer.Option(help="What to draw: light or tiles; of probes: balls, gaussians or volume.")
     ] = None,
     outside: Annotated[bool, typer.Option("--outside", help="Also draw walls seen from outside the room.")] = False,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,
@@ -36,7 +36,7 @@ def view(
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="Slider or setting, repeatable: hour=18.5 of lightmaps; frame=1 of smoke or the walk; turn=DEGREES "
+            help="Slider or setting, repeatable: hour=18.5 of lightmaps; frame=1 of smoke or of --walk; turn=DEGREES "
             "and height=DEGREES of the light of smoke, else turn of the camera; sigma=SIZE of Gaussians in standard "
             "deviations; exposure=STOPS; error=FACTOR, 1 to 64; extinction=PER_LENGTH of smoke at density 1; "
             "block=SIDE of the finest blocks of the volume of probes.",
@@ -45,11 +45,13 @@ def view(
     tone: Annotated[Literal["clamped", "filmic"], typer.Option(help="Tone mapping of light above white.")] = "clamped",
     walk: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Viewpoints of the volume: a JSON list of x, y, z, or `position` of a .npz."),
+        typer.Option(
+            metavar="FILE", help="Viewpoints in --view volume: a JSON list of x, y, z, or a .npz's `position`."
+        ),
     ] = None,
     up: Up = "y",
-    rate: Annotated[float, typer.Option(help="Frames per second of an animation or of frames.")] = 24.0,
-    frames: Annotated[int | None, typer.Option(help="Pictures in an animation; default 48, or all frames.")] = None,
+    rate: Annotated[float, typer.Option(help="Frames per second of an animation or of smoke.")] = 24.0,
+    frames: Annotated[int | None, typer.Option(help="Number of pictures; default 48, or all frames of smoke.")] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the window in pixels.")] = "1280x720",
     screenshot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Write a picture; needs no display.")
@@ -58,7 +60,7 @@ def view(
         Path | None, typer.Option(metavar="OUT.gif", help="Write an animation, .gif or .webp; needs no display.")
     ] = None,
 ) -> None:
-    """Show a file in a window: light at any hour beside the original and the error, tiles, probes, smoke."""
+    """Show lightmaps, probes or smoke in a window; with --original, beside the original and the error."""
     pixels = _size(size)
     values = _values(sliders or ())
     if not 0 < rate <= 1000:

@@ -1,4 +1,4 @@
-"""Arrays of a lattice on its device, and the kernel launches of a step; `wlm.fluid.lattice` validates the input."""
+"""The data of a lattice of air on its device, and the launches of a step; `wlm.fluid.lattice` validates the input."""
 
 import math
 from collections.abc import Mapping
@@ -24,10 +24,10 @@ PERIOD = 2
 
 
 def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp.Device, remedy: str) -> None:
-    """Checks that there is enough free memory for a grid.
+    """Checks that `needed` bytes for a grid are free; `name` and `remedy` are words for the error message.
 
     Raises:
-        WlmError: There is not enough; the message names the grid, the required and free memory, and a remedy.
+        WlmError: There is not enough; the message names the grid, the required and free memory, and the remedy.
     """
     free = free_memory(device)
     if needed > free:
@@ -39,16 +39,16 @@ def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp
 
 
 class Engine:
-    """A lattice on a device.
+    """A lattice of air on a device.
 
     Attributes:
-        spec: The settings that change the code of a step.
+        spec: The settings for which the kernel of a step is specialised.
         device: The device.
-        cells: X Y Z.
+        cells: Number N of cells.
         done: Steps that this object launched itself; replays of a user's CUDA graph are counted only in `clock`.
-        clock, trouble: See `wlm_kernels.fluid.lattice.step_kernel`.
-        solid: uint8 [N], or [0] while no cell has ever been solid.
-        bodies: Velocities and rotations of the solids.
+        clock, trouble: Step counter and first error, see `wlm_kernels.fluid.lattice.step_kernel`.
+        solid: uint8 [N], number of the body of each cell, 0 for fluid; [0] while no cell has ever been solid.
+        bodies: Velocities and rotations of the solid bodies.
     """
 
     def __init__(self, shape: tuple[int, int, int], spec: Spec, tau: float, eddy: float, rise: float, device) -> None:
@@ -74,13 +74,13 @@ class Engine:
 
     @staticmethod
     def bytes_needed(cells: int, lattice: str, storage: str) -> int:
-        """Returns the size in bytes of the two buffers of populations, by far the largest part of the memory."""
+        """Returns the bytes of both arrays of populations for `cells` cells, by far the largest part of the memory."""
         size = wp.types.type_size_in_bytes(STORAGES[storage][0])
         return 2 * len(velocity_set(lattice).c) * cells * size
 
     @property
     def buffers(self) -> tuple[wp.array, wp.array]:
-        """The populations that the next step reads, and the populations that it writes."""
+        """The array of populations that the next step reads, and the array that it writes."""
         return self._f[self.done % 2], self._f[1 - self.done % 2]
 
     def zeros(self, size: int, dtype) -> wp.array:
@@ -89,7 +89,7 @@ class Engine:
     # Setting up.
 
     def set_faces(self, faces: Mapping[str, Face]) -> None:
-        """Sets the boundary conditions at the domain's faces; `prepare` makes the links that apply them."""
+        """Sets the boundary conditions at the domain's faces, by the faces' names; `prepare` then applies them."""
         self._faces = dict(faces)
         self._links: lattice_links.Links | None = None
         self._graph: wp.Graph | None = None
@@ -103,7 +103,7 @@ class Engine:
         self._graph = None
 
     def prepare(self) -> float:
-        """Makes the links of faces that have been set, and returns the speed of the fastest solid in cells per step."""
+        """Applies new boundary conditions, and returns the speed of the fastest solid in cells per step."""
         if self._links is not None:
             return 0.0
         self._bounded = wp.vec3i(*bounded_axes(self._faces))
@@ -119,7 +119,7 @@ class Engine:
         return self.find_links()
 
     def start(self, drho: wp.array, u: wp.array) -> None:
-        """Sets all air to the equilibrium of a density minus 1 and a velocity per cell."""
+        """Sets each cell to equilibrium at the density 1 + `drho`, float [N], and the velocity `u`, vec3 [N]."""
         now, spare = self.buffers
         spare.zero_()
         self._sums.zero_()
@@ -144,7 +144,8 @@ class Engine:
         return fastest
 
     def restore(self, populations: np.ndarray, solid: np.ndarray, done: int) -> float:
-        """Sets a stored state and returns the speed of the fastest solid; the bodies' motion must be set before."""
+        """Sets a stored state and returns the speed of the fastest solid in cells per step; the motion of the bodies
+        must be set before."""
         self.done, self._graph = done, None
         self.clock.fill_(done)
         self.trouble.fill_(QUIET)
@@ -156,7 +157,8 @@ class Engine:
         return self.find_links()
 
     def find_links(self) -> float:
-        """Lists the links of solids, enlarging the arrays if needed, and returns the speed of the fastest solid."""
+        """Lists the populations that solids send back (see `lattice_links`), and returns the speed of the fastest solid
+        in cells per step."""
         # The count is also set without solids: the state before may have had some.
         count, fastest = 0, 0.0
         if self.solid.shape[0] > 0:
@@ -172,7 +174,6 @@ class Engine:
         return fastest
 
     def _make_links(self, columns, size: int) -> lattice_links.Links:
-        """Uploads the links of faces, in arrays of `size` elements."""
         links = lattice_links.Links()
         links.faces = len(columns[0])
         dtypes = {"cell": np.int32, "code": np.uint8, "term": np.float32}
@@ -192,12 +193,12 @@ class Engine:
     # Running.
 
     def run(self, steps: int) -> None:
-        """Launches steps without waiting for the device."""
+        """Queues steps on the device and returns without waiting."""
         for _ in range(steps):
             self._step()
 
     def run_in_graphs(self, steps: int) -> None:
-        """Launches steps as replays of a CUDA graph of `PERIOD` steps; remaining steps run without the graph."""
+        """Queues steps as replays of a CUDA graph of `PERIOD` steps, and remaining steps without the graph."""
         while steps > 0:
             if steps < PERIOD or self.done % PERIOD or self._graph is None:
                 # The first steps load the kernels' modules, which is not allowed during a capture.
@@ -214,7 +215,7 @@ class Engine:
                 steps -= PERIOD
 
     def fields(self, drho: wp.array, u: wp.array) -> None:
-        """Writes the density minus 1 and the velocity, each unless its array is empty."""
+        """Writes the density minus 1 of each cell to `drho` and the velocity to `u`; an array of size 0 is skipped."""
         inputs = [self._n, self.buffers[0], self.solid, self.bodies, self._force, self._forces]
         self._launch(self._fluid_kernels.fields, self.cells, inputs, [drho, u])
 

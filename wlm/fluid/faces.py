@@ -1,4 +1,4 @@
-"""Boundary conditions on the six faces of a lattice's domain, and their links (`wlm_kernels.fluid.lattice_links`)."""
+"""Boundary conditions on the six faces of a box of air, in the form for the kernels of `lattice_links`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ _STILL, _MOVING, _INLET, _OUTLET, _SLIP = range(5)
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """The boundary condition on a face of A x B cells, in the order of the other two axes.
+    """The boundary condition on a face of A x B cells, along the two axes of the face in the order x, y, z.
 
     Attributes:
-        rank: uint8 [A, B], precedence along the domain's edges.
-        kind: uint8 [A, B], kinds of `lattice_links`.
+        rank: uint8 [A, B], precedence at the edges of the box, where two faces meet: the lower rank decides.
+        kind: uint8 [A, B], kind of boundary of each cell, such as `lattice_links.BOUNCE`.
         velocity: float64 [A, B, 3], velocity of a wall or an inlet, cells per step.
-        excess: Density minus 1 to which an outlet of given density relaxes.
+        excess: Density minus 1 to which an outlet with a given density relaxes.
     """
 
     rank: np.ndarray
@@ -46,12 +46,12 @@ def _velocity(size: tuple[int, int], velocity) -> np.ndarray:
     if velocity.shape not in ((3,), (*size, 3)):
         raise ValueError(f"velocity: expected shape (3,) or {(*size, 3)}, got {velocity.shape}")
     if not np.isfinite(velocity).all():
-        raise ValueError("velocity: expected finite numbers")
+        raise ValueError("velocity: expected finite numbers, got NaN or infinity")
     return np.broadcast_to(velocity, (*size, 3))
 
 
 def wall(shape: tuple[int, int, int], face: str, velocity=(0.0, 0.0, 0.0), slip: bool = False) -> Face:
-    """Makes a no-slip wall that moves at a velocity, or a wall without friction (`slip`), which has no velocity."""
+    """Makes a no-slip wall that moves tangentially at `velocity` (cells per step), or a wall without friction."""
     size = _size(shape, face)
     velocity = _velocity(size, velocity)
     if slip:
@@ -60,17 +60,18 @@ def wall(shape: tuple[int, int, int], face: str, velocity=(0.0, 0.0, 0.0), slip:
 
 
 def inlet(shape: tuple[int, int, int], face: str, velocity, where=None) -> Face:
-    """Makes an inlet where `where` (bool [A, B], None: everywhere) is true, and a wall elsewhere."""
+    """Makes an inlet (velocity in cells per step) where `where`, bool [A, B], is true, and a wall elsewhere; None: an
+    inlet everywhere."""
     size = _size(shape, face)
     opened = np.ones(size, bool) if where is None else np.asarray(where, bool)
     if opened.shape != size:
-        raise ValueError(f"where: expected shape {size}, got {opened.shape}")
+        raise ValueError(f"where: expected the shape {size} of the face, got {opened.shape}")
     velocity = np.where(opened[..., None], _velocity(size, velocity), 0.0)
     return Face(np.where(opened, _INLET, _STILL), np.where(opened, INLET, BOUNCE).astype(np.uint8), velocity)
 
 
 def outlet(shape: tuple[int, int, int], face: str, density: float | None = None) -> Face:
-    """Makes an outlet that conserves mass, or one that relaxes to a density."""
+    """Makes an outlet that conserves mass or, with `density`, an outlet whose density relaxes to this number."""
     size = _size(shape, face)
     if density is not None and not (np.isfinite(density) and density > 0.0):
         raise ValueError(f"density: expected a positive number, got {density}")
@@ -94,13 +95,13 @@ def bounded_axes(faces: Mapping[str, Face]) -> tuple[int, int, int]:
 
 
 def walled_axes(faces: Mapping[str, Face]) -> tuple[bool, bool, bool]:
-    """Returns whether each axis is closed by walls at rest, which need no links."""
+    """Returns for each axis whether both of its ends are walls at rest, which the step's kernel handles itself."""
     still = [name in faces and bool((faces[name].rank == _STILL).all()) for name in FACES]
     return still[0] and still[1], still[2] and still[3], still[4] and still[5]
 
 
 def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
-    """Returns the kinds of each axis's two ends for smoke: periodic, closed if all of the face is a wall, or open."""
+    """Returns what each axis's ends are for smoke: `PERIODIC`, `CLOSED` if the whole face is a wall, or `OPEN`."""
     ends = []
     for name in FACES:
         walled = name in faces and np.isin(faces[name].kind, (BOUNCE, SLIP)).all()
@@ -111,9 +112,10 @@ def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
 def face_links(
     shape: tuple[int, int, int], lattice: VelocitySet, faces: Mapping[str, Face]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lists the links of all faces except those of walled axes, by direction and then in the order of the cells.
+    """Lists the links of the faces: the populations that a boundary condition sends into the box.
 
-    Links of solid cells are included; the kernels skip them.
+    Axes with walls at rest at both ends have none. Links are sorted by direction, then by cell. The links of solid
+    cells are included; the kernels skip them.
 
     Returns:
         `cell` int32 [L], `code` uint8 [L] and `term` float32 [L] of `wlm_kernels.fluid.lattice_links.Links`.

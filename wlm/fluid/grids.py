@@ -1,9 +1,9 @@
-"""Grids of a file on one lattice of cubic voxels along the axes; the grids of NanoVDB files.
+"""Reads the grids of NanoVDB files, and brings a file's grids to one lattice of cubic voxels along the axes.
 
-A grid has a map from its voxels to the world. A grid whose voxels are cubes along the axes, in any order and direction,
-is only permuted and flipped. Other grids, with longer, rotated or sheared voxels, are resampled: linearly between the
-centres of their voxels, at cubic voxels of their shortest edge. The box then grows by the voxels that the interpolated
-smoke reaches.
+A grid has a transform from its voxels to the world. A grid whose voxels are cubes along the world's axes, in any order
+and direction, is only permuted and flipped. All other grids, with oblong, rotated or sheared voxels, are resampled
+trilinearly at cubic voxels, whose edge is the shortest edge of the grid's voxels. The box then grows by the voxels that
+the interpolated smoke reaches.
 """
 
 import math
@@ -37,12 +37,12 @@ _APART = 1e-4  # offset in voxels up to which the voxels of two grids coincide
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A grid over the box of its active voxels.
+    """The values of a file's grid in the box of its active voxels.
 
     Attributes:
-        name: Name in messages.
+        name: Name in error messages.
         values: float32 tensor [X, Y, Z].
-        matrix: float64 [4, 4], from the indices of voxel centres, 0 for the first of the box, to the world.
+        matrix: float64 [4, 4], transform of an index of `values` to the centre of this voxel in the world.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cubic voxels along the axes.
+    """A grid of cubic voxels along the world's axes.
 
     Attributes:
         voxel: Edge of a voxel, in the world's unit.
@@ -66,16 +66,15 @@ class Lattice:
 
 
 def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lattice, list[torch.Tensor]]:
-    """Puts grids on one lattice of at most `most` voxels, aligned with the first grid, over the bounding box of all
-    grids.
+    """Brings grids to one lattice, which covers all of them and has the voxels of the first grid, if these are cubic.
 
-    `up` is "x", "y" or "z", the axis of the grids' world that becomes +y.
+    `most` is the largest number of voxels; `up` is "x", "y" or "z", the axis of the grids' world that becomes +y.
 
     Returns:
         The lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
 
     Raises:
-        WlmError: A map has no volume, or the lattice has too many voxels.
+        WlmError: A grid's transform cannot be inverted, or the lattice has too many voxels.
     """
     turned = [(grid, _turned(grid, up)) for grid in grids]
     first, matrix = turned[0]
@@ -86,13 +85,13 @@ def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lat
     ends = [_ends(grid, matrix, 0.0 if same else 0.5) for (grid, matrix), same in zip(turned, kept, strict=True)]
     farthest = float(np.abs(ends).max()) / voxel
     if not farthest <= _FARTHEST:
-        raise WlmError(f"{first.name}: expected a box within {_FARTHEST} voxels of the origin, found {farthest:.4g}")
+        raise WlmError(f"{first.name}: expected voxel coordinates up to {_FARTHEST}, found {farthest:.4g}")
     low = np.floor(np.min([(begin - corner) / voxel for begin, _ in ends], axis=0) + _APART)
     high = np.ceil(np.max([(end - corner) / voxel for _, end in ends], axis=0) - _APART)
     size = [max(int(n), 1) for n in high - low]
     if math.prod(size) > most:
         raise WlmError(
-            f"{first.name}: expected at most {most} cubic voxels of the grid's shortest edge, {voxel:.4g}, "
+            f"{first.name}: expected at most {most} cubic voxels with the grid's shortest edge, {voxel:.4g}, "
             f"found {' x '.join(map(str, size))}"
         )
     lattice = Lattice(voxel, tuple(map(float, corner + low * voxel)), tuple(size))
@@ -100,7 +99,7 @@ def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lat
 
 
 def _turned(grid: Grid, up: str) -> np.ndarray:
-    """Returns the map from the corners of a grid's voxels, instead of their centres, to the rotated world, [4, 4]."""
+    """Returns the transform [4, 4] of the corners of a grid's voxels to the world in which +y is up."""
     matrix = np.eye(4)
     matrix[:3, :3] = UPS[up]
     matrix = matrix @ grid.matrix
@@ -108,25 +107,24 @@ def _turned(grid: Grid, up: str) -> np.ndarray:
     edges = np.linalg.norm(matrix[:3, :3], axis=0)
     # Edges are scaled to length 1, so that the test does not depend on the size of a voxel.
     if not (np.isfinite(edges).all() and edges.all() and abs(np.linalg.det(matrix[:3, :3] / edges)) > _FLAT):
-        raise WlmError(f"{grid.name}: expected a map to the world that keeps a volume, found {grid.matrix.tolist()}")
+        raise WlmError(f"{grid.name}: expected an invertible transform to the world, found {grid.matrix.tolist()}")
     return matrix
 
 
 def _ends(grid: Grid, matrix: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the low and the high corner in the world, [3] each, of a grid's box enlarged by `margin` voxels."""
     box = np.stack(np.meshgrid(*[(-margin, n + margin) for n in grid.values.shape], indexing="ij"), -1).reshape(8, 3)
     corners = box @ matrix[:3, :3].T + matrix[:3, 3]
     return corners.min(0), corners.max(0)
 
 
 def _between(voxel: float, origin: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the map from corners of a lattice's voxels to those of a grid: linear part [3, 3] and shift [3]."""
+    """Returns the matrix [3, 3] and shift [3] that map corners of a lattice's voxels to corners of a grid's voxels."""
     turn = np.linalg.inv(matrix[:3, :3])
     return turn * voxel, turn @ (origin - matrix[:3, 3])
 
 
 def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Whether each voxel of the lattice is a voxel of the grid."""
+    """Returns whether a transform of `_between` maps voxels exactly to voxels, so that no resampling is needed."""
     turn, shift = between
     axes = np.abs(turn).round()
     straight = np.abs(np.abs(turn) - axes).max() <= _CUBIC and (axes.sum(0) == 1).all() and (axes.sum(1) == 1).all()
@@ -134,7 +132,6 @@ def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
 
 
 def _on(lattice: Lattice, grid: Grid, matrix: np.ndarray) -> torch.Tensor:
-    """Returns a grid's values on the lattice."""
     turn, shift = _between(lattice.voxel, np.asarray(lattice.origin), matrix)
     if not _is_kept((turn, shift)):
         return _resampled(lattice, grid.values, turn, shift)
@@ -175,14 +172,14 @@ _LONGEST_NAME = 1 << 12
 
 @dataclass(frozen=True)
 class NanoVdbEntry:
-    """A grid of a file, still compressed.
+    """A grid of a NanoVDB file, still compressed.
 
     Attributes:
         name: Name in the file.
-        data: Bytes in the file.
-        head, meta: Header of its segment, and the grid's metadata in it.
+        data: Compressed bytes.
+        head, meta: Header of the file segment that has the grid, and the grid's metadata in it.
         size: Uncompressed size in bytes.
-        codec: 0 none, 1 zlib, 2 Blosc.
+        codec: Compression: 0 none, 1 zlib, 2 Blosc.
     """
 
     name: str
@@ -193,18 +190,18 @@ class NanoVdbEntry:
     codec: int
 
     def load(self, where: str, trust: bool) -> wp.Volume:
-        """Decompresses the grid; `trust` tells whether it may be as large as it claims, and `where` names the file in
-        messages.
+        """Decompresses the grid; `where` names the file in messages. With `trust` the size that the file states is not
+        checked.
 
         Raises:
-            WlmError: The grid is too large for its compressed size.
-            RuntimeError, ValueError and others: `BAD_GRID`.
+            WlmError: The stated size is too large for the compressed size.
+            RuntimeError, ValueError and others in `BAD_GRID`: The data is damaged.
         """
         if self.codec and not trust:
             check_growth(where, len(self.data), self.size, GROWTH, SURE_BYTES)
         grid = self._unpacked()
         if len(grid) != self.size:
-            raise ValueError(f"expected {self.size} bytes of {self.name}, found {len(grid)}")
+            raise ValueError(f"grid {self.name}: expected {self.size} bytes after decompression, found {len(grid)}")
         meta = bytearray(self.meta)
         struct.pack_into("<Q", meta, _FILE_BYTES, len(grid))
         # The header must claim a single grid: Warp would look for the others.
@@ -218,11 +215,11 @@ class NanoVdbEntry:
             (length,) = struct.unpack_from("<Q", self.data, at)
             piece = bytes(self.data[at + 8 : at + 8 + length])
             if not 0 < length == len(piece):
-                raise ValueError(f"expected {length} packed bytes, found {len(piece)}")
+                raise ValueError(f"grid {self.name}: expected {length} compressed bytes, found {len(piece)}")
             if self.codec == _BLOSC:
                 size = blosc.unpacked_size(piece)
                 if size > left:
-                    raise ValueError(f"expected {self.size} bytes of {self.name}, found more")
+                    raise ValueError(f"grid {self.name}: expected {self.size} bytes after decompression, found more")
                 pieces.append(blosc.unpack(piece, size))
             else:
                 pieces.append(zlib.decompressobj().decompress(piece, left + 1))
@@ -235,35 +232,36 @@ def entries(data: bytes) -> Iterator[NanoVdbEntry]:
     """Yields the grids of a file, which may have several segments with several grids each.
 
     Raises:
-        RuntimeError, ValueError and others: `BAD_GRID`.
+        RuntimeError, ValueError and others in `BAD_GRID`: The data is damaged.
     """
     view, at = memoryview(data), 0
     while at < len(data):
         head = bytes(view[at : at + _FILE_HEADER])
         if head[:7] != b"NanoVDB" or head[7:8] not in b"02":
-            raise ValueError("NanoVDB signature not found")
+            raise ValueError(f"expected the signature of NanoVDB at byte {at}, found {head[:8]!r}")
         count, codec = struct.unpack_from("<2H", head, 12)
         at += _FILE_HEADER
         metas = []
         for _ in range(count):
             length = struct.unpack_from("<I", data, at + _NAME_LENGTH)[0]
             if not 0 < length <= _LONGEST_NAME:
-                raise ValueError(f"expected a name of at most {_LONGEST_NAME} bytes, found {length}")
+                raise ValueError(f"expected a grid's name of 1 to {_LONGEST_NAME} bytes, found {length} bytes")
             metas.append(bytes(view[at : at + _META + length]))
             at += _META + length
         for meta in metas:
             size, packed = struct.unpack_from("<2Q", meta, _GRID_BYTES)
             if at + packed > len(data):
-                raise ValueError(f"it ends before its byte {at + packed}")
+                raise ValueError(f"the file ends before byte {at + packed}, where a grid ends")
             name = meta[_META:-1].decode("utf-8", "replace")
             yield NanoVdbEntry(name, view[at : at + packed], head, meta, size if codec else packed, codec)
             at += packed
     if not data:
-        raise ValueError("it is empty")
+        raise ValueError("the file is empty")
 
 
 def dense(volume: wp.Volume, name: str, most: int) -> Grid:
-    """Makes a grid dense over the box of its active voxels, on its device; over voxel 0 if none is active.
+    """Converts a sparse grid to a dense array over the box of its active voxels, or over voxel (0, 0, 0) if none is
+    active.
 
     Raises:
         WlmError: The grid does not contain floats, or its box has more than `most` voxels.
@@ -277,7 +275,7 @@ def dense(volume: wp.Volume, name: str, most: int) -> Grid:
     matrix[:3, 3] = struct.unpack_from("<3d", head, _SHIFT)
     root = _TREE + struct.unpack_from("<q", head, _TREE + _ROOT)[0]
     if not 0 < root <= volume.array().size - 24:
-        raise WlmError(f"{name}: expected a root within the grid, found it at byte {root}")
+        raise WlmError(f"{name}: expected the root of the tree within the grid's bytes, found it at byte {root}")
     corners = np.frombuffer(volume.array()[root : root + 24].numpy().tobytes(), "<i4").reshape(2, 3).astype(np.int64)
     low, size = corners[0], corners[1] - corners[0] + 1
     if (size < 1).any():
@@ -286,7 +284,7 @@ def dense(volume: wp.Volume, name: str, most: int) -> Grid:
     if math.prod(size.tolist()) > most:
         raise WlmError(
             f"{name}: expected a box of at most {most} voxels from a grid of {volume.array().size} bytes, "
-            f"found {corners.tolist()}"
+            f"found a box from {corners[0].tolist()} to {corners[1].tolist()}"
         )
     out = wp.empty(tuple(size.tolist()), dtype=float, device=volume.device)
     inputs = [volume.id, wp.vec3i(*low.tolist())]

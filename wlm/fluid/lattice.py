@@ -1,7 +1,7 @@
 """A lattice Boltzmann solver of air (neural-six-way-lightmaps, section 5).
 
-Lengths are in cells, times in steps, and the density of air at rest is 1; `Domain` converts. Arrays are [X, Y, Z],
-cell centres at half integers.
+Lengths are in cells, times in steps, and the density of air at rest is 1; `Domain` converts from SI units. Arrays are
+[X, Y, Z]; the centres of cells are at half integers.
 """
 
 import math
@@ -33,11 +33,11 @@ _GRAPH_FROM = 16
 
 @dataclass(frozen=True)
 class Domain:
-    """Sizes of a cell and of a step, which convert SI units to units of a lattice.
+    """Converts SI units to units of a lattice.
 
     Attributes:
-        cell: Metres.
-        step: Seconds.
+        cell: Edge of a cell in metres.
+        step: Duration of a step in seconds.
     """
 
     cell: float
@@ -73,12 +73,13 @@ class Lattice:
         viscosity: Kinematic viscosity in square cells per step; above 0.
         operator: Collision operator, "bgk" or "regularised", see `wlm_kernels.fluid.lattice`.
         smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the default operator is stable at viscosity 1e-6.
-        storage: "float32" or "float16", which halves memory and traffic; a jet's velocity then differs by less than
-            0.2% of its speed (RMS, before the chaotic flows diverge), and its mass drifts by about 3e-5 in 5,000 steps.
+        storage: "float32" or "float16", which halves memory and traffic. With float16 the velocities of a jet differ
+            by less than 0.2% of its speed (RMS, before the chaotic flows diverge), and the total mass drifts by about
+            3e-5 in 5,000 steps.
         lattice: "D2Q9" (Z = 1), "D3Q19" or "D3Q27".
         device: "cpu" or "cuda:N".
-        ramp: Steps in which inlets rise to their velocity. A sudden start causes a sound wave, which walls and
-            mass-conserving outlets reflect; a ramp of four times the longest axis makes it weak.
+        ramp: Number of steps in which inlets rise to their velocity. A sudden start causes a sound wave, which walls
+            and mass-conserving outlets reflect; with a ramp of four times the cells of the longest axis it is weak.
 
     Attributes:
         period: A CUDA graph must contain a multiple of this number of steps, see `step`.
@@ -120,17 +121,17 @@ class Lattice:
 
     @staticmethod
     def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
-        """Returns the memory in bytes of a lattice, without small arrays; arguments as for the class."""
+        """Returns the memory in bytes that a lattice takes, without small arrays; arguments as for `Lattice`."""
         return Engine.bytes_needed(math.prod(shape), lattice, storage)
 
     # Setting up.
 
     def set_wall(self, face: str, velocity: ArrayLike = (0.0, 0.0, 0.0), *, slip: bool = False) -> None:
-        """Closes a face.
+        """Closes a face by a wall.
 
         Args:
             face: One of `wlm.fluid.faces.FACES`, "-x" for example.
-            velocity: Tangential velocity of the wall in cells per step; (3,) or [A, B, 3] for the face's cells.
+            velocity: Tangential velocity of the wall in cells per step; (3,), or [A, B, 3] for each cell of the face.
             slip: Whether the wall has no friction, and therefore no velocity.
         """
         self._set_face(face, fluid_faces.wall(self.shape, face, velocity, slip))
@@ -140,7 +141,7 @@ class Lattice:
 
         Args:
             face: As for `set_wall`.
-            velocity: Cells per step; (3,) or [A, B, 3] for the face's cells.
+            velocity: Velocity of the air in cells per step; (3,), or [A, B, 3] for each cell of the face.
             where: bool [A, B], true in the open part of the face; elsewhere it is a wall. None: the whole face is open.
         """
         self._set_face(face, fluid_faces.inlet(self.shape, face, velocity, where))
@@ -150,8 +151,9 @@ class Lattice:
 
         Args:
             face: As for `set_wall`.
-            density: None: the outflow through all such outlets together equals the inflow, so that mass is conserved. A
-                number: the density relaxes to it, slowly enough to transmit sound, and mass is not conserved.
+            density: Density to which the air relaxes at the outlet, slowly enough to let sound out; mass is then not
+                conserved. None: the outflow through all outlets without a density equals the inflow, so that mass is
+                conserved.
         """
         self._set_face(face, fluid_faces.outlet(self.shape, face, density))
 
@@ -165,14 +167,14 @@ class Lattice:
     ) -> None:
         """Sets which cells are solid and how they move; must be called again after they have moved.
 
-        Cells that become fluid get the equilibrium of the mean of their neighbours. The call waits for the device and
-        cannot be captured in a graph.
+        Cells that become fluid get the mean density and velocity of their neighbours. The call waits for the device
+        and cannot be captured in a CUDA graph.
 
         Args:
-            mask: bool, or numbers of bodies 1 to 255 and 0 for fluid, [X, Y, Z]; a NumPy array, or a Warp array of
-                uint8 on the device, see `wlm_kernels.fluid.lattice_fields`.
-            velocity: Velocity of the bodies' centres, cells per step; (3,) for body 1 or [K, 3] for bodies 1 to K.
-            spin: Angular velocity, radians per step, (3,) or [K, 3].
+            mask: [X, Y, Z], true where a cell is solid; or the number of the body that covers each cell, 1 to 255, and
+                0 for fluid. A NumPy array, or a Warp array of uint8 on the lattice's device.
+            velocity: Velocity of the bodies' centres, cells per step; (3,) for body 1, or [K, 3] for bodies 1 to K.
+            spin: Angular velocity of the bodies, radians per step, (3,) or [K, 3].
             centre: Centres of rotation in cells, (3,) or [K, 3].
 
         Raises:
@@ -182,7 +184,8 @@ class Lattice:
         for field, value in (("velocity", velocity), ("spin", spin), ("centre", centre)):
             vectors = np.atleast_2d(np.asarray(value, np.float32))
             if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) >= BODIES or not np.isfinite(vectors).all():
-                raise ValueError(f"{field}: expected finite numbers of shape (3,) or [K, 3], K < {BODIES}")
+                shapes = f"(3,) or [K, 3] for at most {BODIES - 1} bodies"
+                raise ValueError(f"{field}: expected finite numbers of shape {shapes}, got shape {np.shape(value)}")
             rows = np.zeros((BODIES, 3), np.float32)
             rows[1 : len(vectors) + 1] = vectors
             getattr(bodies, field).assign(rows)
@@ -193,15 +196,17 @@ class Lattice:
         """Sets the force on the air.
 
         Args:
-            force: Acceleration in cells per step squared: (3,) for all cells, or [X, Y, Z, 3]. A Warp array of vec3
-                [X, Y, Z] on the device is not copied and may change between steps. None: no force.
+            force: Acceleration in cells per step squared: (3,) for all cells, or [X, Y, Z, 3]. A Warp array, vec3
+                [X, Y, Z] on the lattice's device, is not copied, and its values may change between steps. None: no
+                force.
         """
         if force is None:
             self._engine.set_force(None, None)
             return
         if isinstance(force, wp.array):
             if force.shape != self.shape or force.dtype != wp.vec3 or force.device != self.device:
-                raise ValueError(f"force: expected vec3 {self.shape} on {self.device}")
+                found = f"{force.shape} on {force.device}"
+                raise ValueError(f"force: expected an array of vec3 {self.shape} on {self.device}, got {found}")
             self._engine.set_force(None, force.flatten())
             return
         vectors = np.asarray(force, np.float32)
@@ -216,14 +221,14 @@ class Lattice:
         """Sets all air to the equilibrium of a velocity and a density.
 
         Args:
-            velocity: Cells per step; (3,) or [X, Y, Z, 3].
-            density: A number or [X, Y, Z]; air at rest has 1.
+            velocity: Velocity in cells per step; (3,) for all cells, or [X, Y, Z, 3].
+            density: Density, one number or [X, Y, Z]; 1 is the density of air at rest.
         """
         self._prepare()
         u = np.broadcast_to(np.asarray(velocity, np.float32), (*self.shape, 3)).reshape(-1, 3)
         drho = (np.broadcast_to(np.asarray(density, np.float64), self.shape) - 1.0).astype(np.float32).ravel()
         if not (np.isfinite(u).all() and np.isfinite(drho).all()):
-            raise ValueError("velocity, density: expected finite numbers")
+            raise ValueError("velocity, density: expected finite numbers, got NaN or infinity")
         u = wp.array(np.ascontiguousarray(u), dtype=wp.vec3, device=self.device)
         self._engine.start(wp.array(drho, device=self.device), u)
         self._begun = True
@@ -238,8 +243,8 @@ class Lattice:
     def step(self, steps: int = 1) -> None:
         """Advances the air by a number of steps, and runs `check` after every `CHECK_EVERY` of them.
 
-        During the capture of a CUDA graph it does not check: call `check` between replays. The number of steps and the
-        number of earlier steps must then be multiples of `period`.
+        During the capture of a CUDA graph it does not check: call `check` between replays of the graph. The number of
+        steps, and the number of steps done before the capture, must then be multiples of `period`.
 
         Raises:
             WlmError: As for `check`.
@@ -249,7 +254,8 @@ class Lattice:
         engine = self._engine
         if self.device.is_cuda and self.device.is_capturing:
             if not self._begun or steps % PERIOD or engine.done % PERIOD:
-                raise ValueError(f"steps: in a graph, expected a multiple of {PERIOD} after eager steps, got {steps}")
+                found = f"got {steps} in it and {engine.done} before it"
+                raise ValueError(f"steps: expected a multiple of {PERIOD} in a CUDA graph and before it, {found}")
             engine.run(steps)
             return
         self._prepare()
@@ -288,7 +294,7 @@ class Lattice:
     # Results.
 
     def velocity(self, out: wp.array | None = None) -> wp.array:
-        """Returns the velocity, vec3 [X, Y, Z], in cells per step; the body's velocity in a solid cell."""
+        """Returns the velocity, vec3 [X, Y, Z], in cells per step; in a solid cell it is the velocity of the body."""
         self._prepare()
         out = wp.empty(self.shape, dtype=wp.vec3, device=self.device) if out is None else out
         self._engine.fields(self._engine.zeros(0, float), out.flatten())
@@ -321,7 +327,7 @@ class Lattice:
         return self._engine.force_on_bodies()[body]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the state, for `load`: scaled populations, solid cells and their motion, steps done."""
+        """Returns the state, for `load`: populations as stored, solid cells and their motion, number of steps done."""
         engine = self._engine
         # On a CPU .numpy() shares the array's memory, which the next step modifies.
         return {
@@ -334,7 +340,8 @@ class Lattice:
     def load(self, state: Mapping[str, np.ndarray]) -> None:
         """Continues from the state of a lattice with the same settings, faces and force.
 
-        On a CPU the following steps are bit for bit the same; on a GPU up to the order of the outlets' atomic sums.
+        The following steps are the same as without the interruption: bit for bit on a CPU; on a GPU except for
+        rounding, since outlets sum in any order.
 
         Raises:
             WlmError: The state has another shape, lattice or storage, or contains NaN or infinity.
@@ -362,7 +369,7 @@ class Lattice:
     def _set_face(self, name: str, face: fluid_faces.Face) -> None:
         _check_speed(float(np.linalg.norm(face.velocity, axis=-1).max()), f"face {name!r}")
         if name not in self._faces and self._begun:
-            raise ValueError(f"face {name!r}: expected to be set before the flow")
+            raise ValueError(f"face {name!r}: expected faces to be set before the flow and before the first step")
         self._faces[name] = face
         self._engine.set_faces(self._faces)
 
@@ -372,13 +379,14 @@ class Lattice:
     def _mask(self, mask) -> wp.array:
         if isinstance(mask, wp.array):
             if mask.shape != self.shape or mask.dtype != wp.uint8 or mask.device != self.device:
-                raise ValueError(f"mask: expected uint8 {self.shape} on {self.device}")
+                found = f"{mask.shape} on {mask.device}"
+                raise ValueError(f"mask: expected an array of uint8 {self.shape} on {self.device}, got {found}")
             return mask.flatten()
         mask = np.asarray(mask)
         if mask.shape != self.shape or mask.dtype.kind not in "biu":
             raise ValueError(f"mask: expected bool or integers {self.shape}, got {mask.dtype} {mask.shape}")
         if mask.min() < 0 or mask.max() >= BODIES:
-            raise ValueError(f"mask: expected numbers from 0 to {BODIES - 1}")
+            raise ValueError(f"mask: expected numbers of bodies, 0 to {BODIES - 1}, got {mask.min()} to {mask.max()}")
         return wp.array(mask.astype(np.uint8).ravel(), dtype=wp.uint8, device=self.device)
 
 

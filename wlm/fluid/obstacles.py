@@ -17,25 +17,25 @@ _SIDES = 24  # segments of a sphere from pole to pole; there are twice as many a
 
 
 def sphere() -> tuple[np.ndarray, np.ndarray]:
-    """Makes a sphere of radius 1."""
+    """Makes the surface of a sphere of radius 1 around the origin."""
     polar = np.linspace(0.0, np.pi, _SIDES + 1)
     return _revolved(np.sin(polar), np.cos(polar))
 
 
 def cylinder() -> tuple[np.ndarray, np.ndarray]:
-    """Makes a cylinder along y of radius and half height 1."""
+    """Makes the surface of a cylinder along y, with radius 1 and height 2, around the origin."""
     return _revolved(np.array([0.0, 1.0, 1.0, 0.0]), np.array([1.0, 1.0, -1.0, -1.0]))
 
 
 def box() -> tuple[np.ndarray, np.ndarray]:
-    """Makes a cube of half edge 1."""
+    """Makes the surface of a cube with edge 2 around the origin."""
     points = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)]) * 2.0 - 1.0
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return points, np.array([half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))])
 
 
 def _revolved(radius: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Makes a surface of revolution about y from rings, top first; the first and the last ring are points."""
+    """Makes a surface of revolution about y from the radii and heights of rings, top first, between two end points."""
     columns = 2 * _SIDES
     angle = np.linspace(0.0, 2.0 * np.pi, columns, endpoint=False)
     middle = slice(1, -1)
@@ -56,11 +56,11 @@ def _revolved(radius: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.nd
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Positions over time, linear between keys, constant before the first key and after the last.
+    """Positions at K times, linear between them, constant before the first time and after the last.
 
     Attributes:
-        positions: float64 [K, 3], cells.
-        times: float64 [K], steps, increasing.
+        positions: float64 [K, 3], in cells.
+        times: float64 [K], in steps of the lattice, increasing.
     """
 
     positions: np.ndarray
@@ -77,22 +77,22 @@ class Trajectory:
         if t.ndim != 1 or len(t) == 0 or p.shape != (len(t), 3):
             raise ValueError(f"path: expected positions [K, 3] and times [K], got {p.shape} and {t.shape}")
         if not (np.isfinite(p).all() and np.isfinite(t).all()):
-            raise ValueError("path: expected finite numbers")
+            raise ValueError("path: expected finite positions and times, got NaN or infinity")
         if (np.diff(t) <= 0).any():
-            raise ValueError("path: expected times that increase")
+            raise ValueError(f"path: expected increasing times, got {t.tolist()}")
         return cls(p, t)
 
     @property
     def moves(self) -> bool:
-        """Whether the trajectory moves, that is whether its positions differ."""
+        """Whether an obstacle on this path moves, that is whether the positions differ."""
         return bool((self.positions != self.positions[0]).any())
 
     def at(self, time: float) -> np.ndarray:
-        """Returns the position at a time, float64 (3,)."""
+        """Returns the position in cells, float64 (3,), at a time in steps."""
         return np.array([np.interp(time, self.times, self.positions[:, axis]) for axis in range(3)])
 
     def describe(self) -> dict:
-        """Returns the settings as JSON values."""
+        """Returns positions and times as JSON values."""
         return {"positions": self.positions.tolist(), "times": self.times.tolist()}
 
 
@@ -123,7 +123,7 @@ class Sphere:
         voxelise_sphere(solid, body, position.tolist(), self.radius)
 
     def describe(self) -> dict:
-        """Returns the settings as JSON values, by which a checkpoint is verified."""
+        """Returns path and radius as JSON values; a checkpoint stores them to recognise its simulation."""
         return self.path.describe() | {"radius": self.radius}
 
 
@@ -135,9 +135,9 @@ class Mesh:
 
     Attributes:
         path: Path of the mesh's origin.
-        vertices: float32 [V, 3] relative to the origin, in units of `scale` cells.
-        triangles: int32 [T, 3], anticlockwise from outside.
-        scale: Cells per unit.
+        vertices: float32 [V, 3], corners relative to the mesh's origin, in the mesh's own unit.
+        triangles: int32 [T, 3], indices of each triangle's corners, anticlockwise seen from outside.
+        scale: Cells per unit of the mesh.
     """
 
     path: Trajectory
@@ -149,14 +149,14 @@ class Mesh:
     def __post_init__(self) -> None:
         v, t = np.asarray(self.vertices), np.asarray(self.triangles)
         if v.ndim != 2 or v.shape[1] != 3 or not np.isfinite(v).all():
-            raise ValueError(f"vertices: expected finite numbers [V, 3], got {v.shape}")
+            raise ValueError(f"vertices: expected finite numbers of shape [V, 3], got shape {v.shape}")
         if t.ndim != 2 or t.shape[1] != 3 or len(t) == 0 or t.min() < 0 or t.max() >= len(v):
-            raise ValueError(f"triangles: expected vertices' numbers [T, 3], at least one, got {t.shape}")
+            raise ValueError(f"triangles: expected indices of vertices of shape [T, 3], T >= 1, got shape {t.shape}")
         if not 0.0 < self.scale < np.inf:
             raise ValueError(f"scale: expected a number above 0, got {self.scale}")
 
     def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """Marks the cells inside the mesh; see `Sphere.cover`."""
+        """Marks the cells whose centres are inside the mesh at a position; arguments as for `Sphere.cover`."""
         device = str(solid.device)
         if device not in self._meshes:
             points = wp.array(np.asarray(self.vertices, np.float32), dtype=wp.vec3, device=device)
@@ -165,7 +165,7 @@ class Mesh:
         voxelise_mesh(solid, body, self._meshes[device], position.tolist(), scale=self.scale)
 
     def describe(self) -> dict:
-        """Returns the settings as JSON values, with a hash of the arrays."""
+        """Returns path and scale as JSON values, and a hash of the mesh; see `Sphere.describe`."""
         digest = hashlib.blake2b(np.asarray(self.vertices, np.float32).tobytes(), digest_size=16)
         digest.update(np.asarray(self.triangles, np.int32).tobytes())
         return self.path.describe() | {"mesh": digest.hexdigest(), "scale": self.scale}

@@ -43,12 +43,12 @@ class Source:
     """A region that emits smoke, in cells and steps of the lattice.
 
     Attributes:
-        shape: "box" or "sphere".
+        shape: "box" or "sphere" (with three radii, an ellipsoid).
         centre: Centre in cells.
-        size: Half edges or radii in cells; above 0.
-        density: Density added per step of the lattice, or the density that is set.
-        temperature: Temperature, added or set like the density.
-        fixed: Whether the values are set instead of added.
+        size: Half edges of the box, or radii, along x, y and z in cells; above 0.
+        density: Density added per step of the lattice or, with `fixed`, the density to set.
+        temperature: Temperature added per step or, with `fixed`, the temperature to set.
+        fixed: Whether density and temperature are set instead of added.
     """
 
     shape: str
@@ -60,7 +60,7 @@ class Source:
 
     def __post_init__(self) -> None:
         if self.shape not in ("box", "sphere"):
-            raise ValueError(f"shape: expected box or sphere, got {self.shape!r}")
+            raise ValueError(f"shape: expected 'box' or 'sphere', got {self.shape!r}")
         for name, least in (("centre", -math.inf), ("size", 0.0)):
             value = getattr(self, name)
             if len(value) != 3 or not all(math.isfinite(v) and v > least for v in value):
@@ -87,19 +87,19 @@ class Buoyancy:
 
     def __post_init__(self) -> None:
         if not all(math.isfinite(v) for v in (self.lift, self.weight, *self.up)):
-            raise ValueError("buoyancy: expected finite numbers")
+            raise ValueError("buoyancy: expected finite numbers, got NaN or infinity")
         if len(self.up) != 3 or abs(math.hypot(*self.up) - 1.0) > 1e-4:
             raise ValueError(f"up: expected a vector of length 1, got {self.up}")
 
 
 def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
-    """Returns the memory in bytes of one cell of smoke; arguments as for `Solver`."""
+    """Returns the memory that one cell of smoke takes, in bytes; arguments as for `Solver`."""
     fields = _buffers(scheme) * (2 if temperature else 1)
     return fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
 
 
 def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Device) -> None:
-    """Checks that a grid of smoke can be indexed and allocated.
+    """Checks that a grid of smoke with `cell_bytes` bytes per cell can be indexed and allocated.
 
     Raises:
         WlmError: The grid has too many cells or does not fit into the memory.
@@ -112,10 +112,10 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
 
 
 class Solver:
-    """Smoke in the air of a lattice.
+    """Simulates smoke in the air of a lattice.
 
-    Set the lattice's faces beforehand; the solver sets its solids and its force. With a moving obstacle each step waits
-    for the device.
+    Set the faces of the lattice beforehand; the solver sets the solids of the lattice and its force. With a moving
+    obstacle each step waits for the device.
 
     Args:
         lattice: The air.
@@ -125,9 +125,9 @@ class Solver:
         temperature: Whether the smoke has a temperature.
         sources: Sources of smoke.
         obstacles: At most 255 obstacles.
-        dissipation: Decay rate of the density per step of the lattice: exp(-dissipation t) remains.
-        cooling: Decay rate of the temperature.
-        buoyancy: Acceleration of the air by smoke; None: none.
+        dissipation: Decay rate of the density: exp(-dissipation t) of it remains after t steps of the lattice.
+        cooling: Decay rate of the temperature, in the same unit.
+        buoyancy: Acceleration of the air by smoke; None: smoke does not move the air.
         substeps: Steps of the lattice per step of the solver. Above a speed of 1 / substeps smoke can jump over walls.
         bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are computed.
         threshold: With bricks, the largest value in a brick that counts as empty.
@@ -170,11 +170,12 @@ class Solver:
                 raise ValueError(f"{name}: expected a number of at least 0, got {rate}")
         self._decay = (math.exp(-dissipation * substeps), math.exp(-cooling * substeps))
         if storage == "float16" and any(0.0 < 1.0 - factor < LEAST_HALF_LOSS for factor in self._decay):
-            raise ValueError(f"dissipation, cooling: expected 0 or {LEAST_HALF_LOSS:.2g} or more per step with float16")
+            least = f"0, or a loss of at least {LEAST_HALF_LOSS:.2g} of the value per solver step"
+            raise ValueError(f"dissipation, cooling: with float16 expected {least}, got less")
         if len(obstacles) > 255:
             raise ValueError(f"obstacles: expected at most 255, got {len(obstacles)}")
         if not temperature and (cooling or (buoyancy and buoyancy.lift) or any(s.temperature for s in sources)):
-            raise ValueError("temperature: expected True for these sources, buoyancy or cooling")
+            raise ValueError("temperature: expected True, since a source, buoyancy or cooling uses it, got False")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
         self.shape = tuple(refinement * size for size in lattice.shape)
@@ -222,9 +223,9 @@ class Solver:
     def step(self, steps: int = 1) -> None:
         """Advances air and smoke by a number of steps.
 
-        During the capture of a CUDA graph it does not check: call `check` between replays. The number of steps, and the
-        number of earlier steps, must then be multiples of `period`, `substeps` a multiple of the lattice's `period`,
-        and obstacles must be at rest.
+        During the capture of a CUDA graph it does not check the air: call `check` between replays of the graph. The
+        number of steps, and the number of steps done before the capture, must then be multiples of `period`, `substeps`
+        must be a multiple of the lattice's `period`, and obstacles must be at rest.
 
         Raises:
             WlmError: The air blew up, or an obstacle is too fast.
@@ -235,8 +236,8 @@ class Solver:
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
             raise ValueError(
-                f"steps: in a graph, expected a multiple of {self.period} after eager steps, substeps a multiple of"
-                f" {self.lattice.period}, and obstacles at rest"
+                f"steps: expected a multiple of {self.period} in a CUDA graph and before it, at least one before it, "
+                f"substeps a multiple of {self.lattice.period}, and obstacles at rest; got {steps} after {self._done}"
             )
         for _ in range(steps):
             if not capturing:
@@ -278,12 +279,12 @@ class Solver:
 
     @property
     def velocity(self) -> wp.array:
-        """Velocity that carried the smoke in the last step, vec3 [cells of the lattice], cells per step."""
+        """Velocity of the air that moved the smoke in the last step, vec3 [cells of the lattice], cells per step."""
         return self._velocity
 
     @property
     def active_cells(self) -> int:
-        """Number of cells of smoke computed in the last step, all cells without bricks; waits for the device."""
+        """Number of cells of smoke that the last step computed; without bricks all. Waits for the device."""
         if self._bricks is DENSE:
             return math.prod(self.shape)
         return int(self._bricks.count.numpy()[0]) * advection_places.BRICK**3
@@ -316,7 +317,7 @@ class Solver:
     # Checkpoints.
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the complete state, atomically.
+        """Writes the complete state to a checkpoint file, whole or not at all.
 
         Raises:
             WlmError: The air blew up, or the file cannot be written; an earlier file is kept.
@@ -336,8 +337,8 @@ class Solver:
     def load(self, path: str | os.PathLike[str]) -> None:
         """Continues from a checkpoint of a solver and a lattice with the same settings.
 
-        On a CPU the following steps are bit for bit the same; on a GPU up to the order of the outlets' atomic sums, and
-        with bricks up to their threshold.
+        The following steps are the same as without the interruption: bit for bit on a CPU; on a GPU except for
+        rounding, since outlets sum in any order. With bricks, the threshold allows small differences.
 
         Raises:
             WlmError: The file is damaged or belongs to another simulation; the message names the difference.
@@ -382,12 +383,10 @@ class Solver:
         self._note_checkpoint(path, air["steps"])
 
     def _note_checkpoint(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
-        """Remembers the file of the last saved state, and the lattice's number of steps in it, for error messages."""
         self._kept = f"; the state of step {int(steps)} is kept in {path}"
 
     @contextmanager
     def _naming_checkpoint(self) -> Iterator[None]:
-        """Adds the file of the last saved state to error messages."""
         try:
             yield
         except WlmError as error:

@@ -1,4 +1,4 @@
-"""Density volumes of smoke: validated input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); `.npz` output.
+"""Density volumes of smoke: checked input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); `.npz` output.
 
 Repairs are listed in `DensityVolume.warnings`, one line for each kind; `docs/fluid.md` lists them and the errors.
 
@@ -32,11 +32,11 @@ EDGE = 8
 
 
 def gather(fields: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Extracts the bricks in which any of several fields [X, Y, Z] of one shape is not 0.
+    """Extracts the bricks of 8^3 voxels in which any of several fields [X, Y, Z] of one shape is not 0.
 
     Returns:
-        Numbers of the bricks int32 [N], increasing, x the slowest axis; and each field's bricks [N, 8, 8, 8], 0
-        outside the box.
+        Indices of the bricks, int32 [N], increasing, with x the slowest axis; and each field's values in them,
+        [N, 8, 8, 8], 0 in the parts of bricks outside the field.
     """
     margins = [part for n in reversed(fields[0].shape) for part in (0, -n % EDGE)]
     cut = []
@@ -49,7 +49,7 @@ def gather(fields: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Ten
 
 
 def scatter(numbers: torch.Tensor, bricks: torch.Tensor, shape: Sequence[int]) -> torch.Tensor:
-    """Inverse of `gather`: returns [X, Y, Z] of a shape, 0 outside the bricks; the numbers must be valid."""
+    """Inverse of `gather`: returns a field of the given shape, 0 outside the bricks with the indices `numbers`."""
     counts = [-(-n // EDGE) for n in shape]
     whole = torch.zeros([n * EDGE for n in counts], dtype=bricks.dtype, device=bricks.device)
     x, y, z = torch.unravel_index(numbers.long(), counts)
@@ -69,7 +69,7 @@ SUFFIXES = (".npz", ".nvdb", ".vdb")
 class DensityVolume:
     """Smoke in a box of cubic voxels.
 
-    The constructor does not validate: frames of a solver are used without a copy. `from_array` validates.
+    The constructor does not check the values, so that frames of a solver need no copy; `from_array` checks them.
 
     Attributes:
         density: float32 or float16 tensor [X, Y, Z], finite, not negative.
@@ -78,7 +78,7 @@ class DensityVolume:
         origin: float64 [3], corner of voxel (0, 0, 0) in the world; its centre is half a voxel further.
         temperature: Tensor like the density; None: no emission.
         emission: Light emitted per unit of length at temperature 1.
-        warnings: Repairs, one line each.
+        warnings: The values that were repaired, one line for each kind.
     """
 
     density: torch.Tensor
@@ -91,7 +91,7 @@ class DensityVolume:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """X, Y, Z in voxels."""
+        """Number of voxels along x, y and z."""
         return tuple(self.density.shape)
 
     @property
@@ -129,20 +129,17 @@ def from_array(
     """Makes a validated volume from arrays.
 
     Args:
-        density: Numbers [X, Y, Z]; copied only if they must be changed or moved.
-        extinction: Extinction per unit of length at density 1.
-        voxel: Edge of a voxel, in the world's unit.
-        origin: Corner of voxel (0, 0, 0) in the world.
-        temperature: [X, Y, Z], or None.
-        emission: Light emitted per unit of length at temperature 1.
+        density, temperature: Numbers [X, Y, Z], copied only if they must be changed or moved; temperature None: the
+            smoke emits no light.
+        extinction, voxel, origin, emission: The attributes of `DensityVolume`.
         device: "cpu" or "cuda:N".
-        name: Name in messages.
+        name: Name of the volume in messages.
 
     Returns:
-        The volume, repaired as `docs/fluid.md` lists.
+        The volume; NaN, infinite and negative values are replaced by 0, see `docs/fluid.md`.
 
     Raises:
-        WlmError: The input is one of the errors of `docs/fluid.md`.
+        WlmError: The input has one of the errors that `docs/fluid.md` lists.
     """
     device = check_device(device)
     # Kernels compute in float32.
@@ -192,17 +189,17 @@ def load_volume(
         emission: Light emitted per unit of length at temperature 1.
         voxel: Edge of a voxel, in the world's unit; None: the size in the file, or 1.
         device: "cpu" or "cuda:N".
-        trust: Whether the file may have as many voxels as it claims (`wlm.formats.limits`).
+        trust: Whether to accept more voxels than is likely for the size of the file (`wlm.formats.limits`).
         up: "x", "y" or "z", the axis of the file's world that becomes +y. None: y, with a warning if a `.nvdb` or
             `.vdb` is longest along z, which is up in Blender and Unreal.
         density: Name of the array or grid; None: `density`, or else the first grid of floats of a VDB file.
-        temperature: Name of the temperature's array or grid; None: `temperature`, if it exists.
+        temperature: Name of the array or grid of temperatures; None: `temperature`, if it exists.
 
     Returns:
-        The volume, repaired as `docs/fluid.md` lists.
+        The volume; NaN, infinite and negative values are replaced by 0, see `docs/fluid.md`.
 
     Raises:
-        WlmError: The input is one of the errors of `docs/fluid.md`; the message names the file and the field.
+        WlmError: The input has one of the errors that `docs/fluid.md` lists; the message names the file and the field.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -232,13 +229,12 @@ def load_volume(
 
 
 def is_long_along_z(volume: DensityVolume) -> bool:
-    """Whether a volume is longest along z, which suggests that its smoke rises along z."""
+    """Returns whether a volume is longest along z, which suggests that its smoke rises along z."""
     x, y, z = volume.shape
     return z > max(x, y)
 
 
 def _turned(volume: DensityVolume, up: str) -> DensityVolume:
-    """Returns the smoke rotated so that the axis `up` becomes +y."""
     matrix = np.diag([volume.voxel] * 3 + [1.0])
     matrix[:3, 3] = np.asarray(volume.origin) + 0.5 * volume.voxel
     parts = [Grid(_DENSITY, volume.density, matrix)]
@@ -250,16 +246,16 @@ def _turned(volume: DensityVolume, up: str) -> DensityVolume:
 
 
 def save_volume(path: str | os.PathLike[str], volume: DensityVolume, *, bricks: bool = False) -> None:
-    """Writes a volume as `.npz`, atomically; `load_volume` reads it back.
+    """Writes a volume as `.npz`, whole or not at all; `load_volume` reads it back.
 
-    With `bricks` empty bricks are omitted instead of compressing everything by deflate: this is much faster, but the
-    file is larger and other programs cannot read it.
+    With `bricks` the file is not compressed, but empty bricks of 8^3 voxels are omitted: writing is much faster, but
+    the file is larger and other programs cannot read it.
 
     Raises:
         WlmError: The suffix is wrong, or the file cannot be written.
     """
     if Path(path).suffix.lower() != ".npz":
-        raise WlmError(f"{path}: expected a name that ends in .npz")
+        raise WlmError(f"{path}: expected a name that ends in .npz, found {Path(path).suffix or 'none'}")
     fields = {_DENSITY: volume.density}
     if volume.temperature is not None:
         fields[_TEMPERATURE] = volume.temperature
@@ -281,7 +277,10 @@ def _check(
     warnings: list[str],
     dtype: torch.dtype | None = None,
 ) -> torch.Tensor:
-    """Returns the values in `dtype` (None: half if they are half, else float32), repaired as `docs/fluid.md` lists."""
+    """Returns a field as a tensor, with NaN, infinite and negative values set to 0, for which warnings are added.
+
+    `dtype` is the type of the tensor; None: half floats if the values are half floats, else float32.
+    """
     if not isinstance(values, torch.Tensor):
         values = np.asarray(values)
         if values.dtype.kind not in "iuf" or values.dtype == np.longdouble:
@@ -307,7 +306,6 @@ def _check(
 
 
 def _found(bad: torch.Tensor) -> tuple[int, tuple[int, ...]]:
-    """Returns the number of bad voxels and the position of the first."""
     first = np.unravel_index(int(bad.flatten().to(torch.uint8).argmax()), bad.shape)
     return int(bad.sum()), tuple(int(i) for i in first)
 
@@ -319,8 +317,8 @@ def _dimmed(name: str, heat: torch.Tensor, emission: float, voxel: float, warnin
     if bad.any():
         count, first = _found(bad)
         warnings.append(
-            f"{name}: {_TEMPERATURE}: {count} voxels that each give off more than {HALF_MAX:,.0f} are lowered to it, "
-            f"the first is {first}"
+            f"{name}: {_TEMPERATURE}: {count} voxels that each emit more light than {HALF_MAX:,.0f}, the largest half "
+            f"float, are lowered to it, the first is {first}"
         )
         heat = heat.clamp(max=most)
     return heat
@@ -358,7 +356,7 @@ def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, tru
 
 
 def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust: bool) -> dict[str, Any]:
-    """Returns the arrays with bricks expanded to whole fields on a device."""
+    """Returns a file's arrays with fields that are stored as bricks expanded to tensors [X, Y, Z] on a device."""
     shape, numbers = arrays.pop("shape", np.zeros(0)), arrays.pop(_BRICKS)
     if shape.shape != (3,) or shape.dtype.kind not in "iu" or not (shape.min() >= 1 and shape.max() <= most):
         raise WlmError(f"{path}: shape: expected 3 whole numbers from 1 to {most}, found {shape.dtype} {shape.shape}")
@@ -370,9 +368,9 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
         stored = sum(array.nbytes for array in arrays.values())
         check_growth(f"{path}: shape", stored, 4 * math.prod(counts) * EDGE**3, sure=4 * SURE_VOXELS)
     if numbers.ndim != 1 or numbers.dtype != np.int32 or (np.diff(numbers.astype(np.int64)) < 1).any():
-        raise WlmError(f"{path}: {_BRICKS}: expected numbers int32 that rise, found {numbers.dtype} {numbers.shape}")
+        raise WlmError(f"{path}: {_BRICKS}: expected increasing int32 [N], found {numbers.dtype} {numbers.shape}")
     if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < math.prod(counts)):
-        raise WlmError(f"{path}: {_BRICKS}: expected numbers from 0 to {math.prod(counts) - 1}, found others")
+        raise WlmError(f"{path}: {_BRICKS}: expected 0 to {math.prod(counts) - 1}, found {numbers[0]} to {numbers[-1]}")
     places = torch.from_numpy(numbers).to(device)
     for name in [name for name in arrays if name.endswith("_bricks")]:
         cut = arrays.pop(name)
@@ -383,7 +381,6 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
 
 
 def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> DensityVolume:
-    """Makes a volume of dense grids: the density and, if there is a second grid, the temperature."""
     voxels = sum(part.values.numel() for part in parts)
     lattice, values = on_one_lattice(
         parts, _LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * voxels)), up
@@ -394,7 +391,6 @@ def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> 
 
 
 def _read_nvdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> list[Grid]:
-    """Reads the dense grids of density and, if it exists, temperature from a NanoVDB file."""
     data = read_file(path, VOLUME_BYTES, "the NanoVDB file")
     try:
         found = {entry.name: entry for entry in reversed(list(entries(data)))}
@@ -410,7 +406,6 @@ def _read_nvdb(path: Path, names: tuple[str | None, str | None], trust: bool) ->
 
 
 def _read_vdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> list[Grid]:
-    """Reads the grids of density and, if it exists, temperature from an OpenVDB file."""
     data = read_file(path, VOLUME_BYTES, "the OpenVDB file")
     file = VdbFile(data, str(path))
     if not file.names:
@@ -428,7 +423,6 @@ def _read_vdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> 
 
 
 def _choose(path: Path, names: Sequence[str], wanted: tuple[str | None, str | None]) -> list[str]:
-    """Returns the names of the grids of density and, if it exists, temperature."""
     density, temperature = wanted
     for name in (density, temperature):
         if name is not None and name not in names:

@@ -1,15 +1,15 @@
-"""The artifact: one safetensors file with all results of a fit by one system, such as "lightmap" or "probe".
+"""The artifact: a `.wlm` file of compressed light, written by one system of wlm, such as "lightmap" or "probe".
 
 The file is a valid safetensors file: an 8-byte length, a JSON header, the tensors. The header's
 `__metadata__`, whose values must be strings, has two keys:
 
-- `wlm`: "<format version> <system> <source> <digest>", where the digest is the BLAKE2b-128 (hex) of the whole
-  file with the digest's own 32 characters as zeros;
+- `wlm`: "<format version> <system> <source> <digest>": the source is a hash of the input; the digest is the
+  BLAKE2b-128 (hex) of the whole file with zeros in place of the digest's 32 characters;
 - `settings`: JSON, with `"` and `'` exchanged, because each `"` inside a JSON string would cost an escape.
 
 Each tensor is called a part. Its offsets in the header must span exactly the bytes of its type and shape.
 
-An artifact whose source is empty is stored in another, compact form: `wlm.formats.compact`.
+An artifact without a source is stored in a compact form that is no safetensors file: `wlm.formats.compact`.
 """
 
 import hashlib
@@ -104,7 +104,7 @@ def write_artifact(
 
     Raises:
         ValueError: A name, a setting or a type that the format cannot store.
-        WlmError: The file cannot be written; an earlier one stays.
+        WlmError: The file cannot be written; the old content stays.
     """
     return atomic_write(path, encode_artifact(system, settings, tensors, source))
 
@@ -129,11 +129,11 @@ def encode_artifact(
     """
     if not source:
         if settings:
-            raise ValueError("settings: expected none in a compact artifact")
+            raise ValueError(f"settings: a compact artifact, one without a source, stores none, got {dict(settings)}")
         return encode_compact(system, tensors)
     for what, word in (("system", system), ("source", source)):
         if not word or not word.isascii() or not word.isprintable() or " " in word:
-            raise ValueError(f"{what}: expected one ASCII word, got {word!r}")
+            raise ValueError(f"{what}: expected one word of ASCII characters, got {word!r}")
     if "__metadata__" in tensors:
         raise ValueError("'__metadata__' is no name for a tensor: the format reserves it")
     # Wide types first, so that every tensor begins at a multiple of its item's size with no padding between.
@@ -265,7 +265,7 @@ def _metadata(path: str | os.PathLike[str], header: dict[str, Any]) -> tuple[tup
         raise WlmError(f"{path}: the artifact's version is damaged: expected an integer, found {words[0]!r}")
     version = int(words[0][:9])
     if version <= FORMAT_VERSION and (len(words) != 4 or not isinstance(metadata.get("settings"), str)):
-        raise WlmError(f"{path}: the artifact's metadata is damaged: expected four words and settings")
+        raise WlmError(f"{path}: the artifact's metadata is damaged: expected a text of four words and settings")
     if version <= FORMAT_VERSION and not (metadata["wlm"].isascii() and metadata["wlm"].isprintable()):
         raise WlmError(f"{path}: the artifact's metadata is damaged: expected words in printable ASCII")
     system, source, digest = (*words[1:], "", "", "")[:3]
@@ -282,10 +282,10 @@ def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tu
         valid = False
     if not valid:
         raise WlmError(f"{path}: part {one_line(name, 60)}: expected a type, a shape and two offsets")
-    # An empty part's other sizes are bounded by no bytes, and NumPy's arrays are.
+    # A part of size 0 along one axis may state any other sizes, and NumPy limits them.
     if len(shape) > _MOST_AXES or math.prod(max(size, 1) for size in shape) > _MOST_NUMBERS:
         raise WlmError(
-            f"{path}: part {one_line(name, 60)}: expected at most {_MOST_AXES} axes of {_MOST_NUMBERS} numbers in all"
+            f"{path}: part {one_line(name, 60)}: the shape {shape} exceeds {_MOST_AXES} axes or {_MOST_NUMBERS} numbers"
         )
     expected = math.prod(shape) * np.dtype(_TYPES[kind]).itemsize
     if end - begin != expected:
@@ -300,10 +300,10 @@ def _check_extents(
     reached = 0
     for name, (_, _, begin, end) in sorted(entries.items(), key=lambda item: item[1][2:]):
         if begin != reached:
-            raise WlmError(f"{path}: part {one_line(name, 60)}: expected it at byte {reached}, found {begin}")
+            raise WlmError(f"{path}: part {one_line(name, 60)}: expected its data at byte {reached}, found {begin}")
         reached = end
     if payload < reached:
-        raise WlmError(f"{path}: the artifact is cut short: expected {reached} bytes of parts, not {payload}")
+        raise WlmError(f"{path}: the artifact is cut short: expected {reached} bytes of parts, found {payload}")
     if payload > reached:
         raise WlmError(f"{path}: expected the end of the file, found {payload - reached} more bytes")
 

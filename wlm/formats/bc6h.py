@@ -73,7 +73,7 @@ _PARTITION_BITS = 5
 
 
 def _fields(text: str) -> list[int]:
-    """Returns the code of each bit, as in `LAYOUT`, from the text of a mode in `_MODES`, such as "rw0-9 gx4"."""
+    """Parses the order of a mode's bits, such as "rw0-9 gx4", to numbers: 16 times the field, plus the bit in it."""
     codes = []
     for token in text.split():
         field = 4 * "rgb".index(token[0]) + "wxyz".index(token[1])
@@ -118,7 +118,7 @@ _RESERVED = -1
 
 
 def _rows() -> np.ndarray:
-    """Makes a table that maps the lowest five bits of a block to its row of `MODES`, or to `_RESERVED`."""
+    """Returns int [32]: for the lowest five bits of a block the row of its mode in `MODES`, or `_RESERVED`."""
     rows = np.full(32, _RESERVED, np.int64)
     for row, (number, bits) in enumerate(MODES[:, :2]):
         rows[np.arange(number, 32, 1 << bits)] = row

@@ -98,7 +98,7 @@ def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.n
     thread.
 
     Args:
-        extra: Name of this package's optional extra with the compressor, for the error message.
+        extra: Name of the optional extra of wlm that installs the compressor, for the error message.
         profile: Quality of the compressor, one of `ENCODERS`.
 
     Returns:
@@ -198,7 +198,7 @@ def _number(bits: np.ndarray) -> np.ndarray:
 
 
 def _shares(bits: np.ndarray, at: int, count: int, anchors: np.ndarray) -> np.ndarray:
-    """Returns the weights of endpoint 1, [n, 16], from the blocks' indices of `count` bits from bit `at` on."""
+    """Returns the interpolation weights of n blocks, [n, 16], whose indices of `count` bits begin at bit `at`."""
     texel = np.arange(16)
     short = (texel == 0) | (texel == anchors[:, :1]) | (texel == anchors[:, 1:])
     start = at + count * texel - (np.cumsum(short, axis=1) - short)

@@ -1,9 +1,9 @@
 """Rate-distortion optimisation of blocks of 4 x 4 texels: blocks are repeated where that adds little error.
 
 A block codec's bytes hardly compress, since no two blocks are equal. Here a block is replaced by an earlier one that
-fits its texels nearly as well: zstd or LZMA then stores a match in place of 16 bytes. The block with the least error
-within a window is used (the nearest of equals) if its error exceeds that of the original by no more than a given
-amount. The size in GPU memory and the decoder stay the same.
+fits its texels nearly as well: zstd or LZMA then stores a match in place of 16 bytes. Of a window of earlier blocks the
+one with the least error is used (the nearest, if several have it), if its error exceeds that of the original block by
+no more than a given amount. The size in GPU memory and the decoder stay the same.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ def reuse_blocks(
         allowed: float32 [H, W, C]; its sum over a block limits the increase of the block's weighted squared error.
 
     Returns:
-        The same number of blocks.
+        The chosen blocks, as many as in `data`.
     """
     blocks = np.frombuffer(data, np.uint8).reshape(-1, _BYTES)
     return reuse_in_order(blocks, *(by_block(image) for image in (decoded, target, weight, allowed))).tobytes()
@@ -40,15 +40,15 @@ def reuse_in_order(
     allowed: np.ndarray,
     window: int = _WINDOW,
 ) -> np.ndarray:
-    """Replaces blocks by earlier ones, like `reuse_blocks`, for blocks in the order of the file.
+    """Does the work of `reuse_blocks` for blocks in any order; each may be replaced by one before it.
 
     Args:
-        blocks: uint8 [n, 16].
+        blocks: uint8 [n, 16], in the order in which the file stores them.
         decoded, target, weight, allowed: float32 [n, V], V values per block; see `reuse_blocks`.
         window: Number of preceding blocks that are tried as replacements.
 
     Returns:
-        uint8 [n, 16].
+        The chosen blocks, uint8 [n, 16].
     """
     blocks, held = blocks.copy(), decoded.copy()
     bound = np.sum(np.square(held - target) * weight + allowed, axis=1)
@@ -62,7 +62,7 @@ def reuse_in_order(
 
 
 def by_block(image: np.ndarray) -> np.ndarray:
-    """Cuts an image [H, W, C] into blocks, float32 [blocks, values of a block]."""
+    """Cuts an image [H, W, C] into blocks of 4 x 4 texels, float32 [H W / 16, 16 C], row by row."""
     height, width, channels = image.shape
     squares = image.reshape(height // _SIDE, _SIDE, width // _SIDE, _SIDE, channels).transpose(0, 2, 1, 3, 4)
     return squares.reshape(-1, _SIDE * _SIDE * channels).astype(np.float32)

@@ -33,9 +33,9 @@ def unpack(packed: bytes, size: int) -> bytes:
     """
     stated = unpacked_size(packed)
     if stated != size and not size < stated <= _PADDED:
-        raise ValueError(f"expected {size} bytes once unpacked, found a size of {stated}")
+        raise ValueError(f"expected a decompressed size of {size} bytes, found {stated}")
     if struct.unpack_from("<I", packed, 12)[0] != len(packed):
-        raise ValueError(f"expected {len(packed)} bytes of Blosc, found another number")
+        raise ValueError(f"the Blosc header states another size than the {len(packed)} bytes of the data")
     codecs = need("imagecodecs", EXTRA)
     out = np.empty(stated, np.uint8)
     try:

@@ -7,8 +7,8 @@ encoding  light                   where it is used
 ========  ======================  =========================================================
 linear    p                       data textures
 srgb      L(p)                    pictures, lightmaps of low range
-rgbm      34.4932 a^2.2 L(p)      Unity, linear colour space (`DecodeLightmapRGBM`); 5^2.2
-dldr      4.5948 L(p)             Unity (`DecodeLightmapDoubleLDR`); 2^2.2
+rgbm      34.4932 a^2.2 L(p)      Unity, linear colour space (`DecodeLightmapRGBM`); factor 5^2.2
+dldr      4.5948 L(p)             Unity (`DecodeLightmapDoubleLDR`); factor 2^2.2
 rgbe      255 p 2^(255 a - 136)   Radiance's numbers as RGBA; 0 where a is 0
 ========  ======================  =========================================================
 """

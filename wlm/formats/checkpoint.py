@@ -1,4 +1,7 @@
-"""Checkpoints of a fit: finished batches in their stored form, and the exact states of the running batches.
+"""Checkpoints of a fit, from which it continues exactly after an interruption.
+
+A fit works in batches (independent parts of the work). A checkpoint has the results of finished batches, and the exact
+states of unfinished ones, such as parameters and optimizer state.
 
 A checkpoint is one file beside the output, in the format of `wlm.formats.artifact`: it is written atomically, and every
 byte is checked when it is read. It records the inputs of the fit and refuses to resume any other fit.
@@ -49,7 +52,7 @@ class Pace:
 
     @contextmanager
     def saving(self) -> Iterator[None]:
-        """Measures the time of a save, done in the block; the next interval starts at its end."""
+        """Measures how long the save inside the `with` block takes; the next interval starts at its end."""
         begin = time.monotonic()
         yield
         self._last = time.monotonic()
@@ -61,7 +64,7 @@ class Pace:
 class Checkpoint:
     """The state of one fit, in the file `OUTPUT.partial`.
 
-    Batches are numbered from 0, and several may be running. A fit of one batch uses number 0.
+    Batches are numbered from 0, and several may be unfinished at a time.
 
     Attributes:
         path: The file.
@@ -84,9 +87,9 @@ class Checkpoint:
         Args:
             output: The output file of the fit; the checkpoint is written beside it.
             system: The system of the fit, for example "lightmap".
-            fit: The inputs that determine the fit (hash of the data, settings, seed) by their names in messages, as
-                JSON values; the version of this package is added.
-            source: A hash of the input, one ASCII word.
+            fit: The inputs that determine the fit (hash of the data, settings, seed) as JSON values; messages use their
+                keys as names. The version of this package is added.
+            source: A hash of the input, without spaces.
             resume: Whether to continue from an existing file. Otherwise the file is ignored, and replaced at the first
                 save.
             every: Seconds between two saves of a running batch; see `Pace`.
@@ -125,11 +128,11 @@ class Checkpoint:
             raise WlmError(f"{self.path}: finished batch {number}: {error}") from error
 
     def running(self, number: int) -> dict[str, np.ndarray] | None:
-        """Returns the state of a batch that was running at the last save, or None."""
+        """Returns the arrays of a batch that was unfinished at the last save, by name, or None."""
         return self._running.get(number)
 
     def restore(self, number: int, load: Callable[[dict[str, np.ndarray]], None]) -> bool:
-        """Restores the state of a batch that was running, and returns whether there was one.
+        """Restores the state of an unfinished batch, and returns whether the checkpoint has one.
 
         `load` restores a state; for an invalid one it raises ValueError before it changes anything.
 
@@ -149,11 +152,11 @@ class Checkpoint:
         return WlmError(f"{self.path}: state of batch {number}: {error}")
 
     def due(self) -> bool:
-        """Returns whether the time of the next save of the running batches has come."""
+        """Returns whether the time of the next save has come."""
         return self._pace.due()
 
     def save_running(self, number: int, state: Mapping[str, np.ndarray]) -> None:
-        """Writes the state of a running batch in place of an older state of the batch.
+        """Writes the state of an unfinished batch in place of its older state.
 
         Raises:
             WlmError: The file cannot be written; the old content stays.
@@ -161,7 +164,7 @@ class Checkpoint:
         self.save({number: state})
 
     def save(self, states: Mapping[int, Mapping[str, np.ndarray]]) -> None:
-        """Writes the states of running batches, by number, in place of older states of these batches.
+        """Writes the states of unfinished batches, by number, in place of their older states.
 
         Raises:
             WlmError: The file cannot be written; the old content stays.
@@ -170,7 +173,7 @@ class Checkpoint:
         self._write()
 
     def add_finished(self, number: int, result: Mapping[str, np.ndarray]) -> None:
-        """Adds the parts of a finished batch and drops its running state.
+        """Adds the results of a finished batch, by name, and removes the state of its unfinished work.
 
         The file is written at once if that takes at most a twentieth of the time, otherwise at the next save.
 
@@ -219,7 +222,7 @@ class Checkpoint:
         artifact = read_artifact(self.path, self.system)
         stored = artifact.settings.get("fit")
         if not isinstance(stored, dict):
-            raise WlmError(f"{self.path}: the checkpoint does not state its fit")
+            raise WlmError(f"{self.path}: the checkpoint is damaged: it does not state the inputs of its fit")
         if difference := _difference(stored, self._key):
             raise WlmError(
                 f"{self.path}: the checkpoint is of another fit: {difference}; resume with the original inputs, or "
@@ -230,7 +233,7 @@ class Checkpoint:
             # At most nine digits: int() refuses very long numbers with its own message.
             if state not in (_FINISHED, _RUNNING) or not re.fullmatch("[0-9]{1,9}", number) or not key:
                 raise WlmError(
-                    f"{self.path}: part {one_line(repr(name), 60)}: expected one of a finished or a running batch"
+                    f"{self.path}: part {one_line(repr(name), 60)}: is of neither a finished nor a running batch"
                 )
             # A copy, since the next save replaces the file, and a mapped one would stay on the disk.
             kept = self._finished if state == _FINISHED else self._running

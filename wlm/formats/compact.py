@@ -38,8 +38,9 @@ def digest(*pieces: bytes | np.ndarray) -> bytes:
 
 
 def encode_compact(system: str, parts: Mapping[str, np.ndarray]) -> list[bytes | np.ndarray]:
-    """Encodes a compact artifact of one of `SYSTEMS`, whose only part is `BODY`, uint8 [B]; returns consecutive
-    buffers.
+    """Encodes a compact artifact of a system in `SYSTEMS`; returns the file's content as consecutive buffers.
+
+    `parts` has only one part: `BODY`, uint8 [bytes].
     """
     begin = _MAGIC + bytes([SYSTEMS.index(system) << 4 | _VERSION])
     return [begin + digest(begin, parts[BODY]), parts[BODY]]
@@ -58,7 +59,9 @@ def parse_compact(where: object, mapped: bytes | memoryview) -> tuple[str, int, 
     begin = view[:4].tobytes()
     version, number = (begin[3] & 15, begin[3] >> 4) if len(begin) == 4 else (_VERSION, 0)
     if version != _VERSION or number >= len(SYSTEMS):
-        raise WlmError(f"{where}: artifact version {version}.{number}: expected {_VERSION} of {', '.join(SYSTEMS)}")
+        raise WlmError(
+            f"{where}: expected artifact version {_VERSION} of {' or '.join(SYSTEMS)}, found {version}, system {number}"
+        )
     if len(view) < _START:
         raise WlmError(f"{where}: the artifact is cut short: expected {_START} bytes, found {len(view)}")
     if digest(begin, view[_START:]) != view[4:_START].tobytes():

@@ -125,13 +125,13 @@ def write_dds(
     if fmt not in DXGI_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(DXGI_FORMATS)}, got {fmt}")
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE and 1 <= depth <= _MAX_DEPTH):
-        raise ValueError(f"expected sides of 1 to {MOST_SIDE} and a depth of 1 to {_MAX_DEPTH} texels")
+        raise ValueError(f"expected 1 to {MOST_SIDE}x{MOST_SIDE}x{_MAX_DEPTH} texels, got {width}x{height}x{depth}")
     volume = depth > 1 if volume is None else volume
     most = 0 if volume else max(width, height).bit_length() - 1
     if not 0 <= mips <= most:
         raise ValueError(f"mips: expected 0 to {most}, got {mips}")
     if not 0 <= layers <= _MAX_DEPTH or (layers and (volume or mips)):
-        raise ValueError(f"layers: expected 0 to {_MAX_DEPTH}, of a 2D texture without mips, got {layers}")
+        raise ValueError(f"layers: expected 0 to {_MAX_DEPTH}, and 0 for a volume or with mips, got {layers}")
     slice_bytes = _slice_bytes(fmt, width, height)
     levels = (_slice_bytes(fmt, max(width >> level, 1), max(height >> level, 1)) for level in range(1, mips + 1))
     whole = depth * max(layers, 1) * slice_bytes + sum(levels)
@@ -207,7 +207,7 @@ def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]
             raise WlmError(f"{path}: the file is cut short: expected {claimed}, found {held}")
         data = file.read(expected)
     if len(data) != expected:
-        raise WlmError(f"{path}: expected {expected} bytes of texels, found another number: does it change?")
+        raise WlmError(f"{path}: expected {expected} bytes of texels, found {len(data)}; has the file changed?")
     return decode_texels(path, layout, data, width, height), layout.names
 
 

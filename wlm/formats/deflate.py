@@ -6,7 +6,7 @@ import zlib
 def inflate(data: bytes, size: int, where: str, expected: str) -> bytes:
     """Decompresses one zlib stream and never allocates more than one byte beyond its expected size.
 
-    `where` names the stream and `expected` its content in messages.
+    `where` names the stream in messages, and `expected` describes its right content, such as "90 bytes".
 
     Raises:
         ValueError: The stream is damaged or has another size.
@@ -17,5 +17,5 @@ def inflate(data: bytes, size: int, where: str, expected: str) -> bytes:
     except zlib.error as error:
         raise ValueError(f"{where}: {error}") from error
     if len(unpacked) != size or not reader.eof or reader.unused_data:
-        raise ValueError(f"{where}: expected {expected}")
+        raise ValueError(f"{where}: expected {expected}, found more or fewer bytes")
     return unpacked

@@ -20,7 +20,7 @@ _QUALITY = 8  # imageio-ffmpeg's quality, 0 to 10
 def film(path: str | os.PathLike[str], height: int, width: int, rate: float) -> Iterator[Callable[[np.ndarray], None]]:
     """Writes an `.mp4` film atomically, at the end of the block.
 
-    Yields a function that adds a frame, uint8 [height, width, 3] in sRGB. The sizes are even, since chroma has half the
+    Yields a function that adds a frame, uint8 [height, width, 3] in sRGB. Sizes must be even, since chroma has half the
     resolution; `rate` is the number of frames per second.
 
     Raises:

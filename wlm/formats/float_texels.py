@@ -48,7 +48,7 @@ class Layout:
 
     @property
     def unpacked(self) -> int:
-        """Bytes of a texel: as half floats or as stored, whichever is larger."""
+        """Bytes of a texel in memory, for limits: as half floats or as stored, whichever is larger."""
         across, down = self.block
         return max(_HALF_BYTES * self.channels, self.size // (across * down))
 

@@ -38,7 +38,7 @@ def claim(folder: Path, index: str, format_name: str) -> None:
         if folder.exists() and read_index(folder / index).get("format") != format_name:
             # Temporary files of a killed process do not count.
             if not all(is_passing(path.name) for path in folder.iterdir()):
-                raise WlmError(f"{folder}: expected an empty folder or one of an earlier output, found other files")
+                raise WlmError(f"{folder}: expected an empty folder or an earlier output, found other files")
     except OSError as error:
         raise WlmError(f"{folder}: cannot write there: {error.strerror or error}") from error
     parent = folder.resolve().parent
@@ -100,13 +100,12 @@ def staged(folder: Path, index: str, format_name: str) -> Iterator[Path]:
 
 
 def _move(made: Path, folder: Path, index: str, format_name: str) -> None:
-    """Moves an output's files into their folder."""
     names = sorted(path.relative_to(made).as_posix() for path in made.rglob("*") if path.is_file())
     names.remove(index)
     folder.mkdir(exist_ok=True)
     old = set(_listed(folder, index))
     write_index(made / index, read_index(made / index) | {"files": names})
-    # An old index must not vouch for new files, nor may the folder become one that cannot be written again.
+    # An old index must not seem to describe new files, and a later run must be able to write the folder.
     write_index(folder / index, {"format": format_name, UNFINISHED: True, "files": sorted(old | set(names))})
     for name in sorted(old - set(names)):
         (folder / name).unlink(missing_ok=True)

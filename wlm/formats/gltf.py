@@ -19,7 +19,7 @@ nodes outside the scene               left out; kept in copies
 external `.bin`, `data:` URIs         read; copies embed them in the `.glb`
 external images                       copies embed them; an image that is missing or not PNG, JPEG, WebP,
                                       KTX2 or DDS keeps its URI
-a buffer outside the file's folder    error, unless the file is trusted; such an image keeps its URI
+a buffer outside the file's folder    error, unless the file is trusted; an image there keeps its URI
 more corners and vertices than        error, unless the file is trusted (`wlm.formats.limits`)
 the limits
 Draco, meshopt, GPU instances         error that names the extension
@@ -96,7 +96,7 @@ class GltfDocument:
         """
         entries = self.content.get(kind, [])
         if not isinstance(number, int) or not 0 <= number < len(entries):
-            raise WlmError(f"{self.path}: {kind}[{number}]: expected one of {len(entries)}")
+            raise WlmError(f"{self.path}: {kind}[{number}]: the file has {len(entries)} {kind}")
         return entries[number]
 
 
@@ -313,7 +313,9 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
                 continue
             local = _floats(document, attributes["NORMAL"], "VEC3")
             if len(local) <= each.row.max():
-                raise WlmError(f"{document.path}: {each.name}: NORMAL: expected {each.row.max() + 1} vertices or more")
+                raise WlmError(
+                    f"{document.path}: {each.name}: expected {each.row.max() + 1} normals or more, found {len(local)}"
+                )
             # Normals transform by the cofactor matrix: the inverse transpose times the determinant. It exists for a
             # scale of 0, too.
             a, b, c = transforms[each.node][:3, :3].T
@@ -328,7 +330,7 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
 
 @contextmanager
 def reported(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turns the exceptions of a malformed tree into one-line errors."""
+    """Turns exceptions that malformed JSON of a glTF file causes in the block into one-line errors."""
     try:
         yield
     except KeyError as error:
@@ -336,11 +338,10 @@ def reported(path: str | os.PathLike[str]) -> Iterator[None]:
     except (ValueError, TypeError, AttributeError, IndexError, OverflowError, RecursionError) as error:
         raise WlmError(f"{path}: malformed glTF: {error}") from error
     except MemoryError as error:
-        raise WlmError(f"{path}: malformed glTF: a count too large for the memory") from error
+        raise WlmError(f"{path}: malformed glTF: it states a count that exceeds the memory") from error
 
 
 def _check_view(document: GltfDocument, number: int, view: dict) -> None:
-    """Raises an error if a buffer view exceeds its buffer."""
     where = f"{document.path}: bufferViews[{number}]"
     document.item("buffers", view["buffer"])
     start, length, held = view.get("byteOffset", 0), view["byteLength"], len(document.buffers[view["buffer"]])
@@ -351,7 +352,7 @@ def _check_view(document: GltfDocument, number: int, view: dict) -> None:
 
 
 def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int, strided: bool = False) -> np.ndarray:
-    """Returns a view of `count` elements of `size` bytes; `place` has a bufferView and perhaps a byteOffset."""
+    """Returns uint8 [count, size]: elements from the bufferView and byteOffset in `place`, a part of an accessor."""
     view = document.item("bufferViews", place["bufferView"])
     offset, length = place.get("byteOffset", 0), view["byteLength"]
     stride = view.get("byteStride", size) if strided else size
@@ -410,7 +411,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
             for number, name in sorted(sets.items()):
                 values = floats(attributes[name], "VEC2")
                 if len(values) != len(local):
-                    raise WlmError(f"{where}: {name}: expected {len(local)} vertices as POSITION, found {len(values)}")
+                    raise WlmError(f"{where}: {name}: expected {len(local)} UVs, like POSITION, found {len(values)}")
                 uv[number] = values[row]
             triangle = triangle.reshape(-1, 3).astype(np.int32)
             mirrored = bool(np.linalg.det(transform[:3, :3]) < 0)
@@ -540,7 +541,7 @@ def _split_glb(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes 
     while at + 8 <= length:
         size, kind = struct.unpack_from("<2I", data, at)
         if at + 8 + size > length:
-            raise WlmError(f"{path}: a chunk at byte {at} of {size} bytes goes beyond the file's {length}")
+            raise WlmError(f"{path}: the chunk of {size} bytes at byte {at} exceeds the file of {length} bytes")
         chunks.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
     if JSON_CHUNK not in chunks:
@@ -551,7 +552,7 @@ def _split_glb(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes 
 def _load_buffers(
     path: str | os.PathLike[str], buffers: Sequence[dict[str, Any]], binary: bytes | None, trust: bool
 ) -> tuple[bytes, ...]:
-    """Returns the bytes of each buffer, at least the stated number; with `trust` also of files outside the folder."""
+    """Returns the bytes of each buffer, from files in the document's folder or, with `trust`, in any folder."""
     files: dict[Path, int] = {}
     return tuple(_load_buffer(path, number, buffer, binary, trust, files) for number, buffer in enumerate(buffers))
 
@@ -576,10 +577,10 @@ def _load_buffer(
         if not isinstance(length, int) or length < 1:
             raise WlmError(f"{where}.byteLength: expected at least 1, found {length}")
         file = local_file(str(path), uri, f"{where}.uri", trust).resolve()
-        # One file, read once per buffer of thousands, would exhaust the memory.
+        # Thousands of buffers of one file, each read separately, would exhaust the memory.
         earlier = files.setdefault(file, number)
         if earlier != number:
-            raise WlmError(f"{where}.uri: expected a file other than that of buffers[{earlier}], found {uri}")
+            raise WlmError(f"{where}.uri: expected another file, since buffers[{earlier}] already names {uri}")
         data = read_file(file, MESH_BYTES, f"buffers[{number}] of {path}", first=length)
     if len(data) < length:
         raise WlmError(f"{where}: expected {length} bytes, found {len(data)}")

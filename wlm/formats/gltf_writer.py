@@ -190,7 +190,7 @@ class _Tree:
             self.payloads = [self.payloads[number] for number in numbers]
 
     def _keep(self, kind: str, slots: Callable[[dict], Iterable[tuple[dict, str]]]) -> list[int]:
-        """Drops the entries of list `kind` that no reference in `slots` uses; returns the old indices of the others."""
+        """Drops the entries of list `kind` that no reference in `slots` uses; returns the old indices of those kept."""
         places = list(slots(self.content))
         numbers = sorted({holder[key] for holder, key in places})
         new = {old: number for number, old in enumerate(numbers)}
@@ -200,7 +200,7 @@ class _Tree:
         return numbers
 
     def _gathered(self, number: int, rows: np.ndarray, bounds: bool) -> int:
-        """Adds an accessor with the given rows of another accessor, in its encoding; returns the new index."""
+        """Adds an accessor with some rows of accessor `number`, encoded as before; returns the new accessor's index."""
         old = self._document.content["accessors"][number]
         values = elements(self._document, number)[rows]
         extra = {"normalized": True} if old.get("normalized", False) else {}
@@ -239,7 +239,6 @@ class _Tree:
 
 
 def _check(new: Replacement, uv_set: int) -> None:
-    """Raises an error if a replacement is invalid."""
     where = new.primitive.name
     if uv_set < 0 or uv_set in new.primitive.uv:
         raise ValueError(f"uv_set: expected a UV set that {where} does not have, got {uv_set}")
@@ -273,7 +272,7 @@ def _accessor_slots(content: dict) -> Iterator[tuple[dict, str]]:
 
 
 def _view_slots(content: dict) -> Iterator[tuple[dict, str]]:
-    """Yields every reference to a buffer view in core glTF."""
+    """Yields every reference to a buffer view in core glTF, as an object and its key."""
     for accessor in content["accessors"]:
         sparse = accessor.get("sparse", {})
         for holder in (accessor, sparse.get("indices", {}), sparse.get("values", {})):

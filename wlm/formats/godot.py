@@ -124,7 +124,7 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
     """Reads the meshes that use a bake's lightmaps, and their rectangles.
 
     Raises:
-        WlmError: The file is missing, is not a bake, is damaged, or has other values in their place.
+        WlmError: The file is missing, is not a bake, is damaged, or its list of meshes has values of other types.
     """
     reader = _reader(path)
     names, external = _open(reader)
@@ -138,7 +138,7 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
             for _ in range(reader.u32() & 0x7FFFFFFF):
                 reader.expect(name, _OBJECT, "a texture")
                 if reader.u32() != _EXTERNAL or (index := reader.u32()) >= len(external):
-                    raise WlmError(f"{path}: {name}: expected textures in files of their own")
+                    raise WlmError(f"{path}: {name}: expected references to texture files, found an embedded texture")
                 textures.append(external[index])
         elif name == _USERS:
             reader.expect(name, _ARRAY, "an array")
@@ -178,9 +178,9 @@ def relit(path: str | os.PathLike[str], sh: np.ndarray) -> bytes:
     """
     points, colours, reader, at = _read(path)
     if bytes(reader.data[:4]) != b"RSRC":
-        raise WlmError(f"{path}: the bake is compressed: expected one saved without compression, to replace its light")
+        raise WlmError(f"{path}: the bake is compressed; save it without compression to replace its light")
     if sh.shape != (len(points), COEFFICIENTS, 3):
-        raise ValueError(f"expected ({len(points)}, {COEFFICIENTS}, 3), got {sh.shape}")
+        raise ValueError(f"sh: expected the shape ({len(points)}, {COEFFICIENTS}, 3), got {sh.shape}")
     changed = colours.reshape(len(points), COEFFICIENTS, 4)
     changed[..., :3] = sh
     light = changed.astype(f"{reader.order}f4").tobytes()
@@ -264,7 +264,7 @@ def _open(reader: _Reader) -> tuple[list[str], list[str]]:
         reader.string()
         offset = reader.u64()  # the last is the main resource
     if offset is None:
-        raise WlmError(f"{path}: expected at least one resource inside, found none")
+        raise WlmError(f"{path}: the file contains no resource: expected at least one")
     reader.seek(offset)
     reader.string()  # the type, repeated
     return names, external
@@ -287,7 +287,7 @@ class _Reader:
         left = len(self.data) - self.position
         if count > left:
             raise WlmError(
-                f"{self.path}: cut short or damaged: expected {count} bytes at {self.position}, found {left}"
+                f"{self.path}: cut short or damaged: expected {count} bytes at byte {self.position}, found {left}"
             )
         piece = self.data[self.position : self.position + count]
         self.position += count
@@ -313,7 +313,7 @@ class _Reader:
         if index & 0x80000000:
             return self._text(index & 0x7FFFFFFF)
         if index >= len(names):
-            raise WlmError(f"{self.path}: damaged: expected a name below {len(names)}, found {index}")
+            raise WlmError(f"{self.path}: damaged: expected an index of a name below {len(names)}, found {index}")
         return names[index]
 
     def key(self) -> str | None:
@@ -412,11 +412,10 @@ class _Reader:
 
 
 def _decompress(reader: _Reader) -> bytes:
-    """Decompresses the blocks of a compressed resource."""
     path = reader.path
     mode, block, total = reader.u32(), reader.u32(), reader.u32()
     if mode != _ZSTD:
-        raise WlmError(f"{path}: compression: expected Zstandard ({_ZSTD}), found {mode}: save without compression")
+        raise WlmError(f"{path}: compression: expected Zstandard ({_ZSTD}), found {mode}; save it without compression")
     if not 0 < block <= _LARGEST_BLOCK:
         raise WlmError(f"{path}: compression: expected blocks of 1 to {_LARGEST_BLOCK} bytes, found {block}")
     # The last block contains the rest and is stored even if it is empty.
@@ -444,7 +443,8 @@ def lmbake_bytes(
         sh: [N, 9, 3], the numbers that the module's description defines.
         tetrahedra: int [T, 4], indices of points.
         planes: [M, 4], planes n x = d of a BSP tree.
-        children: int [M, 2], each node's child where n x > d, then the other: a node, or -1 - t for tetrahedron t.
+        children: int [M, 2], two children per node: on the side n x > d, and on the other side; each is the index of a
+            node, or -1 - t for tetrahedron t.
     """
     low, high = points.min(0), points.max(0)
     node = np.zeros((len(planes), 6), "<u4")

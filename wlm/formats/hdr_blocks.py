@@ -94,7 +94,7 @@ def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
     Args:
         block: Width and height of a block in texels, one of `ASTC_BLOCKS`.
         quality: Effort of the encoder, 0 (fastest) to 100 (exhaustive); decoding does not depend on it.
-        extra: Name of the optional extra for the error message that the package is missing.
+        extra: Name of the optional extra of wlm that installs the encoder, for the error message.
     """
     return _astc(need("astc_encoder", extra), block, quality)
 

@@ -107,9 +107,9 @@ def write_ktx2(
     if fmt not in VK_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")
     if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
-        raise ValueError(f"expected sides of 1 to {_MAX_SIDE} texels, got {width}x{height}")
+        raise ValueError(f"expected a width and a height of 1 to {_MAX_SIDE} texels, got {width}x{height}")
     if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in _CHANNELS):
-        raise ValueError(f"depth: expected 0 to {_MAX_DEPTH} slices of texels, got {depth} of {fmt}")
+        raise ValueError(f"depth: expected 0 to {_MAX_DEPTH}, and 0 for a format of blocks, got {depth} for {fmt}")
     most = 0 if depth else max(width, height).bit_length() - 1
     if not 0 <= mips <= most:
         raise ValueError(f"mips: expected 0 to {most}, got {mips}")
@@ -248,7 +248,7 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
         for field, found in (("byteLength", stored), ("uncompressedByteLength", size))[scheme != _NONE :]:
             if found != expected:
                 raise WlmError(
-                    f"{path}: {field} of level 0: expected {expected}, of {width} x {height} {name}, found {found}"
+                    f"{path}: {field} of level 0: {width} x {height} {name} need {expected} bytes, found {found}"
                 )
         if stored > 2 * expected + 1024:  # no compressor expands data further
             raise WlmError(f"{path}: byteLength of level 0: expected at most {2 * expected + 1024}, found {stored}")
@@ -278,7 +278,7 @@ def _part(
     file.seek(start)
     data = file.read(min(size, most))
     if len(data) != min(size, most):
-        raise WlmError(f"{path}: {what}: expected {min(size, most)} bytes, found another number: does it change?")
+        raise WlmError(f"{path}: {what}: expected {min(size, most)} bytes, found {len(data)}; has the file changed?")
     return data
 
 

@@ -105,13 +105,13 @@ def check_sides(where: str, width: int, height: int) -> None:
 def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure: int = SURE_BYTES) -> None:
     """Checks the claimed size of decompressed data in bytes, `large`, against the compressed size, `small`.
 
-    It may be `sure` bytes or `growth` times the compressed size, whichever is more; `where` names the file and the
-    field.
+    The claimed size may be `sure` bytes or `growth` times the compressed size, whichever is more. `where` names the
+    file and the field in the message.
 
     Raises:
         WlmError: The claimed size is larger.
     """
     if large > max(sure, growth * small):
         raise WlmError(
-            f"{where}: expected at most {growth} times its {small} bytes once unpacked, found a size of {large}"
+            f"{where}: expected at most {growth} times its {small} compressed bytes, found {large} unpacked bytes"
         )

@@ -64,7 +64,7 @@ def locked(output: str | os.PathLike[str]) -> Iterator[None]:
 def temporary(target: Path, *, folder: bool = False) -> Iterator[Path]:
     """Yields the path of an empty file or folder beside its destination, and removes it at the end if it still exists.
 
-    `target` has no links. The name is short, since the name of the destination may have the longest length allowed.
+    `target`, the destination, contains no links. The temporary name is short, since that of `target` may be very long.
 
     Raises:
         OSError: The file or folder cannot be made.
@@ -89,7 +89,7 @@ def temporary(target: Path, *, folder: bool = False) -> Iterator[Path]:
 
 
 def sweep(target: Path) -> None:
-    """Removes the temporary files that killed processes left beside a file or folder and in the folder."""
+    """Removes the temporary files that killed processes left beside `target` and, if it is a folder, in it."""
     stem = _stem(target)
     for parent, prefix in ((target.parent, f"{stem}-"), (target, ".wlm-")):
         with suppress(OSError):
@@ -130,7 +130,7 @@ def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
 
 
 def _make(path: Path, folder: bool) -> int | None:
-    """Makes a file or folder and locks it; returns the handle of the lock, or None without locks."""
+    """Makes a file or folder and locks it; returns its handle, or None on a system without locks."""
     if folder:
         path.mkdir()
     else:
@@ -146,7 +146,6 @@ def _make(path: Path, folder: bool) -> int | None:
 
 
 def _remove_if_dead(path: Path) -> None:
-    """Removes a temporary file or folder whose process has ended."""
     if fcntl is None:
         return
     with suppress(OSError):

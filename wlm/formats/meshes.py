@@ -71,7 +71,7 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
 
 
 def _checked(mesh) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """Extracts the positions, UVs or None, and triangles of a mesh; wrong numbers raise ValueError."""
+    """Returns the positions, UVs (None if it has none) and triangles of a trimesh; ValueError for wrong numbers."""
     position, triangle = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     uv = getattr(mesh.visual, "uv", None)
     if uv is not None and len(uv):
@@ -85,5 +85,5 @@ def _checked(mesh) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         if values is not None and not np.isfinite(values).all():
             raise ValueError(f"expected finite {name}, found NaN or infinity")
     if triangle.size and not 0 <= triangle.min() <= triangle.max() < len(position):
-        raise ValueError(f"expected vertices 0 to {len(position) - 1} in triangles")
+        raise ValueError(f"expected vertices below {len(position)}, found {triangle.min()} to {triangle.max()}")
     return position, uv, triangle.reshape(-1, 3)

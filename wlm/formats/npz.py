@@ -32,9 +32,9 @@ def read_npz(
 
     Args:
         path: The file.
-        choose: Selects from the names of the arrays. It may raise WlmError.
+        choose: Gets the names of all arrays and returns those to read; may raise WlmError.
         numbers: Largest allowed number of values in an array.
-        sure: Bytes of an array that are allowed for any compressed size; see `check_growth`.
+        sure: Size in bytes that an array may have however small its compressed data is; see `check_growth`.
 
     Returns:
         The selected arrays by name. None of them contains Python objects.
@@ -45,9 +45,9 @@ def read_npz(
     # A malicious file can make zipfile and NumPy raise nearly any exception: NumPy parses the header as Python.
     with damaged(f"{path}: cannot read the arrays", Exception), open_file(path, "the arrays") as file:
         if os.fstat(file.fileno()).st_size > VOLUME_BYTES:
-            raise WlmError(f"{path}: cannot read the arrays: expected at most {VOLUME_BYTES} bytes")
+            raise WlmError(f"{path}: cannot read the arrays: expected a file of at most {VOLUME_BYTES} bytes")
         if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
-            raise WlmError(f"{path}: expected a .npz file of several arrays, found a single array")
+            raise WlmError(f"{path}: expected a .npz file, which names its arrays, found a .npy file of one array")
         with zipfile.ZipFile(file) as archive:
             members = {info.filename.removesuffix(_SUFFIX): info for info in archive.infolist()}
             arrays = {}

@@ -1,7 +1,7 @@
 """Validation of the parts of a file against a table of types, shapes and ranges, before they are used.
 
 The digest of an artifact detects damage but not malice, since anyone can compute it. So the content of a part is
-trusted no more than that of a file without a digest.
+checked as if the file had no digest.
 """
 
 from collections.abc import Mapping
@@ -16,13 +16,13 @@ _PIECE = 1 << 20  # numbers checked at once, which bounds the memory of masks
 
 @dataclass(frozen=True)
 class Part:
-    """One row of the table of parts of a file.
+    """The requirements for one array of a file, called a part.
 
     Attributes:
         dtype: NumPy type, or the allowed types.
         shape: Length of each axis; None allows any length. A part without elements is left out of the file.
         optional: Whether the file may lack the part, which is then empty along its first axis.
-        least, most: Bounds of the numbers, or None. NaN violates any bound.
+        least, most: Smallest and largest allowed number, or None for no bound. NaN violates any bound.
         finite: Whether floats must be finite.
     """
 

@@ -75,7 +75,7 @@ def _header(path: str | os.PathLike[str], head: bytes) -> tuple[list[bytes], int
     end = head.find(b"\n", blank + 2)
     if blank < 0 or end < 0:
         raise WlmError(
-            f"{path}: expected a header that ends in an empty line and a size within {_HEADER_BYTES} bytes, found none"
+            f"{path}: expected an empty line and then the size within the first {_HEADER_BYTES} bytes, found neither"
         )
     return [*head[:blank].split(b"\n"), head[blank + 2 : end].strip()], end + 1
 
@@ -98,10 +98,10 @@ def _factor(path: str | os.PathLike[str], lines: list[bytes]) -> tuple[float, fl
             numbers = []
         wanted = 3 if name == "COLORCORR" else 1
         if len(numbers) != wanted or not all(math.isfinite(number) and number > 0 for number in numbers):
-            raise WlmError(f"{path}: {name}: expected finite numbers above 0, {wanted} of them, found {value[:40]}")
+            raise WlmError(f"{path}: {name}: expected {wanted} finite number(s) above 0, found {value[:40]}")
         if name == "GAMMA":
             if numbers != [1.0]:
-                raise WlmError(f"{path}: GAMMA: expected linear light, 1, found {numbers[0]:g}")
+                raise WlmError(f"{path}: GAMMA: expected 1 (linear light), found {numbers[0]:g}")
             continue
         product = [old * new for old, new in zip(product, numbers * (3 // wanted), strict=True)]
     if not all(math.isfinite(factor) and factor > 0 for factor in product):
@@ -117,7 +117,7 @@ def _decode(path: str | os.PathLike[str], data: bytes, rows: int, columns: int) 
     try:
         # The old code repeats a texel by a texel of mantissas 1, 1, 1, which the decoder would take for a colour.
         if data[:2] != b"\2\2" and (texels[:, :3] == 1).all(axis=1).any():
-            raise ValueError("found a repeat of the run-length code of before 1991")
+            raise ValueError("it uses the run-length code of before 1991, which is not read")
         # The decoder knows one orientation; the caller turns the picture.
         canonical = b"#?RADIANCE\nFORMAT=%s\n\n-Y %d +X %d\n" % (_FORMAT.encode(), rows, columns)
         codecs.rgbe_decode(canonical + data, out=pixels)

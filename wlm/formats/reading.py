@@ -32,7 +32,7 @@ def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
     except OSError as error:
         raise WlmError(f"{path}: cannot read {what}: {error.strerror or error}") from error
     except ValueError as error:  # a NUL or an unpaired surrogate
-        raise WlmError(f"{path}: cannot read {what}: a file cannot have that name") from error
+        raise WlmError(f"{path}: cannot read {what}: the name has a NUL or invalid Unicode") from error
     try:
         # Checked after opening: before, the name could be given to another file.
         if not stat.S_ISREG(os.fstat(handle).st_mode):
@@ -61,7 +61,7 @@ def read_file(path: str | os.PathLike[str], limit: int, what: str, first: int | 
         # One byte more than the size, to detect that the file grows.
         data = file.read(wanted + (first is None))
     if len(data) != wanted:
-        raise WlmError(f"{path}: cannot read {what}: expected {wanted} bytes, found another number: does it change?")
+        raise WlmError(f"{path}: cannot read {what}: expected {wanted} bytes, found {len(data)}; has it changed?")
     return data
 
 
@@ -114,7 +114,7 @@ def named_file(document: str | os.PathLike[str], name: str, where: str, trust: b
         plain = name not in (".", "..") and os.path.basename(name) == name and not os.path.islink(path)
         inside = trust or plain or path.resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError) as error:  # a name that is too long or has a NUL, or a cycle of links
-        raise WlmError(f"{where}: cannot follow the name {name}: {error}") from error
+        raise WlmError(f"{where}: cannot resolve the file name {name}: {error}") from error
     if not inside:
         raise WlmError(
             f"{where}: expected a file within {folder}, found {name}; trust=True (--trust on the command line) "

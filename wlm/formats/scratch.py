@@ -26,7 +26,7 @@ def room(shape: tuple[int, ...], dtype: type[np.generic] | np.dtype, where: str,
         shape: Shape of the array.
         dtype: Type of its values.
         where: Purpose of the array for messages.
-        beside: Bytes of other arrays that count towards the limit.
+        beside: Bytes of other arrays, which count towards the limit of memory, `IN_MEMORY`.
 
     Returns:
         An ordinary array.
@@ -42,14 +42,13 @@ def room(shape: tuple[int, ...], dtype: type[np.generic] | np.dtype, where: str,
             _fill(file.fileno(), size)
             return np.frombuffer(mmap.mmap(file.fileno(), size), dtype).reshape(shape)
     except MemoryError as error:
-        raise WlmError(f"{where}: {size:,} bytes: {error}") from error
+        raise WlmError(f"{where}: needs {size:,} bytes of memory: {error}") from error
     except OSError as error:
         reason = error.strerror or error
-        raise WlmError(f"{where}: {size:,} bytes in {tempfile.gettempdir()} (TMPDIR): {reason}") from error
+        raise WlmError(f"{where}: needs {size:,} bytes in {tempfile.gettempdir()} (TMPDIR): {reason}") from error
 
 
 def _fill(handle: int, size: int) -> None:
-    """Allocates the space of a file, filled with zeros."""
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(handle, 0, size)
         return

@@ -74,7 +74,7 @@ class LightingData:
     Attributes:
         position: float64 [N, 3], positions of the light probes in Unity's axes.
         values: float64 [N, 9, 3], coefficients of `SphericalHarmonicsL2`.
-        rectangles: The rectangles of the renderers with a lightmap, in the order of the file, which has no names.
+        rectangles: One for each renderer with a lightmap, in the order of the file, which does not name renderers.
     """
 
     position: np.ndarray
@@ -86,7 +86,7 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
     """Reads the light probes and lightmap rectangles of an asset.
 
     Raises:
-        WlmError: UnityPy is missing; or the file is missing, damaged, text, a bundle or without lighting data.
+        WlmError: UnityPy is missing; or the file is missing, damaged, YAML text, an asset bundle, or has no such data.
     """
     need("UnityPy", _EXTRA)
     data = read_file(path, _BYTES, "the asset")
@@ -108,7 +108,7 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
                 continue
             place, light = _columns(arrays[_POSITIONS], ["x", "y", "z"]), _columns(arrays[_LIGHT], _NAMES)
             if len(place) != len(light):
-                raise WlmError(f"{path}: expected light for each of {len(place)} probes, found that of {len(light)}")
+                raise WlmError(f"{path}: expected light for each of {len(place)} probes, found light for {len(light)}")
             positions.append(place)
             values.append(light.reshape(-1, _CHANNELS, _COEFFICIENTS).transpose(0, 2, 1))
     position = np.concatenate(positions)
@@ -122,7 +122,7 @@ _NAMES = [f"sh[{i:2d}]" for i in range(_COEFFICIENTS * _CHANNELS)]
 
 
 def list_objects(path: str | os.PathLike[str], data: bytes) -> list[tuple[str, Any, bytes, str]]:
-    """Lists the type, layout, bytes and byte order of each object in a file; only the type for types that are not read.
+    """Returns the type, layout, bytes and byte order of each object; the layout is None for types that are not read.
 
     Raises:
         ValueError: UnityPy cannot read the file.
@@ -139,7 +139,7 @@ def list_objects(path: str | os.PathLike[str], data: bytes) -> list[tuple[str, A
     found = []
     for kind, tree, start, size, order in json.loads(run.stdout):
         if tree is not None and not 0 <= start <= start + size <= len(data):
-            raise ValueError(f"an object of {size} bytes at {start} in a file of {len(data)}")
+            raise ValueError(f"an object of {size} bytes at {start} exceeds the file of {len(data)} bytes")
         found.append((kind, tree, data[start : start + size] if tree is not None else b"", order))
     return found
 
@@ -163,7 +163,7 @@ class _Walk:
             self._step(node, node[1])
             if len(self._found) == len(self._wanted):  # the rest of the object is not needed
                 return self._found
-        raise ValueError(f"{min(self._wanted - self._found.keys())} is missing")
+        raise ValueError(f"the array {min(self._wanted - self._found.keys())} is missing")
 
     def _step(self, node: Any, path: str) -> None:
         self._steps += 1
@@ -191,7 +191,7 @@ class _Walk:
                 self._found[path] = np.frombuffer(rows, kind)
             return
         if path in self._wanted:
-            raise ValueError(f"{path}: expected an array of numbers of one size")
+            raise ValueError(f"{path}: expected an array of numbers, found values of varying size")
         for _ in range(count):
             self._step(element, path)
 
@@ -210,12 +210,12 @@ class _Walk:
     def _count(self) -> int:
         count = struct.unpack(self._order + "i", self._take(4))[0]
         if count < 0:
-            raise ValueError(f"an array of {count} values")
+            raise ValueError(f"expected an array of 0 or more values, found {count}")
         return count
 
     def _take(self, size: int) -> bytes:
         if size > len(self._data) - self._at:
-            raise ValueError(f"expected {size} bytes at {self._at}, found {len(self._data) - self._at}")
+            raise ValueError(f"expected {size} bytes at byte {self._at}, found {len(self._data) - self._at}")
         self._at += size
         return self._data[self._at - size : self._at]
 

@@ -13,7 +13,7 @@ MEMORY = 2 << 30
 """Limit of its memory, in bytes, on systems that can set one."""
 
 SECONDS = 4
-"""Limit of its CPU time, in seconds, likewise."""
+"""Limit of its CPU time, in seconds, on systems that can set one."""
 
 
 def main(path: str, kinds: list[str]) -> None:
@@ -42,7 +42,7 @@ def main(path: str, kinds: list[str]) -> None:
 
 
 def _tree(node: Any) -> Any:
-    """Returns a layout: type, name, flags and children."""
+    """Returns a layout as a list: type, name, flags, and the list of the children's layouts."""
     return node and [node.m_Type, node.m_Name, node.m_MetaFlag, [_tree(each) for each in node.m_Children]]
 
 

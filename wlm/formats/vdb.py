@@ -102,7 +102,7 @@ class VdbFile:
         cursor = _Cursor(self._data)
         magic, version = cursor.unpack("<qI")
         if magic != _MAGIC:
-            raise WlmError(f"{self._where}: expected an OpenVDB file, found another")
+            raise WlmError(f"{self._where}: expected an OpenVDB file, found other content")
         if not _OLDEST <= version <= _NEWEST:
             raise WlmError(
                 f"{self._where}: expected version {_OLDEST} to {_NEWEST} of OpenVDB's files, found {version}"
@@ -134,16 +134,15 @@ class VdbFile:
 
 
 class _Cursor:
-    """A read position in bytes."""
+    """A position in the bytes of a file, from which values are read."""
 
     def __init__(self, data: bytes, at: int = 0) -> None:
         self.data, self.at = data, at
 
     def take(self, count: int) -> bytes:
-        """Returns the next bytes."""
         end = self.at + count
         if not 0 <= self.at <= end <= len(self.data):
-            raise ValueError(f"it ends before its byte {end}")
+            raise ValueError(f"the file ends before byte {end}")
         piece = self.data[self.at : end]
         self.at = end
         return piece
@@ -158,7 +157,6 @@ class _Cursor:
         return self.take(length).decode("utf-8", "replace")
 
     def metadata(self) -> None:
-        """Skips metadata."""
         for _ in range(self.unpack("<I")[0]):
             self.text()
             self.text()
@@ -179,7 +177,7 @@ class _Tree:
         self._corners: list[np.ndarray] = []  # the corners of leaves
         self._masks: list[bytes] = []
         if cursor.unpack("<I") != (1,):
-            raise ValueError("expected a tree of one buffer")
+            raise ValueError("expected a tree with one value buffer per leaf, found another number")
         self._background, tiles, children = cursor.unpack("<fII")
         for _ in range(tiles):
             *corner, value, active = cursor.unpack("<3if?")
@@ -207,11 +205,11 @@ class _Tree:
                 self._node(place, _LOWER, _LEAF)
 
     def _check_places(self) -> None:
-        """Raises an error if two nodes have the same place, which would multiply the work for a byte of the file."""
+        """Raises an error if two nodes cover the same voxels: a small malicious file could cause much work."""
         leaves = np.concatenate([np.zeros((0, 3)), *self._corners])
         tiles = np.array([[*tiles.corner, tiles.edge] for tiles in self._tiles]).reshape(-1, 4)
         if any(len(np.unique(places, axis=0)) < len(places) for places in (leaves, tiles)):
-            raise ValueError("expected nodes at different places, found two at one")
+            raise ValueError("expected nodes at different positions, found two at the same position")
 
     def dense(self, most: int) -> tuple[tuple[int, int, int], np.ndarray]:
         """Returns the lowest voxel of the active voxels' bounding box, and the values in the box, float32 [X, Y, Z]."""
@@ -294,7 +292,7 @@ class _Tree:
             elif packed > 0:
                 piece = zlib.decompressobj().decompress(piece, size + 1)
             if len(piece) != size:
-                raise ValueError(f"expected {size} bytes once unpacked, found another number")
+                raise ValueError(f"expected {size} bytes after decompression, found at least {len(piece)}")
         else:
             piece = cursor.take(size)
         return np.frombuffer(piece, "<f2" if self._half else "<f4").astype(np.float32)

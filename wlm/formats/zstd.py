@@ -40,13 +40,13 @@ def decompress(frame: bytes, size: int, name: str) -> bytes:
     try:
         stated = zstandard.frame_content_size(frame)
         if stated != size:
-            raise ValueError(f"{name}: expected {size} bytes, found a frame of {stated}")
+            raise ValueError(f"{name}: expected a frame of {size} decompressed bytes, found {stated}")
         reader = zstandard.ZstdDecompressor().decompressobj(read_across_frames=False)
         unpacked = reader.decompress(frame)
     except zstandard.ZstdError as error:
         raise ValueError(f"{name}: {error}") from error
     if len(unpacked) != size or not reader.eof or reader.unused_data:
-        raise ValueError(f"{name}: expected one whole frame of {size} bytes")
+        raise ValueError(f"{name}: expected one complete frame of {size} decompressed bytes, found other data")
     return unpacked
 
 
@@ -69,17 +69,17 @@ def unpack_parts(tensors: Mapping[str, np.ndarray], shapes: Shapes, table: Mappi
     """Decompresses the parts that `pack_parts` compressed; `check_parts` still has to check their values.
 
     Raises:
-        ValueError: A frame is damaged, is not in the table, or claims far more bytes than it can hold.
+        ValueError: A frame is damaged, a part is not in the table, or a shape needs more bytes than a frame can hold.
     """
     result = dict(tensors)
     for name, shape in shapes.items():
         if name not in table or name not in tensors:
-            raise ValueError(f"setting parts: {one_line(name, 60)} is none of the file's")
+            raise ValueError(f"setting parts: the file has no part {one_line(name, 60)}")
         frame = check_part(tensors, name, Part(np.uint8, (None,)))
         dtype = np.dtype(table[name].dtype).newbyteorder("<")
         size = math.prod(shape) * dtype.itemsize
         if len(shape) > _MOST_AXES or size > _limit(len(frame)):
-            raise ValueError(f"part {name}: {shape}: expected what {len(frame)} bytes can hold")
+            raise ValueError(f"part {name}: the shape {shape} is too large for {len(frame)} compressed bytes")
         data = decompress(frame.tobytes(), size, f"part {name}")
         result[name] = np.frombuffer(data, dtype).reshape(shape).astype(dtype.newbyteorder("="), copy=False)
     return result

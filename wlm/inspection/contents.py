@@ -36,7 +36,7 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
     if is_six_way(path):
         return "six-way", paths
     if len(paths) > 1:
-        raise WlmError(f"{paths[1]}: expected one file; only smoke has several, one EXR a frame")
+        raise WlmError(f"{paths[1]}: expected one file; only six-way lightmaps may be several, an EXR per frame")
     if path.is_dir():
         if (path / SCENE_FILE).is_file():
             return "volume", paths

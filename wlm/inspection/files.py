@@ -95,7 +95,7 @@ def file_system(path: Path) -> str:
 
 
 def document_of(path: Path) -> str | None:
-    """Returns the description of a JSON file that wlm knows; None for other files and unreadable ones."""
+    """Returns the description of a JSON file that an export of wlm contains; None for other or unreadable files."""
     try:
         content = read_json_file(path, "the file")
     except WlmError:
@@ -147,7 +147,6 @@ def _probes(path: Path) -> Finding:
 
 
 def _lmbake(path: Path) -> Finding:
-    """Describes the probes of a Godot bake and the lightmap of its meshes."""
     found = _probes(path)
     try:
         bake = read_users(path)
@@ -250,7 +249,7 @@ def _kind_of_json(path: Path) -> str:
 
 
 def _unity_asset(path: Path) -> Finding:
-    """Describes lighting data of Unity, which needs an extra to be read."""
+    """Describes lighting data of Unity, which an optional package reads."""
     data = read_lighting_data(path)
     rectangles = f"{len(data.rectangles)} rectangles of renderers in lightmaps, without names"
     if not len(data.position):
@@ -260,7 +259,7 @@ def _unity_asset(path: Path) -> Finding:
 
 
 class _Kind(NamedTuple):
-    """A kind of file: the function that describes it, and the system that compresses it, "" for none."""
+    """A kind of file: the function that describes it, and the name of the system that compresses it, "" for none."""
 
     inspect: Callable[[Path], Finding]
     system: str = ""

@@ -59,11 +59,11 @@ def inspect(path: str | os.PathLike[str]) -> list[Finding]:
 
 
 def input_system(path: str | os.PathLike[str]) -> str:
-    """Finds the system that compresses a file or folder, from names and headers alone: "lightmap", "atlas", "probe" or
+    """Finds the system that compresses a file or folder, from names and headers: "lightmap", "atlas", "probe" or
     "smoke".
 
     Raises:
-        WlmError: It does not exist or cannot be read, or it is not one of these inputs; the line says what to do.
+        WlmError: It does not exist, cannot be read, or is no input of these systems; the message says what to do.
     """
     path = Path(path)
     if not path.exists():
@@ -133,7 +133,6 @@ _Found = list[tuple[Finding, set[Path]]]
 
 
 def _documents(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes a folder by the JSON documents in it."""
     documents = [file for file in files if file.suffix.lower() == ".json"]
     for file in sorted(documents, key=lambda file: file.name != SET_FILE)[:_DOCUMENTS]:
         if file.name == SET_FILE:

@@ -95,7 +95,7 @@ def inspect_picture(path: Path) -> Finding:
     """
     picture, name = picture_of(path), path.name.lower()
     if picture is None:
-        raise WlmError(f"{path}: expected a picture")
+        raise WlmError(f"{path}: expected an EXR, Radiance, KTX2, DDS or PNG picture")
     if picture.is_six_way:
         what = f"six-way lightmaps of smoke, {picture.size}"
         return Finding(path, what, command("smoke", "flipbook", path, "-o", "OUT.png"))
@@ -145,7 +145,7 @@ def _from_level(light: np.ndarray) -> float:
 
 
 def read_lit(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the texels of a lightmap that are inside charts or lit, bool [H, W], and the problems of its values.
+    """Finds the texels of a lightmap that are inside charts or not black, bool [H, W], and lists unusual values.
 
     Raises:
         WlmError: The file cannot be read.

@@ -39,7 +39,6 @@ def named(path: Path, files: Sequence[Path]) -> set[Path]:
 
 
 def _checked(folder: Path, listing: Listing) -> Finding:
-    """Describes a set of lightmaps over time and its problems."""
     missing = [file.name for file in listing.files if not file.is_file()]
     problems = [f"{missing[0]} is missing" + f", and {len(missing) - 1} more" * (len(missing) > 1)] if missing else []
     files = list(dict.fromkeys(file for file in listing.files if file.is_file()))

@@ -90,8 +90,7 @@ def fields_struct(stored: type) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """The smoke: density and temperature of each cell, flat arrays [cells] of one type, float or half. The temperature
-    has shape [0] if the smoke has none."""
+    """The smoke: flat arrays [cells] of one type, float or half; [0] for the temperature of smoke that has none."""
 
     density: wp.array
     temperature: wp.array
@@ -107,14 +106,9 @@ class Fields:
 def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, hot: bool) -> wp.Kernel:
     """Builds (once) a kernel that advects smoke; a thread computes a run: neighbouring cells along x.
 
-    Without solids the code is half as long, and without temperatures it uses fewer registers.
-
-    Args:
-        correcting: Whether the kernel does the second half of a MacCormack step; else it does a semi-Lagrangian step.
-        stored: Type of the stored values, `wp.float32` or `wp.float16`.
-        in_bricks: Whether only the bricks in the list of `Bricks` are computed, else all cells.
-        solids: Whether there are solid cells.
-        hot: Whether the smoke has a temperature.
+    With `correcting` the kernel does the second half of a MacCormack step, else a semi-Lagrangian step. Values are of
+    the type `stored`, `wp.float32` or `wp.float16`. With `in_bricks` only listed bricks are computed. Without `solids`
+    (solid cells) the code is half as long; without temperatures (`hot`) it uses fewer registers.
     """
     run = BRICK_RUN if in_bricks else RUN
     fields_type = fields_struct(stored)
@@ -150,7 +144,6 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def interpolate_beside(field: wp.array1d[stored], walls: wp.array1d[wp.uint8], box: Box, p: wp.vec3) -> float:
-        """Interpolates beside a solid: solid cells are excluded, and the other weights are scaled up."""
         at = stencil(box.n, box.periodic, p)
         total = float(0.0)
         weight = float(0.0)
@@ -191,10 +184,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         wall: wp.uint8,
     ):
         """Traces a point x back in time. Returns the end of the trace within the domain, whether the trace left the
-        domain through an open face, and whether its end is beside a solid.
-
-        `wall` is the mark of the coarse cell of x, see `mark_walls`; `v` and `f` are velocity and fractions at x.
-        """
+        domain through an open face, and whether its end is beside a solid; `wall` is the mark of the cell of x."""
         end = trace_back(box, u, around, f, x, v, dt)
         p = wp.vec3(end)
         left = bool(False)
@@ -218,7 +208,6 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
     @wp.func
     def first_of_run(box: Box, bricks: Bricks, i: int, k: int) -> wp.vec3i:
-        """Returns the first cell of run i of the domain or, with bricks, of run i modulo 64 of the k-th one listed."""
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])

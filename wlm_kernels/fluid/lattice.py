@@ -100,8 +100,7 @@ class Spec:
 
 @functools.cache
 def _relax(spec: Spec) -> Any:
-    """Builds (once) the collision: a function from the scaled populations that arrive at a cell, and their moments, to
-    the scaled populations that leave it."""
+    """Builds (once) the collision: a function from the populations that arrive at a cell to the ones that leave it."""
     velocities = lattice(spec.lattice)
     c, w, axes, flat = velocities.c, velocities.w, velocities.axes, velocities.axes == 2
     vec = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide).vec
@@ -111,8 +110,7 @@ def _relax(spec: Spec) -> Any:
 
     @wp.func
     def hermite(drho: float, j: wp.vec3, diagonal: wp.vec3, off: wp.vec3) -> vec:
-        """Returns the scaled populations that have the given density minus 1, momentum, and second-order Hermite
-        coefficients (diagonal and off-diagonal stress)."""
+        """Returns the populations with a given density minus 1, momentum, and stress (as Hermite coefficients)."""
         out = vec()
         rest = drho - 1.5 * (diagonal[0] + diagonal[1] + diagonal[2])
         out[0] = wp.static(w[0] * scale) * rest

@@ -8,14 +8,12 @@ pulls this population, population q of the periodic image of the cell a - c_q, i
 step the values of the links are computed from the populations f* that have just left the cells, and are then written
 into these elements. This takes two passes, since the element of one link may be read by another.
 
-- bounce: f_q = f*_opposite + term, half-way bounce-back; the term is 6 w_q c_q . u at a wall with the velocity u, for
-  a density of 1.
+- bounce: f_q = f*_opposite + term, half-way bounce-back; the term is 6 w_q c_q . u at a wall of velocity u.
 - inlet: the same formula; it adds a mass of u per cell of the face. The term may rise from 0 in the first steps.
 - slip: a wall without friction: the mirror image of the population that leaves the neighbouring cell.
 - outlet: the equilibrium at the cell's own density and velocity (zero gradient). It is then shifted, by w_q times the
   same factor at all outlets, so that outflow equals inflow: mass is conserved to rounding.
-- pressure: the outlet without the shift; the density relaxes towards a given density, and the term is this density
-  minus 1.
+- pressure: the outlet without the shift; its density relaxes towards a given density: the term, plus 1.
 
 Velocities into the domain are set to 0 at an outlet: backflow would feed on itself.
 """
@@ -101,8 +99,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
 
     @wp.func
     def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
-        """Returns the cell i and the velocity c of the population that a slip wall reflects into population q of
-        cell i."""
+        """Returns the cell and the velocity of the population that a slip wall reflects into population q of cell i."""
         p = cell_of(n, i)
         c = t.c[q]
         x = _beyond(p[0] - c[0], n[0], bounded[0])
@@ -116,7 +113,6 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
     def outflow(
         t: Tables, n: wp.vec3i, bounded: wp.vec3i, f: wp.array2d[stored], i: int, q: int, kind: int, term: float
     ) -> float:
-        """Computes the population that an outlet sends to cell i in direction q."""
         drho = float(0.0)
         j = wp.vec3()
         for k in range(t.w.shape[0]):

@@ -1,1 +1,1 @@
-"""Kernels for light probes: training and decoding of Gaussians, principal components, and cascaded volumes."""
+"""Kernels for light probes: Gaussians, principal components, and nested grids of light around a viewer."""

@@ -1,4 +1,4 @@
-"""Decodes probes from principal components, one thread per number; `wlm/probe/exact.py` is the reference."""
+"""Decodes light probes from principal components, one thread per number; `wlm/probe/exact.py` is the reference."""
 
 import warp as wp
 
@@ -30,15 +30,15 @@ def _decode_components(
 def decode_components(
     code: wp.array, bounds: wp.array, basis: wp.array, row: wp.array, numbers: wp.array, out: wp.array
 ) -> None:
-    """Decodes probes to their D numbers.
+    """Decodes light probes to their D numbers (light coefficients).
 
     Args:
-        code: uint8 [V, 1 + K], codes of magnitude and coefficients.
-        bounds: float [2, 1 + K], lowest value and step of each column.
-        basis: float16 [K, D]; empty for unit vectors.
-        row: int [N], row of each probe in `code`; -1 for a dead probe, which decodes to zero.
-        numbers: int [M], indices of probes, below N.
-        out: float [M, D], written.
+        code: uint8 [V, 1 + K], for each of V probes the codes of its magnitude and of its K coefficients.
+        bounds: float [2, 1 + K], for each column of `code` the value of code 0 and the step between codes.
+        basis: float16 [K, D], the principal components; empty: the coefficients are the probe's numbers, K = D.
+        row: int [N], row of each probe in `code`; -1 for a dead probe (without light), which decodes to 0.
+        numbers: int [M], indices of the probes to decode, below N.
+        out: float [M, D], the probes' numbers, written.
     """
     wp.launch(
         _decode_components, out.shape, inputs=[code, bounds, basis, row, numbers], outputs=[out], device=out.device

@@ -36,14 +36,16 @@ _PLACE_MARGIN = wp.constant(1.0e-6)
 
 @wp.struct
 class Cubes:
-    """A grid of cubes with lists of Gaussians; cube (i, j, k) has the index `(i * counts[1] + j) * counts[2] + k`.
+    """A grid of cubes with the list of the Gaussians that may reach each cube.
+
+    Cube (i, j, k) has the index `(i * counts[1] + j) * counts[2] + k`. Lengths are in the unit of the points.
 
     Attributes:
         low: Lowest corner of the grid.
-        size: Side of a cube.
-        counts: Cubes along each axis; C in all.
-        start: [C + 1], index in `item` at which each cube's list begins; the last entry is the number of pairs.
-        item: [pairs], indices of Gaussians, rising within a list.
+        size: Edge of a cube.
+        counts: Number of cubes along each axis; C in all.
+        start: int [C + 1], index in `item` at which each cube's list begins; the last entry is the length of `item`.
+        item: int [pairs], the lists one after another: indices of Gaussians, rising within a list.
     """
 
     low: wp.vec3
@@ -79,7 +81,7 @@ def _number(cubes: Cubes, cell: wp.vec3i) -> int:
 
 @wp.func
 def cube_of(cubes: Cubes, x: wp.vec3) -> int:
-    """Returns the cube that contains a point, or the nearest one; any cube for NaN, which no Gaussian reaches."""
+    """Returns the cube that contains a point or is nearest to it; any cube for NaN, which no Gaussian reaches."""
     return _number(cubes, _cell(cubes, x))
 
 
@@ -90,8 +92,8 @@ def _place_margin(cubes: Cubes) -> float:
 
 @wp.func
 def span(cubes: Cubes, centre: wp.vec3, reach: wp.vec3):
-    """Returns the first and last cube along each axis that meet the box of half side `reach` around `centre`. If these
-    are NaN or infinite, it returns the whole grid, since each point is tested again."""
+    """Returns the first and the last cube along each axis that meet a box: its centre is `centre`, and `reach` is half
+    its size. For a box that is NaN or infinite it returns the whole grid, since each point is tested again anyway."""
     pad = _place_margin(cubes)
     wide = (1.0 + REACH_MARGIN) * reach + wp.vec3(pad, pad, pad)
     low = centre - wide
@@ -182,7 +184,6 @@ def _limit(shape: Shape) -> float:
 
 @wp.func
 def _meets(cubes: Cubes, shape: Shape, limit: float, cell: wp.vec3i) -> bool:
-    """Tests whether a cube meets the Gaussian's support itself, and not only the support's bounding box."""
     if not wp.isfinite(shape.reach):
         return True
     pad = _place_margin(cubes)
@@ -281,7 +282,7 @@ def sort_by_cube(keys, items, count: int, cubes: int, start) -> None:
         items: int [2 * count], indices of Gaussians; the second half is scratch memory.
         count: Number of pairs.
         cubes: Number of cubes, C.
-        start: int [C + 1], written: index at which each cube's pairs begin.
+        start: int [C + 1], written: index of the sorted pairs at which each cube's pairs begin.
     """
     wp.utils.radix_sort_pairs(keys, items, count, end_bit=max(1, (cubes - 1).bit_length()))
     wp.launch(_find_starts, cubes + 1, inputs=[keys, count], outputs=[start], device=keys.device)
@@ -291,13 +292,15 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
     """Builds a grid of cubes over a box, with the list of each cube.
 
     Args:
-        shapes: Shape [K] of the Gaussians, made for the same cut and support as later sums.
-        low, high: Three numbers each, lowest and highest corner of the points' box; it may be flat along any axis.
-        size: Side of a cube, positive, in the frame of the points. None: a quarter of the median reach of the Gaussians
-            along their widest axis, doubled until there are at most 8 K + 4,096 cubes and 256 K + 4,096 pairs to test.
+        shapes: Shape [K] of the K Gaussians, made with the cut and the kind of support that later sums use.
+        low, high: Lowest and highest corner of the box that contains the points, three numbers each; the box may be
+            flat along any axis.
+        size: Edge of a cube, positive, in the unit of the points. None: a quarter of the median reach of the Gaussians
+            along their widest axis, doubled until there are at most 8 K + 4,096 cubes and 256 K + 4,096 pairs of a
+            cube and a Gaussian to test.
 
     Returns:
-        The lists, on the shapes' device.
+        The grid with its lists, on the shapes' device.
 
     Raises:
         ValueError: An argument is wrong, or there would be more than `MOST_PAIRS` cubes or pairs to test; this is
@@ -305,7 +308,7 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
     """
     corners = np.array([low, high], np.float64)
     if corners.shape != (2, 3) or not np.isfinite(corners).all() or (corners[0] > corners[1]).any():
-        raise ValueError(f"low, high: expected two corners of a box, got {low} and {high}")
+        raise ValueError(f"low, high: expected a lowest and a highest corner, got {low} and {high}")
     if size is None:
         cubes = _chosen_grid(shapes, corners)
     elif math.isfinite(size) and size > 0:
@@ -314,10 +317,10 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
         raise ValueError(f"size: expected a positive number, got {size}")
     total = math.prod(cubes.counts)
     if total > MOST_PAIRS:
-        raise ValueError(f"size: {cubes.size:g} makes {total} cubes, expected at most {MOST_PAIRS}")
+        raise ValueError(f"size: {cubes.size:g} makes {total} cubes, expected at most {MOST_PAIRS}: use larger cubes")
     tested = _tested(shapes, cubes)
     if tested > MOST_PAIRS:
-        raise ValueError(f"size: {cubes.size:g} makes {tested} pairs to test, expected at most {MOST_PAIRS}")
+        raise ValueError(f"size: {cubes.size:g} makes {tested} pairs (cube, Gaussian), expected at most {MOST_PAIRS}")
 
     device, gaussians = shapes.device, shapes.shape[0]
     counts = wp.empty(gaussians, dtype=int, device=device)
@@ -359,7 +362,6 @@ def _grid(corners: np.ndarray, size: float) -> Cubes:
 
 
 def _tested(shapes, cubes: Cubes) -> int:
-    """Returns the number of pairs of a cube and a Gaussian that have to be tested."""
     counts = wp.empty(shapes.shape[0], dtype=wp.int64, device=shapes.device)
     wp.launch(_candidates, counts.shape, inputs=[shapes, cubes], outputs=[counts], device=shapes.device)
     return int(counts.numpy().sum())

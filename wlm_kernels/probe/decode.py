@@ -1,4 +1,4 @@
-"""Decodes points: the Gaussians' sum and the network in one launch (gaussian-probe-compression, eq. 5 to 7).
+"""Decodes light at points: sums Gaussians and evaluates a network in one launch (gaussian-probe-compression, eq. 5-7).
 
 On CUDA a block of 128 threads decodes up to 64 points: several threads share the Gaussians that a point's cube lists,
 their sums are added in shared memory, and the network runs on all points together (`native/layers.cuh`, then
@@ -19,7 +19,7 @@ from wlm_kernels.probe.network import THREADS, cpu_network, layer_code, probes_a
 
 @dataclass(frozen=True)
 class DecodeKernels:
-    """The kernel that decodes points, for one size of network and one kind of device.
+    """The kernel that decodes light at points, for one size of network and one kind of device.
 
     Attributes:
         device_kind: "cpu" or "cuda".
@@ -31,17 +31,17 @@ class DecodeKernels:
     _kernel: Any
 
     def launch(self, rows, shapes, cubes, cut, net, gain, x, out) -> None:
-        """Decodes points to their D numbers.
+        """Decodes the light at M points, D numbers (light coefficients) for each.
 
         Args:
-            rows: float [K, 10 + L], the Gaussians.
+            rows: float [K, 10 + L], parameters of the K Gaussians, see `gaussians`.
             shapes: Shape [K], made from the rows with this cut.
             cubes: `cubes.Cubes` of the shapes; points outside use the list of the nearest cube.
             cut: Radius of a support in standard deviations.
             net: float [P], weights of the network, see `network`.
-            gain: Factor of the network's outputs.
-            x: vec3 [M], in the normalised frame.
-            out: float [M, D], written.
+            gain: Factor by which the network's outputs are multiplied.
+            x: vec3 [M], the points in normalised coordinates.
+            out: float [M, D], the light at the points, written.
         """
         count = x.shape[0]
         dims = (-(-count // self.points), THREADS) if self.device_kind == "cuda" else count
@@ -60,9 +60,9 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
     """Builds the kernel for one size of network; later calls return the same kernel.
 
     Args:
-        latent: Length of a latent, L >= 1.
+        latent: Length L of a latent vector, at least 1.
         hidden: Units of a hidden layer, H, a multiple of 8.
-        outputs: Numbers per probe, D >= 1.
+        outputs: Numbers D at a point, at least 1.
         device_kind: "cpu" or "cuda".
     """
     fn = functions(latent)
@@ -136,7 +136,6 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
 
 
 def _finish(latent: int, hidden: int, outputs: int, points: int, vec_latent):
-    """Returns the CUDA code that sums partial latents and runs the network for a block of points."""
     snippet = layer_code(latent, hidden, outputs, points) + native_source(__package__, "decode")
 
     @wp.func_native(snippet)

@@ -1,10 +1,10 @@
-"""Computes the Gaussians' sum at any points and its gradients (gaussian-probe-compression, eq. 2 to 6, 11 and 12).
+"""Sums Gaussians at any points, and computes the gradients (gaussian-probe-compression, eq. 2 to 6, 11 and 12).
 
 With `cubes` a point only evaluates the Gaussians that its cube lists, with the same result as from all Gaussians.
-`backward` computes the gradient of the Gaussians, one per thread, over the points of the cubes within its reach;
-`backward_points` computes the gradient of the points, one per thread. There are no atomic additions. The gradients
-treat the set of Gaussians that reach a point as constant. The reference is `wlm.ops.plain.gaussian_sum`; for probes
-that do not move, `step` trains faster.
+`backward` computes the gradient with respect to the Gaussians: a thread adds up one Gaussian's gradient over the points
+of all cubes within the Gaussian's reach. `backward_points` computes the gradient with respect to the points, one per
+thread. There are no atomic additions. The gradients treat the set of Gaussians that reach a point as constant. The
+reference is `wlm.ops.plain.gaussian_sum`; for probes that do not move, `step` trains faster.
 """
 
 import functools
@@ -61,8 +61,6 @@ def _cubes_of(
 
 @dataclass(frozen=True)
 class _Kernels:
-    """The kernels for one length of latents."""
-
     forward: Any
     backward: Any
     backward_points: Any
@@ -70,7 +68,7 @@ class _Kernels:
 
 @functools.cache
 def sum_kernels(latent: int) -> _Kernels:
-    """Builds the kernels of `sum` and its gradients for latents of length L; later calls return the same kernels."""
+    """Builds (once) the kernels of `sum` and of its gradients for latent vectors of length `latent`."""
     fn = functions(latent)
     vec_latent, vec_sums = fn.vec_latent, fn.vec_sums
     add, accumulate, chain, slope = fn.add, fn.accumulate, fn.chain, fn.slope
@@ -162,9 +160,9 @@ def shapes(rows, cut: float, support: str = "ellipsoid"):
     """Builds the `Shape` of each Gaussian.
 
     Args:
-        rows: float [K, 10 + L], the Gaussians, see `gaussians`.
-        cut: Radius of a support in standard deviations.
-        support: "ellipsoid", or "sphere": the sphere of the longest axis (eq. 6).
+        rows: float [K, 10 + L], parameters of the K Gaussians, see `gaussians`.
+        cut: Radius of a support, outside which a Gaussian is 0, in standard deviations.
+        support: "ellipsoid", or "sphere": the sphere whose radius is the longest half axis (eq. 6).
 
     Returns:
         Shape [K].
@@ -175,16 +173,18 @@ def shapes(rows, cut: float, support: str = "ellipsoid"):
 
 
 def sum(rows, shapes, cubes, x, f, cut: float) -> None:
-    """Computes F(x) = sum of F_k w_k(x) over the Gaussians that reach x (eq. 5).
+    """Computes F(x), the sum of F_k w_k(x) over the Gaussians that reach x (eq. 5): F_k is the latent vector of
+    Gaussian k, w_k(x) its value at x.
 
-    The result is the same bit for bit for any lists, as long as no list lacks a Gaussian that reaches its points.
+    The lists of `cubes` do not change the result, not even its last bit, unless a list lacks a Gaussian that reaches a
+    point of its cube.
 
     Args:
-        rows: float [K, 10 + L].
+        rows: float [K, 10 + L], parameters of the K Gaussians, see `gaussians`.
         shapes: Shape [K], made from the rows with this cut.
         cubes: `cubes.Cubes` of the shapes; None: every point evaluates all Gaussians.
-        x: vec3 [N]; no Gaussian reaches a point that is NaN.
-        f: float [L, N], written.
+        x: vec3 [N], the points; no Gaussian reaches a point that is NaN.
+        f: float [L, N], the sums F(x), written.
         cut: Radius of a support in standard deviations.
     """
     cubes = cubes or everything(rows.shape[0], rows.device)
@@ -197,8 +197,8 @@ def backward(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
 
     Args:
         rows, shapes, cubes, x, cut: As for `sum`.
-        grad_f: float [L, N], the gradient of f.
-        grad: float [K, 10 + L], written.
+        grad_f: float [L, N], gradient of the loss with respect to `f`.
+        grad: float [K, 10 + L], written: gradient with respect to `rows`.
     """
     device, count = rows.device, x.shape[0]
     cubes = cubes or everything(rows.shape[0], device)
@@ -217,7 +217,7 @@ def backward_points(rows, shapes, cubes, x, grad_f, grad, cut: float) -> None:
 
     Args:
         rows, shapes, cubes, x, grad_f, cut: As for `backward`.
-        grad: vec3 [N], written.
+        grad: vec3 [N], written: gradient with respect to `x`.
     """
     cubes = cubes or everything(rows.shape[0], rows.device)
     kernel = sum_kernels(rows.shape[1] - LATENT).backward_points

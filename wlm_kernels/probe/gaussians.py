@@ -1,14 +1,15 @@
-"""3D Gaussians with latents, summed at points (gaussian-probe-compression, eq. 2 to 6), and the gradients of the sum.
+"""3D Gaussians with latent vectors, summed at points (gaussian-probe-compression, eq. 2 to 6), and their gradients.
 
-A Gaussian is a row of 10 + L numbers: centre (3), log of the scale (3), quaternion w x y z (4), latent (L). With
-S = diag(scale), R the rotation and W = S^-1 R^T,
+A Gaussian is a row of 10 + L numbers: centre (3), log of the scale (3), quaternion w x y z (4), latent vector F_k (L).
+With S = diag(scale), R the rotation and W = S^-1 R^T,
 
     F(x) = sum_k F_k w_k(x),   w_k(x) = exp(-|u|^2 / 2),   u = W_k (x - centre_k),   over the k that reach x.
 
-`Shape` is a row prepared for use. The backward pass sums the symmetric a w u u^T and the vector a w u with a = dL/dF .
-F_k over the points; `chain` converts the sums to gradients of the row, without differences of large numbers. For very
-thin Gaussians u itself is a difference of large numbers, and is computed in float64. The reference is
-`tests/reference/gaussians.py`.
+Gaussian k reaches x if x is in its support, an ellipsoid or sphere with a radius in standard deviations. `Shape` has
+the numbers that are computed once from a row. The backward pass sums the symmetric matrix a w u u^T and the vector a w
+u over the points, where a is the scalar product of F_k and the loss's gradient with respect to F. `chain` converts the
+sums to gradients of the row, without differences of large numbers. For very thin Gaussians u itself is a difference of
+large numbers, and is computed in float64. The reference is `tests/reference/gaussians.py`.
 """
 
 import functools
@@ -28,15 +29,15 @@ _SLENDER = wp.constant(100.0)
 
 @wp.struct
 class Shape:
-    """A Gaussian without its latent, prepared for evaluation.
+    """A Gaussian without its latent vector, prepared for evaluation.
 
     Attributes:
-        centre: Centre, in the frame of the points.
+        centre: Centre, in the coordinates of the points.
         whiten: W = S^-1 R^T.
-        rest: Rounding error of W, for slender Gaussians; else 0.
-        reach: Half the size of the support's bounding box.
+        rest: W minus its rounded value `whiten`, for Gaussians so thin that it matters; else 0.
+        reach: Half the size of the support's bounding box along each axis.
         radius: Squared radius of a spherical support; 0 for an ellipsoid.
-        slender: 1 if u needs float64, else 0.
+        slender: 1 for a Gaussian so thin that W (x - centre) needs float64, else 0.
     """
 
     centre: wp.vec3
@@ -72,7 +73,7 @@ def shape_of(centre: wp.vec3, log_scale: wp.vec3, q: wp.vec4, cut: float, sphere
     Args:
         centre, log_scale, q: The first ten numbers of the Gaussian's row.
         cut: Radius of the support in standard deviations.
-        sphere: 1: the support is the sphere of the longest axis (eq. 6); 0: the ellipsoid.
+        sphere: 1: the support is the sphere whose radius is the longest half axis (eq. 6); 0: the ellipsoid.
     """
     s = wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
     shape = Shape()
@@ -132,13 +133,15 @@ def touches(shape: Shape, middle: wp.vec3, half: wp.vec3) -> bool:
 
 @dataclass(frozen=True)
 class GaussianFunctions:
-    """The `wp.func`s for one length of latents; `rows` is float [K, 10 + L], `cut` in standard deviations.
+    """The `wp.func`s on Gaussians with latent vectors of one length L.
+
+    `rows` is float [K, 10 + L], k the index of a Gaussian, and `cut` the radius of its support in standard deviations.
 
     Attributes:
         vec_latent: vec of L floats.
-        vec_sums: vec of 9 + L floats, sums of `accumulate` over points.
-        add: (f, shape, rows, k, x, cut) -> f plus Gaussian k at x.
-        accumulate: (sums, shape, rows, k, x, grad_f, cut) -> sums plus the terms of point x.
+        vec_sums: vec of 9 + L floats, the backward pass's sums over points.
+        add: (f, shape, rows, k, x, cut) -> f plus F_k w_k(x).
+        accumulate: (sums, shape, rows, k, x, grad_f, cut) -> `sums` plus the terms of point x.
         slope: (shape, rows, k, x, grad_f, cut) -> contribution of Gaussian k to the gradient of x.
         chain: (sums, shape, log_scale, q) -> gradient of the first ten numbers of a row; the last L sums are the
             gradient of the latent.
@@ -157,7 +160,7 @@ _vec10 = wp.types.vector(LATENT, float)
 
 @functools.cache
 def functions(latent: int) -> GaussianFunctions:
-    """Builds the functions for latents of length L; later calls return the same functions."""
+    """Builds (once) the functions for latent vectors of length `latent`."""
     vec_latent = wp.types.vector(latent, float)
     vec_sums = wp.types.vector(SHAPE_NUMBERS + latent, float)
 

@@ -1,6 +1,8 @@
-"""The probes' network, forward and backward (gaussian-probe-compression, eq. 7 and 8): loss and all gradients.
+"""The network that turns sums of Gaussians into light probes, its loss and gradients (gaussian-probe-compression, eq. 7
+and 8).
 
-The network has L + 3 inputs, two hidden layers of H units and D outputs. Its weights are one array: for each layer a
+The network has L + 3 inputs (the summed latent vector and the position), two hidden layers of H units and D outputs,
+the numbers of a probe. Its weights are one array: for each layer a
 row for every input, then the biases; a row of the last layer is padded to a multiple of four numbers.
 
 On CUDA a block of threads evaluates all layers for up to 64 probes in shared memory; a thread computes 4 probes by 8
@@ -24,25 +26,25 @@ CPU_LANES = 2
 
 
 def padded(outputs: int) -> int:
-    """Returns the length of a row of the last layer, padded to a multiple of four numbers."""
+    """Rounds the number of outputs up to a multiple of four, the length of a row of the last layer."""
     return -(-outputs // 4) * 4
 
 
 def most_outputs(latent: int, hidden: int) -> int:
-    """Returns the largest number of outputs for which a CUDA block with the fewest probes fits in shared memory."""
+    """Returns the largest number of outputs with which the network fits in the shared memory of a CUDA block."""
     rows = _SHARED // (4 * (_AT_ONCE[-1] + 4))
     return (rows - (latent + 3 + 2 * hidden)) // 4 * 4
 
 
 def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
-    """Returns how many probes, at most 64, a CUDA block can evaluate within its shared memory. Above `most_outputs`
-    none fit; the kernels then only run on the CPU, where this number has no effect."""
+    """Returns how many probes, at most 64, a CUDA block can evaluate within its shared memory. With more outputs than
+    `most_outputs`, the kernels only run on the CPU, where the result has no effect."""
     rows = latent + 3 + 2 * hidden + padded(outputs)
     return next((p for p in _AT_ONCE if rows * (p + 4) * 4 <= _SHARED), _AT_ONCE[-1])
 
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
-    """Returns the CUDA code for the forward pass of a block of probes, to begin a function's body
+    """Returns the CUDA code with which a function begins that evaluates the network for a block of probes
     (`native/layers.cuh`)."""
     sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
     return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
@@ -70,18 +72,19 @@ class NetworkKernels:
         self._kernel.module.load(wp.get_device(device))
 
     def launch(self, groups, f, target, weight, net, grad_f, partial, loss, base=0, count=None) -> None:
-        """Computes the loss, the sum of weight * error^2 over probes and numbers, and its gradients.
+        """Computes the loss, the sum of weight * error^2 over all numbers of all probes, and its gradients.
 
         Args:
-            groups: `step.Groups`.
-            f: float [S, L, N], the Gaussians' sums as S partial sums.
-            target: float [D, N], the probes' numbers.
-            weight: float [D], weight of each number.
+            groups: The N probes, `step.Groups`.
+            f: float [S, L, N], the sum of Gaussians at each probe, as S partial sums.
+            target: float [D, N], the numbers that each probe should have.
+            weight: float [D], weight of each number in the loss.
             net: float [P], weights of the network.
-            grad_f: float [L, N], written.
-            partial: float [B, P], B = `parts(N)`: written on CUDA, added to on the CPU.
+            grad_f: float [L, N], written: gradient with respect to the sum of Gaussians.
+            partial: float [B, P], B = `parts(N)`, partial gradients with respect to `net`: written on CUDA, added to on
+                the CPU.
             loss: float [B], partial losses: written on CUDA, added to on the CPU.
-            base, count: On the CPU, first probe and number of probes of this launch.
+            base, count: Index of the first probe and number of probes of this launch, on the CPU alone; default all.
         """
         probes = groups.x.shape[0]
         if self.device_kind == "cuda":
@@ -100,12 +103,12 @@ class NetworkKernels:
 
 @functools.cache
 def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> NetworkKernels:
-    """Builds the kernels for one size of network; later calls return the same kernels.
+    """Builds (once) the kernels for one size of network.
 
     Args:
-        latent: Length of a latent, L >= 1.
-        hidden: Units of a hidden layer, H, a multiple of 8.
-        outputs: Numbers per probe, D >= 1.
+        latent: Length L of a latent vector, at least 1.
+        hidden: Number H of units of a hidden layer, a multiple of 8.
+        outputs: Numbers D of a probe, at least 1.
         device_kind: "cpu" or "cuda".
     """
     options = {"enable_backward": False}
@@ -155,8 +158,8 @@ class CpuNetwork:
     """The `wp.func`s with which a CPU thread evaluates the network.
 
     Attributes:
-        vec_in, vec_hidden, vec_out: Vectors of the inputs, of the units of a layer, and of the padded outputs.
-        forward: (net, inputs) -> both hidden layers and the outputs.
+        vec_in, vec_hidden, vec_out: Vector types of the inputs, of a hidden layer, and of the padded outputs.
+        forward: (net, inputs) -> the units of both hidden layers, and the outputs.
         hidden_row, output_row: (net, at) -> the row of weights that begins at index `at`.
     """
 
@@ -170,7 +173,7 @@ class CpuNetwork:
 
 @functools.cache
 def cpu_network(latent: int, hidden: int, outputs: int) -> CpuNetwork:
-    """Builds the functions for one size of network; later calls return the same functions."""
+    """Builds (once) the functions for one size of network; arguments as for `network_kernels`."""
     inputs, wide = latent + 3, padded(outputs)
     second = (inputs + 1) * hidden
     third = second + (hidden + 1) * hidden

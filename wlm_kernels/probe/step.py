@@ -35,11 +35,11 @@ _vec8 = wp.types.vector(8, float)
 
 @wp.struct
 class Groups:
-    """Probes in groups of `GROUP` neighbours; N is a multiple of `GROUP`, and there are G = N / GROUP groups.
+    """Light probes in G groups of `GROUP` neighbours; N = G * `GROUP` is the number of probes, rounded up.
 
     Attributes:
-        x: [N], positions in the normalised frame; positions from index `count` on only fill up the last group.
-        middle, half: [G], centres and half sizes of the groups' boxes.
+        x: vec3 [N], positions in normalised coordinates; positions from index `count` on only fill up the last group.
+        middle, half: vec3 [G], centre of each group's bounding box, and half the size of the box.
         count: Number of probes.
     """
 
@@ -55,12 +55,12 @@ class Optimiser:
 
     Attributes:
         control: int [1], number of the step, from 1.
-        schedule: float [steps], factor of all rates at each step.
-        rates: float [10 + L], learning rate of each channel of a Gaussian.
+        schedule: float [steps], factor of all learning rates at each step.
+        rates: float [10 + L], learning rate of each parameter of a Gaussian.
         net_rate: Learning rate of the network.
-        bounds: float [2, 10 + L], lowest and highest value of each channel.
-        keep: 1 to clamp the rows to `bounds`.
-        move: 0 to leave the Gaussians unchanged.
+        bounds: float [2, 10 + L], lowest and highest value of each parameter of a Gaussian.
+        keep: 1 to clamp the Gaussians' parameters to `bounds`, else 0.
+        move: 1 to train the Gaussians, 0 to leave them unchanged.
         adan: 1 to train the Gaussians by Adan (Xie et al. 2024), 0 by Adam; the network is always trained by Adam.
     """
 
@@ -93,9 +93,7 @@ def next_bit(bits: wp.uint32) -> int:
     return 0u;
 #endif
 """)
-def _ballot(bit: int) -> wp.uint32:
-    """Returns a word in which each of the 32 threads of a warp has set one bit."""
-    ...
+def _ballot(bit: int) -> wp.uint32: ...
 
 
 @wp.kernel(enable_backward=False)
@@ -155,10 +153,11 @@ def touch(groups, shapes, by_group, by_gaussian) -> None:
     """Finds which Gaussians may reach which groups.
 
     Args:
-        groups: `Groups`.
-        shapes: Shape [K].
-        by_group: uint32 [G, ceil(K / 32)], written: bit b of word w is Gaussian 32 w + b.
-        by_gaussian: uint32 [K, ceil(G / 32)], written.
+        groups: The G groups of probes.
+        shapes: Shape [K] of the K Gaussians.
+        by_group: uint32 [G, ceil(K / 32)], written: for each group bit b of word w is 1 if Gaussian 32 w + b may reach
+            it.
+        by_gaussian: uint32 [K, ceil(G / 32)], written: for each Gaussian the bits of the groups that it may reach.
     """
     device = shapes.device
     for transposed, bits in enumerate((by_group, by_gaussian)):
@@ -171,7 +170,7 @@ def touch(groups, shapes, by_group, by_gaussian) -> None:
 
 @dataclass(frozen=True)
 class StepKernels:
-    """The launches of a step for one length of latents and one kind of device."""
+    """The launches of a training step, for latent vectors of one length L and one kind of device."""
 
     device_kind: str
     _shapes: Any
@@ -185,15 +184,15 @@ class StepKernels:
             kernel.module.load(wp.get_device(device))
 
     def shapes(self, rows, bounds, quantised, levels, cut, sphere, used, shapes) -> None:
-        """Rounds the Gaussians' parameters to codes, if `quantised`, and converts them to shapes.
+        """Rounds the Gaussians' parameters as a model file stores them, and prepares the Gaussians for evaluation.
 
         Args:
-            rows: float [K, 10 + L], the parameters.
-            bounds: float [2, 10 + L], lowest and highest value of each channel.
-            quantised: 1 to round to codes (eq. 13 and 14), 0 to use the rows unchanged.
-            levels: float [10 + L], highest code of each channel.
+            rows: float [K, 10 + L], parameters of the K Gaussians.
+            bounds: float [2, 10 + L], lowest and highest value of each parameter.
+            quantised: 1 to round to the stored values (eq. 13 and 14), 0 to use the parameters unchanged.
+            levels: float [10 + L], number of steps from the lowest to the highest stored value of each parameter.
             cut, sphere: The arguments of `gaussians.shape_of`.
-            used: float [K, 10 + L], written.
+            used: float [K, 10 + L], the rounded parameters, written.
             shapes: Shape [K], written.
         """
         wp.launch(
@@ -205,12 +204,12 @@ class StepKernels:
         )
 
     def features(self, groups, shapes, used, by_group, cut, f, base=0, count=None) -> None:
-        """Computes the Gaussians' sum at each probe.
+        """Sums the Gaussians at each probe.
 
         Args:
             groups, shapes, used, by_group, cut: The same as for `touch` and `shapes`.
             f: float [S, L, N], written: S partial sums, S = `SPLITS` on CUDA and 1 on the CPU.
-            base, count: On the CPU, first probe and number of probes of this launch.
+            base, count: Index of the first probe and number of probes of this launch, on the CPU alone; default all.
         """
         probes = groups.x.shape[0]
         dims = (probes // GROUP, SPLITS, GROUP) if self.device_kind == "cuda" else count or probes
@@ -224,13 +223,14 @@ class StepKernels:
         )
 
     def collect(self, groups, shapes, used, by_gaussian, grad_f, cut, sums, base=0, count=None) -> None:
-        """Sums the terms of each Gaussian's gradient over the probes.
+        """Computes for each Gaussian the sums over the probes from which its gradient follows.
 
         Args:
             groups, shapes, used, by_gaussian, cut: The same as for `touch` and `shapes`.
-            grad_f: float [L, N], the gradient of the sum; 0 from index `groups.count` on.
-            sums: float [K, 9 + L], written.
-            base, count: On the CPU, first Gaussian and number of Gaussians of this launch.
+            grad_f: float [L, N], gradient with respect to the result of `features`; 0 from index `groups.count` on.
+            sums: float [K, 9 + L], the sums of `GaussianFunctions.accumulate`, written.
+            base, count: Index of the first Gaussian and number of Gaussians of this launch, on the CPU alone; default
+                all.
         """
         gaussians = used.shape[0]
         dims = (gaussians, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
@@ -249,13 +249,13 @@ class StepKernels:
         Args:
             optimiser: The settings.
             rows: float [K, 10 + L], parameters of the Gaussians, updated.
-            used: float [K, 10 + L], values at which the gradients were taken.
-            shapes: Shape [K].
+            used: float [K, 10 + L], parameters at which the gradients were taken.
+            shapes: Shape [K], made from `used`.
             sums: float [K, 9 + L], result of `collect`.
-            moments: float [4, K, 10 + L], the optimiser's running means, updated.
+            moments: float [4, K, 10 + L], Adan's or Adam's running means for the Gaussians, updated.
             net: float [P], weights of the network, updated.
             net_moments: float [2, P], Adam's running means for the network, updated.
-            partial: float [B, P], partial gradients of the network.
+            partial: float [B, P], partial gradients with respect to `net`, see `network.NetworkKernels.launch`.
         """
         wp.launch(
             self._update,
@@ -268,10 +268,10 @@ class StepKernels:
 
 @functools.cache
 def step_kernels(latent: int, device_kind: str) -> StepKernels:
-    """Builds the launches of a step; later calls return the same launches.
+    """Builds (once) the launches of a training step.
 
     Args:
-        latent: Length of a latent, L.
+        latent: Length L of a latent vector.
         device_kind: "cpu" or "cuda".
     """
     fn = functions(latent)
@@ -427,7 +427,6 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
 
 
 def _block_sum(vec_sums, numbers: int):
-    """Sums a vector over the threads of a CUDA block, in a fixed order, into row k of an array."""
 
     @wp.func_native(native_source(__package__, "block_sum", N=numbers, WARPS=_COLLECTORS // 32))
     def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...
@@ -437,7 +436,7 @@ def _block_sum(vec_sums, numbers: int):
 
 @functools.cache
 def update_kernel(latent: int):
-    """Builds the kernel of `step.StepKernels.update` for latents of length L; later calls return the same kernel."""
+    """Builds (once) the kernel of `StepKernels.update` for latent vectors of length `latent`."""
     fn = functions(latent)
     vec_sums, chain = fn.vec_sums, fn.chain
     channels = LATENT + latent

@@ -1,14 +1,14 @@
-"""Reads light at any point from nested grids of blocks around a viewer, through a page table.
+"""Reads light at any point from nested grids around a viewer, whose blocks are found through a page table.
 
-A block of level l is the cell `[b s, (b + 1) s)` of a grid of cubes of side s_l, with integer coordinates b; its D
-numbers are the light at its centre. The window of level l has `side` blocks along each axis and starts at base_l. The
-slot of a block is its coordinates modulo `side`, so that a window that moves by one block changes one slab of slots
-(gaussian-probe-compression, section 3.4). The page table has an entry for each slot: the row of the pool with the
-numbers of the window's block, or -1 where the block is missing.
+Each level l is a grid of cubes, the blocks, with edge s_l. A block has integer coordinates b, covers `[b s, (b + 1) s)`
+and has D numbers, the light at its centre. Only the blocks in the level's window are in memory: `side` blocks along
+each axis from block base_l on. The slot of a block is its coordinates modulo `side`, so that a window that moves by one
+block changes one slab of slots (gaussian-probe-compression, section 3.4). The page table has an entry for each slot:
+the row of the array `pool` with the numbers of the slot's block, or -1 where this light is missing.
 
-Arrays: pool float [R, D]; pages int [L * side^3], by slot; bases vec3i [L]; views vec4 [L], position of the points'
-origin in the grid, `origin / s - (base + side / 2 + 1/2)`, and 1 / s. Gradients are not computed. The reference is
-`tests/reference/volume.py`.
+Arrays for L levels: pool float [R, D]; pages int [L * side^3], by slot; bases vec3i [L]; views vec4 [L], position of
+the points' origin in the grid, `origin / s - (base + side / 2 + 1/2)`, and 1 / s. Gradients are not computed. The
+reference is `tests/reference/volume.py`.
 """
 
 import warp as wp
@@ -130,7 +130,7 @@ def read(pool, pages, bases, views, side: int, points, normals, out, answered, w
     reproduced.
 
     Args:
-        pool, pages, bases, views: The arrays that the module's docstring describes.
+        pool, pages, bases, views: The blocks' light, the page table and the windows, see the module's docstring.
         side: Blocks along an axis of a window, even.
         points: vec3 [M], relative to the origin of `views`. No block covers a point that is NaN or far away.
         normals: vec3 [M], of unit length: light is read half a block in front of the point's surface, so that the far

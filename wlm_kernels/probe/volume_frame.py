@@ -1,15 +1,18 @@
-"""Runs a frame of the cascaded volume on its device: finds new blocks, their probes, and their rows of the pool.
+"""Updates the nested grids of light around a viewer (`volume`) in each frame: finds the blocks whose light is missing,
+decodes the nearest ones, and stores their light in rows of the array `pool`.
 
 The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 
-1. `look` takes the new windows; `scroll` finds for each slot its block, whether a probe is near that block, and whether
-   the pool still has it. Other blocks wait, and are counted by their distance to the viewer.
+1. `Look` copies the new windows; `scroll` finds for each slot its block, whether a probe is near the block, and whether
+   the pool still has its light. The blocks near probes that the pool lacks wait, counted by distance to the viewer.
 2. `choose` finds the distance within which enough blocks wait, gathers these blocks and ranks them. The nearest are
-   decoded, by distances in units of their own side; on a tie first the finer block, then the lower slot.
-3. `allocate` gives each block a row of the pool: the least recently used row of a group that no other block takes from.
-   Groups take turns. A row whose block is in a window is never given away.
-4. `search` finds the probes in a block's reach, 64 ranges of the sorted cells; `volume_weights` weighs up to 16.
-5. `combine` mixes the light of these probes, extrapolated by at most half of their range.
+   decoded, by distances in units of their own edge; at equal distances first the finer block, then the lower slot.
+3. `allocate` gives each chosen block a row of the pool: the least recently used row of a group of rows; each block
+   takes from another group, and groups take turns. A row whose block is in a window is never given away.
+4. `search` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell; `volume_weights`
+   computes weights of at most 16 of these probes.
+5. `combine` computes a block's light as the weighted sum of these probes, clamped to the range of their values, which
+   is extended by half its width on both sides.
 """
 
 import numpy as np
@@ -51,17 +54,17 @@ Views = wp.types.matrix(shape=(LEVELS, 4), dtype=float)
 
 @wp.struct
 class Index:
-    """Probes sorted by cell, and the blocks near probes; see `wlm.probe.volume.index`.
+    """N probes sorted by the cell of a grid, and the W blocks near probes; see `wlm.probe.volume.index`.
 
     Attributes:
         key: [N], Morton keys of the probes' cells, rising.
         number: [N], index of each probe in the input.
         cell: [N], cell of each probe.
-        place: [N], position in the cell, 0 to 1.
-        normal: [N], unit normal of each probe's surface; 0 for a probe on no surface, or if it is unknown.
+        place: [N], position of each probe in its cell, 0 to 1 along each axis.
+        normal: [N], unit normal of the surface on which each probe lies; 0 if there is none or it is unknown.
         block: [W], Morton keys of the blocks, rising within a level.
         level_start: [L + 1], index in `block` at which each level begins.
-        ratios: [L], side of each level divided by the finest side.
+        ratios: [L], edge of a block of each level divided by that of the finest level.
     """
 
     key: wp.array1d[wp.int64]
@@ -76,15 +79,15 @@ class Index:
 
 @wp.struct
 class Windows:
-    """The S slots of the windows of all levels, each for one block.
+    """The windows of all L levels, with S slots in all, each of which holds one block.
 
     Attributes:
-        bases: [L].
-        views: [L], see `wlm_kernels.probe.volume`.
+        bases, views: [L], see `wlm_kernels.probe.volume`.
         held: [S], coordinates of the block of each slot.
-        wanted: [S], the block's number in the index, -1 if no probe is near.
-        pages: [S], the block's row in the pool, or -1.
-        away: [S], squared distance of a waiting block from the viewer, in units of its side; -1 for other blocks.
+        wanted: [S], index of this block in `Index.block`, or -1 if no probe is near.
+        pages: [S], row of this block's light in the pool, or -1.
+        away: [S], squared distance from the viewer of a block that waits to be decoded, in units of the block's edge;
+            -1 for other blocks.
     """
 
     bases: wp.array1d[wp.vec3i]
@@ -97,12 +100,12 @@ class Windows:
 
 @wp.struct
 class Pool:
-    """The R rows of the array that stores the light of blocks, in use or cached.
+    """Which blocks have their light in the R rows of the array `pool`, because they are in a window or were lately.
 
     Attributes:
         stamp: [R], last frame in which the row's block was in a window; -1 for an empty row.
-        owner: [R], number in the index of the row's block, or -1.
-        rows: [W], the row of each block of the index, or -1.
+        owner: [R], index in `Index.block` of the row's block, or -1.
+        rows: [W], row of the light of each block in `Index.block`, or -1.
     """
 
     stamp: wp.array1d[int]
@@ -112,26 +115,26 @@ class Pool:
 
 @wp.struct
 class Work:
-    """Scratch arrays between the launches of a frame, which decodes at most B blocks.
+    """Data that the launches of a frame pass on; a frame decodes at most B blocks.
 
     Attributes:
         clock: [1], the frame's number.
         counters: [7], counts of blocks and probes in this frame.
-        histogram: [TOTALS], number of waiting blocks by distance.
+        histogram: [TOTALS], number of blocks that wait to be decoded, by distance.
         limit: [1], the last bin of the histogram whose blocks are gathered.
         gathered: [MOST], slots of the gathered blocks.
         distance: [MOST], distance of each gathered block, as in `Windows.away`.
         chosen: [B], slots of the chosen blocks, or -1.
-        taken: [B], rows of the pool for these blocks, or -1.
-        begin, count: [B, 64], ranges of probes in the index.
+        taken: [B], row of the pool for each chosen block, or -1.
+        begin, count: [B, 64], first index and length of each range of probes in `Index` near a chosen block.
         picked: [B], number of probes that contribute to a block, 16 at most.
         noise: [B], variance of the noise of each contributing probe.
-        places: [B, 16], positions of the probes from the block's centre, in units of its side, and the additional noise
-            of each.
+        places: [B, 16], position of each contributing probe relative to the block's centre, in units of the block's
+            edge, and the probe's additional variance of noise.
         rows: [B, 16], covariance of each probe with the probes before it and with itself, then 0.
         hats: [B, 16], covariance of each probe with the block.
-        numbers: [B * 16], indices of the probes.
-        weights: [B, 16], weights of the probes.
+        numbers: [B * 16], index of each contributing probe in the input.
+        weights: [B, 16], weight of each contributing probe.
     """
 
     clock: wp.array1d[int]
@@ -170,7 +173,7 @@ def morton(cell: wp.vec3i) -> wp.int64:
 
 @wp.func
 def _lower(keys: wp.array1d[wp.int64], first: int, last: int, key: wp.int64) -> int:
-    """Returns the first index of the rising numbers keys[first:last] whose key is at least the given key, or `last`."""
+    """Returns the first index i in the sorted keys[first:last] with keys[i] >= key, or `last` if there is none."""
     low = first
     high = last
     while low < high:
@@ -260,8 +263,8 @@ def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
 
 @wp.func
 def _descend(histogram: wp.array1d[int], first: int, budget: int, before: int):
-    """Finds the first of 16 counts at which the running sum reaches the budget, or the last count. Returns its index
-    and the sum before it."""
+    """Adds the 16 counts from histogram[first] on to `before` until the sum reaches `budget`. Returns which count, 0 to
+    15, reached it (15 if none did), and the sum before this count."""
     counts = vec16i()
     for i in range(16):  # unrolled, so that all loads are in flight at once
         counts[i] = histogram[first + i]
@@ -402,12 +405,12 @@ def _take_points(points: wp.array1d[wp.vec3], numbers: wp.array1d[int], out: wp.
 
 
 class Look:
-    """The launch that copies the windows and the index of a frame; only its arguments change from frame to frame.
+    """A launch, prepared once, that copies a frame's windows and number to the device.
 
     A volume makes one such object, since packing all arguments again takes longer than the launch.
 
     Args:
-        windows, work: Written by every launch.
+        windows, work: Arrays that every launch writes.
     """
 
     def __init__(self, windows: Windows, work: Work) -> None:
@@ -421,9 +424,9 @@ class Look:
         """Launches the kernel on the current stream.
 
         Args:
-            bases: Integers [L, 3], first block of each window, as the index numbers blocks.
-            views: [L, 4], see `Windows`.
-            frame: Number of the frame, rising.
+            bases: Integers [L, 3], coordinates of the first block of each level's window.
+            views: [L, 4], see `wlm_kernels.probe.volume`.
+            frame: Number of the frame, higher than in the frame before.
         """
         self._bases[: len(bases)], self._views[: len(views)] = bases, views
         self._launch.set_param_at_index(0, Bases.from_buffer(self._bases))
@@ -433,7 +436,7 @@ class Look:
 
 
 def scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:
-    """Finds the block of each slot, and which blocks wait to be decoded."""
+    """Finds the block of each slot of the windows, and which blocks have to be decoded, in this frame or later."""
     inputs = [index, windows, pool, side, work]
     wp.launch(_scroll, windows.held.shape, inputs=inputs, device=work.clock.device)
 
@@ -447,13 +450,14 @@ def choose(windows: Windows, side: int, work: Work) -> None:
 
 
 def allocate(windows: Windows, pool: Pool, work: Work) -> None:
-    """Gives the chosen blocks rows of the pool; a block whose group has no free row keeps waiting."""
+    """Gives each chosen block a row of the pool, from a group of rows of its own; a block whose group has no free row
+    waits for a later frame."""
     size = max(1, min(GROUP, pool.stamp.shape[0] // work.chosen.shape[0]))
     wp.launch(_allocate, work.chosen.shape, inputs=[windows, pool, size, work], device=work.clock.device)
 
 
 def search(index: Index, windows: Windows, side: int, work: Work) -> None:
-    """Finds the probes within reach of the chosen blocks, as ranges of the index."""
+    """Finds the probes within reach of each chosen block, as 64 ranges of the sorted probes of `index`."""
     inputs = [index, windows, side, work]
     wp.launch(_find_ranges, work.count.shape, inputs=inputs, device=work.clock.device)
 
@@ -462,9 +466,9 @@ def combine(work: Work, light: wp.array, pool: wp.array) -> None:
     """Writes the light of the chosen blocks to their rows of the pool.
 
     Args:
-        work: Scratch arrays, with the weights computed.
+        work: Data of the frame, after `volume_weights.weigh`.
         light: float [B * 16, D], light of the probes `work.numbers`.
-        pool: float [R, D], written.
+        pool: float [R, D], the light of blocks, written.
     """
     wp.launch(_combine, (work.chosen.shape[0], pool.shape[1]), inputs=[work, light, pool], device=pool.device)
 

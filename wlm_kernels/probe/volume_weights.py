@@ -1,16 +1,18 @@
-"""Computes the weights of a block's probes in a frame of the cascaded volume.
+"""Computes the weights with which light probes contribute to a block of the nested grids of light (`volume`).
 
-Light is read trilinearly: at x it is A(x) g, the hat functions of the lattice of blocks times the blocks' light g. The
-light of a block follows from up to 16 probes as the best linear unbiased estimate (ordinary kriging), under the
-assumption that g is white noise on the lattice plus a smooth part, so that the covariance of the light at x and y is
+Light is read trilinearly from blocks: at x it is A(x) g, where A(x) are the trilinear weights of all blocks of a level
+and g is the blocks' light. The light of a block follows from up to 16 probes as the best linear unbiased estimate
+(ordinary kriging), under the assumption that g is white noise plus a smooth part, so that the covariance of the light
+at x and y is
 
     k(x, y) = A(x) A(y)^T + 0.3 exp(-|x - y| / (3 s)),
 
-and each probe has noise of variance 0.03, or up to 0.3 where 16 probes represent many more. Because of the white noise,
-the light that is read at a probe is nearly the probe's own, which a weighted mean would blur.
+where s is the edge of a block, and each probe has noise of variance 0.03, or up to 0.3 where 16 probes represent many
+more. Because of the white noise, the light that is read at a probe's position is nearly the light of the probe, which a
+weighted mean would blur.
 
-If normals are known and the block's centre is d sides behind a probe's surface, the noise of that probe is larger by
-3 d^2. A block thus takes its light from probes on its own side of a wall, if there are any.
+If normals are known and the block's centre is d edges behind a probe's surface, 3 d^2 is added to the variance of this
+probe's noise. A block thus takes its light from probes on its own side of a wall, if there are any.
 """
 
 import warp as wp
@@ -33,7 +35,7 @@ _Square = wp.types.matrix(shape=(PROBES, PROBES), dtype=float)
 
 @wp.func
 def _overlap(x: float, y: float) -> float:
-    """Returns A(x) A(y)^T along one axis; x and y are in units of a block's side, with blocks at integers."""
+    """Returns A(x) A(y)^T along one axis; x and y are in units of a block's edge, with block centres at integers."""
     low = wp.floor(x)
     other = wp.floor(y)
     a = x - low
@@ -49,7 +51,6 @@ def _overlap(x: float, y: float) -> float:
 
 @wp.kernel(enable_backward=False)
 def _pick(index: Index, windows: Windows, side: int, work: Work):
-    """Picks the probes that contribute to one block per thread."""
     k, i = wp.tid()
     total = int(0)
     for j in range(_HALVES):
@@ -85,7 +86,6 @@ def _pick(index: Index, windows: Windows, side: int, work: Work):
 
 @wp.kernel(enable_backward=False)
 def _relate(work: Work):
-    """Computes the covariance of one probe per thread with the probes before it, with itself and with the block."""
     k, i = wp.tid()
     if i < work.picked[k]:
         x = work.places[k, i]
@@ -105,7 +105,7 @@ def _relate(work: Work):
 
 @wp.kernel(enable_backward=False)
 def _weigh(work: Work):
-    """Computes the weights of one block's probes per thread by Cholesky decomposition; unused entries become 0."""
+    """Computes the weights of a block's probes by Cholesky decomposition, one block per thread; the rest is 0."""
     k = wp.tid()
     count = work.picked[k]
     lower = _Square()
@@ -144,8 +144,8 @@ def _weigh(work: Work):
 
 
 def weigh(index: Index, windows: Windows, side: int, work: Work) -> None:
-    """Chooses and weighs the probes of the blocks whose ranges `volume_frame.search` found. There are three launches,
-    since only the last one, the longest, is limited to one thread per block."""
+    """Chooses, for each block, at most 16 of the probes that `volume_frame.search` found, and computes their weights.
+    There are three launches, since only the last one, the longest, is limited to one thread per block."""
     device = work.clock.device
     wp.launch(_pick, work.weights.shape, inputs=[index, windows, side, work], block_dim=32, device=device)
     wp.launch(_relate, work.weights.shape, inputs=[work], block_dim=32, device=device)

@@ -145,7 +145,6 @@ def _reach(smoke_type: Any) -> wp.Kernel:
         # out:
         nodes: wp.array3d[wp.vec2],
     ):
-        """Computes the optical depth from a node to a point light."""
         i, j, k = wp.tid()
         p = _node(lattice, i, j, k)
         away = wp.length(lattice.place - p)
@@ -224,8 +223,7 @@ def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, 
 
 
 def spacing_of(march: March) -> tuple[float, float]:
-    """Returns the largest distance between nodes of a march's lattice, and the longest step of the march from node to
-    node, both in voxels."""
+    """Returns the largest distance between nodes of the lattice, and the longest step between them, in voxels."""
     spacing = march.step if march.spacing is None else march.spacing
     return spacing, spacing if march.light_step is None else march.light_step
 

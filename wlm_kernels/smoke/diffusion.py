@@ -3,9 +3,8 @@
 In a cell of extinction s and albedo a the fluence f obeys -div(D grad f) + (1 - a) s f = a q. The source q is the
 direct light that the cell absorbs or scatters, D = 1 / (3 s + |grad f| / f) limits the flux (Wilson's sum), and half of
 the fluence leaves at the box's faces (Marshak's condition). The equation is solved by red-black successive
-over-relaxation in rounds; each round takes D from the fluence of the previous round. Grids go from coarse to fine: the
-coarsest grid has a few cells, between which light spreads within one round; each finer grid starts from the
-interpolated result of the coarser grid.
+over-relaxation in rounds, each with D from the fluence of the previous round, on grids from coarse to fine. On the
+coarsest grid light reaches all cells within a round; a finer grid starts from the coarser grid's interpolated result.
 
 Lengths are in voxels; cell (0, 0, 0) begins at the grid's corner.
 """
@@ -72,10 +71,8 @@ def _reach(
 
 @wp.func
 def _flow(one: float, other: float, size: float) -> float:
-    """Computes the flow of light between two neighbouring cells, per volume and per difference of their fluences.
-
-    `one` and `other` are the diffusion coefficients D of the cells, `size` is the distance of their centres in voxels.
-    """
+    """Computes the flow of light between two cells `size` voxels apart, whose diffusion coefficients D are `one` and
+    `other`, per volume and per difference of their fluences."""
     return 2.0 * one * other / ((one + other) * size * size)
 
 
@@ -98,8 +95,7 @@ def _couple(
     # out:
     flows: wp.array4d[wp.vec4],
 ):
-    """Computes a cell's flows to the next cells along x, y and z (0 at the box's faces), and the reciprocal of the
-    cell's total loss by absorption and flow, all per volume and fluence."""
+    """Computes a cell's flows to the next cells along x, y and z, and 1 over its loss by absorption and all flows."""
     n, i, j, k = wp.tid()
     own = reach[n, i, j, k]
     x = _exchange(own, reach, n, i + 1, j, k, cell[0])
@@ -127,10 +123,7 @@ def _relax(
     # out:
     light: wp.array4d[float],
 ):
-    """Relaxes the cells of one colour of the chessboard (0 or 1) by the factor `over`.
-
-    The first axis of `light` has one entry for each source and, within each source, for each of `each` albedos.
-    """
+    """Relaxes the red or the black cells (`colour` 0 or 1); `light` has an entry for each source and each albedo."""
     n, i, j, half = wp.tid()
     k = 2 * half + ((i + j + colour) & 1)
     if k >= light.shape[3]:
@@ -245,7 +238,6 @@ def _relax_rounds(
     light: wp.array,
     rounds: int,
 ) -> None:
-    """Runs rounds of over-relaxation on one grid, in place: `light` has the fluence before and after."""
     reach, flows = medium.buffer(light.shape, float), medium.buffer(light.shape, wp.vec4)
     halves = (*light.shape[:3], (light.shape[3] + 1) // 2)
     extinction = thickness.reshape(thickness.shape[1:])
@@ -260,7 +252,6 @@ def _relax_rounds(
 
 @wp.func
 def _splat(place: wp.vec3, cell: wp.vec3, light: float, out: wp.array3d[float]):
-    """Adds light to the eight cells around a position, or to the outermost cells for a position near a face."""
     q = wp.cw_div(place, cell) - wp.vec3(0.5, 0.5, 0.5)
     i = int(wp.floor(q[0]))
     j = int(wp.floor(q[1]))
@@ -292,7 +283,6 @@ def _shoot(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        """Traces one ray from a point light and adds the light that the smoke extinguishes to the cells on the ray."""
         n = wp.tid()
         height = 1.0 - (2.0 * float(n) + 1.0) / float(_RAYS)
         around = float(n) * _TURN
@@ -344,7 +334,6 @@ def _stop(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        """Computes the direct light that a cell extinguishes from a light at infinity, per volume."""
         i, j, k = wp.tid()
         total = float(0.0)
         for x in range(parts[0]):
@@ -376,8 +365,6 @@ def _gather(smoke_type: Any) -> wp.Kernel:
         out: wp.array4d[float],
         thin: wp.array2d[float],
     ):
-        """Computes the light that smoke of albedo 1 scatters to a pixel from a given fluence, and the part of this
-        light that comes from thin smoke, as `gather` defines it."""
         n, row, column = wp.tid()
         r = begin(view, row, column, smoke, march.step, 0.5)
         total = float(0.0)

@@ -8,13 +8,8 @@ Extinction per voxel is `extinction * density`. A step has the density of its sa
 A light is given by the direction towards it and has irradiance 4 pi, so that an isotropic phase function is 1 instead
 of 1 / (4 pi).
 
-Every march of a camera ray is the same loop; a kernel adds only what it accumulates:
-
-    r = begin(view, row, column, smoke, step, offset)
-    while r.done < r.count:
-        r = look(r, smoke)                  # r.place, r.sigma, r.x; r.t is the transparency before the step
-        ...
-        r = pass_step(r, cutoff)
+Every march of a camera ray calls `begin` and then, while `r.done < r.count`, `look`, which sets the ray's place, sigma
+and x, and then `pass_step`. Kernels differ only in what they add up between `look` and `pass_step`.
 
 None of these marches has a gradient; `single_scatter` has one. Read `tests/reference/marching.py` first: it is the same
 in float64 NumPy, without shared work between pixels.
@@ -307,10 +302,7 @@ def _in_brick(density: wp.array3d[Any], bricks: int, p: wp.vec3) -> float:
 
 @wp.func
 def sample(smoke: Any, p: wp.vec3) -> float:
-    """Interpolates density like `density_at`, and returns 0 at once in a brick that is known to be empty.
-
-    `p` lies at most half a voxel outside the grid.
-    """
+    """Interpolates density at p, at most half a voxel outside the grid; returns 0 at once in a brick known as empty."""
     return _in_brick(smoke.density, smoke.bricks, p)
 
 
@@ -356,8 +348,7 @@ def phase(g: float, cosine: float) -> float:
 
 @wp.func
 def noise(row: int, column: int, seed: int) -> float:
-    """Computes interleaved gradient noise in [0, 1) (Jimenez 2014): its mean over a few neighbouring pixels is near
-    1/2, so that a small blur removes the noise."""
+    """Computes interleaved gradient noise in [0, 1) (Jimenez 2014), whose mean over a few pixels is near 1/2."""
     pattern = float(seed & (_PATTERNS - 1))
     x = float(column) + 5.588238 * pattern
     y = float(row) + 5.588238 * pattern
@@ -408,10 +399,8 @@ def pass_step(r: Ray, cutoff: float) -> Ray:
 
 @wp.func
 def surface(depth: float, r: Ray, view: View, threshold: float) -> float:
-    """Returns `depth` unless it is 0; else the depth of the current sample if its extinction exceeds the threshold.
-
-    Called at each step, it finds the depth of the smoke's surface, in the unit of the view's depths; 0: none so far.
-    """
+    """Returns the depth of the first sample whose extinction exceeds the threshold; `depth` is the result of the
+    earlier steps, 0 if there was none."""
     if depth == 0.0 and r.sigma > threshold:
         return (r.distance + view.moved) * view.voxel
     return depth
@@ -425,8 +414,7 @@ def emitted(r: Ray, smoke: Any) -> float:
 
 @wp.func
 def optical_depth(smoke: Any, p: wp.vec3, toward: wp.vec3, step: float) -> float:
-    """Computes the optical depth from p to the border of the grid in direction `toward` (eq. 3), in equal steps no
-    longer than `step`, each sampled in its middle."""
+    """Computes the optical depth (eq. 3) from p out of the grid, with samples in the middles of steps up to `step`."""
     r = steps_along(size_of(smoke.density), p, toward, step)
     tau = float(0.0)
     for n in range(r.count):
@@ -445,8 +433,7 @@ def node_position(nodes: wp.array3d[Any], size: wp.vec3, i: int, j: int, k: int)
 
 
 def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
-    """Computes the number of lattice nodes along each axis of a grid of `shape` voxels, for a spacing of at most `step`
-    voxels; a step below 1 counts as 1."""
+    """Computes the nodes along each axis for a spacing of at most `step` voxels; a step below 1 counts as 1."""
     # Each node marches to its lights separately, so the work grows with the fourth power of the resolution.
     return tuple(math.ceil((n + 1) / max(step, 1.0)) + 1 for n in shape)
 
@@ -462,7 +449,6 @@ def occupied_kernel(dtype: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[wp.uint8],
     ):
-        """Tests whether a line of voxels, a brick's edge long plus one voxel at either end, contains smoke."""
         i, j, c = wp.tid()
         smoke = wp.uint8(0)
         for k in range(wp.max(c * BRICK - 1, 0), wp.min((c + 1) * BRICK + 1, density.shape[2])):

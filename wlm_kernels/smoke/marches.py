@@ -156,7 +156,6 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
 
 @wp.func
 def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
-    """Interpolates the optical depths to the right, left, top and bottom bilinearly between four nodes of plane k."""
     sides = wp.vec4()
     for pair in range(2):
         a = wp.lerp(nodes[i, j, k, pair], nodes[i, j + 1, k, pair], fy)

@@ -122,7 +122,6 @@ def _weigh(
     # out:
     out: wp.array3d[float],
 ):
-    """Computes the weight of one feature for a light and an albedo, interpolated between two fitted albedos."""
     light, a, feature = wp.tid()
     total = float(0.0)
     for n in range(MIXES):

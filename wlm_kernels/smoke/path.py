@@ -65,8 +65,6 @@ class PathSettings:
 
 @wp.struct
 class _Grid:
-    """Majorants: upper bounds of the extinction in bricks of `edge` voxels; see `Majorants`."""
-
     bounds: wp.array3d[float]
     edge: float
     low: wp.vec3
@@ -75,8 +73,7 @@ class _Grid:
 
 @wp.struct
 class _Flight:
-    """A free path: the distance t at which it ends, whether it hit smoke there, the emission that it gathered, and the
-    next random state."""
+    """A free path: the distance t of its end, whether it hit smoke there, and the emission that it gathered."""
 
     t: float
     hit: int
@@ -133,13 +130,13 @@ def bits(random: wp.uint64) -> wp.uint32:
 
 @wp.func
 def uniform(random: wp.uint64) -> float:
-    """Generates a number of 24 bits in [0, 1)."""
+    """Returns the random number in [0, 1), with 24 bits, of a random state."""
     return float(bits(random) >> wp.uint32(8)) * (1.0 / 16777216.0)
 
 
 @wp.func
 def scatter(g: float, d: wp.vec3, u: float, v: float) -> wp.vec3:
-    """Samples the Henyey-Greenstein phase function for a path along d."""
+    """Samples the new direction of a path along d by the Henyey-Greenstein phase function; u and v are in [0, 1)."""
     cosine = 1.0 - 2.0 * u
     if wp.abs(g) > 1.0e-3:
         share = (1.0 - g * g) / (1.0 - g + 2.0 * g * u)
@@ -175,7 +172,6 @@ class _Walk:
 
 @wp.func
 def _border(cell: int, count: int, edge: float, p: float, d: float) -> float:
-    """Computes the distance at which a ray leaves a brick along one axis; outermost bricks extend to infinity."""
     if d > 1.0e-9 and cell < count - 1:
         return (float(cell + 1) * edge - p) / d
     if d < -1.0e-9 and cell > 0:
@@ -185,7 +181,6 @@ def _border(cell: int, count: int, edge: float, p: float, d: float) -> float:
 
 @wp.func
 def _enter(grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
-    """Finds the first brick on a ray from p; `t` is not below `end` if the ray meets no brick before its limit."""
     w = _Walk()
     q = p - grid.low
     span = clip(grid.size, q, d)
@@ -203,13 +198,11 @@ def _enter(grid: _Grid, p: wp.vec3, d: wp.vec3, limit: float) -> _Walk:
 
 @wp.func
 def _further(cell: int, count: int, leave: float, across: float) -> float:
-    """Computes the distance at which a ray leaves, along the same axis, the brick that it has just entered."""
     return wp.where(cell > 0 and cell < count - 1, leave + across, _NEVER)
 
 
 @wp.func
 def _onward(w: _Walk, bounds: wp.array3d[float], d: wp.vec3) -> _Walk:
-    """Advances a ray to the next brick, or to its end."""
     w.t = w.border
     if w.t < w.end:
         if w.leave[0] <= w.leave[1] and w.leave[0] <= w.leave[2]:
@@ -309,8 +302,6 @@ def _add(out: wp.array3d[wp.vec3], plane: int, row: int, column: int, light: wp.
 
 @wp.struct
 class _Scene:
-    """All that paths meet besides the smoke: its bricks, camera, lights, mesh of obstacles (in voxels), settings."""
-
     grid: _Grid
     view: View
     lights: wp.array1d[PathLight]
@@ -376,11 +367,9 @@ def _coarser(
 
 @for_smoke
 def _trace(smoke_type: Any, solid: bool) -> wp.Kernel:
-    """Builds the kernel for a type of smoke; `solid` tells whether there are obstacles."""
 
     @wp.func
     def free(mesh: wp.uint64, p: wp.vec3, d: wp.vec3) -> float:
-        """Finds the distance in voxels to the first obstacle along a ray; `_NEVER` if there is none."""
         if wp.static(solid):
             found = wp.mesh_query_ray(mesh, p, d, _NEVER)
             return wp.where(found.result, found.t, _NEVER)
@@ -552,8 +541,7 @@ class Majorants:
 
 
 def bounds(medium: Medium, densest: float) -> Majorants:
-    """Computes the majorants of smoke, in bricks so large that the densest smoke has an optical depth of about one in
-    them.
+    """Computes majorants, in bricks so large that the densest smoke has an optical depth of about one in them.
 
     Args:
         medium: The smoke.
@@ -576,8 +564,7 @@ def bounds(medium: Medium, densest: float) -> Majorants:
 
 
 def _filled(there: np.ndarray) -> tuple[list[int], list[int]]:
-    """Returns the first cell of the smallest box around all true cells, and the cell after its last; if no cell is
-    true, the box is cell (0, 0, 0)."""
+    """Returns the first cell of the smallest box around all true cells, and the cell after its last."""
     begin, end = [], []
     for axis in range(3):
         found = np.flatnonzero(there.any(tuple(other for other in range(3) if other != axis)))

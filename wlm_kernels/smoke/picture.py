@@ -19,7 +19,7 @@ class Solids:
 
     Attributes:
         points: vec3 [V], corners in the world.
-        triangles: int32 [F, 3].
+        triangles: int32 [F, 3], indices of each triangle's corners.
         owner: int32 [F], index of each triangle's obstacle.
         colours: vec3 [obstacles], albedo of each obstacle.
     """
@@ -113,8 +113,7 @@ def _light_solids(
 
 @wp.func
 def _glow(stops: wp.array(dtype=float), colours: wp.array(dtype=wp.vec3), count: int, emission: float) -> wp.vec3:
-    """Computes the colour of an emission by a colour ramp: linear between stops, constant beyond the first and the last
-    stop. Without stops the colour is grey."""
+    """Computes the colour of an emission by a ramp: linear between stops, constant beyond them; grey without stops."""
     if count == 0:
         return wp.vec3(emission, emission, emission)
     colour = colours[0]
@@ -188,8 +187,7 @@ def _compose(
 
 
 def clip_points(solids: Solids, view: View, clip: wp.array) -> None:
-    """Transforms the obstacles' corners to clip space, written to `clip`, vec4 [V]; `view` is a camera in the world. A
-    corner that must not be drawn becomes NaN."""
+    """Writes the obstacles' corners in clip space, vec4 [V]; a corner that must not be drawn becomes NaN."""
     wp.launch(_clip, solids.points.shape, [solids.points, view], [clip], device=clip.device)
 
 

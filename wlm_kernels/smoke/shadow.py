@@ -52,10 +52,7 @@ def _place(bounds: wp.array(dtype=float), resolution: float) -> _Map:
 
 @wp.func
 def _on_map(m: _Map, resolution: float, p: wp.vec3) -> wp.vec3:
-    """Converts a point in the light's axes to the map's column and row, and the point's height towards the light.
-
-    Texel centres have integer columns and rows.
-    """
+    """Converts a point in the light's axes to the map's column, row (integers at texel centres) and height."""
     column = (p[0] - m.middle[0]) / m.texel + 0.5 * resolution - 0.5
     row = (m.middle[1] - p[1]) / m.texel + 0.5 * resolution - 0.5
     return wp.vec3(column, row, p[2])

@@ -44,7 +44,6 @@ class _Cell:
 
 @wp.func
 def _cell(q: wp.vec3, counts: wp.vec3i) -> _Cell:
-    """Finds the eight grid values around q; value (i, j, k) is at q = (i, j, k)."""
     cell = _Cell()
     for axis in range(3):
         i = int(wp.floor(q[axis]))

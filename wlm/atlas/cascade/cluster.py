@@ -1,18 +1,19 @@
 """Groups of triangles whose lighting is alike (lightmap-uv-clustering-cascade, sections 3.1 and 3.2).
 
-Patches of the triangles (`wlm_kernels.atlas.patches`) are the nodes of a graph, with an edge where their distance Dist
-(eq. 2) is below lambda in one of the six orders of the vertices. The node with most edges (on a tie the one with the
-lowest number) represents a group: itself and its neighbours. The group is removed and the edges of the remaining nodes
-are counted again, until no edge is left (eq. 6).
+The lightmap is sampled at a grid of points over each triangle, its patch (`wlm_kernels.atlas.patches`). Patches are the
+nodes of a graph. An edge joins two patches if their distance Dist (eq. 2) is below lambda in one of the six orders of
+the vertices. The node with most edges (on a tie the one with the lowest number) and its neighbours form a group, which
+this node represents. The group is removed and the edges of the remaining nodes are counted anew, until none is left
+(eq. 6).
 
 The cost of this is quadratic. With more than `SAMPLE` triangles, groups are formed among a random sample of `SAMPLE`
-triangles. Every other triangle joins the first representative that it is like, and triangles that joined none are
-sampled again. Each triangle is still like its representative, and no two representatives are alike. Only edges within a
-sample are stored, so that memory grows linearly with the triangles and the texels that they cover.
+triangles. Every other triangle joins the first representative within distance lambda of it, and triangles that joined
+none are sampled again. Each triangle is still within lambda of its representative, and no two representatives are. Only
+edges within a sample are stored, so that memory grows linearly with the triangles and the texels that they cover.
 
 The following points are not specified by the paper or differ from it:
 
-- The sizes of patches are 2 ** k + 1, the smallest one not below R_s (eq. 1), and at most `largest`.
+- A patch has 2 ** k + 1 samples along a side, the smallest such number not below R_s (eq. 1), and at most `largest`.
 - R_s uses lengths in texels, which is also right where the lightmap isn't square.
 - A triangle is excluded if its patch reads a texel above `max_radiance` in any channel. The samples of a triangle
   larger than `largest` lie more than a texel apart, and texels between them are not read.
@@ -49,8 +50,8 @@ class Clusters:
             they were formed, then groups of one triangle.
         representative: int32 [G], for each of G groups the triangle that represents it.
         order: int8 [F]: vertex k of the triangle goes to vertex p[k] of its representative, p = `ORDERS[order]` of
-            `wlm_kernels.atlas.patches`. The first of equally good orders; 0 for representatives.
-        distance: float64 [F], Dist to the representative in this order (eq. 2), below lambda.
+            `wlm_kernels.atlas.patches`. If several orders are equally good, it is the first one; 0 for representatives.
+        distance: float64 [F], distance Dist (eq. 2) of the patch to its representative's in this order, below lambda.
         excluded: bool [F], true for triangles that are too bright or not active: each is a group of its own.
     """
 
@@ -74,21 +75,23 @@ def cluster(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> Clusters:
-    """Groups triangles whose patches are alike.
+    """Groups triangles over which the lightmap looks alike, so that one of them can stand for its whole group.
 
     Args:
-        uv: [V, 2], of the lightmap, finite; v = 0 is the top of row 0. Outside [0, 1] the border's texels are read.
-        triangle: int [F, 3], vertices.
+        uv: [V, 2], lightmap UVs of the vertices, finite; v = 0 is the top of row 0. Beyond [0, 1], border texels are
+            read.
+        triangle: int [F, 3], vertex numbers.
         lightmap: [H, W, 3], linear RGB, finite.
         threshold, colour_threshold: lambda of eq. 4 and lambda_h of section 3.2.1, fractions of `max_radiance`.
-        max_radiance: Above 0. Brighter triangles share with no other (section 4.1.1). It is 255 in 8-bit colours.
+        max_radiance: Above 0. A triangle with a brighter texel shares texels with no other (section 4.1.1). It stands
+            for the paper's 8-bit colour 255.
         active: bool [F], which triangles take part; None for all.
-        largest: The largest size of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
+        largest: Largest number of samples along a side of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
         progress: Called with the triangles done in the stages "compare patches" and "cluster", in turn.
 
     Raises:
-        ValueError: The patches have more samples than 32 bits can count.
+        ValueError: There are more samples of the lightmap in all than 32 bits can count.
     """
     count = len(triangle)
     excluded = np.zeros(count, bool) if active is None else ~active
@@ -120,7 +123,8 @@ def cluster(
 
 
 def _texels(lightmap: np.ndarray, max_radiance: float) -> np.ndarray:
-    """Converts the lightmap to 16 bits per channel; a fourth channel is 1 where a texel is too bright."""
+    """Converts light to 16 bits per channel, `max_radiance` to 65,535; a fourth channel is 1 where a texel is
+    brighter."""
     texels = np.empty((*lightmap.shape[:2], 4), np.uint16)
     fraction = lightmap.astype(np.float64) / max_radiance
     texels[..., :3] = np.rint(np.clip(fraction, 0.0, 1.0) * 65535.0)
@@ -135,15 +139,16 @@ def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
-    """Returns each patch's level, int32 [F]: the index in `SIZES` of the smallest size not below R_s (eq. 1)."""
+    """Returns for each triangle the index in `SIZES` of the smallest size not below its longest edge in texels (eq. 1),
+    int32 [F]."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
 
 
 def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None) -> list[tuple[int, np.ndarray]]:
-    """Yields each group of several nodes with its representative. Where nodes have equally many edges, the one with the
-    lowest triangle number in `number`, int [M], is chosen."""
+    """Returns for each group of several nodes its representative and all its nodes. Where nodes have equally many
+    edges, the one with the lowest triangle number in `number`, int [M], is chosen."""
     count = len(number)
     left = np.arange(count)
     drawn = np.random.default_rng(0).permutation(count)  # the order in which nodes get into samples
@@ -174,7 +179,8 @@ def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None
 
 
 def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Meter, done: int) -> np.ndarray:
-    """Finds the first of the representatives `heads` that each node is like, int [N]; their number if there is none."""
+    """Finds for each of N nodes the index of the first representative in `heads` that it has an edge to, int [N];
+    `len(heads)` where it has none."""
     device, by_mean = graph.patches.device, np.argsort(heads, kind="stable")
 
     def on_device(values: np.ndarray) -> wp.array:
@@ -193,7 +199,7 @@ def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Me
 
 
 def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
-    """Returns the edges between M nodes, uint8 [M, M], 1 where two are alike; `done` is only for the progress."""
+    """Returns the edges between M nodes, uint8 [M, M], 1 where two are alike."""
     count, device = graph.patches.shape[0], graph.patches.device
     edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     piece = max(_PAIRS_AT_ONCE // max(count, 1), 1)

@@ -12,10 +12,11 @@ coordinates of its own texels' centres; `wlm_kernels.atlas.cascade` describes ho
                     difference within a pair in place of an image's gradient. Places that no camera sees count too;
                     seams don't, since a pair doesn't cross one. This is our alternative.
 
-The paper leaves some points open. Here the loss is a sum and not a mean, which changes Adam's steps by its epsilon
-alone; radiance, and so T_p's rate, is in units of the lightmap's mean, since a dark lightmap would otherwise be tuned
-more coarsely than a bright one; after each step T_p is clamped to the range of half floats and T_c to [0, 1], the range
-of its 16 bits, where F is the identity. `Profile.final_rate` lets rates, which are constant in the paper, decay.
+The paper leaves some points open. Here the loss is a sum and not a mean, which hardly changes Adam's steps. Radiance,
+and so T_p's rate, is in units of the lightmap's mean, since a dark lightmap would otherwise be tuned more coarsely than
+a bright one. After each step T_p is clamped to the range of half floats and T_c to [0, 1], the range of its 16 bits,
+where the folding of coordinates by eq. 8 changes nothing. `Profile.final_rate` lets rates, which are constant in the
+paper, decay.
 
 On CUDA gradients are added in any order: two fits with one seed differ in the last bits of each step.
 """
@@ -62,8 +63,8 @@ class Textures:
 
 
 def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters | None:
-    """Groups triangles whose lighting is alike (sections 3.1 and 3.2); None if the threshold is 0: none share
-    texels."""
+    """Groups triangles whose lighting is alike (sections 3.1 and 3.2); returns None if the threshold is 0, since no
+    triangles share texels then."""
     if profile.threshold == 0:
         return None
     # A black lightmap may use any number, since its triangles are all alike.
@@ -103,16 +104,16 @@ def fit_cascade(
 
     Args:
         scene: A scene of one sheet and one state.
-        clusters: The groups of its triangles; None: no triangles share texels.
+        clusters: The groups of its triangles that share texels; None: no triangles share any.
         profile, seed, stages: As for `wlm.atlas.fit.compress`.
-        repack: Whether charts are packed anew (section 3.3.1). If false, the mesh keeps its UVs, the cascade starts as
-            the lightmap itself, and `clusters` and the profile's `scale` are ignored (section 4.5.2).
+        repack: Whether charts are packed anew (section 3.3.1). If false, the mesh keeps its UVs, tuning starts from the
+            original lightmap, and `clusters` and the profile's `scale` are ignored (section 4.5.2).
 
     Returns:
         A model of method "cascade"; or "plain", with the colour texture T_p alone, if `lut_scale` is 0.
 
     Raises:
-        WlmError: An error of `pack` or `tune`, or a package for the blocks of T_p is missing.
+        WlmError: An error of `pack` or `tune`, or the package that encodes T_p's block format isn't installed.
     """
     (sheet,), facts = scene.sheets, {}
     count = len(sheet.triangle)
@@ -155,8 +156,9 @@ def fit_cascade(
 
 def initial(lightmap: np.ndarray, mask: np.ndarray, profile: Profile) -> Textures:
     """Makes the textures from which tuning starts (section 3.3.3). Each texel of T_p is the mean of the lightmap's
-    texels that it covers, and T_c holds the coordinates of its texels' centres. The repacked lightmap is float32 [H_r,
-    W_r, 3]; `mask`, bool [H_r, W_r], is true for texels in charts, from which all others are filled."""
+    texels that it covers, and T_c holds the coordinates of its texels' centres. `lightmap` is the repacked one, float32
+    [H_r, W_r, 3]; `mask`, bool [H_r, W_r], is true for texels in charts. All others first take the nearest of these
+    colours."""
     height, width = mask.shape
     sides = _sides(height, width, profile.colour_scale)
     colour = resized(fill_gaps(lightmap, mask), mask, *sides, "box").numpy().astype(np.float32)
@@ -178,11 +180,11 @@ def tune(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
 ) -> Textures:
-    """Tunes the textures of a cascade so that the mesh looks as with its lightmap. `uv`, float32 [F, 3, 2], are the
-    corners' UVs for the cascade. The checkpoint keeps the state of the steps as batch 1.
+    """Tunes the textures of a cascade so that the mesh looks as it does with the original lightmap. `uv`, float32 [F,
+    3, 2], are the corners' UVs for the cascade. The checkpoint saves the state between steps.
 
     Raises:
-        WlmError: No such device, or the fit diverged.
+        WlmError: There is no such device, or the textures became NaN or infinite (the fit diverged).
     """
     device = interop.check_device(device)
     with interop.stream(device):
@@ -214,8 +216,6 @@ def tune(
 
 
 def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
-    """Reads the groups of `count` triangles that an interrupted compression saved in the checkpoint; None: no
-    groups."""
     triangle = Part(np.int32, (count,), least=0, most=count - 1)
     table = {
         "group": triangle,
@@ -227,7 +227,7 @@ def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
     if (kept := checkpoint.finished(0, table)) is None:
         return None
     if kept["group"].max() >= len(kept["representative"]):
-        raise WlmError(f"{checkpoint.path}: finished batch 0: part group: expected one of the representatives' groups")
+        raise WlmError(f"{checkpoint.path}: the groups of triangles are damaged: a group has no representative")
     return Clusters(**kept)
 
 
@@ -236,7 +236,7 @@ def _sides(height: int, width: int, scale: float) -> tuple[int, int]:
 
 
 class _Step:
-    """One step of tuning. Its buffers are allocated once, so that a CUDA graph may capture it."""
+    """One step of tuning, as a callable. Its buffers are allocated once, so that a CUDA graph may capture the step."""
 
     def __init__(
         self,
@@ -309,7 +309,7 @@ class _Step:
             self._lut.clamp_(0.0, 1.0)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays that later steps depend on, by name."""
+        """Returns the arrays that later steps depend on, by name: the textures and Adam's state."""
         tensors = {"step": self._step}
         for group in self._adam.param_groups:
             for parameter in group["params"]:
@@ -346,7 +346,6 @@ class _Step:
 
     @property
     def done(self) -> int:
-        """The number of steps done."""
         return int(self._step.item())
 
     def textures(self) -> Textures:

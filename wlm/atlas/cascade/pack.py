@@ -1,17 +1,17 @@
 """New UVs in which triangles share texels, and the lightmap under them (lightmap-uv-clustering-cascade, 3.3.1).
 
-The members of a group take the corners of its representative, so their own texels are dropped. Representatives that
-share an edge under the old UVs stay together in one chart. A chart moves rigidly: it is rotated and translated, never
+The triangles of a group take the UVs of its representative, so their own texels are dropped. Representatives that share
+an edge under the old UVs stay together in one chart. A chart moves rigidly: it is rotated and translated, never
 stretched and never mirrored, and all charts are scaled by one epsilon, in texels. `uvunwrap` packs them in float32;
 each chart's rigid motion is fitted to its result by least squares and then applied exactly.
 
 The paper leaves two points open. Here charts have two texels between them (one around each), so that a bilinear read in
-one never reads another's texel, and a triangle that is too thin for the packer gets a separate place, half a texel
+one never reads another's texel, and a triangle that is too thin for the packer gets a chart of its own, half a texel
 high. The atlas has the size that its charts need, W_r x H_r texels (eq. 9), and not exactly the lightmap's size times
 epsilon.
 
 A triangle that isn't `active` takes no texels: it reads one point of an active neighbour, or (0, 0) if it has none.
-Triangles that fold over each other in a chart, or of which three and more share an edge, are in separate charts.
+Triangles that fold over each other in a chart, or of which three or more share an edge, are in separate charts.
 """
 
 import math
@@ -109,10 +109,10 @@ def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
 
 
 def regenerate(sheet: Sheet, packed: Packed, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
-    """Renders the atlas: each texel that a bilinear read of a chart can reach takes the lightmap's colour at that
-    place. A point in a triangle takes the colour at the same barycentric coordinates in the old UVs, as in the paper.
-    Since a chart moves rigidly, one affine map converts all its points, also those just beyond its border. Returns
-    float32 [H_r, W_r, 3], linear, 0 outside of charts; and bool [H_r, W_r], true in charts."""
+    """Renders the new lightmap: each texel that a bilinear read of a chart can reach takes the lightmap's colour at
+    that place. A point in a triangle takes the colour at the same barycentric coordinates in the old UVs, as in the
+    paper. Since a chart moves rigidly, one affine map converts all its points, also those just beyond its border.
+    Returns float32 [H_r, W_r, 3], linear, 0 outside of charts; and bool [H_r, W_r], true in charts."""
     height, width = packed.height, packed.width
     heads = np.flatnonzero(packed.source == np.arange(len(packed.source)))
     outline = _dilated(packed.corner[heads])  # [N, 7, 2]
@@ -135,8 +135,8 @@ def _pack_charts(
     name: str, old: np.ndarray, numbers: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Packs the charts of N triangles, whose corners [N, 3, 2] are in texels of the lightmap; corners with equal
-    `numbers` [N, 3] coincide. Returns each triangle's chart, int [N]; the rotation and the shift of each chart, complex
-    [C] each, as `_motions`; and the atlas's W_r and H_r."""
+    `numbers` [N, 3] coincide. Returns each triangle's chart, int [N]; the rotation (times the scale) and the shift of
+    each of C charts, complex [C] each; and the atlas's width and height in texels."""
     label = charts(numbers)
     # Triangles are made counter-clockwise, since the packer would mirror clockwise ones.
     winding = np.where((_signed_area(old) < 0)[:, None], [0, 2, 1], [0, 1, 2])
@@ -162,7 +162,7 @@ def _uvunwrap(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Calls the packer `uvunwrap`, which leaves out triangles that are too thin for it. Returns new corners in texels,
     float64 [N, 3, 2]; each triangle's chart, int [N], -1 if it has none; whether the triangle has new corners, bool
-    [N]; and the atlas's width and height."""
+    [N]; and the atlas's width and height in texels."""
     uvunwrap = need("uvunwrap", "atlas")
     if not len(points):
         return np.zeros((0, 3, 2)), np.zeros(0, np.int64), np.zeros(0, bool), np.ones(2)
@@ -202,9 +202,9 @@ def _chart_meshes(
     points: np.ndarray, numbers: np.ndarray, label: np.ndarray
 ) -> tuple[np.ndarray, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
     """Makes each chart a flat mesh with its lower corner at the origin: places float32 [v, 3], triangles uint32 [f, 3]
-    and the same places as UVs; also returns the triangles [N] in the order of the meshes. If all charts were one mesh,
-    charts that meet at a point would be joined. The precision of float32 and the thinnest triangle that the packer
-    accepts also depend on the extent of a mesh."""
+    and the same places as UVs; the numbers of the triangles in the order of the meshes, int [N], come first in the
+    result. In one mesh the packer would join charts that meet at a point. In a smaller mesh float32 coordinates are
+    finer, and the packer accepts thinner triangles."""
     charts = np.arange(int(label.max()) + 2)
     low = np.full((len(charts) - 1, 2), np.inf)
     np.minimum.at(low, label, points.min(1))
@@ -223,8 +223,8 @@ def _chart_meshes(
 def _motions(
     name: str, old: np.ndarray, place: np.ndarray, chart: np.ndarray, scale: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fits each chart's rigid motion, x + iy to rotation (x + iy) + shift; returns rotation and shift, complex [C]
-    each."""
+    """Fits the rigid motion that took each of C charts to its new place: z to rotation * z + shift, with points as
+    complex numbers z = x + iy. Returns rotation (times the scale) and shift, complex [C] each."""
     before, after = _complex(old).reshape(-1), _complex(place).reshape(-1)
     chart = np.repeat(chart, 3)
     count = int(chart.max(initial=-1)) + 1
@@ -256,7 +256,7 @@ def _place_inactive(corner: np.ndarray, numbers: np.ndarray, active: np.ndarray)
 
 
 def _thickened(points: np.ndarray, height: float) -> np.ndarray:
-    """Makes right triangles [N, 3, 2] around thin triangles [N, 3, 2], at least `height` high and at least as long."""
+    """Puts right triangles around thin triangles [N, 3, 2]: one leg is `height` long, the other at least as long."""
     out = np.empty_like(points)
     for i, corner in enumerate(points):
         ends = [(corner[k], corner[(k + 1) % 3]) for k in range(3)]

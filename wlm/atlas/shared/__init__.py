@@ -1,1 +1,1 @@
-"""The method "shared": each tile is a sum of a few components, which the states of a sheet share."""
+"""The method "shared": each tile is a sum of few components, which the states (such as hours) of a lightmap share."""

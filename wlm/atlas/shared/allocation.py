@@ -17,7 +17,7 @@ _TRIES, _FULL = 12, 0.995  # attempts to place all tiles, and the used fraction 
 _LEAST_GAIN = 2.0**-24
 _LESS = 0.95  # fraction of the bits at which the error is measured again, for the value of a bit
 _DROPPED = 8  # one in eight of the mixtures that aren't worth their factors is removed per round
-NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take: expected more"
+NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take; give more"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Allocated:
             of each component, in M states.
         coarse: int [T], number of coarse components, which have a single block each.
         size: int [T, 2], width and height in texels of each component that isn't coarse.
-        second: bool [T], whether the tile is in the second texture.
+        second: bool [T], whether the tile is in the second texture, of compressed blocks.
         first: int64 [T, 2], place of the first component on the page.
         page: int64 [T], the page.
         shapes: Numbers of pages, rows and columns of both textures.
@@ -141,8 +141,8 @@ def _worth(
 
 
 def packed(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Packs rectangles, int [T, 2] texels along x and y, on the smallest number of pages of equal size. Returns first
-    texels, int64 [T, 2]; pages, int64 [T]; and rows and columns of a page.
+    """Packs rectangles, int [T, 2] texels along x and y, on as few pages of equal size as possible. Returns the first
+    texel of each, int64 [T, 2]; its page, int64 [T]; and rows and columns of a page.
 
     Raises:
         WlmError: All pages together are too small.
@@ -155,7 +155,7 @@ def packed(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
         if max(shape) <= MOST_SIZE:
             return first, page, shape
         pages += 1
-    raise WlmError(f"budget: expected at most {MOST_PAGES} pages of {MOST_SIZE} texels along a side")
+    raise WlmError(f"budget: too large for {MOST_PAGES} pages of {MOST_SIZE} texels along a side; give less")
 
 
 def _on_pages(size: np.ndarray, page: np.ndarray, pages: int) -> tuple[np.ndarray, tuple[int, int]]:

@@ -30,18 +30,18 @@ _ROUNDS = 4
 @dataclass(frozen=True)
 class ViewShares:
     """The tiles that V views show. `share`, float64 [V, T], is the fraction of a view's pixels that shows each tile, 0
-    for tiles of smaller mip levels; `lost`, float64 [V], is each view's error for which the weights were made."""
+    for tiles of smaller mip levels; `lost`, float64 [V], is each view's error that was assumed in the first weights."""
 
     share: csr_array
     lost: np.ndarray
 
     def by_state(self, states: int) -> "ViewShares":
-        """Returns the shares for separate tiles, repeated for each state: a view's error is the mean over its
-        states."""
+        """Returns the shares for separate tiles in each state, divided by the number of states: a view's error is their
+        mean."""
         return replace(self, share=hstack([self.share] * states, "csr") / states)
 
     def psnr(self, error: np.ndarray) -> float:
-        """Returns the PSNR in dB, peak 1, as the mean over the views; `error` [T] is each tile's error over its
+        """Returns the mean PSNR of the views in dB, for peak 1; `error` [T] is each tile's error divided by its
         weight."""
         if not len(self.lost):
             return -10.0 * math.log10(float(error.mean()) + FLOOR)
@@ -57,7 +57,7 @@ def tile_shares(
     seed: int,
     device: str,
 ) -> ViewShares:
-    """Renders the views of `scene_weights` again and counts the pixels that show each tile. `grids` has the rows and
+    """Renders the same views as `scene_weights` and counts the pixels that show each tile. `grids` has the rows and
     columns of tiles of each sheet."""
     first = np.cumsum([0, *(rows * columns for rows, columns in grids)])
     row = np.full(first[-1], -1)

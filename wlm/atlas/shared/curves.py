@@ -1,7 +1,7 @@
 """Computes the error of each tile of a scene with one, two and more components, at each size.
 
 A mixture is a matrix F of factors by which a group of tiles sums its components. For a tile, a mixture and a size, the
-squared error over all states is the error of exact components plus
+squared error over all states is the error of unrounded components plus
 
     sum_m || sum_k f[m, k] r_k ||² = sum_k || r_k ||²,    since F^T F = 1,
 
@@ -45,13 +45,13 @@ _AT_ONCE = 1024  # tiles
 
 @dataclass(frozen=True, eq=False)
 class SceneTiles:
-    """All tiles of sheets and mip levels that have a weight above 0.
+    """All T tiles of sheets (UV layouts) and their mip levels that have a weight above 0.
 
     Attributes:
         texels: float32 [T, B + 1, B + 1, M, 3], light divided by a unit for each state, in M states.
         weight: float32 [T, P], weights of the tiles' points; all add up to 1.
-        plane: int [T], the sheet or level of each tile, ascending.
-        index: int64 [T], the tile's number in its sheet or level, row by row.
+        plane: int [T], number of the sheet or mip level of each tile, ascending.
+        index: int64 [T], the tile's number in its sheet or mip level, row by row.
         size: B, texels along a tile.
         device: The device on which tiles are fitted.
     """
@@ -64,7 +64,7 @@ class SceneTiles:
     device: str
 
     def light(self, at: np.ndarray | slice) -> tuple[torch.Tensor, torch.Tensor]:
-        """Copies the texels of some tiles and the weights of their points to the device and returns them."""
+        """Returns the texels of the tiles `at` and the weights of their points, copied to the device."""
         return self.texels[at].to(self.device), self.weight[at].to(self.device)
 
     def points(self, texels: torch.Tensor) -> torch.Tensor:
@@ -79,7 +79,7 @@ class SceneTiles:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """A size and a number of components that a tile may have; the last `coarse` of them have a single block each."""
+    """A size and a number of components that a tile may have; the last `coarse` ones take a single block each."""
 
     size: Size
     count: int
@@ -120,7 +120,8 @@ class Candidate:
 
 
 def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
-    """Lists the choices for `count` components: all of one size, or in blocks with the last ones coarse (one block)."""
+    """Lists the choices for `count` components: all are of one size, or, in block formats, the last ones are coarse:
+    stored as a single block each."""
     few = [count - rank for rank in _RANKS if 0 < count - rank <= MOST_COARSE]
     return [
         Choice(size, count, coarse)
@@ -132,9 +133,9 @@ def choices_of(count: int, sizes: list[Size]) -> list[Choice]:
 def candidates(
     tiles: SceneTiles, sizes: list[Size], bits: float, seed: int, stages: Stages, batch: int
 ) -> list[Candidate]:
-    """Computes the error of every tile with one component, with two and so on, until more components gain nothing. The
-    checkpoint of `stages` keeps each number of components as one finished batch, numbered from `batch`. `bits` is the
-    budget of all tiles and factors."""
+    """Computes every tile's error with one component, with two and so on, until a further component gains nothing.
+    `bits` is the budget for all tiles and the factors that they share. The checkpoint of `stages` saves the result for
+    each number of components as one batch, the first with the number `batch`."""
     count, states = tiles.texels.shape[0], tiles.texels.shape[3]
     most = min(states, _RANKS[-1])
     ranks = [*(rank for rank in _RANKS if rank < most), most]
@@ -223,12 +224,12 @@ def _curves(
 
 
 def costs(tried: list[Candidate]) -> np.ndarray:
-    """Returns the bits of each choice, one array per candidate."""
+    """Returns the bits of every choice of all candidates, in one array."""
     return np.array([choice.bits for each in tried for choice in each.choices])
 
 
 def _left(tried: list[Candidate], bits: float) -> tuple[float, np.ndarray]:
-    """Estimates the error of the whole scene; also returns the index of each tile's candidate, int [T]."""
+    """Estimates the whole scene's error within `bits`; also returns the candidate that each tile uses, int [T]."""
     error = np.concatenate([each.error for each in tried])
     chosen = allocate(error, costs(tried), bits, 0.0)
     of = np.repeat(np.arange(len(tried)), [len(each.choices) for each in tried])

@@ -1,10 +1,10 @@
 """Compresses the lightmaps of several sheets and states to one model, whose tiles are sums of components.
 
 Each state's light is divided by its variation, so that errors count as in PSNR (`weights`). Tiles are grouped, and each
-group shares a mixture: the factors by which one, two or more components are summed in each state (`mixture`). Each tile
-has an error curve for each number of components (`curves`) and is weighted by the error of the views that show it
-(`balance`). Numbers of components and sizes are allocated to the tiles of all sheets at once (`allocation`), so that
-one more bit gains as much in every object.
+group shares the factors by which one, two or more components are summed in each state (`mixture`). Each tile has an
+error curve for each number of components (`curves`) and is weighted by the error of the views that show it (`balance`).
+Numbers of components and sizes are allocated to the tiles of all sheets at once (`allocation`), so that one more bit
+gains as much in every object.
 
 States that have little in common, such as a shadow mask and the light of a sky, lose by sharing sizes. Therefore
 separate tiles for each state are tried as well, and the better result is kept (`sharing`), so that a scene is no worse
@@ -101,13 +101,12 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
 
 
 def _of_texels(weight: np.ndarray) -> np.ndarray:
-    """Sums weights of quarters of texels [2 H, 2 W] to weights of texels [H, W]."""
     return weight.reshape(weight.shape[0] // 2, 2, -1, 2).sum((1, 3))
 
 
 def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Solves for the samples of all components and writes them to the colour textures. Returns arrays of the model by
-    name, and the factor by which each component was multiplied, float64 [C, 3]."""
+    name, and the factor by which each component was multiplied to use the format's range, float64 [C, 3]."""
     light = [np.zeros((*shape, 3), np.float32) for shape in given.shapes]
     owner, share = ([np.zeros(shape, kind) for shape in given.shapes] for kind in (np.int32, np.float32))
     largest = np.zeros((len(given.factors), 3), np.float32)

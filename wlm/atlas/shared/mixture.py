@@ -53,14 +53,14 @@ class Mixtures:
         return np.concatenate([constant[None], factor.transpose(1, 0, 2)])
 
     def nearest(self, moment: torch.Tensor) -> torch.Tensor:
-        """Finds for each tile the mixture that keeps most of its energy, int64 [T], from `moments`."""
+        """Finds for each tile the mixture that keeps most of its light's energy, int64 [T], from its `moments`."""
         energy = moment.diagonal(dim1=2, dim2=3).sum((1, 2))
         return _first_best(moment.flatten(1) @ self.kept.T, energy)
 
 
 def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Sums the products of light in pairs of states over the points of each tile: from light [T, M, 3, P] and weights
-    [T, P] to float32 [T, 3, M, M]."""
+    """Returns for each tile and channel the products of light in each pair of M states, summed over its P points with
+    weights [T, P]: float32 [T, 3, M, M]. Light is [T, M, 3, P]."""
     part = (light * weight.sqrt()[:, None, None]).transpose(1, 2)
     return part @ part.transpose(2, 3)
 
@@ -77,7 +77,7 @@ def find_mixtures(
         rank: K, the number of components, 1 to M.
         count: Largest number of mixtures, at least 1.
         seed: Seed for choosing the tiles from which the mixtures start.
-        like: Number of components by which tiles are assigned to mixtures; None: K.
+        like: Number of first components by which tiles are assigned to mixtures; None: all K.
     """
     random, moment, few = np.random.default_rng(seed), np.asarray(moment, np.float64), like or rank
     flat, energy = moment.reshape(len(moment), -1), np.trace(moment, axis1=2, axis2=3).sum(1)
@@ -109,8 +109,8 @@ def find_mixtures(
 
 def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
     """Finds for each tile the first mixture that keeps about the most energy, int64 [T]. `kept` [T, G] is the energy
-    that each mixture keeps, `energy` [T] the whole energy of each tile. Rounding must not assign a tile to a mixture
-    whose offsets were not computed for it."""
+    that each mixture keeps, `energy` [T] the total energy of each tile. Near ties count as equal, since rounding must
+    not assign a tile to a mixture whose offsets were not computed for it."""
     return (kept >= kept.amax(1, keepdim=True) - _ALIKE * energy[:, None]).to(torch.int8).argmax(1)
 
 

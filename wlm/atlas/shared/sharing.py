@@ -47,9 +47,9 @@ _HOPELESS = 1.25  # ratio of sampled separate to shared error above which the re
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A sheet, or a mip level of a sheet, to be cut into tiles. `frames`, float32 [M, H, W, 3], are its lightmaps
-    without gaps; `weight`, float64 [2 H, 2 W], the weights of quarters of texels; `smaller` the index of the next
-    smaller level, 0 for none."""
+    """A sheet (UV layout), or a mip level of one, to be cut into tiles. `frames`, float32 [M, H, W, 3], are its
+    lightmaps without gaps; `weight`, float64 [2 H, 2 W], the weights of quarters of texels; `smaller` the index of the
+    next smaller level, 0 for none."""
 
     name: str
     frames: np.ndarray
@@ -58,9 +58,9 @@ class Plane:
 
 
 def planes_of(scene: LightmappedScene, weights: Sequence[np.ndarray], mips: bool, device: str) -> list[Plane]:
-    """Returns all sheets and then, if `mips`, their mip levels: the first has a quarter of a sheet's sides, rounded up,
-    each next one half of that. A level's texel is the mean of the chart texels that it covers. Its weight is that of
-    one such texel, from `scene_weights`."""
+    """Returns all sheets and then, if `mips`, their mip levels. The first level's sides are a quarter of the sheet's,
+    rounded up; each next level's are half as long. A level's texel has the mean light of the chart texels that it
+    covers, and the mean of their weights from `scene_weights`."""
     pairs = zip(scene.sheets, weights, strict=True)
     planes = [Plane(sheet.name, sheet.lightmaps, weight) for sheet, weight in pairs]
     if not mips:
@@ -116,7 +116,7 @@ class Fitted:
         given: Components, sizes and places of the tiles.
         numbers: Number of integers per entry of T_c.
         states: Number of states with separate tiles; 1: all share tiles.
-        gain: Estimated advantage of separate tiles in views, in dB; None: the measurement was stopped early.
+        gain: Estimated advantage of separate tiles in views, in dB; None if it wasn't computed to the end.
     """
 
     planes: list[Plane]
@@ -138,11 +138,11 @@ def fitted(
     seed: int,
     stages: Stages,
 ) -> Fitted:
-    """Chooses components and sizes for the tiles of all planes, shared by the states or separate for each.
+    """Chooses components and sizes for the tiles of all planes. Tiles are shared by the states or separate for each.
 
     Args:
         scene: The scene.
-        planes: Sheets and levels, from `planes_of`.
+        planes: Sheets and mip levels, from `planes_of`.
         unit: float64 [M], the divisor of each state's light.
         varies: Variation of each sheet's light, from `variation`.
         profile: The settings.
@@ -186,7 +186,7 @@ def _choose_sharing(
     seed: int,
     stages: Stages,
 ) -> Fitted:
-    """Returns shared tiles, or separate tiles for each state if these have less error in views."""
+    """Returns shared tiles, or separate tiles for each state if the views' mean PSNR is higher with separate tiles."""
     states, count = len(unit), len(together.planes)
     planes = [
         replace(plane, frames=plane.frames[m : m + 1], smaller=plane.smaller and plane.smaller + m * count)
@@ -225,7 +225,7 @@ def _hopeless(
     seed: int,
     stages: Stages,
 ) -> bool:
-    """Tests on a sample whether separate tiles have far more error than shared tiles of as many bits."""
+    """Tests on a sample of tiles whether separate tiles have far more error than shared tiles of as many bits."""
     given, count = together.given, len(factor)
     few = np.sort(np.random.default_rng(seed).choice(count, max(count // _SAMPLE, _SAMPLES), replace=False))
     cost = costs(together.tried)
@@ -276,7 +276,6 @@ def _allocated(
 
 
 def _laid_out(planes: list[Plane], tile: int) -> Layout:
-    """Places the entries of all sheets and levels in the lookup texture T_c, on shelves."""
     grid = [tile_counts(*plane.frames.shape[1:3], tile) for plane in planes]
     across = np.array([(columns, rows) for rows, columns in grid])
     best = None

@@ -1,9 +1,9 @@
 """Computes the weights of errors in a scene's sheets and states.
 
-The weight of a place in a sheet depends on the number of pixels that show it in views of the whole scene. Quality is
-the mean PSNR of views and states, a mean of logarithms, so an error counts by its share of the whole error of its view
-or state. At equal bits the whole error is proportional to how much light varies from texel to texel, so views and
-states are weighted by the inverse of the variation of their light.
+A place in a sheet (UV layout) weighs more if more pixels show it in views of the whole scene. Quality is the mean PSNR
+of views and states, a mean of logarithms, so an error counts by its share of the whole error of its view or state. At
+equal bits the whole error is proportional to how much light varies from texel to texel, so views and states are
+weighted by the inverse of the variation of their light.
 """
 
 from collections.abc import Sequence
@@ -87,7 +87,7 @@ def _counts(
     views: Sequence[View | Viewpoint],
     device: str,
 ) -> list[torch.Tensor]:
-    """Sums over the views the fraction of pixels that show each cell, divided by how much light varies in the view."""
+    """Sums the fractions of views' pixels that show each cell (quarter of a texel), divided by the views' variation."""
     sizes = [(grid.height, grid.width) for grid in grids]
     first = np.cumsum([0, *(height * width for height, width in sizes)])
     place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)

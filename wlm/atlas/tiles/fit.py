@@ -1,10 +1,10 @@
 """The method "tiles": each tile of the lightmap at its own resolution, with the samples of least squared error.
 
 The lightmap is cut into tiles of B x B texels whose borders lie on texel centres. A tile becomes nx x ny samples, 1 to
-B + 1 per axis, the outermost on its borders, and light is bilinear between them: with B + 1 samples per axis it is the
-lightmap itself. Tiles share no sample, so each is a small weighted least-squares problem, which is solved for every
-size. The error of a tile is measured with its samples as stored. The sizes are then allocated within a budget,
-`wlm.atlas.tiles.layout`.
+B + 1 per axis, the outermost on its borders, and light is interpolated bilinearly between them; with B + 1 samples per
+axis this gives the lightmap itself. Tiles share no sample, so each is a small weighted least-squares problem, which is
+solved for every size. The error of a tile is measured with its samples as stored. The sizes are then allocated within a
+budget, `wlm.atlas.tiles.layout`.
 
 This replaces sections 3.1 to 3.3 of lightmap-uv-clustering-cascade: sharp shadows get many samples and evenly lit walls
 few, even within one triangle, which the paper's method can't do (section 5.1).
@@ -58,7 +58,8 @@ class Tiles:
 
     Attributes:
         index: int64 [T], number of the tile in the grid, row by row.
-        light: float [T, 3, m * m], at m x m points of the tile, row by row, (k + 0.5) / m along an axis.
+        light: float [T, 3, m * m], at m x m points of the tile, row by row, at (k + 0.5) / m of its side along each
+            axis.
         weight: float [T, m * m], weight of each point's squared error, 0 or more; the sum over all tiles is 1.
         size: Texels along a tile.
     """
@@ -75,7 +76,7 @@ def fit_tiles(
     """Compresses a scene of one sheet and state to tiles; None if even the smallest tiles exceed the budget.
 
     Raises:
-        WlmError: A package for the blocks of T_p is missing, or T_p has too many texels along a side.
+        WlmError: The package that encodes the blocks of T_p isn't installed, or T_p has too many texels along a side.
     """
     (sheet,) = scene.sheets
     with stages("weights"):
@@ -108,8 +109,7 @@ def composed_model(
     index: np.ndarray,
     device: str,
 ) -> AtlasModel:
-    """Makes the model from the tiles' solved samples, their sizes and places, and their numbers in the grid, int64
-    [T]."""
+    """Makes the model from the tiles' solved samples, sizes and places, and numbers in the grid, int64 [T]."""
     size = scene.sheets[0].mask.shape
     counts = tile_counts(*size, profile.tile)
     (first, *second), lut = composed(samples, sizes, packed, index, counts, device)
@@ -201,7 +201,7 @@ def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
 
 def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     """Returns the samples of least weighted squared error, float [T, ny, nx, 3], for tiles that all have nx x ny
-    samples, after at most `rounds` rounds. Conjugate gradients solve the normal equations of each tile and channel,
+    samples, by at most `rounds` iterations of conjugate gradients on the normal equations of each tile and channel,
     starting from the solution for equal weights."""
     with on_stream(tiles.light.device):
         grid, space = _grid(tiles, nx, ny), functools.partial(_empty, tiles)
@@ -227,7 +227,6 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
 
 
 def _grid(tiles: Tiles, nx: int, ny: int) -> kernels.Grid:
-    """Describes a grid of nx x ny samples per tile for the kernels."""
     grid = kernels.Grid()
     grid.points, grid.nx, grid.ny = SUPERSAMPLING * tiles.size, nx, ny
     axes = [_axis(samples, grid.points, str(tiles.light.device)) for samples in (nx, ny)]
@@ -245,7 +244,7 @@ def _laid_out(values: torch.Tensor) -> torch.Tensor:
 
 
 def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
-    """Allocates an array float [T, ...] that is arranged as by `_laid_out`."""
+    """Allocates an array float [T, ...] in the memory layout that `_laid_out` gives."""
     count, device = len(tiles.index), tiles.light.device
     if device.type == "cpu":
         return torch.empty((count, *shape))
@@ -255,7 +254,7 @@ def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
 @functools.cache
 def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Returns the linear interpolation along an axis: the sample before each point, the weight of the next sample, and
-    the inverse Gram matrix of the interpolation, which is cached since computing it on a GPU is slow."""
+    the inverse Gram matrix of the interpolation, which is cached, since it is slow to compute on a GPU."""
     matrix = linear(samples, points)
     place = (torch.arange(points) + 0.5) / points * (samples - 1)
     first = place.floor().clamp(max=max(samples - 2, 0))
@@ -290,7 +289,7 @@ def curves(
     checkpoint: Checkpoint | None = None,
 ) -> np.ndarray:
     """Returns the error of every tile at every size, float64 [sizes, T], with samples rounded as the size's format
-    stores them. The checkpoint keeps the errors of finished sizes as batch 0."""
+    stores them. The checkpoint saves the errors of finished sizes."""
     result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
     begin = 0
 

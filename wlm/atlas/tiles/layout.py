@@ -77,7 +77,8 @@ def sizes_of(profile: Profile) -> list[Size]:
 
 def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
     """Chooses sizes whose rectangles fit in textures of `room` bits, and places the rectangles; returns None if not
-    even the smallest sizes fit. `error` is float64 [sizes, T] on any device; `least` is the error that a bit must save.
+    even the smallest sizes fit. `error` is float64 [sizes, T] on any device; `least` is the smallest error that a bit
+    must save.
 
     Raises:
         WlmError: A texture has more texels along a side than an entry of T_c can name.
@@ -97,7 +98,9 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
             shapes.append(shape)
             most = MOST_SIZE * texture.step
             if max(shape) > most:
-                raise WlmError(f"budget: T_p would have {max(shape)} texels along a side; tiles allow {most}")
+                raise WlmError(
+                    f"budget: too large, T_p would have {max(shape)} texels along a side; expected at most {most}"
+                )
             bits += math.prod(shape) * COLOUR_BITS[texture.format]
         if bits <= room:
             first = np.zeros((len(chosen), 2), np.int64)
@@ -113,7 +116,7 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
 
 
 def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
-    """Finds the width of shelves for the smallest texture; returns this width and the texture's rows and columns."""
+    """Finds the width of shelves (rows of rectangles) for the smallest texture; returns it and the texture's size."""
     if not len(kinds.size):
         return step, (step, step)
     total = float(kinds.size.prod(1) @ kinds.count)
@@ -142,7 +145,7 @@ def composed(
         samples: Groups of tiles of one size, from `solved`.
         sizes: The sizes that tiles may have.
         layout: Sizes and places of the tiles.
-        index: int64 [T], the tiles' numbers in the grid; other tiles show the first texel.
+        index: int64 [T], the tiles' numbers in the grid; all other tiles of the grid show the texture's first texel.
         counts: Rows and columns of the grid.
         device: "cpu" or "cuda:N": copying a large texture through the host takes seconds.
 
@@ -171,15 +174,15 @@ def composed(
 
 
 def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the rows [n, ny, 1] and columns [n, 1, nx] of the texels of n rectangles from their first (x, y) [n,
-    2]."""
+    """Returns rows [n, ny, 1] and columns [n, 1, nx] of the texels of n rectangles from their first (x, y) [n, 2]."""
     row = first[:, 1, None, None] + np.arange(ny)[:, None]
     return row, first[:, 0, None, None] + np.arange(nx)
 
 
 def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, least: float) -> np.ndarray:
-    """Chooses the size of each tile, int [T], for the least sum of errors, float64 [sizes, T], within a budget of bits;
-    each bit must save an error of at least `least`. If even the cheapest exceed the budget, all tiles get them."""
+    """Chooses the size of each tile, int [T], for the least sum of `error`, float64 [sizes, T], within a budget of
+    bits; each bit must save an error of at least `least`. If even the cheapest sizes exceed the budget, all tiles get
+    the cheapest."""
     error = torch.as_tensor(error)
     bits = torch.from_numpy(np.asarray(cost, np.float64)).to(error.device)
 
@@ -204,9 +207,9 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
 
 @dataclass(frozen=True)
 class _Run:
-    """The places of the rectangles of one size. The first `beside` rectangles start at (x, y) on a shelf shared with
-    another size; all others fill separate shelves of `each` rectangles from y = `below` on. `widest` is the right end
-    of all of them."""
+    """The places of all rectangles of one size. The first `beside` rectangles start at (x, y), on a shelf (row) shared
+    with another size. All others fill their own shelves, of `each` rectangles, from y = `below` on. `widest` is the
+    right end of all rectangles."""
 
     beside: int
     x: int
@@ -225,13 +228,11 @@ class _Kinds:
 
     @classmethod
     def of(cls, size: np.ndarray, count: np.ndarray) -> "_Kinds":
-        """Returns the sizes, int [K, 2], all different, and their counts in sorted order."""
         order = np.lexsort((-size[:, 0], -size[:, 1]))
         return cls(size[order], count[order])
 
     def shelves(self, width: int) -> tuple[list[_Run], int]:
-        """Places the rectangles of each size on shelves of a width; returns the places and the shelves' total
-        height."""
+        """Places the rectangles of each size on shelves `width` wide; returns the places and the total height."""
         runs, x, y, height = [], 0, 0, 0
         for (w, h), count in zip(self.size.tolist(), self.count.tolist(), strict=True):
             each = width // w
@@ -248,8 +249,8 @@ class _Kinds:
 
 
 def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
-    """Packs rectangles, int [R, 2] widths and heights, on shelves of one width, in order of height; each shelf is as
-    high as its first rectangle. Returns x and y of each, int64 [R, 2], and the total height of the shelves."""
+    """Packs rectangles, int [R, 2] widths and heights, on shelves (rows) `width` wide, in order of height; each shelf
+    is as high as its first rectangle. Returns x and y of each rectangle, int64 [R, 2], and the total height."""
     first = np.zeros((len(sizes), 2), np.int64)
     if not len(sizes):
         return first, 0
