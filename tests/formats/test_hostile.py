@@ -240,14 +240,14 @@ BARE = [{"primitives": [{"attributes": {"POSITION": 0}}]}]
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"meshes": BARE, "accessors": [accessor(3 * 10**8)]}, "draws more than 4194304 corners"),
+        ({"meshes": BARE, "accessors": [accessor(3 * 10**8)]}, "at most 4194304 drawn corners"),
         (
             {"meshes": BARE, "accessors": [accessor(3 * 10**5)], "nodes": [{"mesh": 0}] * 1000},
-            "draws more than 4194304 corners",
+            "at most 4194304 drawn corners",
         ),
         (
             {"meshes": [{"primitives": BARE[0]["primitives"] * 500}], "nodes": [{"mesh": 0}] * 500},
-            "draws more than 4194304 corners",
+            "at most 4194304 drawn corners",
         ),
         # A stride of nothing, one that isn't of fours, one beyond 252, and one shorter than an element.
         *(
@@ -336,7 +336,7 @@ def lightmap_set(folder: Path, entries: list | None = None, **changes: object) -
 
 def test_a_set_that_lists_one_file_without_end(tmp_path):
     entries = [{"time_hours": i / 6000, "file": "a.exr"} for i in range(100_001)]
-    assert "expected at most 100,000, got 100,001" in refused(lightmap.load, lightmap_set(tmp_path, entries))
+    assert "expected at most 100,000 entries, got 100,001" in refused(lightmap.load, lightmap_set(tmp_path, entries))
     # 1.2 GB of frames.
     with little_memory():
         assert "expected at most 2048 times its" in refused(lightmap.load, lightmap_set(tmp_path, entries[:3000]))
@@ -371,7 +371,7 @@ def test_a_set_names_files_of_its_folder(tmp_path):
         ({"entries": [{"time_hours": 0, "file": "x" * 1000}]}, "cannot read the lightmap"),
         (
             {"entries": [{"time_hours": 0, "file": "set.json"}]},
-            "expected a lightmap, EXR, Radiance (.hdr), KTX2 or DDS, found other",
+            "expected a lightmap, EXR, Radiance (.hdr), PFM, TIFF of floats, KTX2 or DDS, found other",
         ),
     ],
 )
@@ -490,3 +490,25 @@ def test_a_compressed_grid_that_unpacks_to_far_more(tmp_path):
     path = write(tmp_path / "a.nvdb", header + grid + b"\0" + 200 * body)
     with little_memory():
         assert "expected at most 256 times its" in refused(load_volume, path)
+
+
+# JSON and YAML, before their values take memory.
+
+
+@pytest.mark.parametrize("text", ["[" + "{}," * 1_200_000 + "{}]", "[" + "[]," * 3_100_000 + "[]]"])
+def test_json_whose_values_take_far_more_than_its_text(tmp_path, text):
+    with little_memory():
+        line = refused(load_probes, write(tmp_path / "a.json", text))
+    assert line.endswith("bytes of values in JSON, the limit for its size, found more")
+
+
+@pytest.mark.parametrize("number", ["1" + "0" * 400, str(2**64), str(-(2**63) - 1)])
+def test_integers_of_json_fit_arrays(tmp_path, number):
+    text = f'{{"lightmaps": [{{"time_hours": {number}, "file": "a.exr"}}]}}'
+    for read in (lightmap.load, load_probes, read_gltf, read_runs):
+        assert "expected integers within 64 bits" in refused(read, write(tmp_path / "set.json", text))
+
+
+@pytest.mark.parametrize("number", ["1" + ":59" * 300 + ".5", "1" + ":59" * 5000 + ".5", "1:2:x.5"])
+def test_yaml_numbers_of_base_60(tmp_path, number):
+    assert "a.yaml: " in refused(load_settings, Profile, write(tmp_path / "a.yaml", f"name: x\nrate: {number}\n"))

@@ -9,7 +9,7 @@ import imagecodecs
 import numpy as np
 import OpenEXR
 import warp as wp
-from builders import atlas_meshes, bench_rows, probe_sets, smoke_plumes
+from builders import atlas_meshes, bench_rows, probe_layouts, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
 from builders.textures import make_dds, make_ktx2
 from PIL import Image
@@ -163,6 +163,15 @@ def _probe_files(folder: Path) -> None:
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
     np.savez(folder / "positions.npz", position=room.position)
+    vci = [probe_layouts.vci(*row) for row in zip(points, sh.transpose(0, 2, 1), strict=True)]
+    (folder / "probes-vci.json").write_text(json.dumps(vci))
+    scene = probe_layouts.three_scene()
+    for group in scene["object"]["children"][:2]:
+        del group["children"][2:]
+    (folder / "probes-scene.json").write_text(json.dumps(scene))
+    table = probe_layouts.tables()["named.csv"].replace(",", " ").splitlines()[:5]
+    (folder / "probes.csv").write_text("\n".join(table))
+    (folder / "probes.asset").write_text(probe_layouts.unity_text(rectangles=True, count=3))
     (folder / "positions.json").write_text(json.dumps(room.position.round(3).tolist()))
 
 

@@ -28,12 +28,12 @@ from wlm.atlas.materials import Readings, own_lightmaps, settle, slot_readings
 from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
 from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf
-from wlm.formats.light import read_light
+from wlm.formats.light import noted, read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, check_growth
 from wlm.formats.mask import read_mask
 from wlm.formats.meshes import SUFFIXES, read_mesh
 from wlm.ops.indoors import Indoors, indoors
-from wlm.texels import fill_gaps, repair
+from wlm.texels import doubts, fill_gaps, repair
 
 _FLAT = 1e-12  # ratio of area to longest side squared below which float64 can't distinguish the area from 0
 _FACES = 6  # faces of a cube
@@ -262,10 +262,11 @@ def load(
     names_of = [files.name or Path(files.files[0]).stem for files in listing.sheets]
     by_name = {} if placed is not None or alone else all_by_name(names_of, readers)
     if by_name:
-        told = ", ".join(f"{names_of[number]} of {group[0].label}" for number, group in list(by_name.items())[:8])
-        notes = (*notes, f"{listing.path}: each lightmap belongs to the mesh of its name: {told}")
+        matches = ", ".join(f"{names_of[number]} of {group[0].label}" for number, group in list(by_name.items())[:8])
+        notes = (*notes, f"{listing.path}: each lightmap belongs to the mesh of its name: {matches}")
     for number, files in enumerate(listing.sheets):
-        lightmaps, mask, names, read = _read_lightmaps(listing, files, trust)
+        told: list[str] = []
+        lightmaps, mask, names, read = _read_lightmaps(listing, files, trust, told)
         size, decoded = size + read, decoded + lightmaps.nbytes
         if not trust:
             check_growth(f"{listing.path}: its lightmaps", size, decoded, PICTURE_GROWTH, FRAMES)
@@ -290,7 +291,7 @@ def load(
                     f"{listing.path}: {names_of[other]} and {label} are both lightmaps of {each.label}: expected one "
                     "for each mesh, named like the mesh, or a .json list with objects"
                 )
-        warnings = (list(notes) if number == 0 else []) + skipped * alone + warnings
+        warnings = (list(notes) if number == 0 else []) + skipped * alone + told + warnings
         chosen = [_moved(each, uv_set, place) for each, place in pairs]
         others = _alternatives(pairs, uv_set)
         sheets.append(_checked(str(path), label, chosen, uv_set, lightmaps, mask, names, warnings, others))
@@ -554,15 +555,22 @@ def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitiv
 
 
 def _read_lightmaps(
-    listing: Listing, files: SheetFiles, trust: bool
+    listing: Listing, files: SheetFiles, trust: bool, warnings: list[str]
 ) -> tuple[np.ndarray, np.ndarray | None, list[str], int]:
     """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask, or None. Also returns the names of their files for
-    messages, and the bytes of the lightmaps that are files of their own."""
+    messages, and the bytes of the lightmaps that are files of their own; assumptions and doubts are added to
+    `warnings`."""
     lightmaps: list[np.ndarray] = []
+    notes: list[list[str]] = []
     names, size = [], 0
     for name in files.files:
+        notes.append([])
         with listing.opened(name, trust) as (path, label):
-            light = read_light(path)[0] if files.encoding is None else read_encoded(path, files.encoding)
+            if files.encoding is None:
+                light = read_light(path, notes[-1])[0]
+                notes[-1] += doubts(light[..., :3])
+            else:
+                light = read_encoded(path, files.encoding, notes[-1])
             size += 0 if name in listing.held else os.path.getsize(path)
         names.append(label)
         light = np.array(light[:: -1 if files.flip else 1, :, :3], np.float32, order="C")
@@ -573,6 +581,7 @@ def _read_lightmaps(
             shape, first = ("x".join(map(str, each.shape[1::-1])) for each in (light, lightmaps[0]))
             raise WlmError(f"{label}: expected {first} texels, the size of the sheet's first lightmap, found {shape}")
         lightmaps.append(light)
+    warnings += noted(names, notes)
     stack = np.stack(lightmaps) if len(lightmaps) > 1 else lightmaps[0][None]
     mask_path = None if files.mask is None else listing.file(files.mask, trust)
     mask = None if mask_path is None else read_mask(mask_path, names[0], stack.shape[1:3])
@@ -618,9 +627,9 @@ def _checked(
     if flat:
         warnings.append(f"{name}: {_count(flat, 'triangle')} without area in space or in UV: left out")
     if len(lightmaps):
-        doubts = misfits(name, lightmaps[0], position, triangle[active], uv, f"TEXCOORD_{uv_set}", alternatives)
-        mask, lines = _checked_light(name, position, uv, triangle[active], uv_set, lightmaps, mask, names)
-        warnings += doubts + lines
+        lines = misfits(name, lightmaps[0], position, triangle[active], uv, f"TEXCOORD_{uv_set}", alternatives)
+        mask, repairs = _checked_light(name, position, uv, triangle[active], uv_set, lightmaps, mask, names)
+        warnings += lines + repairs
         lightmaps = fill_gaps(lightmaps, mask)
     return Sheet(name, position, triangle, uv, active, lightmaps, mask, tuple(parts), tuple(warnings))
 

@@ -39,7 +39,8 @@ from wlm.formats.gltf import (
     texture_image,
     texture_transform,
 )
-from wlm.formats.gltf_writer import Replacement, encode_glb, image_type
+from wlm.formats.gltf_writer import Replacement, encode_glb
+from wlm.formats.levels import HEAD, level_kind
 from wlm.formats.reading import open_file
 
 SLOTS = ("occlusion", "emissive")
@@ -58,9 +59,7 @@ EXTENSIONS = (*_MATERIALS, _MX, _EPIC, _NEEDLE)
 """Extensions whose lightmaps are read."""
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-_EIGHT_BITS = ("image/png", "image/jpeg", "image/webp")
 _FLOAT = 5126
-_HEAD = 64  # bytes that tell the format of an image
 _NEAR = 0.01  # a transform for lightmaps leaves UVs this near to [0, 1]
 
 
@@ -321,9 +320,9 @@ def _encoding(
     """Returns the encoding of an image, None for a format that defines its light itself."""
     if data is None:
         with open_file(path, "the lightmap") as file:
-            data = file.read(_HEAD)
-    kind = image_type(data)
-    if kind not in _EIGHT_BITS:
+            data = file.read(HEAD)
+    kind = level_kind(path or "", bytes(data[:HEAD]))
+    if kind is None or kind == "TIFF":
         return None
     if stated is not None:
         return stated
@@ -332,7 +331,7 @@ def _encoding(
             f"{document.path}: {_NEEDLE}: an image of 8 bits in Needle's RGBM, whose range differs between versions: "
             "say its encoding (--encoding), or export the lightmap as EXR"
         )
-    alpha = kind == "image/png" and len(data) > 25 and data[25] in (4, 6)  # colour types with alpha
+    alpha = kind == "PNG" and len(data) > 25 and data[25] in (4, 6)  # colour types with alpha
     if name == _EPIC and alpha:
         raise WlmError(f"{document.path}: {_UNREAL}")
     return "rgbm" if name == _MX and alpha else "srgb"

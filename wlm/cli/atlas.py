@@ -22,6 +22,7 @@ from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
     Device,
+    Encoding,
     Engine,
     ExactShader,
     ModelFile,
@@ -46,8 +47,8 @@ _Lights = Annotated[
     Path | None,
     typer.Argument(
         metavar="LIGHTMAPS",
-        help="Lightmap (EXR, HDR, KTX2, DDS, PNG), a folder of them, a .lmbake, or a .json that lists them; default "
-        "those that the glTF file names.",
+        help="Lightmap (EXR, HDR, PFM, TIFF, KTX2, DDS, or a PNG with --encoding), a folder of them, a .lmbake, or a "
+        ".json that lists them; default those that the glTF file names.",
     ),
 ]
 _Mask = Annotated[
@@ -57,7 +58,6 @@ _UvSet = Annotated[
     int | None, typer.Option("--uv-set", min=0, help="The lightmap UVs are TEXCOORD_n; default 1 if present, else 0.")
 ]
 _Node = Annotated[str | None, typer.Option(help="Node that the lightmap belongs to; default the one that fits best.")]
-_Encoding = Annotated[str | None, typer.Option(help="Encoding of a PNG: linear, srgb, rgbm, dldr or rgbe.")]
 _Slot = Annotated[
     str | None,
     typer.Option(help="Material slot whose textures are the lightmaps, without LIGHTMAPS: occlusion or emissive."),
@@ -82,7 +82,7 @@ def compress(
     mask: _Mask = None,
     uv_set: _UvSet = None,
     node: _Node = None,
-    encoding: _Encoding = None,
+    encoding: Encoding = None,
     flip: _Flip = False,
     slot: _Slot = None,
     seed: Seed = 0,
@@ -119,7 +119,7 @@ def evaluate(
     mask: _Mask = None,
     uv_set: _UvSet = None,
     node: _Node = None,
-    encoding: _Encoding = None,
+    encoding: Encoding = None,
     flip: _Flip = False,
     slot: _Slot = None,
     device: Device = "cpu",

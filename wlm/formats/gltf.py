@@ -29,7 +29,6 @@ a file missing or damaged             error that names the file, and the field
 
 import base64
 import binascii
-import json
 import os
 import re
 import struct
@@ -43,8 +42,8 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 
 from wlm.errors import WlmError, one_line
-from wlm.formats.limits import CORNERS, CORNERS_A_BYTE, JSON_BYTES, MESH_BYTES, SURE_CORNERS
-from wlm.formats.reading import damaged, named_file, read_file
+from wlm.formats.limits import CORNERS, CORNERS_A_BYTE, JSON_BYTES, MESH_BYTES, SURE_CORNERS, Budget
+from wlm.formats.reading import damaged, named_file, parse_json, read_file
 
 MAGIC = b"glTF"
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
@@ -59,8 +58,9 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MATRIX_SIDES = {"MAT2": 2, "MAT3": 3, "MAT4": 4}
 _LONGEST_STRIDE = 252  # bytes
 _LABEL = 60  # characters of a name in a message
-_OVERHEAD = 256  # cost of an empty primitive, in corners
+_OVERHEAD = 256  # cost of a primitive under a node, in corners
 _LARGEST_TRANSFORM = 1e9  # magnitude of the numbers of a texture transform
+_MOVES, _UNMOVED = {"matrix", "translation", "rotation", "scale"}, np.eye(4)
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
 _REFUSED = {
     "KHR_draco_mesh_compression": "decompress the mesh first",
@@ -158,7 +158,7 @@ def parse_gltf(
         text, binary = _split_glb(path, data) if data[:4] == MAGIC else (data, None)
         if len(text) > JSON_BYTES:
             raise WlmError(f"{path}: expected at most {JSON_BYTES} bytes of JSON, found {len(text)}")
-        content = json.loads(text.decode("utf-8-sig"))
+        content = parse_json(str(path), text)
         if not isinstance(content, dict) or not isinstance(content.get("asset"), dict):
             raise WlmError(f"{path}: expected a glTF file, found other content")
         version = str(content["asset"].get("version"))
@@ -268,6 +268,8 @@ def elements(document: GltfDocument, number: int) -> np.ndarray:
         rows = np.zeros((count, size), np.uint8)
     if "sparse" in accessor:
         sparse = accessor["sparse"]
+        if sparse["count"] > count:
+            raise WlmError(f"{where}.sparse.count: expected at most {count}, found {sparse['count']}")
         places = sparse["indices"]
         wide = np.dtype(COMPONENTS[places["componentType"]])
         if wide.kind != "u":
@@ -371,20 +373,12 @@ def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int
 def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
     primitives = []
     cache: dict[tuple[int, str], np.ndarray] = {}  # primitives often share their accessors
-    drawn = 0
-
-    def spend(count: int) -> None:
-        nonlocal drawn
-        drawn += count
-        if drawn > document.most:
-            raise WlmError(
-                f"{document.path}: draws more than {document.most} corners and vertices, the limit for its size; "
-                "trust=True (--trust on the command line) lifts the limit for files from a trusted author"
-            )
+    hint = "" if document.trust else " (trust=True, --trust on the command line, lifts the limit for the size)"
+    budget = Budget(document.path, document.most, f"drawn corners and vertices{hint}")
 
     def floats(number: int, kind: str) -> np.ndarray:
         if (number, kind) not in cache:
-            spend(_count(document, number))
+            budget.spend(_count(document, number))
             cache[number, kind] = _floats(document, number, kind)
         return cache[number, kind]
 
@@ -393,6 +387,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
         if mesh_number is None:
             continue
         mesh = document.item("meshes", mesh_number)
+        budget.spend(_OVERHEAD * len(mesh["primitives"]))
         for i, primitive in enumerate(mesh["primitives"]):
             mode, attributes = primitive.get("mode", TRIANGLES), primitive["attributes"]
             if mode not in (TRIANGLES, STRIP, FAN) or "POSITION" not in attributes:
@@ -401,7 +396,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
             where = f"{document.path}: meshes[{mesh_number}].primitives[{i}]"
             # Strips and fans have three corners for each index; copies gather each attribute.
             corners = _count(document, primitive["indices"]) if "indices" in primitive else len(local)
-            spend(corners * (1 if mode == TRIANGLES else 3) + min(corners, len(local)) * len(attributes) + _OVERHEAD)
+            budget.spend(corners * (1 if mode == TRIANGLES else 3) + min(corners, len(local)) * len(attributes))
             triangle = _triangles(_corners(document, where, primitive, len(local)), mode, where)
             if not len(triangle):
                 continue
@@ -503,13 +498,16 @@ def _walk(document: GltfDocument) -> Iterator[tuple[int, np.ndarray]]:
         if number in visited:
             raise WlmError(f"{document.path}: nodes[{number}]: expected one parent, found the node twice in the scene")
         visited.add(number)
-        transform = above @ _transform(node)
+        own = _transform(node)
+        transform = above if own is _UNMOVED else above @ own
         yield number, transform
         stack += [(child, transform) for child in reversed(node.get("children", []))]
 
 
 def _transform(node: dict) -> np.ndarray:
     """Returns the local transform [4, 4] of a node: its matrix, else translation * rotation * scale."""
+    if not _MOVES & node.keys():
+        return _UNMOVED
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T  # stored by columns
     transform = np.eye(4)

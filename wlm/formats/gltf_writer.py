@@ -46,11 +46,6 @@ _OF_VERTICES = ("CESIUM_primitive_outline", "EXT_mesh_primitive_edge_visibility"
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "EXT_texture_")
 
 
-def image_type(data: bytes) -> str | None:
-    """Returns the MIME type of an image that a glTF file may hold, by its first bytes; None for other content."""
-    return next((kind for head, kind in _IMAGE_TYPES.items() if re.match(head, data, re.DOTALL)), None)
-
-
 @dataclass(frozen=True, eq=False)
 class Replacement:
     """New vertices and triangles of a primitive.
@@ -175,7 +170,7 @@ class _Tree:
                 data = read_file(file, MESH_BYTES, where)
             except WlmError:
                 continue
-            kind = image_type(data)
+            kind = next((kind for head, kind in _IMAGE_TYPES.items() if re.match(head, data, re.DOTALL)), None)
             if kind is None:
                 continue
             del image["uri"]

@@ -135,15 +135,9 @@ def _probes(path: Path) -> Finding:
     what = f"{probes.probes:,} light probes of {form}, {int(probes.live.sum()):,} of them lit"
     if len(keys) > 1:
         what += f", under the keys {', '.join(keys[:_MOST_NAMES])}"
-    problems = list(probes.warnings)
-    if coefficients:
-        # No coefficient of nonnegative radiance exceeds the first one by more than this factor.
-        mean = probes.values[probes.live][:, :3]
-        rest = np.abs(probes.values[probes.live][:, 3:]).reshape(len(mean), -1, 3)
-        if rest.size and (wrong := int(np.count_nonzero((rest > 2.3 * np.abs(mean)[:, None]).any((1, 2))))):
-            problems.append(f"{wrong} probes have coefficients too large for radiance: another order or convention?")
+    what += f"; {probes.reading}"
     options = () if key is None else ("--key", key.removeprefix("sh_"))
-    return Finding(path, what, compress_command(path, *options), tuple(problems))
+    return Finding(path, what, compress_command(path, *options), probes.warnings)
 
 
 def _lmbake(path: Path) -> Finding:
@@ -238,14 +232,15 @@ def _model(path: Path) -> Finding:
 
 def _kind_of_json(path: Path) -> str:
     content: Any = read_json_file(path, "the file", JSON_BYTES)
-    if not isinstance(content, dict):
-        return "json"
-    form = str(content.get("format"))
-    if form in _EXPORTS:
-        return "export"
-    if "lightmaps" in content:
-        return "set"
-    return "probes" if "probes" in content or "position" in content else "json"
+    if isinstance(content, dict):
+        if str(content.get("format")) in _EXPORTS:
+            return "export"
+        if "lightmaps" in content:
+            return "set"
+    # This imports scipy.
+    from wlm.probe.json_fields import holds_probes
+
+    return "probes" if holds_probes(content) else "json"
 
 
 def _unity_asset(path: Path) -> Finding:
@@ -296,4 +291,6 @@ _BY_SUFFIX = {
     ".wlm": "model",
     ".json": "json",
     ".asset": "unity asset",
+    ".csv": "probes",
+    ".tsv": "probes",
 }

@@ -263,7 +263,7 @@ def _light(files: Sequence[Path]) -> dict[Path, Picture]:
         if file.suffix.lower() in SUFFIXES:
             with suppress(WlmError):  # an unreadable file is described by itself
                 picture = picture_of(file)
-                if picture is not None and not picture.is_cube and picture.kind != "PNG":
+                if picture is not None and not picture.is_cube and picture.is_light:
                     found[file] = picture
     return found
 

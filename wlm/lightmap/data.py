@@ -33,15 +33,15 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.channels import read_channels
-from wlm.formats.light import read_light
+from wlm.formats.channels import read_channels, read_encoded
+from wlm.formats.light import noted, read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, check_growth
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
 from wlm.lightmap.layout import odd_layout
 from wlm.lightmap.listing import AtlasInfo, LayerInfo, Listing, Source, is_name, list_set
 from wlm.lightmap.sheet import LIGHT, MOST_NAME, VALUE_RANGES, Sheet, check_sheets, first_light, sheets_of
-from wlm.texels import repair
+from wlm.texels import doubts, repair
 
 _READERS = 2  # decompression releases Python's lock; more threads than this only compete for the disk
 _LIGHT_CHANNELS = ("R", "G", "B")
@@ -164,17 +164,18 @@ def load(
     period: float | None = None,
     trust: bool = False,
     layers: Sequence[str] | None = None,
+    encoding: str | None = None,
 ) -> LightmapSet:
     """Reads a lightmap set: a `set.json`, a folder that holds one, a plain folder of lightmaps, or folders from Unity.
 
-    A lightmap is an EXR, Radiance (`.hdr`), KTX2 or DDS file of light (`wlm.formats.light`); a set may mix them.
+    A lightmap is a file of linear light that `wlm.formats.light` reads; a set may mix them.
 
     The keys of a `set.json` are described in docs/formats.md. File names in it are relative to its folder.
 
-    The files of a plain folder that end in `.exr`, `.hdr`, `.ktx2` or `.dds` are read in natural order of their names
-    ("2" before "10"). Without `times`, the hours are read from the names if every name ends like `_18_55h`, `_18.55h`,
-    `_18h` or `_18.55`; the digits after the second separator are decimals, not minutes. A `mask.png` among them is the
-    mask unless `mask` says otherwise.
+    The files of a plain folder that end in `.exr`, `.hdr`, `.pfm`, `.tif`, `.ktx2` or `.dds` are read in natural order
+    of their names ("2" before "10"). Without `times`, the hours are read from the names if every name ends like
+    `_18_55h`, `_18.55h`, `_18h` or `_18.55`; the digits after the second separator are decimals, not minutes. A
+    `mask.png` among them is the mask unless `mask` says otherwise.
 
     A folder with `NAME_comp_light.exr`, as Unity writes it, is one state of light; a folder of such folders has a state
     for each, in natural order of their names. NAME is the atlas; `_comp_dir` and `_comp_shadowmask` are linear layers.
@@ -188,6 +189,8 @@ def load(
         trust: Whether a `set.json` may name files outside its folder, and small files may hold large frames
             (`wlm.formats.limits`).
         layers: Names of the layers to read; None reads all.
+        encoding: How the files store their light, an encoding of `wlm.formats.channels`, if they don't define it
+            themselves; a folder may then hold PNG, JPEG, WebP and TGA files. None uses `stored` of the set, if any.
 
     Returns:
         The set, repaired by the module's rules.
@@ -195,7 +198,7 @@ def load(
     Raises:
         WlmError: The set breaks one of the module's rules; the line names the file and the field.
     """
-    listing = list_set(Path(path), times, layers, trust)
+    listing = list_set(Path(path), times, layers, trust, encoding)
     stamps = np.asarray(listing.times, np.float64)
     period = listing.period if period is None else period
     # Before any file is read, since a wrong list makes that useless.
@@ -387,8 +390,8 @@ class _Reader:
 
     def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None) -> _Stack:
         sources = [state[atlas.name, layer.name] for state in self._listing.states]
-        first = sources[0]
-        pixels, names = _read(first, layer)
+        first, notes = sources[0], [[] for _ in sources]
+        pixels, names = _read(first, layer, notes[0])
         has_alpha = mask == _FROM_ALPHA or (mask is None and _ALPHA in names)
         size, known = pixels.shape[:2], names
         stack = self._stack(atlas, layer, size, names, has_alpha, first.path)
@@ -414,9 +417,11 @@ class _Reader:
         pool = ThreadPoolExecutor(_READERS)
         try:
             # In order, so that the error names the first of several bad files.
-            broken += pool.map(lambda index: put(index, *_read(sources[index], layer)), range(1, len(sources)))
+            rest = range(1, len(sources))
+            broken += pool.map(lambda index: put(index, *_read(sources[index], layer, notes[index])), rest)
         finally:
             pool.shutdown(cancel_futures=True)
+        stack.warnings.extend(noted([source.label for source in sources], notes))
         for source, count in zip(sources, broken, strict=True):
             if count:
                 stack.warnings.append(f"{source.label}: {count} texels are not valid: alpha is NaN or infinite")
@@ -455,14 +460,21 @@ class _Reader:
         return _Stack(frames, np.zeros((count, *size), bool) if alpha else None, [])
 
 
-def _read(source: Source, layer: LayerInfo) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a picture. Returns its values [H, W, C] and the names of its channels."""
-    if layer.encoding == LIGHT.encoding and layer.channels is None:
-        pixels, names = read_light(source.path)
+def _read(source: Source, layer: LayerInfo, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads a picture. Returns its values [H, W, C] and the names of its channels; `notes` gets its assumptions."""
+    light = layer.encoding == LIGHT.encoding
+    if light and layer.stored is not None:
+        pixels, names = read_encoded(source.path, layer.stored, notes), _LIGHT_CHANNELS
+    elif light and layer.channels is None:
+        pixels, names = read_light(source.path, notes)
+        notes += doubts(pixels[..., :3])
     else:
-        pixels, names, levels = read_channels(source.path)
-        if levels and layer.encoding == LIGHT.encoding:
-            raise WlmError(f"{source.path}: layer {layer.name}: expected linear light, such as an EXR, found a PNG")
+        pixels, names, levels = read_channels(source.path, notes, light)
+        if levels and light:
+            raise WlmError(
+                f"{source.path}: layer {layer.name}: expected linear light, such as an EXR, found a picture of "
+                "integers: state what light they stand for with --encoding, or stored in a set.json"
+            )
         if levels:
             least, greatest = VALUE_RANGES[layer.encoding]
             pixels = np.float32(least) + pixels * np.float32(greatest - least)
