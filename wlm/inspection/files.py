@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from wlm.atlas.materials import filled_slots, own_extension, own_lightmaps
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
-from wlm.formats.gltf import read_gltf
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf
 from wlm.formats.godot import read_users
 from wlm.formats.ktx2 import VOLUME_HEAD, is_volume
 from wlm.formats.light import SUFFIXES
@@ -175,6 +176,7 @@ def _volume(path: Path) -> Finding:
 
 
 def _mesh(path: Path) -> Finding:
+    own: tuple[str, str, tuple[str, ...]] = ("compress it together with its lightmap", "", ())
     if path.suffix.lower() not in (".glb", ".gltf"):
         mesh = read_geometry(path, with_uv=False)
         parts, sets, uvs = 1, "", []
@@ -183,7 +185,8 @@ def _mesh(path: Path) -> Finding:
             whole = read_geometry(path)
             sets, uvs = "UVs", [whole.uv[whole.triangle]]
     else:
-        primitives = read_gltf(path)[1]
+        document, primitives = read_gltf(path)
+        own = _own_lightmaps(path, document, primitives)
         count, parts = sum(len(each.triangle) for each in primitives), len({each.mesh for each in primitives})
         numbers = sorted({number for each in primitives for number in each.uv})
         sets = ", ".join(f"TEXCOORD_{number}" for number in numbers)
@@ -200,8 +203,24 @@ def _mesh(path: Path) -> Finding:
         elif area > 1.0:
             cause = "each mesh may have its own lightmap" if parts > 1 else "are they those of a lightmap?"
             problems.append(f"the triangles cover {area:.1f} times the UV square and overlap; {cause}")
-        what += "; compress it together with its lightmap"
-    return Finding(path, what, problems=tuple(problems))
+        what += f"; {own[0]}"
+    return Finding(path, what, own[1], (*problems, *own[2]))
+
+
+def _own_lightmaps(
+    path: Path, document: GltfDocument, primitives: Sequence[GltfPrimitive]
+) -> tuple[str, str, tuple[str, ...]]:
+    """Describes the lightmaps that a glTF file names: what they are, the command that compresses them, problems."""
+    name, slots = own_extension(document), filled_slots(document)
+    if name is None:
+        other = f", or with that of a material slot (--slot {' or '.join(slots)})" if slots else ""
+        return f"compress it together with its lightmap{other}", "", ()
+    try:
+        own = own_lightmaps(document, primitives)
+    except WlmError as error:
+        return f"its lightmaps are named by {name}", "", (said(error, path),)
+    notes = tuple(note.removeprefix(f"{path}: ") for note in own.notes)
+    return f"with {notes[0]}", compress_command(path), notes[1:]
 
 
 def _model(path: Path) -> Finding:
