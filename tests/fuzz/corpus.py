@@ -18,6 +18,7 @@ from benchmarks import Row, write_json
 from wlm.atlas.stored import store
 from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
+from wlm.probe.ambient_cube import write_irradiance_volume
 from wlm.probe.data import save_probes
 from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.march.coarse import with_surface
@@ -162,6 +163,8 @@ def _probe_files(folder: Path) -> None:
     (folder / "probes-list.json").write_text(json.dumps({"convention": "godot", "probes": each}))
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
+    light = probe_sets.synthetic(8).values.reshape(8, 9, 3)
+    write_irradiance_volume(folder / "volume.ktx2", light, np.array([2, 2, 2]))
     np.savez(folder / "positions.npz", position=room.position)
     vci = [probe_layouts.vci(*row) for row in zip(points, sh.transpose(0, 2, 1), strict=True)]
     (folder / "probes-vci.json").write_text(json.dumps(vci))

@@ -373,6 +373,7 @@ _ALL = (
     Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json", "probes-known.json"), _json, _probes),
     Reader("probes-json-forms", "a.json", corpus("probes-vci.json", "probes-scene.json"), _json, _probes),
     Reader("probes-table", "a.csv", corpus("probes.csv"), _table, _probes),
+    Reader("probes-ktx2", "a.ktx2", corpus("volume.ktx2"), vary_ktx2, _probes),
     Reader("probes-asset-text", "a.asset", corpus("probes.asset"), _asset_text, _probes),
     Reader("probes-lmbake", "a.lmbake", corpus("probes.lmbake"), _godot, _probes),
     Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),

@@ -60,7 +60,7 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MATRIX_SIDES = {"MAT2": 2, "MAT3": 3, "MAT4": 4}
 _LONGEST_STRIDE = 252  # bytes
 _LABEL = 60  # characters of a name in a message
-_OVERHEAD = 256  # cost of a primitive under a node, in corners
+_OVERHEAD = 512  # cost of a primitive under a node, in corners
 _LARGEST_TRANSFORM = 1e9  # magnitude of the numbers of a texture transform
 _MOVES, _UNMOVED = {"matrix", "translation", "rotation", "scale"}, np.eye(4)
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
@@ -373,8 +373,8 @@ def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int
 def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
     primitives = []
     cache: dict[tuple[int, str], np.ndarray] = {}  # primitives often share their accessors
-    hint = "" if document.trust else " (trust=True, --trust on the command line, lifts the limit for the size)"
-    budget = Budget(document.path, document.most, f"drawn corners and vertices{hint}")
+    hint = "; trust=True (--trust on the command line) lifts the limit for files from a trusted author"
+    budget = Budget(document.path, document.most, "drawn corners and vertices", "" if document.trust else hint)
 
     def floats(number: int, kind: str) -> np.ndarray:
         if (number, kind) not in cache:

@@ -17,6 +17,7 @@ from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
 from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf
 from wlm.formats.godot import read_users
+from wlm.formats.ktx2 import VOLUME_HEAD, is_volume
 from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
@@ -27,7 +28,6 @@ from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
 from wlm.system import load, system_of
 
-_MAGIC = 16
 BAKED = "lightmaps that wlm bake lightmaps wrote, with their noise and coverage"
 """Description of the folder of a bake."""
 FRAMES = "frames of smoke that wlm smoke simulate wrote"
@@ -39,6 +39,7 @@ _EXPORTS = {
     "wlm-unity-probes": "light probes for Unity",
     "wlm-unreal-light": "light probes for Unreal, volume textures and a shader",
     "wlm-bake": BAKED,
+    "wlm-bevy-irradiance-volume": "an irradiance volume for Bevy",
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
     "wlm-smoke-frames": FRAMES,
 }
@@ -60,10 +61,12 @@ def kind_of(path: Path) -> str:
     Raises:
         WlmError: The file cannot be read.
     """
+    with open_file(path, "the file") as file:
+        head = file.read(VOLUME_HEAD)
+    if is_volume(head):
+        return "probes"
     if picture_of(path) is not None:
         return "picture"
-    with open_file(path, "the file") as file:
-        head = file.read(_MAGIC)
     kind = next((kind for magic, kind in _BY_MAGIC.items() if head.startswith(magic)), None)
     kind = kind or _BY_SUFFIX.get(path.suffix.lower(), "")
     if kind == "arrays":
