@@ -36,7 +36,15 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
         raise WlmError(f"{path}: expected YAML in UTF-8, found an invalid byte at position {error.start}") from error
     try:
         values = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+    except (
+        yaml.YAMLError,
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ) as error:
         raise WlmError(f"{path}: expected YAML: {_yaml_problem(error)}") from error
     if values is None:
         raise WlmError(f"{path}: expected a mapping of settings, found an empty file")

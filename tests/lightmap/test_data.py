@@ -338,7 +338,9 @@ def test_set_that_is_no_json_object_names_the_file(tmp_path, text):
 
 def test_path_that_does_not_exist(tmp_path):
     assert "nowhere" in error_of(load, tmp_path / "nowhere")
-    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds), found none" in error_of(load, tmp_path)
+    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds, .pfm, .tif, .tiff), found none" in error_of(
+        load, tmp_path
+    )
 
 
 def test_plain_folder_takes_files_in_natural_order(tmp_path):
@@ -535,7 +537,7 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
         atlases={"big": {"width": 8, "height": 6, "mask": "mask.png"}, "small": {}},
         lightmaps=[{"time_hours": 3.0, "files": {"big": first | {"dir": "more.exr"}, "small": second}}],
     )
-    assert "layer dir: expected a channel x.G, found R, G, B" in error_of(wlm.lightmap.load, path)
+    assert "layer dir: expected a channel x.G, found the channels R, G, B" in error_of(wlm.lightmap.load, path)
     chosen = wlm.lightmap.load(path, layers=["L0", "L1"])
     np.testing.assert_array_equal(values_of(chosen, "big", "L0")[0], stacked[:6])
     np.testing.assert_array_equal(values_of(chosen, "big", "L1")[0][1:], stacked[12:18][1:])

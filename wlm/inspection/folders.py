@@ -272,7 +272,7 @@ def _light(files: Sequence[Path]) -> dict[Path, Picture]:
         if file.suffix.lower() in SUFFIXES:
             with suppress(WlmError):  # an unreadable file is described by itself
                 picture = picture_of(file)
-                if picture is not None and not picture.is_cube and picture.kind != "PNG":
+                if picture is not None and not picture.is_cube and picture.is_light:
                     found[file] = picture
     return found
 
@@ -288,6 +288,8 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
     if len(pictures) == len(meshes) == 1:
         mesh, light = inspect_file(meshes[0]), inspect_file(pictures[0])
+        if mesh.command:  # the mesh names its lightmaps itself
+            return [(mesh, {mesh.path, light.path})]
         if UNREADABLE not in (mesh.what, light.what):
             what, problems = f"a mesh with the lightmap {light.path.name}", (*mesh.problems, *light.problems)
             return [

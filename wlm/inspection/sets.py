@@ -57,7 +57,7 @@ def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[li
     """
     problems = []
     for file, head in zip(files, heads, strict=True):
-        if head is None or head.kind == "PNG":
+        if head is None or not head.is_light:
             return [f"{file.name} has no radiance"], True
     sized = [(file, head) for file, head in zip(files, heads, strict=True) if head is not None and head.width]
     for file, head in sized[1:]:

@@ -1,0 +1,109 @@
+"""Reading TIFF pictures of one image: floats, which are linear light, and integers, which are levels.
+
+The tags are parsed and bounded here, because they state how much memory the decoder (libtiff in imagecodecs) allocates.
+Format: TIFF 6.0, Adobe.
+"""
+
+import os
+import struct
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.float_texels import EXTRA, check_picture
+from wlm.formats.hdr_blocks import need
+from wlm.formats.limits import IMAGE_BYTES, check_sides
+from wlm.formats.reading import read_file
+
+MAGIC = {b"II*\0": "<", b"MM\0*": ">"}
+"""The first bytes, and the byte order that they state."""
+
+_TAGS = {
+    256: "width",
+    257: "height",
+    258: "bits",
+    262: "photometric",
+    274: "orientation",
+    277: "samples",
+    284: "planes",
+    322: "tile width",
+    323: "tile height",
+    339: "format",
+}
+_FORMATS = {1: "B", 3: "H", 4: "I"}  # of the tags above: byte, short, long
+_MOST_SAMPLES = 64
+_GREY, _RGB, _FLOAT = 1, 2, 3
+
+
+def tags_of(path: str | os.PathLike[str], data: bytes) -> dict[str, int]:
+    """Returns the tags of the first image that concern its layout, the first value of each.
+
+    Raises:
+        WlmError: The file is damaged.
+    """
+    order = MAGIC.get(data[:4], "")
+    found = {"bits": 1, "photometric": _RGB, "orientation": 1, "samples": 1, "planes": 1, "format": 1}
+    try:
+        (at,) = struct.unpack_from(order + "I", data, 4)
+        (count,) = struct.unpack_from(order + "H", data, at)
+        for i in range(count):
+            tag, kind, number, place = struct.unpack_from(order + "HHII", data, at + 2 + 12 * i)
+            if tag in _TAGS and kind in _FORMATS and number:
+                form = order + _FORMATS[kind]
+                inline = number * struct.calcsize(form) <= 4
+                (found[_TAGS[tag]],) = struct.unpack_from(form, data, at + 10 + 12 * i if inline else place)
+        check_sides(str(path), found["width"], found["height"])
+    except (struct.error, KeyError, IndexError) as error:
+        raise WlmError(f"{path}: the TIFF is cut short or damaged: no width and height found") from error
+    return found
+
+
+def read_tiff(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads the first image of a TIFF of grey or RGB, with alpha or without.
+
+    Returns:
+        The pixels, [H, W, C], the top row first whatever the file's orientation: float32, or uint8 and uint16 as
+        stored; and the names of the channels: L, or R, G and B, then A if there is alpha.
+
+    Raises:
+        WlmError: The file is missing, damaged, of another photometric interpretation or number format, or the package
+            imagecodecs is missing.
+    """
+    data = read_file(path, IMAGE_BYTES, "the TIFF")
+    tags = tags_of(path, data)
+    samples, colours = tags["samples"], 3 if tags["photometric"] == _RGB else 1
+    if tags["photometric"] not in (_GREY, _RGB) or not colours <= samples <= _MOST_SAMPLES:
+        raise WlmError(
+            f"{path}: expected a TIFF of grey or RGB, found photometric interpretation {tags['photometric']} with "
+            f"{samples} samples"
+        )
+    texel = max(samples * tags["bits"] // 8, 1)
+    check_picture(path, len(data), tags["width"], tags["height"], texel)
+    if "tile width" in tags:
+        check_picture(path, len(data), tags["tile width"], tags.get("tile height", 1), texel)
+    codecs = need("imagecodecs", EXTRA)
+    try:
+        pixels = codecs.tiff_decode(data)
+    except (RuntimeError, ValueError, TypeError, MemoryError, OSError) as error:
+        raise WlmError(f"{path}: the TIFF is cut short or damaged: {' '.join(str(error).split())[:120]}") from error
+    if tags["planes"] == 2 and samples > 1:
+        pixels = np.moveaxis(pixels, 0, -1)
+    expected = tags["height"], tags["width"], samples
+    if pixels.size != np.prod(expected) or pixels.dtype not in (
+        np.uint8,
+        np.uint16,
+        np.float16,
+        np.float32,
+        np.float64,
+    ):
+        raise WlmError(f"{path}: expected integers of 8 or 16 bits or floats, found {pixels.dtype} {pixels.shape}")
+    pixels = pixels.reshape(expected)[..., : colours + 1]
+    if tags["orientation"] > 4:
+        pixels = pixels.swapaxes(0, 1)
+    down, right = tags["orientation"] not in (3, 4, 7, 8), tags["orientation"] not in (2, 3, 6, 7)
+    pixels = pixels[:: 1 if down else -1, :: 1 if right else -1]
+    if pixels.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            pixels = pixels.astype(np.float32)
+    names = (("L",) if colours == 1 else ("R", "G", "B")) + ("A",) * (samples > colours)
+    return np.ascontiguousarray(pixels), names
