@@ -183,8 +183,9 @@ class Cursor:
 
     def take(self, count: int) -> bytes:
         """Returns the next bytes."""
+        begin = self.at
         self.skip(count)
-        return self.data[self.at - count : self.at]
+        return self.data[begin : self.at]
 
     def unpack(self, form: str) -> tuple:
         """Returns the next numbers, in a format of `struct`."""
@@ -221,6 +222,7 @@ class _Tree:
         self._cursor, self._flags, self._where = cursor, flags, where
         self._one = "<d" if entry.head.type == "double" else "<f"
         self._many = "<f2" if entry.half else self._one
+        self._bytes = np.dtype(self._many).itemsize
         self._tiles: list[Tiles] = []
         self._corners: list[np.ndarray] = []  # the corners of leaves
         self._masks: list[bytes] = []
@@ -327,7 +329,7 @@ class _Tree:
 
     def _numbers(self, count: int) -> np.ndarray:
         """Reads and decompresses the next numbers, float32 [count]."""
-        cursor, half, size = self._cursor, self._many == "<f2", count * np.dtype(self._many).itemsize
+        cursor, half, size = self._cursor, self._many == "<f2", count * self._bytes
         if not count and half:
             return np.zeros(0, np.float32)
         if self._flags & (_ZIP | _BLOSC):
