@@ -18,6 +18,7 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.deflate import inflate
 from wlm.formats.float_texels import Layout, check_picture, decode_texels, unpack_zstd
 from wlm.formats.hdr_blocks import ASTC_BLOCKS
+from wlm.formats.primaries import ACES_AP0, ACES_AP1, ADOBE_RGB, CIE_XYZ, P3_D65, REC709, REC2020, to_rec709
 from wlm.formats.reading import open_file
 
 VK_FORMATS = {
@@ -60,6 +61,8 @@ _SHARED_UNITY, _SHARED_MIDDLE, _SHARED_MOST = 8448, 15, 31
 # The header and the first entry of the level index, which describes the largest level.
 _READ_HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
 _PAIRS_BYTES = 1 << 20  # limit of the key/value data
+# The primaries of Khronos Data Format 1.3; 0 is unspecified.
+_PRIMARIES = {0: REC709, 1: REC709, 4: REC2020, 5: CIE_XYZ, 6: ACES_AP0, 7: ACES_AP1, 10: P3_D65, 11: ADOBE_RGB}
 _DESCRIPTOR_BYTES = 20  # the descriptor up to its transfer function
 _TRANSFERS = (0, 1)  # unspecified, linear
 
@@ -206,10 +209,11 @@ def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) 
     return struct.pack("<I", 4 + size) + block
 
 
-def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the largest mip of a KTX2 texture of light, plain or compressed by zstd or zlib.
 
-    The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored.
+    The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored. Other
+    primaries are converted to Rec. 709, which adds a line to `notes`.
 
     Returns:
         The pixels, float32 [H, W, 3 or 4], and the channel names.
@@ -252,7 +256,9 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
                 )
         if stored > 2 * expected + 1024:  # no compressor expands data further
             raise WlmError(f"{path}: byteLength of level 0: expected at most {2 * expected + 1024}, found {stored}")
-        _check_descriptor(path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES))
+        primaries = _primaries(
+            path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES)
+        )
         words = _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES)
         right, down = _orientation(path, words, layout.channels)
         data = _part(path, file, held, start, stored, "level 0", stored)
@@ -266,6 +272,7 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
     if len(data) != expected:
         raise WlmError(f"{path}: level 0: expected {expected} bytes once unpacked, found {len(data)}")
     pixels = decode_texels(path, layout, data, width, height)
+    to_rec709(pixels, primaries, f"{path}: the data format descriptor", [] if notes is None else notes)
     return np.ascontiguousarray(pixels[:: 1 if down else -1, :: 1 if right else -1]), layout.names
 
 
@@ -282,13 +289,18 @@ def _part(
     return data
 
 
-def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
-    """Checks that the transfer function in the data format descriptor is linear."""
+def _primaries(path: str | os.PathLike[str], data: bytes) -> tuple[float, ...]:
+    """Returns the chromaticities that the data format descriptor states, and checks that its transfer function is
+    linear."""
     if len(data) < _DESCRIPTOR_BYTES:
         raise WlmError(f"{path}: the data format descriptor: expected {_DESCRIPTOR_BYTES} bytes, found {len(data)}")
     transfer = data[14]
     if transfer not in _TRANSFERS:
         raise WlmError(f"{path}: the data format descriptor: expected linear light (transfer 1), found {transfer}")
+    if data[13] not in _PRIMARIES:
+        known = ", ".join(map(str, _PRIMARIES))
+        raise WlmError(f"{path}: the data format descriptor: expected primaries {known}, found {data[13]}")
+    return _PRIMARIES[data[13]]
 
 
 def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tuple[bool, bool]:

@@ -26,11 +26,14 @@ _TAGS = {
     274: "orientation",
     277: "samples",
     284: "planes",
+    319: "primaries",
     322: "tile width",
     323: "tile height",
     339: "format",
+    34675: "colour profile",
 }
-_FORMATS = {1: "B", 3: "H", 4: "I"}  # of the tags above: byte, short, long
+_FORMATS = {1: "B", 3: "H", 4: "I", 5: "I", 7: "B"}  # of the tags above: byte, short, long, rational, undefined
+_COLOURS = ("primaries", "colour profile")
 _MOST_SAMPLES = 64
 _GREY, _RGB, _FLOAT = 1, 2, 3
 
@@ -58,8 +61,10 @@ def tags_of(path: str | os.PathLike[str], data: bytes) -> dict[str, int]:
     return found
 
 
-def read_tiff(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+def read_tiff(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the first image of a TIFF of grey or RGB, with alpha or without.
+
+    `notes` gets a line if the file states primaries or a colour profile, which are not applied.
 
     Returns:
         The pixels, [H, W, C], the top row first whatever the file's orientation: float32, or uint8 and uint16 as
@@ -71,6 +76,9 @@ def read_tiff(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
     """
     data = read_file(path, IMAGE_BYTES, "the TIFF")
     tags = tags_of(path, data)
+    notes += [
+        f"the {name} in it are not applied: its colours are taken as Rec. 709" for name in _COLOURS if name in tags
+    ]
     samples, colours = tags["samples"], 3 if tags["photometric"] == _RGB else 1
     if tags["photometric"] not in (_GREY, _RGB) or not colours <= samples <= _MOST_SAMPLES:
         raise WlmError(
