@@ -84,7 +84,9 @@ def test_nested_and_mirrored_nodes(tmp_path):
     (found,) = _read(maker, tmp_path)
     local = quaternion.apply(POINTS[:4] * [1, -2, 0.5]) + [1, 2, 3]
     np.testing.assert_allclose(found.position, local @ upper[:3, :3].T + upper[:3, 3], atol=1e-12)
-    np.testing.assert_array_equal(found.triangle, TRIANGLES)
+    # The node mirrors, which turns the winding.
+    assert found.mirrored
+    np.testing.assert_array_equal(found.triangle, np.array(TRIANGLES)[:, ::-1])
     assert found.node == 1
 
 

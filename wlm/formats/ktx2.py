@@ -1,6 +1,6 @@
 """KTX2 files: writing of 2D textures (with mips) and 3D textures without supercompression, and reading of light.
 
-Only the largest mip of a 2D texture of light is read; arrays, cubes, volumes and formats of low range or of fewer than
+Only the largest mip of a 2D or a 3D texture of light is read; arrays, cubes and formats of low range or of fewer than
 three channels are refused. Sources: KTX file format specification 2.0; for the data format descriptor, Khronos Data
 Format specification 1.3, basic descriptor block.
 """
@@ -35,6 +35,8 @@ VK_FORMATS = {
 """Formats that can be written, with their Vulkan numbers: 16 or 32 bits per channel, RGB9E5, or blocks of 16 bytes."""
 
 MAGIC = b"\xabKTX 20\xbb\r\n\x1a\n"
+VOLUME_HEAD = 32
+"""Bytes at the beginning of a file that tell whether it is a volume."""
 # Identifier; format, bytes of a channel, width, height, depth, layers, faces, levels, supercompression; offset and
 # length of the descriptor, of the key/value data and of the supercompression data.
 _HEADER = struct.Struct("<12s 9I 4I 2Q")
@@ -111,7 +113,7 @@ def write_ktx2(
         raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")
     if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
         raise ValueError(f"expected a width and a height of 1 to {_MAX_SIDE} texels, got {width}x{height}")
-    if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in _CHANNELS):
+    if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in (*_CHANNELS, _SHARED)):
         raise ValueError(f"depth: expected 0 to {_MAX_DEPTH}, and 0 for a format of blocks, got {depth} for {fmt}")
     most = 0 if depth else max(width, height).bit_length() - 1
     if not 0 <= mips <= most:
@@ -222,6 +224,29 @@ def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> t
         WlmError: The file is missing, is not a KTX2 file, is cut short or damaged, has another format, is an array, a
             cube or a volume, has swizzled or nonlinear channels, or the package that decodes it is missing.
     """
+    pixels, layout, right, down = _read(path, False, [] if notes is None else notes)
+    return np.ascontiguousarray(pixels[0, :: 1 if down else -1, :: 1 if right else -1]), layout.names
+
+
+def is_volume(head: bytes) -> bool:
+    """Whether the first `VOLUME_HEAD` bytes of a file are those of a KTX2 texture with several slices in depth."""
+    return head.startswith(MAGIC) and int.from_bytes(head[28:VOLUME_HEAD], "little") > 1
+
+
+def read_ktx2_volume(path: str | os.PathLike[str]) -> np.ndarray:
+    """Reads the largest mip of a 3D texture of light in its stored order, whatever `KTXorientation` states.
+
+    Returns:
+        The texels, float32 [D, H, W, 3]; alpha is left out.
+
+    Raises:
+        WlmError: As for `read_ktx2`, or the height is not a multiple of that of the blocks.
+    """
+    return _read(path, True, [])[0][..., :3]
+
+
+def _read(path: str | os.PathLike[str], volume: bool, notes: list[str]) -> tuple[np.ndarray, Layout, bool, bool]:
+    """Returns the texels [D, H, W, C] as stored, their layout, and whether columns go right and rows go down."""
     with open_file(path, "the KTX2 file") as file:
         held = os.fstat(file.fileno()).st_size
         head = file.read(_READ_HEADER.size)
@@ -240,15 +265,18 @@ def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> t
         name, layout = _LAYOUTS[number]
         for field, found, fits, expected in (
             ("pixelHeight", height, height > 0, "at least 1 (2D)"),
-            ("pixelDepth", depth, depth <= 1, "0 (no volume)"),
+            ("pixelDepth", depth, volume or depth <= 1, "0 (no volume)"),
             ("layerCount", layers, layers <= 1, "0 (no array)"),
             ("faceCount", faces, faces == 1, "1 (no cube)"),
             ("supercompressionScheme", scheme, scheme in (_NONE, _ZSTD, _ZLIB), "none (0), zstd (2) or zlib (3)"),
         ):
             if not fits:
                 raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
-        check_picture(path, held, width, height, layout.unpacked)
-        expected = layout.bytes_of(width, height)
+        slices = max(depth, 1)
+        if slices > 1 and height % layout.block[1]:
+            raise WlmError(f"{path}: pixelHeight: expected a multiple of {layout.block[1]} in a volume, found {height}")
+        check_picture(path, held, width, height, layout.unpacked * slices)
+        expected = layout.bytes_of(width, height * slices)
         for field, found in (("byteLength", stored), ("uncompressedByteLength", size))[scheme != _NONE :]:
             if found != expected:
                 raise WlmError(
@@ -260,7 +288,7 @@ def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> t
             path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES)
         )
         words = _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES)
-        right, down = _orientation(path, words, layout.channels)
+        right, down = _orientation(path, words, layout.channels, volume)
         data = _part(path, file, held, start, stored, "level 0", stored)
     if scheme == _ZSTD:
         data = unpack_zstd(path, data, expected)
@@ -271,9 +299,9 @@ def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> t
             raise WlmError(str(error)) from error
     if len(data) != expected:
         raise WlmError(f"{path}: level 0: expected {expected} bytes once unpacked, found {len(data)}")
-    pixels = decode_texels(path, layout, data, width, height)
-    to_rec709(pixels, primaries, f"{path}: the data format descriptor", [] if notes is None else notes)
-    return np.ascontiguousarray(pixels[:: 1 if down else -1, :: 1 if right else -1]), layout.names
+    pixels = decode_texels(path, layout, data, width, height * slices)
+    to_rec709(pixels, primaries, f"{path}: the data format descriptor", notes)
+    return pixels.reshape(slices, height, width, -1), layout, right, down
 
 
 def _part(
@@ -303,7 +331,7 @@ def _primaries(path: str | os.PathLike[str], data: bytes) -> tuple[float, ...]:
     return _PRIMARIES[data[13]]
 
 
-def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tuple[bool, bool]:
+def _orientation(path: str | os.PathLike[str], data: bytes, channels: int, volume: bool) -> tuple[bool, bool]:
     """Returns whether columns go right and whether rows go down, and checks the order of the channels."""
     found = {b"KTXorientation": b"rd", b"KTXswizzle": b"rgba"}
     at = 0
@@ -316,6 +344,7 @@ def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tu
             found[key] = value.rstrip(b"\0")
         at += 4 + size + -size % 4
     orientation, swizzle = found.values()
+    orientation = orientation[:2] if volume else orientation
     if orientation not in (b"rd", b"ru", b"ld", b"lu"):
         raise WlmError(f"{path}: KTXorientation: expected rd, ru, ld or lu, found {orientation[:20]!r}")
     if swizzle[:channels] != b"rgba"[:channels]:

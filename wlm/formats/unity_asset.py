@@ -1,8 +1,9 @@
 """Reading of light probes and lightmap rectangles from Unity's `LightingData.asset` and `LightProbes.asset`.
 
 UnityPy (extra `unity`) lists the objects and their layouts, which the file contains, in a separate process
-(`unity_child`). The objects are read here, since UnityPy allocates as many values as a file claims. Only binary assets
-are read: Unity writes lighting data in binary whatever the serialization mode of the project."""
+(`unity_child`). The objects are read here, since UnityPy allocates as many values as a file claims. Unity's editor
+writes lighting data in binary whatever the serialization mode of the project; text assets (`unity_text`) come from
+scripts and from other tools."""
 
 import json
 import os
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats import unity_child
+from wlm.formats import unity_child, unity_text
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import PROBES
 from wlm.formats.reading import damaged, read_file
@@ -88,11 +89,12 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
     Raises:
         WlmError: UnityPy is missing; or the file is missing, damaged, YAML text, an asset bundle, or has no such data.
     """
-    need("UnityPy", _EXTRA)
     data = read_file(path, _BYTES, "the asset")
-    if data.startswith((_TEXT, _BUNDLE)):
-        found = "YAML" if data.startswith(_TEXT) else "an asset bundle"
-        raise WlmError(f"{path}: expected a binary asset of Unity's editor, found {found}")
+    if data.startswith(_TEXT):
+        return _read_text(path, data)
+    if data.startswith(_BUNDLE):
+        raise WlmError(f"{path}: expected an asset of Unity's editor, found an asset bundle")
+    need("UnityPy", _EXTRA)
     positions, values = [np.empty((0, 3))], [np.empty((0, _COEFFICIENTS, _CHANNELS))]
     rectangles: list[Rectangle] = []
     with damaged(f"{path}: the asset is damaged, or UnityPy cannot read its version", *_DAMAGE):
@@ -115,6 +117,28 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
     if len(position) > PROBES:
         raise WlmError(f"{path}: expected at most {PROBES:,} light probes, found {len(position):,}")
     return LightingData(position, np.concatenate(values), tuple(rectangles))
+
+
+def _read_text(path: str | os.PathLike[str], data: bytes) -> LightingData:
+    positions, values = [np.empty((0, 3))], [np.empty((0, _COEFFICIENTS, _CHANNELS))]
+    places: list[Rectangle] = []
+    objects = unity_text.objects(data)
+    if not any(kind in _WANTED for kind, _ in objects):
+        found = ", ".join(sorted({kind for kind, _ in objects})[:4]) or "nothing"
+        raise WlmError(
+            f"{path}: expected Unity's lighting data or light probes, found {found} (the light of Adaptive Probe "
+            "Volumes is in .bytes files, which wlm does not read: bake a Light Probe Group)"
+        )
+    with damaged(f"{path}: the asset is damaged", ValueError):
+        for kind, text in objects:
+            if kind == "LightProbes":
+                place, light = unity_text.probes(text)
+                positions.append(place)
+                values.append(light)
+            elif kind in _WANTED:
+                found_places = unity_text.rectangles(text)
+                places += [Rectangle(n, (x, y, z, w)) for n, (x, y, z, w) in found_places if n < _NO_LIGHTMAP]
+    return LightingData(np.concatenate(positions), np.concatenate(values), tuple(places))
 
 
 _DAMAGE = (ValueError, LookupError, TypeError, AttributeError, RecursionError, struct.error)

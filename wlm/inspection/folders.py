@@ -279,6 +279,8 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
     if len(pictures) == len(meshes) == 1:
         mesh, light = inspect_file(meshes[0]), inspect_file(pictures[0])
+        if mesh.command:  # the mesh names its lightmaps itself
+            return [(mesh, {mesh.path, light.path})]
         if UNREADABLE not in (mesh.what, light.what):
             what, problems = f"a mesh with the lightmap {light.path.name}", (*mesh.problems, *light.problems)
             return [
