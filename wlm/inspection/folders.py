@@ -4,6 +4,7 @@ import os
 import re
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -12,7 +13,15 @@ from PIL import Image
 from wlm.errors import WlmError
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
-from wlm.inspection.files import BAKED, FRAMES, document_of, file_system, inspect_file, kind_of
+from wlm.inspection.files import (
+    BAKED,
+    FRAMES,
+    describe_volume,
+    document_of,
+    file_system,
+    inspect_file,
+    kind_of,
+)
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import Picture, picture_of, said
 from wlm.inspection.sets import UNREADABLE_SET, inspect_set, named, together
@@ -93,7 +102,7 @@ def _folder_system(folder: Path) -> str:
         return "smoke" if stated == FRAMES else "export"
     pictures = _light(files)
     if not pictures:
-        return ""
+        return "smoke" if any(file.suffix.lower() in (".vdb", ".nvdb") for file in files) else ""
     sizes = {picture.size for picture in pictures.values() if picture.width}
     return "meshes" if len(sizes) > 1 else "lightmap"
 
@@ -105,7 +114,7 @@ def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
     try:
         entries = _entries(folder)
         files = [entry for entry in entries if entry.is_file()]
-        for whole in (_documents, _unity, _godot, _flip_books, _pictures):
+        for whole in (_documents, _unity, _godot, _flip_books, _pictures, _volumes):
             for finding, its in whole(folder, [file for file in files if file not in taken]):
                 findings.append(finding)
                 taken |= its
@@ -303,3 +312,23 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     what = f"{count_of(pictures, 'lightmap')} of {heads[pictures[0]].size}"
     taken = {*pictures, folder / "mask.png"} & set(files)
     return [(Finding(folder, what, compress_command(folder, *options), tuple(problems)), taken)]
+
+
+def _volumes(folder: Path, files: Sequence[Path]) -> _Found:
+    """Describes numbered volumes as frames of smoke, by the last of them."""
+    volumes = [file for file in files if file.suffix.lower() in (".vdb", ".nvdb")]
+    if len(volumes) < 2:
+        return []
+    from wlm.smoke.data import load_frames
+
+    try:
+        frames = load_frames(folder, up="y")
+        last = frames.file(frames.numbers[-1])
+        volume = frames.load(frames.numbers[-1])
+    except WlmError:
+        return []  # each file is described by itself
+    if not set(frames.files.values()) <= set(volumes):
+        return []
+    what = f"{len(frames.files)} frames of smoke, the last of them"
+    finding = describe_volume(folder, volume, last, "DIR", what)
+    return [(replace(finding, problems=(*frames.warnings, *finding.problems)), set(frames.files.values()))]
