@@ -76,9 +76,10 @@ def test_the_uv_set_without_texcoord_is_the_second(tmp_path, stated):
 
 
 def test_pictures_inside_the_file(tmp_path):
-    """In a buffer view and as a data: URI; PNG in sRGB, and Radiance."""
+    """In a buffer view and as a data: URI; PNG in sRGB, Radiance and EXR."""
     path = scene(tmp_path, moz(texCoord=1))
-    for data, atol in ((png(srgb(light())), 0.02), (imagecodecs.rgbe_encode(light(), header=True), 0.02)):
+    radiance, exr = imagecodecs.rgbe_encode(light(), header=True), (tmp_path / EXR).read_bytes()
+    for data, atol in ((png(srgb(light())), 0.02), (radiance, 0.02), (exr, 2e-3)):
         uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
         content = json.loads(scene(tmp_path, moz(texCoord=1), images=[{"uri": uri}]).read_text())
         inside = load(tmp_path / "a.gltf")
@@ -165,6 +166,24 @@ def test_lightmaps_of_other_extensions(tmp_path, writer):
     sheet, factor = found.sheets[0], 1.0 if writer in ("EPIC", "NEEDLE") else 2.0
     lit = (light()[sheet.mask] > 0).all(axis=1)
     np.testing.assert_allclose(sheet.lightmap[sheet.mask][lit], factor * light()[sheet.mask][lit], rtol=1e-3)
+
+
+def test_the_renderer_of_several_materials_is_above_its_meshes(tmp_path):
+    content = json.loads(writers_scene(tmp_path, "NEEDLE").read_text())
+    above = content["nodes"][0].pop("extensions")
+    content["nodes"].append({"children": [0], "extensions": above})
+    content["scenes"][0]["nodes"] = [1]
+    (tmp_path / "a.gltf").write_text(json.dumps(content))
+    (place,) = load(tmp_path / "a.gltf").objects
+    assert (place.node, place.scale_offset) == (0, (0.5, 0.5, 0.5, 0.0))
+
+
+def test_a_factor_for_each_channel(tmp_path):
+    factor = {"lightmapTexture": {"index": 0, "texCoord": 1}, "lightmapFactor": [2.0, 1.0, 0.5]}
+    assert_lit(load(scene(tmp_path, {"extensions": {"FB_materials_lightmap": factor}})), light() * [2.0, 1.0, 0.5])
+    factor["lightmapFactor"] = [2.0, -1.0, 0.5]
+    text = error_of(load, scene(tmp_path, {"extensions": {"FB_materials_lightmap": factor}}))
+    assert "expected a factor of one number or three, of 0 or more" in text
 
 
 def test_lightmaps_that_are_named_and_cannot_be_read(tmp_path):
@@ -287,6 +306,19 @@ def test_a_transform_of_the_slot_that_reads_the_uvs(tmp_path, kind):
     (tmp_path / "lights.json").write_text(json.dumps(lists))
     (sheet,) = load(tmp_path / "a.glb", tmp_path / "lights.json").sheets
     np.testing.assert_allclose(np.sort(sheet.uv, axis=0), np.sort(UV * [0.5, 1] + [0.5, 0], axis=0), atol=1e-4)
+
+
+def test_materials_with_a_range_each(tmp_path):
+    """The UVs of each material have their own range, as a quantiser writes them; they become one new set."""
+    halves = np.arange(len(UV))[:, None] < 12
+    first, transform = moved(UV, (2.0, 3.0), (0.01, 0.02))
+    second, other = moved(UV, (4.0, 1.0), (-0.1, 0.01))
+    slots = [{"occlusionTexture": {"index": 0, "texCoord": 1, "extensions": each}} for each in (transform, other)]
+    path = two_materials(tmp_path, *slots, (OTHER, np.where(halves, first, second)))
+    found = load(path, tmp_path / EXR)
+    assert found.uv_set == 2
+    assert_lit(found)
+    assert load(path, tmp_path / EXR, uv_set=2).source == found.source
 
 
 @pytest.mark.parametrize("dilated", [False, True])

@@ -206,9 +206,10 @@ def misfits(
     apart = min(black, away) > _APART
     others = [*alternatives, *_stretched(uv, triangle, lit)]
     if others:
-        rough = float("inf") if texels < _FEWEST or apart else roughness(light, chart)
-        # The light is smoother in charts than across their edges.
-        limit = min(_BETTER * rough, rough - _LEAST, roughness(light, np.zeros((height, width), np.int32)))
+        rough = float("inf") if apart else roughness(light, chart)
+        # The light is smoother in charts than across their edges. Few texels say little about the UVs that are used.
+        everywhere = roughness(light, np.zeros((height, width), np.int32)) * (1.0 if texels >= _FEWEST else _BETTER)
+        limit = min(_BETTER * rough, rough - _LEAST, everywhere)
     best: tuple[float, str] | None = None
     for words, uvs in others:
         other = uvs.astype(np.float64)

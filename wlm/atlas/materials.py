@@ -21,6 +21,7 @@ image read one lightmap, whatever their textures and samplers.
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -60,6 +61,7 @@ EXTENSIONS = (*_MATERIALS, _MX, _EPIC, _NEEDLE)
 
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 _FLOAT = 5126
+_MOST_SLOTS = 64  # texture slots of a material that are examined
 _NEAR = 0.01  # a transform for lightmaps leaves UVs this near to [0, 1]
 
 
@@ -171,9 +173,13 @@ def _own(
     sheets: dict[tuple, SheetFiles] = {}
     held: dict[str, bytes | memoryview] = {}
     readings: Readings = {}
-    lacking, defaults = 0, set()
+    lacking, defaults, order = 0, set(), {}
+    images: dict[int, tuple[str, Path | None]] = {}
+    parents = {
+        child: number for number, node in enumerate(document.content["nodes"]) for child in node.get("children", [])
+    }
     for each in primitives:
-        entry = _entry(document, each, name)
+        entry = _entry(document, each, name, parents.get(each.node, each.node))
         if entry is None:
             continue
         where = f"{document.path}: nodes[{each.node}]: {name}"
@@ -188,9 +194,12 @@ def _own(
             continue
         image = texture_image(document, info["index"])
         factor = _factor(entry.factor, where)
-        label, path = _image(document, image, held)
+        if image not in images:
+            images[image] = _image(document, image, held)
+        label, path = images[image]
         key = label, tuple(np.ravel(factor))
         if key not in sheets:
+            order[key] = len(sheets)
             title = document.item("images", image).get("name")
             sheets[key] = SheetFiles(
                 files=[label],
@@ -201,7 +210,7 @@ def _own(
         sx, sy, x, y = numbers(list(entry.rectangle), where, ("x", "y", "z", "w"))
         inner = texture_transform(where, info)
         moved = np.array([[sx, 0.0], [0.0, sy]]) @ inner + np.array([[0.0, 0.0, x], [0.0, 0.0, y]])
-        readings[each.node, each.primitive] = Reading(list(sheets).index(key), number, tuple(map(float, moved.ravel())))
+        readings[each.node, each.primitive] = Reading(order[key], number, tuple(map(float, moved.ravel())))
     if not readings:
         reason = f"the UVs that it names are missing in {lacking} primitives" if lacking else "no lit mesh is drawn"
         raise WlmError(f"{document.path}: {name}: {reason}")
@@ -225,8 +234,9 @@ def _notes(
     return tuple(notes)
 
 
-def _entry(document: GltfDocument, primitive: GltfPrimitive, name: str) -> _Entry | None:
-    """Returns the slot with which a primitive names its lightmap by the extension or the slot `name`."""
+def _entry(document: GltfDocument, primitive: GltfPrimitive, name: str, parent: int) -> _Entry | None:
+    """Returns the slot with which a primitive names its lightmap by the extension or the slot `name`; `parent` is the
+    node above its own, on which Needle writes the renderer of a mesh of several materials."""
     material = {} if primitive.material is None else document.item("materials", primitive.material)
     if name in SLOTS:
         info = material.get(f"{name}Texture")
@@ -238,7 +248,7 @@ def _entry(document: GltfDocument, primitive: GltfPrimitive, name: str) -> _Entr
         return None if info is None else _Entry(info, uv_set, extension.get(factor, 1.0))
     node = document.item("nodes", primitive.node).get("extensions", {})
     if name == _NEEDLE:
-        return _needle(document, node)
+        return _needle(document, node) or _needle(document, document.item("nodes", parent).get("extensions", {}))
     if name not in node:
         return None
     if name == _MX:
@@ -382,7 +392,7 @@ def _transform_of(
     quantised = document.item("accessors", attributes[f"TEXCOORD_{uv_set}"])["componentType"] != _FLOAT
     found = []
     material = {} if primitive.material is None else document.item("materials", primitive.material)
-    for slot, info in _slots(material):
+    for slot, info in islice(_slots(material), _MOST_SLOTS):
         transform = info.get("extensions", {}).get("KHR_texture_transform", {})
         if transform.get("texCoord", info.get("texCoord", 0)) != uv_set:
             continue
