@@ -15,6 +15,7 @@ from PIL import Image
 from wlm.atlas.data import from_arrays, load
 from wlm.atlas.stored import store, with_uvs
 from wlm.formats.exr import write_exr
+from wlm.formats.geometry import read_geometry
 from wlm.formats.gltf import parse_gltf, read_gltf
 from wlm.inspection import inspect
 
@@ -299,6 +300,7 @@ def test_a_transform_of_the_slot_that_reads_the_uvs(tmp_path, kind):
     found = load(maker.save(tmp_path / "a.glb"), tmp_path / "bake.exr")
     assert_lit(found)
     assert any("TEXCOORD_1 is moved by KHR_texture_transform" in line for line in found.warnings) == (kind != "tiling")
+    np.testing.assert_allclose(np.sort(read_geometry(tmp_path / "a.glb").uv, axis=0), np.sort(UV, axis=0), atol=1e-4)
     lists = {
         "sheets": [{"files": ["bake.exr"]}],
         "objects": [{"node": "0", "sheet": 0, "scale_offset": [0.5, 1, 0.5, 0]}],
