@@ -147,8 +147,3 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch, name):
     primitive = {"attributes": {}, "extensions": {DRACO: {"bufferView": view, "attributes": {}}}}
     text = error_of(read_gltf, scene(maker, primitive, name).save(tmp_path / "a.glb"))
     assert f"uses the extension {name}" in text and "pip install 'wlm[gltf]'" in text
-
-
-def test_instances_are_refused(tmp_path):
-    path = scene(GltfMaker(), {"attributes": {}}, "EXT_mesh_gpu_instancing").save(tmp_path / "a.glb")
-    assert "EXT_mesh_gpu_instancing" in error_of(read_gltf, path) and "uninstance" in error_of(read_gltf, path)

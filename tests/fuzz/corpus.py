@@ -181,7 +181,7 @@ def _probe_files(folder: Path) -> None:
     (folder / "probes-scene.json").write_text(json.dumps(scene))
     table = probe_layouts.tables()["named.csv"].replace(",", " ").splitlines()[:5]
     (folder / "probes.csv").write_text("\n".join(table))
-    (folder / "probes.asset").write_text(probe_layouts.unity_text(rectangles=True, count=3))
+    (folder / "probes.asset").write_text(probe_layouts.unity_text(count=3))
     (folder / "positions.json").write_text(json.dumps(room.position.round(3).tolist()))
 
 

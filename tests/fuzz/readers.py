@@ -4,6 +4,7 @@ A new reader is a row: its good files (in `corpus.py`, or made here), how to cha
 format, and a function that reads it as users do and asserts what the format's page forbids.
 """
 
+import base64
 import functools
 import gzip
 import json
@@ -138,6 +139,38 @@ def _mesh(path: Path) -> None:
     finally:
         again.unlink(missing_ok=True)
     _lit(path)
+
+
+def _own_lights() -> Sequence[bytes]:
+    """glTF files that name their lightmaps, by each kind of extension; the picture is inside."""
+    plain, *pictures = corpus("mesh.gltf", "mask-rgba.png", "plain.hdr")()
+    png, radiance = (base64.b64encode(each).decode() for each in pictures)
+    turned = {"KHR_texture_transform": {"scale": [0.5, 0.5], "offset": [0.25, 0.5], "rotation": 0.1, "texCoord": 1}}
+    info = {"index": 0, "texCoord": 1}
+    renderer = {"lightmapIndex": 0, "lightmapScaleOffset": {"x": 0.5, "y": 0.5, "z": 0.0, "w": 0.5}}
+    needle = {"textures": [{"pointer": "textures/0", "type": 0, "index": 0}]}
+    place = {"texture": info, "coordinateScaleBias": [0.5, 0.5, 0.0, 0.25]}
+    scenes = []
+    for material, node, root in (
+        ({"MOZ_lightmap": {"index": 0, "intensity": 2.0, "extensions": turned}}, {}, {}),
+        ({"FB_materials_lightmap": {"lightmapTexture": info, "lightmapFactor": [1.0, 2.0, 3.0]}}, {}, {}),
+        ({}, {"MX_lightmap": {"lightMapTexture": info, "scale": [0.5, 0.5], "offset": [0.5, 0.0]}}, {}),
+        ({}, {"EPIC_lightmap_textures": {"lightmap": 0}}, {"EPIC_lightmap_textures": {"lightmaps": [place]}}),
+        ({}, {"NEEDLE_components": {"builtin_components": [renderer]}}, {"NEEDLE_lightmaps": needle}),
+    ):
+        content = json.loads(plain)
+        picture = radiance if root or "FB_materials_lightmap" in material else png
+        content["images"] = [{"uri": f"data:image/png;base64,{picture}"}]
+        content["materials"] = [{"extensions": material}]
+        content["nodes"][1]["extensions"], content["extensions"] = node, root
+        scenes.append(json.dumps(content).encode())
+    return scenes
+
+
+def _own_lit(path: Path) -> None:
+    for sheet in wlm.atlas.load(path).sheets:
+        check_finite(position=sheet.position, uv=sheet.uv, lightmap=sheet.lightmap)
+        assert sheet.triangle.max() < len(sheet.position), "a corner beyond the vertices"
 
 
 def _obj(path: Path) -> None:
@@ -387,6 +420,7 @@ _ALL = (
     Reader("tga-flipbook", "a.tga", corpus("flipbook.tga"), _tga, _flipbook),
     Reader("gltf", "a.gltf", corpus("mesh.gltf"), vary_gltf, _mesh, _light, cost=2),
     Reader("glb", "a.glb", corpus("mesh.glb"), vary_glb, _mesh, _light, cost=2),
+    Reader("gltf-lights", "a.gltf", _own_lights, vary_gltf, _own_lit, cost=2),
     Reader("gltf-bake", "a.gltf", corpus("mesh.gltf"), vary_gltf, _surfaces, _light, cost=2),
     Reader("obj", "a.obj", corpus("mesh.obj"), _obj_lines, _obj, _light),
     Reader("atlas-lights", "lights.json", _light_lists, _json, read_listing),

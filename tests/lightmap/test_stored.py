@@ -40,8 +40,8 @@ def test_windows_that_move_between_hours_stay_in_place(tmp_path):
         expected = np.zeros_like(LIGHT)
         expected[2:22, x : x + 20] = LIGHT[2:22, x : x + 20]
         np.testing.assert_array_equal(frame, expected)
-    line = "a_06h.exr: the data window, 20x20 at (4, 2), is placed in the display window, 32x24: 368 texels outside it are "
-    line += "0"
+    line = "a_06h.exr: the data window, 20x20 at (4, 2), is placed in the display window, 32x24: "
+    line += "368 texels outside it are 0"
     assert line in sheet.warnings and line in inspect(tmp_path)[0].problems
 
 

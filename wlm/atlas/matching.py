@@ -175,6 +175,7 @@ def misfits(
     position: np.ndarray,
     triangle: np.ndarray,
     uv: np.ndarray,
+    chart: np.ndarray,
     used: str,
     alternatives: Sequence[tuple[str, np.ndarray]],
 ) -> list[str]:
@@ -184,6 +185,7 @@ def misfits(
     Args:
         name: The lightmap's name.
         lightmap, position, triangle, uv: The light, and the mesh with the UVs in [0, 1] that are used.
+        chart: The chart at each texel with these UVs, see `chart_map`.
         used: Words for these UVs.
         alternatives: Words and UVs [V, 2] to compare with. The UVs that are used, stretched to the lit texels, are
             compared too.
@@ -195,18 +197,21 @@ def misfits(
         lit = (light > 0).any(axis=2)
     if not lit.any():
         return []
-    chart = chart_map(position, uv, triangle, height, width)
+    chart = chart[::step, ::step]
     inside = chart >= 0
     texels = np.count_nonzero(inside)
     near = maximum_filter(inside, 2 * _REACH + 1)
     black = np.count_nonzero(inside & ~lit) / max(texels, 1)
     away = np.count_nonzero(lit & ~near) / np.count_nonzero(lit)
     apart = min(black, away) > _APART
-    everywhere = roughness(light, np.zeros((height, width), np.int32))
-    rough = float("inf") if texels < _FEWEST or apart else roughness(light, chart)
-    limit = min(_BETTER * rough, rough - _LEAST, everywhere)
+    others = [*alternatives, *_stretched(uv, triangle, lit)]
+    if others:
+        rough = float("inf") if apart else roughness(light, chart)
+        # The light is smoother in charts than across their edges. Few texels say little about the UVs that are used.
+        everywhere = roughness(light, np.zeros((height, width), np.int32)) * (1.0 if texels >= _FEWEST else _BETTER)
+        limit = min(_BETTER * rough, rough - _LEAST, everywhere)
     best: tuple[float, str] | None = None
-    for words, uvs in [*alternatives, *_stretched(uv, triangle, lit)]:
+    for words, uvs in others:
         other = uvs.astype(np.float64)
         if not np.isfinite(other).all() or other.min() < -_OUTSIDE or other.max() > 1.0 + _OUTSIDE:
             continue

@@ -173,7 +173,8 @@ def parse_gltf(
         document = GltfDocument(str(path), content, buffers, trust, most)
         for i, view in enumerate(content.get("bufferViews", [])):
             _check_view(document, i, view)
-        return document, _read_primitives(document)
+        with np.errstate(all="ignore"):  # infinite numbers are reported where they are used
+            return document, _read_primitives(document)
 
 
 Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]

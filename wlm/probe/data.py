@@ -29,7 +29,7 @@ from wlm.probe.conventions import (
     from_canonical,
     to_canonical,
 )
-from wlm.probe.json_fields import fields_of, holds_probes, kind_of, numbers_of, read_json
+from wlm.probe.json_fields import fields_of, kind_of, positions_of, read_json
 from wlm.probe.layouts import COEFFICIENT, ORDERS, choose_order, coefficients_first, described
 from wlm.probe.sphere import sh_count
 from wlm.probe.table import read_table
@@ -113,7 +113,7 @@ def load(
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`; optional fields as for `.npz`. The names
       and forms of other writers are known too (`wlm.probe.json_fields`), and scenes of three.js.
     - `.csv`, `.tsv`: a probe in each line, x, y, z and its numbers, below an optional line of names.
-    - `.lmbake`: a lightmap bake of Godot 4.
+    - `.lmbake`, `.res`: a lightmap bake of Godot 4.
     - `.ktx2`: an irradiance volume of Bevy (`wlm.probe.ambient_cube`).
     - `.asset`: the lighting data or light probes of Unity's editor, as text, or binary (extra `unity`).
 
@@ -160,11 +160,7 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
     elif kind in _READERS and kind != ".json":
         position = _READERS[kind](path, None).position
     else:
-        content = read_json(path)
-        if isinstance(content, list) and not holds_probes(content):
-            position = numbers_of(path, _POSITION, content)
-        else:
-            position = _triples(fields_of(path, content).read(_POSITION))
+        position = positions_of(path, read_json(path))
     return _check_positions(str(path), position)
 
 
@@ -274,15 +270,10 @@ def _read_json(path: Path, key: str | None) -> _Raw:
     stated = content.get(_CONVENTION, fields.convention) if isinstance(content, dict) else fields.convention
     if not isinstance(stated, str):
         raise WlmError(f"{path}: {_CONVENTION}: expected a string, got {kind_of(stated)}")
-    position, values = _triples(fields.read(_POSITION)), fields.read(name)
+    position, values = fields.read(_POSITION), fields.read(name)
     if values.ndim == 1 and len(position) and len(values) % len(position) == 0:
         values = values.reshape(len(position), -1)
     return _Raw(position, values, name, stated, beside, fields.axes)
-
-
-def _triples(position: np.ndarray) -> np.ndarray:
-    """Returns positions [N, 3] of which only the numbers are listed, one after the other, in rows."""
-    return position.reshape(-1, 3) if position.ndim == 1 and len(position) % 3 == 0 else position
 
 
 def _read_table(path: Path, key: str | None) -> _Raw:
@@ -311,6 +302,7 @@ _READERS = {
     ".npz": _read_npz,
     ".json": _read_json,
     ".lmbake": _read_godot,
+    ".res": _read_godot,
     ".asset": _read_unity,
     ".csv": _read_table,
     ".tsv": _read_table,
