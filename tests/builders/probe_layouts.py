@@ -57,17 +57,11 @@ def three_scene() -> dict[str, Any]:
     return {"metadata": {"version": 4.6, "type": "Object", "generator": "Object3D.toJSON"}, "object": scene}
 
 
-def unity_text(rectangles: bool = False, count: int = COUNT) -> str:
-    """A text asset of `LightProbes`, and with `rectangles` a `LightingDataAsset` of two renderers before it."""
+def unity_text(count: int = COUNT) -> str:
+    """A text asset of `LightProbes`, after another object."""
     position, light = unity_numbers()
     head = "%YAML 1.1\n%TAG !u! tag:unity3d.com,2011:\n"
-    lines = []
-    if rectangles:
-        lines += ["--- !u!1120 &112000000", "LightingDataAsset:", "  m_Name: day", "  m_LightmappedRendererData:"]
-        for index, place in ((1, "{x: 0.5, y: 0.25, z: 0.125, w: 0}"), (65535, "{x: 1, y: 1, z: 0, w: 0}")):
-            lines += ["  - uvMesh: {fileID: 0}", f"    lightmapIndex: {index}", "    lightmapIndexDynamic: 65535"]
-            lines += [f"    lightmapST: {place}", "    lightmapSTDynamic: {x: 1, y: 1, z: 0, w: 0}"]
-        lines += ["  m_LightmappedRendererDataIDs: []"]
+    lines = ["--- !u!114 &11400000", "MonoBehaviour:", "  m_Name: day"]
     lines += ["--- !u!258 &25800000", "LightProbes:", "  m_Name: LightProbes", "  m_Data:", "    m_ProbeSets: []"]
     lines += ["    m_Positions:", *(f"    - {{x: {x:.9g}, y: {y:.9g}, z: {z:.9g}}}" for x, y, z in position[:count])]
     lines += ["    m_NonTetrahedralizedProbeSetIndexMap: {}", "  m_BakedCoefficients:"]

@@ -186,7 +186,7 @@ def test_godot_file(tmp_path, monkeypatch):
 def test_suffix_and_path(tmp_path):
     (tmp_path / "damaged.npz").write_bytes(b"PK\3\4")
     assert "damaged.npz: cannot read the arrays" in error_of(load, tmp_path / "damaged.npz")
-    assert "or .lmbake or .asset or .csv" in error_of(load, tmp_path / "a.exr")
+    assert "or .lmbake or .res or .asset or .csv" in error_of(load, tmp_path / "a.exr")
     assert "found none" in error_of(load, tmp_path / "a")
     assert "missing.json: cannot read the probes: No such file" in error_of(load, tmp_path / "missing.json")
     (tmp_path / "folder.npz").mkdir()

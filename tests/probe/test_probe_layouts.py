@@ -9,7 +9,6 @@ from builders.checks import error_of
 from builders.probe_layouts import COUNT, canonical, unity_numbers, unity_text, write_json
 from builders.probe_sets import synthetic
 
-from wlm.formats.unity_asset import read_lighting_data
 from wlm.inspection.files import inspect_file
 from wlm.probe.conventions import from_canonical
 from wlm.probe.data import from_arrays, load, load_positions
@@ -72,22 +71,24 @@ def test_what_is_no_table_of_probes(tmp_path, text, message):
     assert found.startswith(f"{path}: ") and message in found
 
 
-@pytest.mark.parametrize("rectangles", [False, True])
-def test_a_text_asset_of_unity(tmp_path, rectangles):
+@pytest.mark.parametrize("ending", ["\n", "\r\n"])
+def test_a_text_asset_of_unity(tmp_path, ending):
     path = tmp_path / "LightProbes.asset"
-    path.write_text(unity_text(rectangles))
+    path.write_text(unity_text(), newline=ending)
     probes = load(path)
     _is_light(probes)
     assert "convention unity, as the file states" in probes.reading and probes.warnings == ()
-    places = read_lighting_data(path).rectangles
-    assert [(each.lightmap, each.scale_offset) for each in places] == [(1, (0.5, 0.25, 0.125, 0.0))] * rectangles
     assert inspect_file(path).what.startswith(f"lighting data of Unity: {COUNT} light probes")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("LightProbes:", "MonoBehaviour:", "found MonoBehaviour (the light of Adaptive Probe Volumes is in .bytes"),
+        (
+            "LightProbes:",
+            "LightingDataAsset:",
+            "found LightingDataAsset, MonoBehaviour (the light of Adaptive Probe Volumes is in .bytes",
+        ),
         ("m_Positions", "m_Places", "m_Positions is missing"),
         ("sh[ 3]: ", "sh[ 3]: 0x", "the asset is damaged"),
         ("sh[ 3]", "sh[ 4]", "in this order"),
@@ -149,10 +150,10 @@ def test_the_first_coefficient_against_the_others():
     assert from_arrays(probes.position, from_canonical(beam, "unity"), convention="unity").warnings == ()
     (warning,) = from_arrays(probes.position, beam, convention="unity", name="yard").warnings
     assert warning.startswith("yard: sh: ") and "too small for the others" in warning
-    assert "convention threejs or godot or unreal fits: --convention?" in warning
+    assert "--convention threejs or godot or unreal fits" in warning
     for wrong in (-light, light - [0.0, 0.0, 9.0], np.random.default_rng(3).normal(size=light.shape)):
         (warning,) = from_arrays(probes.position, wrong).warnings
-        assert "another order, basis or convention?" in warning
+        assert "is it another order, basis or convention?" in warning
     few = light.copy()
     few[0, 0] = 0.0
     assert from_arrays(probes.position, few).warnings == ()
@@ -198,3 +199,20 @@ def test_json_nested_deeply(tmp_path):
         json.loads(content)
         assert str(tmp_path) in error_of(load, tmp_path / "a.json")
         inspect_file(tmp_path / "a.json")
+
+
+def test_what_inspect_takes_for_probes(tmp_path):
+    for content, what in (
+        ([{"position": [0, 0, 0], "fov": 60}], "unknown JSON"),
+        ({"cameras": [{"location": [0, 0, 0], "fov": 60}]}, "unknown JSON"),
+        ({"center": [0, 0, 0], "radius": 2}, "unknown JSON"),
+        ([{"x": 1, "y": 2, "z": 3}], "unknown JSON"),
+        ([], "unknown JSON"),
+        ([{"pos": [0, 0, 0], "coefs": [1, 1, 1]}], "1 light probes of 1 RGB coefficients, 1 of them lit"),
+    ):
+        path = write_json(tmp_path, "a", content)
+        assert inspect_file(path).what.startswith(what), content
+    points = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    vectors = [dict(zip("xyz", point, strict=True)) for point in points]
+    for content in (vectors, {"cameras": [{"location": point, "fov": 60} for point in vectors]}):
+        np.testing.assert_array_equal(load_positions(write_json(tmp_path, "a", content)), points)

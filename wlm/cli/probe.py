@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from wlm.probe import ProbeModel, ProbeSet, Report
 
 _Probes = Annotated[
-    Path, typer.Argument(metavar="PROBES", help="Probe file: .npz, .json, .csv, Godot's .lmbake or Unity's .asset.")
+    Path, typer.Argument(metavar="PROBES", help="Probe file: .npz, .json, .csv, .lmbake, .asset or .ktx2.")
 ]
 _CONVENTIONS = "threejs, godot, unreal or unity"
 _Convention = Annotated[
@@ -198,7 +198,7 @@ def export(
     ] = None,
     cells: Annotated[
         int | None,
-        typer.Option(help="With --engine three, godot or unreal: grid cells along the longest side; default 24."),
+        typer.Option(help="With --engine three, godot, unreal or bevy: grid cells along the longest side; default 24."),
     ] = None,
     mirror: Annotated[
         Literal["x", "y", "z"] | None, typer.Option(help="With --engine unity: axis to flip, as Unity is left-handed.")

@@ -22,7 +22,8 @@ external images                       copies embed them; an image that is missin
 a buffer outside the file's folder    error, unless the file is trusted; an image there keeps its URI
 more corners and vertices than        error, unless the file is trusted (`wlm.formats.limits`)
 the limits
-Draco, meshopt, GPU instances         error that names the extension
+Draco, meshopt                        decompressed, with the extra `gltf` (`gltf_packed`)
+GPU instances                         error that names the extension
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
 """
@@ -42,6 +43,7 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 
 from wlm.errors import WlmError, one_line
+from wlm.formats.gltf_packed import is_fallback, unpack
 from wlm.formats.limits import CORNERS, CORNERS_A_BYTE, JSON_BYTES, MESH_BYTES, SURE_CORNERS, Budget
 from wlm.formats.reading import damaged, named_file, parse_json, read_file
 
@@ -63,10 +65,7 @@ _LARGEST_TRANSFORM = 1e9  # magnitude of the numbers of a texture transform
 _MOVES, _UNMOVED = {"matrix", "translation", "rotation", "scale"}, np.eye(4)
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
 _REFUSED = {
-    "KHR_draco_mesh_compression": "decompress the mesh first",
-    "EXT_meshopt_compression": "decompress the mesh first",
-    "KHR_meshopt_compression": "decompress the mesh first",
-    "EXT_mesh_gpu_instancing": "make its instances nodes first",
+    "EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance",
 }
 
 
@@ -168,12 +167,14 @@ def parse_gltf(
             if name in _REFUSED:
                 raise WlmError(f"{path}: uses the extension {name}, which is not read here: {_REFUSED[name]}")
         buffers = _load_buffers(path, content.get("buffers", []), binary, trust)
+        content, buffers = unpack(path, content, buffers, COMPONENTS)
         held = len(text) + sum(map(len, buffers))
         most = CORNERS if trust else min(CORNERS, max(SURE_CORNERS, CORNERS_A_BYTE * held))
         document = GltfDocument(str(path), content, buffers, trust, most)
         for i, view in enumerate(content.get("bufferViews", [])):
             _check_view(document, i, view)
-        return document, _read_primitives(document)
+        with np.errstate(all="ignore"):  # infinite numbers are reported where they are used
+            return document, _read_primitives(document)
 
 
 Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
@@ -565,6 +566,8 @@ def _load_buffer(
 ) -> bytes:
     uri, length = buffer.get("uri"), buffer["byteLength"]
     where = f"{path}: buffers[{number}]"
+    if is_fallback(buffer):
+        return b""
     if uri is None:
         if number or binary is None:
             raise WlmError(f"{where}: has no uri, and the file has no binary chunk")

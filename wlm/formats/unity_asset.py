@@ -86,25 +86,17 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
 
 
 def _read_text(path: str | os.PathLike[str], data: bytes) -> LightingData:
-    positions, values = [np.empty((0, 3))], [np.empty((0, _COEFFICIENTS, _CHANNELS))]
-    places: list[Rectangle] = []
     objects = unity_text.objects(data)
-    if not any(kind in WANTED for kind, _ in objects):
+    texts = [text for kind, text in objects if kind == "LightProbes"]
+    if not texts:
         found = ", ".join(sorted({kind for kind, _ in objects})[:4]) or "nothing"
         raise WlmError(
-            f"{path}: expected Unity's lighting data or light probes, found {found} (the light of Adaptive Probe "
-            "Volumes is in .bytes files, which wlm does not read: bake a Light Probe Group)"
+            f"{path}: expected LightProbes in this text asset, found {found} (the light of Adaptive Probe Volumes is "
+            "in .bytes files, which wlm does not read: bake a Light Probe Group)"
         )
     with damaged(f"{path}: the asset is damaged", ValueError):
-        for kind, text in objects:
-            if kind == "LightProbes":
-                place, light = unity_text.probes(text)
-                positions.append(place)
-                values.append(light)
-            elif kind in WANTED:
-                found_places = unity_text.rectangles(text)
-                places += [Rectangle(n, (x, y, z, w)) for n, (x, y, z, w) in found_places if n < _NO_LIGHTMAP]
-    return LightingData(np.concatenate(positions), np.concatenate(values), tuple(places))
+        positions, values = zip(*map(unity_text.probes, texts), strict=True)
+    return LightingData(np.concatenate(positions), np.concatenate(values), ())
 
 
 _DAMAGE = (ValueError, LookupError, TypeError, AttributeError, RecursionError, MemoryError, struct.error)

@@ -1,4 +1,4 @@
-"""Reading of light probes and lightmap rectangles from Unity's assets in text form, which is a regular kind of YAML.
+"""Reading of light probes from Unity's assets in text form, a regular kind of YAML.
 
 Unity and other tools write `LightProbes` as text, with a value in each line. The patterns below are the lines that are
 read; no YAML is parsed, so that a file costs no more than its length.
@@ -9,12 +9,10 @@ import re
 import numpy as np
 
 _OBJECT = re.compile(rb"^--- !u!\d+ &-?\d+[^\n]*\r?\n(\w+):", re.MULTILINE)
-_POSITIONS, _LIGHT, _RENDERERS = b"m_Positions", b"m_BakedCoefficients", b"m_LightmappedRendererData"
+_POSITIONS, _LIGHT = b"m_Positions", b"m_BakedCoefficients"
 _NUMBER = rb"([-+.\w]{1,32})"
 _VECTOR = re.compile(rb"\{x: " + _NUMBER + rb",\s+y: " + _NUMBER + rb",\s+z: " + _NUMBER + rb"\}")
 _COEFFICIENT = re.compile(rb"^[ -]+sh\[ ?(\d{1,2})\]: " + _NUMBER + rb"\r?$", re.MULTILINE)
-_INDEX = re.compile(rb"\blightmapIndex: (\d{1,9})\b")
-_PLACE = re.compile(rb"\blightmapST: \{" + rb",\s+".join(b"%c: " % axis + _NUMBER for axis in b"xyzw") + rb"\}")
 _NUMBERS = 27  # of a probe: nine for each colour channel
 
 
@@ -40,19 +38,6 @@ def probes(text: bytes) -> tuple[np.ndarray, np.ndarray]:
     if (numbers.reshape(-1, _NUMBERS) != np.arange(_NUMBERS)).any():
         raise ValueError(f"expected the coefficients sh[ 0] to sh[{_NUMBERS - 1}] of each probe in this order")
     return position, values.reshape(-1, 3, 9).transpose(0, 2, 1)
-
-
-def rectangles(text: bytes) -> list[tuple[int, list[float]]]:
-    """Reads the lightmap index and `lightmapScaleOffset` of each renderer of a `LightingDataAsset` object.
-
-    Raises:
-        ValueError: A number is damaged.
-    """
-    found = []
-    for each in re.split(rb"^ *- ", _member(text, _RENDERERS), flags=re.MULTILINE)[1:]:
-        if (index := _INDEX.search(each)) and (place := _PLACE.search(each)):
-            found.append((int(index[1]), [float(number) for number in place.groups()]))
-    return found
 
 
 def _member(text: bytes, name: bytes) -> bytes:

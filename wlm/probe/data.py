@@ -22,14 +22,15 @@ from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.npz import read_npz
 from wlm.formats.scratch import room
 from wlm.formats.unity_asset import read_lighting_data
+from wlm.probe.ambient_cube import READING, read_irradiance_volume
 from wlm.probe.conventions import (
     CANONICAL,
     CONVENTIONS,
     from_canonical,
     to_canonical,
 )
-from wlm.probe.json_fields import fields_of, holds_probes, kind_of, numbers_of, read_json
-from wlm.probe.layouts import ORDERS, choose_order, coefficients_first, described
+from wlm.probe.json_fields import fields_of, kind_of, positions_of, read_json
+from wlm.probe.layouts import COEFFICIENT, ORDERS, choose_order, coefficients_first, described
 from wlm.probe.sphere import sh_count
 from wlm.probe.table import read_table
 
@@ -98,6 +99,7 @@ class _Raw:
     convention: str = ""
     beside: Mapping[str, np.ndarray] = field(default_factory=dict)
     axes: str = ""
+    reading: str = ""  # if the file determines everything about its numbers
 
 
 def load(
@@ -111,7 +113,8 @@ def load(
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`; optional fields as for `.npz`. The names
       and forms of other writers are known too (`wlm.probe.json_fields`), and scenes of three.js.
     - `.csv`, `.tsv`: a probe in each line, x, y, z and its numbers, below an optional line of names.
-    - `.lmbake`: a lightmap bake of Godot 4.
+    - `.lmbake`, `.res`: a lightmap bake of Godot 4.
+    - `.ktx2`: an irradiance volume of Bevy (`wlm.probe.ambient_cube`).
     - `.asset`: the lighting data or light probes of Unity's editor, as text, or binary (extra `unity`).
 
     Args:
@@ -157,11 +160,7 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
     elif kind in _READERS and kind != ".json":
         position = _READERS[kind](path, None).position
     else:
-        content = read_json(path)
-        if isinstance(content, list) and not holds_probes(content):
-            position = numbers_of(path, _POSITION, content)
-        else:
-            position = _triples(fields_of(path, content).read(_POSITION))
+        position = positions_of(path, read_json(path))
     return _check_positions(str(path), position)
 
 
@@ -271,15 +270,10 @@ def _read_json(path: Path, key: str | None) -> _Raw:
     stated = content.get(_CONVENTION, fields.convention) if isinstance(content, dict) else fields.convention
     if not isinstance(stated, str):
         raise WlmError(f"{path}: {_CONVENTION}: expected a string, got {kind_of(stated)}")
-    position, values = _triples(fields.read(_POSITION)), fields.read(name)
+    position, values = fields.read(_POSITION), fields.read(name)
     if values.ndim == 1 and len(position) and len(values) % len(position) == 0:
         values = values.reshape(len(position), -1)
     return _Raw(position, values, name, stated, beside, fields.axes)
-
-
-def _triples(position: np.ndarray) -> np.ndarray:
-    """Returns positions [N, 3] of which only the numbers are listed, one after the other, in rows."""
-    return position.reshape(-1, 3) if position.ndim == 1 and len(position) % 3 == 0 else position
 
 
 def _read_table(path: Path, key: str | None) -> _Raw:
@@ -299,13 +293,20 @@ def _read_unity(path: Path, key: str | None) -> _Raw:
     return _Raw(data.position, data.values, _choose(path, (_POSITION, _SH), key), "unity", axes=_UNITY_AXES)
 
 
+def _read_volume(path: Path, key: str | None) -> _Raw:
+    position, values = read_irradiance_volume(path)
+    return _Raw(position, values, _choose(path, (_POSITION, _SH), key), reading=READING)
+
+
 _READERS = {
     ".npz": _read_npz,
     ".json": _read_json,
     ".lmbake": _read_godot,
+    ".res": _read_godot,
     ".asset": _read_unity,
     ".csv": _read_table,
     ".tsv": _read_table,
+    ".ktx2": _read_volume,
 }
 
 
@@ -373,16 +374,20 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
             f"{where}: order: expected {' or '.join(ORDERS)}, for 3, 12, 27 ... numbers a probe, got {order!r} for "
             f"{values.size // count}"
         )
+    if raw.reading and (convention or order):
+        raise WlmError(f"{where}: convention and order have no meaning for this kind of file: {raw.reading}")
     origin = "as given" if convention else "as the file states" if raw.convention else ""
     convention = convention or raw.convention or CANONICAL
     doubts: tuple[str, ...] = ()
     reading = f"{values.size // count} numbers a probe, which are no SH in RGB"
-    if coefficients is not None:
+    if raw.reading:
+        order = COEFFICIENT
+    elif coefficients is not None:
         _convert(where, values[:1], convention, to_canonical)  # refuses what does not fit
         certain = order is not None or values.ndim == 3 or coefficients == 1
         order, doubts = choose_order(values, convention, order)
         reading = described(convention, origin, order, certain)
-    reading = f"{reading}; {raw.axes or 'positions and axes as stored'}"
+    reading = raw.reading or f"{reading}; {raw.axes or 'positions and axes as stored'}"
 
     checked = room((count, values.size // count), np.float32, where)
     finite = np.empty(count, bool)

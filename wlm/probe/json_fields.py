@@ -65,9 +65,23 @@ def read_json(path: Path) -> Any:
 
 def holds_probes(content: Any) -> bool:
     """Whether the content of a JSON file looks like probes."""
-    if isinstance(content, dict) and (_PROBES in content or _is_scene(content) or _POSITION in _sources(content)):
+    if isinstance(content, dict) and (_PROBES in content or _POSITION in content or _is_scene(content)):
         return True
-    return _list_of_probes(content) is not None
+    found = _list_of_probes(content)
+    first = found[1][0] if found else content if isinstance(content, dict) else {}
+    sources = _sources(first)
+    return _POSITION in sources and any(name.startswith(_SH) for name in sources)
+
+
+def positions_of(path: Path, content: Any) -> np.ndarray:
+    """Reads the positions of probes, or a list of points, as an array.
+
+    Raises:
+        WlmError: The content has another form.
+    """
+    if isinstance(content, list) and _list_of_probes(content) is None:
+        return numbers_of(path, _POSITION, content)
+    return fields_of(path, content).read(_POSITION)
 
 
 def fields_of(path: Path, content: Any) -> Fields:
@@ -114,6 +128,8 @@ def _fields(path: Path, sources: dict[str, _Source], read: Callable[[str], np.nd
         array = arrays[0] if len(arrays) == 1 else np.stack(arrays, axis=1)
         if source.by_channel:
             array = array.reshape(len(array), 3, -1)
+        if name == _POSITION and array.ndim == 1 and len(array) % 3 == 0:  # the numbers in one list
+            array = array.reshape(-1, 3)
         return array * [-1.0, 1.0, 1.0] if vci and name == _POSITION and array.shape[1:] == (3,) else array
 
     axes = "x of the positions negated, from glTF's axes back to Unity's, in which the light is" if vci else ""

@@ -8,7 +8,6 @@ exceed the bound, or have channels that do not resemble each other.
 
 import numpy as np
 
-from wlm.errors import WlmError
 from wlm.probe.conventions import CANONICAL, CONVENTIONS, to_canonical
 from wlm.probe.sphere import coefficient_bands
 
@@ -66,16 +65,18 @@ def choose_order(values: np.ndarray, convention: str, order: str | None) -> tupl
     if share <= _FEW:
         return known, ()
     text = f"{share:.0%} of the probes have a first coefficient, the mean, that is too small for the others to be light"
-    fitting = [each for each in CONVENTIONS if _fits(sample, known, each) < share / 4.0]
-    hint = f"convention {' or '.join(fitting)} fits: --convention" if fitting else "another order, basis or convention"
-    return known, (f"{text}: {hint}?",)
+    last = values[0].size > 27  # bands that unreal and unity lack
+    others = [each for each in CONVENTIONS if not (last and each in ("unreal", "unity"))]
+    fitting = [each for each in others if _doubt(sample, known, each)[0] < share / 4.0]
+    hint = f"--convention {' or '.join(fitting)} fits" if fitting else "is it another order, basis or convention?"
+    return known, (f"{text}: {hint}",)
 
 
 def _doubt(sample: np.ndarray, order: str, convention: str) -> tuple[float, float]:
     """Returns the share of probes [N, 3 C] that exceed the bound of light, and the share of squares in differences of
     channels."""
+    sample = sample / np.abs(sample).max(axis=1, keepdims=True)
     light = to_canonical(coefficients_first(sample, order), convention)
-    light = light / np.abs(light).max(axis=(1, 2), keepdims=True)
     band, first = coefficient_bands(light.shape[1]), light[:, 0]
     wrong = (first < 0.0).any(axis=1)
     for each in range(1, int(band[-1]) + 1):
@@ -90,13 +91,6 @@ def _better(one: tuple[float, float], other: tuple[float, float]) -> bool:
     if one[0] > _APART or one[0] > other[0] + _FEW:
         return False
     return other[0] > one[0] + _APART or other[1] > max(_TINTED, 3.0 * one[1])
-
-
-def _fits(sample: np.ndarray, order: str, convention: str) -> float:
-    try:
-        return _doubt(sample, order, convention)[0]
-    except WlmError:  # the convention has fewer bands
-        return 1.0
 
 
 def described(convention: str, origin: str, order: str, certain: bool) -> str:

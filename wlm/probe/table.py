@@ -79,6 +79,8 @@ def read_table(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of a table without lines
             rows = np.loadtxt(file, delimiter=mark, skiprows=skip, ndmin=2, max_rows=most, encoding="utf-8-sig")
+    if names and rows.size and rows.shape[1] != len(names):
+        raise WlmError(f"{path}: expected {len(names)} columns, as many as names, found {rows.shape[1]}")
     if not names:
         return rows[:, :3], rows[:, 3:], ""
     if not rows.size:
