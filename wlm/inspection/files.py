@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from wlm.formats.geometry import read_geometry
 from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf
 from wlm.formats.godot import read_users
 from wlm.formats.ktx2 import VOLUME_HEAD, is_volume
-from wlm.formats.light import SUFFIXES
+from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
+from wlm.formats.light import SUFFIXES, read_light
 from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
@@ -28,6 +29,10 @@ from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
 from wlm.system import load, system_of
 
+if TYPE_CHECKING:
+    from wlm.fluid.volume import DensityVolume
+
+_OTHER_LIGHT = (".avif", ".lit")  # suffixes of light that no command reads
 BAKED = "lightmaps that wlm bake lightmaps wrote, with their noise and coverage"
 """Description of the folder of a bake."""
 FRAMES = "frames of smoke that wlm smoke simulate wrote"
@@ -82,8 +87,11 @@ def inspect_file(path: Path) -> Finding:
             return _KINDS[kind].inspect(path)
     except WlmError as error:
         return Finding(path, UNREADABLE, problems=(said(error, path),))
-    if path.suffix.lower() in (*SUFFIXES, ".png"):
-        return Finding(path, UNREADABLE, problems=(f"its content does not match the suffix {path.suffix}",))
+    if path.suffix.lower() in (*SUFFIXES, *LEVEL_SUFFIXES, *_OTHER_LIGHT):
+        try:
+            read_light(path)
+        except WlmError as error:
+            return Finding(path, UNREADABLE, problems=(said(error, path),))
     return Finding(path, "unknown kind of file")
 
 
@@ -157,22 +165,33 @@ def _lmbake(path: Path) -> Finding:
 
 
 def _volume(path: Path) -> Finding:
-    from wlm.fluid.volume import is_long_along_z, load_volume
+    from wlm.fluid.volume import load_volume
 
-    volume = load_volume(path, up="y")
+    return describe_volume(path, load_volume(path, up="y"), path, "OUT.exr")
+
+
+def describe_volume(path: Path, volume: "DensityVolume", file: Path, output: str, frames: str = "") -> Finding:
+    """Describes smoke, of one file or of a folder of frames of which `file` is one; `output` ends the command."""
+    from wlm.fluid.grids import choose
+    from wlm.fluid.volume import grid_heads, is_long_along_z, thickness_hint
+
     size = "x".join(map(str, volume.shape))
     hot = ", with temperature" if volume.temperature is not None else ""
-    what = f"a volume of smoke, {size} voxels of {volume.voxel:.3g}{hot}"
+    what = f"{frames or 'a volume of smoke'}, {size} voxels of {volume.voxel:.3g}{hot}"
+    if len(heads := grid_heads(file)) > 1:
+        what += f", grid {choose(str(file), heads)[0]} of {', '.join(map(str, heads[:_MOST_NAMES]))}"
     problems = list(volume.warnings)
     if not bool((volume.density > 0).any()):
         problems.append("its density is 0 everywhere")
+    if hint := thickness_hint(volume.thickness, volume.extinction):
+        problems.append(hint)
     options: tuple[str, ...] = ()
-    if path.suffix.lower() != ".npz" and is_long_along_z(volume):
+    if file.suffix.lower() != ".npz" and is_long_along_z(volume):
         options = ("--volume", "up=z")
         problems.append(
             "it is longest along z, which is taken for up as in Blender and Unreal; leave --volume out if y is"
         )
-    return Finding(path, what, command("smoke", "bake", path, *options, "-o", "OUT.exr"), tuple(problems))
+    return Finding(path, what, command("smoke", "bake", path, *options, "-o", output), tuple(problems))
 
 
 def _mesh(path: Path) -> Finding:
