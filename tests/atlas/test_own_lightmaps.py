@@ -15,6 +15,7 @@ from PIL import Image
 from wlm.atlas.data import from_arrays, load
 from wlm.atlas.stored import store, with_uvs
 from wlm.formats.exr import write_exr
+from wlm.formats.geometry import read_geometry
 from wlm.formats.gltf import parse_gltf, read_gltf
 from wlm.inspection import inspect
 
@@ -76,9 +77,10 @@ def test_the_uv_set_without_texcoord_is_the_second(tmp_path, stated):
 
 
 def test_pictures_inside_the_file(tmp_path):
-    """In a buffer view and as a data: URI; PNG in sRGB, and Radiance."""
+    """In a buffer view and as a data: URI; PNG in sRGB, Radiance and EXR."""
     path = scene(tmp_path, moz(texCoord=1))
-    for data, atol in ((png(srgb(light())), 0.02), (imagecodecs.rgbe_encode(light(), header=True), 0.02)):
+    radiance, exr = imagecodecs.rgbe_encode(light(), header=True), (tmp_path / EXR).read_bytes()
+    for data, atol in ((png(srgb(light())), 0.02), (radiance, 0.02), (exr, 2e-3)):
         uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
         content = json.loads(scene(tmp_path, moz(texCoord=1), images=[{"uri": uri}]).read_text())
         inside = load(tmp_path / "a.gltf")
@@ -165,6 +167,24 @@ def test_lightmaps_of_other_extensions(tmp_path, writer):
     sheet, factor = found.sheets[0], 1.0 if writer in ("EPIC", "NEEDLE") else 2.0
     lit = (light()[sheet.mask] > 0).all(axis=1)
     np.testing.assert_allclose(sheet.lightmap[sheet.mask][lit], factor * light()[sheet.mask][lit], rtol=1e-3)
+
+
+def test_the_renderer_of_several_materials_is_above_its_meshes(tmp_path):
+    content = json.loads(writers_scene(tmp_path, "NEEDLE").read_text())
+    above = content["nodes"][0].pop("extensions")
+    content["nodes"].append({"children": [0], "extensions": above})
+    content["scenes"][0]["nodes"] = [1]
+    (tmp_path / "a.gltf").write_text(json.dumps(content))
+    (place,) = load(tmp_path / "a.gltf").objects
+    assert (place.node, place.scale_offset) == (0, (0.5, 0.5, 0.5, 0.0))
+
+
+def test_a_factor_for_each_channel(tmp_path):
+    factor = {"lightmapTexture": {"index": 0, "texCoord": 1}, "lightmapFactor": [2.0, 1.0, 0.5]}
+    assert_lit(load(scene(tmp_path, {"extensions": {"FB_materials_lightmap": factor}})), light() * [2.0, 1.0, 0.5])
+    factor["lightmapFactor"] = [2.0, -1.0, 0.5]
+    text = error_of(load, scene(tmp_path, {"extensions": {"FB_materials_lightmap": factor}}))
+    assert "expected a factor of one number or three, of 0 or more" in text
 
 
 def test_lightmaps_that_are_named_and_cannot_be_read(tmp_path):
@@ -280,6 +300,7 @@ def test_a_transform_of_the_slot_that_reads_the_uvs(tmp_path, kind):
     found = load(maker.save(tmp_path / "a.glb"), tmp_path / "bake.exr")
     assert_lit(found)
     assert any("TEXCOORD_1 is moved by KHR_texture_transform" in line for line in found.warnings) == (kind != "tiling")
+    np.testing.assert_allclose(np.sort(read_geometry(tmp_path / "a.glb").uv, axis=0), np.sort(UV, axis=0), atol=1e-4)
     lists = {
         "sheets": [{"files": ["bake.exr"]}],
         "objects": [{"node": "0", "sheet": 0, "scale_offset": [0.5, 1, 0.5, 0]}],
@@ -287,6 +308,19 @@ def test_a_transform_of_the_slot_that_reads_the_uvs(tmp_path, kind):
     (tmp_path / "lights.json").write_text(json.dumps(lists))
     (sheet,) = load(tmp_path / "a.glb", tmp_path / "lights.json").sheets
     np.testing.assert_allclose(np.sort(sheet.uv, axis=0), np.sort(UV * [0.5, 1] + [0.5, 0], axis=0), atol=1e-4)
+
+
+def test_materials_with_a_range_each(tmp_path):
+    """The UVs of each material have their own range, as a quantiser writes them; they become one new set."""
+    halves = np.arange(len(UV))[:, None] < 12
+    first, transform = moved(UV, (2.0, 3.0), (0.01, 0.02))
+    second, other = moved(UV, (4.0, 1.0), (-0.1, 0.01))
+    slots = [{"occlusionTexture": {"index": 0, "texCoord": 1, "extensions": each}} for each in (transform, other)]
+    path = two_materials(tmp_path, *slots, (OTHER, np.where(halves, first, second)))
+    found = load(path, tmp_path / EXR)
+    assert found.uv_set == 2
+    assert_lit(found)
+    assert load(path, tmp_path / EXR, uv_set=2).source == found.source
 
 
 @pytest.mark.parametrize("dilated", [False, True])
@@ -432,6 +466,26 @@ def test_lightmaps_are_bounded_together(tmp_path, monkeypatch):
     path = write_scene(tmp_path / "a.gltf", things, {"images": [{"uri": EXR}], "textures": [{"source": 0}]})
     assert "its lightmaps: expected at most" in error_of(load, path)
     assert len(load(path, trust=True).sheets) == 4
+
+
+def test_what_inspect_says_of_lightmaps_named_by_tile_or_mesh(tmp_path):
+    """Beside the mesh, in a folder of their own, and without it; the commands work as printed."""
+    things = [Thing("Floor", POSITION, TRIANGLE, [UV]), Thing("Wall", POSITION, TRIANGLE, [UV])]
+    path = write_scene(tmp_path / "room.gltf", things)
+    for names, words in (
+        (("Floor", "Wall"), "named after the meshes of room.gltf"),
+        ((1001, 1002), "of the UDIM tiles"),
+    ):
+        folder = tmp_path / f"bakes {names[0]}"
+        folder.mkdir()
+        for name in names:
+            write_exr(folder / f"lm_{name}.exr", light())
+        found = next(each for each in inspect(tmp_path) if each.path == folder)
+        assert words in found.what and found.command == f"wlm compress {path} '{folder}' -o OUT.wlm"
+    (found,) = inspect(folder)
+    assert "UDIM tiles 1001, 1002" in found.what and "compress them with their mesh" in found.what and not found.command
+    (folder / "room.gltf").write_bytes(path.read_bytes())
+    assert inspect(folder)[0].command == f"wlm compress '{folder / 'room.gltf'}' '{folder}' -o OUT.wlm"
 
 
 def test_what_inspect_says_of_them(tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 import OpenEXR
+import tifffile
 import warp as wp
 from builders import atlas_meshes, bench_rows, probe_layouts, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
@@ -64,6 +65,8 @@ def _pictures(folder: Path) -> None:
     image.save(folder / "mask-rgba.png")
     image.convert("L").point(lambda value: 255 * (value > 90)).save(folder / "mask-grey.png")
     image.convert("P").save(folder / "mask-palette.png")
+    image.convert("RGB").save(folder / "levels.jpg")
+    image.save(folder / "levels.webp", lossless=True)
     image.save(folder / "flipbook.png")
     image.save(folder / "flipbook.tga", compression="tga_rle")
 
@@ -75,6 +78,10 @@ def _textures(folder: Path) -> None:
     row = bytes([200, 100, 50, 128, 50, 150, 250, 129]) * 5
     head = b"#?RADIANCE\nEXPOSURE=2\nCOLORCORR=1 2 1\nFORMAT=32-bit_rle_rgbe\n\n"
     (folder / "plain.hdr").write_bytes(head + b"+X 12 +Y 10\n" + 12 * row)
+    head = f"PF\n{_WIDTH} {_HEIGHT}\n-1.0\n".encode()
+    (folder / "light.pfm").write_bytes(head + _pixels(3).astype("<f4").tobytes())
+    tifffile.imwrite(folder / "strips.tif", _pixels(3), photometric="rgb", compression="zlib", rowsperstrip=4)
+    tifffile.imwrite(folder / "tiles.tif", _pixels(1)[..., 0].astype(np.float16), tile=(16, 16), byteorder=">")
     words = np.random.default_rng(1).integers(0, 1 << 32, (4, _HEIGHT, _WIDTH), np.uint32)
     blocks = words.tobytes()[: 9 * 16]
     half = [_pixels(4)[:: 1 << i, :: 1 << i].astype("<f2").tobytes() for i in range(2)]

@@ -25,6 +25,7 @@ from wlm.bake.settings import LightmapSettings
 from wlm.config import load_settings
 from wlm.errors import WlmError
 from wlm.fluid.volume import load_volume
+from wlm.formats.channels import read_encoded
 from wlm.formats.exr import read_exr
 from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
@@ -73,6 +74,22 @@ def _light_file(path: Path) -> None:
     pixels, names = read_light(path)
     assert pixels.dtype == np.float32 and pixels.shape[2] == len(names), f"accepted as {pixels.dtype} {pixels.shape}"
     assert pixels.size, "accepted without a texel"
+
+
+def _levels(path: Path) -> None:
+    light = read_encoded(path, "srgb")
+    check_finite(light=light)
+    assert light.ndim == 3 and light.shape[2] == 3 and light.size, f"accepted as {light.shape}"
+
+
+def _tags(draw: Random, data: bytes) -> bytes:
+    """Changes values of a TIFF's tags, or any bytes."""
+    order = "<" if data[:2] == b"II" else ">"
+    (at,) = struct.unpack_from(f"{order}I", data, 4)
+    (count,) = struct.unpack_from(f"{order}H", data, at)
+    entries = range(at + 2, at + 2 + 12 * count, 12)
+    fields = [(entry + shift, width) for entry in entries for shift, width in ((0, 2), (2, 2), (4, 4), (8, 2), (8, 4))]
+    return vary_numbers(draw, data, fields) if draw.random() < 0.7 else corrupt(draw, data)
 
 
 def _six_way(path: Path) -> None:
@@ -390,6 +407,10 @@ _ALL = (
     *models.READERS,
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
     Reader("radiance", "a.hdr", corpus("runs.hdr", "plain.hdr"), vary_radiance, _light_file),
+    Reader("pfm", "a.pfm", corpus("light.pfm"), corrupt, _light_file),
+    Reader("tiff", "a.tif", corpus("strips.tif", "tiles.tif"), _tags, _light_file),
+    Reader("jpeg", "a.jpg", corpus("levels.jpg"), corrupt, _levels),
+    Reader("webp", "a.webp", corpus("levels.webp"), corrupt, _levels),
     Reader("ktx2", "a.ktx2", corpus(*_KTX2), vary_ktx2, _light_file),
     Reader("inspect", "a.json", corpus("set.json", "probes.json", "positions.json"), _json, _inspect),
     Reader("dds", "a.dds", corpus("shared.dds", "bc6h.dds", "float-legacy.dds"), vary_dds, _light_file),

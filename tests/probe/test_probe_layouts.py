@@ -165,6 +165,8 @@ def test_the_first_coefficient_against_the_others():
         ({"probes": [{"position": {"a": 1, "b": 2}, "sh": [1]}]}, "position[0]: expected numbers"),
         ([{"position": [0, 0, 0], "r": [1, 2, 3, 4], "g": [1, 2, 3, 4], "b": [1]}], "expected as many numbers in each"),
         ([{"pos": [0, 0, 0], "light": "bright"}], "begins with sh"),
+        # The constants of Unity's shaders mix bands.
+        ([{"pos": [0, 0, 0]} | {f"SH{x}{c}": [1, 2, 3, 4] for x in "AB" for c in "rgb"}], "begins with sh"),
         ([{"pos": [0, 0, 0], "coefficients": "bright"}], 'numbers, as many as coefficients[0] has, got "bright"'),
         ([{"irradianceCoefficients": [[1, 1, 1]] * 9}], "expected a JSON object, got [{"),
         ({"lights": [{"irradianceCoefficients": [[1, 1, 1]] * 9}]}, "position is missing; found lights"),

@@ -627,8 +627,10 @@ def _checked(
     if flat:
         warnings.append(f"{name}: {_count(flat, 'triangle')} without area in space or in UV: left out")
     if len(lightmaps):
-        lines = misfits(name, lightmaps[0], position, triangle[active], uv, f"TEXCOORD_{uv_set}", alternatives)
-        mask, repairs = _checked_light(name, position, uv, triangle[active], uv_set, lightmaps, mask, names)
+        chart = chart_map(position, uv, triangle[active], *lightmaps.shape[1:3])
+        used = f"TEXCOORD_{uv_set}"
+        lines = misfits(name, lightmaps[0], position, triangle[active], uv, chart, used, alternatives)
+        mask, repairs = _checked_light(name, uv, triangle[active], chart, used, lightmaps, mask, names)
         warnings += lines + repairs
         lightmaps = fill_gaps(lightmaps, mask)
     return Sheet(name, position, triangle, uv, active, lightmaps, mask, tuple(parts), tuple(warnings))
@@ -636,10 +638,10 @@ def _checked(
 
 def _checked_light(
     name: str,
-    position: np.ndarray,
     uv: np.ndarray,
     triangle: np.ndarray,  # only active triangles
-    uv_set: int,
+    chart: np.ndarray,
+    used: str,
     lightmaps: np.ndarray,
     mask: np.ndarray | None,
     names: Sequence[str],
@@ -653,7 +655,7 @@ def _checked_light(
     texels = 0.5 * float(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum()) * height * width
     if texels < 1.0:
         warnings.append(
-            f"{name}: all triangles together have {texels:.2g} texels of {width} x {height} in TEXCOORD_{uv_set}: are "
+            f"{name}: all triangles together have {texels:.2g} texels of {width} x {height} in {used}: are "
             "its UVs in [0, 1]?"
         )
     coverage = covered_texels(uv, triangle, height, width)
@@ -673,9 +675,9 @@ def _checked_light(
         if missed > _MISSED * covered:
             warnings.append(
                 f"{name}: {_count(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
-                f"does it belong to another UV set than TEXCOORD_{uv_set}, or is it upside down?"
+                f"does it belong to another UV set than {used}, or is it upside down?"
             )
-    if fits_flipped(lightmaps[0], chart_map(position, uv, triangle, height, width)):
+    if fits_flipped(lightmaps[0], chart):
         warnings.append(f"{names[0]}: fits the mesh's charts better upside down: see flip (--flip)")
     for lightmap, path in zip(lightmaps, names, strict=False):
         if specks := replace_strays(lightmap, mask, coverage > 0):

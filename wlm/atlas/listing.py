@@ -18,7 +18,7 @@ import math
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -261,11 +261,17 @@ def _from_folder(where: str, folder: Path) -> Listing:
     ]
     if not sheets:
         raise WlmError(f"{where}: expected lightmaps ({', '.join(SUFFIXES)}), found none")
-    tiled = [re.fullmatch(r"(.*)[._-](1\d{3})", Path(each.name).stem) for each in sheets]
-    tiles = tuple(int(match[2]) for match in tiled if match is not None)
-    if len(tiles) < len(sheets) or len({match[1] for match in tiled}) > 1 or len(set(tiles)) < len(tiles):
-        tiles = ()
+    tiles = tiles_of([Path(each.name).stem for each in sheets])
     return Listing(str(folder), ("light",), tuple(sheets), tiles=tiles)
+
+
+def tiles_of(names: Sequence[str]) -> tuple[int, ...]:
+    """Returns the UDIM tiles of lightmaps by their names without suffix, such as `wall.1001`; empty if they are not
+    named by tiles of one texture."""
+    found = [re.fullmatch(r"(.*)[._-](1\d{3})", name) for name in names]
+    tiles = tuple(int(match[2]) for match in found if match is not None)
+    alike = len(tiles) == len(names) == len(set(tiles)) and len({match[1] for match in found if match is not None}) == 1
+    return tiles if alike else ()
 
 
 def _from_set(path: str, content: dict[str, Any]) -> Listing:

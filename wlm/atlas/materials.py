@@ -19,7 +19,7 @@ image read one lightmap, whatever their textures and samplers.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,12 +39,10 @@ from wlm.formats.gltf import (
     texture_image,
     texture_transform,
 )
+from wlm.formats.gltf_slots import IDENTITY, SLOTS, lightmap_transform
 from wlm.formats.gltf_writer import Replacement, encode_glb
 from wlm.formats.levels import HEAD, level_kind
 from wlm.formats.reading import open_file
-
-SLOTS = ("occlusion", "emissive")
-"""Material slots that may hold a lightmap, if the caller says so."""
 
 # Extensions of materials: the field of the texture (None: the extension itself), the field of the factor, the UV set
 # without texCoord.
@@ -58,10 +56,6 @@ _MX, _EPIC, _NEEDLE = "MX_lightmap", "EPIC_lightmap_textures", "NEEDLE_lightmaps
 EXTENSIONS = (*_MATERIALS, _MX, _EPIC, _NEEDLE)
 """Extensions whose lightmaps are read."""
 
-_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-_FLOAT = 5126
-_NEAR = 0.01  # a transform for lightmaps leaves UVs this near to [0, 1]
-
 
 @dataclass(frozen=True)
 class Reading:
@@ -70,7 +64,7 @@ class Reading:
 
     sheet: int
     uv_set: int
-    transform: tuple[float, ...] = _IDENTITY
+    transform: tuple[float, ...] = IDENTITY
 
     @property
     def rectangle(self) -> tuple[float, float, float, float] | None:
@@ -171,9 +165,13 @@ def _own(
     sheets: dict[tuple, SheetFiles] = {}
     held: dict[str, bytes | memoryview] = {}
     readings: Readings = {}
-    lacking, defaults = 0, set()
+    lacking, defaults, order = 0, set(), {}
+    images: dict[int, tuple[str, Path | None]] = {}
+    parents = {
+        child: number for number, node in enumerate(document.content["nodes"]) for child in node.get("children", [])
+    }
     for each in primitives:
-        entry = _entry(document, each, name)
+        entry = _entry(document, each, name, parents.get(each.node, each.node))
         if entry is None:
             continue
         where = f"{document.path}: nodes[{each.node}]: {name}"
@@ -188,9 +186,12 @@ def _own(
             continue
         image = texture_image(document, info["index"])
         factor = _factor(entry.factor, where)
-        label, path = _image(document, image, held)
+        if image not in images:
+            images[image] = _image(document, image, held)
+        label, path = images[image]
         key = label, tuple(np.ravel(factor))
         if key not in sheets:
+            order[key] = len(sheets)
             title = document.item("images", image).get("name")
             sheets[key] = SheetFiles(
                 files=[label],
@@ -201,7 +202,7 @@ def _own(
         sx, sy, x, y = numbers(list(entry.rectangle), where, ("x", "y", "z", "w"))
         inner = texture_transform(where, info)
         moved = np.array([[sx, 0.0], [0.0, sy]]) @ inner + np.array([[0.0, 0.0, x], [0.0, 0.0, y]])
-        readings[each.node, each.primitive] = Reading(list(sheets).index(key), number, tuple(map(float, moved.ravel())))
+        readings[each.node, each.primitive] = Reading(order[key], number, tuple(map(float, moved.ravel())))
     if not readings:
         reason = f"the UVs that it names are missing in {lacking} primitives" if lacking else "no lit mesh is drawn"
         raise WlmError(f"{document.path}: {name}: {reason}")
@@ -225,8 +226,9 @@ def _notes(
     return tuple(notes)
 
 
-def _entry(document: GltfDocument, primitive: GltfPrimitive, name: str) -> _Entry | None:
-    """Returns the slot with which a primitive names its lightmap by the extension or the slot `name`."""
+def _entry(document: GltfDocument, primitive: GltfPrimitive, name: str, parent: int) -> _Entry | None:
+    """Returns the slot with which a primitive names its lightmap by the extension or the slot `name`; `parent` is the
+    node above its own, on which Needle writes the renderer of a mesh of several materials."""
     material = {} if primitive.material is None else document.item("materials", primitive.material)
     if name in SLOTS:
         info = material.get(f"{name}Texture")
@@ -238,7 +240,7 @@ def _entry(document: GltfDocument, primitive: GltfPrimitive, name: str) -> _Entr
         return None if info is None else _Entry(info, uv_set, extension.get(factor, 1.0))
     node = document.item("nodes", primitive.node).get("extensions", {})
     if name == _NEEDLE:
-        return _needle(document, node)
+        return _needle(document, node) or _needle(document, document.item("nodes", parent).get("extensions", {}))
     if name not in node:
         return None
     if name == _MX:
@@ -342,9 +344,7 @@ def slot_readings(
 ) -> tuple[Readings, tuple[str, ...]]:
     """Finds the texture transforms that apply to lightmap UVs which no extension describes.
 
-    A writer that quantises UVs, such as gltfpack, stores their range in `KHR_texture_transform` of the slots that read
-    them; others store tiling and offset there. Integer UVs take the transform of any slot that reads them, float UVs
-    that of a slot for light if it keeps them in [0, 1]. A slot whose image has the name of the lightmap comes first.
+    See `wlm.formats.gltf_slots`.
 
     Args:
         document, primitives: From `read_gltf`.
@@ -364,56 +364,14 @@ def slot_readings(
         for each in primitives:
             if uv_set not in each.uv:
                 continue
-            slot, transform = _transform_of(document, each, uv_set, lightmap)
+            slot, transform = lightmap_transform(document, each, uv_set, lightmap)
             readings[each.node, each.primitive] = Reading(0, uv_set, transform)
-            if transform != _IDENTITY:
+            if transform != IDENTITY:
                 used[slot] = None
     if not used:
         return {}, ()
     line = f"{document.path}: TEXCOORD_{uv_set} is moved by KHR_texture_transform of {', '.join(used)}"
     return readings, (line,)
-
-
-def _transform_of(
-    document: GltfDocument, primitive: GltfPrimitive, uv_set: int, lightmap: str
-) -> tuple[str, tuple[float, ...]]:
-    """Returns the name of the slot whose transform applies to a primitive's UVs, and the transform."""
-    attributes = document.item("meshes", primitive.mesh)["primitives"][primitive.primitive]["attributes"]
-    quantised = document.item("accessors", attributes[f"TEXCOORD_{uv_set}"])["componentType"] != _FLOAT
-    found = []
-    material = {} if primitive.material is None else document.item("materials", primitive.material)
-    for slot, info in _slots(material):
-        transform = info.get("extensions", {}).get("KHR_texture_transform", {})
-        if transform.get("texCoord", info.get("texCoord", 0)) != uv_set:
-            continue
-        named = _stem(document, info) == lightmap
-        lit = slot.startswith(SLOTS) or "lightmap" in slot.lower()
-        rows = texture_transform(f"{document.path}: materials[{primitive.material}]", info)
-        if not quantised:
-            moved = primitive.uv[uv_set] @ rows[:, :2].T + rows[:, 2]
-            if not (named or lit) or moved.min() < -_NEAR or moved.max() > 1.0 + _NEAR:
-                continue
-        found.append((not named, not lit, slot, tuple(map(float, rows.ravel()))))
-    return min(found)[2:] if found else ("", _IDENTITY)
-
-
-def _slots(holder: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yields the texture slots of a material with their names."""
-    for key, value in holder.items() if isinstance(holder, dict) else ():
-        if isinstance(value, dict) and key not in ("extras", "KHR_texture_transform"):
-            if isinstance(value.get("index"), int):
-                yield key, value
-            else:
-                yield from _slots(value, key)
-
-
-def _stem(document: GltfDocument, info: dict[str, Any]) -> str:
-    """Returns the name of a slot's image without its suffix."""
-    try:
-        image = document.item("images", texture_image(document, info["index"]))
-    except WlmError:
-        return ""
-    return Path(unquote(str(image.get("uri", image.get("name", ""))))).stem
 
 
 def settle(document: GltfDocument, primitives: Sequence[GltfPrimitive], readings: Readings) -> Settled:

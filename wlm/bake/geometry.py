@@ -23,6 +23,7 @@ from wlm.formats.gltf import (
     texture_transform,
     vertex_normals,
 )
+from wlm.formats.gltf_slots import lightmap_uv
 from wlm.formats.gltf_writer import Replacement
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import MESH_BYTES
@@ -142,7 +143,9 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
         made = new.get((each.node, each.primitive))
         gather = np.arange(len(each.position)) if made is None else made.gather
         triangle = each.triangle if made is None else made.triangle
-        uv = each.uv.get(number) if made is None and number is not None else (None if made is None else made.uv)
+        uv = None if made is None else made.uv
+        if made is None and number in each.uv:
+            uv = lightmap_uv(document, each, number)
         surface = _surface(each, gather, triangle, normal, uv, cache[each.material])
         if len(surface.triangle):
             surfaces.append(surface)

@@ -18,6 +18,7 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.deflate import inflate
 from wlm.formats.float_texels import Layout, check_picture, decode_texels, unpack_zstd
 from wlm.formats.hdr_blocks import ASTC_BLOCKS
+from wlm.formats.primaries import ACES_AP0, ACES_AP1, ADOBE_RGB, CIE_XYZ, P3_D65, REC709, REC2020, to_rec709
 from wlm.formats.reading import open_file
 
 VK_FORMATS = {
@@ -62,6 +63,8 @@ _SHARED_UNITY, _SHARED_MIDDLE, _SHARED_MOST = 8448, 15, 31
 # The header and the first entry of the level index, which describes the largest level.
 _READ_HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
 _PAIRS_BYTES = 1 << 20  # limit of the key/value data
+# The primaries of Khronos Data Format 1.3; 0 is unspecified.
+_PRIMARIES = {0: REC709, 1: REC709, 4: REC2020, 5: CIE_XYZ, 6: ACES_AP0, 7: ACES_AP1, 10: P3_D65, 11: ADOBE_RGB}
 _DESCRIPTOR_BYTES = 20  # the descriptor up to its transfer function
 _TRANSFERS = (0, 1)  # unspecified, linear
 
@@ -208,10 +211,11 @@ def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) 
     return struct.pack("<I", 4 + size) + block
 
 
-def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the largest mip of a KTX2 texture of light, plain or compressed by zstd or zlib.
 
-    The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored.
+    The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored. Other
+    primaries are converted to Rec. 709, which adds a line to `notes`.
 
     Returns:
         The pixels, float32 [H, W, 3 or 4], and the channel names.
@@ -220,7 +224,7 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
         WlmError: The file is missing, is not a KTX2 file, is cut short or damaged, has another format, is an array, a
             cube or a volume, has swizzled or nonlinear channels, or the package that decodes it is missing.
     """
-    pixels, layout, right, down = _read(path, volume=False)
+    pixels, layout, right, down = _read(path, False, [] if notes is None else notes)
     return np.ascontiguousarray(pixels[0, :: 1 if down else -1, :: 1 if right else -1]), layout.names
 
 
@@ -238,10 +242,10 @@ def read_ktx2_volume(path: str | os.PathLike[str]) -> np.ndarray:
     Raises:
         WlmError: As for `read_ktx2`, or the height is not a multiple of that of the blocks.
     """
-    return _read(path, volume=True)[0][..., :3]
+    return _read(path, True, [])[0][..., :3]
 
 
-def _read(path: str | os.PathLike[str], volume: bool) -> tuple[np.ndarray, Layout, bool, bool]:
+def _read(path: str | os.PathLike[str], volume: bool, notes: list[str]) -> tuple[np.ndarray, Layout, bool, bool]:
     """Returns the texels [D, H, W, C] as stored, their layout, and whether columns go right and rows go down."""
     with open_file(path, "the KTX2 file") as file:
         held = os.fstat(file.fileno()).st_size
@@ -280,7 +284,9 @@ def _read(path: str | os.PathLike[str], volume: bool) -> tuple[np.ndarray, Layou
                 )
         if stored > 2 * expected + 1024:  # no compressor expands data further
             raise WlmError(f"{path}: byteLength of level 0: expected at most {2 * expected + 1024}, found {stored}")
-        _check_descriptor(path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES))
+        primaries = _primaries(
+            path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES)
+        )
         words = _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES)
         right, down = _orientation(path, words, layout.channels, volume)
         data = _part(path, file, held, start, stored, "level 0", stored)
@@ -294,6 +300,7 @@ def _read(path: str | os.PathLike[str], volume: bool) -> tuple[np.ndarray, Layou
     if len(data) != expected:
         raise WlmError(f"{path}: level 0: expected {expected} bytes once unpacked, found {len(data)}")
     pixels = decode_texels(path, layout, data, width, height * slices)
+    to_rec709(pixels, primaries, f"{path}: the data format descriptor", notes)
     return pixels.reshape(slices, height, width, -1), layout, right, down
 
 
@@ -310,13 +317,18 @@ def _part(
     return data
 
 
-def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
-    """Checks that the transfer function in the data format descriptor is linear."""
+def _primaries(path: str | os.PathLike[str], data: bytes) -> tuple[float, ...]:
+    """Returns the chromaticities that the data format descriptor states, and checks that its transfer function is
+    linear."""
     if len(data) < _DESCRIPTOR_BYTES:
         raise WlmError(f"{path}: the data format descriptor: expected {_DESCRIPTOR_BYTES} bytes, found {len(data)}")
     transfer = data[14]
     if transfer not in _TRANSFERS:
         raise WlmError(f"{path}: the data format descriptor: expected linear light (transfer 1), found {transfer}")
+    if data[13] not in _PRIMARIES:
+        known = ", ".join(map(str, _PRIMARIES))
+        raise WlmError(f"{path}: the data format descriptor: expected primaries {known}, found {data[13]}")
+    return _PRIMARIES[data[13]]
 
 
 def _orientation(path: str | os.PathLike[str], data: bytes, channels: int, volume: bool) -> tuple[bool, bool]:

@@ -18,7 +18,8 @@ from wlm.formats.geometry import read_geometry
 from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf
 from wlm.formats.godot import read_users
 from wlm.formats.ktx2 import VOLUME_HEAD, is_volume
-from wlm.formats.light import SUFFIXES
+from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
+from wlm.formats.light import SUFFIXES, read_light
 from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
@@ -31,6 +32,7 @@ from wlm.system import load, system_of
 if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
 
+_OTHER_LIGHT = (".avif", ".lit")  # suffixes of light that no command reads
 BAKED = "lightmaps that wlm bake lightmaps wrote, with their noise and coverage"
 """Description of the folder of a bake."""
 FRAMES = "frames of smoke that wlm smoke simulate wrote"
@@ -85,8 +87,11 @@ def inspect_file(path: Path) -> Finding:
             return _KINDS[kind].inspect(path)
     except WlmError as error:
         return Finding(path, UNREADABLE, problems=(said(error, path),))
-    if path.suffix.lower() in (*SUFFIXES, ".png"):
-        return Finding(path, UNREADABLE, problems=(f"its content does not match the suffix {path.suffix}",))
+    if path.suffix.lower() in (*SUFFIXES, *LEVEL_SUFFIXES, *_OTHER_LIGHT):
+        try:
+            read_light(path)
+        except WlmError as error:
+            return Finding(path, UNREADABLE, problems=(said(error, path),))
     return Finding(path, "unknown kind of file")
 
 

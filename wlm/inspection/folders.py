@@ -10,7 +10,9 @@ from pathlib import Path
 
 from PIL import Image
 
+from wlm.atlas.listing import tiles_of
 from wlm.errors import WlmError
+from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
 from wlm.inspection.files import (
@@ -31,6 +33,7 @@ MOST = 256
 """Most findings of `inspect`, and most folders that it visits."""
 
 _DEEPEST = 4
+_BESIDE = 16  # folders beside a mesh that are examined for its lightmaps
 _ENTRIES = 20_000  # most entries that are read of a folder
 _DOCUMENTS = 64  # most JSON files that are read of a folder
 _IGNORED = {".md", ".txt", ".meta", ".import", ".uid", ".html", ".pdf", ".py", ".js", ".cs", ".glsl", ".hlsl", ".bin"}
@@ -114,7 +117,7 @@ def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
     try:
         entries = _entries(folder)
         files = [entry for entry in entries if entry.is_file()]
-        for whole in (_documents, _unity, _godot, _flip_books, _pictures, _volumes):
+        for whole in (_documents, _unity, _godot, _flip_books, _mesh_folders, _pictures, _volumes):
             for finding, its in whole(folder, [file for file in files if file not in taken]):
                 findings.append(finding)
                 taken |= its
@@ -295,6 +298,10 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
             return [
                 (Finding(mesh.path, what, compress_command(mesh.path, light.path), problems), {mesh.path, light.path})
             ]
+    if what := _lightmaps_of(meshes[0] if len(meshes) == 1 else None, pictures):
+        words = compress_command(meshes[0], folder) if len(meshes) == 1 else ""
+        what = what if words else f"{what}; compress them with their mesh: wlm compress MESH FOLDER"
+        return [(Finding(folder, what, words), {*pictures, *(meshes if words else ())})]
     if len(pictures) < 2:
         return []
     problems, alike = together(pictures, [heads[file] for file in pictures])
@@ -312,6 +319,34 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     what = f"{count_of(pictures, 'lightmap')} of {heads[pictures[0]].size}"
     taken = {*pictures, folder / "mask.png"} & set(files)
     return [(Finding(folder, what, compress_command(folder, *options), tuple(problems)), taken)]
+
+
+def _lightmaps_of(mesh: Path | None, pictures: Sequence[Path]) -> str:
+    """Describes lightmaps that their names divide among UDIM tiles or the meshes of a file; "" for others."""
+    if tiles := tiles_of([file.stem for file in pictures]):
+        return f"{count_of(pictures, 'lightmap')} of the UDIM tiles {', '.join(map(str, tiles[:8]))}"
+    if mesh is None or len(pictures) < 2:
+        return ""
+    # This imports torch.
+    from wlm.atlas.matching import all_by_name
+
+    with suppress(WlmError):  # described by itself
+        if all_by_name([file.name for file in pictures], read_gltf(mesh)[1]):
+            return f"{count_of(pictures, 'lightmap')} named after the meshes of {mesh.name}"
+    return ""
+
+
+def _mesh_folders(folder: Path, files: Sequence[Path]) -> _Found:
+    """Describes folders of lightmaps beside the one glTF file that they belong to by their names."""
+    meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
+    if len(meshes) != 1:
+        return []
+    found: _Found = []
+    for inside in [entry for entry in _entries(folder) if entry.is_dir() and not entry.is_symlink()][:_BESIDE]:
+        pictures = list(_light([entry for entry in _entries(inside) if entry.is_file()]))
+        if what := _lightmaps_of(meshes[0], pictures):
+            found.append((Finding(inside, what, compress_command(meshes[0], inside)), {inside}))
+    return found
 
 
 def _volumes(folder: Path, files: Sequence[Path]) -> _Found:

@@ -144,13 +144,14 @@ def _sources(first: dict[str, Any]) -> dict[str, _Source]:
     place = [_POSITION] if _POSITION in first else [known[each] for each in _PLACES if each in known][:1]
     place = place or axes_of(names)
     own = any(name.startswith(_SH) for name in names)
-    light = _Source([])
+    found = []  # members for red, green and blue
     for channels in _CHANNELS:
         for name in known:
             stem = name.removesuffix(channels[0])
             members = [known.get(stem + channel, "") for channel in channels]
             if name != stem and all(members) and (stem or not own):
-                light = light if light.members else _Source(members, True)
+                found.append(members)
+    light = _Source(found[0], True) if len(found) == 1 else _Source([])
     if not light.members:
         scalars = [name for name in names if name not in place and isinstance(first[name], int | float)]
         light = _Source(*light_columns(scalars))
