@@ -36,7 +36,15 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
         raise WlmError(f"{path}: expected YAML in UTF-8, found an invalid byte at position {error.start}") from error
     try:
         values = yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+    except (
+        yaml.YAMLError,
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        ArithmeticError,
+        RecursionError,
+    ) as error:
         raise WlmError(f"{path}: expected YAML: {_yaml_problem(error)}") from error
     if values is None:
         raise WlmError(f"{path}: expected a mapping of settings, found an empty file")
@@ -174,6 +182,10 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
         text = f"unknown key '{field}'{_suggestion(cls, problem['loc'])}"
     elif problem["type"] == "missing":
         text = f"{field}: expected a value, found none"
+    elif isinstance(problem["input"], dict) and "Input" not in problem["msg"]:
+        # A check of several fields together: its message, or else its type, names one of them.
+        name = [] if ": " in problem["msg"] else [problem["type"]]
+        text = ": ".join(filter(None, [".".join([*map(str, problem["loc"]), *name]), problem["msg"]]))
     else:
         expected = problem["msg"].replace("Input should be", "expected", 1)
         text = f"{field}: {expected}, got {_shown(problem['input'])}"

@@ -88,7 +88,11 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
     try:
         return wp.from_torch(tensor.detach(), dtype=dtype, requires_grad=False)
     except (RuntimeError, TypeError) as error:
-        raise ValueError(f"cannot use a tensor {tuple(tensor.shape)} of {tensor.dtype} as {dtype}: {error}") from error
+        text = f"tensor {tuple(tensor.shape)} of {tensor.dtype}"
+        if "data pointer" in str(error) or "Batching rule" in str(error):
+            text += ": expected one with memory, which torch.export, vmap and batched gradients do not pass"
+            raise ValueError(text) from error
+        raise ValueError(f"cannot use a {text} as {dtype}: {error}") from error
 
 
 @contextmanager

@@ -23,6 +23,11 @@ _STRIP = 1024  # rows of a lightmap searched for nearest texels at once
 _WHITE, _PERCENTILE = 0.8, 99.0  # display value of that percentile of the light
 _FILMIC_WHITE = 4.0
 
+# Share of values at 1, median and brightest radiance, and mean distance from 8-bit levels that suggest other data than
+# radiance; the numbers of a lightmap that are compared, and the fewest texels for the test of levels.
+_AT_ONE, _BRIGHT, _DARK, _LEVELS, _NEAR_LEVEL = 0.02, 1000.0, 1e-4, 255.0, 0.08
+_SAMPLES, _MANY = 6144, 1000
+
 
 def check_size(height: int, width: int) -> None:
     """Checks the size of a lightmap before memory is allocated for it.
@@ -153,6 +158,33 @@ def _nearest_in_strips(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None
     with ThreadPoolExecutor(min(len(starts), os.cpu_count() or 1)) as threads:
         done = list(threads.map(strip, starts))
     return (rows, columns) if all(done) else None
+
+
+def doubts(light: np.ndarray) -> list[str]:
+    """Compares the range of a lightmap [H, W, 3] with what radiance usually is, on some of its texels.
+
+    Returns:
+        One line for each reason why the values may be something else: another unit, an exposure, or screen colours.
+    """
+    step = max(1, round((light.size / _SAMPLES) ** 0.5))
+    used = light[::step, ::step].reshape(-1, 3)
+    with np.errstate(invalid="ignore"):
+        used = used[(used > 0).any(-1) & np.isfinite(used).all(-1)]
+    if not len(used) or used.min() == used.max():
+        return []
+    brightest, middle = float(used.max()), float(np.median(used.max(-1)))
+    found = []
+    if middle > _BRIGHT:
+        found.append(f"half of the texels exceed {_BRIGHT:,.0f}: are they in lux, or scaled for an encoding?")
+    if brightest < _DARK:
+        found.append(f"no texel exceeds {_DARK:g}, where half floats lose precision: were they scaled by an exposure?")
+    if brightest == 1.0 and np.count_nonzero(used == 1.0) > _AT_ONE * used.size:
+        found.append("values are clamped at 1: are they screen colours instead of radiance?")
+    if len(used) >= _MANY and brightest <= 1.0:
+        codes = used * _LEVELS
+        if float(np.abs(codes - np.rint(codes)).mean()) < _NEAR_LEVEL:
+            found.append("values have 256 levels: were they converted from an 8-bit picture?")
+    return found
 
 
 def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:

@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from builders.checks import error_of
 
+from tests.builders.exr import exr_header
 from wlm.errors import WlmError
-from wlm.formats.exr import HALF_MAX, read_exr, read_planes, write_exr, write_planes
+from wlm.formats.channels import read_channels, read_encoded
+from wlm.formats.exr import HALF_MAX, read_every_channel, read_exr, read_header, read_planes, write_exr, write_planes
 
 PLANES = {"depth": np.ones((3, 4)), "top": np.zeros((3, 4))}
 SCANLINES = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -69,7 +72,7 @@ def test_channels_are_ordered_by_name_and_others_left_out(tmp_path):
     assert np.array_equal(pixels, np.stack([planes[name] for name in "RGB"], -1))
 
 
-def test_tiles_and_a_moved_window_are_read(tmp_path):
+def test_tiles_are_read(tmp_path):
     path = tmp_path / "a.exr"
     header = {
         "compression": OpenEXR.PIZ_COMPRESSION,
@@ -78,12 +81,139 @@ def test_tiles_and_a_moved_window_are_read(tmp_path):
     }
     OpenEXR.File(header, _planes("RGB")).write(str(path))
     assert np.array_equal(read_exr(path)[0], _pixels(3))
-    window = (np.array([5, 7], np.int32), np.array([25, 43], np.int32))
-    OpenEXR.File({**SCANLINES, "dataWindow": window}, _planes("RGB")).write(str(path))
-    assert np.array_equal(read_exr(path)[0], _pixels(3))
 
 
-@pytest.mark.parametrize("names", ["XYZ", "Y", "RG", "rgb", "RGA"])
+@pytest.mark.parametrize("size", [(30, 50), (15, 50), (15, 20)])
+@pytest.mark.parametrize("corner", [(0, 0), (4, 3), (-2, -3), (-6, 12)])
+def test_the_data_window_is_placed_in_the_display_window(tmp_path, corner, size):
+    path, (x, y), (width, height), origin = tmp_path / "a.exr", corner, size, 100
+    display = _box(origin, origin, width, height)
+    header = {**SCANLINES, "dataWindow": _box(origin + x, origin + y, 21, 37), "displayWindow": display}
+    # Rows are stored from the bottom in half of the files.
+    header["lineOrder"] = OpenEXR.DECREASING_Y if x else OpenEXR.INCREASING_Y
+    OpenEXR.File(header, _planes("RGBA")).write(str(path))
+    expected = np.zeros((height + 200, width + 200, 4), np.float32)
+    expected[y + 100 : y + 137, x + 100 : x + 121] = _pixels(4)
+    expected = expected[100 : 100 + height, 100 : 100 + width]
+    notes = []
+    pixels, names = read_exr(path, notes)
+    np.testing.assert_array_equal(pixels, expected)
+    np.testing.assert_array_equal(read_every_channel(path)[0], expected)
+    assert names == tuple("RGBA") and read_header(path) == (width, height, ("A", "B", "G", "R"))
+    (note,) = notes
+    assert note.startswith(f"the data window, 21x37 at ({x}, {y}), is placed in the display window, {width}x{height}: ")
+    stored = np.count_nonzero((expected != 0).any(-1))
+    assert (f"{width * height - stored} texels outside it are 0" in note) == (stored < width * height)
+    assert (f"{21 * 37 - stored} texels beyond it are left out" in note) == (stored < 21 * 37)
+
+
+def test_a_data_window_outside_the_display_window_is_refused(tmp_path):
+    path = tmp_path / "a.exr"
+    OpenEXR.File({**SCANLINES, "displayWindow": _box(30, 0, 9, 9)}, _planes("RGB")).write(str(path))
+    assert "expected a data window that overlaps the display window, found none" in error_of(read_exr, path)
+    OpenEXR.File({**SCANLINES, "displayWindow": _box(0, 0, 60000, 60000)}, _planes("RGB")).write(str(path))
+    assert "expected at most 268435456 texels" in error_of(read_exr, path)
+
+
+def _box(x: int, y: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([x, y], np.int32), np.array([x + width - 1, y + height - 1], np.int32)
+
+
+def _write(path: Path, header: dict, planes: dict[str, np.ndarray]) -> None:
+    OpenEXR.File({**SCANLINES, **header}, dict(planes)).write(str(path))
+
+
+@pytest.mark.parametrize(
+    ("names", "wanted", "note"),
+    [
+        ("Bake.B Bake.G Bake.R", "Bake.R Bake.G Bake.B", "the light is taken from 'Bake', its only layer of colour"),
+        ("V.Combined.A V.Combined.B V.Combined.G V.Combined.R V.Depth.Z", "V.Combined.R V.Combined.G V.Combined.B "
+         "V.Combined.A", "the light is taken from 'V.Combined', its only layer of colour"),
+        ("b g r", "r g b", None),
+        ("x.blue x.green x.red", "x.red x.green x.blue", "the light is taken from 'x', its only layer of colour"),
+        ("B G R r", "R G B", None),
+        ("Y", "Y Y Y", "its only channel, Y, is taken as grey light"),
+        ("B G R s.B s.G s.R", "R G B", "the light is taken from R, G and B; its other layers of colour (s) are not "
+         "read"),
+    ],
+)  # fmt: skip
+def test_the_only_layer_of_colour_is_read(tmp_path, names, wanted, note):
+    path, notes = tmp_path / "a.exr", []
+    planes = dict(zip(names.split(), np.moveaxis(_pixels(8), -1, 0).copy(), strict=False))
+    _write(path, {}, planes)
+    pixels, letters = read_exr(path, notes)
+    np.testing.assert_array_equal(pixels, np.stack([planes[name] for name in wanted.split()], -1))
+    assert letters == tuple("RGBA"[: len(wanted.split())]) and notes == [note] * (note is not None)
+
+
+def test_one_of_several_layers_is_chosen_by_name(tmp_path):
+    path, planes = tmp_path / "a.exr", _planes("RGB")
+    doubled = {name: 2 * plane for name, plane in planes.items()}
+    _write(path, {}, {f"{layer}.{name}": plane for layer in "ab" for name, plane in planes.items()})
+    assert error_of(read_exr, path) == (
+        f"{path}: expected one layer of colour, found 'a', 'b': choose one with --encoding layer:NAME, or by channels "
+        "in a set.json"
+    )
+    assert "expected a layer of colour 'c', found 'a', 'b'" in error_of(read_exr, path, None, "c")
+    np.testing.assert_array_equal(read_encoded(path, "layer:b"), _pixels(3))
+    parts = [OpenEXR.Part({}, dict(each), name=name) for name, each in (("one", planes), ("two", doubled))]
+    OpenEXR.File(parts).write(str(path))
+    assert "found 'one', 'two'" in error_of(read_exr, path)
+    np.testing.assert_array_equal(read_encoded(path, "layer:two"), 2 * _pixels(3))
+    names = ("one.B", "one.G", "one.R", "two.B", "two.G", "two.R")
+    assert read_header(path)[2] == names and read_every_channel(path)[1] == names
+    parts = [OpenEXR.Part({}, {"Z": planes["R"]}, name="z"), OpenEXR.Part({}, dict(planes), name="beauty")]
+    OpenEXR.File(parts).write(str(path))
+    notes = []
+    np.testing.assert_array_equal(read_exr(path, notes)[0], _pixels(3))
+    assert notes == ["the light is taken from 'beauty', its only layer of colour"]
+
+
+AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+XYZ = (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3)
+# Published matrices: ACES2065-1 to linear sRGB with white adapted by Bradford, and IEC 61966-2-1 from CIE XYZ.
+AP0_TO_709 = [[2.52169, -1.13413, -0.38756], [-0.27648, 1.37272, -0.09624], [-0.01538, -0.15298, 1.16835]]
+XYZ_TO_709 = [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+
+
+@pytest.mark.parametrize(
+    ("header", "matrix", "name"),
+    [
+        ({"chromaticities": AP0}, AP0_TO_709, "ACES AP0"),
+        ({"colorInteropID": "lin_ap0_scene"}, AP0_TO_709, "ACES AP0"),
+        ({"acesImageContainerFlag": 1}, AP0_TO_709, "ACES AP0"),
+        ({"chromaticities": XYZ}, XYZ_TO_709, "CIE XYZ"),
+        ({"colorInteropID": "lin_ciexyzd65_scene"}, XYZ_TO_709, "CIE XYZ"),
+        ({"chromaticities": (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)}, np.eye(3), None),
+        ({"colorInteropID": "lin_rec709_scene"}, np.eye(3), None),
+        ({"colorInteropID": "unknown"}, np.eye(3), None),
+    ],
+)
+def test_primaries_are_converted(tmp_path, header, matrix, name):
+    path, notes = tmp_path / "a.exr", []
+    _write(path, header, _planes("RGBA"))
+    pixels = read_exr(path, notes)[0]
+    np.testing.assert_allclose(pixels[..., :3], _pixels(4)[..., :3] @ np.transpose(matrix), atol=5e-3)
+    np.testing.assert_array_equal(pixels[..., 3], _pixels(4)[..., 3])
+    assert notes == [f"converted to Rec. 709 from {name}"] * (name is not None)
+    np.testing.assert_array_equal(read_channels(path, light=True)[0], pixels)
+    np.testing.assert_array_equal(read_channels(path)[0], _pixels(4))  # directions and masks have no primaries
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ({"chromaticities": (0.3,) * 8}, "chromaticities: expected the chromaticities of three primaries and white"),
+        ({"chromaticities": (np.nan, *AP0[1:])}, "chromaticities: expected the chromaticities of three primaries"),
+        ({"colorInteropID": "srgb_rec709_scene"}, "colorInteropID: expected linear light, found srgb_rec709_scene"),
+    ],
+)
+def test_impossible_primaries_and_screen_colours_are_refused(tmp_path, header, words):
+    _write(tmp_path / "a.exr", header, _planes("RGB"))
+    assert words in error_of(read_exr, tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize("names", ["XYZ", "RG", "RGA"])
 def test_misnamed_channels_are_listed(tmp_path, names):
     path = tmp_path / "a.exr"
     OpenEXR.File(SCANLINES, _planes(names)).write(str(path))
@@ -91,6 +221,12 @@ def test_misnamed_channels_are_listed(tmp_path, names):
     with pytest.raises(WlmError) as caught:
         read_exr(path)
     assert str(caught.value) == f"{path}: expected channels R,G,B or R,G,B,A, found {found}"
+
+
+def test_luminance_and_chroma_are_refused_by_name(tmp_path):
+    path, planes = tmp_path / "a.exr", _planes("YRB")
+    _write(path, {}, {"Y": planes["Y"], "RY": planes["R"], "BY": planes["B"]})
+    assert error_of(read_exr, path).endswith("found BY,RY,Y (luminance and chroma: save it as RGB)")
 
 
 READERS = pytest.mark.parametrize("read", [read_exr, read_planes])
@@ -105,7 +241,7 @@ def test_integers_and_several_parts_are_refused(tmp_path, read):
         read(path)
     parts = [OpenEXR.Part({}, planes, name=name) for name in ("one", "two")]
     OpenEXR.File(parts).write(str(path))
-    with pytest.raises(WlmError, match="expected an EXR file of one part, found 2"):
+    with pytest.raises(WlmError, match="expected (an EXR file of one part|one layer of colour), found"):
         read(path)
 
 
@@ -163,7 +299,7 @@ def test_a_file_cut_anywhere_is_refused_in_silence(tmp_path, kind, capfd):
 
 def test_lines_of_others_on_stderr_pass(tmp_path, capfd, monkeypatch):
     path = tmp_path / "a.exr"
-    path.write_bytes(b"\x76\x2f\x31\x01")
+    path.write_bytes(exr_header())
     opened = OpenEXR.File
 
     def chatty(*args, **kwargs):

@@ -7,10 +7,12 @@ import imagecodecs
 import numpy as np
 import pytest
 import texture2ddecoder
+import tifffile
 from builders.checks import error_of
 from builders.textures import make_dds, make_ktx2
 
 from benchmarks.rivals.lightmap_blocks import ispc_bc6h
+from wlm.formats.channels import read_encoded
 from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
 from wlm.formats.hdr_blocks import ASTC_BLOCKS, ASTC_MEDIUM, astc
@@ -173,12 +175,15 @@ def test_kinds_are_told_by_content(tmp_path):
     np.testing.assert_array_equal(read_light(tmp_path / "a.exr")[0], light)
     for content, found in (
         (b"", "other content"),
-        (b"\x89PNG\r\n\x1a\n", "a PNG, whose encoding of light is unknown"),
+        (
+            b"\x89PNG\r\n\x1a\n",
+            "a PNG: state what light its numbers stand for with --encoding (linear, srgb, rgbm, ...)",
+        ),
         (b"\xabKTX 11\xbb\r\n\x1a\n", "a KTX file of version 1"),
     ):
         (tmp_path / "a.exr").write_bytes(content)
         message = error_of(read_light, tmp_path / "a.exr")
-        expected = "expected a lightmap, EXR, Radiance (.hdr), KTX2 or DDS, found "
+        expected = "expected a lightmap, EXR, Radiance (.hdr), PFM, TIFF of floats, KTX2 or DDS, found "
         assert message == f"{tmp_path / 'a.exr'}: {expected}{found}"
 
 
@@ -279,3 +284,157 @@ def test_a_missing_package_is_named_with_the_file(tmp_path, monkeypatch):
     (tmp_path / "a.dds").write_bytes(make_dds(95, 4, 4, bytes(16)))
     words = "a.dds: cannot decode the texels: atlas: imagecodecs is missing; needs the extra: pip install 'wlm[atlas]'"
     assert words in error_of(read_light, tmp_path / "a.dds")
+
+
+def test_pfm_of_either_byte_order_and_of_grey(tmp_path):
+    light, path = _light(5, 7).astype(np.float32), tmp_path / "a.pfm"
+    for scale, order in (("-1", "<f4"), ("1.0", ">f4"), ("-2e0", "<f4")):
+        notes = []
+        path.write_bytes(f"PF\n7 5\n{scale}\n".encode() + light[::-1].astype(order).tobytes())
+        np.testing.assert_array_equal(read_light(path, notes)[0], light)
+        assert notes == ["the scale of its header, 2, is not applied"] * ("2" in scale)
+    path.write_bytes(b"Pf 7 5 -1\n" + light[::-1, :, 0].astype("<f4").tobytes())
+    notes = []
+    np.testing.assert_array_equal(read_light(path, notes)[0], light[..., :1].repeat(3, 2))
+    assert notes == ["its only channel is taken as grey light"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"PF\n2 2\n-1\n" + bytes(47), "cut short: expected 48 bytes of texels, found 47"),
+        (b"PF\n2 2\n0\n" + bytes(48), "expected a PFM header"),
+        (b"PF\n2 2\n1e+e\n" + bytes(48), "expected a PFM header"),
+        (b"PF\n0 2\n-1\n", "expected at least one texel"),
+        (b"PF\n16384 16384\n-1\n" + bytes(48), "expected at most 2048 times"),
+        (b"PFa", "expected a PFM header"),
+    ],
+)
+def test_a_damaged_pfm(tmp_path, content, words):
+    path = tmp_path / "a.exr"
+    path.write_bytes(content)
+    assert words in error_of(read_light, path)
+
+
+TIFFS = (
+    {},
+    {"byteorder": ">"},
+    {"compression": "zlib", "predictor": True},
+    {"tile": (16, 16), "compression": "lzw"},
+    {"planarconfig": "separate"},
+    {"rowsperstrip": 5},
+)
+
+
+@pytest.mark.parametrize("kind", ["<f2", "<f4", "<f8"])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_float_tiffs(tmp_path, kind, channels):
+    light, path, notes = _light(32, 20, channels).astype(kind), tmp_path / "a.tif", []
+    for options in TIFFS:
+        _tiff(path, light, options)
+        pixels, names = read_light(path, notes)
+        np.testing.assert_array_equal(pixels, light if channels > 1 else light.repeat(3, 2))
+        assert pixels.dtype == np.float32 and names == (RGBA if channels == 4 else RGB)
+    assert set(notes) == ({"its only colour channel is taken as grey light"} if channels == 1 else set())
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_tiffs_of_integers_need_an_encoding(tmp_path, kind):
+    levels, path = (np.arange(60).reshape(4, 5, 3) * np.iinfo(kind).max / 60).astype(kind), tmp_path / "a.tiff"
+    _tiff(path, levels, {})
+    assert "found a TIFF of integers: state what light its numbers stand for" in error_of(read_light, path)
+    np.testing.assert_allclose(read_encoded(path, "linear"), levels / np.iinfo(kind).max, rtol=1e-6)
+    _tiff(path, levels.astype(np.float32), {})
+    assert "expected a picture of integers, found floats" in error_of(read_encoded, path, "linear")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_turned_tiff(tmp_path, orientation):
+    light, path = _light(3, 5), tmp_path / "a.tif"
+    # Where the first row and the first column of the file are in the picture: TIFF 6.0, tag 274.
+    stored = light.swapaxes(0, 1) if orientation > 4 else light
+    rows, columns = (0, 1) if orientation <= 4 else (1, 0)
+    if orientation in (3, 4, 7, 8):
+        stored = np.flip(stored, rows)
+    if orientation in (2, 3, 6, 7):
+        stored = np.flip(stored, columns)
+    _tiff(path, stored, {"extratags": [(274, 3, 1, orientation, True)]})
+    np.testing.assert_array_equal(read_light(path)[0], light)
+
+
+def test_tiffs_that_are_refused(tmp_path):
+    path, light = tmp_path / "a.tif", _light(16, 16).astype(np.float32)
+    _tiff(path, light, {})
+    whole = path.read_bytes()
+    for length in (*range(0, 60), len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:length])
+        assert error_of(read_light, path).startswith(f"{path}: ")
+    for tag, value, words in (
+        (256, 60000, "cut short or damaged"),
+        (256, 70000, "65536 along a side"),
+        (262, 5, "expected a TIFF of grey or RGB, found photometric interpretation 5 with 3 samples"),
+        (277, 2, "with 2 samples"),
+        (257, 17, "a.tif: "),
+    ):
+        path.write_bytes(_with_tag(whole, tag, value))
+        assert words in error_of(read_light, path), tag
+    path.write_bytes(_with_tag(_with_tag(whole, 256, 16384), 257, 16384))
+    assert "expected at most 2048 times" in error_of(read_light, path)
+    path.write_bytes(b"II+\0" + whole[4:])
+    assert "found a BigTIFF" in error_of(read_light, path)
+
+
+def _tiff(path, light, options):
+    form = "minisblack" if light.shape[2] == 1 else "rgb"
+    stored = light[..., 0] if light.shape[2] == 1 else light
+    if options.get("planarconfig") == "separate":
+        stored = light.transpose(2, 0, 1)
+        if light.shape[2] == 1:
+            stored, options = light[..., 0], {}
+    extra = ["unassalpha"] if light.shape[2] == 4 else None
+    tifffile.imwrite(path, np.ascontiguousarray(stored), photometric=form, extrasamples=extra, **options)
+
+
+def _with_tag(data, tag, value):
+    (at,) = struct.unpack_from("<I", data, 4)
+    (count,) = struct.unpack_from("<H", data, at)
+    for entry in range(at + 2, at + 2 + 12 * count, 12):
+        if struct.unpack_from("<H", data, entry) == (tag,):
+            return data[: entry + 2] + struct.pack("<HII", 4, 1, value) + data[entry + 12 :]
+    raise AssertionError(f"no tag {tag}")
+
+
+def test_other_files_are_named(tmp_path):
+    for content, words in (
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "found a pointer of Git LFS: run git"),
+        (b"<!DOCTYPE html>", "found text such as a web page"),
+        (b"\0\0\0\x20ftypavif" + bytes(40), "found an AVIF"),
+        (b"\x1f\x8b" + bytes(40), "found a file under gzip"),
+    ):
+        (tmp_path / "a.exr").write_bytes(content)
+        assert words in error_of(read_light, tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(("number", "name"), [(0, None), (1, None), (4, "Rec. 2020"), (7, "ACES AP1 (ACEScg)")])
+def test_primaries_of_a_ktx2(tmp_path, number, name):
+    light, path, notes = _light(6, 5).astype(np.float32) / 100, tmp_path / "a.ktx2", []
+    content = bytearray(make_ktx2(106, 5, 6, [light.tobytes()]))
+    (descriptor,) = struct.unpack_from("<I", content, DESCRIPTOR_AT)
+    content[descriptor + 13] = number
+    path.write_bytes(content)
+    pixels = read_light(path, notes)[0]
+    assert notes == [f"converted to Rec. 709 from {name}"] * (name is not None)
+    assert np.array_equal(pixels, light) == (name is None)
+    grey = np.float32([0.5, 0.5, 0.5])
+    path.write_bytes(content[: -light.nbytes] + np.broadcast_to(grey, light.shape).tobytes())
+    np.testing.assert_allclose(read_light(path)[0], 0.5, atol=1e-3)
+    content[descriptor + 13] = 200
+    path.write_bytes(content)
+    assert "expected primaries 0, 1, 4, 5, 6, 7, 10, 11, found 200" in error_of(read_light, path)
+
+
+def test_a_colour_profile_of_a_tiff_is_mentioned(tmp_path):
+    path, notes = tmp_path / "a.tif", []
+    _tiff(path, _light(4, 4).astype(np.float32), {"iccprofile": b"profile" * 30})
+    read_light(path, notes)
+    assert notes == ["its colour profile is not applied: colours are taken as Rec. 709"]

@@ -125,8 +125,27 @@ def test_bombs(tmp_path):
             begin = header(shape)
             file.writestr(f"{name}.npy", begin + bytes(shape[0] * shape[1] * 4))
             assert size < shape[0] * shape[1] * 4 + (1 << 20)
-    assert "position: expected at most 256 times its" in refused(load_probes, path)
-    assert "position: expected at most 256 times its" in refused(load_positions, path)
+    assert "b.npz: expected at most 67108864 bytes of arrays" in refused(load_probes, path)
+    assert "b.npz: expected at most 67108864 bytes of arrays" in refused(load_positions, path)
+    # The limit is for the sum of the arrays that are read, and small types count as float32.
+    np.savez_compressed(path, density=np.zeros((400, 500, 500), np.uint8), temperature=np.zeros((400, 500, 500), "f2"))
+    assert "b.npz: expected at most 536870912 bytes of arrays" in refused(load_volume, path)
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+@pytest.mark.parametrize(("read", "name"), READERS)
+def test_methods_whose_output_zipfile_does_not_bound(tmp_path, method, read, name):
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", method) as file:
+        for member in (name, "sh"):
+            file.writestr(f"{member}.npy", header((3, 3)) + bytes(36))
+    assert f"{name}: expected an array that is stored or deflated, found the method {method}" in refused(read, path)
+
+
+@pytest.mark.parametrize(("read", "name"), READERS)
+def test_a_long_list_of_members_is_not_read(tmp_path, read, name):
+    path = archive(tmp_path / "a.npz", {f"{name}{i:060}": b"" for i in range(10_000)})
+    assert "expected a list of members of at most 1048576 bytes" in refused(read, path)
 
 
 def test_a_convention_of_no_characters(tmp_path):

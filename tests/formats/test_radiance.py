@@ -85,9 +85,11 @@ def test_orientations(tmp_path, down, right, upright):
 def test_exposures_and_colours_multiply(tmp_path):
     texels = _noise(2, 2)
     texels[..., 3] = 128
-    head = HEAD + b"EXPOSURE=2\nVIEW= -vf x\nEXPOSURE= 4.0\nCOLORCORR= 1 .5 2\nGAMMA=1.0\nPRIMARIES=1 2\n"
-    pixels = read_radiance(_file(tmp_path / "a.hdr", texels, head))[0]
+    head = HEAD + b"EXPOSURE=2\nVIEW= -vf x\nEXPOSURE= 4.0\nCOLORCORR= 1 .5 2\nGAMMA=1.0\n"
+    notes = []
+    pixels = read_radiance(_file(tmp_path / "a.hdr", texels, head), notes)[0]
     np.testing.assert_array_equal(pixels, _values(texels) / [8, 4, 16])
+    assert notes == ["divided by the EXPOSURE of its header, 8 4 16, which other readers may ignore"]
     texels[..., 3] = 255
     assert np.isinf(read_radiance(_file(tmp_path / "a.hdr", texels, HEAD + b"EXPOSURE=1e-30\n"))[0]).any()
 
@@ -95,7 +97,9 @@ def test_exposures_and_colours_multiply(tmp_path):
 @pytest.mark.parametrize(
     ("head", "size", "data", "words"),
     [
-        (HEAD + b"FORMAT=32-bit_rle_xyze\n", "-Y 1 +X 1", b"", "FORMAT: expected 32-bit_rle_rgbe, found 32-bit_rle_x"),
+        (HEAD + b"FORMAT=32-bit_rle_rgb\n", "-Y 1 +X 1", b"", "FORMAT: expected 32-bit_rle_rgbe or 32-bit_rle_xy"),
+        (HEAD + b"PRIMARIES=1 2\n", "-Y 1 +X 1", b"abcd", "PRIMARIES: expected 8 finite number(s), found 1 2"),
+        (HEAD + b"PRIMARIES=1 0 1 0 1 0 1 0\n", "-Y 1 +X 1", b"abcd", "PRIMARIES: expected the chromaticities"),
         (HEAD + b"GAMMA=2.2\n", "-Y 1 +X 1", b"abcd", "GAMMA: expected 1 (linear light), found 2.2"),
         (HEAD + b"EXPOSURE=0\n", "-Y 1 +X 1", b"abcd", "EXPOSURE: expected 1 finite number(s) above 0, found 0"),
         (HEAD + b"EXPOSURE=nan\n", "-Y 1 +X 1", b"abcd", "EXPOSURE: expected 1 finite number(s)"),
@@ -117,3 +121,23 @@ def test_what_is_refused(tmp_path, head, size, data, words):
     path = _file(tmp_path / "a.hdr", data, head, size)
     message = error_of(read_radiance, path)
     assert message.startswith(f"{path}: ") and words in message
+
+
+def test_primaries_and_xyz_become_rec_709(tmp_path):
+    texels = _noise(3, 4)
+    texels[..., 3] = 128
+    path, notes = tmp_path / "a.hdr", []
+    stored = _values(texels)
+    rec709 = b"PRIMARIES=.64 .33 .3 .6 .15 .06 .3127 .329\n"
+    np.testing.assert_array_equal(read_radiance(_file(path, texels, HEAD + rec709), notes)[0], stored)
+    assert not notes
+    ap0 = b"PRIMARIES= 0.7347 0.2653 0 1 0.0001 -0.077 0.32168 0.33767\n"
+    pixels = read_radiance(_file(path, texels, HEAD + ap0), notes)[0]
+    matrix = [[2.52169, -1.13413, -0.38756], [-0.27648, 1.37272, -0.09624], [-0.01538, -0.15298, 1.16835]]
+    np.testing.assert_allclose(pixels, stored @ np.transpose(matrix), atol=2e-3)
+    xyz = HEAD.replace(b"rgbe", b"xyze")
+    pixels = read_radiance(_file(path, texels, xyz), notes)[0]
+    matrix = [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+    np.testing.assert_allclose(pixels, stored @ np.transpose(matrix), atol=2e-3)
+    assert notes[:2] == ["converted to Rec. 709 from ACES AP0", "converted to Rec. 709 from CIE XYZ"]
+    assert "179 times the W/(sr m2) of RGB" in notes[2]

@@ -338,7 +338,9 @@ def test_set_that_is_no_json_object_names_the_file(tmp_path, text):
 
 def test_path_that_does_not_exist(tmp_path):
     assert "nowhere" in error_of(load, tmp_path / "nowhere")
-    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds), found none" in error_of(load, tmp_path)
+    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds, .pfm, .tif, .tiff), found none" in error_of(
+        load, tmp_path
+    )
 
 
 def test_plain_folder_takes_files_in_natural_order(tmp_path):

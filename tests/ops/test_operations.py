@@ -347,7 +347,7 @@ REFUSED = [
     ("plane", {"values": torch.zeros(0, 7, 3)}, "values: expected at least one cell and one channel, got (0, 7, 3)"),
     ("plane-periodic-layers", {"layer": torch.full((60,), -1)}, "layer: expected numbers from 0 to 2, found -1"),
     ("plane-periodic-layers", {"layer": torch.zeros(59).int()}, "layer: expected int32 or int64 [60], got"),
-    ("volume", {"points": torch.zeros(5, 2)}, "points: expected float32 [5, 3], got torch.float32 (5, 2)"),
+    ("volume", {"points": torch.zeros(5, 2)}, "points: expected float32 [..., 3], got torch.float32 (5, 2)"),
     ("triplane", {"yz": torch.zeros(6, 4, 2)}, "yz: expected float32 [any, any, 3], got"),
     ("triplane", {"reduce": "mean"}, "reduce: expected one of sum, product, concatenate, got 'mean'"),
     ("mlp-8", {"gelu": "relu"}, "gelu: expected one of exact, tanh, fast, got 'relu'"),
@@ -367,6 +367,16 @@ REFUSED = [
     ("march", {"emission": torch.zeros(6, 7, 8)}, "emission: expected float32 [6, 7, 8, 3], got"),
     ("march", {"step": 0.0}, "step: expected a number above 0, got 0.0"),
     ("march", {"g": 1.0}, "g: expected a number within -1 and 1, got 1.0"),
+    (
+        "plane",
+        {"points": np.zeros((5, 2))},
+        "points: expected a torch tensor, float32 [..., 2], got numpy.ndarray: use",
+    ),
+    ("bc7_map-layers", {"layer": np.zeros(50, int)}, "layer: expected a torch tensor, int32 or int64 [50], got numpy."),
+    ("mlp-8", {"hidden": [[1.0]]}, "hidden: expected a torch tensor, float32 [...], got list"),
+    ("bc7_map", {"weights": [0.5]}, "weights: expected a torch tensor, float32 [any, any], got list"),
+    ("march", {"origin": [0, 0, 0]}, "origin: expected a torch tensor, float32 [..., 3], got list"),
+    ("gaussian_sum", {"rows": torch.rand(3, 12).to_sparse()}, "rows: expected a dense tensor, got torch.sparse_coo"),
 ]
 
 
@@ -376,6 +386,33 @@ def test_refused(name: str, changes: dict, message: str):
     with pytest.raises(ValueError) as error:
         getattr(ops, case.op)(**{**case.tensors("cpu"), **case.options, **changes})
     assert str(error.value).startswith(message)
+
+
+@pytest.mark.parametrize("transform", ["grad", "jacrev", "vmap", "jvp", "jacobian", "batched"])
+def test_function_transforms_are_refused(transform: str):
+    """torch.func, vectorised Jacobians and batched gradients end in one line."""
+    values, points = torch.rand(4, 4, 1), torch.rand(5, 2)
+
+    def read(points: torch.Tensor) -> torch.Tensor:
+        return ops.plane(values, points)
+
+    def batched() -> tuple[torch.Tensor, ...]:
+        points.requires_grad_()
+        return torch.autograd.grad(read(points), points, torch.ones(3, 5, 1), is_grads_batched=True)
+
+    calls = {
+        "grad": lambda: torch.func.grad(lambda each: read(each).sum())(points),
+        "jacrev": lambda: torch.func.jacrev(read)(points),
+        "vmap": lambda: torch.func.vmap(read)(points[None]),
+        "jvp": lambda: torch.func.jvp(read, (points,), (points,)),
+        "jacobian": lambda: torch.autograd.functional.jacobian(read, points, vectorize=True),
+        "batched": batched,
+    }
+    with pytest.raises(
+        ValueError, match=r"^torch\.func: wlm.ops supports no grad|vmap and batched gradients do not"
+    ) as error:
+        calls[transform]()
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("name", [n for n in ops.__all__ if n not in ("plain", "Raster", "bc7_blocks")])

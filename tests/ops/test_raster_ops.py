@@ -7,6 +7,7 @@ from kernels.compare import close, exact
 
 from wlm import ops
 from wlm.ops import plain
+from wlm.ops.tensors import check
 
 SIZE = (30, 41)
 
@@ -133,11 +134,45 @@ def test_what_is_refused(device: str):
         (lambda: ops.interpolate(uv[0], triangle, raster), r"attribute: expected float32 \[any, any\]"),
         (lambda: ops.texture(image[0], uv), r"image: expected float32 \[any, any, any\]"),
         (lambda: ops.texture(image[:0], uv), r"image: expected at least one texel and one channel, got \(0, 2, 3\)"),
-        (lambda: ops.texture(image, clip), r"uv: expected float32 \[25, 2\], got .* \(25, 4\)"),
+        (lambda: ops.texture(image, clip), r"uv: expected float32 \[\.\.\., 2\], got .* \(25, 4\)"),
         (lambda: ops.texture(image, uv.to("meta")), "uv: expected a tensor on .*, got one on meta"),
         (lambda: ops.rasterize(clip, triangle.to("meta"), 3, 4), "triangle: expected a tensor on .* meta"),
+        (
+            lambda: ops.interpolate(uv, triangle[:3], raster),
+            "triangle: expected the 32 triangles that were drawn, got 3",
+        ),
+        (lambda: ops.rasterize(clip, triangle, 8.0, 8), "height: expected a whole number of pixels, got 8.0"),
+        (
+            lambda: ops.rasterize(clip, triangle.cpu().numpy(), 8, 8),
+            r"triangle: .* tensor, int32 .*, got numpy.ndarray",
+        ),
         (lambda: ops.texture(image, uv, filter="cubic"), "filter: expected linear or nearest, got 'cubic'"),
         (lambda: ops.texture(image, uv, boundary="zero"), "boundary: expected clamp or wrap or mirror, got 'zero'"),
     ):
         with pytest.raises(ValueError, match=message):
             call()
+
+
+def test_sizes_under_compile():
+    """torch.compile with symbolic sizes accepts a tensor that fits."""
+
+    def checked(tensor: torch.Tensor) -> torch.Tensor:
+        check("tensor", tensor, (None, None, 2))
+        return 2 * tensor
+
+    assert torch.compile(checked, backend="eager", dynamic=True)(torch.ones(8, 8, 2)).sum() == 256
+
+
+@pytest.mark.slow
+def test_compiled():
+    """Under torch.compile a picture and its gradients are those of plain calls."""
+    corners = torch.tensor([[-1.0, -1, 0, 1], [1, -1, 0, 1], [1, 1, 0, 1]], requires_grad=True)
+    attribute, triangle = torch.rand(3, 2, requires_grad=True), torch.tensor([[0, 1, 2]])
+
+    def loss(corners: torch.Tensor, attribute: torch.Tensor) -> torch.Tensor:
+        return ops.interpolate(attribute, triangle, ops.rasterize(corners, triangle, 8, 8)).square().sum()
+
+    found, expected = torch.compile(loss, backend="aot_eager")(corners, attribute), loss(corners, attribute)
+    assert expected > 1.0 and torch.equal(found, expected)
+    gradients = [torch.autograd.grad(each, (corners, attribute)) for each in (found, expected)]
+    assert all(map(torch.equal, *gradients))

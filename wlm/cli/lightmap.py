@@ -25,6 +25,7 @@ from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
     Device,
+    Encoding,
     Engine,
     ExactShader,
     ModelFile,
@@ -47,7 +48,8 @@ if TYPE_CHECKING:
 _Set = Annotated[
     Path,
     typer.Argument(
-        metavar="SET", help="A set.json, a folder of lightmaps (.exr, .hdr, .ktx2, .dds), or folders of Unity bakes."
+        metavar="SET",
+        help="A set.json, a folder of lightmaps (.exr, .hdr, .pfm, .tif, .ktx2, .dds), or folders of Unity bakes.",
     ),
 ]
 _Times = Annotated[
@@ -89,6 +91,7 @@ def compress(
     mask: _Mask = None,
     period: _Period = None,
     layers: _Layers = None,
+    encoding: Encoding = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -115,7 +118,12 @@ def compress(
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
     options |= {"workers": workers, "cluster": cluster}
     data, model, facts = models.fit(
-        "lightmap", lambda: _load(set_path, times, mask, period, layers, trust), output, profile, settings, **options
+        "lightmap",
+        lambda: _load(set_path, times, mask, period, layers, encoding, trust),
+        output,
+        profile,
+        settings,
+        **options,
     )
     from wlm.lightmap.evaluation import lost_light
 
@@ -134,6 +142,7 @@ def evaluate(
     mask: _Mask = None,
     period: _Period = None,
     layers: _Layers = None,
+    encoding: Encoding = None,
     device: Device = "cpu",
     trust: Trust = False,
 ) -> None:
@@ -151,7 +160,7 @@ def evaluate(
 
     device = check_device(device)
     model = load(file, "lightmap")
-    lightmaps = _load(set_path, times, mask, period, layers, trust)
+    lightmaps = _load(set_path, times, mask, period, layers, encoding, trust)
     note_warnings(lightmaps.warnings)
     with running("score") as progress:
         size = file.stat().st_size
@@ -235,14 +244,20 @@ def info(
 
 
 def _load(
-    path: Path, times: str | None, mask: str | None, period: float | None, layers: str | None, trust: bool
+    path: Path,
+    times: str | None,
+    mask: str | None,
+    period: float | None,
+    layers: str | None,
+    encoding: str | None,
+    trust: bool,
 ) -> "LightmapSet":
     from wlm.lightmap import load
     from wlm.lightmap.data import parse_times
 
     stamps = None if times is None else parse_times(times)
     names = None if layers is None else [name.strip() for name in layers.split(",")]
-    return load(path, times=stamps, mask=mask, period=period, trust=trust, layers=names)
+    return load(path, times=stamps, mask=mask, period=period, trust=trust, layers=names, encoding=encoding)
 
 
 def _facts(model: "LightmapModel") -> dict[str, Any]:

@@ -26,6 +26,15 @@ Original = Annotated[
     typer.Option(metavar="PATH", help="The uncompressed input to compare with: a set, a lightmap or a probe file."),
 ]
 Up = Annotated[Literal["y", "z"], typer.Option(help="Axis of the scene that points up.")]
+Encoding = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ENCODING",
+        help="Encoding of light in a PNG, JPEG, WebP, TGA or TIFF of integers: linear, srgb, rgbm (of Unity in linear "
+        "colour space), rgbm:RANGE:GAMMA, that is (RANGE x alpha x colour)^GAMMA, rgbd (of Babylon.js), "
+        "rgbd:RANGE:GAMMA, dldr or rgbe; or layer:NAME, the layer of an EXR that has several.",
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Trust = Annotated[
     bool,
@@ -33,8 +42,10 @@ Trust = Annotated[
 ]
 Profile = Annotated[str, typer.Option(metavar="NAME|FILE.yaml", help="Name of a settings profile, or a YAML file.")]
 Engine = Annotated[
-    Literal["three", "godot", "unity", "unreal"] | None,
-    typer.Option(help="Write a kit for this engine. Default: textures, buffers and a shader for any program."),
+    Literal["three", "godot", "unity", "unreal", "bevy"] | None,
+    typer.Option(
+        help="Write a kit for this engine (bevy: probes only). Default: textures, buffers and a shader for any program."
+    ),
 ]
 ShaderLanguage = Annotated[
     Literal["glsl", "glsl-es", "hlsl", "msl", "wgsl"] | None,

@@ -28,7 +28,7 @@ import numpy as np
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_write
 from wlm.formats.compact import encode_compact, is_compact, parse_compact
-from wlm.formats.reading import open_file
+from wlm.formats.reading import check_json, open_file
 
 FORMAT_VERSION = 2
 
@@ -36,7 +36,7 @@ _LENGTH = struct.Struct("<Q")
 _NO_DIGEST = "0" * 32
 _EXCHANGED_QUOTES = str.maketrans({'"': "'", "'": '"'})
 _ALIGNMENT = 8  # of the first tensor, in bytes: that of the widest type
-_HEADER_LIMIT = 100_000_000  # bytes; the safetensors library refuses a longer header too
+_HEADER_LIMIT = 16 << 20  # bytes: settings, names and times of a set of the most states and sheets take some
 
 _MOST_AXES, _MOST_NUMBERS = 8, 1 << 48  # of a part
 
@@ -190,6 +190,7 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
     if start > size:
         raise WlmError(f"{path}: the artifact is cut short: expected a header of {length} bytes, found fewer")
     encoded = mapped[_LENGTH.size : start]
+    check_json(f"{path}: the artifact's header", encoded)
     header = _parse_json(path, encoded, "header")
     stated, settings_text = _metadata(path, header)
     version, found_system, source, digest = stated

@@ -1,100 +1,132 @@
-"""Reads pictures with any channels (light, directions, masks, data), and PNGs that encode light in one of five ways.
+"""Reads pictures with any channels (light, directions, masks, data), and pictures of integers that encode light.
 
 Here p is a stored colour value in [0, 1], a the stored alpha, and L the sRGB curve to linear light (IEC 61966-2-1):
 
-========  ======================  =========================================================
-encoding  light                   where it is used
-========  ======================  =========================================================
-linear    p                       data textures
-srgb      L(p)                    pictures, lightmaps of low range
-rgbm      34.4932 a^2.2 L(p)      Unity, linear colour space (`DecodeLightmapRGBM`); factor 5^2.2
-dldr      4.5948 L(p)             Unity (`DecodeLightmapDoubleLDR`); factor 2^2.2
-rgbe      255 p 2^(255 a - 136)   Radiance's numbers as RGBA; 0 where a is 0
-========  ======================  =========================================================
-"""
+==========  ========================  ==========================================================="""
 
-import io
 import os
 
 import numpy as np
-from PIL.PngImagePlugin import PngImageFile
 
 from wlm.errors import WlmError
-from wlm.formats.exr import MAGIC as EXR_MAGIC
-from wlm.formats.exr import float_planes, read_part
+from wlm.formats.exr import read_every_channel, read_exr
+from wlm.formats.exr_header import MAGIC as EXR_MAGIC
+from wlm.formats.levels import HEAD, KINDS, level_kind, read_levels
 from wlm.formats.light import read_light
-from wlm.formats.limits import IMAGE_BYTES, PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
-from wlm.formats.mask import DAMAGED_PICTURE
-from wlm.formats.reading import damaged, open_file, read_file
+from wlm.formats.reading import open_file
 
-_PNG_MAGIC = b"\x89PNG"
-_FIRST = ("R", "G", "B", "A")  # in this order; other channels follow, sorted by name
-_RGBM, _DLDR = 5.0**2.2, 2.0**2.2
-_ALPHA = ("rgbm", "rgbe")
+_RGBM, _DLDR, _BABYLON = 5.0**2.2, 2.0**2.2, 2.2
+_ALPHA = ("rgbm", "rgbd", "rgbe")
+_RANGED = ("rgbm", "rgbd")  # encodings with a range and a gamma
+_LAYER = "layer:"
+_NEAR_ONE = 0.75  # RGBM with a fine alpha has its brightest channel above this in half of the texels
 
-ENCODINGS = ("linear", "srgb", "rgbm", "dldr", "rgbe")
+ENCODINGS = ("linear", "srgb", "rgbm", "rgbd", "dldr", "rgbe")
 """Names of the encodings in the module's table."""
 
+EXPECTED = "linear, srgb, rgbm, rgbm:RANGE:GAMMA, rgbd, rgbd:RANGE:GAMMA, dldr, rgbe, or layer:NAME for an EXR"
+"""The forms of an encoding, for messages."""
 
-def read_channels(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...], bool]:
-    """Reads all channels of an EXR file, a PNG (8 bits, or grey of 16 bits) or another picture of light.
+
+def read_channels(
+    path: str | os.PathLike[str], notes: list[str] | None = None, light: bool = False
+) -> tuple[np.ndarray, tuple[str, ...], bool]:
+    """Reads all channels of an EXR file, a picture of integers, or another picture of light.
+
+    Args:
+        path: The file.
+        notes: Each assumption and conversion adds a line.
+        light: Whether the colours are light, which is converted to the primaries of Rec. 709.
 
     Returns:
         The pixels, float32 [H, W, C], the top row first; the channel names, R, G, B and A first; and whether the values
-        are integers of a PNG, scaled to [0, 1].
+        are integers, scaled to [0, 1].
 
     Raises:
         WlmError: The file is missing, of another kind, cut short or damaged.
     """
+    notes = [] if notes is None else notes
     with open_file(path, "the picture") as file:
-        magic = file.read(len(_PNG_MAGIC))
-    if magic == _PNG_MAGIC:
-        return *_read_png(path), True
-    return *(_read_exr(path) if magic == EXR_MAGIC else read_light(path)), False
+        head = file.read(HEAD)
+    kind = level_kind(path, head)
+    if kind is not None and kind != "TIFF":
+        return *read_levels(path, kind, notes), True
+    return *(read_every_channel(path, notes, light) if head.startswith(EXR_MAGIC) else read_light(path, notes)), False
 
 
-def _read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    channels = read_part(path).channels
-    names = tuple(sorted(channels, key=lambda name: (_FIRST.index(name) if name in _FIRST else len(_FIRST), name)))
-    if not names:
-        raise WlmError(f"{path}: expected channels, found none")
-    return np.stack(float_planes(path, channels, names), axis=-1), names
+def read_encoded(path: str | os.PathLike[str], encoding: str, notes: list[str] | None = None) -> np.ndarray:
+    """Reads the light of a picture by an encoding of the module's table: linear, float32 [H, W, 3], the top row first.
 
-
-def _read_png(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    data = read_file(path, IMAGE_BYTES, "the PNG")
-    # `Image.open` would try the readers of other formats, too.
-    with damaged(f"{path}: cannot read the PNG", *DAMAGED_PICTURE), PngImageFile(io.BytesIO(data)) as image:
-        check_sides(str(path), image.width, image.height)
-        size = image.width * image.height * len(image.getbands())
-        check_growth(str(path), len(data), size, PICTURE_GROWTH, PICTURE_BYTES)
-        if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16"):
-            raise WlmError(f"{path}: expected a PNG of grey or RGB, with alpha or without, found {image.mode}")
-        pixels, names = np.asarray(image), image.getbands()
-    levels = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
-    return levels.reshape(*pixels.shape[:2], -1), ("L",) if len(names) == 1 else tuple(names)
-
-
-def read_encoded(path: str | os.PathLike[str], encoding: str) -> np.ndarray:
-    """Reads the light of a PNG with one of `ENCODINGS`: linear, float32 [H, W, 3], the top row first.
+    Args:
+        path: The file.
+        encoding: The encoding, such as "srgb" or "rgbm:16:1".
+        notes: Each assumption, and each doubt about the encoding, adds a line.
 
     Raises:
-        WlmError: The encoding is unknown; the file is missing, damaged or not a PNG; or it lacks colour, or the alpha
-            that the encoding needs.
+        WlmError: The encoding is unknown; the file is missing, damaged or not a picture of integers; or it lacks the
+            alpha that the encoding needs.
     """
-    if encoding not in ENCODINGS:
-        raise WlmError(f"encoding: expected one of {', '.join(ENCODINGS)}, got {encoding!r}")
-    pixels, names, levels = read_channels(path)
-    if not levels:
-        raise WlmError(f"{path}: encoding: expected a PNG; other formats define their encoding themselves")
-    if names not in (("R", "G", "B"), ("R", "G", "B", "A")) or (encoding in _ALPHA and len(names) == 3):
-        alpha = " with alpha" if encoding in _ALPHA else ""
-        raise WlmError(f"{path}: encoding {encoding}: expected a PNG of RGB{alpha}, found {''.join(names)}")
-    colour, alpha = pixels[..., :3], pixels[..., 3:]
-    if encoding == "rgbe":
+    notes = [] if notes is None else notes
+    name, largest, gamma = parse_encoding(encoding)
+    if name == _LAYER:
+        return read_exr(path, notes, encoding.removeprefix(_LAYER))[0][..., :3]
+    with open_file(path, "the lightmap") as file:
+        kind = level_kind(path, file.read(HEAD))
+    if kind is None:
+        raise WlmError(
+            f"{path}: encoding: expected a {KINDS} of integers; other formats define their encoding themselves"
+        )
+    pixels, names = read_levels(path, kind, notes)
+    if name in _ALPHA and "A" not in names:
+        raise WlmError(f"{path}: encoding {name}: expected a picture with alpha, found {''.join(names)}")
+    colour, alpha = (pixels[..., :-1], pixels[..., -1:]) if "A" in names else (pixels, None)
+    if colour.shape[2] == 1:
+        notes.append("its grey is taken as grey light")
+        colour = np.repeat(colour, 3, axis=2)
+    _note_doubts(name, largest, colour, alpha, notes)
+    if name == "rgbe":
         exponent = np.rint(alpha * 255.0)
         return np.where(exponent > 0, np.rint(colour * 255.0) * np.exp2(exponent - 136.0), 0.0).astype(np.float32)
-    if encoding != "linear":
+    if name == "rgbm" and largest:
+        return ((largest * alpha * colour) ** gamma).astype(np.float32)
+    if name == "rgbd":
+        # Without a range as Babylon.js writes it, whose range is 255.
+        light = colour ** (gamma if largest else _BABYLON) * ((largest or 255.0) / 255.0)
+        return np.divide(light, alpha, out=np.zeros_like(light), where=alpha > 0).astype(np.float32)
+    if name != "linear":
         colour = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
-    factor = {"rgbm": _RGBM * alpha**2.2, "dldr": _DLDR}.get(encoding, 1.0)
+    factor = _RGBM * alpha**2.2 if name == "rgbm" else _DLDR if name == "dldr" else 1.0
     return (colour * factor).astype(np.float32)
+
+
+def parse_encoding(encoding: str) -> tuple[str, float, float]:
+    """Returns the name of an encoding, its range, which is 0 if none is stated, and its gamma.
+
+    The name of "layer:NAME" is "layer:".
+
+    Raises:
+        WlmError: The encoding is not in the module's table.
+    """
+    if encoding.startswith(_LAYER) and len(encoding) > len(_LAYER):
+        return _LAYER, 0.0, 1.0
+    name, *numbers = encoding.split(":")
+    try:
+        values = [float(number) for number in numbers]
+    except ValueError:
+        values = [0.0]
+    if name not in ENCODINGS or len(values) > 2 * (name in _RANGED) or not all(0 < value < 1e6 for value in values):
+        raise WlmError(f"encoding: expected {EXPECTED}, got {encoding!r}")
+    return name, *(*values, 0.0)[:1], *(*values[1:], 1.0)[:1]
+
+
+def _note_doubts(name: str, largest: float, colour: np.ndarray, alpha: np.ndarray | None, notes: list[str]) -> None:
+    """Adds lines about an assumed range, and about levels that do not look like the encoding."""
+    if name in _RANGED and not largest:
+        whose = "Unity in linear colour space, 34.49 a^2.2" if name == "rgbm" else "Babylon.js, p^2.2 / a"
+        notes.append(f"{name} is taken to be that of {whose}: state another as {name}:RANGE:GAMMA")
+    if alpha is None:
+        return
+    if name in _ALPHA and alpha.min() == alpha.max():
+        notes.append(f"alpha is {alpha.max():.3g} everywhere, which {name} hardly writes: is it srgb or linear?")
+    if name not in _ALPHA and np.mean((alpha > 0) & (alpha < 1)) > 0.5 and np.median(colour.max(-1)) > _NEAR_ONE:
+        notes.append(f"alpha varies and colours are near 1, as in RGBM: is its encoding rgbm, not {name}?")

@@ -1,10 +1,14 @@
-"""OpenEXR files of one flat part: pictures of RGB or RGBA, single-channel images with a JSON note, and headers."""
+"""OpenEXR files: pictures of RGB or RGBA, single-channel images with a JSON note, and headers.
+
+Pictures cover the display window, whatever the data window, and have the primaries of Rec. 709. Their colour may be in
+a named layer, such as `ViewLayer.Combined.R`, or in one part of several.
+"""
 
 import contextlib
 import io
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,59 +17,229 @@ import OpenEXR
 
 from wlm.errors import WlmError, one_line
 from wlm.formats.atomic import atomic_path
-from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
-from wlm.formats.reading import open_file
+from wlm.formats.exr_header import check_header
+from wlm.formats.primaries import ACES_AP0, CIE_XYZ, REC709, to_rec709
 from wlm.formats.stderr import captured_stderr
-
-MAGIC = b"\x76\x2f\x31\x01"
-"""The first bytes of an EXR file."""
-
-_SAMPLE_BYTES = 2  # of a half float: the library's header does not distinguish half and float
 
 HALF_MAX = 65504.0
 """The largest finite half float."""
 
 _COLOUR = ("R", "G", "B")
 _ALPHA = "A"
+_LETTERS = {"r": "R", "red": "R", "g": "G", "green": "G", "b": "B", "blue": "B", "a": "A", "alpha": "A"}
+_MOST_NAMES, _MOST_CHANNELS = 8, 64  # layers and channels that a message lists
 _NOTE = "wlm"  # the header's attribute
 
 
-def read_exr(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the colour channels of a single-part EXR file, over its data window.
+def read_exr(
+    path: str | os.PathLike[str], notes: list[str] | None = None, layer: str | None = None
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads the light of an EXR file, over its display window, in the primaries of Rec. 709.
 
-    Half and float files are read, scan lines or tiles. Channels other than R, G, B and A are ignored. Values are
-    returned unchanged, NaN and infinity included.
+    Half and float files are read, scan lines or tiles, of one part or several. The light is in the channels R, G and B,
+    also in lower case; without them in the only layer that has such channels, or in a lone channel Y, which is grey.
+    NaN and infinity are kept. Texels of the display window that the file doesn't store are 0.
+
+    Args:
+        path: The file.
+        notes: Each assumption and conversion adds a line.
+        layer: Name of the layer or the part; None: the rule above.
 
     Returns:
         The pixels, float32 [H, W, 3 or 4], and the names of the channels, ("R", "G", "B") or ("R", "G", "B", "A").
 
     Raises:
-        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data, or
-            lacks one of R, G and B.
+        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has deep data, or has no colour or
+            several layers of it.
     """
-    channels = read_part(path).channels
-    if any(name not in channels for name in _COLOUR):
-        raise WlmError(f"{path}: expected channels R,G,B or R,G,B,A, found {','.join(channels) or 'none'}")
-    names = (*_COLOUR, _ALPHA) if _ALPHA in channels else _COLOUR
-    return np.stack(float_planes(path, channels, names), axis=-1), names
+    notes = [] if notes is None else notes
+    channels = _channels(_flat_parts(path))
+    chosen = _light_channels(path, list(channels), layer, notes)
+    pixels = _pixels(path, channels, list(chosen.values()), notes)
+    header = channels[chosen["R"]][0].header
+    to_rec709(pixels, _chromaticities(path, header, notes), f"{path}: chromaticities", notes)
+    return pixels, tuple(chosen)
 
 
-def float_planes(path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]) -> list[np.ndarray]:
-    """Returns the pixels of the channels `names` of an EXR part, float32 [H, W] each.
+def read_every_channel(
+    path: str | os.PathLike[str], notes: list[str] | None = None, light: bool = False
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads all channels of an EXR file, over its display window; `read_exr` explains `notes`.
+
+    Args:
+        path: The file.
+        notes: Each conversion adds a line.
+        light: Whether the colours of each layer are light, which is converted to the primaries of Rec. 709.
+
+    Returns:
+        The pixels, float32 [H, W, C], and the names of the channels: R, G, B and A first, others sorted. In a file of
+        several parts, a name begins with that of its part, such as "beauty.R".
+
+    Raises:
+        WlmError: See `read_exr`, but no layer of colour is needed.
+    """
+    notes = [] if notes is None else notes
+    channels, first = _channels(_flat_parts(path)), (*_COLOUR, _ALPHA)
+    names = sorted(channels, key=lambda name: (first.index(name) if name in first else len(first), name))
+    if not names:
+        raise WlmError(f"{path}: expected channels, found none")
+    pixels = _pixels(path, channels, names, notes)
+    for layer in _layers(names).values() if light else ():
+        chromaticities = _chromaticities(path, channels[layer["R"]][0].header, notes)
+        if not np.allclose(chromaticities, REC709):
+            places, lines = [names.index(layer[letter]) for letter in _COLOUR], []
+            colour = pixels[..., places]
+            to_rec709(colour, chromaticities, f"{path}: chromaticities", lines)
+            pixels[..., places] = colour
+            notes += [line for line in lines if line not in notes]
+    return pixels, tuple(names)
+
+
+_Channels = Mapping[str, tuple[OpenEXR.Part, Any]]  # the part and the channel of each name
+
+
+def _channels(parts: Sequence[OpenEXR.Part]) -> _Channels:
+    """Returns the channels of all parts; in a file of several parts, a name begins with that of its part."""
+    found = {}
+    for part in parts:
+        prefix = f"{part.name()}." if len(parts) > 1 else ""
+        for name, channel in part.channels.items():
+            found[name if name.startswith(prefix) else prefix + name] = (part, channel)
+    return found
+
+
+def _layers(names: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Returns the layers of colour: for each name, which is "" for channels without one, the channels of R, G, B and
+    A in this order."""
+    found: dict[str, dict[str, str]] = {}
+    for name in names:
+        layer, _, channel = name.rpartition(".")
+        letter = _LETTERS.get(channel.lower())
+        if letter is not None and (letter == channel or letter not in found.get(layer, ())):
+            found.setdefault(layer, {})[letter] = name
+    return {
+        layer: {letter: channels[letter] for letter in (*_COLOUR, _ALPHA) if letter in channels}
+        for layer, channels in found.items()
+        if channels.keys() >= set(_COLOUR)
+    }
+
+
+def _light_channels(
+    path: str | os.PathLike[str], names: list[str], layer: str | None, notes: list[str]
+) -> dict[str, str]:
+    """Chooses the channels of light by the rule of `read_exr`: for R, G, B and perhaps A the name in the file."""
+    layers = _layers(names)
+    listed = ", ".join(f"{each!r}" for each in list(layers)[:_MOST_NAMES]) or "none"
+    if layer is not None:
+        if layer not in layers:
+            raise WlmError(f"{path}: expected a layer of colour {layer!r}, found {listed}")
+        return layers[layer]
+    if "" in layers:
+        if others := ", ".join([each for each in layers if each][:_MOST_NAMES]):
+            notes.append(f"the light is taken from R, G and B; its other layers of colour ({others}) are not read")
+        return layers[""]
+    if len(layers) == 1:
+        ((only, channels),) = layers.items()
+        notes.append(f"the light is taken from {only!r}, its only layer of colour")
+        return channels
+    if layers:
+        raise WlmError(
+            f"{path}: expected one layer of colour, found {listed}: choose one with --encoding layer:NAME, or by "
+            "channels in a set.json"
+        )
+    if len(names) == 1 and names[0] in ("Y", "L"):
+        notes.append(f"its only channel, {names[0]}, is taken as grey light")
+        return dict.fromkeys(_COLOUR, names[0])
+    reason = " (luminance and chroma: save it as RGB)" if {"Y", "RY", "BY"} <= set(names) else ""
+    found = ",".join(names[:_MOST_CHANNELS]) or "none"
+    raise WlmError(f"{path}: expected channels R,G,B or R,G,B,A, found {found}{reason}")
+
+
+def _pixels(path: str | os.PathLike[str], channels: _Channels, names: Sequence[str], notes: list[str]) -> np.ndarray:
+    """Returns the pixels of channels over the display window, float32 [H, W, C]."""
+    pixels = np.zeros(0, np.float32)
+    for index, name in enumerate(names):
+        part, channel = channels[name]
+        (plane,) = float_planes(path, {name: channel}, [name])
+        plane = _framed(f"{path}: channel {name}", part, plane, notes)
+        if not index:
+            pixels = np.empty((*plane.shape, len(names)), np.float32)
+        if plane.shape != pixels.shape[:2]:
+            raise WlmError(f"{path}: channel {name}: expected {pixels.shape[:2]} pixels, found {plane.shape}")
+        pixels[..., index] = plane
+    return pixels
+
+
+def _framed(where: str, part: OpenEXR.Part, plane: np.ndarray, notes: list[str]) -> np.ndarray:
+    """Places the pixels of the data window, float32 [h, w], in the display window, 0 elsewhere: [H, W]."""
+    data, display = _window(part, "dataWindow"), _window(part, "displayWindow")
+    if data == display:
+        return plane
+    left, top, width, height = display
+    x, y = data[0] - left, data[1] - top
+    if plane.shape != (data[3], data[2]):
+        raise WlmError(f"{where}: expected {data[2]}x{data[3]} pixels, found {plane.shape[1]}x{plane.shape[0]}")
+    rows, columns = (slice(max(at, 0), max(at + size, 0)) for at, size in ((y, data[3]), (x, data[2])))
+    framed = np.zeros((height, width), np.float32)
+    inside = plane[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]
+    if not inside.size:
+        raise WlmError(f"{where}: expected a data window that overlaps the display window, found none")
+    framed[rows, columns] = inside
+    line = f"the data window, {data[2]}x{data[3]} at ({x}, {y}), is placed in the display window, {width}x{height}"
+    if inside.size < framed.size:
+        line += f": {framed.size - inside.size} texels outside it are 0"
+    if inside.size < plane.size:
+        line += f"{';' if inside.size < framed.size else ':'} {plane.size - inside.size} texels beyond it are left out"
+    if line not in notes:
+        notes.append(line)
+    return framed
+
+
+def _window(part: OpenEXR.Part, name: str) -> tuple[int, int, int, int]:
+    """Returns the left and top, the width and the height of a window in the header of a part."""
+    (left, top), (right, bottom) = (np.asarray(corner).tolist() for corner in part.header[name])
+    return left, top, right - left + 1, bottom - top + 1
+
+
+def _chromaticities(path: str | os.PathLike[str], header: Mapping[str, Any], notes: list[str]) -> Sequence[float]:
+    """Returns the chromaticities that a header states; those of Rec. 709, the format's default, if it states none.
+
+    Raises:
+        WlmError: The header says that the values are not linear.
+    """
+    if "chromaticities" in header:
+        return tuple(header["chromaticities"])
+    space = str(header.get("colorInteropID", ""))
+    if space == "lin_ciexyzd65_scene":
+        return CIE_XYZ
+    if space.startswith("lin_"):
+        stated = OpenEXR.colorInteropIDToChromaticities(space)
+        if stated is None:
+            notes.append(f"the colour space {space[:_MOST_CHANNELS]} is not known: its primaries are taken as Rec. 709")
+        return stated or REC709
+    if space not in ("", "data", "unknown"):
+        raise WlmError(f"{path}: colorInteropID: expected linear light, found {space[:_MOST_CHANNELS]}")
+    return ACES_AP0 if header.get("acesImageContainerFlag") else REC709
+
+
+def float_planes(
+    path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]
+) -> Iterator[np.ndarray]:
+    """Yields the pixels of the channels `names` of an EXR part, float32 [H, W] each.
 
     Raises:
         WlmError: A channel is neither half nor float, or has another shape than the first.
     """
-    planes: list[np.ndarray] = []
+    shape = None
     for name in names:
         pixels = channels[name].pixels
         if pixels is None or pixels.dtype not in (np.float16, np.float32):
             content = "no pixels" if pixels is None else pixels.dtype
             raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
-        if planes and pixels.shape != planes[0].shape:
-            raise WlmError(f"{path}: channel {name}: expected {planes[0].shape} pixels, found {pixels.shape}")
-        planes.append(pixels.astype(np.float32, copy=False))
-    return planes
+        shape = pixels.shape if shape is None else shape
+        if pixels.shape != shape:
+            raise WlmError(f"{path}: channel {name}: expected {shape} pixels, found {pixels.shape}")
+        yield pixels.astype(np.float32, copy=False)
 
 
 def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True) -> None:
@@ -149,35 +323,31 @@ def read_part(path: str | os.PathLike[str]) -> OpenEXR.Part:
     Raises:
         WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data.
     """
-    size = _check_magic(path)
-    file, complaints = _open(path, size)
-    parts = file.parts if file is not None else []
-    if not parts:
-        raise WlmError(f"{path}: the EXR file is cut short or damaged: {complaints or 'no pixels found'}")
+    parts = _flat_parts(path)
     if len(parts) > 1:
         raise WlmError(f"{path}: expected an EXR file of one part, found {len(parts)}")
-    if parts[0].type() in (OpenEXR.deepscanline, OpenEXR.deeptile):
-        raise WlmError(f"{path}: expected a flat EXR picture, found deep data")
     return parts[0]
 
 
+def _flat_parts(path: str | os.PathLike[str]) -> list[OpenEXR.Part]:
+    """Reads all parts of an EXR file. Raises `WlmError` as `read_part` does, but for several parts."""
+    file, complaints = _open(path)
+    parts = file.parts if file is not None else []
+    if not parts or complaints:
+        raise WlmError(f"{path}: the EXR file is cut short or damaged: {complaints or 'no pixels found'}")
+    return list(parts)
+
+
 def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]]:
-    """Reads the width, height and channel names of the first part of an EXR file, without its pixels.
+    """Reads the size of the display window and the names of all channels of an EXR file, without its pixels.
+
+    In a file of several parts, a name begins with that of its part.
 
     Raises:
-        WlmError: The file is missing, is not an EXR file, or its header is damaged or exceeds the limits.
+        WlmError: See `wlm.formats.exr_header.check_header`.
     """
-    size = _check_magic(path)
-    with _captured_chatter() as chatter:
-        try:
-            parts = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts
-            _check_size(path, size, parts)
-            first, last = (np.asarray(corner).tolist() for corner in parts[0].header["dataWindow"])
-            names = tuple(channel.name for channel in parts[0].header["channels"])
-        except (RuntimeError, ValueError, LookupError, MemoryError) as error:
-            found = chatter.text or one_line(error)
-            raise WlmError(f"{path}: the EXR file is cut short or damaged: {found}") from error
-    return last[0] - first[0] + 1, last[1] - first[1] + 1, names
+    parts = check_header(path)
+    return *parts[0].size, tuple(name for part in parts for name in part.full_names(len(parts) > 1))
 
 
 def write_part(
@@ -215,33 +385,12 @@ def write_part(
             raise WlmError(f"{path}: cannot write: {reason}; is the disk full?") from error
 
 
-def _check_magic(path: str | os.PathLike[str]) -> int:
-    """Checks the magic number of an EXR file and returns the file size in bytes."""
-    with open_file(path, "the EXR file") as file:
-        magic, size = file.read(len(MAGIC)), os.fstat(file.fileno()).st_size
-    if magic != MAGIC:
-        raise WlmError(f"{path}: expected an EXR file, found other content")
-    return size
-
-
-def _check_size(path: str | os.PathLike[str], held: int, parts: list[OpenEXR.Part]) -> None:
-    """Raises an error if the header claims more pixels than the limits or the file size allow."""
-    total = 0
-    for part in parts:
-        first, last = (np.asarray(corner).tolist() for corner in part.header["dataWindow"])
-        width, height = (end - begin + 1 for begin, end in zip(first, last, strict=True))
-        check_sides(str(path), width, height)
-        total += width * height * _SAMPLE_BYTES * len(part.header["channels"])
-    check_growth(str(path), held, total, PICTURE_GROWTH, PICTURE_BYTES)
-
-
-def _open(path: str | os.PathLike[str], size: int) -> tuple["OpenEXR.File | None", str]:
+def _open(path: str | os.PathLike[str]) -> tuple["OpenEXR.File | None", str]:
     """Returns the opened file and the library's messages; on failure the file is None or has no parts."""
+    check_header(path)
     with _captured_chatter() as chatter:
         try:
             # Channels are kept separate, since joined ones have other names in RGB, RGBA and layered files.
-            # The header is checked first, since the library allocates the claimed size before it reads a pixel.
-            _check_size(path, size, OpenEXR.File(str(path), separate_channels=True, header_only=True).parts)
             file = OpenEXR.File(str(path), separate_channels=True)
         except (RuntimeError, ValueError, MemoryError) as error:
             return None, chatter.text or one_line(error)

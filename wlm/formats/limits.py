@@ -20,6 +20,15 @@ INDEX_BYTES = 64 << 20
 JSON_BYTES = 512 << 20
 """Largest JSON file of data: a million probes with 27 numbers, or a glTF tree with embedded buffers."""
 
+JSON_GROWTH = 24
+"""Largest memory of the values of a JSON text per byte of it. Lists of three numbers of three digits take 16."""
+
+SURE_JSON = 256 << 20
+"""Memory of the values of a JSON text that is allowed for any length of it, in bytes."""
+
+MEMBERS_BYTES = 1 << 20
+"""Largest list of members of a ZIP archive: ten thousand arrays."""
+
 BAKE_BYTES = 1 << 30
 """Largest Godot bake. A probe has 156 bytes, and its tetrahedra and BSP tree some hundred."""
 
@@ -54,10 +63,10 @@ PICTURE_TEXELS = 1 << 28
 """Most texels of a lightmap file: 16384 x 16384, the largest texture of most GPUs."""
 
 PICTURE_GROWTH = 2048
-"""Largest expansion of a lightmap file to half floats. Black pixels expand 950 times under ZIP."""
+"""Largest expansion of a lightmap file. Black pixels expand 950 times under ZIP."""
 
 PICTURE_BYTES = 256 << 20
-"""Bytes of half floats that are allowed for any size of file: 6000 x 6000 black texels under any compression."""
+"""Decoded bytes that are allowed for any size of file: 6000 x 6000 black texels of half floats."""
 
 IMAGE_BYTES = 2 << 30
 """Largest PNG or TGA: 16384 x 16384 texels of 8 bytes."""
@@ -115,3 +124,22 @@ def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure:
         raise WlmError(
             f"{where}: expected at most {growth} times its {small} compressed bytes, found {large} unpacked bytes"
         )
+
+
+class Budget:
+    """Work or memory that the read of one file may still take; all loops of the read spend from it beforehand."""
+
+    def __init__(self, where: str, most: int, unit: str, hint: str = "") -> None:
+        """Starts with `most` of a unit. For messages: the file, the unit in plural, and advice that follows."""
+        self._left = most
+        self._text = f"{where}: expected at most {most} {unit} for the size of the file, found more{hint}"
+
+    def spend(self, amount: int) -> None:
+        """Takes an amount from what is left.
+
+        Raises:
+            WlmError: Less is left.
+        """
+        self._left -= amount
+        if self._left < 0:
+            raise WlmError(self._text)

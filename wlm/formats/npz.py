@@ -1,6 +1,7 @@
 """Reading of `.npz` files, named arrays in a ZIP file, whose headers are checked before they are inflated.
 
-Arrays above `wlm.formats.scratch.IN_MEMORY` are mapped from an unnamed temporary file.
+Members must be stored or deflated, as NumPy writes them: zipfile bounds the output of no other method. Arrays above
+`wlm.formats.scratch.IN_MEMORY` are mapped from an unnamed temporary file.
 """
 
 import io
@@ -13,12 +14,14 @@ from typing import BinaryIO
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.limits import SURE_BYTES, VOLUME_BYTES, check_growth
+from wlm.formats.limits import GROWTH, MEMBERS_BYTES, SURE_BYTES, VOLUME_BYTES, Budget
 from wlm.formats.reading import damaged, open_file
 from wlm.formats.scratch import room
 
 _SUFFIX = ".npy"
 _PIECE = 1 << 20  # bytes inflated at once
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_VALUE_BYTES = 4  # readers turn smaller numbers into float32
 
 
 def read_npz(
@@ -44,21 +47,38 @@ def read_npz(
     """
     # A malicious file can make zipfile and NumPy raise nearly any exception: NumPy parses the header as Python.
     with damaged(f"{path}: cannot read the arrays", Exception), open_file(path, "the arrays") as file:
-        if os.fstat(file.fileno()).st_size > VOLUME_BYTES:
+        size = os.fstat(file.fileno()).st_size
+        if size > VOLUME_BYTES:
             raise WlmError(f"{path}: cannot read the arrays: expected a file of at most {VOLUME_BYTES} bytes")
         if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
             raise WlmError(f"{path}: expected a .npz file, which names its arrays, found a .npy file of one array")
-        with zipfile.ZipFile(file) as archive:
+        budget = Budget(str(path), max(sure, GROWTH * size), "bytes of arrays")
+        with zipfile.ZipFile(_Pieces(file)) as archive:  # type: ignore[arg-type]
             members = {info.filename.removesuffix(_SUFFIX): info for info in archive.infolist()}
             arrays = {}
             for name in choose(list(members)):
                 if name not in members:
                     raise WlmError(f"{path}: {name} is missing; found {', '.join(members) or 'nothing'}")
-                arrays[name] = _read(f"{path}: {name}", archive, members[name], numbers, sure)
+                arrays[name] = _read(f"{path}: {name}", archive, members[name], numbers, budget)
             return arrays
 
 
-def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: int, sure: int) -> np.ndarray:
+class _Pieces:
+    """A file that is read only in pieces: zipfile reads the list of members as one, of any claimed size."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.seek, self.tell, self.seekable, self._file = file.seek, file.tell, file.seekable, file
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._file.read(size if 0 <= size <= MEMBERS_BYTES else MEMBERS_BYTES + 1)
+        if len(data) > MEMBERS_BYTES:
+            raise ValueError(f"expected a list of members of at most {MEMBERS_BYTES} bytes, found more")
+        return data
+
+
+def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: int, budget: Budget) -> np.ndarray:
+    if info.compress_type not in _METHODS:
+        raise WlmError(f"{where}: expected an array that is stored or deflated, found the method {info.compress_type}")
     with archive.open(info) as member:
         # NumPy would inflate a header of any length before it checks it.
         begin = io.BytesIO(member.read(_PIECE))
@@ -69,7 +89,7 @@ def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: 
         size, stated = count * dtype.itemsize, info.file_size - begin.tell()
         if stated != size:
             raise WlmError(f"{where}: expected {size} bytes of numbers, found {stated}")
-        check_growth(where, info.compress_size, size, sure=sure)
+        budget.spend(count * max(dtype.itemsize, _VALUE_BYTES))
         flat = room((count,), dtype, where)
         unfilled = memoryview(flat.view(np.uint8)) if size else memoryview(b"")
         piece = begin.read()

@@ -4,7 +4,7 @@ The header is parsed and bounded here; imagecodecs decodes the texels. The run-l
 
 Format: "Radiance File Formats", section "Picture File Format", of the Radiance documentation. A mantissa m with the
 exponent e is m 2^(e - 136), as in `rgbe.c` and in the readers of engines; Radiance itself uses m + 1/2, which makes
-black texels glow.
+black texels glow. Pictures of RGB without `PRIMARIES` are taken as Rec. 709, as engines do.
 """
 
 import math
@@ -16,31 +16,34 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.float_texels import EXTRA, check_picture
 from wlm.formats.hdr_blocks import need
+from wlm.formats.primaries import CIE_XYZ, to_rec709
 from wlm.formats.reading import open_file
 
 MAGIC = b"#?"
 
 _HEADER_BYTES = 64 << 10
-_FORMAT = "32-bit_rle_rgbe"
+_FORMAT, _XYZ = "32-bit_rle_rgbe", "32-bit_rle_xyze"
 _SIZE = re.compile(rb"([+-])([XY]) +([0-9]{1,9}) +([+-])([XY]) +([0-9]{1,9})")
 _TEXEL = 4  # bytes: red, green, blue, exponent
 _UNPACKED = 6  # bytes of a texel as half floats
+_FIELDS = {"FORMAT": 1, "GAMMA": 1, "EXPOSURE": 1, "COLORCORR": 3, "PRIMARIES": 8}  # the number of values
 
 
-def read_radiance(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a Radiance picture of RGB.
+def read_radiance(path: str | os.PathLike[str], notes: list[str] | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads a Radiance picture of RGB or CIE XYZ.
 
-    Values are divided by every `EXPOSURE` and `COLORCORR` of the header, which are factors that were applied to them;
-    `PRIMARIES` are ignored.
+    Values are divided by every `EXPOSURE` and `COLORCORR` of the header, which are factors that were applied to them.
+    CIE XYZ and other `PRIMARIES` are converted to Rec. 709. Each of these adds a line to `notes`.
 
     Returns:
         The pixels, float32 [H, W, 3], the top row first whatever the file's orientation, and the names of the
         channels.
 
     Raises:
-        WlmError: The file is missing, is not a Radiance picture, is cut short or damaged, contains XYZ or
-            gamma-corrected values, or the package imagecodecs is missing.
+        WlmError: The file is missing, is not a Radiance picture, is cut short or damaged, contains gamma-corrected
+            values, or the package imagecodecs is missing.
     """
+    notes = [] if notes is None else notes
     with open_file(path, "the Radiance picture") as file:
         held = os.fstat(file.fileno()).st_size
         head = file.read(_HEADER_BYTES)
@@ -50,7 +53,7 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
         axes = _SIZE.fullmatch(lines.pop())
         if axes is None or axes[2] == axes[5]:
             raise WlmError(f"{path}: expected a size like -Y 512 +X 512 after the header, found another line")
-        factor = _factor(path, lines)
+        factor, primaries = _header_fields(path, lines)
         rows, columns = int(axes[3]), int(axes[6])  # of the file: a row may be a column of the picture
         upright = axes[2] == b"Y"
         check_picture(path, held, *((columns, rows) if upright else (rows, columns)), _UNPACKED)
@@ -66,6 +69,12 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, 
     if factor != (1.0, 1.0, 1.0):
         with np.errstate(over="ignore"):
             pixels /= np.array(factor)
+        text = " ".join(f"{number:g}" for number in (factor if len(set(factor)) > 1 else factor[:1]))
+        notes.append(f"divided by the EXPOSURE of its header, {text}, which other readers may ignore")
+    if primaries is not None:
+        to_rec709(pixels, primaries, f"{path}: PRIMARIES", notes)
+        if primaries == CIE_XYZ:
+            notes.append("its unit is kept: CIE XYZ is usually in cd/m2, 179 times the W/(sr m2) of RGB")
     return np.ascontiguousarray(pixels), ("R", "G", "B")
 
 
@@ -80,25 +89,33 @@ def _header(path: str | os.PathLike[str], head: bytes) -> tuple[list[bytes], int
     return [*head[:blank].split(b"\n"), head[blank + 2 : end].strip()], end + 1
 
 
-def _factor(path: str | os.PathLike[str], lines: list[bytes]) -> tuple[float, float, float]:
-    """Returns the factors that EXPOSURE and COLORCORR applied to red, green and blue, and checks the other fields."""
-    product = [1.0, 1.0, 1.0]
+def _header_fields(
+    path: str | os.PathLike[str], lines: list[bytes]
+) -> tuple[tuple[float, float, float], tuple[float, ...] | None]:
+    """Checks the fields of a header. Returns the factors of EXPOSURE and COLORCORR for red, green and blue, and the
+    chromaticities, or None."""
+    product, primaries, xyz = [1.0, 1.0, 1.0], None, False
     for line in lines:
         name, equals, value = line.decode("latin-1").partition("=")
         name, value = name.strip(), value.strip()
-        if not equals or name not in ("FORMAT", "GAMMA", "EXPOSURE", "COLORCORR"):
+        if not equals or name not in _FIELDS:
             continue
         if name == "FORMAT":
-            if value != _FORMAT:
-                raise WlmError(f"{path}: FORMAT: expected {_FORMAT}, found {value[:40]}")
+            xyz = value == _XYZ
+            if value not in (_FORMAT, _XYZ):
+                raise WlmError(f"{path}: FORMAT: expected {_FORMAT} or {_XYZ}, found {value[:40]}")
             continue
         try:
             numbers = [float(word) for word in value.split()]
         except ValueError:
             numbers = []
-        wanted = 3 if name == "COLORCORR" else 1
-        if len(numbers) != wanted or not all(math.isfinite(number) and number > 0 for number in numbers):
-            raise WlmError(f"{path}: {name}: expected {wanted} finite number(s) above 0, found {value[:40]}")
+        wanted, least = _FIELDS[name], -math.inf if name == "PRIMARIES" else 0.0
+        if len(numbers) != wanted or not all(math.isfinite(number) and number > least for number in numbers):
+            above = "" if name == "PRIMARIES" else " above 0"
+            raise WlmError(f"{path}: {name}: expected {wanted} finite number(s){above}, found {value[:40]}")
+        if name == "PRIMARIES":
+            primaries = tuple(numbers)
+            continue
         if name == "GAMMA":
             if numbers != [1.0]:
                 raise WlmError(f"{path}: GAMMA: expected 1 (linear light), found {numbers[0]:g}")
@@ -106,7 +123,7 @@ def _factor(path: str | os.PathLike[str], lines: list[bytes]) -> tuple[float, fl
         product = [old * new for old, new in zip(product, numbers * (3 // wanted), strict=True)]
     if not all(math.isfinite(factor) and factor > 0 for factor in product):
         raise WlmError(f"{path}: EXPOSURE and COLORCORR: expected finite products above 0, found {product}")
-    return tuple(product)
+    return tuple(product), CIE_XYZ if xyz else primaries
 
 
 def _decode(path: str | os.PathLike[str], data: bytes, rows: int, columns: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,10 +10,14 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from wlm.errors import WlmError, one_line
-from wlm.formats.limits import INDEX_BYTES
+from wlm.formats.limits import INDEX_BYTES, INTEGER, JSON_GROWTH, SURE_JSON, Budget
 
 # Windows lacks the first two, and no file name blocks there. The last one disables newline translation.
 _FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
+
+_POINTER = b"version https://git-lfs"  # the first bytes of the text that stands for a file which was not fetched
+_MANY_DIGITS = re.compile(rb"\d{19}")
+_LONGEST_INTEGER = 40  # characters
 
 _LONGEST_NAME = 1024  # characters; systems allow 255 for each component
 
@@ -38,6 +43,11 @@ def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
             raise WlmError(f"{path}: cannot read {what}: expected a file, found a folder, a device or a pipe")
         with os.fdopen(handle, "rb", closefd=False) as file:
+            if file.read(len(_POINTER)) == _POINTER:
+                raise WlmError(
+                    f"{path}: cannot read {what}: found a pointer of Git LFS: run git lfs pull to fetch the file"
+                )
+            file.seek(0)
             yield file
     except OSError as error:
         raise WlmError(f"{path}: cannot read {what}: {error.strerror or error}") from error
@@ -71,9 +81,53 @@ def read_json_file(path: str | os.PathLike[str], what: str, limit: int = INDEX_B
     Raises:
         WlmError: See `read_file`; or the content is not JSON.
     """
-    data = read_file(path, limit, what)
-    with damaged(f"{path}: not valid JSON", ValueError, RecursionError, MemoryError):
-        return json.loads(data)
+    return parse_json(str(path), read_file(path, limit, what))
+
+
+def parse_json(where: str, data: bytes) -> Any:
+    """Parses a JSON text in UTF-8, if its values take no more memory than its length makes likely.
+
+    Raises:
+        WlmError: The text is not JSON, has integers beyond 64 bits, or its values would take too much memory.
+    """
+    check_json(where, data)
+    # Python makes integers of any length, which no array holds.
+    whole = _whole if _MANY_DIGITS.search(data) else None
+    with damaged(f"{where}: not valid JSON", ValueError, RecursionError, MemoryError):
+        return json.loads(data, parse_int=whole)
+
+
+def check_json(where: str, data: bytes) -> None:
+    """Checks the memory that the values of a JSON text would take, before it is parsed.
+
+    Raises:
+        WlmError: They would take more than its length makes likely.
+    """
+    budget = Budget(where, max(SURE_JSON, JSON_GROWTH * len(data)), "bytes of values in JSON")
+    # Sizes in Python: an object with its table, a list with room for some items, an item with its number, half a text.
+    for mark, size in ((b"{", 232), (b"[", 88), (b",", 40), (b'"', 32)):
+        budget.spend(size * data.count(mark))
+
+
+def _whole(text: str) -> int:
+    value = int(text) if len(text) < _LONGEST_INTEGER else 2 * INTEGER
+    if not -INTEGER <= value < 2 * INTEGER:
+        raise ValueError(f"expected integers within 64 bits, found {text[:_LONGEST_INTEGER]}")
+    return value
+
+
+class FileBytes:
+    """An open file as a sequence of bytes, of which only the slices that are asked for are read."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        self._file.seek(part.start)
+        return self._file.read(part.stop - part.start)
 
 
 @contextmanager

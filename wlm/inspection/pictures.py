@@ -7,21 +7,20 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats import dds, ktx2, radiance
+from wlm.formats import dds, ktx2, pfm, radiance
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import HALF_MAX, read_header
-from wlm.formats.exr import MAGIC as EXR_MAGIC
+from wlm.formats.exr_header import MAGIC as EXR_MAGIC
+from wlm.formats.levels import level_kind
 from wlm.formats.light import read_light
 from wlm.formats.limits import check_sides
 from wlm.formats.reading import open_file
 from wlm.inspection.finding import Finding, command
+from wlm.texels import doubts
 
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_FIRST = 80  # bytes that include the size, except in EXR and Radiance files
+_FIRST = 80  # bytes that include the size, except in EXR, Radiance, TIFF, JPEG, WebP and TGA files
 _FACES = 6  # faces of a cube
-# Share of values at 1, median radiance, and mean distance from 8-bit levels that suggest other data than radiance.
-_AT_ONE, _BRIGHT, _LEVELS, _NEAR_LEVEL = 0.02, 1000.0, 255.0, 0.08
-_MANY = 1000  # fewest texels for the test of levels
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,8 @@ class Picture:
     """Facts from the header of a picture.
 
     Attributes:
-        kind: "EXR", "Radiance", "KTX2", "DDS" or "PNG".
+        kind: "EXR", "Radiance", "PFM", "TIFF", "KTX2" or "DDS"; or "PNG", "JPEG", "WebP" or "TGA", which are no light
+            without an encoding.
         width, height: Size in texels; 0 if the beginning of the file does not state it.
         channels: Names of the channels; empty if the beginning of the file does not state them.
     """
@@ -43,6 +43,11 @@ class Picture:
     def size(self) -> str:
         """Width and height in pixels as text, such as "512x256"."""
         return f"{self.width}x{self.height}"
+
+    @property
+    def is_light(self) -> bool:
+        """Whether the format may define light itself."""
+        return self.kind not in ("PNG", "JPEG", "WebP", "TGA")
 
     @property
     def is_cube(self) -> bool:
@@ -74,6 +79,8 @@ def picture_of(path: Path) -> Picture | None:
         return Picture("EXR", width, height, channels)
     if head.startswith(radiance.MAGIC):
         return Picture("Radiance")
+    if head.startswith(pfm.MAGIC):
+        return Picture("PFM", *pfm.header_of(path, head)[:2])
     for kind, magic, form, at in (
         ("KTX2", ktx2.MAGIC, "<2I", 20),
         ("DDS", dds.MAGIC, "<2I", 12),
@@ -84,7 +91,8 @@ def picture_of(path: Path) -> Picture | None:
             width, height = (second, first) if kind == "DDS" else (first, second)
             check_sides(str(path), width, height)
             return Picture(kind, width, height)
-    return None
+    other = level_kind(path, head)
+    return None if other is None else Picture(other)
 
 
 def inspect_picture(path: Path) -> Finding:
@@ -104,13 +112,16 @@ def inspect_picture(path: Path) -> Finding:
     if "_comp_dir" in name or "_comp_shadowmask" in name:
         layer = "light directions" if "_comp_dir" in name else "a shadow mask"
         return Finding(path, f"{layer} of Unity, {picture.size}; read together with the light in its folder")
-    if picture.kind == "PNG":
-        pixels = read_channels(path)[0]
-        return Finding(path, f"a PNG of {picture.size}, {pixels.shape[2]} channels: a mask or colours, no radiance")
-    pixels, names = read_light(path)
+    notes: list[str] = []
+    if not picture.is_light:
+        pixels, names, _ = read_channels(path, notes)
+        height, width = pixels.shape[:2]
+        what = f"a {picture.kind} of {width}x{height}, {''.join(names)}: a mask, colours, or light with an --encoding"
+        return Finding(path, what, problems=tuple(notes))
+    pixels, names = read_light(path, notes)
     height, width = pixels.shape[:2]
     what = f"a lightmap, {picture.kind}, {width}x{height}, {''.join(names)}; compress it together with its mesh"
-    return Finding(path, what, problems=problems_of(pixels))
+    return Finding(path, what, problems=(*notes, *problems_of(pixels)))
 
 
 def problems_of(pixels: np.ndarray) -> tuple[str, ...]:
@@ -123,25 +134,11 @@ def problems_of(pixels: np.ndarray) -> tuple[str, ...]:
     used = light[finite] if pixels.shape[2] == 3 else light[finite & (pixels[..., 3] > 0)]
     if below := int(np.count_nonzero((used < 0).any(-1))):
         problems.append(f"{below} texels are negative")
-    used = used[(used > 0).any(-1)]
-    if not len(used):
+    if not (used > 0).any():
         return (*problems, "no texel is above 0")
-    brightest, middle = float(used.max()), float(np.median(used.max(-1)))
-    if brightest > HALF_MAX:
+    if (brightest := float(used.max())) > HALF_MAX:
         problems.append(f"values up to {brightest:.3g} exceed half floats and are clamped to 65,504")
-    if middle > _BRIGHT:
-        problems.append(f"half of the texels exceed {middle:.3g}: are they in lux, or scaled for an encoding?")
-    if brightest == 1.0 and np.count_nonzero(used == 1.0) > _AT_ONE * used.size:
-        problems.append("values are clamped at 1: are they screen colours instead of radiance?")
-    if len(used) >= _MANY and brightest <= 1.0 and _from_level(used) < _NEAR_LEVEL:
-        problems.append("values have 256 levels: were they converted from an 8-bit picture?")
-    return tuple(problems)
-
-
-def _from_level(light: np.ndarray) -> float:
-    """Returns the mean distance of values [N, 3] from the nearest of 256 8-bit levels, in units of a level."""
-    codes = light[:: max(1, len(light) // 65536)] * _LEVELS
-    return float(np.abs(codes - np.rint(codes)).mean())
+    return (*problems, *doubts(light))
 
 
 def read_lit(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -150,12 +147,14 @@ def read_lit(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     Raises:
         WlmError: The file cannot be read.
     """
-    pixels, names = read_light(path)
+    notes: list[str] = []
+    pixels, names = read_light(path, notes)
+    problems = (*notes, *problems_of(pixels))
     alpha = pixels[..., 3] > 0 if "A" in names else None
     if alpha is not None and alpha.any() and not alpha.all():
-        return alpha, problems_of(pixels)
+        return alpha, problems
     with np.errstate(invalid="ignore"):
-        return (pixels[..., :3] > 0).any(-1), problems_of(pixels)
+        return (pixels[..., :3] > 0).any(-1), problems
 
 
 def said(error: WlmError, path: Path) -> str:

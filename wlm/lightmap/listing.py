@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from wlm.errors import WlmError
+from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
 from wlm.formats.reading import named_file, read_json_file
@@ -56,11 +57,14 @@ class LayerInfo:
         name: Name of the layer.
         encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
         channels: Channels to read; None reads R, G and B of radiance and all channels of other layers.
+        stored: How the files of a layer of radiance store their light, if they don't define it themselves: an encoding
+            of `wlm.formats.channels`. None: they do.
     """
 
     name: str
     encoding: str
     channels: tuple[str, ...] | None = None
+    stored: str | None = None
 
 
 @dataclass(frozen=True)
@@ -113,9 +117,13 @@ class Listing:
 
 
 def list_set(
-    path: Path, times: Sequence[float] | None = None, layers: Sequence[str] | None = None, trust: bool = False
+    path: Path,
+    times: Sequence[float] | None = None,
+    layers: Sequence[str] | None = None,
+    trust: bool = False,
+    stored: str | None = None,
 ) -> Listing:
-    """Lists the files of a set, by the rules that `wlm.lightmap.load` describes.
+    """Lists the files of a set, by the rules that `wlm.lightmap.load` describes. `stored` is its `encoding`.
 
     Raises:
         WlmError: The set cannot be read, a field is missing or wrong, a file lies outside the folder, there are too
@@ -124,7 +132,8 @@ def list_set(
     if path.is_dir() and (path / SET_FILE).is_file():
         path = path / SET_FILE
     if path.is_dir():
-        listing = _list_states(path, times, layers) if state_folders(path) else _list_folder(path, times)
+        unity = state_folders(path)
+        listing = _list_states(path, times, layers) if unity else _list_folder(path, times, stored is not None)
     elif path.is_file():
         if path.suffix.lower() != ".json":
             lone = path.suffix.lower() in SUFFIXES
@@ -133,6 +142,9 @@ def list_set(
         listing = _parse(path, times, trust)
     else:
         raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of lightmaps ({EXPECTED})")
+    if stored is not None:
+        light = (replace(each, stored=stored) if each.encoding == LIGHT.encoding else each for each in listing.layers)
+        listing = replace(listing, layers=tuple(light))
     if layers is None:
         return listing
     names = [layer.name for layer in listing.layers]
@@ -187,10 +199,11 @@ def _check_count(where: Path, items: Sequence[object], times: Sequence[float], n
         raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(items, noun)}; expected a time for each")
 
 
-def _list_folder(folder: Path, times: Sequence[float] | None) -> Listing:
-    """Lists a folder of lightmaps without a `set.json`; a "mask.png" in it is the mask."""
+def _list_folder(folder: Path, times: Sequence[float] | None, levels: bool) -> Listing:
+    """Lists a folder of lightmaps, also of integers if `levels`; a "mask.png" in it is the mask."""
+    suffixes = SUFFIXES + LEVEL_SUFFIXES * levels
     try:
-        files = [f for f in folder.iterdir() if f.suffix.lower() in SUFFIXES and f.is_file()]
+        files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and f.is_file() and f.name != "mask.png"]
     except OSError as error:
         raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
     # Hidden files belong to other programs: macOS writes one beside every file on a foreign disk.
@@ -302,7 +315,7 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
         raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
     plain = "layers" not in content
     if plain:
-        layers = (LayerInfo(LIGHT.layer, LIGHT.encoding),)
+        layers = (LayerInfo(LIGHT.layer, LIGHT.encoding, stored=_stored(path, content, "")),)
         expected = "a whole number of texels above 0"
         size = tuple(_field(path, content, key, "", _is_size, expected) for key in ("height", "width"))
         atlases = (AtlasInfo(LIGHT.atlas, _mask(path, content, "", trust), size, _mesh(path, content, "", trust)),)
@@ -377,13 +390,21 @@ def _layer(path: Path, name: str, value: Any) -> LayerInfo:
     encoding = _field(
         path, options, "encoding", f"{place}.", lambda text: text in list(VALUE_RANGES), f"one of {names}"
     )
+    stored = _stored(path, options, f"{place}.") if encoding == LIGHT.encoding else None
     if options.get("channels") is None:
-        return LayerInfo(name, encoding)
+        return LayerInfo(name, encoding, stored=stored)
     channels = _field(path, options, "channels", f"{place}.", _is_list, f"a list of 1 to {MOST_CHANNELS} channels")
     named = len(channels) <= MOST_CHANNELS and all(is_name(channel) for channel in channels)
     if not named or len(set(channels)) < len(channels):
         raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} different names of channels")
-    return LayerInfo(name, encoding, tuple(channels))
+    return LayerInfo(name, encoding, tuple(channels), stored)
+
+
+def _stored(path: Path, holder: dict[str, Any], place: str) -> str | None:
+    """Reads how files store the light of a layer, such as "rgbm:8:2"; None if the field is absent."""
+    if holder.get("stored") is None:
+        return None
+    return _field(path, holder, "stored", place, is_text, "an encoding, such as srgb or rgbm:8:2")
 
 
 def _atlas(path: Path, name: str, value: Any, trust: bool) -> AtlasInfo:

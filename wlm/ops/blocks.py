@@ -101,6 +101,7 @@ def bc7_blocks(endpoints: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
 
 
 def _check(endpoints: torch.Tensor, weights: torch.Tensor) -> None:
+    check("weights", weights, (...,))
     check("weights", weights, (None,) * (3 if weights.ndim == 3 else 2))
     *layers, height, width = weights.shape
     if height % 4 or width % 4:

@@ -50,7 +50,7 @@ def gaussian_sum(
     check("rows", rows, (None, None))
     if rows.shape[1] <= LATENT:
         raise ValueError(f"rows: expected more than {LATENT} columns, got {rows.shape[1]}")
-    check("points", points, (*points.shape[:-1], 3), rows.device)
+    check("points", points, (..., 3), rows.device)
     check_finite(rows=rows, points=points)
     sums = _GaussianSum.apply(rows, points.reshape(-1, 3), float(cut), support)
     return sums.reshape(*points.shape[:-1], -1 if sums.numel() else sums.shape[1])

@@ -78,7 +78,7 @@ def march(
     check("colour", colour, (len(toward), 3), device)
     if emission is not None:
         check("emission", emission, (*density.shape, 3), device)
-    check("origin", origin, (*origin.shape[:-1], 3), device)
+    check("origin", origin, (..., 3), device)
     check("direction", direction, tuple(origin.shape), device)
     for name, tensor in {"origin": origin, "direction": direction, "toward": toward}.items():
         if tensor.requires_grad:

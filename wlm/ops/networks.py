@@ -35,6 +35,8 @@ def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: st
     """
     if gelu not in GELUS:
         raise ValueError(f"gelu: expected one of {', '.join(GELUS)}, got {gelu!r}")
+    for name, tensor in {"x": x, "hidden": hidden, "output": output}.items():
+        check(name, tensor, (...,))
     check("x", x, (None,) * (3 if x.ndim == 3 else 2))
     width, outputs = hidden.shape[-1] if hidden.ndim else 0, output.shape[-1] if output.ndim else 0
     networks = tuple(x.shape[:-2])

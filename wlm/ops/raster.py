@@ -31,6 +31,7 @@ class Raster:
             and y down; None if not requested. Has no gradient.
         coverage: int32 [H, W], number of triangles that cover the pixel's centre, including hidden ones; None if not
             requested.
+        count: Number F of the triangles that were drawn; None: unknown.
     """
 
     triangle: torch.Tensor
@@ -38,6 +39,7 @@ class Raster:
     depth: torch.Tensor
     derivative: torch.Tensor | None
     coverage: torch.Tensor | None
+    count: int | None = None
 
 
 def rasterize(
@@ -110,10 +112,12 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
         float [H, W, C].
 
     Raises:
-        ValueError: See `rasterize`.
+        ValueError: See `rasterize`; or there are not as many triangles as were drawn.
     """
     check("attribute", attribute, (None, None))
     triangle = _checked_triangles(triangle, attribute)
+    if raster.count not in (None, len(triangle)):
+        raise ValueError(f"triangle: expected the {raster.count} triangles that were drawn, got {len(triangle)}")
     check("raster.barycentric", raster.barycentric, (None, None, 2), attribute.device)
     return _Interpolate.apply(attribute, triangle, raster.triangle, raster.barycentric)
 
@@ -141,7 +145,7 @@ def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", bo
     check("image", image, (None, None, None))
     if 0 in image.shape:
         raise ValueError(f"image: expected at least one texel and one channel, got {tuple(image.shape)}")
-    check("uv", uv, (*uv.shape[:-1], 2), image.device)
+    check("uv", uv, (..., 2), image.device)
     texels = _Texture.apply(image, uv.reshape(-1, 2), filter, boundary)
     return texels.reshape(*uv.shape[:-1], image.shape[2])
 
@@ -149,8 +153,11 @@ def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", bo
 def _rasterize(position, triangle, height, width, space, cull, derivative, coverage) -> Raster:
     check("uv" if space == "uv" else "clip", position, (None, 2 if space == "uv" else 4))
     triangle = _checked_triangles(triangle, position)
+    for name, pixels in (("height", height), ("width", width)):
+        if not hasattr(pixels, "__index__"):
+            raise ValueError(f"{name}: expected a whole number of pixels, got {pixels!r}")
     options = {"space": space, "cull": cull, "derivative": derivative, "coverage": coverage}
-    return Raster(*_Rasterize.apply(position, triangle, height, width, options))
+    return Raster(*_Rasterize.apply(position, triangle, height, width, options), len(triangle))
 
 
 class _Rasterize(torch.autograd.Function):

@@ -85,7 +85,7 @@ def triplane(
     channels = None if reduce == "concatenate" else xy.shape[2]
     check("xz", xz, (None, None, channels), xy.device)
     check("yz", yz, (None, None, channels), xy.device)
-    check("points", points, (*points.shape[:-1], 3), xy.device)
+    check("points", points, (..., 3), xy.device)
     x, y, z = points.unbind(-1)
     # The backward pass of a stack of columns is cheaper than that of indexing.
     projections = {"xy": (xy, x, y), "xz": (xz, x, z), "yz": (yz, y, z)}
@@ -111,7 +111,7 @@ def sample(
     check(names[0], values, (None,) * (axes + 1 if layer is None else axes + 2))
     if 0 in values.shape:
         raise ValueError(f"{names[0]}: expected at least one cell and one channel, got {tuple(values.shape)}")
-    check(names[1], points, (*points.shape[:-1], axes), values.device)
+    check(names[1], points, (..., axes), values.device)
     check_finite(**dict(zip(names, (values, points), strict=True)))
     shape = points.shape[:-1]
     if layer is None:

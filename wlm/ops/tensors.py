@@ -2,6 +2,7 @@
 
 import math
 from contextlib import AbstractContextManager, nullcontext
+from types import EllipsisType
 from typing import Any
 
 import torch
@@ -9,16 +10,17 @@ import warp as wp
 
 from wlm.interop import to_warp, warp_stream
 
-Shape = tuple[int | None, ...]
-"""Sizes of a tensor's axes; None allows any size."""
+Shape = tuple[int | EllipsisType | None, ...]
+"""Sizes of a tensor's axes; None allows any size, and a leading `...` any number of axes."""
 
 
 def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | None = None) -> None:
     """Checks that a tensor is float32 and has the given shape and device; None allows any device of Warp.
 
     Raises:
-        ValueError: Its shape, type or device doesn't fit.
+        ValueError: It isn't a dense torch tensor, its shape, type or device doesn't fit, or torch.func is active.
     """
+    _check_tensor(name, tensor, "float32", shape)
     if tensor.dtype != torch.float32 or not _fits(tensor, shape):
         raise ValueError(f"{name}: expected float32 {_text(shape)}, got {tensor.dtype} {tuple(tensor.shape)}")
     _check_device(name, tensor, device)
@@ -28,8 +30,9 @@ def check_index(name: str, index: torch.Tensor, count: int, shape: Shape, device
     """Checks a tensor of indices from 0 to `count` - 1; values are not checked while a CUDA graph is captured.
 
     Raises:
-        ValueError: Its shape, type, device or a number doesn't fit.
+        ValueError: As for `check`, or a number doesn't fit.
     """
+    _check_tensor(name, index, "int32 or int64", shape)
     if index.dtype not in (torch.int32, torch.int64) or not _fits(index, shape):
         raise ValueError(f"{name}: expected int32 or int64 {_text(shape)}, got {index.dtype} {tuple(index.shape)}")
     _check_device(name, index, device)
@@ -89,6 +92,17 @@ def optional_array(tensor: torch.Tensor | None, dimensions: int, dtype: Any, dev
     return to_warp(tensor, dtype)
 
 
+def _check_tensor(name: str, tensor: torch.Tensor, types: str, shape: Shape) -> None:
+    if not isinstance(tensor, torch.Tensor):
+        kind = f"{type(tensor).__module__}.{type(tensor).__name__}".removeprefix("builtins.")
+        raise ValueError(f"{name}: expected a torch tensor, {types} {_text(shape)}, got {kind}: use torch.as_tensor")
+    if tensor.layout != torch.strided:
+        raise ValueError(f"{name}: expected a dense tensor, got {tensor.layout}: use its to_dense()")
+    # torch's own error for such a call tells nothing to a caller.
+    if not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active():
+        raise ValueError("torch.func: wlm.ops supports no grad, jvp, jacrev or vmap of it: use torch.autograd.grad")
+
+
 def _check_device(name: str, tensor: torch.Tensor, device: torch.device | None) -> None:
     if device is not None and tensor.device != device:
         raise ValueError(f"{name}: expected a tensor on {device}, got one on {tensor.device}")
@@ -98,11 +112,17 @@ def _check_device(name: str, tensor: torch.Tensor, device: torch.device | None) 
 
 def _fits(tensor: torch.Tensor, shape: Shape) -> bool:
     sizes = tuple(tensor.shape)
-    return len(sizes) == len(shape) and all(want in (None, size) for want, size in zip(shape, sizes, strict=True))
+    if shape[:1] == (...,):
+        shape = shape[1:]
+        sizes = sizes[max(len(sizes) - len(shape), 0) :]
+    # `want in (None, size)` is false for equal sizes once torch.compile traces it.
+    return len(sizes) == len(shape) and all(
+        want is None or want == size for want, size in zip(shape, sizes, strict=True)
+    )
 
 
 def _text(shape: Shape) -> str:
-    return f"[{', '.join('any' if size is None else str(size) for size in shape)}]"
+    return f"[{', '.join({None: 'any', ...: '...'}.get(size, str(size)) for size in shape)}]"
 
 
 def _capturing(tensor: torch.Tensor) -> bool:
