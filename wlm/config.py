@@ -182,6 +182,10 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
         text = f"unknown key '{field}'{_suggestion(cls, problem['loc'])}"
     elif problem["type"] == "missing":
         text = f"{field}: expected a value, found none"
+    elif isinstance(problem["input"], dict) and "Input" not in problem["msg"]:
+        # A check of several fields together: its message, or else its type, names one of them.
+        name = [] if ": " in problem["msg"] else [problem["type"]]
+        text = ": ".join(filter(None, [".".join([*map(str, problem["loc"]), *name]), problem["msg"]]))
     else:
         expected = problem["msg"].replace("Input should be", "expected", 1)
         text = f"{field}: {expected}, got {_shown(problem['input'])}"

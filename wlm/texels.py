@@ -26,7 +26,7 @@ _FILMIC_WHITE = 4.0
 # Share of values at 1, median and brightest radiance, and mean distance from 8-bit levels that suggest other data than
 # radiance; the numbers of a lightmap that are compared, and the fewest texels for the test of levels.
 _AT_ONE, _BRIGHT, _DARK, _LEVELS, _NEAR_LEVEL = 0.02, 1000.0, 1e-4, 255.0, 0.08
-_SAMPLES, _MANY = 1 << 17, 1000
+_SAMPLES, _MANY = 6144, 1000
 
 
 def check_size(height: int, width: int) -> None:

@@ -324,7 +324,7 @@ def test_what_a_list_of_lightmaps_says_wrong(tmp_path):
         lists.write_text(json.dumps({"sheets": [{"files": ["day.exr"]}]} | content))
         return error_of(load, path, lists)
 
-    assert "no material has a lightmap (MOZ_lightmap)" in error_of(load, path)
+    assert "no material has a lightmap (MOZ_lightmap, " in error_of(load, path)
     assert "sheets: expected 2 files in each, one per state, found [1]" in told(states=["a", "b"])
     assert "objects[0].sheet: expected 0 to 0, found 3" in told(objects=[{"node": "left", "sheet": 3}])
     assert "node: expected one of left, right, found 'top'" in told(objects=[{"node": "top", "sheet": 0}])

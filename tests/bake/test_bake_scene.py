@@ -149,8 +149,8 @@ def test_normals_turn_with_their_node(tmp_path):
         a, b, c = primitive.position[primitive.triangle].transpose(1, 0, 2)
         face = np.cross(b - a, c - a)
         face /= np.linalg.norm(face, axis=1, keepdims=True)
-        # The node mirrors: the file's winding is the other way round.
-        assert np.einsum("fk,fck->fc", face, normal[primitive.triangle]) == pytest.approx(-1, abs=1e-4)
+        # The node mirrors, and the triangles keep their front.
+        assert np.einsum("fk,fck->fc", face, normal[primitive.triangle]) == pytest.approx(1, abs=1e-4)
     surfaces = read_geometry(path, None).surfaces
     a, b, c = surfaces[0].position[surfaces[0].triangle].transpose(1, 0, 2)
     assert (np.einsum("fk,fk->f", np.cross(b - a, c - a), surfaces[0].normal[surfaces[0].triangle[:, 0]]) > 0).all()

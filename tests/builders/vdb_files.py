@@ -20,8 +20,9 @@ def _bits(mask: np.ndarray) -> bytes:
 
 
 class _Writer:
-    def __init__(self, flags: int, half: bool, background: float) -> None:
-        self._flags, self._type, self._background = flags, "<f2" if half else "<f4", np.float32(background)
+    def __init__(self, flags: int, half: bool, background: float, one: str) -> None:
+        self._flags, self._one = flags, one
+        self._type, self._background = "<f2" if half else {"f": "<f4", "d": "<f8"}[one], np.float32(background)
 
     def values(self, values: np.ndarray, active: np.ndarray) -> bytes:
         """Values [count] as the flags have them, with what isn't active in the shortest of the format's ways."""
@@ -36,13 +37,13 @@ class _Writer:
         if len(others) < 2 and first in (bg, -bg):
             return (b"\0" if first == bg else b"\1") + stored
         if len(others) < 2:
-            return b"\2" + struct.pack("<f", first) + stored
+            return b"\2" + struct.pack(f"<{self._one}", first) + stored
         if set(others) == {bg, -bg}:
             return b"\3" + _bits(~active & (values == bg)) + stored
         if bg in others:
             one = first if last == bg else last
-            return b"\4" + struct.pack("<f", one) + _bits(~active & (values == bg)) + stored
-        return b"\5" + struct.pack("<2f", first, last) + _bits(~active & (values == last)) + stored
+            return b"\4" + struct.pack(f"<{self._one}", one) + _bits(~active & (values == bg)) + stored
+        return b"\5" + struct.pack(f"<2{self._one}", first, last) + _bits(~active & (values == last)) + stored
 
     def _packed(self, values: np.ndarray) -> bytes:
         data = values.astype(self._type).tobytes()
@@ -54,9 +55,12 @@ class _Writer:
         return struct.pack("<q", len(packed)) + packed
 
 
-def tree(values: np.ndarray, active: np.ndarray, flags: int, half: bool = False, background: float = 0.0) -> bytes:
-    """A tree of values [X, Y, Z] from voxel 0 on, multiples of 8 up to 128; leaves of one active value become tiles."""
-    writer = _Writer(flags, half, background)
+def tree(
+    values: np.ndarray, active: np.ndarray, flags: int, half: bool = False, background: float = 0.0, one: str = "f"
+) -> bytes:
+    """A tree of values [X, Y, Z] from voxel 0 on, multiples of 8 up to 128; leaves of one active value become tiles.
+    `one` is "d" for doubles."""
+    writer = _Writer(flags, half, background, one)
     shape = [n // _LEAF for n in values.shape]
     tiles, filled, leaves = np.full((_LOWER,) * 3, np.float32(background)), np.zeros((_LOWER,) * 3, bool), []
     children = np.zeros((_LOWER,) * 3, bool)
@@ -71,7 +75,7 @@ def tree(values: np.ndarray, active: np.ndarray, flags: int, half: bool = False,
     top = np.zeros((_UPPER,) * 3, bool)
     top[0, 0, 0] = True
     none = np.zeros_like(top)
-    result = struct.pack("<IfII3i", 1, background, 0, 1, 0, 0, 0)
+    result = struct.pack(f"<I{one}II3i", 1, background, 0, 1, 0, 0, 0)
     result += _bits(top) + _bits(none) + writer.values(np.full(top.shape, np.float32(background)), none)
     result += _bits(children) + _bits(filled) + writer.values(tiles, filled)
     result += b"".join(_bits(on) for _, on in leaves)
@@ -92,12 +96,15 @@ def affine(matrix: np.ndarray) -> bytes:
 
 
 def vdb_file(grids: dict[str, tuple[bytes, bytes, int, bool]]) -> bytes:
-    """A file of grids: for each name its map, its tree, the flags and whether it has half floats."""
+    """A file of grids: for each name its map, its tree, the flags and whether it has half floats. A class and a type
+    may follow a name: "density|fog volume|double"."""
     data = struct.pack("<qIII?", 0x56444220, 224, 10, 0, True) + _UUID + struct.pack("<II", 0, len(grids))
     for name, (placed, nodes, flags, half) in grids.items():
-        data += _text(name) + _text("Tree_float_5_4_3" + "_HalfFloat" * half) + _text("")
+        name, each, kind = name.split("|") if "|" in name else (name, "", "float")
+        data += _text(name) + _text(f"Tree_{kind}_5_4_3" + "_HalfFloat" * half) + _text("")
         metadata = _text("is_saved_as_half_float") + _text("bool") + struct.pack("<I?", 1, half)
-        head = struct.pack("<2I", flags, 1) + metadata + placed
+        metadata += (_text("class") + _text("string") + _text(each)) if each else b""
+        head = struct.pack("<2I", flags, 1 + bool(each)) + metadata + placed
         begin = len(data) + 24
         data += struct.pack("<3q", begin, begin + len(head), begin + len(head) + len(nodes)) + head + nodes
     return data

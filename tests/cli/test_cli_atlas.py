@@ -71,6 +71,34 @@ def test_the_options_of_compress_reach_the_fit(inputs, tmp_path):
     np.testing.assert_array_equal(decoded.any(axis=2), mask > 0)
 
 
+def test_lightmaps_of_a_material_slot(tmp_path):
+    """Compressed, evaluated and decoded; the transform of the second material makes a new UV set."""
+    position, triangle, uv = box((0, 0, 0), (1, 1, 1))
+    turned = {"KHR_texture_transform": {"rotation": np.pi / 2, "offset": [0.0, 1.0]}}  # (v, 1 - u)
+    slots = [{"index": 0}, {"index": 0, "extensions": turned}]
+    things = [
+        Thing(name, position + 2 * i, triangle, [places], material={"emissiveTexture": slot})
+        for i, (name, slot, places) in enumerate(
+            zip("ab", slots, (uv * [0.5, 1], np.stack([1 - uv[:, 1], 0.5 + uv[:, 0] / 2], 1)), strict=True)
+        )
+    ]
+    row, column = np.mgrid[:48, :64] / 64
+    light = np.stack([0.2 + column, 0.3 + row, 0.5 + 0 * row], 2)
+    write_exr(tmp_path / "lm.exr", light)
+    pictures = {"textures": [{"source": 0}], "images": [{"uri": "lm.exr"}]}
+    path = write_scene(tmp_path / "a.gltf", things, pictures)
+    assert "--slot emissive" in fails("compress", path, "-o", tmp_path / "a.wlm")
+    call("compress", path, "-o", tmp_path / "a.wlm", "--slot", "emissive", *QUICK)
+    assert "warning: " in call.stderr and "1 lightmap of the slot emissive" in call.stderr
+    assert wlm.load(tmp_path / "a.wlm").stored.uv_set == 1
+    call("evaluate", tmp_path / "a.wlm", path, "--slot", "emissive", *QUICK, "--resolution", 64)
+    call("decode", tmp_path / "a.wlm", "-o", tmp_path / "out.exr")
+    decoded = read_exr(tmp_path / "out.exr")[0]
+    covered = decoded.any(axis=2)
+    assert covered.mean() > 0.7
+    np.testing.assert_allclose(decoded[covered], light[covered], atol=0.05)
+
+
 def test_wrong_words_are_one_line(inputs, tmp_path):
     out = ["-o", tmp_path / "a.wlm"]
     words = ["compress", *inputs, *out]

@@ -76,9 +76,11 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
         "night has no Lightmap-0_comp_shadowmask",
         "unity/day/ReflectionProbe-0.exr: six faces of a cube, 48x8",
         "set: a set of lightmaps at 5 times, 128x128 -> wlm compress HERE/set -o OUT.wlm",
-        "room.lmbake: 9 light probes of 9 RGB coefficients, 9 of them lit -> wlm compress",
+        "room.lmbake: 9 light probes of 9 RGB coefficients, 9 of them lit; SH of radiance in the file's unit; "
+        "convention godot, as the file states; coefficient by coefficient (r0 g0 b0 r1 ...); Godot's axes, "
+        "right-handed, y up, in metres -> wlm compress",
         "smoke.npz: a volume of smoke, 4x5x6 voxels of 1 -> wlm smoke bake",
-        "two.npz: 9 light probes of 9 RGB coefficients, 9 of them lit, under the keys sh_9, sh_12 -> "
+        "two.npz: 9 light probes of 9 RGB coefficients, 9 of them lit, under the keys sh_9, sh_12; SH",
         "wlm compress HERE/other/two.npz --key 9 -o OUT.wlm",
         "smoke.vdb: cannot be read",
         "map.wlm: compressed lightmaps over time",

@@ -55,6 +55,7 @@ def test_compress_prints_one_table(room, profile, tmp_path):
     assert re.search(rf"gaussians +│ +{model.content.count} │", text)
     assert model.content.count + model.content.dropped == round(0.1 * (PROBES - DEAD))
     assert re.search(r"fit: 30 of 30, PSNR \d+\.\d+ dB", call.stderr)
+    assert f"{room}: {data.load(room).reading}" in call.stderr
     assert (model.profile.name, model.profile.steps, len(model.positions)) == ("tiny", 30, 0)
     assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"], "no checkpoint is left"
 
@@ -144,6 +145,18 @@ def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path):
         assert word in text
     said = [line.removeprefix("warning: ") for line in call.stderr.splitlines() if line.startswith("warning: ")]
     assert "worst probe:" in call.stderr and said == report.warnings
+
+
+def test_evaluate_reads_numbers_channel_by_channel(fitted, room, tmp_path):
+    probes = data.load(room)
+    by_channel = probes.values.reshape(-1, 9, 3).transpose(0, 2, 1).reshape(-1, 27)
+    np.savez(tmp_path / "a.npz", position=probes.position, sh=by_channel)
+    for words, kind in (((), "assumed: --order"), (("--order", "channel"), "channel by channel (r0 r1 ... g0 ...);")):
+        call("evaluate", fitted, tmp_path / "a.npz", *words)
+        assert "not the input" not in call.stderr and kind in call.stderr
+        assert ("fits light better" in call.stderr) == (not words)
+    call("evaluate", fitted, tmp_path / "a.npz", "--order", "coefficient")
+    assert "not the input" in call.stderr and "Then add --order channel" in call.stderr
 
 
 def test_evaluate_against_another_set(fitted, tmp_path):

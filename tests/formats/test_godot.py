@@ -119,7 +119,7 @@ def test_compressed(tmp_path, block):
 
 def test_damaged_compressed_files(tmp_path):
     data = compress(compressible(*probes(300)))
-    assert "found 0: save without" in message(tmp_path, compress(compressible(*probes()), mode=0))
+    assert "found 0; save it without" in message(tmp_path, compress(compressible(*probes()), mode=0))
     for size in (0, (1 << 20) + 1, 0xFFFFFFFF):
         damaged = data[:8] + struct.pack("<I", size) + data[12:]
         assert f"expected blocks of 1 to 1048576 bytes, found {size}" in message(tmp_path, damaged)
@@ -210,3 +210,34 @@ def test_other_damage_has_its_own_line(tmp_path):
     assert "contains no resource: expected at least one" in message(
         tmp_path, data[:at] + writer.u32(0) + data[at + 4 :]
     )
+
+
+def test_a_long_name_counts_at_each_use(tmp_path):
+    """A path of 65,535 names of 2 MB each: 131 GB from a kilobyte."""
+    writer = Writer()
+    path = writer.u32(22) + writer.numbers("H", 65_535, 0) + writer.u32(0) * 65_535
+    user = [path, writer.u32(11) + writer.reals(0, 0, 1, 1), writer.u32(3, 0), writer.u32(3, -1 & 0xFFFFFFFF)]
+    content = writer.file([("user_data", writer.array(*user))], magic=b"")
+    name = writer.text("uses_spherical_harmonics")
+    long = writer.text("n" * (2 << 20))
+    at = content.index(name)
+    # The main resource starts that much later.
+    place = struct.unpack_from("<Q", content, content.index(b"local://0\0") + 10)[0]
+    moved = content.replace(struct.pack("<Q", place), struct.pack("<Q", place + len(long) - len(name)), 1)
+    data = compress(b"RSRC" + moved[:at] + long + moved[at + len(name) :], 1 << 20)
+    (tmp_path / "a.lmbake").write_bytes(data)
+    assert len(data) < 10_000
+    tracemalloc.start()
+    assert "bytes of names and values for the size of the file" in error_of(read_users, tmp_path / "a.lmbake")
+    assert tracemalloc.get_traced_memory()[1] < 100 << 20
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("value", [b"\1\0\0\0", b"\x05\0\0\0\1\0\0\0\0"])
+def test_many_small_values_in_few_bytes(tmp_path, value):
+    """64 MB of nothing, in blocks that are packed together."""
+    writer = Writer()
+    many = 4_000_000
+    content = writer.file([("x", writer.u32(30, many) + value * many)], magic=b"")
+    (tmp_path / "a.lmbake").write_bytes(compress(b"RSRC" + content, 1 << 20))
+    assert "bytes of names and values for the size of the file" in error_of(read_lmbake, tmp_path / "a.lmbake")

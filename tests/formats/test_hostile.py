@@ -24,6 +24,7 @@ from PIL import Image
 from rich.markup import escape
 
 from benchmarks.rows import read_runs
+from tests.fuzz.limits import Limits
 from wlm import atlas, lightmap
 from wlm.atlas.stored import with_uvs
 from wlm.cli.console import note, show, show_text, table
@@ -39,6 +40,7 @@ from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.meshes import read_mesh
 from wlm.formats.reading import named_file, read_file
+from wlm.lightmap import data
 from wlm.lightmap.model import Profile
 from wlm.probe import load as load_probes
 from wlm.probe import load_positions
@@ -477,7 +479,7 @@ def test_a_grid_whose_box_is_far_larger_than_what_it_stores(tmp_path):
     path = write(tmp_path / "a.nvdb", gzip.decompress((FILES / "bbox-700.nvdb.gz").read_bytes()))
     with little_memory():
         message = refused(load_volume, path)
-    assert "expected a box of at most 20623360 voxels from a grid of 322240 bytes" in message
+    assert "expected a box of at most 20623360 voxels, found [[0, 0, 0], [699, 699, 699]]" in message
 
 
 def test_a_compressed_grid_that_unpacks_to_far_more(tmp_path):
@@ -486,10 +488,38 @@ def test_a_compressed_grid_that_unpacks_to_far_more(tmp_path):
     header = struct.pack("<QIHH", 0x304244566F6E614E, 32 << 21, 1, 1)
     grid = bytearray(176)
     struct.pack_into("<2Q", grid, 0, 200 << 20, 200 * len(body))
+    struct.pack_into("<I", grid, 32, 1)  # a grid of floats
     struct.pack_into("<I", grid, 136, 1)  # of the name, which is empty
     path = write(tmp_path / "a.nvdb", header + grid + b"\0" + 200 * body)
     with little_memory():
         assert "expected at most 256 times its" in refused(load_volume, path)
+
+
+def test_alpha_that_differs_by_time_is_filled_in_linear_time(tmp_path):
+    """Two files serve 4,000 times, and each is read once."""
+    for name, alpha in (("a.exr", [[0.0, 1.0]]), ("b.exr", [[1.0, 0.0]])):
+        write_exr(tmp_path / name, np.dstack([np.full((1, 2, 3), 0.5), alpha]))
+    entries = [{"time_hours": i / 1000, "file": "ab"[i > 1000] + ".exr"} for i in range(4000)]
+    write(tmp_path / "set.json", {"width": 2, "height": 1, "mask": "alpha", "lightmaps": entries})
+    with Limits().held():
+        frames = lightmap.load(tmp_path).light
+    assert (frames.frames == 0.5).all() and frames.covered.sum() == 4000
+
+
+def test_slices_of_one_file_are_decoded_once(tmp_path, monkeypatch):
+    write_exr(tmp_path / "a.exr", np.arange(24, dtype=np.float32).reshape(8, 1, 3))
+    slices = [{"file": "a.exr", "slice": i, "slices": 8} for i in range(8)]
+    layers = {"light": "radiance", "more": "unit"}
+    lightmaps = [{"time_hours": i, "files": {"0": dict.fromkeys(layers, each)}} for i, each in enumerate(slices)]
+    content = {"layers": layers, "atlases": {"0": {"mask": "all"}}, "lightmaps": lightmaps}
+    write(tmp_path / "set.json", content)
+    frames = lightmap.load(tmp_path).light.frames
+    np.testing.assert_array_equal(frames.reshape(8, 3), np.arange(24).reshape(8, 3))
+    # All layers together may decode so many bytes: the light fits, the other layer does not.
+    monkeypatch.setattr(data, "FRAMES", frames.nbytes)
+    monkeypatch.setattr(data, "PICTURE_GROWTH", 0)
+    assert "decoded bytes for the size of the file" in refused(lightmap.load, tmp_path)
+    assert lightmap.load(tmp_path, layers=["light"]).times.size == 8
 
 
 # JSON and YAML, before their values take memory.
@@ -499,7 +529,7 @@ def test_a_compressed_grid_that_unpacks_to_far_more(tmp_path):
 def test_json_whose_values_take_far_more_than_its_text(tmp_path, text):
     with little_memory():
         line = refused(load_probes, write(tmp_path / "a.json", text))
-    assert line.endswith("bytes of values in JSON, the limit for its size, found more")
+    assert line.endswith("bytes of values in JSON for the size of the file, found more")
 
 
 @pytest.mark.parametrize("number", ["1" + "0" * 400, str(2**64), str(-(2**63) - 1)])

@@ -413,3 +413,28 @@ def test_other_files_are_named(tmp_path):
     ):
         (tmp_path / "a.exr").write_bytes(content)
         assert words in error_of(read_light, tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(("number", "name"), [(0, None), (1, None), (4, "Rec. 2020"), (7, "ACES AP1 (ACEScg)")])
+def test_primaries_of_a_ktx2(tmp_path, number, name):
+    light, path, notes = _light(6, 5).astype(np.float32) / 100, tmp_path / "a.ktx2", []
+    content = bytearray(make_ktx2(106, 5, 6, [light.tobytes()]))
+    (descriptor,) = struct.unpack_from("<I", content, DESCRIPTOR_AT)
+    content[descriptor + 13] = number
+    path.write_bytes(content)
+    pixels = read_light(path, notes)[0]
+    assert notes == [f"converted to Rec. 709 from {name}"] * (name is not None)
+    assert np.array_equal(pixels, light) == (name is None)
+    grey = np.float32([0.5, 0.5, 0.5])
+    path.write_bytes(content[: -light.nbytes] + np.broadcast_to(grey, light.shape).tobytes())
+    np.testing.assert_allclose(read_light(path)[0], 0.5, atol=1e-3)
+    content[descriptor + 13] = 200
+    path.write_bytes(content)
+    assert "expected primaries 0, 1, 4, 5, 6, 7, 10, 11, found 200" in error_of(read_light, path)
+
+
+def test_a_colour_profile_of_a_tiff_is_mentioned(tmp_path):
+    path, notes = tmp_path / "a.tif", []
+    _tiff(path, _light(4, 4).astype(np.float32), {"iccprofile": b"profile" * 30})
+    read_light(path, notes)
+    assert notes == ["its colour profile is not applied: colours are taken as Rec. 709"]

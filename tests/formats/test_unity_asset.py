@@ -3,6 +3,7 @@
 import struct
 import sys
 import tracemalloc
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -11,7 +12,7 @@ from builders import unity_assets
 from builders.unity_assets import lighting, node, probes
 
 from wlm.errors import WlmError
-from wlm.formats import unity_asset
+from wlm.formats import unity_asset, unity_child
 from wlm.formats.unity_asset import read_lighting_data
 from wlm.inspection import inspect
 from wlm.probe.conventions import from_canonical
@@ -28,7 +29,8 @@ def unity(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "UnityPy", ModuleType("UnityPy"))
 
     def give(*objects):
-        monkeypatch.setattr(unity_asset, "list_objects", lambda path, data: list(objects))
+        size = sum(len(each[2]) for each in objects)
+        monkeypatch.setattr(unity_asset, "run_child", lambda data: unity_child.encode(objects, size))
         path = tmp_path / "LightingData.asset"
         path.write_bytes(b"".join(each[2] for each in objects) or b"none")
         return path
@@ -99,7 +101,7 @@ def test_no_room_is_made_for_what_a_file_claims(unity):
 
 def test_text_and_bundles_are_named(unity):
     path = unity()
-    for head, said in ((b"%YAML 1.1\n", "found YAML"), (b"UnityFS\0", "found an asset bundle")):
+    for head, said in ((b"%YAML 1.1\n", "found nothing"), (b"UnityFS\0", "found an asset bundle")):
         path.write_bytes(head)
         with pytest.raises(WlmError, match=said):
             read_lighting_data(path)
@@ -116,15 +118,39 @@ def test_without_the_extra(monkeypatch, tmp_path):
 
 def test_a_reader_that_ends_is_told(tmp_path, monkeypatch):
     path, child = tmp_path / "LightingData.asset", tmp_path / "child.py"
+    limits = Path(unity_child.__file__).parent
     path.write_bytes(bytes(64))
     monkeypatch.setitem(sys.modules, "UnityPy", ModuleType("UnityPy"))
     monkeypatch.setattr(unity_asset.unity_child, "__file__", str(child))
     for program, said in (
         ("import os; os.abort()", "UnityPy crashed"),
         ("raise EOFError('no more')", "EOFError: no more"),
-        ("print('[]')", "found neither"),
-        ('print(\'[["LightProbes", [], 60, 8, "<"]]\')', "an object of 8 bytes at 60 exceeds the file of 64 bytes"),
+        ("print('[[], []]')", "found neither"),
+        ("print('[')", "damaged, or UnityPy cannot read its version"),
+        (
+            'print(\'[["LightProbes"], [["m_BakedCoefficients", 9, 27]]]\')',
+            "damaged, or UnityPy cannot read its version",
+        ),
+        ("while True: pass", "exceeded its limits"),
+        ("print(len(bytes(1 << 40)))", "MemoryError"),
     ):
-        child.write_text(program)
+        child.write_text(
+            f"import sys; sys.path.insert(0, {str(limits)!r})\nimport unity_child; unity_child._limit()\n{program}"
+        )
         with pytest.raises(WlmError, match=said):
             read_lighting_data(path)
+
+
+def test_layouts_are_walked_once_and_objects_count_once():
+    """A layout of 40 levels, each twice the one below by reference, and an object that the file has many times."""
+    deep = node("float", "x")
+    for _ in range(40):
+        deep = node("Pair", "data", deep, deep)
+    with pytest.raises((ValueError, OverflowError)):
+        unity_child.encode(
+            [("LightingDataAsset", node("L", "Base", unity_assets.vector("m_Odd", deep)), bytes(64), "<")], 64
+        )
+    item = probes(PLACES, SH)
+    assert unity_child.encode([item], len(item[2]))
+    with pytest.raises(ValueError, match="expected objects at different places"):
+        unity_child.encode([item, item], len(item[2]))

@@ -8,8 +8,9 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 import OpenEXR
+import tifffile
 import warp as wp
-from builders import atlas_meshes, bench_rows, probe_sets, smoke_plumes
+from builders import atlas_meshes, bench_rows, probe_layouts, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
 from builders.textures import make_dds, make_ktx2
 from PIL import Image
@@ -18,6 +19,7 @@ from benchmarks import Row, write_json
 from wlm.atlas.stored import store
 from wlm.fluid.volume import from_array, save_volume
 from wlm.formats.exr import write_exr
+from wlm.probe.ambient_cube import write_irradiance_volume
 from wlm.probe.data import save_probes
 from wlm.smoke.data import open_frames, write_six_way
 from wlm.smoke.march.coarse import with_surface
@@ -63,6 +65,8 @@ def _pictures(folder: Path) -> None:
     image.save(folder / "mask-rgba.png")
     image.convert("L").point(lambda value: 255 * (value > 90)).save(folder / "mask-grey.png")
     image.convert("P").save(folder / "mask-palette.png")
+    image.convert("RGB").save(folder / "levels.jpg")
+    image.save(folder / "levels.webp", lossless=True)
     image.save(folder / "flipbook.png")
     image.save(folder / "flipbook.tga", compression="tga_rle")
 
@@ -74,6 +78,10 @@ def _textures(folder: Path) -> None:
     row = bytes([200, 100, 50, 128, 50, 150, 250, 129]) * 5
     head = b"#?RADIANCE\nEXPOSURE=2\nCOLORCORR=1 2 1\nFORMAT=32-bit_rle_rgbe\n\n"
     (folder / "plain.hdr").write_bytes(head + b"+X 12 +Y 10\n" + 12 * row)
+    head = f"PF\n{_WIDTH} {_HEIGHT}\n-1.0\n".encode()
+    (folder / "light.pfm").write_bytes(head + _pixels(3).astype("<f4").tobytes())
+    tifffile.imwrite(folder / "strips.tif", _pixels(3), photometric="rgb", compression="zlib", rowsperstrip=4)
+    tifffile.imwrite(folder / "tiles.tif", _pixels(1)[..., 0].astype(np.float16), tile=(16, 16), byteorder=">")
     words = np.random.default_rng(1).integers(0, 1 << 32, (4, _HEIGHT, _WIDTH), np.uint32)
     blocks = words.tobytes()[: 9 * 16]
     half = [_pixels(4)[:: 1 << i, :: 1 << i].astype("<f2").tobytes() for i in range(2)]
@@ -162,7 +170,18 @@ def _probe_files(folder: Path) -> None:
     (folder / "probes-list.json").write_text(json.dumps({"convention": "godot", "probes": each}))
     writer = Writer()
     (folder / "probes.lmbake").write_bytes(writer.file(bake(writer, points, sh)))
+    light = probe_sets.synthetic(8).values.reshape(8, 9, 3)
+    write_irradiance_volume(folder / "volume.ktx2", light, np.array([2, 2, 2]))
     np.savez(folder / "positions.npz", position=room.position)
+    vci = [probe_layouts.vci(*row) for row in zip(points, sh.transpose(0, 2, 1), strict=True)]
+    (folder / "probes-vci.json").write_text(json.dumps(vci))
+    scene = probe_layouts.three_scene()
+    for group in scene["object"]["children"][:2]:
+        del group["children"][2:]
+    (folder / "probes-scene.json").write_text(json.dumps(scene))
+    table = probe_layouts.tables()["named.csv"].replace(",", " ").splitlines()[:5]
+    (folder / "probes.csv").write_text("\n".join(table))
+    (folder / "probes.asset").write_text(probe_layouts.unity_text(count=3))
     (folder / "positions.json").write_text(json.dumps(room.position.round(3).tolist()))
 
 

@@ -4,6 +4,7 @@ A new reader is a row: its good files (in `corpus.py`, or made here), how to cha
 format, and a function that reads it as users do and asserts what the format's page forbids.
 """
 
+import base64
 import functools
 import gzip
 import json
@@ -24,6 +25,7 @@ from wlm.bake.settings import LightmapSettings
 from wlm.config import load_settings
 from wlm.errors import WlmError
 from wlm.fluid.volume import load_volume
+from wlm.formats.channels import read_encoded
 from wlm.formats.exr import read_exr
 from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
@@ -74,6 +76,22 @@ def _light_file(path: Path) -> None:
     assert pixels.size, "accepted without a texel"
 
 
+def _levels(path: Path) -> None:
+    light = read_encoded(path, "srgb")
+    check_finite(light=light)
+    assert light.ndim == 3 and light.shape[2] == 3 and light.size, f"accepted as {light.shape}"
+
+
+def _tags(draw: Random, data: bytes) -> bytes:
+    """Changes values of a TIFF's tags, or any bytes."""
+    order = "<" if data[:2] == b"II" else ">"
+    (at,) = struct.unpack_from(f"{order}I", data, 4)
+    (count,) = struct.unpack_from(f"{order}H", data, at)
+    entries = range(at + 2, at + 2 + 12 * count, 12)
+    fields = [(entry + shift, width) for entry in entries for shift, width in ((0, 2), (2, 2), (4, 4), (8, 2), (8, 4))]
+    return vary_numbers(draw, data, fields) if draw.random() < 0.7 else corrupt(draw, data)
+
+
 def _six_way(path: Path) -> None:
     six, looks = read_shaded(path)
     assert looks is None or looks.ramp is None or len(looks.ramp.stops) > 1, "accepted with a glow of one colour"
@@ -121,6 +139,38 @@ def _mesh(path: Path) -> None:
     finally:
         again.unlink(missing_ok=True)
     _lit(path)
+
+
+def _own_lights() -> Sequence[bytes]:
+    """glTF files that name their lightmaps, by each kind of extension; the picture is inside."""
+    plain, *pictures = corpus("mesh.gltf", "mask-rgba.png", "plain.hdr")()
+    png, radiance = (base64.b64encode(each).decode() for each in pictures)
+    turned = {"KHR_texture_transform": {"scale": [0.5, 0.5], "offset": [0.25, 0.5], "rotation": 0.1, "texCoord": 1}}
+    info = {"index": 0, "texCoord": 1}
+    renderer = {"lightmapIndex": 0, "lightmapScaleOffset": {"x": 0.5, "y": 0.5, "z": 0.0, "w": 0.5}}
+    needle = {"textures": [{"pointer": "textures/0", "type": 0, "index": 0}]}
+    place = {"texture": info, "coordinateScaleBias": [0.5, 0.5, 0.0, 0.25]}
+    scenes = []
+    for material, node, root in (
+        ({"MOZ_lightmap": {"index": 0, "intensity": 2.0, "extensions": turned}}, {}, {}),
+        ({"FB_materials_lightmap": {"lightmapTexture": info, "lightmapFactor": [1.0, 2.0, 3.0]}}, {}, {}),
+        ({}, {"MX_lightmap": {"lightMapTexture": info, "scale": [0.5, 0.5], "offset": [0.5, 0.0]}}, {}),
+        ({}, {"EPIC_lightmap_textures": {"lightmap": 0}}, {"EPIC_lightmap_textures": {"lightmaps": [place]}}),
+        ({}, {"NEEDLE_components": {"builtin_components": [renderer]}}, {"NEEDLE_lightmaps": needle}),
+    ):
+        content = json.loads(plain)
+        picture = radiance if root or "FB_materials_lightmap" in material else png
+        content["images"] = [{"uri": f"data:image/png;base64,{picture}"}]
+        content["materials"] = [{"extensions": material}]
+        content["nodes"][1]["extensions"], content["extensions"] = node, root
+        scenes.append(json.dumps(content).encode())
+    return scenes
+
+
+def _own_lit(path: Path) -> None:
+    for sheet in wlm.atlas.load(path).sheets:
+        check_finite(position=sheet.position, uv=sheet.uv, lightmap=sheet.lightmap)
+        assert sheet.triangle.max() < len(sheet.position), "a corner beyond the vertices"
 
 
 def _obj(path: Path) -> None:
@@ -190,6 +240,15 @@ def _grid_fields(data: bytes) -> list[tuple[int, int]]:
 
 def _grid(draw: Random, data: bytes) -> bytes:
     return vary_numbers(draw, data, _grid_fields(data))
+
+
+def _table(draw: Random, data: bytes) -> bytes:
+    return vary_text(draw, data.decode(), (",", ";", "r0", "x", "sh", "#", "\t", "1e999", "nan"))
+
+
+def _asset_text(draw: Random, data: bytes) -> bytes:
+    words = ("  m_Positions:", "- {x: ", "sh[ 0]: ", "--- !u!258 &1", "    ", "{", "LightProbes:")
+    return vary_text(draw, data.decode(), words)
 
 
 def _godot(draw: Random, data: bytes) -> bytes:
@@ -348,6 +407,10 @@ _ALL = (
     *models.READERS,
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
     Reader("radiance", "a.hdr", corpus("runs.hdr", "plain.hdr"), vary_radiance, _light_file),
+    Reader("pfm", "a.pfm", corpus("light.pfm"), corrupt, _light_file),
+    Reader("tiff", "a.tif", corpus("strips.tif", "tiles.tif"), _tags, _light_file),
+    Reader("jpeg", "a.jpg", corpus("levels.jpg"), corrupt, _levels),
+    Reader("webp", "a.webp", corpus("levels.webp"), corrupt, _levels),
     Reader("ktx2", "a.ktx2", corpus(*_KTX2), vary_ktx2, _light_file),
     Reader("inspect", "a.json", corpus("set.json", "probes.json", "positions.json"), _json, _inspect),
     Reader("dds", "a.dds", corpus("shared.dds", "bc6h.dds", "float-legacy.dds"), vary_dds, _light_file),
@@ -357,11 +420,16 @@ _ALL = (
     Reader("tga-flipbook", "a.tga", corpus("flipbook.tga"), _tga, _flipbook),
     Reader("gltf", "a.gltf", corpus("mesh.gltf"), vary_gltf, _mesh, _light, cost=2),
     Reader("glb", "a.glb", corpus("mesh.glb"), vary_glb, _mesh, _light, cost=2),
+    Reader("gltf-lights", "a.gltf", _own_lights, vary_gltf, _own_lit, cost=2),
     Reader("gltf-bake", "a.gltf", corpus("mesh.gltf"), vary_gltf, _surfaces, _light, cost=2),
     Reader("obj", "a.obj", corpus("mesh.obj"), _obj_lines, _obj, _light),
     Reader("atlas-lights", "lights.json", _light_lists, _json, read_listing),
     Reader("probes-npz", "a.npz", corpus("probes.npz", "probes-known.npz"), vary_npz, _probes),
     Reader("probes-json", "a.json", corpus("probes.json", "probes-list.json", "probes-known.json"), _json, _probes),
+    Reader("probes-json-forms", "a.json", corpus("probes-vci.json", "probes-scene.json"), _json, _probes),
+    Reader("probes-table", "a.csv", corpus("probes.csv"), _table, _probes),
+    Reader("probes-ktx2", "a.ktx2", corpus("volume.ktx2"), vary_ktx2, _probes),
+    Reader("probes-asset-text", "a.asset", corpus("probes.asset"), _asset_text, _probes),
     Reader("probes-lmbake", "a.lmbake", corpus("probes.lmbake"), _godot, _probes),
     Reader("positions-npz", "a.npz", corpus("positions.npz"), vary_npz, _positions),
     Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),

@@ -5,7 +5,9 @@ import torch
 from builders.smoke_plumes import plume
 
 import wlm
+from wlm.errors import WlmError
 from wlm.fluid.volume import save_volume
+from wlm.smoke.codec import open_network
 
 
 @pytest.fixture
@@ -51,3 +53,13 @@ def test_a_predictor_for_many_frames(smoke):
     assert not torch.equal(predictor(smoke, cameras[0], 2).lightmaps, first[0].lightmaps)
     # Of smoke as smooth as this, on a grid as small, the march says all.
     assert float(predictor.share) < 0.2 and "its guide, the coarse march, is as accurate" in predictor.note()
+
+
+def test_a_network_of_extreme_weights_is_an_error(smoke):
+    """Half floats hold the weights, but float32 does not hold what they give."""
+    model = open_network()
+    with torch.no_grad():
+        for weight in model.network.parameters():
+            weight.fill_(65504.0)
+    with pytest.raises(WlmError, match="the network predicts NaN or infinite light"):
+        wlm.smoke.predict(smoke, wlm.smoke.Camera.around(smoke, pixels=16), model)

@@ -9,6 +9,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import torch
+import warp as wp
 import yaml
 from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
 from pydantic import ValidationError
@@ -18,6 +19,7 @@ from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
 from wlm.fluid.volume import save_volume
 from wlm.formats.exr import read_planes, write_planes
+from wlm.smoke import simulation
 from wlm.smoke.data import (
     CHECKPOINT,
     NumberedFiles,
@@ -40,12 +42,68 @@ from wlm.smoke.scene import (
     make_camera,
     obstacle_mesh,
 )
+from wlm.smoke.simulation import warnings_of
 
 
 def _scene(tmp_path, **changed):
     path = tmp_path / "scene.yaml"
     path.write_text(yaml.safe_dump(SCENE | changed))
     return load_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({}, None),
+        ({"inlets": []}, "sources, inlets: there are none"),
+        ({"sources": [{"centre": [5, 5, 5], "radius": 0.1}]}, "sources.0: it is outside the box from"),
+        ({"sources": [{"centre": [0, 0.5, 0.5], "radius": 0.1}]}, None),
+        (
+            {"sources": [{"centre": [0, 0.5, 0], "radius": 0.1, "start": 9}]},
+            "sources.0: it is not active between 0 and",
+        ),
+        ({"sources": [{"centre": [0, 0.5, 0], "radius": 0.03}]}, "sources.0: it is smaller than a voxel of 0.05 m"),
+        ({"obstacles": [SPHERE]}, "obstacles.0: it is thinner than a cell of 0.2 m"),
+        ({"obstacles": [SPHERE | {"radius": 0.18}]}, None),
+        ({"obstacles": [SPHERE | {"radius": 0.18, "path": [[0, 2, 0, 0]]}]}, "obstacles.0: it is outside the box"),
+        (
+            {"obstacles": [{"shape": "box", "radius": [2, 0.01, 2], "path": [[0, 0, 1.3, 0]]}]},
+            "obstacles.0: it is outside",
+        ),
+    ],
+)
+def test_what_has_no_effect_is_said(tmp_path, changed, words):
+    warnings = warnings_of(_scene(tmp_path, **changed))
+    assert len(warnings) == (words is not None) and all(f"plume: {words}" in each for each in warnings)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "box", "cylinder"])
+def test_a_thin_obstacle_covers_a_cell_wherever_it_is(tmp_path, shape):
+    radius = 0.01 if shape == "sphere" else [0.01, 0.01, 0.01]
+    scene = _scene(tmp_path, obstacles=[{"shape": shape, "radius": radius, "path": [[0, 0, 0.6, 0]]}])
+    (obstacle,), solid = simulation._obstacles(scene), wp.zeros(scene.grid.cells, wp.uint8, "cpu")
+    for position in [[2.0, 3.0, 2.0], *np.random.default_rng(2).uniform(1, 4, (40, 3))]:
+        obstacle.cover(solid, 1, np.asarray(position))
+        assert 1 <= solid.numpy().sum() <= 8
+    # A wall through the box has no hole.
+    wall = {"shape": "box", "radius": [1, 0.004, 1], "path": [[0, 0, 0.6, 0]]}
+    (obstacle,) = simulation._obstacles(_scene(tmp_path, obstacles=[wall]))
+    for height in np.linspace(1, 4, 31):
+        obstacle.cover(solid, 1, np.array([2.5, height, 2.5]))
+        assert solid.numpy().any(1).all()
+
+
+def test_settings_that_exclude_each_other_are_one_line(tmp_path):
+    """The message has the names and the reason, and not the settings."""
+    faces = dict.fromkeys(("-x", "+x", "+y", "-z", "+z"), "wall")
+    for changed, words in (
+        ({"grid": SCENE["grid"] | {"faces": faces}}, "scene.yaml: inlets: expected an open face without an inlet"),
+        ({"grid": SCENE["grid"] | {"faces": {"-x": "periodic"}}}, "scene.yaml: grid.faces: expected both faces of"),
+        ({"inlets": [SCENE["inlets"][0] | {"velocity": [0, -1, 0]}]}, "scene.yaml: inlets.0.velocity: expected a vel"),
+    ):
+        with pytest.raises(WlmError, match=words) as caught:
+            _scene(tmp_path, **changed)
+        assert "{" not in str(caught.value) and "got" not in str(caught.value)
 
 
 def test_a_scene_from_a_file(tmp_path):
@@ -115,10 +173,16 @@ def test_scaling_keeps_one_cell(tmp_path):
         ),
         ({"obstacles": [SPHERE | {"path": []}]}, "obstacles.0.path"),
         ({"obstacles": [SPHERE | {"path": [[0, 0, 0, 0], [0, 1, 1, 1]]}]}, "0.path: expected times that increase"),
-        ({"obstacles": [SPHERE | {"shape": "box"}]}, "obstacles.0: expected one number for a sphere, three"),
+        ({"obstacles": [SPHERE | {"shape": "box"}]}, "obstacles.0.radius: expected one number for a sphere, three"),
         ({"inlets": [{"face": "up", "velocity": [0, 1, 0]}]}, "inlets.0.face"),
-        ({"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]}, "inlets.0: expected a velocity that points into"),
-        ({"inlets": [{"face": "-x", "velocity": [0, 1, 0]}]}, "inlets.0: expected a velocity that points into"),
+        (
+            {"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]},
+            "inlets.0.velocity: expected a velocity that points into",
+        ),
+        (
+            {"inlets": [{"face": "-x", "velocity": [0, 1, 0]}]},
+            "inlets.0.velocity: expected a velocity that points into",
+        ),
         ({"grid": {"cells": [4, 4, 4], "cell": 1, "faces": dict.fromkeys(FACES, "wall")}}, "expected an open face"),
         (
             {"grid": {"cells": [4, 4, 4], "cell": 1, "faces": {"-y": "periodic", "+y": "periodic"}}},

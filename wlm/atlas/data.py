@@ -20,13 +20,16 @@ from pathlib import Path
 
 import numpy as np
 
+from wlm.atlas.charts import charts, welded
 from wlm.atlas.coverage import covered_texels, touched_texels
-from wlm.atlas.listing import Listing, SheetFiles, is_listing, lone_lightmap, material_lightmaps, read_listing
-from wlm.atlas.matching import chart_map, choose_mesh, fits_flipped, named, replace_strays
+from wlm.atlas.listing import Listing, SheetFiles, is_listing, lone_lightmap, read_listing
+from wlm.atlas.matching import all_by_name, chart_map, choose_mesh, fits_flipped, misfits, named, replace_strays
+from wlm.atlas.materials import Readings, own_lightmaps, settle, slot_readings
 from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
-from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf, reported
+from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf
 from wlm.formats.light import noted, read_light
+from wlm.formats.limits import FRAMES, PICTURE_GROWTH, check_growth
 from wlm.formats.mask import read_mask
 from wlm.formats.meshes import SUFFIXES, read_mesh
 from wlm.ops.indoors import Indoors, indoors
@@ -34,7 +37,14 @@ from wlm.texels import doubts, fill_gaps, repair
 
 _FLAT = 1e-12  # ratio of area to longest side squared below which float64 can't distinguish the area from 0
 _FACES = 6  # faces of a cube
+_TEXELS = 12.0  # UDIM tiles and repeated textures reach less far
+_EDGE = 1e-6  # width of the border of the UV square that counts as inside
+_WHOLE = (1.0, 1.0, 0.0, 0.0)
 _MISSED = 0.01  # fraction of covered texels that a mask may miss without a warning
+
+
+Rectangle = tuple[float, float, float, float]
+"""Scale and offset of UVs, v down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +70,7 @@ class Placed:
     node: int
     label: str
     sheet: int
-    scale_offset: tuple[float, float, float, float] = (1.0, 1.0, 0.0, 0.0)
+    scale_offset: Rectangle = (1.0, 1.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +190,7 @@ def load(
     node: str | None = None,
     encoding: str | None = None,
     flip: bool = False,
+    slot: str | None = None,
     trust: bool = False,
 ) -> LightmappedScene:
     """Reads a mesh or scene and its lightmaps.
@@ -188,15 +199,16 @@ def load(
         mesh_path: A `.glb`, `.gltf`, `.obj` or `.ply` file.
         lights_path: One lightmap (EXR, Radiance, KTX2, DDS: see `wlm.formats.light`; or PNG), row 0 at v = 0 of glTF
             and v = 1 of other formats; or a list of lightmaps, a folder of them or a Godot bake, see
-            `wlm.atlas.listing`; None: the lightmaps that the materials name.
+            `wlm.atlas.listing`; None: the lightmaps that the glTF file names itself, see `wlm.atlas.materials`.
         mask_path: With one lightmap, a PNG of its size; a texel belongs to a chart where any colour channel is above
             0. None derives it from the triangles.
         uv_set: n of `TEXCOORD_n`, the lightmap's UVs. None: the set that a list of lightmaps names; without one, 1,
             where engines look for lightmap UVs, if any primitive has it; else 0. Formats other than glTF have only 0.
         node: If there is one lightmap, the node that it belongs to: the node's name, its mesh's name or its number.
-        encoding: If there is one lightmap, a PNG's encoding, one of `wlm.formats.channels.ENCODINGS`; None for other
-            files.
+        encoding: If there is one lightmap, a PNG's encoding, one of `wlm.formats.channels.ENCODINGS`; None: no PNG. For
+            the glTF file's own lightmaps, that of images of 8 bits; None: that of their extension.
         flip: If there is one lightmap, whether its top row is at v = 1 of glTF.
+        slot: "occlusion" or "emissive": the slot of the materials that holds the lightmaps.
         trust: Whether files may name files outside their folder, and decompress to huge data (`wlm.formats.limits`).
 
     Raises:
@@ -205,35 +217,85 @@ def load(
     path = Path(mesh_path)
     document, primitives, metres = _read_triangles(path, trust)
     alone = not is_listing(lights_path)
-    if alone:
-        listing = lone_lightmap(lights_path, path.stem, mask_path, encoding, flip)
-    else:
-        for name, value in {"mask": mask_path, "node": node, "encoding": encoding, "flip": flip or None}.items():
+    if not alone:
+        given = {"mask": mask_path, "node": node, "encoding": lights_path and encoding, "flip": flip or None}
+        for name, value in given.items():
             if value is not None:
                 raise WlmError(f"{name}: can't be given with a list of lightmaps; state it in the list")
-        listing = _listed(path, document, lights_path)
+    if slot is not None and lights_path is not None:
+        raise WlmError("slot: only allowed without lightmaps beside the mesh: it reads those of its materials")
+    sets = {number for each in primitives for number in each.uv}
+    known = uv_set if uv_set in sets else None
+    readings: Readings = {}
+    if lights_path is None:
+        own = own_lightmaps(document, primitives, slot, encoding, known)
+        listing, readings, notes = own.listing, own.readings, own.notes
+    else:
+        listing = lone_lightmap(lights_path, path.stem, mask_path, encoding, flip) if alone else None
+        listing = read_listing(lights_path) if listing is None else listing
+        known = listing.uv_set if known is None else known
+        default = 1 if 1 in sets else 0
+        stem = Path(listing.sheets[0].files[0]).stem
+        readings, notes = slot_readings(document, primitives, default if known is None else known, stem)
+        notes = listing.notes + notes
+    places: dict[int, tuple[int, Rectangle]] = {}
+    if readings:
+        document, primitives, known, places = settle(document, primitives, readings)
     if node is not None:
         primitives = named(str(path), primitives, node)
-    readers, uv_set, skipped = _select(str(path), primitives, listing.uv_set if uv_set is None else uv_set)
-    placed = None if listing.objects is None else _placed(str(path), readers, listing)
-    sheets, objects, used = [], [], set()
+    wanted = known if uv_set is None or uv_set in sets else uv_set
+    readers, uv_set, skipped = _select(str(path), primitives, wanted)
+    placed: list[tuple[GltfPrimitive, Placed]] | None = None
+    if lights_path is None:
+        placed = [(each, Placed(each.node, each.label, *places[each.node])) for each in readers if each.node in places]
+    elif listing.tiles and _leave_square(readers, uv_set):
+        document, primitives, placed = _tiled(str(path), readers, uv_set, listing)
+        notes = (
+            *notes,
+            f"{listing.path}: UDIM tiles {', '.join(map(str, listing.tiles))}, each with the charts inside it",
+        )
+    elif listing.objects is not None:
+        placed = _placed(str(path), readers, listing, places)
+    sheets: list[Sheet] = []
+    objects, owner = [], {}
+    size, decoded = sum(map(len, document.buffers)), 0
+    names_of = [files.name or Path(files.files[0]).stem for files in listing.sheets]
+    by_name = {} if placed is not None or alone else all_by_name(names_of, readers)
+    if by_name:
+        matches = ", ".join(f"{names_of[number]} of {group[0].label}" for number, group in list(by_name.items())[:8])
+        notes = (*notes, f"{listing.path}: each lightmap belongs to the mesh of its name: {matches}")
     for number, files in enumerate(listing.sheets):
-        notes: list[str] = []
-        lightmaps, mask, names = _read_lightmaps(listing, files, trust, notes)
-        label = files.name or Path(files.files[0]).stem
-        if placed is None:
-            chosen, warnings = choose_mesh(str(path), label, readers, uv_set, lightmaps[0])
-            nodes = {each.node: each.label for each in chosen}
-            objects += [Placed(each, name, number) for each, name in nodes.items()]
+        told: list[str] = []
+        lightmaps, mask, names, read = _read_lightmaps(listing, files, trust, told)
+        size, decoded = size + read, decoded + lightmaps.nbytes
+        if not trust:
+            check_growth(f"{listing.path}: its lightmaps", size, decoded, PICTURE_GROWTH, FRAMES)
+        label, warnings = names_of[number], []
+        if placed is not None:
+            pairs = [(each, place) for each, place in placed if place.sheet == number]
         else:
-            chosen, warnings = [_moved(each, uv_set, place) for each, place in placed if place.sheet == number], []
-            objects += [place for _, place in placed if place.sheet == number]
-        if not chosen:
+            moved = {(each.node, each.primitive): _moved(each, uv_set, _base(places, each, number)) for each in readers}
+            candidates = by_name.get(number) or readers
+            chosen, warnings = choose_mesh(
+                str(path), label, [moved[each.node, each.primitive] for each in candidates], uv_set, lightmaps[0], alone
+            )
+            keys = {(each.node, each.primitive) for each in chosen}
+            pairs = [(each, _base(places, each, number)) for each in readers if (each.node, each.primitive) in keys]
+        if not pairs:
             raise WlmError(f"{listing.path}: sheets[{number}]: no triangle of the mesh is lit by it")
-        used |= {(each.node, each.primitive) for each in chosen}
-        warnings = skipped * alone + notes + warnings
-        sheets.append(_checked(str(path), label, chosen, uv_set, lightmaps, mask, names, warnings))
-    rest = [] if alone else [each for each in primitives if (each.node, each.primitive) not in used]
+        objects += [place for _, place in pairs]
+        for each, _ in pairs:
+            other = owner.setdefault((each.node, each.primitive), number)
+            if other != number:
+                raise WlmError(
+                    f"{listing.path}: {names_of[other]} and {label} are both lightmaps of {each.label}: expected one "
+                    "for each mesh, named like the mesh, or a .json list with objects"
+                )
+        warnings = (list(notes) if number == 0 else []) + skipped * alone + told + warnings
+        chosen = [_moved(each, uv_set, place) for each, place in pairs]
+        others = _alternatives(pairs, uv_set)
+        sheets.append(_checked(str(path), label, chosen, uv_set, lightmaps, mask, names, warnings, others))
+    rest = [] if alone else [each for each in primitives if (each.node, each.primitive) not in owner]
     blocker = np.concatenate([np.empty((0, 3, 3)), *(each.position[each.triangle] for each in rest)])
     objects = tuple(dict.fromkeys(objects))
     source = _hash(sheets)
@@ -386,16 +448,6 @@ def _compact(where: str, name: str, position: np.ndarray, triangle: np.ndarray, 
         return name, position[used].astype(np.float32), corner.reshape(-1, 3), uv[used].astype(np.float32)
 
 
-def _listed(path: Path, document: GltfDocument, lights_path: str | os.PathLike[str] | None) -> Listing:
-    if lights_path is not None:
-        return read_listing(lights_path)
-    with reported(path):
-        listing = material_lightmaps(document)
-    if listing is None:
-        raise WlmError(f"{path}: no material has a lightmap (MOZ_lightmap): give a lightmap or a list of lightmaps")
-    return listing
-
-
 def _select(
     where: str, primitives: list[GltfPrimitive], uv_set: int | None
 ) -> tuple[list[GltfPrimitive], int, list[str]]:
@@ -419,22 +471,84 @@ def _select(
     return selected, uv_set, [line]
 
 
-def _placed(where: str, readers: list[GltfPrimitive], listing: Listing) -> list[tuple[GltfPrimitive, Placed]]:
-    """Finds the primitives that the objects of a list name, and their rectangles in the sheets."""
+def _placed(
+    where: str, readers: list[GltfPrimitive], listing: Listing, places: dict[int, tuple[int, Rectangle]]
+) -> list[tuple[GltfPrimitive, Placed]]:
+    """Finds the primitives that the objects of a list name, and their rectangles in the sheets. `places` has the
+    rectangles of texture transforms, which apply first."""
     pairs = []
     for each in listing.objects or ():
         for primitive in named(where, readers, each.node):
-            pairs.append((primitive, Placed(primitive.node, primitive.label, each.sheet, tuple(each.scale_offset))))
-    places: dict[tuple[int, int], Placed] = {}
+            sx, sy, x, y = _base(places, primitive, each.sheet).scale_offset
+            width, height, left, top = each.scale_offset
+            rectangle = (width * sx, height * sy, width * x + left, height * y + top)
+            pairs.append((primitive, Placed(primitive.node, primitive.label, each.sheet, rectangle)))
+    found: dict[tuple[int, int], Placed] = {}
     for primitive, place in pairs:
-        if places.setdefault((primitive.node, primitive.primitive), place) != place:
+        if found.setdefault((primitive.node, primitive.primitive), place) != place:
             raise WlmError(f"{listing.path}: objects: {primitive.label} is given two lightmaps")
     return list({(each.node, each.primitive): (each, place) for each, place in pairs}.values())
 
 
+def _base(places: dict[int, tuple[int, Rectangle]], primitive: GltfPrimitive, sheet: int) -> Placed:
+    """Returns the place of a primitive in a sheet by its texture transform alone."""
+    rectangle = places[primitive.node][1] if primitive.node in places else _WHOLE
+    return Placed(primitive.node, primitive.label, sheet, rectangle)
+
+
+def _leave_square(readers: Sequence[GltfPrimitive], uv_set: int) -> bool:
+    return any(((each.uv[uv_set] < -_EDGE) | (each.uv[uv_set] > 1.0 + _EDGE)).any() for each in readers)
+
+
+def _tiled(
+    where: str, readers: Sequence[GltfPrimitive], uv_set: int, listing: Listing
+) -> tuple[GltfDocument, list[GltfPrimitive], list[tuple[GltfPrimitive, Placed]]]:
+    """Splits primitives by UDIM tile: tile 1001 + i + 10 j has u from i to i + 1 and v, up, from j to j + 1. Returns a
+    document with a mesh for each primitive and tile, its primitives, and their places in the sheets."""
+    meshes, sheets = [], []
+    for each in readers:
+        _check_finite(where, each, uv_set)
+        uv = each.uv[uv_set].astype(np.float64)
+        middle = uv[each.triangle].mean(axis=1)
+        column, row = np.floor(middle[:, 0]), np.floor(1.0 - middle[:, 1])
+        tile = np.where((column < 0) | (column > 9) | (row < 0), -1, 1001 + column + 10 * row)
+        for number in np.unique(tile).astype(np.int64).tolist():
+            if number not in listing.tiles:
+                at = ", ".join(f"{x:.3g}" for x in middle[tile == number][0])
+                raise WlmError(
+                    f"{where}: {each.name}: {_count(int((tile == number).sum()), 'triangle')} at UV ({at}) of "
+                    f"TEXCOORD_{uv_set}: expected UDIM tiles {', '.join(map(str, listing.tiles))}"
+                )
+            here = tile == number
+            local = uv + [-float((number - 1001) % 10), float((number - 1001) // 10)]
+            name = f"{each.label}.{number}"
+            meshes.append(_compact(where, name, each.position, each.triangle[here], local))
+            sheets.append(listing.tiles.index(number))
+    document, primitives = document_from_meshes(meshes, Path(where).stem, uv_set)
+    placed = [(each, Placed(each.node, each.label, sheet)) for each, sheet in zip(primitives, sheets, strict=True)]
+    return document, primitives, placed
+
+
+def _alternatives(pairs: Sequence[tuple[GltfPrimitive, Placed]], uv_set: int) -> list[tuple[str, np.ndarray]]:
+    """Lists other UVs that a sheet's triangles might have been baked with: words for a message, and UVs [V, 2]."""
+    found = []
+    for number in sorted(set.intersection(*(set(each.uv) for each, _ in pairs)) - {uv_set}):
+        uv = [_moved(each, number, place).uv[number] for each, place in pairs]
+        found.append((f"TEXCOORD_{number} (--uv-set {number})", np.concatenate(uv)))
+    if any(place.scale_offset != _WHOLE for _, place in pairs):
+        stored = np.concatenate([each.uv[uv_set] for each, _ in pairs])
+        found.append((f"TEXCOORD_{uv_set} as stored, without rectangle or texture transform", stored))
+        turned = []
+        for each, place in pairs:
+            sx, sy, x, y = place.scale_offset
+            turned.append(_moved(each, uv_set, replace(place, scale_offset=(sx, sy, x, 1.0 - sy - y))).uv[uv_set])
+        found.append(("rectangles that are counted from the bottom (convention unity)", np.concatenate(turned)))
+    return found
+
+
 def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitive:
     sx, sy, x, y = place.scale_offset
-    if (sx, sy, x, y) == (1.0, 1.0, 0.0, 0.0):
+    if place.scale_offset == _WHOLE:
         return primitive
     uv = primitive.uv[uv_set] * np.float32([sx, sy]) + np.float32([x, y])
     return replace(primitive, uv=primitive.uv | {uv_set: uv})
@@ -442,32 +556,36 @@ def _moved(primitive: GltfPrimitive, uv_set: int, place: Placed) -> GltfPrimitiv
 
 def _read_lightmaps(
     listing: Listing, files: SheetFiles, trust: bool, warnings: list[str]
-) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask, or None. Also returns the names of their files;
-    assumptions and doubts are added to `warnings`."""
+) -> tuple[np.ndarray, np.ndarray | None, list[str], int]:
+    """Reads a sheet's lightmaps, float32 [M, H, W, 3], and its mask, or None. Also returns the names of their files for
+    messages, and the bytes of the lightmaps that are files of their own; assumptions and doubts are added to
+    `warnings`."""
     lightmaps: list[np.ndarray] = []
     notes: list[list[str]] = []
-    names = [str(listing.file(name, trust)) for name in files.files]
-    for path in names:
+    names, size = [], 0
+    for name in files.files:
         notes.append([])
-        if files.encoding is None:
-            light = read_light(path, notes[-1])[0]
-            notes[-1] += doubts(light[..., :3])
-        else:
-            light = read_encoded(path, files.encoding, notes[-1])
+        with listing.opened(name, trust) as (path, label):
+            if files.encoding is None:
+                light = read_light(path, notes[-1])[0]
+                notes[-1] += doubts(light[..., :3])
+            else:
+                light = read_encoded(path, files.encoding, notes[-1])
+            size += 0 if name in listing.held else os.path.getsize(path)
+        names.append(label)
         light = np.array(light[:: -1 if files.flip else 1, :, :3], np.float32, order="C")
         if files.intensity != 1.0:
             with np.errstate(invalid="ignore", over="ignore"):  # an overflow is repaired like an infinity in the file
                 light *= np.float32(files.intensity)
         if lightmaps and light.shape != lightmaps[0].shape:
-            size, first = ("x".join(map(str, each.shape[1::-1])) for each in (light, lightmaps[0]))
-            raise WlmError(f"{path}: expected {first} texels, the size of the sheet's first lightmap, found {size}")
+            shape, first = ("x".join(map(str, each.shape[1::-1])) for each in (light, lightmaps[0]))
+            raise WlmError(f"{label}: expected {first} texels, the size of the sheet's first lightmap, found {shape}")
         lightmaps.append(light)
     warnings += noted(names, notes)
     stack = np.stack(lightmaps) if len(lightmaps) > 1 else lightmaps[0][None]
     mask_path = None if files.mask is None else listing.file(files.mask, trust)
     mask = None if mask_path is None else read_mask(mask_path, names[0], stack.shape[1:3])
-    return stack, mask, [*names, str(mask_path)]
+    return stack, mask, [*names, str(mask_path)], size
 
 
 def _checked(
@@ -479,9 +597,11 @@ def _checked(
     mask: np.ndarray | None,  # [H, W]
     names: Sequence[str],
     warnings: Sequence[str] = (),
+    alternatives: Sequence[tuple[str, np.ndarray]] = (),
 ) -> Sheet:
     """Checks and repairs the triangles and lightmaps [M, H, W, 3] of a sheet. If there are no lightmaps (M = 0), the
-    mask is required. `names` are the files of the lightmaps and the mask, for messages."""
+    mask is required. `names` are the files of the lightmaps and the mask, for messages; `alternatives` are other UVs
+    [V, 2] to compare with, and words for them."""
     warnings, parts, vertices, triangles = list(warnings), [], 0, 0
     for primitive in primitives:
         _check_finite(where, primitive, uv_set)
@@ -494,6 +614,7 @@ def _checked(
     beyond = np.maximum(-uv, uv - 1.0).max(axis=1)
     outside = np.count_nonzero(beyond > 0)
     if outside:
+        _check_inside(where, position, uv, triangle, uv_set, alternatives)
         warnings.append(
             f"{name}: {_count(outside, 'vertex', 'vertices')} with UVs outside [0, 1], by up to {beyond.max():.3g}: "
             "clamped"
@@ -506,18 +627,21 @@ def _checked(
     if flat:
         warnings.append(f"{name}: {_count(flat, 'triangle')} without area in space or in UV: left out")
     if len(lightmaps):
-        mask, lines = _checked_light(name, position, uv, triangle[active], uv_set, lightmaps, mask, names)
-        warnings += lines
+        chart = chart_map(position, uv, triangle[active], *lightmaps.shape[1:3])
+        used = f"TEXCOORD_{uv_set}"
+        lines = misfits(name, lightmaps[0], position, triangle[active], uv, chart, used, alternatives)
+        mask, repairs = _checked_light(name, uv, triangle[active], chart, used, lightmaps, mask, names)
+        warnings += lines + repairs
         lightmaps = fill_gaps(lightmaps, mask)
     return Sheet(name, position, triangle, uv, active, lightmaps, mask, tuple(parts), tuple(warnings))
 
 
 def _checked_light(
     name: str,
-    position: np.ndarray,
     uv: np.ndarray,
     triangle: np.ndarray,  # only active triangles
-    uv_set: int,
+    chart: np.ndarray,
+    used: str,
     lightmaps: np.ndarray,
     mask: np.ndarray | None,
     names: Sequence[str],
@@ -531,7 +655,7 @@ def _checked_light(
     texels = 0.5 * float(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]).sum()) * height * width
     if texels < 1.0:
         warnings.append(
-            f"{name}: all triangles together have {texels:.2g} texels of {width} x {height} in TEXCOORD_{uv_set}: are "
+            f"{name}: all triangles together have {texels:.2g} texels of {width} x {height} in {used}: are "
             "its UVs in [0, 1]?"
         )
     coverage = covered_texels(uv, triangle, height, width)
@@ -551,15 +675,49 @@ def _checked_light(
         if missed > _MISSED * covered:
             warnings.append(
                 f"{name}: {_count(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
-                f"does it belong to another UV set than TEXCOORD_{uv_set}, or is it upside down?"
+                f"does it belong to another UV set than {used}, or is it upside down?"
             )
-    if fits_flipped(lightmaps[0], chart_map(position, uv, triangle, height, width)):
+    if fits_flipped(lightmaps[0], chart):
         warnings.append(f"{names[0]}: fits the mesh's charts better upside down: see flip (--flip)")
     for lightmap, path in zip(lightmaps, names, strict=False):
         if specks := replace_strays(lightmap, mask, coverage > 0):
             warnings.append(f"{path}: {_count(specks, 'texel')} in specks far above all other light: replaced")
         warnings += [f"{path}: {text}" for text in repair(lightmap, mask, path)]
     return mask, warnings
+
+
+def _check_inside(
+    where: str,
+    position: np.ndarray,
+    uv: np.ndarray,
+    triangle: np.ndarray,
+    uv_set: int,
+    alternatives: Sequence[tuple[str, np.ndarray]],
+) -> None:
+    """Raises an error if a chart lies wholly outside [0, 1]: its light would be lost."""
+    corner = uv[triangle]
+    beyond = ((corner <= _EDGE).all(axis=1) | (corner >= 1.0 - _EDGE).all(axis=1)).any(axis=1)
+    if not (beyond & _has_area(uv, triangle)).any():
+        return
+    number = charts(welded(position, uv, triangle))
+    count = number.max() + 1
+    lost = np.bincount(number, _has_area(uv, triangle), count) > 0
+    lost &= np.bincount(number, ~beyond, count) == 0
+    if not lost.any():
+        return
+    (u, v), (right, bottom) = corner.reshape(-1, 2).min(axis=0), corner.reshape(-1, 2).max(axis=0)
+    extent = f"u {u:.3g} to {right:.3g}, v {v:.3g} to {bottom:.3g}"
+    inside = [words for words, other in alternatives if other.min() >= -_EDGE and other.max() <= 1.0 + _EDGE]
+    if max(right, bottom) - min(u, v) > _TEXELS:
+        advice = "are they in texels? Divide them by the size of the lightmap"
+    else:
+        advice = (
+            "are they those of a repeated texture, or of UDIM tiles? Tiles need a folder of lightmaps NAME.1001.exr"
+        )
+    if inside:
+        advice = f"those of {inside[0]} lie within it; {advice}"
+    what = "all UVs lie" if lost.all() else f"{int(lost.sum())} of {count} charts lie wholly"
+    raise WlmError(f"{where}: {what} outside [0, 1] in TEXCOORD_{uv_set} ({extent}): {advice}")
 
 
 def _check_finite(where: str, primitive: GltfPrimitive, uv_set: int) -> None:

@@ -10,13 +10,17 @@ Other lists: a `.lmbake` of Godot 4, with its texture, an EXR, beside it (a stac
 to be cut first); a `set.json` of `wlm lightmap`, which is one sheet with a state for each time; and a folder, which
 stands for its `set.json` or else for each picture of light in it, a sheet of one state for the mesh that it fits.
 
-Without a list the materials' own lightmaps are read, `MOZ_lightmap`: each texture is a sheet, `KHR_texture_transform`
-gives the rectangle, `intensity` is a factor, and PNGs are sRGB, as the writers of that extension store them.
+Without a list the lightmaps that the glTF file names itself are read (`materials`).
 """
 
 import json
+import math
 import os
-from dataclasses import dataclass
+import re
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,15 +28,15 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from wlm.config import check_settings
 from wlm.errors import WlmError
-from wlm.formats.gltf import GltfDocument
 from wlm.formats.godot import GodotUser, read_users
 from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import INDEX_BYTES
 from wlm.formats.reading import named_file, read_json_file
 
+_Three = Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)]
 _Four = Annotated[list[float], Field(min_length=4, max_length=4)]
-_MOZ, _TRANSFORM = "MOZ_lightmap", "KHR_texture_transform"
 _SET_FILE = "set.json"
+_NO_LIGHTMAP = (-1, 65534, 65535)
 
 
 class SheetFiles(BaseModel):
@@ -45,7 +49,7 @@ class SheetFiles(BaseModel):
     encoding: str | None = None
     flip: bool = False
     mask: str | None = None
-    intensity: float = Field(1.0, ge=0.0)
+    intensity: Annotated[float, Field(ge=0.0)] | _Three = 1.0
 
 
 class ObjectPlace(BaseModel):
@@ -79,6 +83,9 @@ class Listing:
         objects: Nodes and their rectangles; None: every sheet is assigned to the mesh that it fits.
         uv_set: n of the glTF attribute `TEXCOORD_n`; None: 1 if the mesh has TEXCOORD_1, else 0.
         direct: Whether the caller gave the paths of lightmaps; false if a file names them.
+        held: The bytes of pictures that the file holds itself, by their names in `sheets`.
+        tiles: For each sheet its UDIM tile, 1001 + u + 10 v (v up); empty if the files are not named by tiles.
+        notes: Assumptions, one line each.
     """
 
     path: str
@@ -87,6 +94,26 @@ class Listing:
     objects: tuple[ObjectPlace, ...] | None = None
     uv_set: int | None = None
     direct: bool = False
+    held: Mapping[str, bytes | memoryview] = field(default_factory=dict)
+    tiles: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @contextmanager
+    def opened(self, name: str, trust: bool) -> Iterator[tuple[str, str]]:
+        """Yields the path of a picture and its name for messages; one that is held is in a file without a name."""
+        if name not in self.held:
+            path = str(self.file(name, trust))
+            yield path, path
+            return
+        label = f"{self.path}: {name}"
+        with tempfile.TemporaryFile() as file:
+            file.write(self.held[name])
+            file.flush()
+            path = f"/proc/self/fd/{file.fileno()}"
+            try:
+                yield path, label
+            except WlmError as error:
+                raise WlmError(str(error).replace(path, label)) from error
 
     def file(self, name: str, trust: bool) -> Path:
         """Returns the path of a file that the list names.
@@ -101,7 +128,7 @@ class Listing:
 
 def is_listing(path: str | os.PathLike[str] | None) -> bool:
     """Tests whether a path names several lightmaps: a folder, a JSON file or a Godot bake. True also for None, which
-    stands for the lightmaps that the materials name."""
+    stands for the lightmaps that the glTF file names itself."""
     return path is None or os.path.isdir(path) or os.fspath(path).lower().endswith((".json", ".lmbake"))
 
 
@@ -136,10 +163,12 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
         raise WlmError(f"{path}: expected a JSON object with the key sheets, found other JSON")
     if "lightmaps" in content and "sheets" not in content:
         return _from_set(str(path), content)
-    convention = content.get("convention", "gltf")
+    convention, unlit = content.get("convention", "gltf"), 0
     if isinstance(content.get("objects"), list) and convention in ("unity", "godot"):
         objects = [_object(each, convention, f"{path}: objects[{i}]") for i, each in enumerate(content["objects"])]
-        content = content | {"objects": objects}
+        lit = [each for each in objects if not isinstance(each, dict) or has_lightmap(each.get("sheet", 0))]
+        unlit = len(objects) - len(lit)
+        content = content | {"objects": lit}
     checked = check_settings(_Content, content, f"{path}: ")
     counts = {len(sheet.files) for sheet in checked.sheets}
     states = checked.states or [str(i) for i in range(len(checked.sheets[0].files))]
@@ -149,59 +178,14 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
         if each.sheet >= len(checked.sheets):
             raise WlmError(f"{path}: objects[{i}].sheet: expected 0 to {len(checked.sheets) - 1}, found {each.sheet}")
     objects = None if checked.objects is None else tuple(checked.objects)
-    return Listing(str(path), tuple(states), tuple(checked.sheets), objects, checked.uv_set)
+    line = f"{path}: {unlit} objects without a lightmap (their number is -1, 65534 or 65535): they only hide others"
+    sheets, notes = tuple(checked.sheets), (line,) * (unlit > 0)
+    return Listing(str(path), tuple(states), sheets, objects, checked.uv_set, notes=notes)
 
 
-def material_lightmaps(document: GltfDocument) -> Listing | None:
-    """Lists the lightmaps that the materials of a glTF file name; returns None if no material names one.
-
-    Raises:
-        WlmError: A texture is malformed, uses another UV set than the others, or is embedded in the file.
-    """
-    sheets: dict[tuple[int, float], SheetFiles] = {}
-    objects, sets = [], set()
-    order: list[tuple[int, float]] = []
-    for number, node in enumerate(document.content.get("nodes", [])):
-        if "mesh" not in node:
-            continue
-        found = set()
-        for primitive in document.item("meshes", node["mesh"])["primitives"]:
-            if primitive.get("material") is None:
-                continue
-            info = document.item("materials", primitive["material"]).get("extensions", {}).get(_MOZ)
-            if info is None:
-                continue
-            key = info["index"], float(info.get("intensity", 1.0))
-            if key not in sheets:
-                sheets[key] = _texture(document, *key)
-                order.append(key)
-            transform = info.get("extensions", {}).get(_TRANSFORM, {})
-            if transform.get("rotation"):
-                raise WlmError(f"{document.path}: nodes[{number}]: {_MOZ}: a rotated texture transform can't be read")
-            sets.add(transform.get("texCoord", info.get("texCoord", 0)))
-            scale, offset = transform.get("scale", (1.0, 1.0)), transform.get("offset", (0.0, 0.0))
-            found.add((order.index(key), *map(float, (*scale, *offset))))
-        if len(found) > 1:
-            raise WlmError(f"{document.path}: nodes[{number}]: expected one lightmap for all of its materials")
-        for sheet, *rectangle in found:
-            objects.append(ObjectPlace(node=str(number), sheet=sheet, scale_offset=rectangle))
-    if not sheets:
-        return None
-    if len(sets) > 1:
-        raise WlmError(f"{document.path}: {_MOZ}: expected one texCoord for all lightmaps, found {sorted(sets)}")
-    return Listing(document.path, ("light",), tuple(sheets[key] for key in order), tuple(objects), sets.pop())
-
-
-def _texture(document: GltfDocument, number: int, intensity: float) -> SheetFiles:
-    where = f"{document.path}: textures[{number}]"
-    texture = document.item("textures", number)
-    source = texture.get("extensions", {}).get("KHR_texture_basisu", {}).get("source", texture.get("source"))
-    image = document.item("images", source)
-    if "uri" not in image or str(image["uri"]).startswith("data:"):
-        raise WlmError(f"{where}: expected a lightmap in a separate file, found one inside: write it to a file")
-    uri = str(image["uri"])
-    encoding = "srgb" if uri.lower().endswith(".png") else None
-    return SheetFiles(files=[uri], name=image.get("name"), encoding=encoding, intensity=intensity)
+def has_lightmap(number: Any) -> bool:
+    """Tests whether the number of a renderer's lightmap names one; Unity writes -1, 65534 or 65535 for none."""
+    return number is not None and number not in _NO_LIGHTMAP
 
 
 def _object(entry: Any, convention: str, where: str) -> Any:
@@ -216,25 +200,31 @@ def _object(entry: Any, convention: str, where: str) -> Any:
         if "slice_index" in entry:
             entry["sheet"] = entry.pop("slice_index")
         if "uv_scale" in entry:
-            x, y, width, height = _numbers(entry.pop("uv_scale"), f"{where}.uv_scale", ("x", "y", "width", "height"))
+            x, y, width, height = numbers(entry.pop("uv_scale"), f"{where}.uv_scale", ("x", "y", "width", "height"))
             entry["scale_offset"] = [width, height, x, y]
         return entry
     if "lightmapIndex" in entry:
         entry["sheet"] = entry.pop("lightmapIndex")
     name = "lightmapScaleOffset" if "lightmapScaleOffset" in entry else "scale_offset"
     if name in entry:
-        sx, sy, x, y = _numbers(entry.pop(name), f"{where}.{name}", ("x", "y", "z", "w"))
+        sx, sy, x, y = numbers(entry.pop(name), f"{where}.{name}", ("x", "y", "z", "w"))
         entry["scale_offset"] = [sx, sy, x, 1.0 - sy - y]  # the rectangle applies to 1 - v
     return entry
 
 
-def _numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
+def numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
+    """Checks four finite numbers, a list or an object with the given keys.
+
+    Raises:
+        WlmError: They are not; `where` names their place.
+    """
     if isinstance(value, dict) and set(keys) <= set(value):
         value = [value[key] for key in keys]
     if not (
         isinstance(value, list)
         and len(value) == 4
         and all(isinstance(each, int | float) and not isinstance(each, bool) for each in value)
+        and all(map(math.isfinite, value))
     ):
         raise WlmError(f"{where}: expected 4 numbers, found {json.dumps(value)[:60]}")
     return [float(each) for each in value]
@@ -271,7 +261,17 @@ def _from_folder(where: str, folder: Path) -> Listing:
     ]
     if not sheets:
         raise WlmError(f"{where}: expected lightmaps ({', '.join(SUFFIXES)}), found none")
-    return Listing(str(folder), ("light",), tuple(sheets), None, None)
+    tiles = tiles_of([Path(each.name).stem for each in sheets])
+    return Listing(str(folder), ("light",), tuple(sheets), tiles=tiles)
+
+
+def tiles_of(names: Sequence[str]) -> tuple[int, ...]:
+    """Returns the UDIM tiles of lightmaps by their names without suffix, such as `wall.1001`; empty if they are not
+    named by tiles of one texture."""
+    found = [re.fullmatch(r"(.*)[._-](1\d{3})", name) for name in names]
+    tiles = tuple(int(match[2]) for match in found if match is not None)
+    alike = len(tiles) == len(names) == len(set(tiles)) and len({match[1] for match in found if match is not None}) == 1
+    return tiles if alike else ()
 
 
 def _from_set(path: str, content: dict[str, Any]) -> Listing:

@@ -6,7 +6,9 @@ that a baker leaves between charts. So the mean difference between neighbouring 
 UVs that the lightmap was baked for.
 """
 
+import re
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,6 +18,7 @@ from wlm.atlas.charts import charts, welded
 from wlm.atlas.coverage import covered_texels
 from wlm.errors import WlmError
 from wlm.formats.gltf import GltfPrimitive
+from wlm.formats.light import SUFFIXES
 from wlm.ops.raster import rasterize_uv
 from wlm.texels import fill_gaps
 
@@ -28,19 +31,27 @@ _LEAST, _FEWEST = 0.005, 1024  # smallest roughness in octaves; fewest texels in
 _SHARED = 0.02  # fraction of texels under several meshes; a smaller one is rounding at neighbouring charts
 _BRIGHT, _PERCENTILE = 16.0, 99.5  # a speck is brighter than this multiple of this percentile of the light
 _WIDEST = 3  # a speck is narrower than this number of texels
+# Squares weigh the edges of charts more than the noise inside: on a room with filled gaps, the right UVs have at most
+# 0.88 of the squares of 23 other layouts, but 1.2 of their mean.
+_SQUARES = 2
+_EXAMINED = 1024  # longest side of the picture in which UVs are compared
+_APART, _TINY = 0.25, 0.02  # shares of charts without light and of light without charts, and of light in charts
+_BOX = "its UVs, about"
+_OUTSIDE, _STRETCHED = 1e-3, 0.05  # UVs this far outside [0, 1] are clamped; smaller changes of UVs aren't compared
 _FRINGE, _REACH = 4.0, 5  # limit over the brightest chart texel nearby, and the window's side in texels
 
 
 def choose_mesh(
-    where: str, name: str, primitives: list[GltfPrimitive], uv_set: int, lightmap: np.ndarray
+    where: str, name: str, primitives: list[GltfPrimitive], uv_set: int, lightmap: np.ndarray, alone: bool = True
 ) -> tuple[list[GltfPrimitive], list[str]]:
     """Chooses the primitives for which a lightmap was baked. Also returns lines of text that say what was left out.
 
     Meshes that lie side by side in UV space share it. Where they overlap, the mesh in whose charts the lightmap is
-    smoothest is chosen; a mesh that several nodes draw counts once.
+    smoothest is chosen; a mesh that several nodes draw counts once. Where the light fits none clearly better, the name
+    of the lightmap decides (`by_name`). `alone` is whether the lightmap is the only one, for the advice in messages.
 
     Raises:
-        WlmError: The lightmap fits no mesh clearly better than all others.
+        WlmError: The lightmap fits no mesh clearly better than all others, and has the name of none.
     """
     numbers = sorted({each.mesh for each in primitives})
     if len(numbers) == 1:
@@ -59,17 +70,43 @@ def choose_mesh(
     rough = [min(roughness(light, chart) for light in (lightmap, lightmap[::-1])) for chart in charted]
     order = np.argsort(rough)
     best, second = order[:2]
-    if not rough[best] < _BETTER * rough[second]:
-        names = ", ".join(group[0].label for group in groups[:8]) + (", ..." if len(groups) > 8 else "")
-        raise WlmError(
-            f"{where}: {len(groups)} meshes lie on each other in TEXCOORD_{uv_set}, and the lightmap fits none clearly "
-            f"better: expected the name of one as the node (--node): {names}"
-        )
-    line = (
-        f"{name}: {len(groups)} meshes lie on each other in TEXCOORD_{uv_set}: the lightmap fits "
-        f"{groups[best][0].label} best; the others are left out"
+    lie = f"{len(groups)} meshes lie on each other in TEXCOORD_{uv_set}"
+    if rough[best] < _BETTER * rough[second]:
+        return groups[best], [f"{name}: {lie}: the lightmap fits {groups[best][0].label} best; the others are left out"]
+    if chosen := by_name(name, primitives):
+        return chosen, [f"{name}: {lie}: by its name, the lightmap is that of {chosen[0].label}"]
+    names = ", ".join(group[0].label for group in groups[:8]) + (", ..." if len(groups) > 8 else "")
+    advice = "as the node (--node)" if alone else "in the lightmap's file name, or a .json list with objects"
+    raise WlmError(
+        f"{where}: {name}: {lie}, and it fits none clearly better: expected the name of one {advice}: {names}"
     )
-    return groups[best], [line]
+
+
+def by_name(name: str, primitives: Sequence[GltfPrimitive]) -> list[GltfPrimitive]:
+    """Returns the primitives of the node or the mesh whose name a lightmap's name contains as whole words, for example
+    Floor in Floor_baked.hdr; of several names the longest. None if there is no such name or it isn't unique."""
+    words = f"_{_words(Path(name).stem if name.lower().endswith(SUFFIXES) else name)}_"
+    found: dict[str, list[GltfPrimitive]] = {}
+    for each in primitives:
+        for label in {_words(each.label), _words(each.mesh_label)}:
+            if label and f"_{label}_" in words:
+                found.setdefault(label, []).append(each)
+    longest = sorted(found, key=len)[-2:]
+    if not found or (len(longest) > 1 and len(longest[0]) == len(longest[1])):
+        return []
+    return found[longest[-1]]
+
+
+def all_by_name(names: Sequence[str], primitives: Sequence[GltfPrimitive]) -> dict[int, list[GltfPrimitive]]:
+    """Returns for each of several lightmaps the primitives that its name selects, if the names of all of them select
+    different ones; else nothing."""
+    found = {number: by_name(name, primitives) for number, name in enumerate(names)}
+    keys = [(each.node, each.primitive) for group in found.values() for each in group]
+    return found if len(names) > 1 and all(found.values()) and len(set(keys)) == len(keys) else {}
+
+
+def _words(name: str) -> str:
+    return re.sub(r"[\W_]+", "_", name.casefold()).strip("_")
 
 
 def named(where: str, primitives: list[GltfPrimitive], node: str) -> list[GltfPrimitive]:
@@ -95,10 +132,10 @@ def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height
     return np.where(seen < 0, -1, number[seen.clip(0)])
 
 
-def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
+def roughness(lightmap: np.ndarray, chart: np.ndarray, power: int = 1) -> float:
     """Returns the mean difference, in octaves (factors of 2), between neighbouring texels of one chart (`chart_map`);
     infinity without such texels. NaN and infinity count as large differences. A large lightmap is sampled in evenly
-    spread bands of rows with `_LOOKED_AT` texels in all."""
+    spread bands of rows with `_LOOKED_AT` texels in all. `power` is the exponent of the differences."""
     bands = _bands(*chart.shape)
     with np.errstate(invalid="ignore"):
         greys = [lightmap[band].astype(np.float64).mean(axis=2) for band in bands]
@@ -114,7 +151,7 @@ def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
             (a, b), (c, d), (e, f) = (_neighbours(values, axis) for values in (octave, chart[band], finite))
             inside = (c == d) & (c >= 0)
             step = np.where(e & f, np.minimum(np.abs(a - b), _STEP), _STEP)
-            total, count = total + float(step[inside].sum()), count + int(inside.sum())
+            total, count = total + float((step[inside] ** power).sum()), count + int(inside.sum())
     return total / count if count else float("inf")
 
 
@@ -133,6 +170,108 @@ def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
         return False
     flipped, rough = roughness(lightmap[::-1], chart), roughness(lightmap, chart)
     return flipped < min(_BETTER * rough, rough - _LEAST)
+
+
+def misfits(
+    name: str,
+    lightmap: np.ndarray,
+    position: np.ndarray,
+    triangle: np.ndarray,
+    uv: np.ndarray,
+    chart: np.ndarray,
+    used: str,
+    alternatives: Sequence[tuple[str, np.ndarray]],
+) -> list[str]:
+    """Returns a line of doubt if a lightmap [H, W, 3] fits its charts badly: other UVs make it clearly smoother in the
+    charts, the light and the charts lie in different places, or the charts leave nearly all of the light out.
+
+    Args:
+        name: The lightmap's name.
+        lightmap, position, triangle, uv: The light, and the mesh with the UVs in [0, 1] that are used.
+        chart: The chart at each texel with these UVs, see `chart_map`.
+        used: Words for these UVs.
+        alternatives: Words and UVs [V, 2] to compare with. The UVs that are used, stretched to the lit texels, are
+            compared too.
+    """
+    step = -(-max(lightmap.shape[:2]) // _EXAMINED)
+    light = lightmap[::step, ::step]
+    height, width = light.shape[:2]
+    with np.errstate(invalid="ignore"):
+        lit = (light > 0).any(axis=2)
+    if not lit.any():
+        return []
+    chart = chart[::step, ::step]
+    inside = chart >= 0
+    texels = np.count_nonzero(inside)
+    near = maximum_filter(inside, 2 * _REACH + 1)
+    black = np.count_nonzero(inside & ~lit) / max(texels, 1)
+    away = np.count_nonzero(lit & ~near) / np.count_nonzero(lit)
+    apart = min(black, away) > _APART
+    others = [*alternatives, *_stretched(uv, triangle, lit)]
+    if others:
+        rough = float("inf") if apart else roughness(light, chart, _SQUARES)
+        # The light is smoother in charts than across their edges. Few texels say little about the UVs that are used.
+        everywhere = roughness(light, np.zeros((height, width), np.int32), _SQUARES) * (
+            1.0 if texels >= _FEWEST else _BETTER
+        )
+        limit = min(_BETTER * rough, rough - _LEAST**2, everywhere)
+    best: tuple[float, str] | None = None
+    for words, uvs in others:
+        other = uvs.astype(np.float64)
+        if not np.isfinite(other).all() or other.min() < -_OUTSIDE or other.max() > 1.0 + _OUTSIDE:
+            continue
+        other = other.clip(0.0, 1.0)
+        charted = chart_map(position, other, triangle, height, width)
+        count = np.count_nonzero(charted >= 0)
+        if count < max(_FEWEST, texels // 4 if texels >= _FEWEST else 4 * texels):
+            continue
+        overlaps = np.count_nonzero(covered_texels(other, triangle, height, width) > 1)
+        for words_of, picture in ((words, light), (f"{words} with the lightmap upside down (--flip)", light[::-1])):
+            found = roughness(picture, charted, _SQUARES)
+            dark = np.count_nonzero((charted >= 0) & ~(picture > 0).any(axis=2))
+            if overlaps <= _SHARED * count and dark <= _APART * count and found < limit:
+                # A stretched box is only roughly right, and the lightmap upside down is a second change.
+                less_likely = words.startswith(_BOX) or words_of != words
+                ranked = (found / (_BETTER if less_likely else 1.0), words_of)
+                best = min(best or ranked, ranked)
+    if best is not None:
+        return [
+            f"{name}: the light is smoother in the charts of {best[1]} than in those of {used}: does it belong to them?"
+        ]
+    if np.count_nonzero(lit) >= _FEWEST and texels:
+        if apart:
+            return [
+                f"{name}: {black:.0%} of the texels in charts of {used} are black, and {away:.0%} of the lit texels "
+                "are in no chart: do these UVs belong to this lightmap?"
+            ]
+        if texels < _TINY * np.count_nonzero(lit):
+            return [
+                f"{name}: the charts of {used} cover {texels / np.count_nonzero(lit):.2%} of the lit texels: do these "
+                "UVs belong to this lightmap?"
+            ]
+    return []
+
+
+def _stretched(uv: np.ndarray, triangle: np.ndarray, lit: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    """Returns the UVs stretched so that the charts' box is that of the lit texels, and scaled so that it is in the
+    middle of the square, if that changes them noticeably."""
+    corner = uv[triangle].reshape(-1, 2)
+    low, high = corner.min(axis=0), corner.max(axis=0)
+    at = [np.flatnonzero(lit.any(axis=axis)) for axis in (0, 1)]
+    first = np.array([each[0] / lit.shape[1 - axis] for axis, each in enumerate(at)])
+    last = np.array([(each[-1] + 1) / lit.shape[1 - axis] for axis, each in enumerate(at)])
+    if not (high > low).all():
+        return []
+    # The second alternative has equal margins on both sides.
+    scales = ((last - first) / (high - low), 1.0 / np.maximum(low + high, _LEAST))
+    offsets = (first - scales[0] * low, np.zeros(2))
+    found = []
+    for scale, offset in zip(scales, offsets, strict=True):
+        if np.abs(np.concatenate([scale - 1.0, offset])).max() >= _STRETCHED:
+            text = f"scaled by {scale[0]:.3g} and {scale[1]:.3g}"
+            text = f"{_BOX} {text}, moved by {offset[0]:.3g} and {offset[1]:.3g}" if offset.any() else f"its UVs {text}"
+            found.append((text, uv * scale + offset))
+    return found
 
 
 def replace_strays(lightmap: np.ndarray, mask: np.ndarray, covered: np.ndarray) -> int:

@@ -12,7 +12,18 @@ from PIL import Image, UnidentifiedImageError
 
 from wlm.bake.settings import LightmapSettings
 from wlm.errors import WlmError, one_line
-from wlm.formats.gltf import GltfDocument, GltfPrimitive, local_file, read_gltf, reported, vertex_normals
+from wlm.formats.gltf import (
+    GltfDocument,
+    GltfPrimitive,
+    held_image,
+    local_file,
+    read_gltf,
+    reported,
+    texture_image,
+    texture_transform,
+    vertex_normals,
+)
+from wlm.formats.gltf_slots import lightmap_uv
 from wlm.formats.gltf_writer import Replacement
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import MESH_BYTES
@@ -132,7 +143,9 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
         made = new.get((each.node, each.primitive))
         gather = np.arange(len(each.position)) if made is None else made.gather
         triangle = each.triangle if made is None else made.triangle
-        uv = each.uv.get(number) if made is None and number is not None else (None if made is None else made.uv)
+        uv = None if made is None else made.uv
+        if made is None and number in each.uv:
+            uv = lightmap_uv(document, each, number)
         surface = _surface(each, gather, triangle, normal, uv, cache[each.material])
         if len(surface.triangle):
             surfaces.append(surface)
@@ -281,9 +294,8 @@ def _material(document: GltfDocument, number: int | None) -> Material:
         texture = _texture(document, used["index"])
         uv_set = used.get("texCoord", 0)
         if _TRANSFORM in used.get("extensions", {}):
-            transform = used["extensions"][_TRANSFORM]
-            uv_set = transform.get("texCoord", uv_set)
-            placed = _placed(f"{document.path}: materials[{number}]", transform)
+            uv_set = used["extensions"][_TRANSFORM].get("texCoord", uv_set)
+            placed = texture_transform(f"{document.path}: materials[{number}]", used)
     return Material(
         str(content.get("name", "")),
         tuple(map(float, factor)),
@@ -295,27 +307,13 @@ def _material(document: GltfDocument, number: int | None) -> Material:
     )
 
 
-def _placed(where: str, transform: dict[str, Any]) -> np.ndarray:
-    """Returns the matrix of `KHR_texture_transform`: scale, then counter-clockwise rotation (v down), then offset."""
-    names = {"scale": [1.0, 1.0], "rotation": 0.0, "offset": [0.0, 0.0]}
-    scale, turn, offset = (np.array(transform.get(name, usual), np.float64) for name, usual in names.items())
-    numbers = [*scale.ravel(), *turn.ravel(), *offset.ravel()]
-    if (scale.shape, turn.shape, offset.shape) != ((2,), (), (2,)) or not np.abs(numbers).max() <= _LARGEST:
-        raise WlmError(f"{where}: {_TRANSFORM}: expected two numbers each for scale and offset, and one for rotation")
-    cosine, sine = np.cos(turn), np.sin(turn)
-    return np.column_stack([np.array([[cosine, sine], [-sine, cosine]]) * scale, offset])
-
-
 def _texture(document: GltfDocument, number: int) -> np.ndarray:
     """Reads an image as linear light, float32 [H, W, 3]."""
     where = f"{document.path}: textures[{number}]"
-    image = document.item("images", document.item("textures", number).get("source"))
-    if "bufferView" in image:
-        view = document.item("bufferViews", image["bufferView"])
-        start = view.get("byteOffset", 0)
-        data = bytes(document.buffers[view["buffer"]][start : start + view["byteLength"]])
-    else:
-        file = local_file(document.path, image["uri"], where, document.trust)
+    source = texture_image(document, number)
+    data = held_image(document, source)
+    if data is None:
+        file = local_file(document.path, document.item("images", source)["uri"], where, document.trust)
         data = read_file(file, MESH_BYTES, where)
     try:
         with Image.open(io.BytesIO(data), formats=["PNG", "JPEG", "WEBP"]) as picture:

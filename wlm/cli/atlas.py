@@ -48,7 +48,7 @@ _Lights = Annotated[
     typer.Argument(
         metavar="LIGHTMAPS",
         help="Lightmap (EXR, HDR, PFM, TIFF, KTX2, DDS, or a PNG with --encoding), a folder of them, a .lmbake, or a "
-        ".json that lists them; default those that the mesh's materials name.",
+        ".json that lists them; default those that the glTF file names.",
     ),
 ]
 _Mask = Annotated[
@@ -58,6 +58,10 @@ _UvSet = Annotated[
     int | None, typer.Option("--uv-set", min=0, help="The lightmap UVs are TEXCOORD_n; default 1 if present, else 0.")
 ]
 _Node = Annotated[str | None, typer.Option(help="Node that the lightmap belongs to; default the one that fits best.")]
+_Slot = Annotated[
+    str | None,
+    typer.Option(help="Material slot whose textures are the lightmaps, without LIGHTMAPS: occlusion or emissive."),
+]
 _Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is at v = 1 instead of v = 0.")]
 _Views = Annotated[
     int | None, typer.Option(min=1, max=4096, help=f"Cameras outside the scene, and as many inside; default {_VIEWS}.")
@@ -80,6 +84,7 @@ def compress(
     node: _Node = None,
     encoding: Encoding = None,
     flip: _Flip = False,
+    slot: _Slot = None,
     seed: Seed = 0,
     device: Device = "cpu",
     resume: Resume = False,
@@ -95,7 +100,7 @@ def compress(
     def load() -> "LightmappedScene":
         from wlm.atlas import load
 
-        reading = {"uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip}
+        reading = {"uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip, "slot": slot}
         return load(mesh, lightmaps, mask_path=mask, **reading, trust=trust)
 
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
@@ -116,6 +121,7 @@ def evaluate(
     node: _Node = None,
     encoding: Encoding = None,
     flip: _Flip = False,
+    slot: _Slot = None,
     device: Device = "cpu",
     trust: Trust = False,
 ) -> None:
@@ -130,7 +136,7 @@ def evaluate(
     device = check_device(device)
     model = load_model(file, "atlas")
     uv_set = model.stored.uv_set if uv_set is None else uv_set
-    reading = {"uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip}
+    reading = {"uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip, "slot": slot}
     scene = load(mesh, lightmaps, mask_path=mask, **reading, trust=trust)
     with running("evaluate") as progress:
         report = evaluate(model, scene, views=views, resolution=resolution, device=device, progress=progress)

@@ -42,8 +42,10 @@ Trust = Annotated[
 ]
 Profile = Annotated[str, typer.Option(metavar="NAME|FILE.yaml", help="Name of a settings profile, or a YAML file.")]
 Engine = Annotated[
-    Literal["three", "godot", "unity", "unreal"] | None,
-    typer.Option(help="Write a kit for this engine. Default: textures, buffers and a shader for any program."),
+    Literal["three", "godot", "unity", "unreal", "bevy"] | None,
+    typer.Option(
+        help="Write a kit for this engine (bevy: probes only). Default: textures, buffers and a shader for any program."
+    ),
 ]
 ShaderLanguage = Annotated[
     Literal["glsl", "glsl-es", "hlsl", "msl", "wgsl"] | None,

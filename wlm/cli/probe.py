@@ -42,11 +42,18 @@ if TYPE_CHECKING:
     from wlm.probe import ProbeModel, ProbeSet, Report
 
 _Probes = Annotated[
-    Path, typer.Argument(metavar="PROBES", help="Probe file: .npz, .json, Godot's .lmbake or Unity's .asset.")
+    Path, typer.Argument(metavar="PROBES", help="Probe file: .npz, .json, .csv, .lmbake, .asset or .ktx2.")
 ]
 _CONVENTIONS = "threejs, godot, unreal or unity"
 _Convention = Annotated[
     str | None, typer.Option(help=f"SH convention of PROBES: {_CONVENTIONS}; default the file's own.")
+]
+_Order = Annotated[
+    Literal["coefficient", "channel"] | None,
+    typer.Option(
+        help="Order of the SH numbers in PROBES: by coefficient (r0 g0 b0 r1 ...) or by channel (r0 r1 ... g0 ...); "
+        "default as their shape shows, or as fits light."
+    ),
 ]
 _At = Annotated[
     Path | None,
@@ -66,6 +73,7 @@ def compress(
     ] = False,
     key: Key = None,
     convention: _Convention = None,
+    order: _Order = None,
     seed: Seed = 0,
     device: Device = "cpu",
     resume: Resume = False,
@@ -80,7 +88,7 @@ def compress(
     def load() -> "ProbeSet":
         from wlm.probe import load
 
-        return load(probes, key=key, convention=convention)
+        return load(probes, key=key, convention=convention, order=order)
 
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every, "positions": positions}
     data, model, facts = models.fit("probe", load, output, profile, settings, **options)
@@ -92,6 +100,7 @@ def compress(
         **model.content.facts(),
     }
     show_facts(model.name, facts)
+    note(f"{probes}: {data.reading}")
     if model.choice:
         note(model.choice)
 
@@ -109,6 +118,7 @@ def evaluate(
     mesh: SceneFile = None,
     key: Key = None,
     convention: _Convention = None,
+    order: _Order = None,
     device: Device = "cpu",
 ) -> None:
     """Compare compressed probes with the original: PSNR of the coefficients and of the irradiance, and sizes."""
@@ -120,7 +130,7 @@ def evaluate(
     from wlm.system import load as load_model
 
     model = load_model(file, "probe")
-    probes = load(probes_path, key=key, convention=convention)
+    probes = load(probes_path, key=key, convention=convention, order=order)
     note_warnings(probes.warnings)
     with running("evaluate") as progress:
         size = file.stat().st_size
@@ -133,6 +143,7 @@ def evaluate(
         content = report.to_json() | ({"volume": walks} if walks else {})
         write_json(json_path, content | ({"views": [score.to_json() for score in pictures]} if pictures else {}))
     _show_report(file, model, report)
+    note(f"{probes_path}: {probes.reading}")
     show_walks(walks)
     show_pictures(pictures)
 
@@ -187,7 +198,7 @@ def export(
     ] = None,
     cells: Annotated[
         int | None,
-        typer.Option(help="With --engine three, godot or unreal: grid cells along the longest side; default 24."),
+        typer.Option(help="With --engine three, godot, unreal or bevy: grid cells along the longest side; default 24."),
     ] = None,
     mirror: Annotated[
         Literal["x", "y", "z"] | None, typer.Option(help="With --engine unity: axis to flip, as Unity is left-handed.")

@@ -31,6 +31,7 @@ from wlm.cli.smoke_options import (
     SmokeOptions,
     White,
     check_white,
+    note_thickness,
     outputs,
     vector,
     vectors,
@@ -97,7 +98,7 @@ def simulate(
     from wlm.interop import check_device
     from wlm.smoke.data import CHECKPOINT, open_frames
     from wlm.smoke.scene import load_scene
-    from wlm.smoke.simulation import make_solver, simulate
+    from wlm.smoke.simulation import make_solver, simulate, warnings_of
     from wlm.system import Progress
 
     device = check_device(device)
@@ -108,12 +109,16 @@ def simulate(
         scene = scene.model_copy(update={"frames": frames})
     # The solver comes first, so that a simulation that cannot start removes no earlier frames.
     solver = make_solver(scene, device=device)
+    note_warnings(warnings := warnings_of(scene))
     folder = open_frames(output, scene, resume=resume)
     figures: dict[str, float] = {}
+    most = 0.0
     with running("simulate", output / CHECKPOINT, unit="frame") as report:
 
         def progress(now: Progress) -> None:
+            nonlocal most
             figures.update(now.figures)
+            most = max(most, figures.get("smoke", 0.0))
             report(now)
 
         options = {"resume": resume, "checkpoint_every": checkpoint_every, "velocity": velocity}
@@ -128,6 +133,8 @@ def simulate(
     }
     if figures:
         facts |= {"smoke in the last frame": figures["smoke"], "seconds per frame": figures["frame s"]}
+        if not most and not warnings:
+            note_warnings([f"{scene.name}: no frame has smoke: is each source inside an obstacle?"])
     show_facts(f"{output}: {scene.name}", facts)
 
 
@@ -293,10 +300,11 @@ def light(
     colour, highest = colour or (1.0, 1.0, 1.0), 1 if orders == "single" else HIGHEST
     file = outputs(smoke, frames.single, output, "light", ".png", ".exr")
     rows = table(str(smoke), ["file", "mean", "largest", "clipped pixels", *(["noise"] * (samples is not None))])
-    pictures = []
+    pictures, thickness = [], 0.0
     with running("light") as progress:
         for frame, volume in frames.volumes(progress=progress):
             note_warnings(volume.warnings)
+            thickness = max(thickness, volume.thickness)
             view, looks, noise = frames.view(camera, volume), frames.looks(frame), []
             if samples is None:
                 march, lamps = orders_march(volume, g), [*own, *twelve]
@@ -327,6 +335,7 @@ def light(
     if not frames.single:
         contact_sheet(output / SHEET, {"": pictures})
     show(rows)
+    note_thickness(frames, thickness)
 
 
 @app.command()
@@ -371,6 +380,7 @@ def run(
     from wlm.smoke.data import NumberedFiles
     from wlm.smoke.network.prediction import SmokePredictor
     from wlm.smoke.scene import load_scene
+    from wlm.smoke.simulation import warnings_of
     from wlm.view.pictures import save_png
     from wlm.view.smoke_run import Lighting, write_all
     from wlm.view.smoke_run import run as frames_of
@@ -386,6 +396,7 @@ def run(
     scene = scene.model_copy(update={"camera": camera, "frames": frames or scene.frames})
     if colour is not None:
         scene = scene.model_copy(update={"smoke": scene.smoke.model_copy(update={"albedo": colour})})
+    note_warnings(warnings_of(scene))
     predictor = None if network is None else SmokePredictor(network, device)
     lighting = Lighting(None if single else scene.smoke.albedo, predictor)
     with running("run", unit="frame") as progress:

@@ -72,7 +72,9 @@ class SmokeOptions:
         for name in ("extinction", "emission"):
             if name in settings:
                 settings[name] = _float(f"--volume {name}", settings[name])
-        return load_frames(smoke, **settings, trust=self.trust or None, device=check_device(self.device))
+        frames = load_frames(smoke, **settings, trust=self.trust or None, device=check_device(self.device))
+        note_warnings(frames.warnings)
+        return frames
 
     def view(self, frames: "Frames", *, orthographic: bool = True) -> "CameraSettings":
         """Returns the camera of the scene, or the default one, changed by the options; errors name the option."""
@@ -216,10 +218,11 @@ def write_lightmaps(
             note(f"{output}: {done} frames are finished" if done else f"{files.partial}: there is nothing to resume")
     columns = ["file", "covered pixels", "mean light", *(["largest error", "RMS error"] * errors)]
     rows = table(str(frames.path), columns)
-    numbers = [each for each in frames.numbers if files is None or each not in files.done]
+    numbers, thickness = [each for each in frames.numbers if files is None or each not in files.done], 0.0
     with running("six", None if files is None else files.partial, "frame", whole=False) as progress:
         for frame, volume in frames.volumes(numbers, progress):
             note_warnings(volume.warnings)
+            thickness = max(thickness, volume.thickness)
             looks = frames.looks(frame)
             if looks is not None and settings.get("albedo") is not None:
                 looks = looks.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
@@ -238,3 +241,12 @@ def write_lightmaps(
     if files is not None:
         files.finish()
     show(rows)
+    note_thickness(frames, thickness)
+
+
+def note_thickness(frames: "Frames", thickness: float) -> None:
+    """Prints a warning if the smoke of all frames together, of a largest optical thickness, is too thin or thick."""
+    from wlm.fluid.volume import thickness_hint
+
+    if hint := thickness_hint(thickness, frames.extinction_used):
+        note_warnings([f"{frames.path}: {hint}"])

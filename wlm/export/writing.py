@@ -23,7 +23,7 @@ from typing import Any
 
 from wlm.bundle import FORMAT, INDEX_FILE, RESERVED, Bundle
 from wlm.errors import WlmError
-from wlm.export.engines.kit import ENGINES
+from wlm.export.engines.kit import ENGINES, PROBE_ENGINES
 from wlm.export.files import write_buffer, write_reference, write_texture
 from wlm.export.shading import ENDINGS, check_language, translate
 from wlm.formats.folder import compact_json, made_parents, read_index, staged
@@ -57,13 +57,13 @@ def export(
         model: A lightmap, atlas or probe model, a flip book of smoke, or any object with a method `bundle`; or the
             `Bundle` itself.
         folder: The folder; made if it does not exist.
-        engine: One of `wlm.export.ENGINES`; None for the raw folder.
+        engine: One of `wlm.export.ENGINES`, or "bevy" for probes; None for the raw folder.
         shader: Language of the raw folder's shader, one of `wlm.export.LANGUAGES`.
         exact: Whether the raw folder's shader fetches texels and interpolates in floats, without the texture filter.
         device: Device that decodes the model for the folder's reference image, for example "cpu" or "cuda:0".
         options: Options of the kit. Probes: `original`, the file that was compressed, if the model does not store its
-            positions; `cells`, the number of a grid's cells along its longest side (three, godot, unreal); `mirror`,
-            the axis to mirror (unity).
+            positions; `cells`, the number of a grid's cells along its longest side (three, godot, unreal, bevy);
+            `mirror`, the axis to mirror (unity).
 
     Returns:
         The files written, the index last.
@@ -73,8 +73,8 @@ def export(
             or cannot be written; a number of the model is not finite; or a texture is larger than GPUs accept.
     """
     check_language(shader)
-    if engine is not None and engine not in ENGINES:
-        raise WlmError(f"engine: expected one of {', '.join(ENGINES)}, got {engine!r}")
+    if engine is not None and engine not in PROBE_ENGINES:
+        raise WlmError(f"engine: expected one of {', '.join(PROBE_ENGINES)}, got {engine!r}")
     if engine is not None and (exact or shader != "glsl"):
         raise WlmError(f"engine {engine}: shader and exact have no meaning for a kit, whose language is the engine's")
     folder = Path(folder)
@@ -110,9 +110,10 @@ def _write_raw(bundle: Bundle, folder: Path, language: str, exact: bool) -> None
 def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: dict[str, Any]) -> None:
     """Writes the kit of a bundle, or of each part of a collection that contains light, in a subfolder each."""
     if not bundle.parts:
-        if bundle.system not in _KITS:
+        module = _KITS.get(bundle.system, "")
+        if not module or (engine not in ENGINES and "{engine}" not in module):
             raise WlmError(f"{bundle.name}: there is no kit for {engine}; export a raw folder")
-        write_kit = import_module(_KITS[bundle.system].format(engine=engine)).write_kit
+        write_kit = import_module(module.format(engine=engine)).write_kit
         known = tuple(signature(write_kit).parameters)[3:]
         _check_options(options, known, f"a {bundle.system} kit for {engine}")
         if "device" in known:

@@ -1,4 +1,4 @@
-"""Reads the grids of NanoVDB files, and brings a file's grids to one lattice of cubic voxels along the axes.
+"""Chooses the grids of smoke in a file, and brings them to one lattice of cubic voxels along the axes.
 
 A grid has a transform from its voxels to the world. A grid whose voxels are cubes along the world's axes, in any order
 and direction, is only permuted and flipped. All other grids, with oblong, rotated or sheared voxels, are resampled
@@ -7,18 +7,15 @@ the interpolated smoke reaches.
 """
 
 import math
-import struct
-import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 import warp as wp
 
-from wlm.errors import WlmError
-from wlm.formats import blosc
-from wlm.formats.limits import GROWTH, SURE_BYTES, check_growth
+from wlm.errors import WlmError, one_line
+from wlm.formats.vdb import GridHead, VdbGrid
 from wlm.interop import device_name, to_warp
 from wlm_kernels.fluid import grids as kernels
 
@@ -63,6 +60,72 @@ class Lattice:
     voxel: float
     origin: tuple[float, float, float]
     shape: tuple[int, int, int]
+
+
+_DENSITY, _TEMPERATURE, _LEVEL_SET, _FOG = "density", "temperature", "level set", "fog volume"
+_SHAPES = (_LEVEL_SET, "staggered")  # classes of grids that are no smoke
+_MOST_NAMES = 32  # grids that a message lists
+# Parts of names of grids that are the density of smoke, and of those that are another quantity.
+_SMOKE = ("dens", "smoke", "soot", "fog", "cloud", "steam", "mist", "vapor", "vapour", "dust", "extinction")
+_OTHERS = (
+    *("temp", "heat", "flame", "fire", "burn", "fuel", "react", "emission", "emissive", "incandescence", "kelvin"),
+    *("vel", "speed", "press", "diverg", "vort", "curl", "force", "collision", "obstacle", "mask", "distance"),
+    *("sdf", "surface", "levelset", "phi", "shadow", "color", "colour", "albedo", "grad"),
+)
+
+
+def choose(
+    where: str, heads: Sequence[GridHead], density: str | None = None, temperature: str | None = None
+) -> tuple[str, str | None, list[str]]:
+    """Chooses the grids of the density and of the temperature by their names and classes.
+
+    The density is the grid `density`, else the only one with a name of smoke, else the only one whose name is that of
+    no other quantity. A level set is chosen only by its name.
+
+    Args:
+        where: Name of the file or folder in messages.
+        heads: Its grids.
+        density, temperature: Names that are given; None: chosen.
+
+    Returns:
+        The name of the density's grid, that of the temperature's if there is one, and warnings for grids that were
+        chosen by another name than `density`.
+
+    Raises:
+        WlmError: A given grid is missing, or it is not clear which grid is the density.
+    """
+    found = one_line(", ".join(map(str, heads[:_MOST_NAMES])), 400) or "no grid"
+    first = {head.name: head for head in reversed(heads)}
+    for name in (density, temperature):
+        if name is not None and not (name in first and first[name].is_number):
+            raise WlmError(f"{where}: {name}: expected one of its grids of floats, found {found}")
+    names = list(dict.fromkeys(head.name for head in heads if head.is_number and head.group not in _SHAPES))
+    warnings = []
+    if density is None:
+        exact = [name for name in names if name == _DENSITY] or [name for name in names if name.lower() == _DENSITY]
+        other = [name for name in names if any(part in name.lower() for part in _OTHERS)]
+        left = [name for name in names if name not in other]
+        chosen = exact or [name for name in left if any(part in name.lower() for part in _SMOKE)] or left
+        vectors = not exact and any(head.name.lower() == _DENSITY and not head.is_number for head in heads)
+        if len(chosen) != 1 or vectors:
+            usable = next((head.name for head in heads if head.is_number), None)
+            name = next(iter(chosen or names), usable)
+            advice = "export it as floats" if name is None else f"choose one, such as --volume density={name}"
+            level = "; a level set is filled with smoke if it is chosen" if name not in names and name else ""
+            raise WlmError(f"{where}: expected a grid of floats named density, found {found}: {advice}{level}")
+        density = chosen[0]
+        if not exact and density:
+            more = f" (found {found}; --volume density=NAME chooses)" if len(heads) > 1 else ""
+            warnings.append(f"{where}: the grid {density} is read as the density{more}")
+    if temperature is None and density.lower() != _TEMPERATURE:
+        temperature = next((name for name in names if name.lower() == _TEMPERATURE), None)
+    return density, temperature, warnings
+
+
+def is_level_set(grid: VdbGrid, group: str) -> bool:
+    """Whether the values of a grid of a class are distances to a surface: by its class, or else because the background
+    is above 0 and a value below."""
+    return grid.background > 0 and group != _FOG and (group == _LEVEL_SET or bool(grid.values.min() < 0))
 
 
 def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lattice, list[torch.Tensor]]:
@@ -156,138 +219,3 @@ def _resampled(lattice: Lattice, values: torch.Tensor, turn: np.ndarray, shift: 
     device = device_name(values.device)
     wp.launch(kernels.resample, lattice.shape, inputs, [to_warp(out)], device=device)
     return out
-
-
-BAD_GRID = (RuntimeError, TypeError, ValueError, LookupError, OverflowError, MemoryError, struct.error, zlib.error)
-"""Exceptions for data that is not NanoVDB, is truncated, or has wrong sizes."""
-
-# Sizes of a file's header and of a grid's metadata; offsets in the metadata of the grid's size, its size in the file,
-# and the length of its name.
-_FILE_HEADER, _META, _GRID_BYTES, _FILE_BYTES, _NAME_LENGTH = 16, 176, 0, 8, 136
-_ZIP, _BLOSC = 1, 2
-# Offsets in a grid's header: the map's linear part and shift in doubles; the tree, and in it the offset of the root.
-_LINEAR, _SHIFT, _TREE, _ROOT = 384, 528, 672, 24
-_LONGEST_NAME = 1 << 12
-
-
-@dataclass(frozen=True)
-class NanoVdbEntry:
-    """A grid of a NanoVDB file, still compressed.
-
-    Attributes:
-        name: Name in the file.
-        data: Compressed bytes.
-        head, meta: Header of the file segment that has the grid, and the grid's metadata in it.
-        size: Uncompressed size in bytes.
-        codec: Compression: 0 none, 1 zlib, 2 Blosc.
-    """
-
-    name: str
-    data: memoryview
-    head: bytes
-    meta: bytes
-    size: int
-    codec: int
-
-    def load(self, where: str, trust: bool) -> wp.Volume:
-        """Decompresses the grid; `where` names the file in messages. With `trust` the size that the file states is not
-        checked.
-
-        Raises:
-            WlmError: The stated size is too large for the compressed size.
-            RuntimeError, ValueError and others in `BAD_GRID`: The data is damaged.
-        """
-        if self.codec and not trust:
-            check_growth(where, len(self.data), self.size, GROWTH, SURE_BYTES)
-        grid = self._unpacked()
-        if len(grid) != self.size:
-            raise ValueError(f"grid {self.name}: expected {self.size} bytes after decompression, found {len(grid)}")
-        meta = bytearray(self.meta)
-        struct.pack_into("<Q", meta, _FILE_BYTES, len(grid))
-        # The header must claim a single grid: Warp would look for the others.
-        return wp.Volume.load_from_nvdb(b"".join((self.head[:12], struct.pack("<2H", 1, 0), meta, grid)), device="cpu")
-
-    def _unpacked(self) -> bytes:
-        if self.codec not in (_ZIP, _BLOSC):
-            return bytes(self.data)
-        pieces, at, left = [], 0, self.size
-        while at < len(self.data):
-            (length,) = struct.unpack_from("<Q", self.data, at)
-            piece = bytes(self.data[at + 8 : at + 8 + length])
-            if not 0 < length == len(piece):
-                raise ValueError(f"grid {self.name}: expected {length} compressed bytes, found {len(piece)}")
-            if self.codec == _BLOSC:
-                size = blosc.unpacked_size(piece)
-                if size > left:
-                    raise ValueError(f"grid {self.name}: expected {self.size} bytes after decompression, found more")
-                pieces.append(blosc.unpack(piece, size))
-            else:
-                pieces.append(zlib.decompressobj().decompress(piece, left + 1))
-            left -= len(pieces[-1])
-            at += 8 + length
-        return b"".join(pieces)
-
-
-def entries(data: bytes) -> Iterator[NanoVdbEntry]:
-    """Yields the grids of a file, which may have several segments with several grids each.
-
-    Raises:
-        RuntimeError, ValueError and others in `BAD_GRID`: The data is damaged.
-    """
-    view, at = memoryview(data), 0
-    while at < len(data):
-        head = bytes(view[at : at + _FILE_HEADER])
-        if head[:7] != b"NanoVDB" or head[7:8] not in b"02":
-            raise ValueError(f"expected the signature of NanoVDB at byte {at}, found {head[:8]!r}")
-        count, codec = struct.unpack_from("<2H", head, 12)
-        at += _FILE_HEADER
-        metas = []
-        for _ in range(count):
-            length = struct.unpack_from("<I", data, at + _NAME_LENGTH)[0]
-            if not 0 < length <= _LONGEST_NAME:
-                raise ValueError(f"expected a grid's name of 1 to {_LONGEST_NAME} bytes, found {length} bytes")
-            metas.append(bytes(view[at : at + _META + length]))
-            at += _META + length
-        for meta in metas:
-            size, packed = struct.unpack_from("<2Q", meta, _GRID_BYTES)
-            if at + packed > len(data):
-                raise ValueError(f"the file ends before byte {at + packed}, where a grid ends")
-            name = meta[_META:-1].decode("utf-8", "replace")
-            yield NanoVdbEntry(name, view[at : at + packed], head, meta, size if codec else packed, codec)
-            at += packed
-    if not data:
-        raise ValueError("the file is empty")
-
-
-def dense(volume: wp.Volume, name: str, most: int) -> Grid:
-    """Converts a sparse grid to a dense array over the box of its active voxels, or over voxel (0, 0, 0) if none is
-    active.
-
-    Raises:
-        WlmError: The grid does not contain floats, or its box has more than `most` voxels.
-    """
-    if volume.dtype is not wp.float32:
-        raise WlmError(f"{name}: expected a grid of floats, found {volume.get_grid_info().type_str}")
-    # Warp exposes neither the box nor the map in double precision.
-    head = volume.array()[: _TREE + _ROOT + 8].numpy()
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array(struct.unpack_from("<9d", head, _LINEAR)).reshape(3, 3)
-    matrix[:3, 3] = struct.unpack_from("<3d", head, _SHIFT)
-    root = _TREE + struct.unpack_from("<q", head, _TREE + _ROOT)[0]
-    if not 0 < root <= volume.array().size - 24:
-        raise WlmError(f"{name}: expected the root of the tree within the grid's bytes, found it at byte {root}")
-    corners = np.frombuffer(volume.array()[root : root + 24].numpy().tobytes(), "<i4").reshape(2, 3).astype(np.int64)
-    low, size = corners[0], corners[1] - corners[0] + 1
-    if (size < 1).any():
-        # No active voxel: one empty voxel.
-        low, size = np.zeros(3, np.int64), np.ones(3, np.int64)
-    if math.prod(size.tolist()) > most:
-        raise WlmError(
-            f"{name}: expected a box of at most {most} voxels from a grid of {volume.array().size} bytes, "
-            f"found a box from {corners[0].tolist()} to {corners[1].tolist()}"
-        )
-    out = wp.empty(tuple(size.tolist()), dtype=float, device=volume.device)
-    inputs = [volume.id, wp.vec3i(*low.tolist())]
-    wp.launch(kernels.dense, out.shape, inputs, [out], device=volume.device)
-    matrix[:3, 3] += matrix[:3, :3] @ low
-    return Grid(name, wp.to_torch(out), matrix)

@@ -18,13 +18,14 @@ import warp as wp
 from torch.nn.functional import pad
 
 from wlm.errors import WlmError
-from wlm.fluid.grids import BAD_GRID, UPS, Grid, dense, entries, on_one_lattice
+from wlm.fluid.grids import UPS, Grid, choose, is_level_set, on_one_lattice
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import HALF_MAX
-from wlm.formats.limits import RESAMPLED, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, VOXELS_A_BYTE, check_growth
+from wlm.formats.limits import RESAMPLED, SURE_VOXELS, VOLUME_BYTES, VOXELS, check_growth
+from wlm.formats.nanovdb import NanoVdbFile
 from wlm.formats.npz import read_npz
-from wlm.formats.reading import read_file
-from wlm.formats.vdb import VdbFile
+from wlm.formats.reading import FileBytes, open_file, read_file
+from wlm.formats.vdb import LARGEST, GridHead, VdbFile
 from wlm.interop import check_device, device_name, to_warp
 
 EDGE = 8
@@ -58,8 +59,10 @@ def scatter(numbers: torch.Tensor, bricks: torch.Tensor, shape: Sequence[int]) -
 
 
 _DENSITY, _TEMPERATURE, _BRICKS = "density", "temperature", "bricks"
-_LARGEST = 2**31 - 1  # largest number of voxels that a kernel can index
 _TINY, _HUGE = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+
+_THIN, _THICK = 0.1, 1000.0  # optical thickness of smoke that hides 10% of the light, and that looks solid
+_KELVIN = 250.0  # temperatures above it are probably kelvins; those of smoke simulations are about 1
 
 SUFFIXES = (".npz", ".nvdb", ".vdb")
 """Suffixes of the files that `load_volume` reads."""
@@ -108,6 +111,12 @@ class DensityVolume:
     def centre(self) -> np.ndarray:
         """Centre of the box in the world, float64 [3]."""
         return np.asarray(self.origin) + 0.5 * self.size
+
+    @property
+    def thickness(self) -> float:
+        """Largest optical thickness along an axis: the extinction times the density, integrated through the box."""
+        along = max(float(self.density.sum(axis, dtype=torch.float32).max()) for axis in range(3))
+        return self.extinction * self.voxel * along
 
     def arrays(self) -> tuple[wp.array, wp.array | None]:
         """Returns density and temperature as Warp arrays that share the tensors' memory."""
@@ -192,7 +201,7 @@ def load_volume(
         trust: Whether to accept more voxels than is likely for the size of the file (`wlm.formats.limits`).
         up: "x", "y" or "z", the axis of the file's world that becomes +y. None: y, with a warning if a `.nvdb` or
             `.vdb` is longest along z, which is up in Blender and Unreal.
-        density: Name of the array or grid; None: `density`, or else the first grid of floats of a VDB file.
+        density: Name of the array or grid; None: `density`, or in a VDB file as `wlm.fluid.grids.choose` does.
         temperature: Name of the array or grid of temperatures; None: `temperature`, if it exists.
 
     Returns:
@@ -213,19 +222,42 @@ def load_volume(
         volume = from_array(**_read_npz(path, names, device, trust), **factors, device=device)
         volume = _turned(volume, up) if up != "y" else volume
     else:
-        # The grid becomes dense on the CPU, where the file's tree is.
-        read = _read_nvdb if path.suffix.lower() == ".nvdb" else _read_vdb
-        volume = _from_parts(read(path, names, trust), up, trust, **factors)
+        grids, warnings = _read_grids(path, names, trust)
+        volume = _from_parts(grids, up, trust, **factors)
+        volume = replace(volume, warnings=(*warnings, *volume.warnings))
         heat = None if volume.temperature is None else volume.temperature.to(device)
         volume = replace(volume, density=volume.density.to(device), temperature=heat)
         if not told and is_long_along_z(volume):
             warning = f"{path}: longest along z: if that is up, as in Blender and Unreal, say so (--volume up=z)"
             volume = replace(volume, warnings=(*volume.warnings, warning))
+    if volume.temperature is not None and emission == 1.0 and (hottest := float(volume.temperature.max())) > _KELVIN:
+        warning = (
+            f"{path}: temperatures up to {hottest:,.0f}: if they are kelvins, --volume emission={1 / hottest:.2g} lets "
+            "the hottest voxel emit 1 per length"
+        )
+        volume = replace(volume, warnings=(*volume.warnings, warning))
     if voxel is None:
         return volume
     if not _TINY <= voxel <= _HUGE:
         raise WlmError(f"{path}: voxel: expected a length above 0 that float32 holds, found {voxel}")
     return replace(volume, voxel=voxel, origin=tuple(voxel / volume.voxel * o for o in volume.origin))
+
+
+def thickness_hint(thickness: float, extinction: float) -> str | None:
+    """Returns a line for smoke so thin that it can hardly be seen, or so thick that it looks solid; None otherwise.
+
+    Args:
+        thickness: `DensityVolume.thickness`, of several frames the largest.
+        extinction: The extinction per unit of length at density 1 that it has.
+    """
+    if not 0 < thickness < _THIN and not thickness > _THICK:
+        return None
+    looks, good = ("can hardly be seen", 3.0) if thickness < _THIN else ("looks like a solid", 10.0)
+    found, better = (f"{float(f'{value:.2g}'):g}" for value in (thickness, extinction * good / thickness))
+    return (
+        f"the smoke has an optical thickness of at most {found} and {looks}: --volume extinction={better} makes it "
+        f"{good:.0f}"
+    )
 
 
 def is_long_along_z(volume: DensityVolume) -> bool:
@@ -240,7 +272,7 @@ def _turned(volume: DensityVolume, up: str) -> DensityVolume:
     parts = [Grid(_DENSITY, volume.density, matrix)]
     if volume.temperature is not None:
         parts.append(Grid(_TEMPERATURE, volume.temperature, matrix))
-    lattice, values = on_one_lattice(parts, _LARGEST, up)
+    lattice, values = on_one_lattice(parts, LARGEST, up)
     heat = values[1] if len(values) > 1 else None
     return replace(volume, density=values[0], temperature=heat, origin=lattice.origin)
 
@@ -290,7 +322,7 @@ def _check(
             values = torch.from_numpy(np.array(values, kept, order="C"))
     elif values.dtype.is_complex or values.dtype == torch.bool:
         raise WlmError(f"{name}: {field}: expected numbers, found {values.dtype}")
-    if values.ndim != 3 or 0 in values.shape or values.numel() > _LARGEST:
+    if values.ndim != 3 or 0 in values.shape or values.numel() > LARGEST:
         raise WlmError(f"{name}: {field}: expected [X, Y, Z] voxels, found {tuple(values.shape)}")
     dtype = dtype or (torch.float16 if values.dtype == torch.float16 else torch.float32)
     values = values.detach().to(device, dtype).contiguous()
@@ -334,7 +366,7 @@ def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, tru
             return [name for name in found if name.removesuffix("_bricks") in (*wanted, _BRICKS, "shape")]
         return [*needed, *(name for name in wanted if name in found and name not in needed)]
 
-    most = _LARGEST if trust else VOXELS
+    most = LARGEST if trust else VOXELS
     arrays = read_npz(path, choose, numbers=most, sure=VOLUME_BYTES if trust else 4 * SURE_VOXELS)
     if _BRICKS in arrays:
         arrays = _in_place(path, arrays, most, device, trust)
@@ -382,53 +414,49 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
 
 def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> DensityVolume:
     voxels = sum(part.values.numel() for part in parts)
-    lattice, values = on_one_lattice(
-        parts, _LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * voxels)), up
-    )
+    lattice, values = on_one_lattice(parts, LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * voxels)), up)
     place = {"voxel": lattice.voxel, "origin": lattice.origin, "device": device_name(values[0].device)}
     heat = values[1] if len(values) > 1 else None
     return from_array(values[0], temperature=heat, **place, **factors)
 
 
-def _read_nvdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> list[Grid]:
-    data = read_file(path, VOLUME_BYTES, "the NanoVDB file")
-    try:
-        found = {entry.name: entry for entry in reversed(list(entries(data)))}
-        chosen = _choose(path, list(reversed(found)), names)
-        volumes = {name: found[name].load(str(path), trust) for name in chosen}
-    except BAD_GRID as error:
-        raise WlmError(f"{path}: cannot read the NanoVDB file: {str(error) or type(error).__name__}") from error
-    grids = []
-    for name, volume in volumes.items():
-        most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * volume.array().size))
-        grids.append(dense(volume, f"{path}: {name or 'grid 0'}", most))
-    return grids
+def grid_heads(path: Path) -> tuple[GridHead, ...]:
+    """Returns the names, types and classes of the grids of a `.nvdb` or `.vdb` file; none for a `.npz`.
+
+    Raises:
+        WlmError: The file is missing or damaged.
+    """
+    if path.suffix.lower() not in _FILES:
+        return ()
+    kind, what = _FILES[path.suffix.lower()]
+    with open_file(path, what) as file:
+        return kind(FileBytes(file), str(path)).heads
 
 
-def _read_vdb(path: Path, names: tuple[str | None, str | None], trust: bool) -> list[Grid]:
-    data = read_file(path, VOLUME_BYTES, "the OpenVDB file")
-    file = VdbFile(data, str(path))
-    if not file.names:
-        raise WlmError(f"{path}: expected a grid of floats, found {', '.join(file.others) or 'no grid'}")
-    if names[0] is None and (other := next((o for o in file.others if o.startswith(f"{_DENSITY} (")), None)):
-        raise WlmError(f"{path}: expected a grid of floats for the density, found {other}; choose another grid")
-    most = _LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * len(data)))
+def _read_grids(path: Path, names: tuple[str | None, str | None], trust: bool) -> tuple[list[Grid], list[str]]:
+    """Reads the grids of density and, if it exists, temperature from a file, with warnings."""
+    kind, what = _FILES[path.suffix.lower()]
+    file = kind(read_file(path, VOLUME_BYTES, what), str(path))
+    density, temperature, warnings = choose(str(path), file.heads, *names)
     grids = []
-    for name in _choose(path, file.names, names):
-        grid = file.read(name, most)
-        matrix = grid.matrix.copy()
+    same = [head for head in file.heads if head.name == density]
+    if len(same) > 1:
+        warnings.append(f"{path}: {len(same)} grids are named {density or 'nothing'}: only the first is read")
+    for name in (density,) if temperature is None else (density, temperature):
+        grid = file.read(name, trust)
+        matrix, where, values = grid.matrix.copy(), f"{path}: {name or 'grid 0'}", grid.values
         matrix[:3, 3] += matrix[:3, :3] @ grid.low
-        grids.append(Grid(f"{path}: {name or 'grid 0'}", torch.from_numpy(np.ascontiguousarray(grid.values)), matrix))
-    return grids
+        if name == density and is_level_set(grid, same[0].group):
+            if names[0] is None:
+                raise WlmError(f"{where}: expected density, found a level set: --volume density={name} fills it")
+            # Smoke fills the inside, and fades to the surface within the narrow band.
+            values = np.clip(-values / grid.background, 0.0, 1.0)
+            warnings.append(f"{where}: a level set, which is filled with smoke of density 1")
+        grids.append(Grid(where, torch.from_numpy(np.ascontiguousarray(values)), matrix))
+    return grids, warnings
 
 
-def _choose(path: Path, names: Sequence[str], wanted: tuple[str | None, str | None]) -> list[str]:
-    density, temperature = wanted
-    for name in (density, temperature):
-        if name is not None and name not in names:
-            raise WlmError(f"{path}: {name} is missing; found {', '.join(names)}")
-    if density is None:
-        density = _DENSITY if _DENSITY in names else names[0]
-    if temperature is None and _TEMPERATURE in names and density != _TEMPERATURE:
-        temperature = _TEMPERATURE
-    return [density] if temperature is None else [density, temperature]
+_FILES: dict[str, tuple[Any, str]] = {
+    ".nvdb": (NanoVdbFile, "the NanoVDB file"),
+    ".vdb": (VdbFile, "the OpenVDB file"),
+}

@@ -13,7 +13,7 @@ integer UVs and positions             read, normalised or not (KHR_mesh_quantiza
 strided, sparse, absent (zero) data   read
 a mesh under two nodes                returned twice; in copies each node has its own mesh, and equal
                                       data is stored once
-a node that mirrors                   vertices keep their order, so triangles face the other way
+a node that mirrors                   the winding of its triangles is turned round, so that they keep their front
 skins, morph targets, animations      ignored: the mesh is read in its rest pose, with its node's transform
 nodes outside the scene               left out; kept in copies
 external `.bin`, `data:` URIs         read; copies embed them in the `.glb`
@@ -22,7 +22,8 @@ external images                       copies embed them; an image that is missin
 a buffer outside the file's folder    error, unless the file is trusted; an image there keeps its URI
 more corners and vertices than        error, unless the file is trusted (`wlm.formats.limits`)
 the limits
-Draco, meshopt, GPU instances         error that names the extension
+Draco, meshopt                        decompressed, with the extra `gltf` (`gltf_packed`)
+GPU instances                         error that names the extension
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
 """
@@ -42,8 +43,9 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 
 from wlm.errors import WlmError, one_line
+from wlm.formats.gltf_packed import is_fallback, unpack
 from wlm.formats.limits import CORNERS, CORNERS_A_BYTE, JSON_BYTES, MESH_BYTES, SURE_CORNERS, Budget
-from wlm.formats.reading import named_file, parse_json, read_file
+from wlm.formats.reading import damaged, named_file, parse_json, read_file
 
 MAGIC = b"glTF"
 JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
@@ -58,14 +60,12 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MATRIX_SIDES = {"MAT2": 2, "MAT3": 3, "MAT4": 4}
 _LONGEST_STRIDE = 252  # bytes
 _LABEL = 60  # characters of a name in a message
-_OVERHEAD = 256  # cost of a primitive under a node, in corners
+_OVERHEAD = 512  # cost of a primitive under a node, in corners
+_LARGEST_TRANSFORM = 1e9  # magnitude of the numbers of a texture transform
 _MOVES, _UNMOVED = {"matrix", "translation", "rotation", "scale"}, np.eye(4)
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
 _REFUSED = {
-    "KHR_draco_mesh_compression": "decompress the mesh first",
-    "EXT_meshopt_compression": "decompress the mesh first",
-    "KHR_meshopt_compression": "decompress the mesh first",
-    "EXT_mesh_gpu_instancing": "make its instances nodes first",
+    "EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance",
 }
 
 
@@ -114,6 +114,8 @@ class GltfPrimitive:
         row: int64 [V], the row of each vertex in the primitive's accessors.
         label, mesh_label: Names of the node and of its mesh; "node 3" or "mesh 2", by index, without a name.
         material: Index of the material, or None.
+        mirrored: Whether the node's transform has a negative determinant, for which `triangle` has the opposite winding
+            of the file (glTF 2.0, 3.7.4).
     """
 
     node: int
@@ -127,6 +129,7 @@ class GltfPrimitive:
     label: str
     mesh_label: str
     material: int | None
+    mirrored: bool = False
 
 
 def read_gltf(path: str | os.PathLike[str], trust: bool = False) -> tuple[GltfDocument, list[GltfPrimitive]]:
@@ -164,12 +167,14 @@ def parse_gltf(
             if name in _REFUSED:
                 raise WlmError(f"{path}: uses the extension {name}, which is not read here: {_REFUSED[name]}")
         buffers = _load_buffers(path, content.get("buffers", []), binary, trust)
+        content, buffers = unpack(path, content, buffers, COMPONENTS)
         held = len(text) + sum(map(len, buffers))
         most = CORNERS if trust else min(CORNERS, max(SURE_CORNERS, CORNERS_A_BYTE * held))
         document = GltfDocument(str(path), content, buffers, trust, most)
         for i, view in enumerate(content.get("bufferViews", [])):
             _check_view(document, i, view)
-        return document, _read_primitives(document)
+        with np.errstate(all="ignore"):  # infinite numbers are reported where they are used
+            return document, _read_primitives(document)
 
 
 Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
@@ -184,13 +189,16 @@ def document_from_arrays(
     return document, primitive
 
 
-def document_from_meshes(meshes: Sequence[Arrays], name: str) -> tuple[GltfDocument, list[GltfPrimitive]]:
+def document_from_meshes(
+    meshes: Sequence[Arrays], name: str, uv_set: int = 0
+) -> tuple[GltfDocument, list[GltfPrimitive]]:
     """Makes a glTF document of several meshes, each with its own node.
 
     Args:
         meshes: At least one: name; positions [V, 3], stored as float32; triangles int [F, 3], at least one; and UVs
-            [V, 2], u right, v down, stored as float32 `TEXCOORD_0`.
+            [V, 2], u right, v down, stored as float32 in all UV sets up to `uv_set`.
         name: Name of the document.
+        uv_set: n of the last `TEXCOORD_n`.
 
     Returns:
         The document and its primitives, one for each mesh.
@@ -213,11 +221,10 @@ def document_from_meshes(meshes: Sequence[Arrays], name: str) -> tuple[GltfDocum
         first = len(accessors) - 3
         accessors[first] |= {"min": points.min(axis=0).tolist(), "max": points.max(axis=0).tolist()}
         nodes.append({"mesh": number, "name": label})
-        trees.append(
-            {"primitives": [{"attributes": {"POSITION": first, "TEXCOORD_0": first + 1}, "indices": first + 2}]}
-        )
+        attributes = {"POSITION": first} | {f"TEXCOORD_{number}": first + 1 for number in range(uv_set + 1)}
+        trees.append({"primitives": [{"attributes": attributes, "indices": first + 2}]})
         row, short = np.arange(len(points)), one_line(label, _LABEL)
-        arrays = points.astype(np.float64), corners.astype(np.int32), {0: places}
+        arrays = points.astype(np.float64), corners.astype(np.int32), {uv_set: places}
         primitives.append(GltfPrimitive(number, number, 0, label, *arrays, row, short, short, None))
     content = {
         "asset": {"version": "2.0", "generator": "wlm"},
@@ -367,8 +374,8 @@ def _rows(document: GltfDocument, where: str, place: dict, count: int, size: int
 def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
     primitives = []
     cache: dict[tuple[int, str], np.ndarray] = {}  # primitives often share their accessors
-    hint = "" if document.trust else " (trust=True, --trust on the command line, lifts the limit for the size)"
-    budget = Budget(document.path, document.most, f"drawn corners and vertices{hint}")
+    hint = "; trust=True (--trust on the command line) lifts the limit for files from a trusted author"
+    budget = Budget(document.path, document.most, "drawn corners and vertices", "" if document.trust else hint)
 
     def floats(number: int, kind: str) -> np.ndarray:
         if (number, kind) not in cache:
@@ -402,6 +409,8 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                 if len(values) != len(local):
                     raise WlmError(f"{where}: {name}: expected {len(local)} UVs, like POSITION, found {len(values)}")
                 uv[number] = values[row]
+            triangle = triangle.reshape(-1, 3).astype(np.int32)
+            mirrored = bool(np.linalg.det(transform[:3, :3]) < 0)
             primitives.append(
                 GltfPrimitive(
                     node=node,
@@ -409,12 +418,13 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                     primitive=i,
                     name=f"node {node}, mesh {mesh_number}, primitive {i}",
                     position=local[row].astype(np.float64) @ transform[:3, :3].T + transform[:3, 3],
-                    triangle=triangle.reshape(-1, 3).astype(np.int32),
+                    triangle=triangle[:, ::-1] if mirrored else triangle,
                     uv=uv,
                     row=row,
                     label=_label(document.content["nodes"][node], f"node {node}"),
                     mesh_label=_label(mesh, f"mesh {mesh_number}"),
                     material=_material(where, primitive),
+                    mirrored=mirrored,
                 )
             )
     return primitives
@@ -556,20 +566,14 @@ def _load_buffer(
 ) -> bytes:
     uri, length = buffer.get("uri"), buffer["byteLength"]
     where = f"{path}: buffers[{number}]"
+    if is_fallback(buffer):
+        return b""
     if uri is None:
         if number or binary is None:
             raise WlmError(f"{where}: has no uri, and the file has no binary chunk")
         data = binary
     elif uri.startswith("data:"):
-        head, comma, body = uri.partition(",")
-        if not comma:
-            raise WlmError(f"{where}.uri: expected a data: URI with a comma before its content")
-        data = unquote_to_bytes(body)
-        if head.endswith(";base64"):
-            try:
-                data = base64.b64decode(data, validate=True)
-            except binascii.Error as error:
-                raise WlmError(f"{where}.uri: expected base64: {error}") from error
+        data = _data_uri(f"{where}.uri", uri)
     else:
         if not isinstance(length, int) or length < 1:
             raise WlmError(f"{where}.byteLength: expected at least 1, found {length}")
@@ -582,6 +586,69 @@ def _load_buffer(
     if len(data) < length:
         raise WlmError(f"{where}: expected {length} bytes, found {len(data)}")
     return data
+
+
+def _data_uri(where: str, uri: str) -> bytes:
+    """Returns the bytes that a `data:` URI holds."""
+    head, comma, body = uri.partition(",")
+    if not comma:
+        raise WlmError(f"{where}: expected a data: URI with a comma before its content")
+    data = unquote_to_bytes(body)
+    if head.endswith(";base64"):
+        with damaged(f"{where}: expected base64", binascii.Error):
+            data = base64.b64decode(data, validate=True)
+    return data
+
+
+def texture_image(document: GltfDocument, number: object) -> int:
+    """Returns the index of the image of a texture. Of several sources float pictures come first, then those that all
+    readers know.
+
+    Raises:
+        WlmError: There is no such texture, or it names no image.
+    """
+    texture = document.item("textures", number)
+    extensions = texture.get("extensions", {})
+    for name in ("EXT_texture_exr", "", "EXT_texture_webp", "KHR_texture_basisu", "MSFT_texture_dds"):
+        source = (extensions.get(name, {}) if name else texture).get("source")
+        if source is not None:
+            return source
+    others = ", ".join(one_line(name, _LABEL) for name in extensions) or "no source"
+    raise WlmError(f"{document.path}: textures[{number}]: expected an image that can be read, found {others}")
+
+
+def held_image(document: GltfDocument, number: int) -> bytes | memoryview | None:
+    """Returns the bytes of an image in a buffer view or a `data:` URI; None for an image in a file of its own.
+
+    Raises:
+        WlmError: There is no such image, or its buffer view or URI is malformed.
+    """
+    image = document.item("images", number)
+    if "bufferView" in image:
+        view = document.item("bufferViews", image["bufferView"])
+        start = view.get("byteOffset", 0)
+        return memoryview(document.buffers[view["buffer"]])[start : start + view["byteLength"]]
+    if str(image["uri"]).startswith("data:"):
+        return _data_uri(f"{document.path}: images[{number}].uri", image["uri"])
+    return None
+
+
+def texture_transform(where: str, info: dict) -> np.ndarray:
+    """Returns the KHR_texture_transform of a texture slot, float64 [2, 3]: UV' = transform[:, :2] UV + transform[:, 2].
+
+    Raises:
+        WlmError: It is malformed; `where` names the slot.
+    """
+    transform = info.get("extensions", {}).get("KHR_texture_transform", {})
+    names = {"scale": [1.0, 1.0], "rotation": 0.0, "offset": [0.0, 0.0]}
+    scale, turn, offset = (np.array(transform.get(name, usual), np.float64) for name, usual in names.items())
+    numbers = [*scale.ravel(), *turn.ravel(), *offset.ravel()]
+    if (scale.shape, turn.shape, offset.shape) != ((2,), (), (2,)) or not np.abs(numbers).max() <= _LARGEST_TRANSFORM:
+        raise WlmError(
+            f"{where}: KHR_texture_transform: expected two numbers each for scale and offset, and one for rotation"
+        )
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return np.column_stack([np.array([[cosine, sine], [-sine, cosine]]) * scale, offset])
 
 
 def local_file(document_path: str, uri: str, where: str, trust: bool) -> Path:

@@ -106,11 +106,11 @@ def encode_glb(
         raise ValueError("replacements: expected at most one for each primitive")
     with reported(document.path):
         tree = _Tree(document)
-        for node in sorted({node for node, _ in keys}):
-            primitives = tree.own_mesh(node)["primitives"]
-            for each in replacements:
-                if each.primitive.node == node:
-                    tree.replace(primitives[each.primitive.primitive], each, uv_set)
+        meshes: dict[int, dict] = {}
+        for each in sorted(replacements, key=lambda each: each.primitive.node):
+            node = each.primitive.node
+            meshes[node] = meshes[node] if node in meshes else tree.own_mesh(node)
+            tree.replace(meshes[node]["primitives"][each.primitive.primitive], each, uv_set)
         tree.embed_images()
         tree.drop_unused()
     return _pack(document.path if path is None else path, tree.content, tree.payloads)
@@ -150,7 +150,8 @@ class _Tree:
             primitive["attributes"].setdefault(f"TEXCOORD_{number}", uv)
         # Index 65535 would restart the primitive.
         component, name = (_UINT16, "<u2") if len(new.gather) < 65536 else (_UINT32, "<u4")
-        corners = np.ascontiguousarray(new.triangle, name).reshape(-1, 1)
+        triangle = new.triangle[:, ::-1] if new.primitive.mirrored else new.triangle  # as the file has them
+        corners = np.ascontiguousarray(triangle, name).reshape(-1, 1)
         primitive["indices"] = self._accessor(corners.view(np.uint8), component, "SCALAR", _INDICES)
         primitive["mode"] = TRIANGLES
         for name in _OF_VERTICES:

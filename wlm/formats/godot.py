@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.limits import BAKE_BYTES, check_growth
+from wlm.formats.limits import BAKE_BYTES, Budget, check_growth
 from wlm.formats.reading import read_file
 from wlm.formats.zstd import decompress
 
@@ -86,6 +86,9 @@ _PACKED = {
 # Kinds of references to a resource: no content, two strings (in old files), an index, an index.
 _EMPTY, _EXTERNAL_PATH, _INTERNAL, _EXTERNAL = range(4)
 
+# A value or name counts as so many bytes, and all may take so many: a million for any size of file.
+_COST, _SURE, _GROWTH = 32, 32 << 20, 8
+
 # Real files nest values two deep. The limit keeps a damaged file from exhausting the stack.
 _DEEPEST = 32
 
@@ -139,7 +142,7 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
                 reader.expect(name, _OBJECT, "a texture")
                 if reader.u32() != _EXTERNAL or (index := reader.u32()) >= len(external):
                     raise WlmError(f"{path}: {name}: expected references to texture files, found an embedded texture")
-                textures.append(external[index])
+                textures.append(reader.refer(external[index]))
         elif name == _USERS:
             reader.expect(name, _ARRAY, "an array")
             count = reader.u32() & 0x7FFFFFFF
@@ -222,9 +225,9 @@ def _reader(path: str | os.PathLike[str]) -> _Reader:
     magic = data[:4]
     if magic == b"RSCC":
         # The decompressed content has no magic number, and its offsets count from its start.
-        return _Reader(path, _decompress(_Reader(path, data, 4)), 0)
+        return _Reader(path, _decompress(_Reader(path, data, 4, len(data))), 0, len(data))
     if magic == b"RSRC":
-        return _Reader(path, data, 4)
+        return _Reader(path, data, 4, len(data))
     raise WlmError(f"{path}: expected a Godot binary resource (RSRC or RSCC), found {magic!r} at its start")
 
 
@@ -276,14 +279,17 @@ class _Reader:
     A stated length is compared with the remaining bytes before anything is allocated.
     """
 
-    def __init__(self, path: str | os.PathLike[str], data: bytes, start: int) -> None:
+    def __init__(self, path: str | os.PathLike[str], data: bytes, start: int, held: int) -> None:
         self.path = path
         self.data = memoryview(data)
         self.position = start
         self.order = "<"
         self.real = 4
+        # Compressed bakes hold many values in few bytes, and values refer to names of any length by an index.
+        self._budget = Budget(str(path), max(_SURE, _GROWTH * held), "bytes of names and values")
 
     def take(self, count: int) -> memoryview:
+        self._budget.spend(_COST)
         left = len(self.data) - self.position
         if count > left:
             raise WlmError(
@@ -314,7 +320,12 @@ class _Reader:
             return self._text(index & 0x7FFFFFFF)
         if index >= len(names):
             raise WlmError(f"{self.path}: damaged: expected an index of a name below {len(names)}, found {index}")
-        return names[index]
+        return self.refer(names[index])
+
+    def refer(self, name: str) -> str:
+        """Returns a name that a value refers to, whose length counts at each use."""
+        self._budget.spend(len(name))
+        return name
 
     def key(self) -> str | None:
         """Reads a key of a dictionary; returns None if it is not text."""

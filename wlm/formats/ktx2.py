@@ -1,6 +1,6 @@
 """KTX2 files: writing of 2D textures (with mips) and 3D textures without supercompression, and reading of light.
 
-Only the largest mip of a 2D texture of light is read; arrays, cubes, volumes and formats of low range or of fewer than
+Only the largest mip of a 2D or a 3D texture of light is read; arrays, cubes and formats of low range or of fewer than
 three channels are refused. Sources: KTX file format specification 2.0; for the data format descriptor, Khronos Data
 Format specification 1.3, basic descriptor block.
 """
@@ -18,6 +18,7 @@ from wlm.formats.atomic import atomic_write
 from wlm.formats.deflate import inflate
 from wlm.formats.float_texels import Layout, check_picture, decode_texels, unpack_zstd
 from wlm.formats.hdr_blocks import ASTC_BLOCKS
+from wlm.formats.primaries import ACES_AP0, ACES_AP1, ADOBE_RGB, CIE_XYZ, P3_D65, REC709, REC2020, to_rec709
 from wlm.formats.reading import open_file
 
 VK_FORMATS = {
@@ -34,6 +35,8 @@ VK_FORMATS = {
 """Formats that can be written, with their Vulkan numbers: 16 or 32 bits per channel, RGB9E5, or blocks of 16 bytes."""
 
 MAGIC = b"\xabKTX 20\xbb\r\n\x1a\n"
+VOLUME_HEAD = 32
+"""Bytes at the beginning of a file that tell whether it is a volume."""
 # Identifier; format, bytes of a channel, width, height, depth, layers, faces, levels, supercompression; offset and
 # length of the descriptor, of the key/value data and of the supercompression data.
 _HEADER = struct.Struct("<12s 9I 4I 2Q")
@@ -60,6 +63,8 @@ _SHARED_UNITY, _SHARED_MIDDLE, _SHARED_MOST = 8448, 15, 31
 # The header and the first entry of the level index, which describes the largest level.
 _READ_HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
 _PAIRS_BYTES = 1 << 20  # limit of the key/value data
+# The primaries of Khronos Data Format 1.3; 0 is unspecified.
+_PRIMARIES = {0: REC709, 1: REC709, 4: REC2020, 5: CIE_XYZ, 6: ACES_AP0, 7: ACES_AP1, 10: P3_D65, 11: ADOBE_RGB}
 _DESCRIPTOR_BYTES = 20  # the descriptor up to its transfer function
 _TRANSFERS = (0, 1)  # unspecified, linear
 
@@ -108,7 +113,7 @@ def write_ktx2(
         raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")
     if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
         raise ValueError(f"expected a width and a height of 1 to {_MAX_SIDE} texels, got {width}x{height}")
-    if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in _CHANNELS):
+    if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in (*_CHANNELS, _SHARED)):
         raise ValueError(f"depth: expected 0 to {_MAX_DEPTH}, and 0 for a format of blocks, got {depth} for {fmt}")
     most = 0 if depth else max(width, height).bit_length() - 1
     if not 0 <= mips <= most:
@@ -206,10 +211,11 @@ def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) 
     return struct.pack("<I", 4 + size) + block
 
 
-def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the largest mip of a KTX2 texture of light, plain or compressed by zstd or zlib.
 
-    The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored.
+    The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored. Other
+    primaries are converted to Rec. 709, which adds a line to `notes`.
 
     Returns:
         The pixels, float32 [H, W, 3 or 4], and the channel names.
@@ -218,6 +224,29 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
         WlmError: The file is missing, is not a KTX2 file, is cut short or damaged, has another format, is an array, a
             cube or a volume, has swizzled or nonlinear channels, or the package that decodes it is missing.
     """
+    pixels, layout, right, down = _read(path, False, [] if notes is None else notes)
+    return np.ascontiguousarray(pixels[0, :: 1 if down else -1, :: 1 if right else -1]), layout.names
+
+
+def is_volume(head: bytes) -> bool:
+    """Whether the first `VOLUME_HEAD` bytes of a file are those of a KTX2 texture with several slices in depth."""
+    return head.startswith(MAGIC) and int.from_bytes(head[28:VOLUME_HEAD], "little") > 1
+
+
+def read_ktx2_volume(path: str | os.PathLike[str]) -> np.ndarray:
+    """Reads the largest mip of a 3D texture of light in its stored order, whatever `KTXorientation` states.
+
+    Returns:
+        The texels, float32 [D, H, W, 3]; alpha is left out.
+
+    Raises:
+        WlmError: As for `read_ktx2`, or the height is not a multiple of that of the blocks.
+    """
+    return _read(path, True, [])[0][..., :3]
+
+
+def _read(path: str | os.PathLike[str], volume: bool, notes: list[str]) -> tuple[np.ndarray, Layout, bool, bool]:
+    """Returns the texels [D, H, W, C] as stored, their layout, and whether columns go right and rows go down."""
     with open_file(path, "the KTX2 file") as file:
         held = os.fstat(file.fileno()).st_size
         head = file.read(_READ_HEADER.size)
@@ -236,15 +265,18 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
         name, layout = _LAYOUTS[number]
         for field, found, fits, expected in (
             ("pixelHeight", height, height > 0, "at least 1 (2D)"),
-            ("pixelDepth", depth, depth <= 1, "0 (no volume)"),
+            ("pixelDepth", depth, volume or depth <= 1, "0 (no volume)"),
             ("layerCount", layers, layers <= 1, "0 (no array)"),
             ("faceCount", faces, faces == 1, "1 (no cube)"),
             ("supercompressionScheme", scheme, scheme in (_NONE, _ZSTD, _ZLIB), "none (0), zstd (2) or zlib (3)"),
         ):
             if not fits:
                 raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
-        check_picture(path, held, width, height, layout.unpacked)
-        expected = layout.bytes_of(width, height)
+        slices = max(depth, 1)
+        if slices > 1 and height % layout.block[1]:
+            raise WlmError(f"{path}: pixelHeight: expected a multiple of {layout.block[1]} in a volume, found {height}")
+        check_picture(path, held, width, height, layout.unpacked * slices)
+        expected = layout.bytes_of(width, height * slices)
         for field, found in (("byteLength", stored), ("uncompressedByteLength", size))[scheme != _NONE :]:
             if found != expected:
                 raise WlmError(
@@ -252,9 +284,11 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
                 )
         if stored > 2 * expected + 1024:  # no compressor expands data further
             raise WlmError(f"{path}: byteLength of level 0: expected at most {2 * expected + 1024}, found {stored}")
-        _check_descriptor(path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES))
+        primaries = _primaries(
+            path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES)
+        )
         words = _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES)
-        right, down = _orientation(path, words, layout.channels)
+        right, down = _orientation(path, words, layout.channels, volume)
         data = _part(path, file, held, start, stored, "level 0", stored)
     if scheme == _ZSTD:
         data = unpack_zstd(path, data, expected)
@@ -265,8 +299,9 @@ def read_ktx2(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
             raise WlmError(str(error)) from error
     if len(data) != expected:
         raise WlmError(f"{path}: level 0: expected {expected} bytes once unpacked, found {len(data)}")
-    pixels = decode_texels(path, layout, data, width, height)
-    return np.ascontiguousarray(pixels[:: 1 if down else -1, :: 1 if right else -1]), layout.names
+    pixels = decode_texels(path, layout, data, width, height * slices)
+    to_rec709(pixels, primaries, f"{path}: the data format descriptor", notes)
+    return pixels.reshape(slices, height, width, -1), layout, right, down
 
 
 def _part(
@@ -282,16 +317,21 @@ def _part(
     return data
 
 
-def _check_descriptor(path: str | os.PathLike[str], data: bytes) -> None:
-    """Checks that the transfer function in the data format descriptor is linear."""
+def _primaries(path: str | os.PathLike[str], data: bytes) -> tuple[float, ...]:
+    """Returns the chromaticities that the data format descriptor states, and checks that its transfer function is
+    linear."""
     if len(data) < _DESCRIPTOR_BYTES:
         raise WlmError(f"{path}: the data format descriptor: expected {_DESCRIPTOR_BYTES} bytes, found {len(data)}")
     transfer = data[14]
     if transfer not in _TRANSFERS:
         raise WlmError(f"{path}: the data format descriptor: expected linear light (transfer 1), found {transfer}")
+    if data[13] not in _PRIMARIES:
+        known = ", ".join(map(str, _PRIMARIES))
+        raise WlmError(f"{path}: the data format descriptor: expected primaries {known}, found {data[13]}")
+    return _PRIMARIES[data[13]]
 
 
-def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tuple[bool, bool]:
+def _orientation(path: str | os.PathLike[str], data: bytes, channels: int, volume: bool) -> tuple[bool, bool]:
     """Returns whether columns go right and whether rows go down, and checks the order of the channels."""
     found = {b"KTXorientation": b"rd", b"KTXswizzle": b"rgba"}
     at = 0
@@ -304,6 +344,7 @@ def _orientation(path: str | os.PathLike[str], data: bytes, channels: int) -> tu
             found[key] = value.rstrip(b"\0")
         at += 4 + size + -size % 4
     orientation, swizzle = found.values()
+    orientation = orientation[:2] if volume else orientation
     if orientation not in (b"rd", b"ru", b"ld", b"lu"):
         raise WlmError(f"{path}: KTXorientation: expected rd, ru, ld or lu, found {orientation[:20]!r}")
     if swizzle[:channels] != b"rgba"[:channels]:

@@ -68,7 +68,7 @@ def read_levels(path: str | os.PathLike[str], kind: str, notes: list[str]) -> tu
         WlmError: The file is missing, damaged, animated, or not of grey, of RGB or of a palette.
     """
     if kind == "TIFF":
-        pixels, names = tiff.read_tiff(path)
+        pixels, names = tiff.read_tiff(path, notes)
     else:
         data = read_file(path, IMAGE_BYTES, f"the {kind}")
         # `Image.open` would try the readers of other formats, too.

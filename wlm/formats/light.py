@@ -21,7 +21,7 @@ _Notes = list[str]
 
 
 def _read_tiff(path: str | os.PathLike[str], notes: _Notes) -> tuple[np.ndarray, tuple[str, ...]]:
-    pixels, names = tiff.read_tiff(path)
+    pixels, names = tiff.read_tiff(path, notes)
     if pixels.dtype != np.float32:
         raise WlmError(f"{path}: expected a lightmap, {EXPECTED}, found a TIFF of integers{_STATE_IT}")
     if "L" not in names:
@@ -34,7 +34,7 @@ def _read_tiff(path: str | os.PathLike[str], notes: _Notes) -> tuple[np.ndarray,
 _READERS: dict[bytes, Callable[[str | os.PathLike[str], _Notes], tuple[np.ndarray, tuple[str, ...]]]] = {
     EXR_MAGIC: read_exr,
     radiance.MAGIC: radiance.read_radiance,
-    ktx2.MAGIC: lambda path, notes: ktx2.read_ktx2(path),
+    ktx2.MAGIC: ktx2.read_ktx2,
     dds.MAGIC: lambda path, notes: dds.read_dds(path),
     **dict.fromkeys(pfm.MAGIC, pfm.read_pfm),
     **dict.fromkeys(tiff.MAGIC, _read_tiff),

@@ -129,9 +129,10 @@ def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure:
 class Budget:
     """Work or memory that the read of one file may still take; all loops of the read spend from it beforehand."""
 
-    def __init__(self, where: str, most: int, unit: str) -> None:
-        """Starts with `most` of a unit; `where` names the file, and `unit` is plural, like "bytes of names"."""
-        self._where, self._most, self._unit, self._left = where, most, unit, most
+    def __init__(self, where: str, most: int, unit: str, hint: str = "") -> None:
+        """Starts with `most` of a unit. For messages: the file, the unit in plural, and advice that follows."""
+        self._left = most
+        self._text = f"{where}: expected at most {most} {unit} for the size of the file, found more{hint}"
 
     def spend(self, amount: int) -> None:
         """Takes an amount from what is left.
@@ -141,6 +142,4 @@ class Budget:
         """
         self._left -= amount
         if self._left < 0:
-            raise WlmError(
-                f"{self._where}: expected at most {self._most} {self._unit}, the limit for its size, found more"
-            )
+            raise WlmError(self._text)

@@ -116,6 +116,20 @@ def _whole(text: str) -> int:
     return value
 
 
+class FileBytes:
+    """An open file as a sequence of bytes, of which only the slices that are asked for are read."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        self._file.seek(part.start)
+        return self._file.read(part.stop - part.start)
+
+
 @contextmanager
 def damaged(message: str, *errors: type[Exception]) -> Iterator[None]:
     """Turns the given exceptions, raised in the block by damaged data, into a one-line error: message and reason.

@@ -13,7 +13,7 @@ from wlm.errors import WlmError
 from wlm.formats.float_texels import EXTRA, check_picture
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import IMAGE_BYTES, check_sides
-from wlm.formats.reading import read_file
+from wlm.formats.reading import damaged, read_file
 
 MAGIC = {b"II*\0": "<", b"MM\0*": ">"}
 """The first bytes, and the byte order that they state."""
@@ -26,13 +26,15 @@ _TAGS = {
     274: "orientation",
     277: "samples",
     284: "planes",
+    319: "list of primaries",
     322: "tile width",
     323: "tile height",
-    339: "format",
+    34675: "colour profile",
 }
-_FORMATS = {1: "B", 3: "H", 4: "I"}  # of the tags above: byte, short, long
+_FORMATS = {1: "B", 3: "H", 4: "I", 5: "I", 7: "B"}  # of the tags above: byte, short, long, rational, undefined
+_COLOURS = ("list of primaries", "colour profile")
 _MOST_SAMPLES = 64
-_GREY, _RGB, _FLOAT = 1, 2, 3
+_GREY, _RGB = 1, 2
 
 
 def tags_of(path: str | os.PathLike[str], data: bytes) -> dict[str, int]:
@@ -42,8 +44,8 @@ def tags_of(path: str | os.PathLike[str], data: bytes) -> dict[str, int]:
         WlmError: The file is damaged.
     """
     order = MAGIC.get(data[:4], "")
-    found = {"bits": 1, "photometric": _RGB, "orientation": 1, "samples": 1, "planes": 1, "format": 1}
-    try:
+    found = {"bits": 1, "photometric": _RGB, "orientation": 1, "samples": 1, "planes": 1}
+    with damaged(f"{path}: the TIFF is cut short or damaged", struct.error, KeyError, IndexError):
         (at,) = struct.unpack_from(order + "I", data, 4)
         (count,) = struct.unpack_from(order + "H", data, at)
         for i in range(count):
@@ -53,13 +55,13 @@ def tags_of(path: str | os.PathLike[str], data: bytes) -> dict[str, int]:
                 inline = number * struct.calcsize(form) <= 4
                 (found[_TAGS[tag]],) = struct.unpack_from(form, data, at + 10 + 12 * i if inline else place)
         check_sides(str(path), found["width"], found["height"])
-    except (struct.error, KeyError, IndexError) as error:
-        raise WlmError(f"{path}: the TIFF is cut short or damaged: no width and height found") from error
     return found
 
 
-def read_tiff(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+def read_tiff(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads the first image of a TIFF of grey or RGB, with alpha or without.
+
+    `notes` gets a line if the file states primaries or a colour profile, which are not applied.
 
     Returns:
         The pixels, [H, W, C], the top row first whatever the file's orientation: float32, or uint8 and uint16 as
@@ -71,6 +73,7 @@ def read_tiff(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
     """
     data = read_file(path, IMAGE_BYTES, "the TIFF")
     tags = tags_of(path, data)
+    notes += [f"its {name} is not applied: colours are taken as Rec. 709" for name in _COLOURS if name in tags]
     samples, colours = tags["samples"], 3 if tags["photometric"] == _RGB else 1
     if tags["photometric"] not in (_GREY, _RGB) or not colours <= samples <= _MOST_SAMPLES:
         raise WlmError(
@@ -82,20 +85,13 @@ def read_tiff(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]
     if "tile width" in tags:
         check_picture(path, len(data), tags["tile width"], tags.get("tile height", 1), texel)
     codecs = need("imagecodecs", EXTRA)
-    try:
+    faults = ArithmeticError, LookupError, RuntimeError, ValueError, TypeError, MemoryError, OSError
+    with damaged(f"{path}: the TIFF is cut short or damaged", *faults):
         pixels = codecs.tiff_decode(data)
-    except (RuntimeError, ValueError, TypeError, MemoryError, OSError) as error:
-        raise WlmError(f"{path}: the TIFF is cut short or damaged: {' '.join(str(error).split())[:120]}") from error
     if tags["planes"] == 2 and samples > 1:
         pixels = np.moveaxis(pixels, 0, -1)
     expected = tags["height"], tags["width"], samples
-    if pixels.size != np.prod(expected) or pixels.dtype not in (
-        np.uint8,
-        np.uint16,
-        np.float16,
-        np.float32,
-        np.float64,
-    ):
+    if pixels.size != np.prod(expected) or pixels.dtype.str[1:] not in ("u1", "u2", "f2", "f4", "f8"):
         raise WlmError(f"{path}: expected integers of 8 or 16 bits or floats, found {pixels.dtype} {pixels.shape}")
     pixels = pixels.reshape(expected)[..., : colours + 1]
     if tags["orientation"] > 4:

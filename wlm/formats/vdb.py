@@ -1,35 +1,61 @@
 """Reading of OpenVDB's `.vdb` files: the float grids that Blender, Houdini and EmberGen write, as dense arrays.
 
 No package of OpenVDB can be installed from an index, so the format is read here: files from version 222 on (OpenVDB
-2.0, 2013) and trees `float_5_4_3`, stored as floats or halves, with whole leaves or only their active voxels,
-uncompressed or compressed by zlib or Blosc. Grids of other types are skipped. The only description of the format is
-OpenVDB's source code: `io/Archive.cc`, `io/Compression.h`, `tree/RootNode.h`, `InternalNode.h`, `LeafNode.h`."""
+2.0, 2013) and trees `float_5_4_3` and `double_5_4_3`, stored in full or as halves, with whole leaves or only their
+active voxels, uncompressed or compressed by zlib or Blosc. Grids of other types are listed only. The only description
+of the format is OpenVDB's source code: `io/Archive.cc`, `io/Compression.h`, `tree/RootNode.h`, `InternalNode.h`,
+`LeafNode.h`."""
 
 import math
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.blosc import unpack as unpack_blosc
+from wlm.formats.limits import SURE_BOX, VOXELS, VOXELS_A_BYTE
 from wlm.formats.reading import damaged
 
 _MAGIC, _OLDEST, _NEWEST = 0x56444220, 222, 224
 _HALF = "_HalfFloat"
-_FLOATS = ("Tree_float_5_4_3", "Tree_float_5_4_3" + _HALF)
+_NUMBERS = ("float", "double", "fp4", "fp8", "fp16", "fpn")
 _ZIP, _ACTIVE_MASK, _BLOSC = 1, 2, 4
 # Codes of the format: one or two inactive values are stored, and a mask selects between them.
 _ONE_VALUE, _TWO_VALUES, _MASK, _ALL = (2, 4, 5), 5, (3, 4, 5), 6
-_LEAF, _LOWER, _UPPER = 8, 16, 32  # children along an edge of each kind of node
-_LOWER_EDGE, _UPPER_EDGE = _LEAF * _LOWER, _LEAF * _LOWER * _UPPER  # voxels
-_MASK_BYTES = _LEAF**3 // 8
+LEAF, LOWER, UPPER = 8, 16, 32
+"""Voxels along an edge of a leaf, and children along an edge of a lower and of an upper inner node."""
+
+_LOWER_EDGE, _UPPER_EDGE = LEAF * LOWER, LEAF * LOWER * UPPER  # voxels
+_MASK_BYTES = LEAF**3 // 8
+LARGEST = 2**31 - 1
+"""Largest number of voxels that a kernel can index."""
 _FARTHEST = 1 << 30  # bound of coordinates, which prevents overflow
 _LONGEST_TEXT = 1 << 16
 _MOST_GRIDS = 4096
-_DAMAGE = (ValueError, LookupError, OverflowError, MemoryError, struct.error, zlib.error)
+DAMAGE = (ValueError, LookupError, OverflowError, MemoryError, struct.error, zlib.error)
+"""Exceptions for damaged data."""
+
+
+@dataclass(frozen=True)
+class GridHead:
+    """The name of a grid, the type of its values such as "float", and its class such as "level set", "" if unknown."""
+
+    name: str
+    type: str
+    group: str
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the grid has one number per voxel that can be read."""
+        return self.type in _NUMBERS
+
+    def __str__(self) -> str:
+        kind = self.group if self.group and self.is_number else self.type
+        return (self.name or "an unnamed grid") + ("" if kind in _NUMBERS else f" ({kind})")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,20 +67,22 @@ class VdbGrid:
         matrix: float64 [4, 4], from the indices of voxel centres to world space.
         low: Index of the lowest voxel of the bounding box, (x, y, z).
         values: float32 [X, Y, Z] over the bounding box of the active voxels, or voxel 0 if none is active.
+        background: Value of all voxels that are not stored.
     """
 
     name: str
     matrix: np.ndarray
     low: tuple[int, int, int]
     values: np.ndarray
+    background: float
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """An entry in the file's list of grids: its offset in bytes, and the name of a grid whose tree it shares."""
+    """A grid of a file: whether it is stored as halves, the grid whose tree it shares, and its offset in bytes."""
 
-    name: str
-    type: str
+    head: GridHead
+    half: bool
     parent: str
     at: int
 
@@ -63,8 +91,7 @@ class VdbFile:
     """A `.vdb` file in memory, of which only the list of grids has been read.
 
     Attributes:
-        names: Names of the float grids, in the order of the file.
-        others: Names and types of the other grids.
+        heads: The grids, in the order of the file; of several with one name, only the first can be read.
     """
 
     def __init__(self, data: bytes, where: str) -> None:
@@ -74,32 +101,37 @@ class VdbFile:
             WlmError: The content is no OpenVDB file, is too old or too new, or is damaged.
         """
         self._where, self._data = where, data
-        with damaged(f"{where}: cannot read the OpenVDB file", *_DAMAGE):
+        with damaged(f"{where}: cannot read the OpenVDB file", *DAMAGE):
             entries = list(self._list())
-        self._entries = {entry.name: entry for entry in reversed(entries)}
-        self.names = tuple(dict.fromkeys(entry.name for entry in entries if entry.type in _FLOATS))
-        self.others = tuple(f"{entry.name} ({entry.type})" for entry in entries if entry.type not in _FLOATS)
+        self._entries = {entry.head.name: entry for entry in reversed(entries)}
+        self.heads = tuple(entry.head for entry in entries)
 
-    def read(self, name: str, most: int) -> VdbGrid:
-        """Reads the grid of one of `names`, whose bounding box may have at most `most` voxels.
+    def read(self, name: str, trust: bool) -> VdbGrid:
+        """Reads a grid; `trust` tells whether its bounding box may be as large as it claims.
 
         Raises:
-            WlmError: The grid is damaged, is a frustum, or has a bounding box that is too large.
+            WlmError: The grid is damaged, has no numbers, is a frustum, or has a bounding box that is too large.
         """
-        entry, where = self._entries[name], f"{self._where}: {name}"
-        with damaged(f"{where}: cannot read the OpenVDB file", *_DAMAGE):
+        entry, where = self._entries[name], f"{self._where}: {name or 'grid 0'}"
+        if not entry.head.is_number:
+            raise WlmError(f"{where}: expected a grid of floats, found {entry.head.type}")
+        most = LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * len(self._data)))
+        with damaged(f"{where}: cannot read the OpenVDB file", *DAMAGE):
             matrix, cursor, flags = self._head(entry, where)
             if entry.parent:
                 if entry.parent not in self._entries or self._entries[entry.parent].parent:
                     raise WlmError(f"{where}: the grid {entry.parent}, whose tree it shares, is missing")
                 entry = self._entries[entry.parent]
+                if not entry.head.is_number:
+                    raise WlmError(f"{where}: expected a grid of floats, found {entry.head.type}")
                 _, cursor, flags = self._head(entry, where)
-            tree = _Tree(cursor, flags, entry.type.endswith(_HALF), where)
-            low, values = tree.dense(most)
-        return VdbGrid(name, matrix, low, values)
+            with np.errstate(over="ignore", invalid="ignore"):  # of doubles, which the reader of the grid repairs
+                tree = _Tree(cursor, flags, entry, where)
+                low, values = tree.dense(most)
+        return VdbGrid(name, matrix, low, values, float(tree.background))
 
     def _list(self) -> Iterator[_Entry]:
-        cursor = _Cursor(self._data)
+        cursor = Cursor(self._data)
         magic, version = cursor.unpack("<qI")
         if magic != _MAGIC:
             raise WlmError(f"{self._where}: expected an OpenVDB file, found other content")
@@ -120,12 +152,15 @@ class VdbFile:
             # Grids of equal names have a number after a separator character.
             name, kind, parent = (cursor.text() for _ in range(3))
             at, _, end = cursor.unpack("<3q")
-            yield _Entry(name.partition("\x1e")[0], kind, parent.partition("\x1e")[0], at)
+            cursor.at = at + 4
+            group, plain = cursor.metadata(), kind.removesuffix(_HALF)
+            head = GridHead(name.partition("\x1e")[0], plain.removeprefix("Tree_").removesuffix("_5_4_3"), group)
+            yield _Entry(head, plain != kind, parent.partition("\x1e")[0], at)
             cursor.at = end
 
-    def _head(self, entry: _Entry, where: str) -> tuple[np.ndarray, "_Cursor", int]:
+    def _head(self, entry: _Entry, where: str) -> tuple[np.ndarray, "Cursor", int]:
         """Returns a grid's transform, a cursor at the start of its tree, and its compression flags."""
-        cursor = _Cursor(self._data, entry.at)
+        cursor = Cursor(self._data, entry.at)
         (flags,) = cursor.unpack("<I")
         if flags & ~(_ZIP | _ACTIVE_MASK | _BLOSC):
             raise WlmError(f"{where}: expected values compressed by zlib or Blosc, found the flags {flags}")
@@ -133,34 +168,46 @@ class VdbFile:
         return _matrix(cursor, where), cursor, flags
 
 
-class _Cursor:
-    """A position in the bytes of a file, from which values are read."""
+class Cursor:
+    """A position in bytes, or in a file (`wlm.formats.reading.FileBytes`), from which values are read."""
 
-    def __init__(self, data: bytes, at: int = 0) -> None:
+    def __init__(self, data: Any, at: int = 0) -> None:
         self.data, self.at = data, at
 
-    def take(self, count: int) -> bytes:
+    def skip(self, count: int) -> None:
+        """Moves past the next bytes, which must exist."""
         end = self.at + count
         if not 0 <= self.at <= end <= len(self.data):
             raise ValueError(f"the file ends before byte {end}")
-        piece = self.data[self.at : end]
         self.at = end
-        return piece
+
+    def take(self, count: int) -> bytes:
+        """Returns the next bytes."""
+        begin = self.at
+        self.skip(count)
+        return self.data[begin : self.at]
 
     def unpack(self, form: str) -> tuple:
+        """Returns the next numbers, in a format of `struct`."""
         return struct.unpack(form, self.take(struct.calcsize(form)))
 
     def text(self) -> str:
+        """Reads a text with its length in front of it."""
         (length,) = self.unpack("<I")
         if length > _LONGEST_TEXT:
             raise ValueError(f"expected a text of at most {_LONGEST_TEXT} bytes, found {length}")
         return self.take(length).decode("utf-8", "replace")
 
-    def metadata(self) -> None:
+    def metadata(self) -> str:
+        """Reads metadata; returns the class of the grid, "" if it is not stated."""
+        group = ""
         for _ in range(self.unpack("<I")[0]):
-            self.text()
-            self.text()
-            self.take(self.unpack("<I")[0])
+            name, _, (length,) = self.text(), self.text(), self.unpack("<I")
+            if name == "class" and length < _LONGEST_TEXT:
+                group = self.take(length).decode("utf-8", "replace")
+            else:
+                self.skip(length)
+        return "" if group == "unknown" else group
 
     def bits(self, count: int) -> np.ndarray:
         """Reads a mask, bool [count]."""
@@ -171,57 +218,54 @@ class _Cursor:
 class _Tree:
     """The nodes of a grid: first the topology, with only the masks of leaves, and then the values of the leaves."""
 
-    def __init__(self, cursor: _Cursor, flags: int, half: bool, where: str) -> None:
-        self._cursor, self._flags, self._half, self._where = cursor, flags, half, where
-        self._tiles: list[_Tiles] = []
+    def __init__(self, cursor: Cursor, flags: int, entry: _Entry, where: str) -> None:
+        self._cursor, self._flags, self._where = cursor, flags, where
+        self._one = "<d" if entry.head.type == "double" else "<f"
+        self._many = "<f2" if entry.half else self._one
+        self._bytes = np.dtype(self._many).itemsize
+        self._tiles: list[Tiles] = []
         self._corners: list[np.ndarray] = []  # the corners of leaves
         self._masks: list[bytes] = []
         if cursor.unpack("<I") != (1,):
             raise ValueError("expected a tree with one value buffer per leaf, found another number")
-        self._background, tiles, children = cursor.unpack("<fII")
-        for _ in range(tiles):
-            *corner, value, active = cursor.unpack("<3if?")
-            shape = (1, 1, 1)
-            self._tiles.append(_Tiles(corner, _UPPER_EDGE, np.full(shape, value), np.full(shape, active)))
+        self.background = np.float32(cursor.unpack(self._one)[0])
+        tiles, children = cursor.unpack("<II")
+        kind = np.dtype([("corner", "<i4", 3), ("value", self._one), ("active", "u1")])
+        self._roots = np.frombuffer(cursor.take(tiles * kind.itemsize), kind)
+        corners = [self._roots["corner"].astype(np.int64)]
         for _ in range(children):
-            self._node(np.array(cursor.unpack("<3i"), np.int64), _UPPER, _LOWER_EDGE)
-        self._check_places()
+            corners.append(np.array([cursor.unpack("<3i")], np.int64))
+            self._node(corners[-1][0], UPPER, _LOWER_EDGE)
+        # Nodes that overlap would multiply the work for a byte of the file.
+        places = np.concatenate(corners)
+        if (places % _UPPER_EDGE).any() or len(np.unique(places, axis=0)) < len(places):
+            raise ValueError(f"expected nodes at different multiples of {_UPPER_EDGE}, found others")
 
     def _node(self, corner: np.ndarray, side: int, edge: int) -> None:
         """Reads an inner node with `side` children along each edge, each of `edge` voxels."""
         cursor, count = self._cursor, side**3
         children, active = cursor.bits(count), cursor.bits(count)
         values = self._values(active)
-        seen = ~children & (active | (values != self._background))
+        seen = ~children & (active | (values != self.background))
         if seen.any():
             cube = (side,) * 3
-            self._tiles.append(_Tiles(corner, edge, values.reshape(cube), active.reshape(cube), seen.reshape(cube)))
+            self._tiles.append(Tiles(corner, edge, values.reshape(cube), seen.reshape(cube), active.reshape(cube)))
         places = corner + edge * np.stack(np.unravel_index(np.flatnonzero(children), (side,) * 3), 1)
-        if edge == _LEAF:
+        if edge == LEAF:
             self._corners.append(places)
             self._masks.append(cursor.take(_MASK_BYTES * len(places)))
         else:
             for place in places:
-                self._node(place, _LOWER, _LEAF)
-
-    def _check_places(self) -> None:
-        """Raises an error if two nodes cover the same voxels: a small malicious file could cause much work."""
-        leaves = np.concatenate([np.zeros((0, 3)), *self._corners])
-        tiles = np.array([[*tiles.corner, tiles.edge] for tiles in self._tiles]).reshape(-1, 4)
-        if any(len(np.unique(places, axis=0)) < len(places) for places in (leaves, tiles)):
-            raise ValueError("expected nodes at different positions, found two at the same position")
+                self._node(place, LOWER, LEAF)
 
     def dense(self, most: int) -> tuple[tuple[int, int, int], np.ndarray]:
         """Returns the lowest voxel of the active voxels' bounding box, and the values in the box, float32 [X, Y, Z]."""
         corners = np.concatenate([np.zeros((0, 3), np.int64), *self._corners])
         masks = np.frombuffer(b"".join(self._masks), np.uint8).reshape(-1, _MASK_BYTES)
         low, high = self._box(corners, masks)
-        if not (low.min() >= -_FARTHEST and high.max() <= _FARTHEST and math.prod((high - low).tolist()) <= most):
-            box = [low.tolist(), (high - 1).tolist()]
-            raise WlmError(f"{self._where}: expected a box of at most {most} voxels, found {box}")
-        # The array consists of whole leaves.
-        first = low // _LEAF * _LEAF
-        values = np.full(-(-(high - first) // _LEAF) * _LEAF, self._background, np.float32)
+        values, first = leaf_array(low, high, most, self._where)
+        values.fill(self.background)
+        Tiles.paste_roots(values, first, self._roots["corner"].astype(np.int64), self._roots["value"])
         for tiles in self._tiles:
             tiles.paste(values, first)
         inside = ((corners >= first) & (corners < first + values.shape)).all(1)
@@ -230,7 +274,7 @@ class _Tree:
             leaf = self._values(np.unpackbits(mask, bitorder="little").view(bool))
             if kept:
                 x, y, z = at
-                values[x : x + _LEAF, y : y + _LEAF, z : z + _LEAF] = leaf.reshape(_LEAF, _LEAF, _LEAF)
+                values[x : x + LEAF, y : y + LEAF, z : z + LEAF] = leaf.reshape(LEAF, LEAF, LEAF)
         return tuple(low.tolist()), values[tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))]
 
     def _box(self, corners: np.ndarray, masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -242,14 +286,18 @@ class _Tree:
         ends = corners.min(0, initial=_FARTHEST), corners.max(0, initial=-_FARTHEST)
         outer = ((corners == ends[0]) | (corners == ends[1])).any(1)
         for corner, mask in zip(corners[outer], masks[outer], strict=True):
-            places = np.argwhere(np.unpackbits(mask, bitorder="little").reshape((_LEAF,) * 3))
+            places = np.argwhere(np.unpackbits(mask, bitorder="little").reshape((LEAF,) * 3))
             lows.append(corner + places.min(0))
             highs.append(corner + places.max(0) + 1)
         for tiles in self._tiles:
-            if tiles.active.any():
-                places = np.argwhere(tiles.active & tiles.seen)
+            places = np.argwhere(tiles.active & tiles.seen)
+            if len(places):
                 lows.append(tiles.corner + tiles.edge * places.min(0))
                 highs.append(tiles.corner + tiles.edge * (places.max(0) + 1))
+        places = self._roots["corner"][self._roots["active"] != 0].astype(np.int64)
+        if len(places):
+            lows.append(places.min(0))
+            highs.append(places.max(0) + _UPPER_EDGE)
         if not lows:
             # No voxel is active, for example before the smoke starts.
             return np.zeros(3, np.int64), np.ones(3, np.int64)
@@ -261,11 +309,11 @@ class _Tree:
         (kind,) = cursor.unpack("<B")
         if kind > _ALL:
             raise ValueError(f"expected a storage code from 0 to {_ALL}, found {kind}")
-        others = [self._background if kind == 0 else -self._background, self._background]
+        others = [self.background if kind == 0 else -self.background, self.background]
         if kind in _ONE_VALUE:
-            others[0] = cursor.unpack("<f")[0]
+            others[0] = cursor.unpack(self._one)[0]
         if kind == _TWO_VALUES:
-            others[1] = cursor.unpack("<f")[0]
+            others[1] = cursor.unpack(self._one)[0]
         chosen = cursor.bits(len(active)) if kind in _MASK else None
         count = len(active)
         if self._flags & _ACTIVE_MASK and kind != _ALL:
@@ -281,8 +329,8 @@ class _Tree:
 
     def _numbers(self, count: int) -> np.ndarray:
         """Reads and decompresses the next numbers, float32 [count]."""
-        cursor, size = self._cursor, count * (2 if self._half else 4)
-        if not count and self._half:
+        cursor, half, size = self._cursor, self._many == "<f2", count * self._bytes
+        if not count and half:
             return np.zeros(0, np.float32)
         if self._flags & (_ZIP | _BLOSC):
             (packed,) = cursor.unpack("<q")
@@ -295,25 +343,51 @@ class _Tree:
                 raise ValueError(f"expected {size} bytes after decompression, found at least {len(piece)}")
         else:
             piece = cursor.take(size)
-        return np.frombuffer(piece, "<f2" if self._half else "<f4").astype(np.float32)
+        return np.frombuffer(piece, self._many).astype(np.float32)
+
+
+def leaf_array(low: np.ndarray, high: np.ndarray, most: int, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """Allocates the whole leaves around a box of voxels from `low` [3] up to but without `high` [3].
+
+    Returns:
+        Uninitialised values, float32 [X, Y, Z], and their first voxel [3].
+
+    Raises:
+        WlmError: They have more than `most` voxels.
+    """
+    first = low // LEAF * LEAF
+    shape = -(-(high - first) // LEAF) * LEAF
+    if not (low.min() >= -_FARTHEST and high.max() <= _FARTHEST and math.prod(shape.tolist()) <= most):
+        box = [low.tolist(), (high - 1).tolist()]
+        raise WlmError(f"{where}: expected a box of at most {most} voxels, found {box}")
+    return np.empty(shape, np.float32), first
 
 
 @dataclass(frozen=True, eq=False)
-class _Tiles:
+class Tiles:
     """Children of a node with one constant value each (tiles).
 
     Attributes:
         corner: Index of the lowest voxel of the node, [3].
         edge: Edge of a child, in voxels.
-        values, active: Value and active state of each child, [N, N, N], N children along each edge.
-        seen: Whether each child is a tile that differs from the background, [N, N, N]; by default, all are.
+        values: Value of each child, [N, N, N], N children along each edge.
+        seen: Whether each child is a tile that differs from the background, [N, N, N].
+        active: Whether each child is active, [N, N, N].
     """
 
     corner: np.ndarray
     edge: int
     values: np.ndarray
+    seen: np.ndarray
     active: np.ndarray
-    seen: np.ndarray = field(default_factory=lambda: np.ones((1, 1, 1), bool))
+
+    @staticmethod
+    def paste_roots(values: np.ndarray, first: np.ndarray, corners: np.ndarray, constants: np.ndarray) -> None:
+        """Writes the tiles of a root with corners [N, 3] at different multiples of 4096."""
+        begins = np.maximum(corners - first, 0)
+        ends = np.minimum(corners - first + _UPPER_EDGE, values.shape)
+        for i in np.flatnonzero((begins < ends).all(1)).tolist():
+            values[tuple(slice(a, b) for a, b in zip(begins[i], ends[i], strict=True))] = constants[i]
 
     def paste(self, values: np.ndarray, first: np.ndarray) -> None:
         """Writes the tiles into the values of a box of voxels, whose lowest voxel is `first`."""
@@ -329,7 +403,7 @@ class _Tiles:
         np.copyto(part, self.values[child], where=self.seen[child])
 
 
-def _matrix(cursor: _Cursor, where: str) -> np.ndarray:
+def _matrix(cursor: Cursor, where: str) -> np.ndarray:
     """Reads a transform, float64 [4, 4], from the indices of voxel centres to world space."""
     kind = cursor.text()
     matrix = np.eye(4)
@@ -344,7 +418,10 @@ def _matrix(cursor: _Cursor, where: str) -> np.ndarray:
     elif kind == "TranslationMap":
         matrix[:3, 3] = cursor.unpack("<3d")
     else:
-        raise WlmError(f"{where}: expected a linear transform, found a {kind[:40]}")
+        reason = " (a camera's frustum)" if "Frustum" in kind else ""
+        raise WlmError(
+            f"{where}: expected a linear transform, found a {kind[:40]}{reason}: resample the grid to cubic voxels"
+        )
     if not np.isfinite(matrix).all():
         raise ValueError("expected a transform of finite numbers")
     return matrix

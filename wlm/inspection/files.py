@@ -8,15 +8,18 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from wlm.atlas.materials import filled_slots, own_extension, own_lightmaps
 from wlm.errors import WlmError
 from wlm.formats.geometry import read_geometry
-from wlm.formats.gltf import read_gltf
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf
 from wlm.formats.godot import read_users
-from wlm.formats.light import SUFFIXES
+from wlm.formats.ktx2 import VOLUME_HEAD, is_volume
+from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
+from wlm.formats.light import SUFFIXES, read_light
 from wlm.formats.limits import JSON_BYTES
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
@@ -26,7 +29,10 @@ from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
 from wlm.system import load, system_of
 
-_MAGIC = 16
+if TYPE_CHECKING:
+    from wlm.fluid.volume import DensityVolume
+
+_OTHER_LIGHT = (".avif", ".lit")  # suffixes of light that no command reads
 BAKED = "lightmaps that wlm bake lightmaps wrote, with their noise and coverage"
 """Description of the folder of a bake."""
 FRAMES = "frames of smoke that wlm smoke simulate wrote"
@@ -38,6 +44,7 @@ _EXPORTS = {
     "wlm-unity-probes": "light probes for Unity",
     "wlm-unreal-light": "light probes for Unreal, volume textures and a shader",
     "wlm-bake": BAKED,
+    "wlm-bevy-irradiance-volume": "an irradiance volume for Bevy",
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
     "wlm-smoke-frames": FRAMES,
 }
@@ -59,10 +66,12 @@ def kind_of(path: Path) -> str:
     Raises:
         WlmError: The file cannot be read.
     """
+    with open_file(path, "the file") as file:
+        head = file.read(VOLUME_HEAD)
+    if is_volume(head):
+        return "probes"
     if picture_of(path) is not None:
         return "picture"
-    with open_file(path, "the file") as file:
-        head = file.read(_MAGIC)
     kind = next((kind for magic, kind in _BY_MAGIC.items() if head.startswith(magic)), None)
     kind = kind or _BY_SUFFIX.get(path.suffix.lower(), "")
     if kind == "arrays":
@@ -78,8 +87,11 @@ def inspect_file(path: Path) -> Finding:
             return _KINDS[kind].inspect(path)
     except WlmError as error:
         return Finding(path, UNREADABLE, problems=(said(error, path),))
-    if path.suffix.lower() in (*SUFFIXES, ".png"):
-        return Finding(path, UNREADABLE, problems=(f"its content does not match the suffix {path.suffix}",))
+    if path.suffix.lower() in (*SUFFIXES, *LEVEL_SUFFIXES, *_OTHER_LIGHT):
+        try:
+            read_light(path)
+        except WlmError as error:
+            return Finding(path, UNREADABLE, problems=(said(error, path),))
     return Finding(path, "unknown kind of file")
 
 
@@ -134,15 +146,9 @@ def _probes(path: Path) -> Finding:
     what = f"{probes.probes:,} light probes of {form}, {int(probes.live.sum()):,} of them lit"
     if len(keys) > 1:
         what += f", under the keys {', '.join(keys[:_MOST_NAMES])}"
-    problems = list(probes.warnings)
-    if coefficients:
-        # No coefficient of nonnegative radiance exceeds the first one by more than this factor.
-        mean = probes.values[probes.live][:, :3]
-        rest = np.abs(probes.values[probes.live][:, 3:]).reshape(len(mean), -1, 3)
-        if rest.size and (wrong := int(np.count_nonzero((rest > 2.3 * np.abs(mean)[:, None]).any((1, 2))))):
-            problems.append(f"{wrong} probes have coefficients too large for radiance: another order or convention?")
+    what += f"; {probes.reading}"
     options = () if key is None else ("--key", key.removeprefix("sh_"))
-    return Finding(path, what, compress_command(path, *options), tuple(problems))
+    return Finding(path, what, compress_command(path, *options), probes.warnings)
 
 
 def _lmbake(path: Path) -> Finding:
@@ -159,25 +165,37 @@ def _lmbake(path: Path) -> Finding:
 
 
 def _volume(path: Path) -> Finding:
-    from wlm.fluid.volume import is_long_along_z, load_volume
+    from wlm.fluid.volume import load_volume
 
-    volume = load_volume(path, up="y")
+    return describe_volume(path, load_volume(path, up="y"), path, "OUT.exr")
+
+
+def describe_volume(path: Path, volume: "DensityVolume", file: Path, output: str, frames: str = "") -> Finding:
+    """Describes smoke, of one file or of a folder of frames of which `file` is one; `output` ends the command."""
+    from wlm.fluid.grids import choose
+    from wlm.fluid.volume import grid_heads, is_long_along_z, thickness_hint
+
     size = "x".join(map(str, volume.shape))
     hot = ", with temperature" if volume.temperature is not None else ""
-    what = f"a volume of smoke, {size} voxels of {volume.voxel:.3g}{hot}"
+    what = f"{frames or 'a volume of smoke'}, {size} voxels of {volume.voxel:.3g}{hot}"
+    if len(heads := grid_heads(file)) > 1:
+        what += f", grid {choose(str(file), heads)[0]} of {', '.join(map(str, heads[:_MOST_NAMES]))}"
     problems = list(volume.warnings)
     if not bool((volume.density > 0).any()):
         problems.append("its density is 0 everywhere")
+    if hint := thickness_hint(volume.thickness, volume.extinction):
+        problems.append(hint)
     options: tuple[str, ...] = ()
-    if path.suffix.lower() != ".npz" and is_long_along_z(volume):
+    if file.suffix.lower() != ".npz" and is_long_along_z(volume):
         options = ("--volume", "up=z")
         problems.append(
             "it is longest along z, which is taken for up as in Blender and Unreal; leave --volume out if y is"
         )
-    return Finding(path, what, command("smoke", "bake", path, *options, "-o", "OUT.exr"), tuple(problems))
+    return Finding(path, what, command("smoke", "bake", path, *options, "-o", output), tuple(problems))
 
 
 def _mesh(path: Path) -> Finding:
+    own: tuple[str, str, tuple[str, ...]] = ("compress it together with its lightmap", "", ())
     if path.suffix.lower() not in (".glb", ".gltf"):
         mesh = read_geometry(path, with_uv=False)
         parts, sets, uvs = 1, "", []
@@ -186,7 +204,8 @@ def _mesh(path: Path) -> Finding:
             whole = read_geometry(path)
             sets, uvs = "UVs", [whole.uv[whole.triangle]]
     else:
-        primitives = read_gltf(path)[1]
+        document, primitives = read_gltf(path)
+        own = _own_lightmaps(path, document, primitives)
         count, parts = sum(len(each.triangle) for each in primitives), len({each.mesh for each in primitives})
         numbers = sorted({number for each in primitives for number in each.uv})
         sets = ", ".join(f"TEXCOORD_{number}" for number in numbers)
@@ -203,8 +222,24 @@ def _mesh(path: Path) -> Finding:
         elif area > 1.0:
             cause = "each mesh may have its own lightmap" if parts > 1 else "are they those of a lightmap?"
             problems.append(f"the triangles cover {area:.1f} times the UV square and overlap; {cause}")
-        what += "; compress it together with its lightmap"
-    return Finding(path, what, problems=tuple(problems))
+        what += f"; {own[0]}"
+    return Finding(path, what, own[1], (*problems, *own[2]))
+
+
+def _own_lightmaps(
+    path: Path, document: GltfDocument, primitives: Sequence[GltfPrimitive]
+) -> tuple[str, str, tuple[str, ...]]:
+    """Describes the lightmaps that a glTF file names: what they are, the command that compresses them, problems."""
+    name, slots = own_extension(document), filled_slots(document)
+    if name is None:
+        other = f", or with that of a material slot (--slot {' or '.join(slots)})" if slots else ""
+        return f"compress it together with its lightmap{other}", "", ()
+    try:
+        own = own_lightmaps(document, primitives)
+    except WlmError as error:
+        return f"its lightmaps are named by {name}", "", (said(error, path),)
+    notes = tuple(note.removeprefix(f"{path}: ") for note in own.notes)
+    return f"with {notes[0]}", compress_command(path), notes[1:]
 
 
 def _model(path: Path) -> Finding:
@@ -219,14 +254,15 @@ def _model(path: Path) -> Finding:
 
 def _kind_of_json(path: Path) -> str:
     content: Any = read_json_file(path, "the file", JSON_BYTES)
-    if not isinstance(content, dict):
-        return "json"
-    form = str(content.get("format"))
-    if form in _EXPORTS:
-        return "export"
-    if "lightmaps" in content:
-        return "set"
-    return "probes" if "probes" in content or "position" in content else "json"
+    if isinstance(content, dict):
+        if str(content.get("format")) in _EXPORTS:
+            return "export"
+        if "lightmaps" in content:
+            return "set"
+    # This imports scipy.
+    from wlm.probe.json_fields import holds_probes
+
+    return "probes" if holds_probes(content) else "json"
 
 
 def _unity_asset(path: Path) -> Finding:
@@ -277,4 +313,6 @@ _BY_SUFFIX = {
     ".wlm": "model",
     ".json": "json",
     ".asset": "unity asset",
+    ".csv": "probes",
+    ".tsv": "probes",
 }

@@ -3,13 +3,24 @@
 import os
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
+from wlm.atlas.listing import tiles_of
 from wlm.errors import WlmError
+from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
-from wlm.inspection.files import BAKED, FRAMES, document_of, file_system, inspect_file, kind_of
+from wlm.inspection.files import (
+    BAKED,
+    FRAMES,
+    describe_volume,
+    document_of,
+    file_system,
+    inspect_file,
+    kind_of,
+)
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import Picture, picture_of, said
 from wlm.inspection.sets import UNREADABLE_SET, inspect_set, named, together
@@ -19,6 +30,7 @@ MOST = 256
 """Most findings of `inspect`, and most folders that it visits."""
 
 _DEEPEST = 4
+_BESIDE = 16  # folders beside a mesh that are examined for its lightmaps
 _ENTRIES = 20_000  # most entries that are read of a folder
 _DOCUMENTS = 64  # most JSON files that are read of a folder
 _IGNORED = {".md", ".txt", ".meta", ".import", ".uid", ".html", ".pdf", ".py", ".js", ".cs", ".glsl", ".hlsl", ".bin"}
@@ -88,7 +100,7 @@ def _folder_system(folder: Path) -> str:
         return "smoke" if stated == FRAMES else "export"
     pictures = _light(files)
     if not pictures:
-        return ""
+        return "smoke" if any(file.suffix.lower() in (".vdb", ".nvdb") for file in files) else ""
     sizes = {picture.size for picture in pictures.values() if picture.width}
     return "meshes" if len(sizes) > 1 else "lightmap"
 
@@ -100,7 +112,7 @@ def _folder(folder: Path, most: int) -> tuple[list[Finding], list[Path]]:
     try:
         entries = _entries(folder)
         files = [entry for entry in entries if entry.is_file()]
-        for whole in (_documents, _unity, _godot, _flip_books, _pictures):
+        for whole in (_documents, _unity, _godot, _flip_books, _mesh_folders, _pictures, _volumes):
             for finding, its in whole(folder, [file for file in files if file not in taken]):
                 findings.append(finding)
                 taken |= its
@@ -279,11 +291,17 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
     if len(pictures) == len(meshes) == 1:
         mesh, light = inspect_file(meshes[0]), inspect_file(pictures[0])
+        if mesh.command:  # the mesh names its lightmaps itself
+            return [(mesh, {mesh.path, light.path})]
         if UNREADABLE not in (mesh.what, light.what):
             what, problems = f"a mesh with the lightmap {light.path.name}", (*mesh.problems, *light.problems)
             return [
                 (Finding(mesh.path, what, compress_command(mesh.path, light.path), problems), {mesh.path, light.path})
             ]
+    if what := _lightmaps_of(meshes[0] if len(meshes) == 1 else None, pictures):
+        words = compress_command(meshes[0], folder) if len(meshes) == 1 else ""
+        what = what if words else f"{what}; compress them with their mesh: wlm compress MESH FOLDER"
+        return [(Finding(folder, what, words), {*pictures, *(meshes if words else ())})]
     if len(pictures) < 2:
         return []
     problems, alike = together(pictures, [heads[file] for file in pictures])
@@ -301,3 +319,51 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     what = f"{count_of(pictures, 'lightmap')} of {heads[pictures[0]].size}"
     taken = {*pictures, folder / "mask.png"} & set(files)
     return [(Finding(folder, what, compress_command(folder, *options), tuple(problems)), taken)]
+
+
+def _lightmaps_of(mesh: Path | None, pictures: Sequence[Path]) -> str:
+    """Describes lightmaps that their names divide among UDIM tiles or the meshes of a file; "" for others."""
+    if tiles := tiles_of([file.stem for file in pictures]):
+        return f"{count_of(pictures, 'lightmap')} of the UDIM tiles {', '.join(map(str, tiles[:8]))}"
+    if mesh is None or len(pictures) < 2:
+        return ""
+    # This imports torch.
+    from wlm.atlas.matching import all_by_name
+
+    with suppress(WlmError):  # described by itself
+        if all_by_name([file.name for file in pictures], read_gltf(mesh)[1]):
+            return f"{count_of(pictures, 'lightmap')} named after the meshes of {mesh.name}"
+    return ""
+
+
+def _mesh_folders(folder: Path, files: Sequence[Path]) -> _Found:
+    """Describes folders of lightmaps beside the one glTF file that they belong to by their names."""
+    meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
+    if len(meshes) != 1:
+        return []
+    found: _Found = []
+    for inside in [entry for entry in _entries(folder) if entry.is_dir() and not entry.is_symlink()][:_BESIDE]:
+        pictures = list(_light([entry for entry in _entries(inside) if entry.is_file()]))
+        if what := _lightmaps_of(meshes[0], pictures):
+            found.append((Finding(inside, what, compress_command(meshes[0], inside)), {inside}))
+    return found
+
+
+def _volumes(folder: Path, files: Sequence[Path]) -> _Found:
+    """Describes numbered volumes as frames of smoke, by the last of them."""
+    volumes = [file for file in files if file.suffix.lower() in (".vdb", ".nvdb")]
+    if len(volumes) < 2:
+        return []
+    from wlm.smoke.data import load_frames
+
+    try:
+        frames = load_frames(folder, up="y")
+        last = frames.file(frames.numbers[-1])
+        volume = frames.load(frames.numbers[-1])
+    except WlmError:
+        return []  # each file is described by itself
+    if not set(frames.files.values()) <= set(volumes):
+        return []
+    what = f"{len(frames.files)} frames of smoke, the last of them"
+    finding = describe_volume(folder, volume, last, "DIR", what)
+    return [(replace(finding, problems=(*frames.warnings, *finding.problems)), set(frames.files.values()))]

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from wlm.errors import WlmError
+from wlm.formats.light import noted
 from wlm.inspection.finding import Finding, compress_command
 from wlm.inspection.pictures import Picture, picture_of, read_lit, said
 from wlm.lightmap.layout import PICTURES, odd_layout, spread
@@ -44,8 +45,10 @@ def _checked(folder: Path, listing: Listing) -> Finding:
     files = list(dict.fromkeys(file for file in listing.files if file.is_file()))
     heads = [picture_of(file) for file in files]
     size = next((head.size for head in heads if head is not None and head.width), "an unknown size")
-    problems += together(files, heads)[0]
     what = f"a set of lightmaps at {count_of(listing.files, 'time')}, {size}"
+    if (stored := listing.layers[0].stored) is not None:
+        return Finding(folder, f"{what}, stored as {stored}", compress_command(folder), tuple(problems))
+    problems += together(files, heads)[0]
     return Finding(folder, what, compress_command(folder), tuple(problems))
 
 
@@ -64,14 +67,15 @@ def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[li
         if head.size != sized[0][1].size:
             return [f"{file.name} is {head.size}, {sized[0][0].name} is {sized[0][1].size}"], False
     chosen = [files[i] for i in spread(len(files), PICTURES)]
-    lit = []
+    lit, notes = [], []
     for file in chosen:
         try:
             one, found = read_lit(file)
         except WlmError as error:
             return [*problems, f"{file.name}: {said(error, file)}"], True
         lit.append(one)
-        problems += [f"{file.name}: {text}" for text in found]
+        notes.append(found)
+    problems += noted([file.name for file in chosen], notes)
     if len({one.shape for one in lit}) > 1:
         return [*problems, "their sizes differ"], False
     odd = odd_layout(len(lit), lit.__getitem__)

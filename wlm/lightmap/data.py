@@ -35,7 +35,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.formats.channels import read_channels, read_encoded
 from wlm.formats.light import noted, read_light
-from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, check_growth
+from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, Budget, check_growth
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
 from wlm.lightmap.layout import odd_layout
@@ -43,6 +43,7 @@ from wlm.lightmap.listing import AtlasInfo, LayerInfo, Listing, Source, is_name,
 from wlm.lightmap.sheet import LIGHT, MOST_NAME, VALUE_RANGES, Sheet, check_sheets, first_light, sheets_of
 from wlm.texels import doubts, repair
 
+_PIECE = 1 << 18  # frames times texels that are filled at once
 _READERS = 2  # decompression releases Python's lock; more threads than this only compete for the disk
 _LIGHT_CHANNELS = ("R", "G", "B")
 _ALPHA = "A"
@@ -387,11 +388,18 @@ class _Reader:
         self._listing, self._place, self._trust = listing, np.argsort(order), trust
         self._sizes: dict[Sheet, tuple[int, int]] = {}
         self._made = 0  # bytes of the sheets that memory was allocated for
+        self._held = sum(os.path.getsize(file) for file in set(listing.files) if os.path.exists(file))
+        # A file may serve many atlases and layers, each of which reads it whole.
+        most = max(FRAMES, PICTURE_GROWTH * self._held)
+        self._budget = Budget(f"{listing.where}: lightmaps", most, "decoded bytes")
 
     def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None) -> _Stack:
         sources = [state[atlas.name, layer.name] for state in self._listing.states]
-        first, notes = sources[0], [[] for _ in sources]
-        pixels, names = _read(first, layer, notes[0])
+        first, files, notes = sources[0], {}, [[] for _ in sources]
+        for index, source in enumerate(sources):
+            files.setdefault(os.path.normpath(source.path), []).append(index)
+        whole, names = self._file(first.path, layer, notes[0])
+        pixels = _part(whole, first)
         has_alpha = mask == _FROM_ALPHA or (mask is None and _ALPHA in names)
         size, known = pixels.shape[:2], names
         stack = self._stack(atlas, layer, size, names, has_alpha, first.path)
@@ -413,12 +421,19 @@ class _Reader:
             stack.alpha[place] = np.isfinite(alpha) & (alpha > 0)
             return int(np.count_nonzero(~np.isfinite(alpha)))
 
-        broken = [put(0, pixels, names)]
+        def put_all(path: str) -> None:
+            """Reads a file once, for all times that it serves."""
+            indices = files[path]
+            start = indices[0]
+            read = self._file(sources[start].path, layer, notes[start]) if start else (whole, names)
+            for index in indices:
+                broken[index] = put(index, _part(read[0], sources[index]), read[1])
+
+        broken = [0] * len(sources)
         pool = ThreadPoolExecutor(_READERS)
         try:
             # In order, so that the error names the first of several bad files.
-            rest = range(1, len(sources))
-            broken += pool.map(lambda index: put(index, *_read(sources[index], layer, notes[index])), rest)
+            list(pool.map(put_all, files))
         finally:
             pool.shutdown(cancel_futures=True)
         stack.warnings.extend(noted([source.label for source in sources], notes))
@@ -449,9 +464,8 @@ class _Reader:
         check_sheets(str(where), self._sizes)
         count = len(self._listing.states)
         if not self._trust:
-            files = sum(os.path.getsize(file) for file in set(self._listing.files) if os.path.exists(file))
             total = sum(math.prod(at) for at in self._sizes.values()) * 3 * 4 * count
-            check_growth(f"{where}: lightmaps", files, total, PICTURE_GROWTH, FRAMES)
+            check_growth(f"{where}: lightmaps", self._held, total, PICTURE_GROWTH, FRAMES)
         # One array from the start: a list of frames that is stacked at the end would need twice the memory.
         text, frames = f"{where}: {count} lightmaps of {_size(size)}", {}
         for sheet in sheets:
@@ -459,30 +473,41 @@ class _Reader:
             self._made += frames[sheet].nbytes
         return _Stack(frames, np.zeros((count, *size), bool) if alpha else None, [])
 
+    def _file(self, path: Path, layer: LayerInfo, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+        pixels, names = _read(path, layer, notes)
+        if not self._trust:
+            self._budget.spend(pixels.nbytes)
+        return pixels, names
 
-def _read(source: Source, layer: LayerInfo, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a picture. Returns its values [H, W, C] and the names of its channels; `notes` gets its assumptions."""
+
+def _part(pixels: np.ndarray, source: Source) -> np.ndarray:
+    """Returns the rows of a file's pixels [H, W, C] that belong to a picture."""
+    if source.slices == 1:
+        return pixels
+    height, rest = divmod(len(pixels), source.slices)
+    if rest or not height:
+        raise WlmError(f"{source.path}: expected {source.slices} slices of equal height, found {len(pixels)} rows")
+    return pixels[source.slice * height : (source.slice + 1) * height]
+
+
+def _read(path: Path, layer: LayerInfo, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Reads a file. Returns its values [H, W, C] and the names of its channels; `notes` gets its assumptions."""
     light = layer.encoding == LIGHT.encoding
     if light and layer.stored is not None:
-        pixels, names = read_encoded(source.path, layer.stored, notes), _LIGHT_CHANNELS
+        pixels, names = read_encoded(path, layer.stored, notes), _LIGHT_CHANNELS
     elif light and layer.channels is None:
-        pixels, names = read_light(source.path, notes)
+        pixels, names = read_light(path, notes)
         notes += doubts(pixels[..., :3])
     else:
-        pixels, names, levels = read_channels(source.path, notes, light)
+        pixels, names, levels = read_channels(path, notes, light)
         if levels and light:
             raise WlmError(
-                f"{source.path}: layer {layer.name}: expected linear light, such as an EXR, found a picture of "
+                f"{path}: layer {layer.name}: expected linear light, such as an EXR, found a picture of "
                 "integers: state what light they stand for with --encoding, or stored in a set.json"
             )
         if levels:
             least, greatest = VALUE_RANGES[layer.encoding]
             pixels = np.float32(least) + pixels * np.float32(greatest - least)
-    if source.slices > 1:
-        height, rest = divmod(len(pixels), source.slices)
-        if rest or not height:
-            raise WlmError(f"{source.path}: expected {source.slices} slices of equal height, found {len(pixels)} rows")
-        pixels = pixels[source.slice * height : (source.slice + 1) * height]
     return pixels, names
 
 
@@ -581,18 +606,20 @@ def _clamp(sheet: Sheet, labels: Sequence[str], frames: np.ndarray, mask: np.nda
 
 def _fill_in_time(frames: np.ndarray, covered: np.ndarray, times: np.ndarray, period: float | None) -> None:
     """Fills texels that a frame lacks, in place, from the frame nearest in time in which they are valid."""
-    mask = covered.any(0)
-    for i, time in enumerate(times):
-        apart = np.abs(times - time)
-        if period is not None:
-            apart = np.minimum(apart, period - apart)
-        missing = mask & ~covered[i]
-        for j in np.argsort(apart, kind="stable"):
-            found = missing & covered[j]
-            frames[i][found] = frames[j][found]
-            missing &= ~found
-            if not missing.any():
-                break
+    count, around = len(times), np.inf if period is None else period
+    number, stamps = np.arange(count)[:, None], times[:, None]
+    for row in range(covered.shape[1]):
+        some = np.flatnonzero(covered[:, row].any(0) & ~covered[:, row].all(0))
+        for columns in np.array_split(some, -(-len(some) * count // _PIECE) or 1):
+            here = covered[:, row, columns]
+            before = np.maximum.accumulate(np.where(here, number, -1))
+            after = np.minimum.accumulate(np.where(here, number, count)[::-1])[::-1]
+            # Before the first valid frame comes the last one of the day before, after the last one the first.
+            earlier, later = np.where(before < 0, before[-1], before), np.where(after == count, after[0], after)
+            since = stamps - times[earlier] + np.where(before < 0, around, 0.0)
+            until = times[later] - stamps + np.where(after == count, around, 0.0)
+            nearer = (since < until) | ((since == until) & (earlier < later))
+            frames[:, row, columns] = frames[np.where(nearer, earlier, later), row, columns]
 
 
 def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:

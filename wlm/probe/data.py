@@ -1,4 +1,4 @@
-"""Reads light probes at free positions from `.npz`, `.json`, Godot's `.lmbake` or Unity's `.asset`.
+"""Reads light probes at free positions from `.npz`, `.json`, tables, and files of Godot, Unity, three.js and Bevy.
 
 A probe holds spherical harmonics (gaussian-probe-compression, eq. 1, with 3, 12 or 27 numbers), or any other numbers.
 The table of hard cases in docs/probe.md lists what is repaired and what is refused. `ProbeSet.warnings` has a line for
@@ -22,14 +22,17 @@ from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.npz import read_npz
 from wlm.formats.scratch import room
 from wlm.formats.unity_asset import read_lighting_data
+from wlm.probe.ambient_cube import READING, read_irradiance_volume
 from wlm.probe.conventions import (
     CANONICAL,
     CONVENTIONS,
     from_canonical,
     to_canonical,
 )
-from wlm.probe.json_fields import fields_of, kind_of, numbers_of, read_json
+from wlm.probe.json_fields import fields_of, kind_of, positions_of, read_json
+from wlm.probe.layouts import COEFFICIENT, ORDERS, choose_order, coefficients_first, described
 from wlm.probe.sphere import sh_count
+from wlm.probe.table import read_table
 
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 """Largest number whose square fits float32."""
@@ -38,6 +41,8 @@ _ROWS = 1 << 16  # probes per piece, so that float64 copies stay at some tens of
 _FARTHEST = 1e150  # squares of distances fit float64
 _POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
 _NORMAL, _VALID = _BESIDE = "normal", "valid"
+_GODOT_AXES = "Godot's axes, right-handed, y up, in metres"
+_UNITY_AXES = "Unity's axes, left-handed, y up, in metres"
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,7 @@ class ProbeSet:
         source: Hash of the positions, the values and `live`, 16 hexadecimal digits of BLAKE2b.
         warnings: A line of text for each kind of repair.
         normal: float64 [N, 3], unit normal of each probe's surface, 0 for a probe on no surface; None if unknown.
+        reading: How the numbers were understood, in one line: convention, order, axes; and what was assumed.
     """
 
     name: str
@@ -65,6 +71,7 @@ class ProbeSet:
     source: str
     warnings: tuple[str, ...]
     normal: np.ndarray | None = None
+    reading: str = ""
 
     @property
     def probes(self) -> int:
@@ -89,19 +96,26 @@ class _Raw:
     position: np.ndarray
     values: np.ndarray
     key: str
-    convention: str
+    convention: str = ""
     beside: Mapping[str, np.ndarray] = field(default_factory=dict)
+    axes: str = ""
+    reading: str = ""  # if the file determines everything about its numbers
 
 
-def load(path: str | os.PathLike[str], *, key: str | None = None, convention: str | None = None) -> ProbeSet:
+def load(
+    path: str | os.PathLike[str], *, key: str | None = None, convention: str | None = None, order: str | None = None
+) -> ProbeSet:
     """Reads light probes from a file.
 
     - `.npz`: arrays `position` (N, 3) and `sh...` (N, C, 3) or (N, D), and a string `convention` if `sh...` is not
       canonical; optionally `normal` (N, 3) and `valid` (N), as for `from_arrays`.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
-      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`; optional fields as for `.npz`.
-    - `.lmbake`: a lightmap bake of Godot 4.
-    - `.asset`: the lighting data or light probes of Unity's editor (extra `unity`).
+      `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`; optional fields as for `.npz`. The names
+      and forms of other writers are known too (`wlm.probe.json_fields`), and scenes of three.js.
+    - `.csv`, `.tsv`: a probe in each line, x, y, z and its numbers, below an optional line of names.
+    - `.lmbake`, `.res`: a lightmap bake of Godot 4.
+    - `.ktx2`: an irradiance volume of Bevy (`wlm.probe.ambient_cube`).
+    - `.asset`: the lighting data or light probes of Unity's editor, as text, or binary (extra `unity`).
 
     Args:
         path: The file; its suffix determines the kind.
@@ -109,6 +123,9 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
             the only array whose name begins with "sh".
         convention: Convention of the file's numbers, one of `wlm.probe.conventions.CONVENTIONS`. None takes the file's
             own: "godot" for `.lmbake`, "unity" for `.asset`, otherwise the field `convention`, or else canonical.
+        order: Order of the numbers of spherical harmonics: "coefficient" (r0 g0 b0 r1 ...) or "channel" (r0 r1 ... g0
+            ...). None takes the order that the shape shows, (N, C, 3) or (N, 3, C), or for (N, D) the one that fits
+            light better, with a warning if that is "channel".
 
     Returns:
         The set, with its faults repaired where that is possible; see `ProbeSet.warnings`.
@@ -120,9 +137,7 @@ def load(path: str | os.PathLike[str], *, key: str | None = None, convention: st
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(_READERS)}, found {path.suffix or 'none'}")
-    raw = reader(path, key)
-    stated = raw.convention if convention is None else convention
-    return _check(str(path), path.stem, raw, stated)
+    return _check(str(path), path.stem, reader(path, key), convention, order)
 
 
 def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
@@ -142,14 +157,10 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
     kind = path.suffix.lower()
     if kind == ".npz":
         position = read_npz(path, lambda _: [_POSITION], numbers=3 * PROBES)[_POSITION]
-    elif kind in (".lmbake", ".asset"):
+    elif kind in _READERS and kind != ".json":
         position = _READERS[kind](path, None).position
     else:
-        content = read_json(path)
-        if isinstance(content, list):
-            position = numbers_of(path, _POSITION, content)
-        else:
-            position = fields_of(path, content)[1](_POSITION)
+        position = positions_of(path, read_json(path))
     return _check_positions(str(path), position)
 
 
@@ -160,6 +171,7 @@ def from_arrays(
     name: str = "array",
     key: str = _SH,
     convention: str = CANONICAL,
+    order: str | None = None,
     normal: np.ndarray | None = None,
     valid: np.ndarray | None = None,
 ) -> ProbeSet:
@@ -167,10 +179,11 @@ def from_arrays(
 
     Args:
         position: [N, 3] of numbers; copied.
-        values: [N, C, 3], RGB last, or [N, D] of numbers; copied.
+        values: [N, C, 3], RGB last, [N, 3, C] or [N, D] of numbers; copied.
         name: Name of the set, also used in messages.
         key: Name of the array of values.
         convention: Convention of the values, one of `wlm.probe.conventions.CONVENTIONS`.
+        order: Order of the values, as for `load`.
         normal: [N, 3], normal of each probe's surface, of any length, 0 for a probe on no surface; copied.
         valid: [N], true or false, or from 0 to 1: a probe below 0.5 is dead.
 
@@ -182,7 +195,7 @@ def from_arrays(
     """
     beside = {_NORMAL: normal, _VALID: valid}
     beside = {field: np.asarray(array) for field, array in beside.items() if array is not None}
-    return _check(name, name, _Raw(np.asarray(position), np.asarray(values), key, convention, beside), convention)
+    return _check(name, name, _Raw(np.asarray(position), np.asarray(values), key, beside=beside), convention, order)
 
 
 def save_probes(
@@ -242,7 +255,7 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
         return [_POSITION, name, *({_CONVENTION, *_BESIDE} & set(names) - {name})]
 
     arrays = read_npz(path, choose, numbers=PROBES * NUMBERS)
-    stated = arrays[_CONVENTION] if _CONVENTION in arrays else np.array(CANONICAL)
+    stated = arrays[_CONVENTION] if _CONVENTION in arrays else np.array("")
     if stated.dtype.kind != "U" or stated.ndim:
         raise WlmError(f"{path}: {_CONVENTION}: expected a string, got {stated.dtype} {stated.shape}")
     beside = {field: arrays[field] for field in _BESIDE if field in arrays and field != name}
@@ -251,28 +264,50 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
 
 def _read_json(path: Path, key: str | None) -> _Raw:
     content = read_json(path)
-    names, read = fields_of(path, content)
-    name = _choose(path, names, key)
-    beside = {field: read(field) for field in _BESIDE if field in names}
-    stated = content.get(_CONVENTION, CANONICAL)
+    fields = fields_of(path, content)
+    name = _choose(path, fields.names, key)
+    beside = {field: fields.read(field) for field in _BESIDE if field in fields.names}
+    stated = content.get(_CONVENTION, fields.convention) if isinstance(content, dict) else fields.convention
     if not isinstance(stated, str):
         raise WlmError(f"{path}: {_CONVENTION}: expected a string, got {kind_of(stated)}")
-    return _Raw(read(_POSITION), read(name), name, stated, beside)
+    position, values = fields.read(_POSITION), fields.read(name)
+    if values.ndim == 1 and len(position) and len(values) % len(position) == 0:
+        values = values.reshape(len(position), -1)
+    return _Raw(position, values, name, stated, beside, fields.axes)
+
+
+def _read_table(path: Path, key: str | None) -> _Raw:
+    position, values, remark = read_table(path)
+    return _Raw(position, values, _choose(path, (_POSITION, _SH), key), axes=remark)
 
 
 def _read_godot(path: Path, key: str | None) -> _Raw:
     position, values = read_lmbake(path)
-    return _Raw(position, values, _choose(path, (_POSITION, _SH), key), "godot")
+    return _Raw(position, values, _choose(path, (_POSITION, _SH), key), "godot", axes=_GODOT_AXES)
 
 
 def _read_unity(path: Path, key: str | None) -> _Raw:
     data = read_lighting_data(path)
     if not len(data.position):
         raise WlmError(f"{path}: expected light probes, found none: the scene has no baked LightProbeGroup")
-    return _Raw(data.position, data.values, _choose(path, (_POSITION, _SH), key), "unity")
+    return _Raw(data.position, data.values, _choose(path, (_POSITION, _SH), key), "unity", axes=_UNITY_AXES)
 
 
-_READERS = {".npz": _read_npz, ".json": _read_json, ".lmbake": _read_godot, ".asset": _read_unity}
+def _read_volume(path: Path, key: str | None) -> _Raw:
+    position, values = read_irradiance_volume(path)
+    return _Raw(position, values, _choose(path, (_POSITION, _SH), key), reading=READING)
+
+
+_READERS = {
+    ".npz": _read_npz,
+    ".json": _read_json,
+    ".lmbake": _read_godot,
+    ".res": _read_godot,
+    ".asset": _read_unity,
+    ".csv": _read_table,
+    ".tsv": _read_table,
+    ".ktx2": _read_volume,
+}
 
 
 def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
@@ -315,19 +350,44 @@ def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.nda
         raise WlmError(f"{where}: {error}") from error
 
 
-def _check(where: str, name: str, raw: _Raw, convention: str) -> ProbeSet:
-    """Checks the content of a file and returns it as a set, repaired where possible."""
+def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str | None) -> ProbeSet:
+    """Checks the content of a file and returns it as a set, repaired where possible.
+
+    `convention` and `order` are those that the caller states.
+    """
     position, values, key, beside = _check_positions(where, raw.position), raw.values, raw.key, raw.beside
     count = len(position)
     if values.dtype.kind not in "iuf":
         raise WlmError(f"{where}: {key}: expected numbers, got {values.dtype}")
-    if values.ndim not in (2, 3) or len(values) != count or values.size == 0 or values.shape[2:] not in ((), (3,)):
+    coefficients = sh_count(values.size // count) if values.ndim > 1 else None
+    by_channel = coefficients is not None and values.shape[1:] == (3, coefficients)
+    fits = values.ndim == 2 or (values.ndim == 3 and (values.shape[2] == 3 or by_channel))
+    if not fits or len(values) != count or values.size == 0:
         raise WlmError(
             f"{where}: {key}: expected ({count}, C, 3) with RGB last or ({count}, D), a row for each position, "
             f"got {values.shape}"
         )
     if values.size > NUMBERS * count:
         raise WlmError(f"{where}: {key}: expected at most {NUMBERS} numbers a probe, got {values.size // count}")
+    if order is not None and (order not in ORDERS or coefficients is None):
+        raise WlmError(
+            f"{where}: order: expected {' or '.join(ORDERS)}, for 3, 12, 27 ... numbers a probe, got {order!r} for "
+            f"{values.size // count}"
+        )
+    if raw.reading and (convention or order):
+        raise WlmError(f"{where}: convention and order have no meaning for this kind of file: {raw.reading}")
+    origin = "as given" if convention else "as the file states" if raw.convention else ""
+    convention = convention or raw.convention or CANONICAL
+    doubts: tuple[str, ...] = ()
+    reading = f"{values.size // count} numbers a probe, which are no SH in RGB"
+    if raw.reading:
+        order = COEFFICIENT
+    elif coefficients is not None:
+        _convert(where, values[:1], convention, to_canonical)  # refuses what does not fit
+        certain = order is not None or values.ndim == 3 or coefficients == 1
+        order, doubts = choose_order(values, convention, order)
+        reading = described(convention, origin, order, certain)
+    reading = raw.reading or f"{reading}; {raw.axes or 'positions and axes as stored'}"
 
     checked = room((count, values.size // count), np.float32, where)
     finite = np.empty(count, bool)
@@ -336,6 +396,8 @@ def _check(where: str, name: str, raw: _Raw, convention: str) -> ProbeSet:
         # float64 distinguishes numbers that do not fit float32 from Inf.
         wide = values[rows].astype(np.float64)
         finite[rows] = np.isfinite(wide).all(axis=tuple(range(1, wide.ndim)))
+        if coefficients is not None and order is not None:
+            wide = coefficients_first(wide, order)
         wide = _convert(where, wide, convention, to_canonical).reshape(len(wide), -1)
         beyond = np.flatnonzero(finite[rows] & (np.abs(wide).max(axis=1) > LARGEST))
         if len(beyond):
@@ -352,7 +414,7 @@ def _check(where: str, name: str, raw: _Raw, convention: str) -> ProbeSet:
         raise WlmError(f"{where}: {key}: every probe is zero, not finite or not valid: there is nothing to fit")
     normal = _check_normal(where, beside[_NORMAL], count) if _NORMAL in beside else None
 
-    warnings = []
+    warnings = [f"{name}: {key}: {doubt}" for doubt in doubts]
     broken = np.flatnonzero(~finite)
     if len(broken):
         warnings.append(
@@ -362,7 +424,8 @@ def _check(where: str, name: str, raw: _Raw, convention: str) -> ProbeSet:
     repeated = _repeated(position)
     if repeated:
         warnings.append(f"{name}: {_probes(repeated)} at the position of another: Gaussians decode them to one value")
-    return ProbeSet(name, position, checked, key, live, _hash(position, checked, live), tuple(warnings), normal)
+    source = _hash(position, checked, live)
+    return ProbeSet(name, position, checked, key, live, source, tuple(warnings), normal, reading)
 
 
 def _check_positions(where: str, position: np.ndarray) -> np.ndarray:

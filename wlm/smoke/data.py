@@ -2,10 +2,11 @@
 
 The folder of a simulated scene contains `scene.json` and `frame_0001.npz`, `frame_0002.npz` and so on, each a volume
 that `wlm.smoke.load` reads. `simulate` writes it, and can be stopped and resumed. A folder of another program's frames
-contains volumes whose names differ only in a number before the suffix.
+contains volumes whose names differ in a number only.
 """
 
 import functools
+import itertools
 import json
 import os
 import re
@@ -21,7 +22,8 @@ import torch
 from wlm import __version__
 from wlm.config import check_settings
 from wlm.errors import WlmError
-from wlm.fluid.volume import SUFFIXES, DensityVolume, load_volume
+from wlm.fluid.grids import choose
+from wlm.fluid.volume import SUFFIXES, DensityVolume, from_array, grid_heads, load_volume
 from wlm.formats.atomic import atomic_write
 from wlm.formats.exr import read_header, read_planes, write_planes
 from wlm.formats.exr_header import check_header
@@ -42,7 +44,8 @@ CHECKPOINT = "simulation.partial"
 load = load_volume
 
 _FORMAT, _VERSION = "wlm-smoke-frames", 1
-_NUMBERED = re.compile(r"(.*?)(\d{1,9})(\.[^.\d]+)")  # text before the last number, the number, the suffix
+# A number in a file name, with its sign: a minus that follows no word.
+_NUMBER = re.compile(r"((?<![^._ -])-(?=\d)|(?<!\d))(\d{1,9})(?!\d)")
 _TRANSPARENCY = "transparency"
 _DEPTH = "depth"
 
@@ -58,6 +61,7 @@ class Frames:
         device: Device of the volumes.
         extinction, emission: Replace the scene's extinction and emission; None: the scene's, or 1 without a scene.
         options: Options of `load` for the files of other programs: `trust`, `up`, `density`, `temperature`.
+        warnings: Assumptions about the files of other programs, one line each.
     """
 
     path: Path
@@ -67,6 +71,7 @@ class Frames:
     extinction: float | None = None
     emission: float | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     @property
     def single(self) -> bool:
@@ -105,6 +110,18 @@ class Frames:
         low = np.min([box[1] for box in smoky], axis=0)
         return low, np.max([box[2] for box in smoky], axis=0) - low
 
+    @property
+    def extinction_used(self) -> float:
+        """Extinction per unit of length at density 1."""
+        return self._factors["extinction"]
+
+    @property
+    def _factors(self) -> dict[str, float]:
+        """Extinction and emission: those given, or the scene's, or 1."""
+        smoke = None if self.scene is None else self.scene.smoke
+        given = {name: getattr(self, name) for name in ("extinction", "emission")}
+        return {name: getattr(smoke, name, 1.0) if value is None else value for name, value in given.items()}
+
     def file(self, number: int) -> Path:
         """Returns the file of a frame, which may not exist yet."""
         return self.files.get(number, self.path / f"frame_{number:04d}.npz")
@@ -123,12 +140,16 @@ class Frames:
         Raises:
             WlmError: The file is missing or damaged.
         """
-        smoke = None if self.scene is None else self.scene.smoke
-        factors = {}
-        for name in ("extinction", "emission"):
-            override = getattr(self, name)
-            factors[name] = override if override is not None else getattr(smoke, name, 1.0)
-        return load_volume(self.file(number), **factors, device=self.device, **self.options)
+        factors = self._factors
+        options = dict(self.options)
+        if self.scene is None and not self.single and (heads := grid_heads(self.file(number))):
+            # All frames have the same grids; files from before the smoke or the fire may lack them.
+            names = {head.name for head in heads}
+            if options["density"] not in names:
+                return from_array(np.zeros((1, 1, 1), np.float32), **factors, device=self.device)
+            if options.get("temperature") not in names:
+                options.pop("temperature", None)
+        return load_volume(self.file(number), **factors, device=self.device, **options)
 
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
@@ -170,7 +191,7 @@ def load_frames(
     if not path.is_dir():
         return Frames(path, None, {1: path}, *given)
     if not (path / SCENE_FILE).is_file():
-        return Frames(path, None, _sequence(path), *given)
+        return _frames_of_others(path, *given)
     if (name := next((name for name in options if name != "trust"), None)) is not None:
         raise WlmError(f"{path}: option {name}: applies only to files of other programs, found frames of simulate")
     frames = Frames(path, _read_scene(path), numbered(path, "frame", ".npz"), *given)
@@ -179,23 +200,57 @@ def load_frames(
     return frames
 
 
-def _sequence(folder: Path) -> dict[int, Path]:
-    """Returns a folder's volumes by the last number in their file names, which must differ in nothing else."""
-    found: dict[tuple[str, str], dict[int, Path]] = {}
+def _frames_of_others(
+    folder: Path, device: str, extinction: float | None, emission: float | None, options: dict
+) -> Frames:
+    """Opens a folder of another program's frames, with one choice of grids for all of them."""
+    files, warnings = _sequence(folder)
+    heads = {number: grid_heads(file) for number, file in files.items()}
+    if some := list(dict.fromkeys(head for each in heads.values() for head in each)):
+        density, hot, chosen = choose(str(folder), some, options.get("density"), options.get("temperature"))
+        options = options | {"density": density} | ({} if hot is None else {"temperature": hot})
+        without = [files[number].name for number, each in heads.items() if density not in {head.name for head in each}]
+        if without:
+            count = f"{len(without)} of {len(files)} frames"
+            chosen.append(f"{folder}: {count} have no grid {density} and thus no smoke, the first is {without[0]}")
+        warnings += chosen
+    return Frames(folder, None, files, device, extinction, emission, options, tuple(warnings))
+
+
+def _sequence(folder: Path) -> tuple[dict[int, Path], list[str]]:
+    """Returns a folder's volumes by the number in their names that differs between them, and warnings."""
+    found: dict[tuple[str, ...], list[tuple[list[int], Path]]] = {}
     for path in sorted(folder.iterdir()):
-        match = _NUMBERED.fullmatch(path.name)
-        if match and match[3].lower() in SUFFIXES and path.is_file():
-            files = found.setdefault((match[1], match[3]), {})
-            number = int(match[2])
-            if number in files:
-                raise WlmError(f"{folder}: two frames have the same number: {files[number].name} and {path.name}")
-            files[number] = path
-    if len(found) != 1:
-        kinds = ", ".join(f"{stem}*{suffix}" for stem, suffix in found) or f"neither {SCENE_FILE} nor any"
+        if path.suffix.lower() in SUFFIXES and path.name[0] != "." and path.is_file():
+            parts = _NUMBER.split(path.stem)
+            if numbers := [int(sign + digits) for sign, digits in zip(parts[1::3], parts[2::3], strict=True)]:
+                found.setdefault((*parts[::3], path.suffix), []).append((numbers, path))
+    sequences = {}
+    for texts, files in found.items():
+        columns = list(zip(*(numbers for numbers, _ in files), strict=True))
+        varying = [i for i, column in enumerate(columns) if len(set(column)) > 1] or [len(columns) - 1]
+        shown = ["*" if i in varying else f"{column[0]}" for i, column in enumerate(columns)]
+        name = "".join(f"{text}{number}" for text, number in zip(texts, [*shown, texts[-1]], strict=False))
+        # Several numbers may differ, such as frame and time, if each of them sorts the files in the same way.
+        orders = {
+            tuple(sorted(range(len(files)), key=lambda i: (column[i], files[i][1].name)))
+            for column in (columns[i] for i in varying)
+            if len(varying) == 1 or len(set(column)) == len(column)
+        }
+        sequences[name] = (columns[varying[0]], files, orders)
+    if len(sequences) != 1 or len(next(iter(sequences.values()))[2]) != 1:
+        kinds = ", ".join(sequences) or f"neither {SCENE_FILE} nor any"
         raise WlmError(
             f"{folder}: expected frames of simulate, or one sequence of volumes such as smoke_0001.vdb, found {kinds}"
         )
-    return dict(sorted(next(iter(found.values())).items()))
+    numbers, files, orders = next(iter(sequences.values()))
+    ordered = [(numbers[i], files[i][1]) for i in next(iter(orders))]
+    twice = next((pair for pair in itertools.pairwise(ordered) if pair[0][0] == pair[1][0]), None)
+    if twice is None:
+        return dict(ordered), []
+    both = " and ".join(path.name for _, path in twice)
+    warning = f"{folder}: {both} have the same number: the frames are numbered from 1 in the order of number and name"
+    return dict(enumerate((path for _, path in ordered), 1)), [warning]
 
 
 def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = False) -> Frames:
@@ -229,7 +284,7 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
 
 def numbered(folder: Path, stem: str, suffix: str) -> dict[int, Path]:
     """Returns a folder's files by number, in rising order: `six_0001.exr` has stem `six` and suffix `.exr`."""
-    pattern = re.compile(rf"{re.escape(stem)}_(\d+){re.escape(suffix)}")
+    pattern = re.compile(rf"{re.escape(stem)}_(-?\d+){re.escape(suffix)}")
     files = {int(match[1]): path for path in folder.iterdir() if (match := pattern.fullmatch(path.name))}
     return dict(sorted(files.items()))
 

@@ -18,7 +18,7 @@ from wlm.formats.lock import locked
 from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
 from wlm.smoke.march.motion import velocity_file, write_velocity
-from wlm.smoke.scene import Inlet, Scene, SourceSettings
+from wlm.smoke.scene import Inlet, ObstacleSettings, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
 
 _Timed = tuple[fluid.Source, Callable[[float], bool]]
@@ -56,6 +56,31 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
     except ValueError as error:
         # Each setting is within its range, but together they are too small or too large.
         raise WlmError(f"{scene.name}: {error}") from error
+
+
+def warnings_of(scene: Scene) -> list[str]:
+    """Returns a line for each source and obstacle that has no effect or another one than its picture."""
+    grid, warnings, end = scene.grid, [], scene.time(scene.frames)
+    low, high = np.asarray(grid.origin), grid.origin + grid.size
+    box = f"it is outside the box from {low.tolist()} to {high.tolist()}"
+    for i, ball in enumerate(scene.sources):
+        if np.linalg.norm(np.clip(ball.centre, low, high) - ball.centre) >= ball.radius:
+            warnings.append(f"sources.{i}: {box}, and emits no smoke")
+        elif ball.start >= end or (ball.stop is not None and ball.stop <= 0.0):
+            warnings.append(f"sources.{i}: it is not active between 0 and {end:g} s, and emits no smoke")
+        elif ball.radius < 0.5 * math.sqrt(3.0) * grid.voxel:  # half of a voxel's diagonal
+            warnings.append(f"sources.{i}: it is smaller than a voxel of {grid.voxel:g} m, and may emit no smoke")
+    for i, obstacle in enumerate(scene.obstacles):
+        radius, places = np.broadcast_to(obstacle.radius, 3), np.array(obstacle.path)[:, 1:]
+        if (places.max(0) + radius <= low).any() or (places.min(0) - radius >= high).any():
+            warnings.append(f"obstacles.{i}: {box}")
+        elif (_radius(scene, obstacle) > radius).any():
+            warnings.append(
+                f"obstacles.{i}: it is thinner than a cell of {grid.cell:g} m, and is simulated as a cell thick"
+            )
+    if not (scene.sources or scene.inlets):
+        warnings.append("sources, inlets: there are none, and thus there is no smoke")
+    return [f"{scene.name}: {warning}" for warning in warnings]
 
 
 def volume_of(scene: Scene, solver: fluid.Solver) -> DensityVolume:
@@ -274,9 +299,20 @@ def _obstacles(scene: Scene) -> list[Obstacle]:
     for settings in scene.obstacles:
         keys = np.array(settings.path)
         path = Trajectory.of((keys[:, 1:] - grid.origin) / grid.cell, keys[:, 0] / scene.step)
+        radius = _radius(scene, settings)
         if settings.shape == "sphere":
-            obstacles.append(Sphere(path, settings.radius / grid.cell))
+            obstacles.append(Sphere(path, float(radius[0]) / grid.cell))
         else:
-            points, triangles = settings.mesh()
+            points, triangles = settings.model_copy(update={"radius": tuple(radius)}).mesh()
             obstacles.append(Mesh(path, points.astype(np.float32), triangles.astype(np.int32), scale=1.0 / grid.cell))
     return obstacles
+
+
+def _radius(scene: Scene, obstacle: ObstacleSettings) -> np.ndarray:
+    """Returns the half extents [3] with which an obstacle is simulated: at least such that it covers the centre of a
+    cell wherever it is, so that a thin one stops the air."""
+    half = 0.5 * scene.grid.cell
+    round_axes = {"sphere": (3, 3, 3), "cylinder": (2, 1, 2), "box": (1, 1, 1)}[obstacle.shape]
+    # The sides of a cylinder are segments, slightly inside the circle.
+    least = half * np.sqrt(round_axes) * np.where(np.array(round_axes) == 1, 1.0 + 1e-4, 1.01)
+    return np.maximum(np.broadcast_to(np.asarray(obstacle.radius, np.float64), 3), least)

@@ -1,23 +1,10 @@
-"""Conversion of sparse grids to dense ones, and resampling of voxels of any shape to cubic voxels."""
+"""Resampling of voxels of any shape to cubic voxels."""
 
 import warp as wp
 
 from wlm_kernels.smoke.march import density_at, size_of
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.kernel
-def dense(
-    # in:
-    grid: wp.uint64,
-    low: wp.vec3i,
-    # out:
-    out: wp.array3d[float],
-):
-    """Copies a NanoVDB grid of floats to a dense array, whose element (0, 0, 0) is the grid's voxel `low`."""
-    i, j, k = wp.tid()
-    out[i, j, k] = wp.volume_lookup_f(grid, low[0] + i, low[1] + j, low[2] + k)
 
 
 @wp.kernel

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-_LEAST_STEP = 0.01  # voxels; shorter steps would take far too long
+LEAST_STEP = 0.01
+"""Shortest step in voxels; shorter steps would take far too long."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class March:
     def __post_init__(self) -> None:
         for name in ("step", "spacing", "light_step"):
             value = getattr(self, name)
-            if value is not None and not _LEAST_STEP <= value < float("inf"):
-                raise ValueError(f"{name}: expected at least {_LEAST_STEP} voxels, got {value}")
+            if value is not None and not LEAST_STEP <= value < float("inf"):
+                raise ValueError(f"{name}: expected at least {LEAST_STEP} voxels, got {value}")
         if not 0 <= self.jitter <= 1:
             raise ValueError(f"jitter: expected 0 to 1, got {self.jitter}")
         if not -1 < self.g < 1:

@@ -12,6 +12,9 @@ from wlm.errors import WlmError
 ENGINES = ("three", "godot", "unity", "unreal")
 """Engines for which kits are written: three.js, Godot 4, Unity, Unreal Engine 5."""
 
+PROBE_ENGINES = (*ENGINES, "bevy")
+"""Engines for which probes are written."""
+
 README_FILE = "README.md"
 
 # Most texels along a side of a picture that the editor imports, or that WebGL2 supports on most machines.

@@ -1,1 +1,1 @@
-"""Exports light probes to the files of three.js, Godot, Unity and Unreal."""
+"""Exports light probes to the files of three.js, Godot, Unity, Unreal and Bevy."""

@@ -15,7 +15,7 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.launch import run
 from wlm.smoke.scene import Looks
 from wlm_kernels.smoke import marches
-from wlm_kernels.smoke.settings import March
+from wlm_kernels.smoke.settings import LEAST_STEP, March
 
 _SURFACE = March(step=1.0, jitter=0.0)  # march for the depth at which obstacles and their shadows are drawn
 _STEPS = 130  # steps through the box of `coarse_march`
@@ -45,7 +45,7 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
 
 def coarse_march(volume: DensityVolume, seed: int = 0) -> March:
     """Returns settings of a march in steps of 1/130 of the smoke's longest edge, with a seed for its jitter."""
-    return March(max(volume.shape) / _STEPS, seed=seed)
+    return March(max(max(volume.shape) / _STEPS, LEAST_STEP), seed=seed)
 
 
 def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.Tensor:

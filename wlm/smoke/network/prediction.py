@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import torch
 
+from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import check_device, device_name, stream
 from wlm.smoke.camera import Camera
@@ -71,6 +72,7 @@ class SmokePredictor:
 
         Raises:
             ValueError: The camera is in perspective.
+            WlmError: The network predicts NaN or infinity.
         """
         if device_name(smoke.device) != self.device:
             hot = None if smoke.temperature is None else smoke.temperature.to(self.device)
@@ -87,6 +89,10 @@ class SmokePredictor:
         if decoder.guide == "six":
             with stream(self.device):
                 planes = self._gated(_as_planes(guide), planes, smoke, camera, march)
+        if not torch.isfinite(planes).all():
+            raise WlmError(
+                "the network predicts NaN or infinite light: its weights are too large; take another network"
+            )
         return decode_lightmaps(planes, hot=smoke.temperature is not None, camera=camera)
 
     def _gated(

@@ -9,7 +9,7 @@ from pydantic_core import PydanticCustomError
 
 from wlm.smoke.network.planes import GUIDES
 from wlm.system import Settings
-from wlm_kernels.smoke.settings import March
+from wlm_kernels.smoke.settings import LEAST_STEP, March
 
 EDGE, SPEED, LATTICE_SPEED = 1.0, 1.0, 0.1
 """Edge of the box in metres; speed of the fastest air in metres per second, and the same speed in cells per air
@@ -155,9 +155,10 @@ class DatasetSettings(BaseModel):
     def look(self, shape: Sequence[int], seed: int = 0) -> March:
         """Returns march settings for the guiding map of a volume of `shape` voxels, with a seed for the jitter."""
         longest = max(shape)
-        spacing = None if self.guide_spacing is None else self.guide_spacing * longest
+        spacing = None if self.guide_spacing is None else max(self.guide_spacing * longest, LEAST_STEP)
         threshold = self.surface / longest
-        return March(self.guide_step * longest, spacing, jitter=self.jitter, seed=seed, threshold=threshold)
+        step = max(self.guide_step * longest, LEAST_STEP)
+        return March(step, spacing, jitter=self.jitter, seed=seed, threshold=threshold)
 
 
 class TrainSettings(BaseModel):

@@ -1,0 +1,290 @@
+"""Volume files of many writers: which grid is the smoke, types of values, sequences, and files that claim too much."""
+
+import gzip
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders.nvdb_files import LEVEL_SET, nvdb_file, raw_grid
+from builders.vdb_files import ACTIVE_MASK, ZIP, scaled, tree, vdb_file
+
+from wlm.errors import WlmError
+from wlm.fluid.grids import choose
+from wlm.fluid.volume import from_array, load_volume, thickness_hint
+from wlm.formats.vdb import GridHead
+from wlm.inspection import inspect
+from wlm.inspection.folders import input_system
+from wlm.smoke.data import load_frames
+from wlm.smoke.march.coarse import coarse_march
+from wlm.smoke.network.settings import DatasetSettings
+
+FILES = Path(__file__).resolve().parents[1] / "files"
+SHAPE = (16, 8, 24)
+
+
+def smoke(shape: tuple[int, int, int] = SHAPE) -> np.ndarray:
+    """Smoke that fills its box, with a leaf of one value."""
+    values = np.random.default_rng(7).random(shape).astype(np.float32) + 0.25
+    values[:8, :8, :8] = 0.5
+    return values
+
+
+def distances(shape: tuple[int, int, int] = (16, 16, 16)) -> np.ndarray:
+    """Distances to a ball, cut off at 3."""
+    places = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1) - 7.5
+    return np.clip(np.linalg.norm(places, axis=-1) - 5, -3, 3).astype(np.float32)
+
+
+def grid(values: np.ndarray, background: float = 0.0, one: str = "f", edge: float = 0.5) -> tuple:
+    nodes = tree(values, np.ones(values.shape, bool), ACTIVE_MASK, False, background, one)
+    return scaled(edge, edge, edge), nodes, ACTIVE_MASK, False
+
+
+def write(path: Path, *names: str, values: np.ndarray | None = None) -> Path:
+    path.write_bytes(vdb_file({name: grid(smoke() if values is None else values) for name in names}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "bits", "error"),
+    [("float", 0, 0), ("double", 0, 0), ("fp4", 4, 0.035), ("fp8", 8, 0.002), ("fp16", 16, 8e-6)]
+    + [("fpn", bits, 0.51 / (2**bits - 1)) for bits in (1, 2, 4, 8, 16)],
+)
+def test_types_of_nanovdb(tmp_path: Path, kind: str, bits: int, error: float):
+    """Files and raw buffers, of this and of an early version, hold the same smoke within the quantum."""
+    made, values = raw_grid(smoke(), kind, bits=bits or 8), smoke()
+    early = made[:7] + b"0" + made[8:]
+    for data in (nvdb_file(made), made, early, nvdb_file(made) + nvdb_file(raw_grid(0 * values, name="heat"))):
+        (tmp_path / "a.nvdb").write_bytes(data)
+        volume = load_volume(tmp_path / "a.nvdb", up="y")
+        assert (volume.voxel, volume.origin, volume.warnings) == (0.5, (0.75, 1.75, 2.75), ())
+        assert float((volume.density - volume.density.new_tensor(values)).abs().max()) <= error + 1e-7
+    packed = struct.pack("<Q", len(zlib.compress(made))) + zlib.compress(made)
+    (tmp_path / "a.nvdb").write_bytes(nvdb_file(packed, codec=1, size=len(made)))
+    assert load_volume(tmp_path / "a.nvdb", up="y").shape == SHAPE
+
+
+def test_quantised_files_of_openvdb(tmp_path: Path):
+    """Two files that NanoVDB's own writer made hold one smoke."""
+    found = []
+    for kind in ("fp4", "fpn"):
+        (tmp_path / f"{kind}.nvdb").write_bytes(gzip.decompress((FILES / f"smoke-{kind}.nvdb.gz").read_bytes()))
+        found.append(load_volume(tmp_path / f"{kind}.nvdb").density)
+    assert found[0].shape == (23, 31, 19) and float(found[0].max()) == pytest.approx(1.274, abs=0.01)
+    assert float((found[0] - found[1]).abs().max()) < 0.05 and float(found[0].std()) > 0.1
+
+
+def test_nanovdb_that_claims_too_much(tmp_path: Path):
+    """The same nodes many times, sizes beyond the file, compressed pieces beyond the size: one line."""
+    whole, path = raw_grid(smoke()), tmp_path / "a.nvdb"
+    root = 672 + 64
+    upper = root + 64 + 32
+    many = bytearray(whole)
+    many[upper + 32 + 4096 : upper + 8224] = b"\xff" * 4096  # each child of the upper node is the one lower node
+    many[upper + 8256 : upper + 8256 + 8 * 32768] = struct.pack("<q", 8256 + 8 * 32768) * 32768
+    many[root + 12 : root + 24] = struct.pack("<3i", 4095, 7, 7)
+    leaves = bytearray(whole)
+    lower = upper + 8256 + 8 * 32768
+    leaves[lower + 32 + 512 : lower + 1056] = b"\xff" * 512
+    leaves[lower + 1088 : lower + 1088 + 8 * 4096] = struct.pack("<q", 1088 + 8 * 4096) * 4096
+    leaves[root + 12 : root + 24] = struct.pack("<3i", 127, 127, 127)
+    outside = bytearray(whole)
+    struct.pack_into("<q", outside, root + 64 + 8, 1 << 40)
+    tiles = bytearray(whole)
+    struct.pack_into("<I", tiles, root + 24, 1 << 30)
+    far = bytearray(whole)
+    struct.pack_into("<6i", far, root, 0, 0, 0, 1 << 23, 0, 0)  # a line of few voxels, in leaves of many
+    old = bytearray(whole)
+    struct.pack_into("<I", old, 16, 28 << 21)
+    bomb = struct.pack("<Q", 2045) + zlib.compress(bytes(2 << 20), 9)
+    bomb = struct.pack("<Q", len(bomb) - 8) + bomb[8:]
+    for data, message in (
+        (many, "its nodes claim 32 of 33856 bytes"),
+        (leaves, "its nodes claim 4096 of 2144 bytes"),
+        (outside, "a node is outside the grid"),
+        (tiles, "its root claims 1073741824 tiles"),
+        (far, "expected a box of at most"),
+        (old, "expected version 32 of NanoVDB's grids, found 28"),
+        (nvdb_file(bomb * 50, codec=1, size=len(whole)), "after decompression, found another number"),
+        (nvdb_file(whole, codec=9), "expected a codec from 0 to 2, found 9"),
+        (raw_grid(smoke(), "float")[:632] + struct.pack("<2I", 2, 6) + whole[640:], r"found density \(vec3f\): export"),
+    ):
+        path.write_bytes(bytes(data))
+        with pytest.raises(WlmError, match=rf"a\.nvdb: .*{message}"):
+            load_volume(path)
+
+
+def test_doubles_of_openvdb(tmp_path: Path):
+    values = smoke().astype(np.float64)
+    for flags in (ACTIVE_MASK, ACTIVE_MASK | ZIP):
+        for half in (False, True):
+            nodes = tree(values, values > 0.6, flags, half, 0.0, "d")
+            data = vdb_file({"density|fog volume|double": (scaled(0.5, 0.5, 0.5), nodes, flags, half)})
+            (tmp_path / "a.vdb").write_bytes(data)
+            np.testing.assert_allclose(
+                load_volume(tmp_path / "a.vdb", up="y").density, values, rtol=1e-3 if half else 0
+            )
+
+
+def test_tiles_that_overlap(tmp_path: Path):
+    """Root tiles at places that are no multiples of 4096 could overlap, which would take the machine."""
+    head, nodes, *_ = grid(smoke())
+    for shift in (0, 1, 8):
+        tiles = [struct.pack("<3if?", 4096 + i * shift, 0, 0, 0.5, False) for i in range(2)]
+        moved = nodes[:8] + struct.pack("<I", 2) + nodes[12:16] + b"".join(tiles) + nodes[16:]
+        (tmp_path / "a.vdb").write_bytes(vdb_file({"density": (head, moved, ACTIVE_MASK, False)}))
+        with pytest.raises(WlmError, match="expected nodes at different multiples of 4096"):
+            load_volume(tmp_path / "a.vdb")
+
+
+@pytest.mark.parametrize(
+    ("heads", "chosen"),
+    [
+        ("flame density", "density"),
+        ("collision|level_set dens", "dens"),
+        ("flames smoke heat", "smoke"),
+        ("density|level_set soot", "soot"),
+        ("Density", "Density"),
+        ("vel|vec3s fuel_density fog", "fog"),
+        ("temperature cd", "cd"),
+        ("density_noise shadow", "density_noise"),
+        ("temperature", None),
+        ("flame heat", None),
+        ("surface|level_set", None),
+        ("density|vec3s", None),
+        ("density|vec3s heat", None),
+        ("smoke fog", None),
+        ("a b", None),
+        ("points|ptdataidx32", None),
+    ],
+)
+def test_the_grid_of_the_smoke(heads: str, chosen: str | None):
+    """By name and class; another name than density is said, and what is not clear is an error that lists the grids."""
+    found = []
+    for text in heads.split():
+        name, _, kind = text.partition("|")
+        group = kind.replace("_", " ") if kind == "level_set" else ""
+        found.append(GridHead(name, "float" if group or not kind else kind, group))
+    if chosen is None:
+        with pytest.raises(WlmError, match=f"a: expected a grid of floats named density, found {found[0].name}"):
+            choose("a", found)
+        return
+    density, _, warnings = choose("a", found)
+    assert density == chosen and len(warnings) == (chosen.lower() != "density")
+    assert all(f"the grid {chosen} is read as the density" in each for each in warnings)
+
+
+def test_level_sets(tmp_path: Path):
+    """A level set is refused by its class or its values; if it is named, its inside is filled."""
+    ball = distances()
+    for name, path in (("a", tmp_path / "a.vdb"), ("b", tmp_path / "b.nvdb"), ("c", tmp_path / "c.vdb")):
+        if path.suffix == ".nvdb":
+            data = bytearray(nvdb_file(raw_grid(ball, name="density", group=LEVEL_SET)))
+            root = data.index(b"NanoVDB1") + 672 + 64
+            struct.pack_into("<f", data, root + 28, 3.0)
+            path.write_bytes(data)
+        else:
+            path.write_bytes(vdb_file({"density" + "|level set|float" * (name == "a"): grid(ball, 3.0)}))
+        with pytest.raises(WlmError, match="level set"):
+            load_volume(path)
+        filled = load_volume(path, density="density")
+        assert len(filled.warnings) == 1 and "filled with smoke of density 1" in filled.warnings[0]
+        np.testing.assert_allclose(filled.density, np.clip(-ball / 3, 0, 1), atol=1e-6)
+        assert inspect(path)[0].what == "cannot be read"
+    # Negative values alone are no level set: the background of fog is 0.
+    path = write(tmp_path / "d.vdb", "density", values=smoke() - 0.3)
+    assert "negative voxels count as 0" in load_volume(path, up="y").warnings[0]
+
+
+def test_two_grids_of_one_name(tmp_path: Path):
+    path = write(tmp_path / "a.vdb", "density", "density\x1e1")
+    assert load_volume(path, up="y").warnings == (f"{path}: 2 grids are named density: only the first is read",)
+
+
+def test_temperatures_in_kelvin(tmp_path: Path):
+    data = {"density": grid(smoke()), "temperature": grid(1500 * smoke())}
+    (tmp_path / "a.vdb").write_bytes(vdb_file(data))
+    (warning,) = load_volume(tmp_path / "a.vdb", up="y").warnings
+    assert "if they are kelvins, --volume emission=0.0005" in warning
+    assert load_volume(tmp_path / "a.vdb", up="y", emission=5e-4).warnings == ()
+
+
+def test_one_grid_for_a_sequence(tmp_path: Path):
+    """Before the smoke begins, a file may have other grids only; none of them stands in for it."""
+    write(tmp_path / "s_0001.vdb", "flame")
+    write(tmp_path / "s_0002.vdb", "flame", "density", "temperature")
+    frames = load_frames(tmp_path, up="y")
+    assert frames.warnings == (
+        f"{tmp_path}: 1 of 2 frames have no grid density and thus no smoke, the first is s_0001.vdb",
+    )
+    assert not frames.load(1).density.any() and frames.load(2).density.any() and frames.load(2).temperature is not None
+    (finding,) = inspect(tmp_path)
+    assert (
+        finding.what.startswith("2 frames of smoke")
+        and finding.command == f"wlm smoke bake {tmp_path} --volume up=z -o DIR"
+    )
+    assert input_system(tmp_path) == "smoke"
+    write(tmp_path / "s_0001.vdb", "smoke")
+    assert not load_frames(tmp_path, up="y").load(1).density.any()
+    assert load_frames(tmp_path, up="y", density="smoke").load(1).density.any()
+    with pytest.raises(WlmError, match="fog: expected one of its grids of floats, found smoke, flame, density"):
+        load_frames(tmp_path, density="fog")
+
+
+@pytest.mark.parametrize(
+    ("names", "numbers"),
+    [
+        (["s.-2", "s.-1", "s.0", "s.1"], (-2, -1, 0, 1)),
+        (["smoke_-0002", "smoke_0003", "smoke_0010"], (-2, 3, 10)),
+        (["smoke-0001", "smoke-0002"], (1, 2)),
+        (["explosion_0001_low", "explosion_0002_low"], (1, 2)),
+        (["frame0009_density", "frame10_density"], (9, 10)),
+        (["1", "2", "10"], (1, 2, 10)),
+        (["cloud (1)", "cloud (2)"], (1, 2)),
+        (["sim_v2_256.0001", "sim_v2_256.0002"], (1, 2)),
+        (["fire_0001_t040", "fire_0002_t080", "fire_0003_t120"], (1, 2, 3)),
+        (["fire_0001_0.04", "fire_0002_0.08", "fire_0003_1.00"], None),
+        (["s1", "s01", "s2"], (1, 2, 3)),
+        (["a_0001", "._a_0001", "notes"], (1,)),
+        (["20240131_0001", "20240131_0002"], (1, 2)),
+        (["sim_v1_0001", "sim_v1_0002", "sim_v2_0001"], None),
+        (["a_0001_low", "a_0001_high"], None),
+        (["smoke"], None),
+    ],
+)
+def test_names_of_frames(tmp_path: Path, names: list[str], numbers: tuple[int, ...] | None):
+    for name in names:
+        write(tmp_path / f"{name}.vdb", "density", values=smoke((8, 8, 8)))
+    if numbers is None:
+        with pytest.raises(WlmError, match="expected frames of simulate, or one sequence of volumes"):
+            load_frames(tmp_path)
+        return
+    frames = load_frames(tmp_path)
+    assert frames.numbers == numbers
+    if "s01" in names:
+        assert [path.name for path in frames.files.values()] == ["s01.vdb", "s1.vdb", "s2.vdb"]
+        assert "s01.vdb and s1.vdb have the same number" in frames.warnings[0]
+    else:
+        assert not frames.warnings and [path.stem for path in frames.files.values()] == names[: len(numbers)]
+
+
+def test_defaults_of_a_tiny_box_have_a_floor():
+    volume = from_array(np.ones((1, 1, 1)))
+    assert coarse_march(volume).step == 0.01
+    for guide in (DatasetSettings(), DatasetSettings(guide="six", guide_spacing=0.005)):
+        march = guide.look((1, 1, 1))
+        assert march.step >= 0.01 and (march.spacing is None or march.spacing >= 0.01)
+
+
+@pytest.mark.parametrize(("density", "voxel", "better"), [(1.0, 1e-3, 300), (250.0, 1.0, 4e-3), (1.0, 0.1, None)])
+def test_smoke_that_cannot_be_seen(tmp_path: Path, density: float, voxel: float, better: float | None):
+    np.savez(tmp_path / "a.npz", density=np.full((10, 10, 10), density), voxel=voxel)
+    volume = load_volume(tmp_path / "a.npz")
+    hint, (finding,) = thickness_hint(volume.thickness, 1.0), inspect(tmp_path / "a.npz")
+    assert (hint is None) == (better is None) and finding.problems == (() if hint is None else (hint,))
+    if better is not None:
+        assert f"--volume extinction={better:g} makes it" in hint
+        again = load_volume(tmp_path / "a.npz", extinction=better)
+        assert thickness_hint(again.thickness, better) is None

@@ -1,0 +1,414 @@
+"""Finds the lightmaps that a glTF file names itself, and the texture transforms of lightmap UVs.
+
+==========================  =======================  ================================================================
+named by                    UV set without texCoord  rectangle, factor and encoding
+==========================  =======================  ================================================================
+`MOZ_lightmap`,             1                        `intensity`; images of 8 bits are sRGB, as Hubs writes them
+`XR3_lightmap`
+`FB_materials_lightmap`     0                        `lightmapFactor`, sRGB
+`WEBGI_materials_lightmap`  0                        `lightMapIntensity`, sRGB
+`MX_lightmap`, of nodes     1                        `scale`, `offset`, `intensity`; RGBM if the image has alpha
+`EPIC_lightmap_textures`    0                        `coordinateScaleBias`; Unreal's encoded pairs of halves are refused
+`NEEDLE_lightmaps`          1                        `lightmapScaleOffset` of the node's renderer, v up; float images
+a slot that the caller      0                        the factor of `emissive`; sRGB
+chooses
+==========================  =======================  ================================================================
+
+A set 1 that the mesh lacks is 0. `KHR_texture_transform` of the slot applies before the rectangle. Slots that read one
+image read one lightmap, whatever their textures and samplers.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+import numpy as np
+
+from wlm.atlas.listing import Listing, SheetFiles, has_lightmap, numbers
+from wlm.errors import WlmError, one_line
+from wlm.formats.gltf import (
+    GltfDocument,
+    GltfPrimitive,
+    held_image,
+    local_file,
+    parse_gltf,
+    reported,
+    texture_image,
+    texture_transform,
+)
+from wlm.formats.gltf_slots import IDENTITY, SLOTS, lightmap_transform
+from wlm.formats.gltf_writer import Replacement, encode_glb
+from wlm.formats.levels import HEAD, level_kind
+from wlm.formats.reading import open_file
+
+# Extensions of materials: the field of the texture (None: the extension itself), the field of the factor, the UV set
+# without texCoord.
+_MATERIALS: dict[str, tuple[str | None, str, int]] = {
+    "MOZ_lightmap": (None, "intensity", 1),
+    "XR3_lightmap": (None, "intensity", 1),
+    "FB_materials_lightmap": ("lightmapTexture", "lightmapFactor", 0),
+    "WEBGI_materials_lightmap": ("lightMapTexture", "lightMapIntensity", 0),
+}
+_MX, _EPIC, _NEEDLE = "MX_lightmap", "EPIC_lightmap_textures", "NEEDLE_lightmaps"
+EXTENSIONS = (*_MATERIALS, _MX, _EPIC, _NEEDLE)
+"""Extensions whose lightmaps are read."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a primitive reads its lightmap: number of the sheet; n of `TEXCOORD_n`; and the rows of the matrix [2, 3]
+    that moves these UVs (u, v, 1) into the sheet, v down."""
+
+    sheet: int
+    uv_set: int
+    transform: tuple[float, ...] = IDENTITY
+
+    @property
+    def rectangle(self) -> tuple[float, float, float, float] | None:
+        """The transform as a rectangle: scale and offset; None if it turns or shears."""
+        a, b, x, c, d, y = self.transform
+        return None if b or c else (a, d, x, y)
+
+
+Readings = dict[tuple[int, int], Reading]
+"""The readings by node and number of the primitive in its mesh."""
+
+
+@dataclass(frozen=True, eq=False)
+class OwnLightmaps:
+    """The lightmaps that a file names: its list without objects, the readings, and one line for each assumption."""
+
+    listing: Listing
+    readings: Readings
+    notes: tuple[str, ...]
+
+
+class Settled(NamedTuple):
+    """A document whose primitives read one UV set: the document, its primitives, n of the set, and by node the number
+    of its sheet and its rectangle."""
+
+    document: GltfDocument
+    primitives: list[GltfPrimitive]
+    uv_set: int
+    places: dict[int, tuple[int, tuple[float, float, float, float]]]
+
+
+class _Entry(NamedTuple):
+    """A texture slot that holds a lightmap; `rectangle` is scale and offset, v down."""
+
+    info: dict[str, Any]
+    uv_set: int
+    factor: Any = 1.0
+    rectangle: Sequence[float] = (1.0, 1.0, 0.0, 0.0)
+
+
+def own_extension(document: GltfDocument) -> str | None:
+    """Returns the first of `EXTENSIONS` that a material, a node or the file itself has; None without one."""
+    content = document.content
+    holders = [content, *content.get("materials", []), *content.get("nodes", [])]
+    found = {name for holder in holders for name in holder.get("extensions", {})}
+    return next((name for name in EXTENSIONS if name in found), None)
+
+
+def filled_slots(document: GltfDocument) -> list[str]:
+    """Returns the names among `SLOTS` of the slots that have a texture."""
+    materials = document.content.get("materials", [])
+    return [slot for slot in SLOTS if any(f"{slot}Texture" in each for each in materials)]
+
+
+def own_lightmaps(
+    document: GltfDocument,
+    primitives: Sequence[GltfPrimitive],
+    slot: str | None = None,
+    encoding: str | None = None,
+    uv_set: int | None = None,
+) -> OwnLightmaps:
+    """Lists the lightmaps that a file names.
+
+    Args:
+        document, primitives: From `read_gltf`.
+        slot: One of `SLOTS`, to read it instead of an extension.
+        encoding: Encoding of images of 8 bits; None: that of the table.
+        uv_set: Replaces the stated UV set of all slots.
+
+    Raises:
+        WlmError: The file names no lightmap that can be read; the line names the extension or the slots that it has.
+    """
+    with reported(document.path):
+        name = slot or own_extension(document)
+        if slot is not None and slot not in SLOTS:
+            raise WlmError(f"slot: expected one of {', '.join(SLOTS)}, got {slot!r}")
+        if name is None:
+            raise WlmError(f"{document.path}: {_none(document)}")
+        return _own(document, primitives, name, encoding, uv_set)
+
+
+def _none(document: GltfDocument) -> str:
+    """Says that a document names no lightmap, and what it has instead."""
+    used = [
+        one_line(each, 60) for each in document.content.get("extensionsUsed", []) if "lightmap" in str(each).lower()
+    ]
+    text = f"no material has a lightmap ({', '.join(EXTENSIONS)})"
+    if used:
+        text += f"; its extension {', '.join(used)} is not known"
+    if slots := filled_slots(document):
+        return f"{text}: give a lightmap, or read that of a material slot: --slot {' or '.join(slots)}"
+    return f"{text}: expected a lightmap or a list of them beside it"
+
+
+def _own(
+    document: GltfDocument, primitives: Sequence[GltfPrimitive], name: str, encoding: str | None, uv_set: int | None
+) -> OwnLightmaps:
+    sheets: dict[tuple, SheetFiles] = {}
+    held: dict[str, bytes | memoryview] = {}
+    readings: Readings = {}
+    lacking, defaults, order = 0, set(), {}
+    images: dict[int, tuple[str, Path | None]] = {}
+    parents = {
+        child: number for number, node in enumerate(document.content["nodes"]) for child in node.get("children", [])
+    }
+    for each in primitives:
+        entry = _entry(document, each, name, parents.get(each.node, each.node))
+        if entry is None:
+            continue
+        where = f"{document.path}: nodes[{each.node}]: {name}"
+        info = entry.info
+        stated = info.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", info.get("texCoord"))
+        number = stated if uv_set is None else uv_set
+        if number is None:
+            number = entry.uv_set if entry.uv_set in each.uv else 0
+            defaults.add(number)
+        if number not in each.uv:
+            lacking += 1
+            continue
+        image = texture_image(document, info["index"])
+        factor = _factor(entry.factor, where)
+        if image not in images:
+            images[image] = _image(document, image, held)
+        label, path = images[image]
+        key = label, tuple(np.ravel(factor))
+        if key not in sheets:
+            order[key] = len(sheets)
+            title = document.item("images", image).get("name")
+            sheets[key] = SheetFiles(
+                files=[label],
+                name=title if isinstance(title, str) and title else None,
+                encoding=_encoding(document, name, held.get(label), path, encoding),
+                intensity=factor,
+            )
+        sx, sy, x, y = numbers(list(entry.rectangle), where, ("x", "y", "z", "w"))
+        inner = texture_transform(where, info)
+        moved = np.array([[sx, 0.0], [0.0, sy]]) @ inner + np.array([[0.0, 0.0, x], [0.0, 0.0, y]])
+        readings[each.node, each.primitive] = Reading(order[key], number, tuple(map(float, moved.ravel())))
+    if not readings:
+        reason = f"the UVs that it names are missing in {lacking} primitives" if lacking else "no lit mesh is drawn"
+        raise WlmError(f"{document.path}: {name}: {reason}")
+    listing = Listing(document.path, ("light",), tuple(sheets.values()), held=held)
+    return OwnLightmaps(listing, readings, _notes(document, name, sheets, defaults, lacking))
+
+
+def _notes(
+    document: GltfDocument, name: str, sheets: dict[tuple, SheetFiles], defaults: set[int], lacking: int
+) -> tuple[str, ...]:
+    """Returns one line for each assumption about the lightmaps of a document."""
+    many = f"{len(sheets)} lightmap{'s' if len(sheets) > 1 else ''}"
+    notes = [f"{document.path}: {many} of {'the slot ' if name in SLOTS else ''}{name}"]
+    for encoding in sorted({each.encoding for each in sheets.values() if each.encoding}):
+        notes.append(f"{document.path}: {name}: images of 8 bits are read as {encoding} (see --encoding)")
+    if defaults:
+        names = ", ".join(f"TEXCOORD_{number}" for number in sorted(defaults))
+        notes.append(f"{document.path}: {name}: texCoord is not stated: {names} is read (see --uv-set)")
+    if lacking:
+        notes.append(f"{document.path}: {name}: {lacking} primitives lack the UVs that it names: left out")
+    return tuple(notes)
+
+
+def _entry(document: GltfDocument, primitive: GltfPrimitive, name: str, parent: int) -> _Entry | None:
+    """Returns the slot with which a primitive names its lightmap by the extension or the slot `name`; `parent` is the
+    node above its own, on which Needle writes the renderer of a mesh of several materials."""
+    material = {} if primitive.material is None else document.item("materials", primitive.material)
+    if name in SLOTS:
+        info = material.get(f"{name}Texture")
+        return None if info is None else _Entry(info, 0, _emission(material) if name == "emissive" else 1.0)
+    if name in _MATERIALS:
+        field, factor, uv_set = _MATERIALS[name]
+        extension = material.get("extensions", {}).get(name)
+        info = extension if field is None or extension is None else extension.get(field)
+        return None if info is None else _Entry(info, uv_set, extension.get(factor, 1.0))
+    node = document.item("nodes", primitive.node).get("extensions", {})
+    if name == _NEEDLE:
+        return _needle(document, node) or _needle(document, document.item("nodes", parent).get("extensions", {}))
+    if name not in node:
+        return None
+    if name == _MX:
+        own = node[name]
+        return _Entry(
+            own["lightMapTexture"],
+            1,
+            own.get("intensity", 1.0),
+            (*own.get("scale", (1.0, 1.0)), *own.get("offset", (0.0, 0.0))),
+        )
+    own = document.content["extensions"][name]["lightmaps"][node[name]["lightmap"]]
+    plain = list(own.get("lightmapScale", [1] * 4)) == [1] * 4 and list(own.get("lightmapAdd", [0] * 4)) == [0] * 4
+    if not plain:
+        raise WlmError(f"{document.path}: nodes[{primitive.node}]: {_UNREAL}")
+    return _Entry(own["texture"], 0, 1.0, own.get("coordinateScaleBias", (1.0, 1.0, 0.0, 0.0)))
+
+
+_UNREAL = (
+    f"{_EPIC} holds Unreal's encoded lightmap (the logarithm of luminance in two halves), which is not read: export "
+    "the light as EXR, and list it with the rectangles"
+)
+
+
+def _needle(document: GltfDocument, node: dict[str, Any]) -> _Entry | None:
+    """Returns the lightmap of Needle's renderer on a node."""
+    textures = document.content.get("extensions", {}).get(_NEEDLE, {}).get("textures", [])
+    for component in node.get("NEEDLE_components", {}).get("builtin_components", []):
+        number = component.get("lightmapIndex")
+        if not has_lightmap(number):
+            continue
+        found = [each for each in textures if each.get("type") == 0 and each.get("index", 0) == number]
+        if not found:
+            raise WlmError(f"{document.path}: {_NEEDLE}: expected a lightmap of index {number}, found none")
+        pointer = re.fullmatch(r"(?:#?/)?textures/(\d+)", str(found[0].get("pointer")))
+        if pointer is None:
+            where = one_line(found[0].get("pointer"), 60)
+            raise WlmError(f"{document.path}: {_NEEDLE}.pointer: expected textures/NUMBER, found {where}")
+        place = component.get("lightmapScaleOffset", {"x": 1.0, "y": 1.0, "z": 0.0, "w": 0.0})
+        sx, sy, x, y = numbers(place, f"{document.path}: {_NEEDLE}", ("x", "y", "z", "w"))
+        return _Entry({"index": int(pointer[1])}, 1, 1.0, (sx, sy, x, 1.0 - sy - y))
+    return None
+
+
+def _emission(material: dict[str, Any]) -> Any:
+    """Returns the factor of the emissive texture; 1 where it is 0 or not stated, since the slot holds light."""
+    factor = np.array(material.get("emissiveFactor", (0.0, 0.0, 0.0)), np.float64)
+    strength = material.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+    return (factor * strength).tolist() if factor.any() else 1.0
+
+
+def _factor(value: Any, where: str) -> float | list[float]:
+    """Checks a factor, of all channels or of each."""
+    factor = np.array(value, np.float64)
+    if factor.shape not in ((), (3,)) or not (np.isfinite(factor) & (factor >= 0)).all():
+        raise WlmError(f"{where}: expected a factor of one number or three, of 0 or more, found {one_line(value, 60)}")
+    return float(factor.ravel()[0]) if (factor == factor.ravel()[0]).all() else factor.tolist()
+
+
+def _image(document: GltfDocument, number: int, held: dict[str, bytes | memoryview]) -> tuple[str, Path | None]:
+    """Returns the name of an image, which tells it from others: that of its file with the path, or of its place in the
+    document, whose bytes are added to `held`."""
+    data = held_image(document, number)
+    if data is not None:
+        image = document.item("images", number)
+        label = f"bufferViews[{image['bufferView']}]" if "bufferView" in image else f"images[{number}]"
+        held[label] = data
+        return label, None
+    uri = str(document.item("images", number)["uri"])
+    path = local_file(document.path, uri, f"{document.path}: images[{number}].uri", document.trust)
+    name = unquote(uri)
+    # Some writers don't encode a percent sign of the name.
+    raw = Path(document.path).parent / uri
+    return (uri, raw) if not path.exists() and raw.exists() else (name, path)
+
+
+def _encoding(
+    document: GltfDocument, name: str, data: bytes | memoryview | None, path: Path | None, stated: str | None
+) -> str | None:
+    """Returns the encoding of an image, None for a format that defines its light itself."""
+    if data is None:
+        with open_file(path, "the lightmap") as file:
+            data = file.read(HEAD)
+    kind = level_kind(path or "", bytes(data[:HEAD]))
+    if kind is None or kind == "TIFF":
+        return None
+    if stated is not None:
+        return stated
+    if name == _NEEDLE:
+        raise WlmError(
+            f"{document.path}: {_NEEDLE}: an image of 8 bits in Needle's RGBM, whose range differs between versions: "
+            "say its encoding (--encoding), or export the lightmap as EXR"
+        )
+    alpha = kind == "PNG" and len(data) > 25 and data[25] in (4, 6)  # colour types with alpha
+    if name == _EPIC and alpha:
+        raise WlmError(f"{document.path}: {_UNREAL}")
+    return "rgbm" if name == _MX and alpha else "srgb"
+
+
+def slot_readings(
+    document: GltfDocument, primitives: Sequence[GltfPrimitive], uv_set: int, lightmap: str
+) -> tuple[Readings, tuple[str, ...]]:
+    """Finds the texture transforms that apply to lightmap UVs which no extension describes.
+
+    See `wlm.formats.gltf_slots`.
+
+    Args:
+        document, primitives: From `read_gltf`.
+        uv_set: n of `TEXCOORD_n`, the lightmap's UVs.
+        lightmap: Name of the lightmap without its suffix.
+
+    Returns:
+        The readings of all primitives that have these UVs, all of sheet 0; empty if no transform applies. And one line
+        about the transforms.
+
+    Raises:
+        WlmError: A material is malformed.
+    """
+    readings: Readings = {}
+    used: dict[str, None] = {}
+    with reported(document.path):
+        for each in primitives:
+            if uv_set not in each.uv:
+                continue
+            slot, transform = lightmap_transform(document, each, uv_set, lightmap)
+            readings[each.node, each.primitive] = Reading(0, uv_set, transform)
+            if transform != IDENTITY:
+                used[slot] = None
+    if not used:
+        return {}, ()
+    line = f"{document.path}: TEXCOORD_{uv_set} is moved by KHR_texture_transform of {', '.join(used)}"
+    return readings, (line,)
+
+
+def settle(document: GltfDocument, primitives: Sequence[GltfPrimitive], readings: Readings) -> Settled:
+    """Makes all readings of a node one rectangle of one UV set.
+
+    Where they are not, because a transform turns, a node's materials have different transforms, or slots read different
+    sets, the moved UVs are added to a copy of the document as a new UV set.
+
+    Raises:
+        WlmError: The materials of one node read different lightmaps.
+    """
+    by_node: dict[int, set[Reading | None]] = {}
+    for each in primitives:
+        by_node.setdefault(each.node, set()).add(readings.get((each.node, each.primitive)))
+    for node, its in by_node.items():
+        if len({each.sheet for each in its if each is not None}) > 1:
+            raise WlmError(
+                f"{document.path}: nodes[{node}]: expected one lightmap for all of its materials, found several: split "
+                "the mesh by material"
+            )
+    sets = {each.uv_set for each in readings.values()}
+    places = {}
+    if len(sets) == 1 and all(len(its) == 1 for its in by_node.values()):
+        for node, (reading,) in by_node.items():
+            if reading is not None:
+                places[node] = reading.sheet, reading.rectangle
+        if all(rectangle is not None for _, rectangle in places.values()):
+            return Settled(document, list(primitives), sets.pop(), places)
+    number = 1 + max(number for each in primitives for number in each.uv)
+    replacements = []
+    for each in primitives:
+        reading = readings.get((each.node, each.primitive))
+        if reading is not None:
+            rows = np.array(reading.transform).reshape(2, 3)
+            uv = (each.uv[reading.uv_set] @ rows[:, :2].T + rows[:, 2]).astype(np.float32)
+            replacements.append(Replacement(each, np.arange(len(uv)), each.triangle, uv))
+            places[each.node] = reading.sheet, (1.0, 1.0, 0.0, 0.0)
+    data = b"".join(encode_glb(document, replacements, number))
+    document, primitives = parse_gltf(document.path, data, document.trust)
+    return Settled(document, primitives, number, places)

@@ -1,0 +1,180 @@
+"""Decompression of glTF meshes: KHR_draco_mesh_compression, EXT_meshopt_compression and KHR_meshopt_compression.
+
+Both need the extra `gltf`: Draco is decoded by DracoPy in a process of its own (`draco_child`), meshopt by meshopt. The
+result is a document without the extension, whose compressed parts are in new buffers.
+"""
+
+import copy
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from wlm.errors import WlmError, one_line
+from wlm.formats import draco_child
+from wlm.formats.hdr_blocks import need
+from wlm.formats.limits import GROWTH, SURE_BYTES, check_growth
+from wlm.formats.reading import damaged
+
+DRACO, MESHOPT = "KHR_draco_mesh_compression", ("EXT_meshopt_compression", "KHR_meshopt_compression")
+_EXTRA, _SECONDS = "gltf", 120.0
+
+
+def is_fallback(buffer: dict[str, Any]) -> bool:
+    """Tests whether a buffer is a place for decompressed data that has no bytes in the file."""
+    return "uri" not in buffer and any(
+        buffer.get("extensions", {}).get(name, {}).get("fallback", False) for name in MESHOPT
+    )
+
+
+def unpack(
+    path: str | os.PathLike[str], content: dict, buffers: Sequence[bytes], components: dict[int, str]
+) -> tuple[dict, tuple[bytes, ...]]:
+    """Decompresses the buffer views and primitives of a glTF tree.
+
+    Args:
+        path: The file, for messages.
+        content: The JSON tree.
+        buffers: The bytes of each buffer.
+        components: NumPy types of component types.
+
+    Returns:
+        The tree and the buffers; those that were given if nothing is compressed.
+
+    Raises:
+        WlmError: A package is missing, or the data is damaged or too large for the file.
+    """
+    stated = (*content.get("extensionsUsed", []), *content.get("extensionsRequired", []))
+    used = [name for name in (DRACO, *MESHOPT) if name in stated]
+    if not used:
+        return content, tuple(buffers)
+    content, buffers = copy.deepcopy(content), list(buffers)
+    held = sum(map(len, buffers))
+    if set(used) & set(MESHOPT):
+        _unpack_views(path, content, buffers, held)
+    if DRACO in used:
+        _unpack_primitives(path, content, buffers, held, components)
+    for name in ("extensionsUsed", "extensionsRequired"):
+        if name in content:
+            content[name] = [each for each in content[name] if each not in used]
+    for holder in (*content["bufferViews"], *(each for mesh in content["meshes"] for each in mesh["primitives"])):
+        if holder.get("extensions") == {}:
+            del holder["extensions"]
+    for number, buffer in enumerate(content["buffers"]):
+        if is_fallback(buffer):
+            content["buffers"][number] = {"byteLength": len(buffers[number])}
+    return content, tuple(buffers)
+
+
+def _needed(path: str | os.PathLike[str], package: str, extension: str) -> Any:
+    try:
+        return need(package, _EXTRA)
+    except WlmError as error:
+        raise WlmError(f"{path}: uses the extension {extension}: {error}, or export the file without it") from error
+
+
+def _add(content: dict, buffers: list[bytes], data: bytes, **extra: Any) -> dict[str, Any]:
+    """Adds a buffer; returns a view of all of it."""
+    content["buffers"].append({"byteLength": len(data)})
+    buffers.append(data)
+    return {"buffer": len(buffers) - 1, "byteLength": len(data), **extra}
+
+
+def _unpack_views(path: str | os.PathLike[str], content: dict, buffers: list[bytes], held: int) -> None:
+    total = 0
+    for number, view in enumerate(content.get("bufferViews", [])):
+        name = next((each for each in MESHOPT if each in view.get("extensions", {})), None)
+        if name is None:
+            continue
+        where = f"{path}: bufferViews[{number}].{name}"
+        meshopt = _needed(path, "meshopt", name)
+        packed = view["extensions"].pop(name)
+        count, stride, start, length = (
+            packed["count"],
+            packed["byteStride"],
+            packed.get("byteOffset", 0),
+            packed["byteLength"],
+        )
+        source = packed["buffer"]
+        if not all(isinstance(each, int) and each >= 0 for each in (count, stride, start, length, source)):
+            raise WlmError(f"{where}: expected whole numbers of 0 or more")
+        if source >= len(buffers) or start + length > len(buffers[source]):
+            raise WlmError(f"{where}: needs {start + length} bytes of buffers[{source}], which lacks them")
+        total += count * stride
+        check_growth(where, held, total)
+        with damaged(f"{where}: damaged", ValueError, RuntimeError, TypeError):
+            options = (packed["mode"], packed.get("filter", "NONE"))
+            data = meshopt.decode_gltf_buffer(buffers[source][start : start + length], count, stride, *options)
+        rows = {"byteStride": stride} if packed["mode"] == "ATTRIBUTES" else {}
+        view |= {"byteOffset": 0} | _add(content, buffers, np.asarray(data).tobytes(), **rows)
+
+
+def _packed_primitives(content: dict) -> Iterator[tuple[str, dict, dict]]:
+    """Yields the place of each primitive that Draco compresses, the primitive, and its extension, which is removed."""
+    for i, mesh in enumerate(content.get("meshes", [])):
+        for k, primitive in enumerate(mesh["primitives"]):
+            packed = primitive.get("extensions", {}).pop(DRACO, None)
+            if packed is not None:
+                yield f"meshes[{i}].primitives[{k}].{DRACO}", primitive, packed
+
+
+def _unpack_primitives(
+    path: str | os.PathLike[str], content: dict, buffers: list[bytes], held: int, components: dict[int, str]
+) -> None:
+    found = list(_packed_primitives(content))
+    if not found:
+        return
+    _needed(path, "DracoPy", DRACO)
+    pieces = []
+    for where, _, packed in found:
+        view = content["bufferViews"][packed["bufferView"]]
+        start = view.get("byteOffset", 0)
+        pieces.append(buffers[view["buffer"]][start : start + view["byteLength"]])
+        if sum(map(len, pieces)) > held:
+            raise WlmError(f"{path}: {where}: expected meshes in bytes of their own, found the same ones again")
+    with damaged(f"{path}: {DRACO}: damaged", ValueError):
+        meshes = _decode(pieces, max(SURE_BYTES, GROWTH * held))
+    for (where, primitive, packed), arrays in zip(found, meshes, strict=True):
+        places = [(name, primitive["attributes"][name], number) for name, number in packed["attributes"].items()]
+        for name, place, number in [*places, ("indices", primitive.get("indices"), -1)]:
+            if place is None or number not in arrays:
+                raise WlmError(f"{path}: {where}: {name}: expected an accessor and compressed data for it")
+            accessor = content["accessors"][place]
+            data = arrays[number].reshape(-1, 1) if number == -1 else arrays[number]
+            if len(data) != accessor["count"]:
+                raise WlmError(f"{path}: {where}: {name}: expected {accessor['count']} elements, found {len(data)}")
+            content["bufferViews"].append(
+                _add(content, buffers, data.astype(components[accessor["componentType"]]).tobytes())
+            )
+            accessor |= {"bufferView": len(content["bufferViews"]) - 1, "byteOffset": 0}
+
+
+def _decode(pieces: Sequence[bytes], most: int) -> list[dict[int, np.ndarray]]:
+    """Decompresses meshes of Draco: for each its arrays by the id of the attribute, -1 for the corners.
+
+    Raises:
+        ValueError: They are damaged or too large.
+    """
+    command = [sys.executable, "-P", draco_child.__file__, str(most)]
+    data = json.dumps([len(each) for each in pieces]).encode() + b"\n" + b"".join(pieces)
+    try:
+        run = subprocess.run(command, input=data, capture_output=True, timeout=_SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ValueError(str(error)) from error
+    if run.returncode:
+        lines = run.stderr.decode(errors="replace").strip().splitlines()
+        raise ValueError(one_line(lines[-1], 120) if run.returncode > 0 and lines else "DracoPy crashed")
+    head, _, body = run.stdout.partition(b"\n")
+    meshes, at = [], 0
+    for entries in json.loads(head):
+        arrays = {}
+        for number, kind, shape in entries:
+            size = int(np.prod(shape)) * np.dtype(kind).itemsize
+            arrays[number] = np.frombuffer(body[at : at + size], kind).reshape(shape)
+            at += size
+        meshes.append(arrays)
+    return meshes

@@ -1,0 +1,95 @@
+"""Texture transforms of lightmap UVs in glTF files.
+
+A writer that quantises UVs, such as gltfpack, stores their range in `KHR_texture_transform` of the slots that read
+them; others store tiling and offset there. Integer UVs take the transform of any slot that reads them, float UVs that
+of a slot for light if it keeps them in [0, 1]. A slot whose image has the name of the lightmap comes first.
+"""
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, reported, texture_image, texture_transform
+
+SLOTS = ("occlusion", "emissive")
+"""Material slots that may hold a lightmap."""
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+"""Rows of the transform that leaves UVs as they are."""
+
+_FLOAT = 5126
+_MOST_SLOTS = 64  # texture slots of a material that are examined
+_NEAR = 0.01  # a transform for lightmaps leaves UVs this near to [0, 1]
+
+
+def lightmap_transform(
+    document: GltfDocument, primitive: GltfPrimitive, uv_set: int, lightmap: str = ""
+) -> tuple[str, tuple[float, ...]]:
+    """Finds the texture transform that applies to lightmap UVs.
+
+    Args:
+        document, primitive: From `read_gltf`.
+        uv_set: n of `TEXCOORD_n`, which the primitive has.
+        lightmap: Name of the lightmap without its suffix; "" if it is not known.
+
+    Returns:
+        The name of the slot, "" for none; and the rows of the matrix [2, 3] that moves (u, v, 1).
+
+    Raises:
+        WlmError: The material is malformed.
+    """
+    attributes = document.item("meshes", primitive.mesh)["primitives"][primitive.primitive]["attributes"]
+    quantised = document.item("accessors", attributes[f"TEXCOORD_{uv_set}"])["componentType"] != _FLOAT
+    found = []
+    material = {} if primitive.material is None else document.item("materials", primitive.material)
+    for slot, info in islice(_slots(material), _MOST_SLOTS):
+        transform = info.get("extensions", {}).get("KHR_texture_transform", {})
+        if transform.get("texCoord", info.get("texCoord", 0)) != uv_set:
+            continue
+        named = _stem(document, info) == lightmap
+        lit = slot.startswith(SLOTS) or "lightmap" in slot.lower()
+        rows = texture_transform(f"{document.path}: materials[{primitive.material}]", info)
+        if not quantised:
+            moved = primitive.uv[uv_set] @ rows[:, :2].T + rows[:, 2]
+            if not (named or lit) or moved.min() < -_NEAR or moved.max() > 1.0 + _NEAR:
+                continue
+        found.append((not named, not lit, slot, tuple(map(float, rows.ravel()))))
+    return min(found)[2:] if found else ("", IDENTITY)
+
+
+def lightmap_uv(document: GltfDocument, primitive: GltfPrimitive, uv_set: int) -> np.ndarray:
+    """Returns the lightmap UVs of a primitive, float32 [V, 2], with the transform that applies to them.
+
+    Raises:
+        WlmError: The material is malformed.
+    """
+    with reported(document.path):
+        transform = lightmap_transform(document, primitive, uv_set)[1]
+    if transform == IDENTITY:
+        return primitive.uv[uv_set]
+    rows = np.array(transform).reshape(2, 3)
+    return (primitive.uv[uv_set] @ rows[:, :2].T + rows[:, 2]).astype(np.float32)
+
+
+def _slots(holder: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yields the texture slots of a material with their names."""
+    for key, value in holder.items() if isinstance(holder, dict) else ():
+        if isinstance(value, dict) and key not in ("extras", "KHR_texture_transform"):
+            if isinstance(value.get("index"), int):
+                yield key, value
+            else:
+                yield from _slots(value, key)
+
+
+def _stem(document: GltfDocument, info: dict[str, Any]) -> str:
+    """Returns the name of a slot's image without its suffix."""
+    try:
+        image = document.item("images", texture_image(document, info["index"]))
+    except WlmError:
+        return ""
+    return Path(unquote(str(image.get("uri", image.get("name", ""))))).stem
