@@ -225,8 +225,8 @@ def _source(
         files = {1: lightmaps} if lightmaps.suffix.lower() == ".exr" else six_way_files(lightmaps)
         if not files:
             raise WlmError(
-                f"{lightmaps}: expected six-way lightmaps: make them with wlm smoke bake or predict, or give the "
-                "second texture of a flip book by --with"
+                f"{lightmaps}: expected six-way lightmaps; wlm smoke bake or predict makes them of smoke; a flip book "
+                "also needs its second texture by --with"
             )
 
         def read(count: int | None, progress: "OnProgress") -> "Iterator[Shot]":
