@@ -26,7 +26,8 @@ from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.data import load_frames, open_frames, write_six_way
-from wlm.smoke.flipbook.book import Shot, pack_book, read_flipbook, write_book
+from wlm.smoke.flipbook.book import Shot, pack_book, write_book
+from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import guide, with_surface
 from wlm.smoke.march.fine import bake
@@ -144,7 +145,7 @@ def plume(out: Path, device: str) -> dict[str, float]:
     files, clipped = write_book(book, out / "plume_book.png")
     read = read_flipbook([*files], "unity", rows=2, columns=2)
     pairs = zip(read, sides, strict=True)
-    lost = max(float((a.lightmaps - book.gain * b.lightmaps.cpu()).abs().max()) for a, b in pairs)
+    lost = max(float(book.gain * (a.lightmaps - b.lightmaps.cpu()).abs().max()) for a, b in pairs)
     if clipped or not lost <= MOST_BOOK_ERROR:
         raise WlmError(f"demo: plume: flip book: expected an error of half a level, got {lost:.3g}, {clipped} clipped")
     return {

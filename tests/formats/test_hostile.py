@@ -44,7 +44,7 @@ from wlm.lightmap import data
 from wlm.lightmap.model import Profile
 from wlm.probe import load as load_probes
 from wlm.probe import load_positions
-from wlm.smoke.flipbook.book import read_flipbook
+from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.scene import load_scene
 
 FILES = Path(__file__).resolve().parents[1] / "files" / "hostile"

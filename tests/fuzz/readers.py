@@ -36,7 +36,7 @@ from wlm.inspection import inspect
 from wlm.inspection.finding import UNREADABLE
 from wlm.probe.data import load_positions
 from wlm.smoke.data import load_frames, read_shaded
-from wlm.smoke.flipbook.book import read_flipbook
+from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
 

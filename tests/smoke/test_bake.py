@@ -6,14 +6,13 @@ import math
 import numpy as np
 import pytest
 import torch
-from builders.smoke_axes import axis_faults
 from builders.smoke_plumes import facing, unit_grid
 from reference.single_light import lit
 
 from benchmarks.path_tracer import PathTracer
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import DIRECTIONS, RULES, VECTORS, Camera, weights
-from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.lightmaps import SixWay, axis_faults
 from wlm.smoke.march.fine import bake
 
 
@@ -36,13 +35,15 @@ def test_names_of_the_axes(device: str, way: tuple):
     x, y, z = unit_grid(20)
     ball = np.clip(6 - 8 * np.sqrt(x**2 + y**2 + z**2), 0, 1).astype(np.float32)
     volume = from_array(ball, extinction=1.0, device=device)
-    maps = bake(volume, facing(volume, way), step=1.0, estimate=False).lightmaps.cpu().numpy()
+    maps = bake(volume, facing(volume, way), step=1.0, estimate=False).lightmaps.cpu()
     assert axis_faults(maps) == ()
     for a, b in ((0, 1), (2, 3), (4, 5)):
-        swapped = maps.copy()
+        swapped = maps.clone()
         swapped[[a, b]] = maps[[b, a]]
         assert axis_faults(swapped)
-    assert axis_faults(maps[:, :, ::-1]) and axis_faults(maps[:, ::-1]) and axis_faults(np.zeros_like(maps))
+    assert axis_faults(maps.flip(2)) and axis_faults(maps.flip(1)) and not axis_faults(torch.zeros_like(maps))
+    maps[3] = 0.0
+    assert axis_faults(maps) == ("no light in bottom",)
 
 
 @pytest.mark.parametrize("direction", DIRECTIONS)

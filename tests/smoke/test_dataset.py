@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from builders.smoke_axes import axis_faults, from_srgb
+from builders.smoke_axes import from_srgb
 from builders.smoke_samples import small_pool
 from pydantic import ValidationError
 
 from wlm.errors import WlmError
 from wlm.fluid.solver import LEAST_HALF_LOSS
+from wlm.smoke.lightmaps import axis_faults
 from wlm.smoke.march.fine import bake
 from wlm.smoke.network import dataset
 from wlm.smoke.network.dataset import (
@@ -195,7 +196,7 @@ def test_what_a_pool_holds(pool):
     # The guide is a rough picture of the same smoke.
     off = (opacity - targets[:, :, OPACITY_PLANE]).square().mean() / targets[:, :, OPACITY_PLANE].square().mean()
     assert off < 0.15
-    assert axis_faults(from_srgb(targets[:, 1, :6]).numpy()) == ()
+    assert axis_faults(from_srgb(targets[:, 1, :6])) == ()
     hot = [draw_scene(SMALL, 5, int(number)).smoke.emission > 0 for number in samples.sequence]
     glow = samples.targets[:, 1, EMISSION_PLANE].float().amax((1, 2)) > 0
     assert glow.tolist() == hot and 0 < sum(hot) < len(hot)

@@ -7,16 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from builders.smoke_axes import axis_faults
 from builders.smoke_plumes import unit_grid
 from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
-from wlm.formats.exr import read_exr, write_exr
+from wlm.formats.exr import read_exr, write_exr, write_planes
 from wlm.smoke.camera import DIRECTIONS, LAYOUTS, Camera
-from wlm.smoke.flipbook.book import Book, Shot, is_straight, pack_book, read_flipbook, write_book
-from wlm.smoke.lightmaps import SixWay
+from wlm.smoke.data import is_six_way, read_shaded
+from wlm.smoke.flipbook.book import Book, Shot, pack_book, write_book
+from wlm.smoke.flipbook.naming import parse_layout, second_names
+from wlm.smoke.flipbook.reading import read_flipbook
+from wlm.smoke.lightmaps import SixWay, axis_faults
 from wlm.smoke.march.fine import bake
 
 KINDS = {".exr": 6e-4, ".png": 0.51 / 255, ".tga": 0.51 / 255}
@@ -39,7 +41,7 @@ def test_written_frames_are_read(tmp_path: Path, layout: str, suffix: str):
     paths, clipped = write_book(_book(frames, layout), tmp_path / f"a{suffix}")
     assert [path.name for path in paths] == [f"a_1{suffix}", f"a_2{suffix}"] and clipped == 0
     result = read_flipbook([*paths], layout, rows=2, columns=3)
-    assert len(result) == 6 and not result[5].lightmaps.any() and (result[5].transparency == 1).all()
+    assert len(result) == 5  # the empty cell is none of the frames
     for one, frame in zip(result, frames, strict=False):
         for field in ("lightmaps", "transparency", "emission"):
             np.testing.assert_allclose(getattr(one, field), getattr(frame, field), atol=KINDS[suffix], err_msg=field)
@@ -100,8 +102,90 @@ def test_directions_survive(tmp_path: Path, suffix: str):
     frames = [bake(from_array(ball, extinction=0.6), camera, step=1.0, estimate=False)] * 2
     paths, _ = write_book(_book(frames), tmp_path / f"a{suffix}")
     for layout in LAYOUTS:
-        maps = np.stack([frame.lightmaps for frame in read_flipbook([*paths], layout, rows=1, columns=2)])
-        assert (axis_faults(maps) == ()) == (layout == "unity"), layout
+        notes: list[str] = []
+        read = read_flipbook([*paths], layout, rows=1, columns=2, notes=notes)
+        doubted = any("the light contradicts" in line and "it fits --from unity better" in line for line in notes)
+        assert doubted == (layout != "unity"), layout
+    swapped = "left,top,back,alpha:right,bottom,front"
+    read_flipbook([*paths], swapped, rows=1, columns=2, notes=notes)
+    assert "--from unity better" in notes[-1]
+    # Files of other programs state nothing: layout, cells and alpha are seen in the light.
+    if suffix != ".exr":
+        for path in paths:
+            Image.fromarray(np.asarray(Image.open(path))).save(path)
+    else:
+        for path in paths:
+            write_exr(path, read_exr(path)[0])
+    notes.clear()
+    read = read_flipbook([*paths], notes=notes)
+    assert "layout unity, by its light" in notes[0] and "1 x 2 cells, by its dark borders" in notes[0]
+    assert "alpha premultiplied, by its light" in notes[0] and len(notes) == 1
+    assert axis_faults(torch.stack([frame.lightmaps for frame in read])) == ()
+    straight = read_flipbook([*paths], straight=True, notes=notes)
+    assert "the light suggests premultiplied alpha" in notes[-1] and len(straight) == 2
+
+
+def test_the_gain_and_the_padding_are_read(tmp_path: Path):
+    """What wlm wrote is read as it was, without options; a given gain replaces the stated one."""
+    frames = [SixWay(0.2 * frame.lightmaps, frame.transparency, 0.2 * frame.emission) for frame in _frames(5)]
+    for suffix, error in KINDS.items():
+        paths, _ = write_book(_book(frames, "embergen", gain=None, padding=2), tmp_path / f"a{suffix}")
+        notes: list[str] = []
+        read = read_flipbook([*paths], notes=notes)
+        assert len(read) == 5 and "layout embergen" in notes[0] and "gain 5.0" in notes[0]
+        for one, frame in zip(read, frames, strict=True):
+            np.testing.assert_allclose(one.lightmaps, frame.lightmaps, atol=error)
+            np.testing.assert_allclose(one.emission, frame.emission, atol=error)
+        raw = read_flipbook([*paths], gain=1.0)
+        assert float(raw[0].lightmaps.max()) > 4.9 * float(frames[0].lightmaps.max())
+
+
+LAYERED = {
+    "channels": "{0}",
+    "layers": "C_{0}.R C_{0}.G C_{0}.B",
+    "short": "light{1}.R light{1}.G light{1}.B",
+    "pair": "",
+}
+
+
+@pytest.mark.parametrize("kind", LAYERED)
+def test_layers_of_one_file(tmp_path: Path, kind: str):
+    """EXR files with a channel or a layer per light, or with both textures as layers."""
+    (frame,) = _frames(1, emission=False)
+    planes = {"A": 1.0 - frame.transparency.numpy()}
+    if kind == "pair":
+        for layer, names in zip(("lightmapA", "lightmapB"), LAYOUTS["unity"], strict=True):
+            planes |= {f"{layer}.{letter}": frame[name].numpy() for letter, name in zip("RGB", names, strict=False)}
+    short = {"right": "Rgt", "left": "Lft", "top": "Up", "bottom": "Down", "front": "Front", "back": "Behind"}
+    for name in DIRECTIONS if kind != "pair" else ():
+        planes |= dict.fromkeys(LAYERED[kind].format(name, short[name]).split(), frame[name].numpy())
+    path = tmp_path / "smoke_0001.exr"
+    write_planes(path, planes)
+    notes: list[str] = []
+    six, looks = read_shaded(path, notes=notes)
+    assert looks is None and "alpha premultiplied, as EXR defines it" in notes[0] and is_six_way(path)
+    np.testing.assert_allclose(six.lightmaps, frame.lightmaps, atol=6e-4)
+    np.testing.assert_allclose(six.transparency, frame.transparency, atol=6e-4)
+    write_planes(path, planes | {"N_left": planes["A"]})
+    if kind != "pair":
+        with pytest.raises(WlmError, match="expected one layer for left, found "):
+            read_shaded(path)
+
+
+def test_names_of_pairs():
+    for first, second, layout in (
+        ("puff_RLT_8x8", "puff_BBF_8x8", "o3de"),
+        ("six_point_1_tlr", "six_point_2_bbf", "embergen"),
+        ("smoke_RTBk", "smoke_LBTF", "unity"),
+        ("smokeP", "smokeN", "unity"),
+        ("fx_positive", "fx_negative", "unity"),
+        ("LightmapA", "LightmapB", ""),
+        ("a_1", "a_2", ""),
+    ):
+        assert (second.lower(), layout) in [(name.lower(), known) for name, known in second_names(first)]
+    assert second_names("wall") == []
+    with pytest.raises(WlmError, match="--from: expected unity, o3de"):
+        parse_layout("right,left:top")
 
 
 def test_straight_alpha_in_a_third_texture(tmp_path: Path):
@@ -115,7 +199,6 @@ def test_straight_alpha_in_a_third_texture(tmp_path: Path):
     expected = frames[1].lightmaps * (1.0 - frames[1].transparency)
     np.testing.assert_allclose(read[1].lightmaps, expected, atol=0.01)
     np.testing.assert_allclose(read[1].transparency, frames[1].transparency, atol=0.003)
-    assert not is_straight(read) and is_straight(plain)
     with pytest.raises(WlmError, match="expected an alpha channel or a third texture for straight alpha"):
         read_flipbook([*paths], "unity", rows=1, columns=2, straight=True)
     Image.new("L", (8, 8)).save(book[2])

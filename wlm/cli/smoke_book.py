@@ -1,7 +1,6 @@
 """`wlm smoke shade` and `flipbook`: six-way lightmaps as pictures, as textures, and as folders for engines."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -39,10 +38,21 @@ _Cells = Annotated[
 ]
 _Layout = Literal["unity", "o3de", "o3de-tlrb", "embergen"]
 _From = Annotated[
-    _Layout | None, typer.Option("--from", help="Order of the channels in the given flip book; default unity.")
+    str | None,
+    typer.Option(
+        "--from",
+        metavar="LAYOUT",
+        help="Layout of a given flip book: unity, o3de, o3de-tlrb, embergen, or the channels of both textures, such as "
+        "right,top,back,alpha:left,bottom,front,emission; default by names or content.",
+    ),
 ]
 _Straight = Annotated[
-    bool, typer.Option("--straight", help="The flip book given by --with has straight (not premultiplied) alpha.")
+    bool | None,
+    typer.Option("--straight/--premultiplied", help="Alpha of a given flip book; default by content."),
+]
+_FromGain = Annotated[
+    float | None,
+    typer.Option("--from-gain", help="Factor on the light of a given flip book; default as wlm wrote it, or 1."),
 ]
 
 
@@ -67,7 +77,8 @@ def shade(
     textures: _With = None,
     cells: _Cells = None,
     source_layout: _From = None,
-    straight: _Straight = False,
+    straight: _Straight = None,
+    from_gain: _FromGain = None,
     device: Device = "cpu",
 ) -> None:
     """Light six-way lightmaps into PNGs; a folder of frames also gets the scene's obstacles and a contact sheet.
@@ -83,7 +94,7 @@ def shade(
     from wlm.view.pictures import contact_sheet, save_png, to_bytes
     from wlm.view.smoke import picture
 
-    single, shots = _source(lightmaps, textures, cells, source_layout, straight, device)
+    single, shots = _source(lightmaps, textures, cells, source_layout, straight, from_gain, device)
     plain = Looks(lights=[LightSettings(toward=(1, 1, 1))])
     file = outputs(lightmaps, single, output, "shade", ".png")
     rows = table(str(lightmaps), ["file", "covered pixels", "mean", "largest", "clipped pixels"])
@@ -124,7 +135,8 @@ def flipbook(
     textures: _With = None,
     cells: _Cells = None,
     source_layout: _From = None,
-    straight: _Straight = False,
+    straight: _Straight = None,
+    from_gain: _FromGain = None,
     mips: Annotated[
         int | None,
         typer.Option(
@@ -151,7 +163,7 @@ def flipbook(
     from wlm.smoke.flipbook.book import pack_book, write_book
     from wlm.smoke.flipbook.motion import mip_padding, open_motion
 
-    _, read = _source(lightmaps, textures, cells, source_layout, straight, device)
+    _, read = _source(lightmaps, textures, cells, source_layout, straight, from_gain, device)
     if motion is not None and textures:
         raise WlmError("--motion needs lightmaps of bake or predict, since a flip book does not state its camera")
     for option, value in (("gain", gain), ("rate", rate)):
@@ -193,36 +205,57 @@ def _source(
     lightmaps: Path,
     textures: Sequence[Path] | None,
     cells: str | None,
-    layout: _Layout | None,
-    straight: bool,
+    layout: str | None,
+    straight: bool | None,
+    gain: float | None,
     device: str,
 ) -> "_Source":
     """Opens lightmaps or a flip book. Returns whether it has a single frame, and a function that yields frames."""
     from wlm.interop import check_device
-    from wlm.smoke.data import six_way_files, spread
-    from wlm.smoke.flipbook.book import Shot, is_straight, read_flipbook, read_shots
+    from wlm.smoke.data import is_foreign, six_way_files, spread
+    from wlm.smoke.flipbook.book import Shot, read_shots
+    from wlm.smoke.flipbook.reading import read_flipbook
 
     device = check_device(device)
-    if not textures:
-        for option, given in (("cells", cells), ("from", layout), ("straight", straight)):
-            if given:
+    notes: list[str] = []
+    if not textures and not is_foreign(lightmaps):
+        for option, given in (("cells", cells), ("from", layout), ("straight", straight), ("from-gain", gain)):
+            if given is not None:
                 raise WlmError(f"--{option}: has no meaning without --with, the second texture of a flip book")
         files = {1: lightmaps} if lightmaps.suffix.lower() == ".exr" else six_way_files(lightmaps)
         if not files:
-            raise WlmError(f"{lightmaps}: expected six-way lightmaps; wlm smoke bake or predict makes them of smoke")
-        return not lightmaps.is_dir(), partial(read_shots, files, device)
-    rows, cross, columns = (cells or "").partition("x")
-    if not (cross and rows.isdecimal() and columns.isdecimal() and 0 < int(rows) <= 64 and 0 < int(columns) <= 64):
+            raise WlmError(
+                f"{lightmaps}: expected six-way lightmaps; wlm smoke bake or predict makes them of smoke; a flip book "
+                "also needs its second texture by --with"
+            )
+
+        def read(count: int | None, progress: "OnProgress") -> "Iterator[Shot]":
+            yield from read_shots(files, device, count, progress, notes)
+            _say(notes)
+
+        return not lightmaps.is_dir(), read
+    rows, cross, columns = (cells or "0x0").partition("x")
+    if not (cross and rows.isdecimal() and columns.isdecimal() and int(rows) <= 64 and int(columns) <= 64) or (
+        cells and not (int(rows) and int(columns))
+    ):
         raise WlmError(f"--cells: expected rows and columns of 1 to 64, such as 8x8, got {cells}")
-    options = {"rows": int(rows), "columns": int(columns), "straight": straight, "device": device}
-    frames = read_flipbook((lightmaps, *textures), layout or "unity", **options)
-    if not straight and is_straight(frames):
-        note(f"{lightmaps}: has colour where opacity is 0; if its alpha is not premultiplied, give --straight")
+    if gain is not None and not 0 < gain < float("inf"):
+        raise WlmError(f"--from-gain: expected a number above 0, got {gain}")
+    size = {"rows": int(rows) or None, "columns": int(columns) or None}
+    paths = (lightmaps, *(textures or ()))
+    frames = read_flipbook(paths, layout, **size, straight=straight, gain=gain, notes=notes, device=device)
+    _say(notes)
 
     def shots(count: int | None, progress: "OnProgress") -> "Iterable[Shot]":
         return [Shot(n, frames[n - 1]) for n in spread(range(1, len(frames) + 1), count)]
 
     return len(frames) == 1, shots
+
+
+def _say(notes: Sequence[str]) -> None:
+    """Prints the first assumption, and each warning once."""
+    for line in dict.fromkeys(line for i, line in enumerate(notes) if not i or "warning: " in line):
+        note(line)
 
 
 def _show(title: str, book: "Book", contents: Mapping[Path, Sequence[str]], clipped: int) -> None:

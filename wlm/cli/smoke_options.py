@@ -199,6 +199,7 @@ def write_lightmaps(
         errors: Whether the lightmaps state the error due to the step length.
     """
     from wlm.smoke.data import NumberedFiles, write_six_way
+    from wlm.smoke.lightmaps import axis_faults
     from wlm.smoke.march.coarse import with_surface
 
     files = None
@@ -227,6 +228,8 @@ def write_lightmaps(
                 looks = looks.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
             six = with_surface(make(volume, frames.view(camera, volume)), volume, looks)
             path = output if files is None else files.file(frame)
+            for fault in axis_faults(six.lightmaps):
+                note(f"{path}: {fault}")
             write_six_way(path, six, looks)
             covered = six.transparency < 0.99
             rows.add_row(

@@ -242,11 +242,13 @@ def float_planes(
         yield pixels.astype(np.float32, copy=False)
 
 
-def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True) -> None:
+def write_exr(
+    path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True, note: Mapping[str, Any] | None = None
+) -> None:
     """Writes linear pixels [H, W, 3 or 4] as an EXR file of scan lines with lossless ZIP compression, atomically.
 
     With `half` they are rounded to half floats: values beyond their range, infinity included, become +-65504; NaN
-    stays.
+    stays. `note` is a JSON object for the header.
 
     Raises:
         ValueError: The pixels' shape is not [H, W, 3 or 4].
@@ -257,7 +259,7 @@ def write_exr(path: str | os.PathLike[str], pixels: np.ndarray, half: bool = Tru
     pixels = np.clip(pixels, -HALF_MAX, HALF_MAX).astype(np.float16) if half else pixels.astype(np.float32, copy=False)
     planes = zip((*_COLOUR, _ALPHA), np.moveaxis(pixels, -1, 0), strict=False)
     # The library requires contiguous planes.
-    write_part(path, {name: np.ascontiguousarray(plane) for name, plane in planes}, read_exr)
+    write_part(path, {name: np.ascontiguousarray(plane) for name, plane in planes}, read_exr, _attributes(note))
 
 
 def write_planes(
@@ -282,14 +284,17 @@ def write_planes(
     shapes = {np.shape(plane) for plane in planes.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
         raise ValueError(f"expected planes [H, W] of one shape, got {sorted(shapes)}")
-    attributes = {} if note is None else {_NOTE: json.dumps(note, allow_nan=False)}
     channels = {}
     for name, plane in planes.items():
         plane = np.asarray(plane)
         if name not in whole:
             plane = np.clip(plane, -HALF_MAX, HALF_MAX)
         channels[name] = np.ascontiguousarray(plane, np.float32 if name in whole else np.float16)
-    write_part(path, channels, read_planes, attributes)
+    write_part(path, channels, read_planes, _attributes(note))
+
+
+def _attributes(note: Mapping[str, Any] | None) -> dict[str, str]:
+    return {} if note is None else {_NOTE: json.dumps(note, allow_nan=False)}
 
 
 def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -1,14 +1,11 @@
 """Describes folders: groups of files that belong together, and single files."""
 
 import os
-import re
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-
-from PIL import Image
 
 from wlm.atlas.listing import tiles_of
 from wlm.errors import WlmError
@@ -37,8 +34,6 @@ _BESIDE = 16  # folders beside a mesh that are examined for its lightmaps
 _ENTRIES = 20_000  # most entries that are read of a folder
 _DOCUMENTS = 64  # most JSON files that are read of a folder
 _IGNORED = {".md", ".txt", ".meta", ".import", ".uid", ".html", ".pdf", ".py", ".js", ".cs", ".glsl", ".hlsl", ".bin"}
-# Channels of the two textures of a flip book, as they appear in file names, and the layout.
-_BOOKS = (("rlt", "bbf", "o3de"), ("tlr", "bbf", "embergen"), ("rtb", "lbf", "unity"), ("tlrb", "fb", "o3de-tlrb"))
 _IGNORED_NAMES = ("license", "licence", "readme", "copying")
 
 
@@ -228,44 +223,40 @@ def _godot(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes pairs of textures that are named as engines name six-way lightmaps."""
+    """Describes pairs of textures that are named as six-way lightmaps are, or as pairs whose light is that of them."""
+    pictures = [file for file in files if file.suffix.lower() in (".png", ".tga", ".exr")]
     found: _Found = []
-    for file in files:
-        for first, second, layout in _BOOKS:
-            match = re.search(rf"(^|[_.-]){first}([_.-]|$)", file.name, re.IGNORECASE)
-            if match is None or file.suffix.lower() not in (".png", ".tga", ".exr"):
+    taken: set[Path] = set()
+    for file in pictures[:_DOCUMENTS]:
+        # This imports torch, which takes seconds.
+        from wlm.smoke.flipbook.naming import second_names
+        from wlm.smoke.flipbook.reading import guess_book, read_flipbook
+
+        for name, layout in second_names(file.stem):
+            other = next((each for each in pictures if each.name.lower() == f"{name}{file.suffix}".lower()), None)
+            if other is None or other == file or taken & {file, other}:
                 continue
-            name = file.name[: match.start()] + match[1] + second + match[2] + file.name[match.end() :]
-            other = next((each for each in files if each.name.lower() == name.lower()), None)
-            if other is None:
-                continue
-            stated = re.search(r"(\d+)x(\d+)", file.stem)
-            what = f"a flip book of six-way lightmaps of smoke, with {other.name}"
-            book = [file, "--with", other, "--from", layout]
-            problems: tuple[str, ...] = ()
-            words = ["smoke", "shade", *book]
-            if not any(map(_may_have_alpha, (file, other))):
-                problems = ("no opacity: wlm smoke shade needs the texture that has it as a second --with",)
-                words = ["smoke", "flipbook", *book]
-            if stated is None:
-                problems += ("the name states no cells: wlm smoke shade needs --cells ROWSxCOLUMNS",)
-            else:
-                words += ["--cells", f"{stated[2]}x{stated[1]}", "-o", "OUT.png" if "flipbook" in words else "DIR"]
-            finding = Finding(file, what, "" if stated is None else command(*words), problems)
-            found.append((finding, {file, other}))
+            with suppress(WlmError):
+                if not layout and guess_book(file, other) is None:
+                    continue
+                notes: list[str] = []
+                what = f"a flip book of six-way lightmaps of smoke, with {other.name}"
+                book = [file, "--with", other, *(("--from", layout) if layout else ())]
+                try:
+                    frames = read_flipbook((file, other), layout or None, notes=notes)
+                except WlmError as error:
+                    found.append((Finding(file, what, problems=(said(error, file),)), {file, other}))
+                    taken |= {file, other}
+                    continue
+                use = "shade"
+                if frames[0].transparency is None:
+                    notes.append("no opacity: wlm smoke shade needs the texture that has it as a second --with")
+                    use = "flipbook"
+                output = "OUT.png" if use == "flipbook" or len(frames) == 1 else "DIR"
+                finding = Finding(file, what, command("smoke", use, *book, "-o", output), tuple(notes))
+                found.append((finding, {file, other}))
+                taken |= {file, other}
     return found
-
-
-def _may_have_alpha(file: Path) -> bool:
-    """Returns whether a texture has an alpha channel; True for an unreadable one, whose reader reports the problem."""
-    try:
-        head = picture_of(file)
-        if head is not None and head.kind == "EXR":
-            return "A" in head.channels
-        with Image.open(file, formats=["PNG", "TGA"]) as image:
-            return "A" in image.getbands()
-    except (WlmError, OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        return True
 
 
 def _light(files: Sequence[Path]) -> dict[Path, Picture]:
@@ -285,6 +276,15 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
     heads = _light(files)
     smoke = [file for file, head in heads.items() if head.is_six_way]
     if smoke:
+        # This imports torch, which takes seconds.
+        from wlm.smoke.data import six_way_files
+
+        try:
+            alike = len(six_way_files(folder)) == len(smoke)
+        except WlmError:
+            alike = False
+        if not alike:
+            return []  # each is described by itself
         what = f"six-way lightmaps of smoke, {count_of(smoke, 'frame')} of {heads[smoke[0]].size}"
         return [(Finding(folder, what, command("smoke", "flipbook", folder, "-o", "OUT.png")), set(smoke))]
     pictures = [file for file in heads if "_comp_" not in file.name.lower()]

@@ -61,9 +61,9 @@ class Picture:
         if len(self.channels) < _FACES:
             return False
         # This imports torch, which takes seconds.
-        from wlm.smoke.camera import DIRECTIONS
+        from wlm.smoke.flipbook.naming import six_way_channels
 
-        return set(DIRECTIONS) <= set(self.channels)
+        return bool(six_way_channels(self.channels))
 
 
 def picture_of(path: Path) -> Picture | None:
@@ -105,8 +105,15 @@ def inspect_picture(path: Path) -> Finding:
     if picture is None:
         raise WlmError(f"{path}: expected an EXR, Radiance, KTX2, DDS or PNG picture")
     if picture.is_six_way:
-        what = f"six-way lightmaps of smoke, {picture.size}"
-        return Finding(path, what, command("smoke", "flipbook", path, "-o", "OUT.png"))
+        what, assumed = f"six-way lightmaps of smoke, {picture.size}", list[str]()
+        # This imports torch, too.
+        from wlm.smoke.data import read_shaded
+
+        try:
+            read_shaded(path, notes=assumed)
+        except WlmError as error:
+            return Finding(path, what, problems=(said(error, path),))
+        return Finding(path, what, command("smoke", "flipbook", path, "-o", "OUT.png"), tuple(assumed))
     if picture.is_cube:
         return Finding(path, f"six faces of a cube, {picture.size}: a reflection probe, which no command reads")
     if "_comp_dir" in name or "_comp_shadowmask" in name:

@@ -25,10 +25,13 @@ from wlm.errors import WlmError
 from wlm.fluid.grids import choose
 from wlm.fluid.volume import SUFFIXES, DensityVolume, from_array, grid_heads, load_volume
 from wlm.formats.atomic import atomic_write
-from wlm.formats.exr import read_part, read_planes, write_planes
+from wlm.formats.exr import read_header, read_planes, write_planes
+from wlm.formats.exr_header import check_header
 from wlm.formats.folder import claim, read_index, write_index
 from wlm.formats.lock import is_passing
 from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
+from wlm.smoke.flipbook.naming import six_way_channels
+from wlm.smoke.flipbook.reading import NOTE, read_flipbook
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, Looks, Scene, make_camera
 from wlm.system import Meter, OnProgress
@@ -391,28 +394,42 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None
 
 
 def is_six_way(path: Path) -> bool:
-    """Returns whether a file is an EXR image with a channel for each of the six directions.
+    """Returns whether a file is an EXR image with a channel, a layer or a part for each of the six directions.
 
     Raises:
         WlmError: The file is named .exr and cannot be read.
     """
     if path.suffix.lower() != ".exr" or not path.is_file():
         return False
-    return all(name in read_part(path).channels for name in DIRECTIONS)
+    return bool(six_way_channels(read_header(path)[2]))
+
+
+def is_foreign(path: Path) -> bool:
+    """Returns whether a file is an EXR image of six-way lightmaps of another program.
+
+    Raises:
+        WlmError: As for `is_six_way`.
+    """
+    return is_six_way(path) and NOTE not in check_header(path)[0].attributes
 
 
 def six_way_files(folder: Path) -> dict[int, Path]:
-    """Returns the files of six-way lightmaps in a folder by frame number; empty if its EXR files have other content.
+    """Returns the files of six-way lightmaps in a folder by frame number; empty if it has none.
 
     Raises:
-        WlmError: The first EXR file cannot be read.
+        WlmError: An EXR file cannot be read, or the lightmaps are not those of one sequence.
     """
     if not folder.is_dir():
         return {}
     if files := numbered(folder, "six", ".exr"):
         return files
-    others = sorted(path for path in folder.glob("*.exr") if path.name[0] != ".")
-    return dict(enumerate(others, 1)) if others and is_six_way(others[0]) else {}
+    others = [path for path in folder.glob("*.exr") if path.name[0] != "." and is_six_way(path)]
+    stems = sorted({re.sub(r"\d+", "#", path.name) for path in others})
+    if len(stems) > 1:
+        raise WlmError(f"{folder}: expected six-way lightmaps of one sequence, found {', '.join(stems[:8])}")
+    # Numbers in names are compared as numbers.
+    others.sort(key=lambda path: [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)])
+    return dict(enumerate(others, 1))
 
 
 def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
@@ -424,12 +441,19 @@ def read_six_way(path: str | os.PathLike[str], device: str = "cpu") -> SixWay:
     return read_shaded(path, device)[0]
 
 
-def read_shaded(path: str | os.PathLike[str], device: str = "cpu") -> tuple[SixWay, Looks | None]:
+def read_shaded(
+    path: str | os.PathLike[str], device: str = "cpu", notes: list[str] | None = None
+) -> tuple[SixWay, Looks | None]:
     """Reads the lightmaps that `write_six_way` wrote and, if present, the scene's lights, colours and obstacles.
+
+    A file of another program is read as by `read_flipbook`, which adds its assumptions to `notes`.
 
     Raises:
         WlmError: As for `read_six_way`, or the lights, colours or obstacles are invalid.
     """
+    if is_foreign(Path(path)):
+        (six,) = read_flipbook([path], notes=notes, device=device)
+        return six, None
     planes, note = read_planes(path)
     for name in (*DIRECTIONS, _TRANSPARENCY):
         if name not in planes:

@@ -16,6 +16,9 @@ from wlm.smoke.camera import DIRECTIONS, Camera, weights
 from wlm.smoke.shading import Light, Ramp
 from wlm.smoke.transport.lights import checked_albedo, checked_colour
 
+_DARKEST = 1e-20
+_LEAST_SHIFT = 1e-3  # of the image, between the centres of light of opposite lightmaps
+
 
 @dataclass(frozen=True)
 class StepError:
@@ -113,3 +116,46 @@ class SixWay:
         if self.transparency is None:
             raise ValueError("transparency: the lightmaps have no transparency, which a background needs")
         return image + self.transparency[..., None] * torch.as_tensor(background).to(image)
+
+
+def light_centres(planes: torch.Tensor) -> torch.Tensor:
+    """Returns where the light is in planes [N, C, H, W] of N frames.
+
+    Returns:
+        float64 [C, 3]: the mean place of the light to the right and upwards, 0 to 1, and the plane's share of the light
+        of all planes.
+    """
+    height, width = planes.shape[2:]
+    planes = planes.clamp(min=0.0)
+    right = (torch.arange(width, device=planes.device) + 0.5) / width
+    up = 1.0 - (torch.arange(height, device=planes.device) + 0.5) / height
+    total = planes.sum((0, 2, 3)).clamp(min=_DARKEST)
+    sums = planes.sum((0, 2)) @ right / total, planes.sum((0, 3)) @ up / total, total / total.sum()
+    return torch.stack(sums, 1).double().cpu()
+
+
+def axis_shifts(centres: torch.Tensor) -> torch.Tensor:
+    """Returns how far right is to the right of left, top above bottom, and front brighter than back, [3]."""
+    return (centres[0::2] - centres[1::2]).diagonal()
+
+
+def axis_faults(lightmaps: torch.Tensor) -> tuple[str, ...]:
+    """Checks that lightmaps [..., 6, H, W] are bright where the light of their direction falls.
+
+    A lightmap is brighter on the side from which its light comes, whatever the smoke, and smoke that scatters evenly is
+    brighter under a light from the front than from behind.
+
+    Returns:
+        A line for each fault; none for black lightmaps, and where the light shows no direction.
+    """
+    maps = lightmaps.reshape(-1, *lightmaps.shape[-3:])
+    dark = [name for name, light in zip(DIRECTIONS, maps.amax((0, 2, 3)).tolist(), strict=True) if not light > 0.0]
+    if dark:
+        return () if len(dark) == len(DIRECTIONS) else (f"no light in {', '.join(dark)}",)
+    texts = ("to the right of", "above", "brighter than")
+    shifts = zip(axis_shifts(light_centres(maps)).tolist(), DIRECTIONS[::2], DIRECTIONS[1::2], texts, strict=True)
+    return tuple(
+        f"warning: {one} and {other} may be exchanged: the light of {one} is not {text} that of {other}"
+        for shift, one, other, text in shifts
+        if shift < -_LEAST_SHIFT
+    )

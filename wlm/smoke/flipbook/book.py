@@ -5,26 +5,25 @@ is premultiplied by the opacity: a picture is this light plus the background tim
 `wlm.smoke.camera.LAYOUTS` lists the content of the channels.
 """
 
-import io
+import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
-from wlm.formats.exr import read_exr, write_exr
-from wlm.formats.limits import IMAGE_BYTES, PICTURE_GROWTH, check_growth
-from wlm.formats.mask import DAMAGED_PICTURE
-from wlm.formats.reading import read_file
-from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS, Camera
+from wlm.formats.exr import write_exr
+from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
 from wlm.smoke.data import Frames, read_shaded, spread
 from wlm.smoke.flipbook.motion import ZERO, encoded, frames_motion, mip_levels, scale_of
+from wlm.smoke.flipbook.reading import NOTE, suffix_of
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import Looks
 from wlm.smoke.shading import Ramp
@@ -32,10 +31,6 @@ from wlm.system import Meter, OnProgress
 
 RATE = 25.0
 """Frames per second if the smoke has no rate."""
-
-_SUFFIXES = (".exr", ".png", ".tga")
-_MODES, _GREY = ("RGB", "RGBA"), ("L", "LA")
-_BARE, _LIT = 0.999, 0.05  # least transparency without smoke; largest mean light there
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +49,11 @@ class Shot:
 
 
 def read_shots(
-    files: Mapping[int, Path], device: str = "cpu", count: int | None = None, progress: OnProgress | None = None
+    files: Mapping[int, Path],
+    device: str = "cpu",
+    count: int | None = None,
+    progress: OnProgress | None = None,
+    notes: list[str] | None = None,
 ) -> Iterator[Shot]:
     """Yields the frames of lightmaps that `bake` or `predict` wrote, one after the other.
 
@@ -63,6 +62,7 @@ def read_shots(
         device: Device of the lightmaps.
         count: Largest number of frames, which are evenly spread over all; None: all frames.
         progress: Called after each frame.
+        notes: As for `read_shaded`.
 
     Raises:
         WlmError: A file is damaged or of another kind.
@@ -70,7 +70,7 @@ def read_shots(
     numbers = spread(tuple(files), count)
     meter = Meter(progress, "read", len(numbers))
     for done, number in enumerate(numbers, 1):
-        yield Shot(number, *read_shaded(files[number], device))
+        yield Shot(number, *read_shaded(files[number], device, notes))
         meter.report(done)
 
 
@@ -256,112 +256,24 @@ def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, t
     output = Path(output)
     endings = {"first": "1", "second": "2", "motion": "motion"}
     paths = {name: output.with_name(f"{output.stem}_{endings[name]}{output.suffix}") for name in book.pages}
-    clipped = sum(_write_page(path, book.pages[name]) for name, path in paths.items())
+    facts = {"layout": book.layout, "rows": book.rows, "columns": book.columns, "frames": book.count}
+    text = json.dumps(facts | {"padding": book.padding, "gain": book.gain}, separators=(",", ":"))
+    clipped = sum(_write_page(path, book.pages[name], text) for name, path in paths.items())
     return {path: book.channels[name] for name, path in paths.items()}, clipped
 
 
-def _write_page(path: Path, page: np.ndarray) -> int:
-    """Writes a texture [H, W, 3 or 4] and returns the number of clipped values."""
+def _write_page(path: Path, page: np.ndarray, text: str) -> int:
+    """Writes a texture [H, W, 3 or 4] with the `text` of `NOTE`, and returns the number of clipped values."""
     if not np.isfinite(page).all():
         raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
-    if _suffix(path) == ".exr":
-        write_exr(path, page)
+    if suffix_of(path) == ".exr":
+        write_exr(path, page, note=json.loads(text))
         return int((page > 65504.0).sum())
     image = Image.fromarray(np.round(np.clip(page, 0.0, 1.0) * 255.0).astype(np.uint8))
+    entry: dict[str, Any] = {"id_section": text.encode()}
+    if suffix_of(path) == ".png":
+        entry = {"pnginfo": PngInfo()}
+        entry["pnginfo"].add_text(NOTE, text)
     with atomic_path(path) as temporary:
-        image.save(temporary, format=_suffix(path)[1:].upper())
+        image.save(temporary, format=suffix_of(path)[1:].upper(), **entry)
     return int((page > 1.0).sum())
-
-
-def read_flipbook(
-    paths: Sequence[str | os.PathLike[str]],
-    layout: str,
-    *,
-    rows: int,
-    columns: int,
-    straight: bool = False,
-    device: str = "cpu",
-) -> list[SixWay]:
-    """Reads the frames of a flip book of any program; the unknown camera is taken to be in front of the smoke.
-
-    Args:
-        paths: The files, .exr, .png or .tga (8 bits per channel, linear): the two of the layout, and optionally a third
-            with the opacity in its alpha or first channel.
-        layout: Name of the order of the channels, one of `LAYOUTS`.
-        rows, columns: Number of rows and of columns of cells; all cells are read.
-        straight: Whether the files have straight (unpremultiplied) alpha; the result is premultiplied.
-        device: Device of the frames.
-
-    Returns:
-        The frames, float32; transparency and emission are None if no channel stores them.
-
-    Raises:
-        WlmError: There are not two or three files; one is missing, damaged, of another kind or size, has numbers that
-            are not finite, or lacks a channel of the layout; or alpha is straight and there is no opacity.
-    """
-    where = ", ".join(map(str, paths))
-    if len(paths) not in (2, 3):
-        raise WlmError(f"{where}: expected two textures, or three with one of opacity, got {len(paths)}")
-    pages = [_read(path, grey=number == 2) for number, path in enumerate(paths)]
-    if any(page.shape[:2] != pages[0].shape[:2] for page in pages):
-        raise WlmError(f"{where}: expected textures of one size, found {[page.shape[:2] for page in pages]}")
-    height, width = pages[0].shape[0] // rows, pages[0].shape[1] // columns
-    if pages[0].shape[:2] != (rows * height, columns * width) or not (height and width):
-        size = f"{pages[0].shape[0]} x {pages[0].shape[1]}"
-        raise WlmError(f"{where}: expected sides that divide into {rows} rows and {columns} columns, found {size}")
-    planes: dict[str, torch.Tensor] = {}
-    named = [*LAYOUTS[layout], (ALPHA,)]
-    if len(pages) == 3:
-        pages[2] = pages[2][..., -1:] if pages[2].shape[2] in (2, 4) else pages[2][..., :1]
-    for page, names in zip(pages, named, strict=False):
-        cells = page.reshape(rows, height, columns, width, -1).transpose(4, 0, 2, 1, 3)
-        cells = torch.from_numpy(cells.reshape(-1, rows * columns, height, width).astype(np.float32)).to(device)
-        planes |= dict(zip(names, cells, strict=False))
-    missing = [name for name in DIRECTIONS if name not in planes]
-    if missing:
-        raise WlmError(f"{where}: layout {layout}: expected channels for {', '.join(missing)}, found none")
-    camera = Camera.look_at((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), extent=1.0, height=height, width=width)
-    maps = torch.stack([planes[name] for name in DIRECTIONS], 1)
-    alpha, glow = planes.get(ALPHA), planes.get(EMISSION)
-    if straight:
-        if alpha is None:
-            raise WlmError(f"{where}: expected an alpha channel or a third texture for straight alpha, found none")
-        maps, glow = maps * alpha[:, None], None if glow is None else glow * alpha
-    absent = [None] * len(maps)
-    parts = (maps, absent if alpha is None else 1.0 - alpha, absent if glow is None else glow)
-    return [SixWay(*part, camera) for part in zip(*parts, strict=True)]
-
-
-def is_straight(frames: Sequence[SixWay]) -> bool:
-    """Returns whether pixels without smoke have light, a sign of straight alpha; False if there is no opacity."""
-    bare = [frame.lightmaps.amax(0)[frame.transparency > _BARE] for frame in frames if frame.transparency is not None]
-    light = torch.cat(bare) if bare else torch.zeros(0)
-    return len(light) > 0 and float(light.mean()) > _LIT
-
-
-def _read(path: str | os.PathLike[str], *, grey: bool) -> np.ndarray:
-    if _suffix(path) == ".exr":
-        page = read_exr(path)[0]
-        if not np.isfinite(page).all():
-            raise WlmError(f"{path}: expected finite light, found NaN or infinity")
-        return page
-    data = read_file(path, IMAGE_BYTES, "the picture")
-    try:
-        # From memory: for a file on disk Pillow would allocate as many bytes as a chunk claims.
-        with Image.open(io.BytesIO(data), formats=[_suffix(path)[1:].upper()]) as image:
-            modes = (*_MODES, *_GREY) if grey else _MODES
-            if image.mode not in modes:
-                raise WlmError(f"{path}: expected {' or '.join(modes)} with 8 bits per channel, found {image.mode}")
-            floats = 4 * image.width * image.height * len(image.getbands())
-            check_growth(str(path), len(data), floats, PICTURE_GROWTH)
-            pixels = np.asarray(image).astype(np.float32) / np.float32(255.0)
-            return pixels.reshape(*pixels.shape[:2], -1)
-    except DAMAGED_PICTURE as error:
-        raise WlmError(f"{path}: cannot read the picture: {str(error) or type(error).__name__}") from error
-
-
-def _suffix(path: str | os.PathLike[str]) -> str:
-    suffix = Path(path).suffix.lower()
-    if suffix not in _SUFFIXES:
-        raise WlmError(f"{path}: expected a name that ends in {', '.join(_SUFFIXES)}, found {suffix or 'none'}")
-    return suffix
