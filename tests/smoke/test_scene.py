@@ -405,7 +405,8 @@ def test_files_that_are_no_lightmaps(tmp_path):
 
     refused({k: v for k, v in planes.items() if k != "top"}, note, "expected a channel top as bake writes")
     refused(planes | {"top": planes["top"] * np.nan}, note, "channel top: expected finite numbers")
-    refused(planes, None, "header attribute wlm: expected a camera as bake writes")
+    write_planes(path, planes, None)
+    assert read_six_way(path).camera.extent == 1.0, "another program's lightmaps get a camera of unit extent"
     refused(planes, {"camera": {"extent": 1}}, "header attribute wlm: expected a camera as bake writes")
     refused(
         planes,

@@ -72,7 +72,8 @@ def shade(
     background: Background = None,
     white: White = 1.0,
     rule: Annotated[
-        Literal["squared", "absolute", "normalised"], typer.Option(help="How a light's direction weights the maps.")
+        Literal["squared", "absolute", "normalised"],
+        typer.Option(help="The rule by which a light's direction weights the maps."),
     ] = "squared",
     textures: _With = None,
     cells: _Cells = None,

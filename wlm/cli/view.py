@@ -27,7 +27,7 @@ def view(
     original: Original = None,
     key: Key = None,
     view: Annotated[
-        str | None, typer.Option(help="What to draw: light or tiles; of probes: balls, gaussians or volume.")
+        str | None, typer.Option(help="The picture: light or tiles; of probes: balls, gaussians or volume.")
     ] = None,
     outside: Annotated[bool, typer.Option("--outside", help="Also draw walls seen from outside the room.")] = False,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,

@@ -76,7 +76,7 @@ class Profile(Settings):
     static_budget_db: float = Field(60.0, gt=0.0)
     """A tile is stored as one pattern that only changes in brightness if its PSNR in dB is then at least this."""
     frames: Literal["auto", "never", "always"] = "auto"
-    """Which tiles are stored as a BC7 image for each time instead of feature maps and a network. "auto": the tiles that
+    """The tiles stored as a BC7 image for each time instead of feature maps and a network. "auto": the tiles that
     take no more bytes of GPU memory as BC7 images."""
 
     @model_validator(mode="after")

@@ -147,17 +147,17 @@ def test_probes_of_which_none_is_dead_have_a_page(tmp_path):
 
 
 def test_frames_of_smoke_are_of_one_size(tmp_path):
-    for name, size in (("a", 8), ("b", 4)):
+    for name, size in (("a_1", 8), ("a_2", 4)):
         camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=size, width=size)
         planes = torch.rand(7, size, size)
         write_six_way(tmp_path / f"{name}.exr", SixWay(planes[:6], planes[6], camera=camera))
     with pytest.raises(WlmError, match="expected 8x8 pixels as the first frame, found 4x4"):
-        make_page([tmp_path / "a.exr", tmp_path / "b.exr"])
+        make_page([tmp_path / "a_1.exr", tmp_path / "a_2.exr"])
     with pytest.raises(WlmError, match="--rate"):
-        make_page([tmp_path / "a.exr"], rate=0.0)
-    assert make_page([tmp_path / "a.exr"]).title == "a"
-    (tmp_path / "b.exr").write_bytes((tmp_path / "a.exr").read_bytes())
-    folder, files = make_page([tmp_path]), make_page([tmp_path / "a.exr", tmp_path / "b.exr"])
+        make_page([tmp_path / "a_1.exr"], rate=0.0)
+    assert make_page([tmp_path / "a_1.exr"]).title == "a_1"
+    (tmp_path / "a_2.exr").write_bytes((tmp_path / "a_1.exr").read_bytes())
+    folder, files = make_page([tmp_path]), make_page([tmp_path / "a_1.exr", tmp_path / "a_2.exr"])
     assert folder.manifest == files.manifest and folder.title == files.title == tmp_path.name
 
 
