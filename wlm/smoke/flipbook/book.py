@@ -307,7 +307,7 @@ def read_flipbook(
         raise WlmError(f"{where}: expected textures of one size, found {[page.shape[:2] for page in pages]}")
     height, width = pages[0].shape[0] // rows, pages[0].shape[1] // columns
     if pages[0].shape[:2] != (rows * height, columns * width) or not (height and width):
-        size = f"{pages[0].shape[0]} x {pages[0].shape[1]}"
+        size = "{1}x{0} pixels".format(*pages[0].shape)
         raise WlmError(f"{where}: expected sides that divide into {rows} rows and {columns} columns, found {size}")
     planes: dict[str, torch.Tensor] = {}
     named = [*LAYOUTS[layout], (ALPHA,)]
