@@ -25,6 +25,10 @@ demo-network: $(STAMP)
 pictures: demo
 	$(BIN)/python demos/pictures.py
 
+# Python keeps the compiled form of modules and tests, even where the environment turns that off: each of the many
+# commands that the tests start would otherwise compile the whole package again.
+export PYTHONDONTWRITEBYTECODE =
+
 # The tests of a file stay on one worker, so that fixtures of a module are made once.
 test: lint
 	$(BIN)/pytest -n 2 --dist loadfile

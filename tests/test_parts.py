@@ -123,7 +123,7 @@ def test_weird_settings_are_one_line(name, path):
             if (key, kind) in ACCEPTED:
                 kept.read(path)
             elif (key, kind) == ("period", "fraction"):
-                refused(kept, path, "times: expected 0 to 1.5")
+                refused(kept, path, "times: expected 0 to the period 1.5")
             else:
                 refused(kept, path, "setting ", key)
         for text in ("NaN", "Infinity", "-Infinity", "1e999"):

@@ -69,6 +69,6 @@ def test_the_command_fails_where_a_figure_is_worse(tmp_path):
 
 
 def test_the_command_says_what_it_cannot_compare(tmp_path):
-    assert "found none" in invoke(tmp_path, OLD, replace(OLD, option="H")).stderr
+    assert "no row has the method" in invoke(tmp_path, OLD, replace(OLD, option="H")).stderr
     result = CliRunner().invoke(app, ["compare", str(tmp_path / "old.json"), str(tmp_path / "absent.json")])
     assert "absent.json" in result.stderr

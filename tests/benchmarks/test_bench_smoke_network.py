@@ -246,4 +246,4 @@ def test_traced_rows(monkeypatch, denoiser):
     # 0.2 is 0.4845 in sRGB.
     assert rows[0]["psnr"] == pytest.approx(-20.0 * np.log10(0.5 - 0.48453), abs=0.01)
     monkeypatch.setattr(bench, "has_tracer", lambda: False)
-    assert bench.traced_rows(traced) == [] and "left out, mitsuba is not installed" in lines[-1]
+    assert bench.traced_rows(traced) == [] and "left out, because mitsuba is not installed" in lines[-1]

@@ -119,7 +119,7 @@ def test_compressed(tmp_path, block):
 
 def test_damaged_compressed_files(tmp_path):
     data = compress(compressible(*probes(300)))
-    assert "found 0: save without" in message(tmp_path, compress(compressible(*probes()), mode=0))
+    assert "found 0; save it without" in message(tmp_path, compress(compressible(*probes()), mode=0))
     for size in (0, (1 << 20) + 1, 0xFFFFFFFF):
         damaged = data[:8] + struct.pack("<I", size) + data[12:]
         assert f"expected blocks of 1 to 1048576 bytes, found {size}" in message(tmp_path, damaged)

@@ -336,7 +336,7 @@ def lightmap_set(folder: Path, entries: list | None = None, **changes: object) -
 
 def test_a_set_that_lists_one_file_without_end(tmp_path):
     entries = [{"time_hours": i / 6000, "file": "a.exr"} for i in range(100_001)]
-    assert "expected at most 100,000, got 100,001" in refused(lightmap.load, lightmap_set(tmp_path, entries))
+    assert "expected at most 100,000 entries, got 100,001" in refused(lightmap.load, lightmap_set(tmp_path, entries))
     # 1.2 GB of frames.
     with little_memory():
         assert "expected at most 2048 times its" in refused(lightmap.load, lightmap_set(tmp_path, entries[:3000]))

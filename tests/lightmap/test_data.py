@@ -535,7 +535,7 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
         atlases={"big": {"width": 8, "height": 6, "mask": "mask.png"}, "small": {}},
         lightmaps=[{"time_hours": 3.0, "files": {"big": first | {"dir": "more.exr"}, "small": second}}],
     )
-    assert "layer dir: expected a channel x.G, found R, G, B" in error_of(wlm.lightmap.load, path)
+    assert "layer dir: expected a channel x.G, found the channels R, G, B" in error_of(wlm.lightmap.load, path)
     chosen = wlm.lightmap.load(path, layers=["L0", "L1"])
     np.testing.assert_array_equal(values_of(chosen, "big", "L0")[0], stacked[:6])
     np.testing.assert_array_equal(values_of(chosen, "big", "L1")[0][1:], stacked[12:18][1:])

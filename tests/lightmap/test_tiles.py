@@ -270,7 +270,7 @@ def _file_of(sheet):
 
 @pytest.mark.parametrize(
     ("content", "says"),
-    [(b"x", "part mask: "), (b"", "part mask: "), (zstd.compress(bytes(7288)), "part mask: expected 7287 bytes")],
+    [(b"x", "part mask: "), (b"", "part mask: "), (zstd.compress(bytes(7288)), "part mask: expected a frame of 7287 ")],
 )
 def test_a_wrong_mask_is_one_line(model, tmp_path, content, says):
     path = tmp_path / "m.wlm"

@@ -92,8 +92,8 @@ def test_unity_shows_the_same_light(mirror, outputs, tmp_path):
 def test_what_unity_refuses(tmp_path):
     np.savez(tmp_path / "other.npz", position=np.zeros((3, 3)))
     for model, settings, message in [
-        (random_model(outputs=48, positions=True), {}, "expected L0, L1 or L2"),
-        (random_model(outputs=5, positions=True), {}, "expected L0, L1 or L2"),
+        (random_model(outputs=48, positions=True), {}, "expected 3, 12 or 27 numbers per probe"),
+        (random_model(outputs=5, positions=True), {}, "expected 3, 12 or 27 numbers per probe"),
         (random_model(positions=True), {"mirror": "w"}, "mirror: expected x, y or z"),
         (random_model(), {}, "stores no positions"),
         (random_model(), {"original": tmp_path / "other.npz"}, "expected the 200 probes"),

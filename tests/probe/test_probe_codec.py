@@ -45,7 +45,7 @@ def test_gaussians_come_back(settings, tmp_path):
 
 
 def test_only_quantised_gaussians_are_stored(tmp_path):
-    with pytest.raises(ValueError, match="expected quantised Gaussians"):
+    with pytest.raises(ValueError, match="expected Gaussians quantised to integers"):
         random_model().save(tmp_path / "a.wlm")
 
 

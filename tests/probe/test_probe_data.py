@@ -67,7 +67,7 @@ def test_any_count_of_probes_and_numbers(shape):
 
 def test_several_arrays_need_a_key(tmp_path):
     path = _write(tmp_path / "a.npz", **{"sh": _values(N, 3), "sh_09.00": _values(N, 12), "sh_12.00": _values(N, 27)})
-    assert "give the key of one: sh, sh_09.00, sh_12.00" in error_of(load, path)
+    assert "choose one by its key: sh, sh_09.00, sh_12.00" in error_of(load, path)
     for key, outputs, name in (("12.00", 27, "sh_12.00"), ("sh_09.00", 12, "sh_09.00"), ("sh", 3, "sh")):
         loaded = load(path, key=key)
         assert (loaded.outputs, loaded.key) == (outputs, name)

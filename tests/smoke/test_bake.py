@@ -147,7 +147,7 @@ def test_wrong_settings():
         weights((0.0, 0.0, np.nan))
     with pytest.raises(ValueError, match=r"lightmaps: expected \[6, H, W\]"):
         SixWay(torch.zeros(5, 2, 2), None)
-    with pytest.raises(ValueError, match="transparency: the lightmaps have no transparency"):
+    with pytest.raises(ValueError, match="transparency: expected shape"):
         SixWay(torch.zeros(6, 2, 2), torch.zeros(2, 3))
     for change in ({"up": (0.0, 2.0, 0.0)}, {"right": (-1.0, 0.0, 0.0)}, {"extent": 0.0}, {"width": 0}):
         fields = {"position": (0, 0, 9), "right": (1, 0, 0), "up": (0, 1, 0), "toward": (0, 0, 1)}

@@ -292,7 +292,7 @@ def test_nan_never_enters(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(dataset, "ATTEMPTS", 2)
     nan = torch.full((24, 24), float("nan"))
     monkeypatch.setattr(dataset, "bake", lambda *a, **k: dataclasses.replace(bake(*a, **k), transparency=nan))
-    with pytest.raises(WlmError, match=r"2 scenes .* NaN"):
+    with pytest.raises(WlmError, match=r"2 random scenes .* NaN"):
         make_pool(FEW, seed=5)
 
 

@@ -77,7 +77,7 @@ def test_noise_flickers():
 
 def test_hard_pools():
     pool = small_pool(2)
-    with pytest.raises(ValueError, match="samples"):
+    with pytest.raises(ValueError, match="at least one sample"):
         evaluate(_network(), pool.take(torch.zeros(len(pool), dtype=torch.bool)))
     empty = replace(pool, guides=torch.zeros_like(pool.guides), targets=torch.zeros_like(pool.targets))
     report = evaluate(_network(), empty)

@@ -200,7 +200,7 @@ def test_the_best_network_is_kept(tmp_path):
         return _train(tmp_path / "a", profile, make_pool=_worse, progress=report)
 
     # It ends far below where it began, and the best stays.
-    with pytest.raises(WlmError, match=r"diverged: .* dB after 24 steps, .* before the first; .* rate than 0.01"):
+    with pytest.raises(WlmError, match=r"diverged: .* dB after 24 steps, .* before the first; .* rate below 0.01"):
         run(1e-2)
     assert wlm.load(tmp_path / "a").summary["psnr"] == max(scores)
     scores.clear()
@@ -327,7 +327,7 @@ def test_a_step_learns_from_crops():
         assert torch.equal(motion[0], pool.motion[n, :, y : y + 16, x : x + 16].float())
     trainer.run(pool, plan)
     assert trainer.step == 6 and trainer.skipped == 0
-    with pytest.raises(ValueError, match="at most 32 pixels"):
+    with pytest.raises(ValueError, match="at most the samples' 32 pixels"):
         plan_round(settings.model_copy(update={"crop": 48}), pool, seed=0, round=0)
 
 

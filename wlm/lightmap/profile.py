@@ -47,7 +47,7 @@ class Profile(Settings):
     between stored times has the same length, so that a lamp that is switched within minutes gets as many texels as an
     hour of the afternoon; the axis wraps if the set is periodic."""
     interpolation: Literal["radiance", "network"] = "radiance"
-    """How to decode between two stored times. "radiance": decode both times and interpolate the radiance linearly.
+    """The way to decode between two stored times. "radiance": decode both times and interpolate the radiance linearly.
     "network": evaluate the network once, with features that are interpolated in time, as in the paper."""
     steps: int = Field(20000, ge=10)
     """Number of training steps."""

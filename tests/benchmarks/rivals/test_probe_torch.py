@@ -115,5 +115,5 @@ def test_what_is_refused():
         with pytest.raises(ValueError, match="expected positions"):
             dense(*bad)
     for changes in ({"count": 0}, {"steps": 0}, {"latent": 0}, {"hidden": 0}):
-        with pytest.raises(ValueError, match="at least 1 of each"):
+        with pytest.raises(ValueError, match="numbers of at least 1"):
             dense(x, values, **changes)
