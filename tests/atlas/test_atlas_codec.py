@@ -211,7 +211,7 @@ def _shared_refused(tmp_path, words, settings=None, tensors=None, separate=False
         ("sheets", put((0, 4), 3), "the numbers of tiles don't fit the size"),
         ("sheets", put((1, 2), 90), "beyond the lookup texture"),
         ("sheets", put((0, 6), 1), "its next mip level must be a later row, found 1"),
-        ("sheets", lambda v: v[:1], "expected 1 equal groups of 2 or more rows, found 1 rows"),
+        ("sheets", lambda v: v[:1], "expected 1 equal groups of 2 or more rows, found 1"),
     ],
 )
 def test_shared_parts_that_do_not_fit_are_refused(part, change, words, tmp_path):
