@@ -220,7 +220,9 @@ def report(
 @app.command()
 def plot(
     files: _Results,
-    system: Annotated[str, typer.Option(metavar="NAME", help="lightmap, atlas, probe, smoke or smoke-network.")],
+    system: Annotated[
+        str, typer.Option(metavar="NAME", help="lightmap, atlas, probe, smoke or smoke-network: whose results to draw.")
+    ],
     output: Annotated[Path, output_option("FILE.png", "The picture, .png, .svg or .pdf.")],
 ) -> None:
     """Draw the rows of one system in result files: quality against size or time, and error against time."""
@@ -237,8 +239,8 @@ def plot(
 
 @app.command()
 def compare(
-    new: Annotated[Path, typer.Argument(metavar="NEW.json", help="Results of the changed code.")],
-    old: Annotated[Path, typer.Argument(metavar="OLD.json", help="Results of the code before the change.")],
+    new: Annotated[Path, typer.Argument(metavar="NEW.json", help="Result file of the changed code.")],
+    old: Annotated[Path, typer.Argument(metavar="OLD.json", help="Result file from before the change.")],
 ) -> None:
     """Compare two result files; fail if NEW is over 0.05 dB worse, or over 5% slower on the same machine."""
     from benchmarks import FIGURES, read_runs
@@ -252,6 +254,6 @@ def compare(
         row, figure = change.row, FIGURES[change.name]
         name = " ".join(filter(None, (row.scene, row.method, row.option)))
         note(f"worse: {name}: {figure.heading}: {figure.text(change.old)} before, {figure.text(change.new)} now")
-    note(f"{len(changes)} figures compared with {old}: {len(worse)} are worse")
+    note(f"{len(changes)} measured values compared with {old}: {len(worse)} are worse")
     if worse:
         raise typer.Exit(1)

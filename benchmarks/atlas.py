@@ -4,8 +4,8 @@ For each lightmap of each mesh the results table has these kinds of rows:
 
 - method "ours", one row for each profile, a set of options: size of the file, time to compress and write it, error in
   views from all around the mesh, and time to read a million random points of its surface. A full run also measures the
-  first profile at compression ratios (CR) of 92.5% and 95%, and in as many bits as the first profile of method
-  "cascade" takes.
+  first profile at compression ratios (CR) of 92.5% and 95%, and in as many bits as the first profile takes that
+  compresses by a cascade.
 - method "lightmap": the time to read the same points from the lightmap itself, in half floats.
 - the rivals of `benchmarks.rivals.atlas` in as many bits as the first profile takes; in a full run also in as many as
   every other profile takes. Bits are counted by eq. 9 of lightmap-uv-clustering-cascade, which leaves out UVs and
@@ -168,7 +168,7 @@ def read_lightmaps(
     """
     if mesh_path is not None:
         if meshes_path is not None or not lightmap_paths:
-            raise WlmError("expected --mesh FILE with --lightmap FILE, or --meshes DIR alone")
+            raise WlmError("expected --mesh FILE with --lightmap FILE, or only --meshes DIR")
         return _lightmaps(Path(mesh_path), [Path(path) for path in lightmap_paths], mask_path)
     if lightmap_paths or mask_path is not None:
         raise WlmError("--lightmap and --mask need --mesh FILE")
@@ -354,7 +354,7 @@ class _AtlasBench(Bench):
         return _Entry(row, Decoder(model, self.device), decode, model)
 
     def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
-        """Fits the first cascade's textures in rendered views and in UV space. Returns an entry for each fit."""
+        """Fits the first cascade's textures in rendered views, then in UV space. Returns an entry for each fit."""
         cascade = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
         if cascade is None:
             return []

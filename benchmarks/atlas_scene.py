@@ -142,7 +142,7 @@ class _SceneBench(Bench):
         )
         rows = [row]
         if parts:
-            self.note(f"{profile.name}: compressing {len(scene.sheets) * len(scene.states)} lightmaps alone")
+            self.note(f"{profile.name}: compressing {len(scene.sheets) * len(scene.states)} lightmaps, each by itself")
             weights = scene_weights(scene, self._varies, profile, _SEED, device)
             alone = scene_parts(scene, weights, model.bits, profile.colour, device)
             decoders["parts"] = alone

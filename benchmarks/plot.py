@@ -55,7 +55,7 @@ class Panel:
     def __post_init__(self) -> None:
         for name in (self.x, self.y):
             if name not in FIGURES:
-                raise WlmError(f"plot: unknown figure {name!r}")
+                raise WlmError(f"plot: unknown measured quantity {name!r}; known are psnr, bpp, decode_ms ...")
 
     def position(self, row: Row) -> tuple[float, float] | None:
         """Returns a row's values on the x and y axis; None if the panel does not show the row or it lacks a value."""
@@ -110,7 +110,7 @@ def plot(rows: Sequence[Row], path: str | Path, x: str | Panel | Sequence[str | 
     methods = list(dict.fromkeys(row.method for row in rows))
     for panel in panels:
         if not any(panel.position(row) for row in rows):
-            raise WlmError(f"plot: no row has both figures, {panel.y} and {panel.x}")
+            raise WlmError(f"plot: expected results with both {panel.y} and {panel.x}, found none in the result files")
 
     # A Figure of its own canvas, not pyplot: no global state, no window, nothing to close.
     figure = Figure(figsize=(5.0 * len(panels), 3.9 * len(scenes)), dpi=150, layout="constrained")

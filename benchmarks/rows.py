@@ -62,7 +62,7 @@ class Row:
         """
         for name in self.figures:
             if name not in FIGURES:
-                raise ValueError(f"unknown figure {name!r}")
+                raise ValueError(f"unknown measured quantity {name!r}; benchmarks.figures lists the known")
         measured = {name: value for name, value in self.figures.items() if value is not None and math.isfinite(value)}
         # NumPy's numbers don't fit JSON.
         plain = {name: value if isinstance(value, int) else float(value) for name, value in measured.items()}
@@ -232,7 +232,7 @@ def _read_row(values: object, where: str) -> Row:
             raise WlmError(f"{where}: field {name!r}: expected {kind.__name__}, got {value!r}")
     for name, value in values["figures"].items():
         if not isinstance(value, int | float) or isinstance(value, bool):
-            raise WlmError(f"{where}: figure {name!r}: expected a number, got {value!r}")
+            raise WlmError(f"{where}: measured quantity {name!r}: expected a number, got {value!r}")
     try:
         return Row(**values)
     except (ValueError, OverflowError) as error:

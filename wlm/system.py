@@ -67,8 +67,8 @@ class Settings(BaseModel):
 
     @classmethod
     def load(cls, profile: str | os.PathLike[str] | Self) -> Self:
-        """Loads a profile by its name (`configs/FILES-NAME.yaml`) or the path of a YAML file; an instance is returned
-        unchanged.
+        """Loads a profile by its name (NAME in `configs/FILES-NAME.yaml`; `FILES` is the class's) or the path of a YAML
+        file; an instance is returned unchanged.
 
         Raises:
             WlmError: Unknown profile, unreadable file, or a wrong setting.

@@ -128,7 +128,7 @@ def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int)
         else:
             high = middle - 1
     if low == 0:
-        raise ValueError(f"share: {share} leaves less than the {bits} bits of a block for texels {sheet.mask.shape}")
+        raise ValueError(f"share: {share} of the bits of {sheet.mask.size} texels is less than a block, {bits} bits")
     return size(low), _read_blocks(sheet, size(low), block)
 
 

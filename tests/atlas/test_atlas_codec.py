@@ -211,7 +211,7 @@ def _shared_refused(tmp_path, words, settings=None, tensors=None, separate=False
         ("sheets", put((0, 4), 3), "the numbers of tiles don't fit the size"),
         ("sheets", put((1, 2), 90), "beyond the lookup texture"),
         ("sheets", put((0, 6), 1), "its next mip level must be a later row, found 1"),
-        ("sheets", lambda v: v[:1], "rows for 2 sheets and their mip levels, equally many in 1 states, found 1 rows"),
+        ("sheets", lambda v: v[:1], "expected 1 equal groups of 2 or more rows, found 1"),
     ],
 )
 def test_shared_parts_that_do_not_fit_are_refused(part, change, words, tmp_path):
@@ -219,7 +219,7 @@ def test_shared_parts_that_do_not_fit_are_refused(part, change, words, tmp_path)
 
 
 def test_shared_settings_that_do_not_fit_are_refused(tmp_path):
-    _shared_refused(tmp_path, "rows for 2 sheets and their mip levels", {"separate": True})
+    _shared_refused(tmp_path, "expected 2 equal groups of 2 or more rows", {"separate": True})
     _shared_refused(tmp_path, "expected the size of its sheet", {"sizes": [[48, 40], [48, 64]]})
     _shared_refused(tmp_path, "expected rgb9e5 or mixed for method shared", {"colour": "half"})
     _shared_refused(tmp_path, "setting objects: expected at least one object for each of the 2 sheets", {"objects": []})

@@ -151,7 +151,7 @@ def test_what_is_refused(tmp_path, lightmaps):
     mesh, exr = tmp_path / "Cube" / "mesh.glb", tmp_path / "Cube" / "day.exr"
     for paths, line in (
         ((tmp_path / "absent",), "absent: no such folder"),
-        ((tmp_path / "Cube", mesh, [exr]), "expected --mesh FILE with --lightmap FILE, or --meshes DIR alone"),
+        ((tmp_path / "Cube", mesh, [exr]), "expected --mesh FILE with --lightmap FILE, or only --meshes DIR"),
         ((None, mesh), "expected --mesh FILE with --lightmap FILE"),
         ((None, None, [exr]), "--lightmap and --mask need --mesh FILE"),
         ((None, tmp_path / "absent.glb", [exr]), "absent.glb"),

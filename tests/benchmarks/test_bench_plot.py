@@ -131,13 +131,13 @@ def test_labels_of_a_crowd_do_not_overlap(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("rows", "name", "x", "message"),
     [
-        (ROWS, "p.png", "speed", "unknown figure 'speed'"),
+        (ROWS, "p.png", "speed", "unknown measured quantity 'speed'"),
         (ROWS, "p.gif", "bpp", r"\.gif.*ends in"),
         ([], "p.png", "bpp", "no row"),
-        ([Row("l", "c", "m", "", {"psnr": 1.0})], "p.png", "bpp", "no row has both figures, psnr and bpp"),
+        ([Row("l", "c", "m", "", {"psnr": 1.0})], "p.png", "bpp", "expected results with both psnr and bpp"),
         (ROWS, "nowhere/p.png", "bpp", "nowhere"),
-        (ROWS, "p.png", Panel("bpp", "max_error"), "no row has both figures, max_error and bpp"),
-        (ROWS, "p.png", Panel("bpp", methods=("PCA",)), "no row has both figures, psnr and bpp"),
+        (ROWS, "p.png", Panel("bpp", "max_error"), "expected results with both max_error and bpp"),
+        (ROWS, "p.png", Panel("bpp", methods=("PCA",)), "expected results with both psnr and bpp"),
     ],
 )
 def test_what_cannot_be_drawn_is_one_clear_line(tmp_path, rows, name, x, message):

@@ -33,7 +33,7 @@ def test_figures_are_known_finite_and_plain():
     )
     assert row.figures == {"psnr": 2.5, "bytes": 3} and type(row["psnr"]) is float and type(row["bytes"]) is int
     assert row.get("ssim") is None and row.with_figures(ssim=1.0, psnr=None).figures == {"bytes": 3, "ssim": 1.0}
-    with pytest.raises(ValueError, match="unknown figure 'speed'"):
+    with pytest.raises(ValueError, match="unknown measured quantity 'speed'"):
         row.with_figures(speed=1.0)
 
 
@@ -101,9 +101,9 @@ def rows(*changes):
         (rows({}, {"speed": 1}), "row 1: unknown field 'speed'"),
         (rows({"method": None}), "row 0: field 'method': expected str, got None"),
         (rows({"figures": [1]}), "field 'figures': expected dict"),
-        (rows({"figures": {"psnr": "42"}}), "figure 'psnr': expected a number, got '42'"),
-        (rows({"figures": {"psnr": True}}), "figure 'psnr': expected a number, got True"),
-        (rows({"figures": {"speed": 1.0}}), "unknown figure 'speed'"),
+        (rows({"figures": {"psnr": "42"}}), "quantity 'psnr': expected a number, got '42'"),
+        (rows({"figures": {"psnr": True}}), "quantity 'psnr': expected a number, got True"),
+        (rows({"figures": {"speed": 1.0}}), "unknown measured quantity 'speed'"),
     ],
 )
 def test_a_broken_file_is_named_with_its_fault(tmp_path, edit, message):

@@ -144,7 +144,7 @@ def test_a_probe_that_outshines_the_others_is_said():
 def test_a_fit_that_diverged_keeps_no_state():
     trainer = Trainer(*_input(synthetic(60)), SMALL, 0, "cpu")
     trainer._tensors["net"][5] = np.nan
-    with pytest.raises(WlmError, match="the fit diverged; use smaller learning rates than small"):
+    with pytest.raises(WlmError, match="the fit diverged; use smaller learning rates than profile small"):
         trainer.state()
 
 

@@ -262,10 +262,7 @@ def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
     count, states = len(header.sheets), len(header.states) if header.separate else 1
     stride, rest = divmod(len(table), states)
     if rest or stride < count:
-        raise ValueError(
-            f"part sheets: expected rows for {count} sheets and their mip levels, equally many in "
-            f"{states} states, found {len(table)} rows"
-        )
+        raise ValueError(f"part sheets: expected {states} equal groups of {count} or more rows, found {len(table)}")
     names, places = (list(header.sheets) + [""] * (stride - count)) * states, []
     for number, row in enumerate(table.tolist()):
         smaller, first = row[6], number // stride * stride

@@ -134,8 +134,8 @@ class Decoder:
     def _read_rows(
         self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, lod: torch.Tensor | None = None
     ) -> torch.Tensor:
-        """Returns light, float32 [N, 3], at UVs of sheets or mip levels; `row`, int [N], has their rows in
-        `AtlasModel.table`."""
+        """Returns light, float32 [N, 3], at N UVs; `row`, int [N], has for each UV the row in `AtlasModel.table` of the
+        sheet or mip level that it is in."""
         if lod is not None:
             return self._between(uv, row.long(), factors, (lod - MIP_OCTAVES + 1).clamp(0.0, 32.0))
         uv, row = uv.contiguous(), row.int().contiguous()

@@ -192,17 +192,17 @@ def compare(
     labels: Mapping[str, Labels] | None = None,
     progress: OnProgress | None = None,
 ) -> dict[str, Score]:
-    """Compares any decoders with the original lightmaps. Each view is rendered twice, for all decoders at once.
+    """Compares any decoders with the original lightmaps. All decoders share a view's two renderings.
 
     Args:
         scene: The scene with its original lightmaps.
         decoders: The decoders, by names that the result uses; see `Sampler`.
-        views: Number of cameras spread evenly around the scene, and of as many inside; or the cameras themselves. None:
+        views: Number of cameras spread evenly around the scene; as many are placed inside. Or the cameras. None:
             `VIEWS`, or `SHARED_VIEWS` for several lightmaps.
         resolution: Pixels along a side of a view, 1 to 16,384. None: `RESOLUTION` or `SHARED_RESOLUTION`.
         device: "cpu" or "cuda:N", where the decoders are called.
-        labels: By the name of a decoder, a function from points to numbers of charts or tiles: its seams lie where the
-            number changes. For other decoders, seams are the borders of the lightmaps' charts. Outlines in front of
+        labels: By the name of a decoder, a function from points to the index of their chart or tile: seams lie where
+            it changes. For other decoders, seams are the borders of the lightmaps' charts. Outlines in front of
             other surfaces are no seams.
         progress: Called with the number of views done.
 

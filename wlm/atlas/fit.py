@@ -172,9 +172,9 @@ def _lost_light(scene: LightmappedScene, model: AtlasModel, device: str) -> list
 def with_fallback(
     scene: LightmappedScene, grid: FineGrid, model: AtlasModel | None, profile: Profile, weight: torch.Tensor | None
 ) -> AtlasModel:
-    """Returns the model, or a plain smaller lightmap if one of at most as many bits has no larger weighted error.
+    """Returns the model, or a plain smaller lightmap if that has at most the model's bits and no larger weighted error.
     `weight`, float64 [2 H, 2 W], has the weights of errors in quarters of texels (cells). Without a model the smaller
-    lightmap has as many bits as the budget allows, but at least one texel or block."""
+    lightmap has as many bits as `profile.budget` allows, but at least one texel or block."""
     (sheet,), device = scene.sheets, grid.device
     height, width = sheet.mask.shape
     bits = profile.budget * sheet.mask.size * SOURCE_BITS if model is None else model.bits

@@ -173,7 +173,7 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
     counts = {len(sheet.files) for sheet in checked.sheets}
     states = checked.states or [str(i) for i in range(len(checked.sheets[0].files))]
     if counts != {len(states)}:
-        raise WlmError(f"{path}: sheets: expected {len(states)} files in each, one per state, found {sorted(counts)}")
+        raise WlmError(f"{path}: sheets: expected {len(states)} files each, one per state, found {sorted(counts)}")
     for i, each in enumerate(checked.objects or ()):
         if each.sheet >= len(checked.sheets):
             raise WlmError(f"{path}: objects[{i}].sheet: expected 0 to {len(checked.sheets) - 1}, found {each.sheet}")
@@ -275,7 +275,7 @@ def tiles_of(names: Sequence[str]) -> tuple[int, ...]:
 
 
 def _from_set(path: str, content: dict[str, Any]) -> Listing:
-    """Reads a list from a `set.json`, which is one sheet with a state for each time."""
+    """Reads the list of lightmaps in a `set.json`: one sheet (lightmap), with a state of light for each time of day."""
     entries = content["lightmaps"]
     fields = ("time_hours", "file")
     entries = entries if isinstance(entries, list) else [None]

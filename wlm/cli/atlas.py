@@ -52,10 +52,10 @@ _Lights = Annotated[
     ),
 ]
 _Mask = Annotated[
-    Path | None, typer.Option(metavar="PNG", help="PNG, not black where charts are; default from the triangles.")
+    Path | None, typer.Option(metavar="PNG", help="Valid texels: not black in this PNG; default those in triangles.")
 ]
 _UvSet = Annotated[
-    int | None, typer.Option("--uv-set", min=0, help="The lightmap UVs are TEXCOORD_n; default 1 if present, else 0.")
+    int | None, typer.Option("--uv-set", min=0, help="n of the lightmap UVs TEXCOORD_n; default 1 if present, else 0.")
 ]
 _Node = Annotated[str | None, typer.Option(help="Node that the lightmap belongs to; default the one that fits best.")]
 _Slot = Annotated[
@@ -64,7 +64,7 @@ _Slot = Annotated[
 ]
 _Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is at v = 1 instead of v = 0.")]
 _Views = Annotated[
-    int | None, typer.Option(min=1, max=4096, help=f"Cameras outside the scene, and as many inside; default {_VIEWS}.")
+    int | None, typer.Option(min=1, max=4096, help=f"Number of cameras outside, and as many inside; default {_VIEWS}.")
 ]
 _Resolution = Annotated[
     int | None, typer.Option(min=16, max=16384, help=f"Edge of a square view in pixels; default {_RESOLUTION}.")
@@ -150,11 +150,11 @@ def evaluate(
 def decode(
     file: ModelFile,
     output: Annotated[Path, output_option("OUT", "A .exr; with --view also a .png.")],
-    sheet: Annotated[int, typer.Option(min=0, help="Number of the lightmap, as wlm info lists them.")] = 0,
-    state: Annotated[float, typer.Option(min=0.0, help="Number of the state; a fraction mixes two states.")] = 0.0,
+    sheet: Annotated[int, typer.Option(min=0, help="Number of the lightmap in the list of wlm info, from 0.")] = 0,
+    state: Annotated[float, typer.Option(min=0.0, help="Number of the state, from 0; a fraction mixes two.")] = 0.0,
     view: Annotated[
         int | None,
-        typer.Option(min=0, help="Draw the view of this camera of wlm evaluate, counted from 0."),
+        typer.Option(min=0, help="Number, from 0, of a camera of wlm evaluate: draw its view instead."),
     ] = None,
     views: _Views = None,
     resolution: _Resolution = None,

@@ -53,7 +53,7 @@ _Set = Annotated[
     ),
 ]
 _Times = Annotated[
-    str | None, typer.Option(help="Times of the lightmaps in order, such as 0,6.5,12 or 0:24:1 (start:stop:step).")
+    str | None, typer.Option(help="Times of the lightmaps in order, such as 0,6.5,12 or 0:24:1 for 0,1,...,23.")
 ]
 _Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as set.json states.')]
 _Period = Annotated[
@@ -179,9 +179,9 @@ def decode(
         typer.Option(metavar="MAP.dds", help="Also write the decoded light as a DDS texture: RGB9E5 with mips."),
     ] = None,
     layer: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Layer to decode; default the first layer of radiance.")
+        str | None, typer.Option(metavar="NAME", help="Name of the layer; default the first layer of radiance.")
     ] = None,
-    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Atlas to decode; default the first.")] = None,
+    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the atlas; default the first.")] = None,
     device: Device = "cpu",
 ) -> None:
     """Decode a whole lightmap at one time."""

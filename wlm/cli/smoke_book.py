@@ -31,7 +31,7 @@ _Lightmaps = Annotated[
 ]
 _With = Annotated[
     list[Path] | None,
-    typer.Option("--with", metavar="TEXTURE", help="Second texture of a flip book; repeat for an opacity texture."),
+    typer.Option("--with", metavar="TEXTURE", help="A flip book's second texture; a second --with is its opacity."),
 ]
 _Cells = Annotated[
     str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Cells of the flip book (see --with), such as 8x8.")

@@ -2,8 +2,8 @@
 
 A grid has a transform from its voxels to the world. A grid whose voxels are cubes along the world's axes, in any order
 and direction, is only permuted and flipped. All other grids, with oblong, rotated or sheared voxels, are resampled
-trilinearly at cubic voxels, whose edge is the shortest edge of the grid's voxels. The box then grows by the voxels that
-the interpolated smoke reaches.
+trilinearly at cubic voxels, whose edge is the shortest edge of the grid's voxels. The grid's box
+then grows by the voxels outside it where interpolation is not 0.
 """
 
 import math

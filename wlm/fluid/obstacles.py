@@ -150,8 +150,10 @@ class Mesh:
         v, t = np.asarray(self.vertices), np.asarray(self.triangles)
         if v.ndim != 2 or v.shape[1] != 3 or not np.isfinite(v).all():
             raise ValueError(f"vertices: expected finite numbers of shape [V, 3], got shape {v.shape}")
-        if t.ndim != 2 or t.shape[1] != 3 or len(t) == 0 or t.min() < 0 or t.max() >= len(v):
+        if t.ndim != 2 or t.shape[1] != 3 or len(t) == 0:
             raise ValueError(f"triangles: expected indices of vertices of shape [T, 3], T >= 1, got shape {t.shape}")
+        if t.min() < 0 or t.max() >= len(v):
+            raise ValueError(f"triangles: expected vertex indices of 0 to {len(v) - 1}, got {t.min()} to {t.max()}")
         if not 0.0 < self.scale < np.inf:
             raise ValueError(f"scale: expected a number above 0, got {self.scale}")
 

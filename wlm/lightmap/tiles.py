@@ -102,7 +102,7 @@ class TileCut:
 
     Attributes:
         index: `[N]` int64, number of each tile in its grid, row-major.
-        light: For each tile `[T, h, w, 3]` float32, irradiance; h and w are 128, or less at the map's end.
+        light: For each tile `[T, h, w, 3]` float32, irradiance at T times; h and w are 128, or less at the map's end.
         mask: For each tile `[h, w]` bool, true where a texel is valid.
     """
 

@@ -65,7 +65,7 @@ def march(
     if not (math.isfinite(step) and step > 0.0):
         raise ValueError(f"step: expected a number above 0, got {step}")
     if not -1.0 < g < 1.0:
-        raise ValueError(f"g: expected a number within -1 and 1, got {g}")
+        raise ValueError(f"g: expected a number between -1 and 1, got {g}")
     check("density", density, (None, None, None))
     if 0 in density.shape:
         raise ValueError(f"density: expected at least one voxel, got {tuple(density.shape)}")

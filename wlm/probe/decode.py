@@ -68,7 +68,7 @@ class Decoder(ABC):
         """Returns a source that decodes the light of probes at positions [N, 3] whenever a volume asks for it.
 
         Raises:
-            WlmError: A position is not finite; or the model has principal components and probes at other positions.
+            WlmError: A position is not finite; or principal components are read at other positions than their probes'.
         """
 
     def own_positions(self) -> np.ndarray:

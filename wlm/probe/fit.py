@@ -154,7 +154,7 @@ def _fit_gaussians(
     finally:
         trainer.close()
     if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
-        raise WlmError(f"{probes.name}: the fit diverged; use smaller learning rates than {profile.name}")
+        raise WlmError(f"{probes.name}: the fit diverged; use smaller learning rates than profile {profile.name}")
     fitted = make(
         profile=profile.model_copy(update={"method": "gaussians"}),
         content=content,

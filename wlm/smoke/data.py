@@ -469,7 +469,7 @@ def read_shaded(
         raise WlmError(f"{path}: header attribute wlm: expected a camera as bake writes: {error}") from error
     size = next(iter(planes.values())).shape
     if size != (camera.height, camera.width):
-        raise WlmError(f"{path}: expected {camera.height} x {camera.width} pixels, as its camera has, found {size}")
+        raise WlmError(f"{path}: expected its camera's (height, width) {camera.height, camera.width}, found {size}")
     tensors = {name: torch.from_numpy(plane).to(device) for name, plane in planes.items()}
     lightmaps = torch.stack([tensors[name] for name in DIRECTIONS])
     six = SixWay(lightmaps, tensors[_TRANSPARENCY], tensors.get(EMISSION), camera, tensors.get(_DEPTH))

@@ -67,7 +67,7 @@ class SixWay:
             if plane is not None and tuple(plane.shape) != size:
                 raise ValueError(f"{name}: expected shape {size}, as the lightmaps have, got {tuple(plane.shape)}")
         if self.camera is not None and (self.camera.height, self.camera.width) != size:
-            raise ValueError(f"camera: expected the size {size}, got {(self.camera.height, self.camera.width)} pixels")
+            raise ValueError(f"camera: expected (height, width) {size}, got {(self.camera.height, self.camera.width)}")
 
     def __getitem__(self, direction: str) -> torch.Tensor:
         """Returns the lightmap of a direction, such as "front", [H, W]."""

@@ -135,11 +135,11 @@ class Drawing:
         six = smoke if isinstance(smoke, SixWay) else None
         seen = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
         if six is not None and None in self._axes:
-            raise ValueError("six: expected only directional lights, since lightmaps hold no positions")
+            raise ValueError("lights: expected only directional lights for six-way lightmaps, got a point light")
         if seen.transparency is None:
-            raise ValueError("transparency: expected lightmaps with transparency, found none")
+            raise ValueError("smoke: expected lightmaps or lit smoke with transparency, found none")
         if self._obstacles and seen.depth is None:
-            raise ValueError("six: expected lightmaps with their depth, for the obstacles")
+            raise ValueError("smoke: expected a depth, which obstacles need, found none")
         with stream(self._device):
             solids = None
             if self._obstacles:
@@ -214,7 +214,7 @@ def picture(
     """
     lit = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
     if lit.camera is None:
-        raise ValueError("six: expected lightmaps with their camera")
+        raise ValueError("smoke: expected lightmaps or lit smoke with a camera, found none")
     options = {"albedo": albedo, "background": background, "ramp": ramp, "obstacles": obstacles, "rule": rule}
     device = device_name(lit.transparency.device if lit.transparency is not None else lit.lightmaps.device)
     drawing = Drawing(lit.camera, lit.lights if lights is None else lights, **options, device=device)

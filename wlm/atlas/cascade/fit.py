@@ -211,7 +211,7 @@ def tune(
                 checkpoint.save_running(1, step.state())
         tuned = step.textures()
     if not (np.isfinite(tuned.colour).all() and np.isfinite(tuned.lut).all()):
-        raise WlmError(f"{sheet.name}: the fit diverged; expected smaller rates than those of {profile.name}")
+        raise WlmError(f"{sheet.name}: the fit diverged; use smaller learning rates than profile {profile.name}")
     return tuned
 
 

@@ -87,7 +87,7 @@ class Choice:
 
     @property
     def extent(self) -> tuple[int, int]:
-        """The texels along x and y that all components take together."""
+        """Width and height in texels of the rectangle that a tile's components take."""
         return tuple(extent(np.array([self.size.nx, self.size.ny]), np.array(self.count), self.coarse).tolist())
 
     @property

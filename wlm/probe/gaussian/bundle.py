@@ -1,7 +1,7 @@
-"""Packs Gaussians into GPU buffers: 16-bit codes and half floats, in the layout that the shader reads.
+"""Packs Gaussians and their network into GPU buffers, in the layout that the shader reads.
 
-The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here the Gaussians are stored as the 16-bit
-codes of the fit, which take as many bytes and decode exactly to the trained numbers.
+The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here the Gaussians are stored as the model's
+16-bit codes, which take as many bytes and decode exactly to the model's numbers; the network is in half floats.
 """
 
 import numpy as np

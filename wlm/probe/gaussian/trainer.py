@@ -331,7 +331,7 @@ class Trainer:
         """
         result = {key: self._tensors[key].cpu().numpy().copy() for key in _STATE}
         if not all(map(all_finite, result.values())):
-            raise WlmError(f"the fit diverged; use smaller learning rates than {self._name}")
+            raise WlmError(f"the fit diverged; use smaller learning rates than profile {self._name}")
         return result | {"kept": self.needed.copy(), "entered": np.array(self._entered)}
 
     def table(self, step: int) -> dict[str, Part]:
