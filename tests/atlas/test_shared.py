@@ -325,7 +325,7 @@ def test_what_a_list_of_lightmaps_says_wrong(tmp_path):
         return error_of(load, path, lists)
 
     assert "no material has a lightmap (MOZ_lightmap, " in error_of(load, path)
-    assert "sheets: expected 2 files in each, one per state, found [1]" in told(states=["a", "b"])
+    assert "sheets: expected 2 files each, one per state, found [1]" in told(states=["a", "b"])
     assert "objects[0].sheet: expected 0 to 0, found 3" in told(objects=[{"node": "left", "sheet": 3}])
     assert "node: expected one of left, right, found 'top'" in told(objects=[{"node": "top", "sheet": 0}])
     twice = [{"node": "left", "sheet": 0}, {"node": "left", "sheet": 0, "scale_offset": [1, 1, 0.5, 0]}]

@@ -366,7 +366,7 @@ REFUSED = [
     ("march", {"origin": torch.zeros(40, 3).requires_grad_()}, "origin: expected a tensor that requires no gradient"),
     ("march", {"emission": torch.zeros(6, 7, 8)}, "emission: expected float32 [6, 7, 8, 3], got"),
     ("march", {"step": 0.0}, "step: expected a number above 0, got 0.0"),
-    ("march", {"g": 1.0}, "g: expected a number within -1 and 1, got 1.0"),
+    ("march", {"g": 1.0}, "g: expected a number between -1 and 1, got 1.0"),
     (
         "plane",
         {"points": np.zeros((5, 2))},
