@@ -216,7 +216,7 @@ def test_wrong_files(tmp_path: Path):
     refused("a_1.png: cannot read the picture")
     write_book(_book(_frames(1)), tmp_path / "a.png")
     refused("expected sides that divide into 4 rows and 4 columns, found 6 x 9", cells=4)
-    refused("expected sides that divide into 12 rows and 12 columns, found 9x6 pixels", cells=12)
+    refused("expected sides that divide into 12 rows and 12 columns, found 6 x 9", cells=12)
     Image.new("RGB", (9, 5)).save(paths[1])
     refused("textures of one size")
     Image.new("L", (9, 6)).save(paths[1])
