@@ -8,8 +8,9 @@ import numpy as np
 from wlm.bundle import Texture
 from wlm.errors import WlmError
 from wlm.formats.bc7 import decode_image
-from wlm.formats.dds import DXGI_FORMATS, MOST_SIDE, write_dds
+from wlm.formats.dds import DXGI_FORMATS, write_dds
 from wlm.formats.exr import write_exr
+from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.ktx2 import write_ktx2
 from wlm.formats.shared_exponent import unpack_rgb9e5
 
