@@ -1,6 +1,7 @@
 """Lines about what is assumed of a set of lightmaps, the same from `wlm compress` and `wlm inspect`."""
 
 import hashlib
+import os
 from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -56,7 +57,7 @@ def _equal(sources: Sequence[Source | None], digests: dict[Path, bytes]) -> list
     """Returns groups of indices of pictures that are byte for byte equal; keeps the hash of each file that is read."""
     sizes: dict[tuple[int, ...], list[tuple[int, Path]]] = {}
     for i, source in enumerate(sources):
-        if source is not None and source.path.is_file():
+        if source is not None and os.path.isfile(source.path):  # False for a name that is too long
             key = source.path.stat().st_size, source.slice, source.slices
             sizes.setdefault(key, []).append((i, source.path))
     groups: dict[tuple[object, ...], list[int]] = {}
