@@ -18,7 +18,7 @@ from PIL import Image
 import wlm
 from wlm.formats import scratch
 from wlm.formats.channels import read_channels
-from wlm.formats.exr import read_exr, write_exr, write_part
+from wlm.formats.exr import read_exr, write_exr, write_planes
 from wlm.formats.light import read_light
 from wlm.lightmap.data import Layer, LightmapSet, from_layers, parse_times
 from wlm.lightmap.hours import hours_of_names
@@ -593,7 +593,7 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
     write_exr(tmp_path / "stacked.exr", stacked, half=False)
     names = ("x.R", "x.G", "y.R", "B", "G", "R")
     planes = {name: random.uniform(-1.0, 1.0, (6, 8)).astype(np.float32) for name in names}
-    write_part(tmp_path / "more.exr", planes, read_channels)
+    write_planes(tmp_path / "more.exr", planes, whole=names)
     small = random.random((3, 5, 3)).astype(np.float32)
     write_exr(tmp_path / "small.exr", small, half=False)
     Image.fromarray(np.uint8([[0, 255, 255, 0, 128]] * 3)).save(tmp_path / "grey.png")
@@ -616,7 +616,7 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
     np.testing.assert_array_equal(values_of(chosen, "small", "L0")[0], small)
     assert values_of(chosen, "small", "L1").shape == (1, 3, 5, 1)
     assert [own.mask.sum() for own in chosen.sheets.values()] == [40, 40, 15, 15]
-    write_part(tmp_path / "order.exr", dict.fromkeys(("A", "B", "BA", "G", "R"), planes["R"]), read_channels)
+    write_planes(tmp_path / "order.exr", dict.fromkeys(("A", "B", "BA", "G", "R"), planes["R"]))
     assert read_channels(tmp_path / "order.exr")[1] == ("R", "G", "B", "A", "BA")
     layers["dir"]["channels"] = ["G", "R"]
     both = write_set_json(

@@ -198,8 +198,7 @@ def decode(
     quiet_warp()
     import numpy as np
 
-    from wlm.formats.channels import read_channels
-    from wlm.formats.exr import HALF_MAX, write_part
+    from wlm.formats.exr import write_planes
     from wlm.lightmap.runtime_texture import write_texture
     from wlm.system import load
 
@@ -210,9 +209,7 @@ def decode(
     decoder = model.decoder(device)
     frame = decoder.frame(time, layer, atlas)
     names = [name for sheet in sheets for name in sheet.channels]
-    planes = np.moveaxis(np.clip(frame, -HALF_MAX, HALF_MAX).astype(np.float16), 2, 0)
-    channels = {name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)}
-    write_part(output, channels, read_channels)
+    write_planes(output, dict(zip(names, np.moveaxis(frame, 2, 0), strict=True)))
     if texture is not None:
         write_texture(texture, model.sheets[sheets[0]], time, device)
     facts = {"file": output, "time": time, "layer": sheets[0].layer, "atlas": sheets[0].atlas, "channels": names}
