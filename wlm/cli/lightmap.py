@@ -53,11 +53,18 @@ _Set = Annotated[
     ),
 ]
 _Times = Annotated[
-    str | None, typer.Option(help="Times of the lightmaps in order, such as 0,6.5,12 or 0:24:1 for 0,1,...,23.")
+    str | None,
+    typer.Option(
+        help="Times of the lightmaps in the order of set.json or of their names, such as 0,6.5,12 or 0:24:1 for "
+        "0,1,...,23; default as set.json or the names state."
+    ),
 ]
 _Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as set.json states.')]
 _Period = Annotated[
-    float | None, typer.Option(help="Length of the day, in the times' unit; default as set.json states.")
+    float | None,
+    typer.Option(
+        help="Length of the day, in the unit of the times; default that of set.json, or 24 for hours in names."
+    ),
 ]
 _Layers = Annotated[
     str | None, typer.Option(metavar="NAMES", help="Layers of the set to read, separated by commas; default all.")
