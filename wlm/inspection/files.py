@@ -276,8 +276,9 @@ def _kind_of_json(path: Path) -> str:
 
     if holds_probes(content):
         return "probes"
+    points = content.get("position") if isinstance(content, dict) else content
     with suppress(WlmError):
-        if isinstance(content, dict) or not any(isinstance(each, dict) for each in content):
+        if isinstance(points, list) and points and isinstance(points[0], list):
             load_positions(path)
             return "positions"
     return "json"
@@ -294,7 +295,7 @@ def _positions(path: Path) -> Finding:
     from wlm.probe.data import load_positions
 
     use = "for --positions of wlm decode and --walk of wlm view"
-    return Finding(path, f"{len(load_positions(path)):,} positions without light, {use}")
+    return Finding(path, f"{count_of(load_positions(path), 'position')} without light, {use}")
 
 
 def _settings(path: Path) -> Finding:

@@ -24,9 +24,10 @@ from wlm.inspection.files import (
     scene_command,
 )
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
-from wlm.inspection.pictures import Picture, picture_of, said
-from wlm.inspection.sets import UNREADABLE_SET, inspect_set, named, together
-from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders, time_of_name
+from wlm.inspection.pictures import Picture, picture_of, said, size_of
+from wlm.inspection.sets import UNREADABLE_SET, assumed, inspect_set, named, together
+from wlm.lightmap.hours import hours_of_names
+from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders
 
 MOST = 256
 """Most findings of `inspect`, and most folders that it visits."""
@@ -204,30 +205,23 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
     if not states or (folder / SET_FILE).is_file():
         return []
     held = {state: [entry for entry in _entries(state) if "_comp_" in entry.name.lower()] for state in states}
-    times = [time_of_name(state.name) for state in states]
     problems: list[str] = []
-    options: list[str] = []
-    if len(states) > 1 and None in times:
-        options += ["--times", f"0:{len(states)}:1"]
+    times, options = None, list[str]()
+    if len(states) > 1 and None in hours_of_names([state.name for state in states])[0]:
+        times, options = range(len(states)), ["--times", f"0:{len(states)}:1"]
         problems.append(f"the hours of {', '.join(state.name for state in states[:8])} are unknown: change --times")
-    stated: list[float] = [float(i) for i in range(len(states))]
-    try:
-        listing = list_set(folder, stated)
-    except WlmError as error:
-        problems.append(said(error, folder))
-        shared = ["light", *(name for name in ("dir", "shadowmask") if _lists(folder, stated, ["light", name]))]
-        options += ["--layers", ",".join(shared)]
-        listing = list_set(folder, stated, shared)
+    listing = list_set(folder, times)
     sizes, words = [], compress_command(folder, *options)
     for atlas in listing.atlases:
-        paths = [one[atlas.name, "light"].path for one in listing.states]
+        paths = [one[key].path for one in listing.states for key in [(atlas.name, "light")] if key in one]
         try:
             heads = [picture_of(path) for path in paths]
-            sizes += sorted({head.size for head in heads if head is not None})
+            sizes += sorted({size_of(path) for path in paths})
             problems += [f"{atlas.name}: {text}" for text in together(paths, heads)[0]]
         except WlmError as error:
             words = ""
             problems.append(said(error, folder))
+    problems += assumed(listing)
     names = ", ".join(layer.name for layer in listing.layers)
     size = " and ".join(dict.fromkeys(sizes))
     maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"
@@ -244,14 +238,6 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
         if entry not in its and entry.is_file() and not _is_ignored(entry)
     ]
     return [(finding, set(states)), *((inspect_file(entry), set()) for entry in rest)]
-
-
-def _lists(folder: Path, times: list[float], layers: list[str]) -> bool:
-    try:
-        list_set(folder, times, layers)
-    except WlmError:
-        return False
-    return True
 
 
 def _godot(folder: Path, files: Sequence[Path]) -> _Found:
@@ -356,16 +342,16 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
         if not size:
             # The charts show which lightmap belongs to which mesh of the scene.
             return [_of_mesh(folder, f"{what} of different UV layouts, not times of one", mesh, pictures, problems)]
-        times, what = None, f"{what} of {size}"
-        if any(time_of_name(file.stem) is None for file in pictures):
-            times = [float(i) for i in range(len(pictures))]
+        times, options, what = None, list[str](), f"{what} of {size}"
+        if None in hours_of_names([file.stem for file in pictures])[0]:
+            times, options = range(len(pictures)), ["--times", f"0:{len(pictures)}:1"]
             problems.append("the names state no hours: are they one lightmap at several times? Then change --times")
         if others := [file for file in _entries(folder) if file.suffix.lower() in SUFFIXES and file not in pictures]:
             raise WlmError(
                 f"{others[0].name} is no lightmap that can be read: move it, or list the others in a {SET_FILE}"
             )
-        list_set(folder, times)
-        words = compress_command(folder, *(() if times is None else ("--times", f"0:{len(times)}:1")))
+        problems += assumed(list_set(folder, times))
+        words = compress_command(folder, *options)
     except WlmError as error:
         problems.append(said(error, folder))
     taken = {*pictures, folder / "mask.png"} & set(files)

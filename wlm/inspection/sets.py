@@ -6,9 +6,10 @@ from pathlib import Path
 from wlm.errors import WlmError
 from wlm.formats.light import noted
 from wlm.inspection.finding import Finding, compress_command
-from wlm.inspection.pictures import Picture, picture_of, read_lit, said
+from wlm.inspection.pictures import Picture, picture_of, read_lit, said, size_of
+from wlm.lightmap.assumptions import set_lines, size_line
 from wlm.lightmap.layout import PICTURES, odd_layout, spread
-from wlm.lightmap.listing import count_of, list_set
+from wlm.lightmap.listing import Listing, count_of, list_set
 from wlm.lightmap.sheet import LIGHT
 
 UNREADABLE_SET = "a lightmap set that cannot be read"
@@ -29,12 +30,10 @@ def inspect_set(path: Path) -> Finding:
             names = ", ".join(layer.name for layer in listing.layers)
             what = f"{what}: {count_of(listing.atlases, 'atlas')} with {names}"
         else:
-            heads = [picture_of(file) for file in files]
             stored = listing.layers[0].stored
-            problems, size = ([], "") if stored else together(files, heads)
-            size = size or next((head.size for head in heads if head is not None and head.width), "an unknown size")
-            what = f"{what}, {size}" + (f", stored as {stored}" if stored else "")
-        return Finding(folder, what, compress_command(folder), tuple(problems))
+            what = f"{what}, {size_of(files[0])}" + (f", stored as {stored}" if stored else "")
+            problems = [] if stored else together(files, [picture_of(file) for file in files])[0]
+        return Finding(folder, what, compress_command(folder), (*problems, *assumed(listing)))
     except WlmError as error:
         return Finding(folder, UNREADABLE_SET, problems=(said(error, path),))
 
@@ -46,6 +45,22 @@ def named(path: Path, files: Sequence[Path]) -> set[Path]:
     except WlmError:
         return set()
     return {*listing.files, *(Path(str(atlas.mask)) for atlas in listing.atlases)} & set(files)
+
+
+def assumed(listing: Listing) -> list[str]:
+    """Returns the lines about times, states and sizes of a set that `wlm compress` prints, too."""
+    lines = list(set_lines(listing))
+    for atlas in listing.atlases:
+        lead = ""
+        for layer in listing.light_first:
+            source = next(
+                (state[atlas.name, layer.name] for state in listing.states if (atlas.name, layer.name) in state), None
+            )
+            size = "" if source is None else size_of(source.path, source.slices)
+            if lead and size and size != lead:
+                lines.append(size_line(atlas.name, layer.name, size, lead))
+            lead = lead or size
+    return lines
 
 
 def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[list[str], str]:

@@ -151,7 +151,7 @@ def write_kit(
         "resolution": lattice.count.tolist(),
     }
     for name, (fmt, texels) in textures.items():
-        write_dds(folder / name, texels.tobytes(), width, height, depth, fmt, volume=True)
+        write_dds(folder / name, texels.tobytes(), width, height, fmt, depth)
     (folder / SHADER_FILE).write_text(text, encoding="utf-8")
     write_index(folder / INFO_FILE, document)
     return {"about": _ABOUT}
