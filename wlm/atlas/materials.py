@@ -27,7 +27,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from wlm.atlas.listing import Listing, SheetFiles, has_lightmap, numbers
+from wlm.atlas.listing import Listing, SheetFiles, numbers
 from wlm.errors import WlmError, one_line
 from wlm.formats.gltf import (
     GltfDocument,
@@ -43,6 +43,7 @@ from wlm.formats.gltf_slots import IDENTITY, SLOTS, lightmap_transform
 from wlm.formats.gltf_writer import Replacement, encode_glb
 from wlm.formats.levels import HEAD, level_kind
 from wlm.formats.reading import open_file
+from wlm.formats.unity_asset import has_lightmap
 
 # Extensions of materials: the field of the texture (None: the extension itself), the field of the factor, the UV set
 # without texCoord.
