@@ -142,7 +142,9 @@ def _unpack_primitives(
         places = [(name, primitive["attributes"][name], number) for name, number in packed["attributes"].items()]
         for name, place, number in [*places, ("indices", primitive.get("indices"), -1)]:
             if place is None or f"{mesh},{number}" not in arrays:
-                raise WlmError(f"{path}: {where}: {name}: expected both an accessor and compressed data, found at most one")
+                raise WlmError(
+                    f"{path}: {where}: {name}: expected both an accessor and compressed data, found at most one"
+                )
             accessor, data = content["accessors"][place], arrays[f"{mesh},{number}"]
             data = data.reshape(-1, 1) if number == -1 else data
             if len(data) != accessor["count"]:
