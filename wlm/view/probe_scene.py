@@ -8,16 +8,16 @@ from typing import Self
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+from trimesh.creation import icosphere
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
-from wlm.formats.hdr_blocks import need
 from wlm.ops.plain import rotations
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
 from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius
-from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
+from wlm.probe.sphere import irradiance, irradiance_weights, sh_count, unit_or_zero
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import Light, StoredLight
 from wlm.probe.volume.walk import camera_path, settle
@@ -173,7 +173,8 @@ class _ProbeScene(Scene):
         self._surface: np.ndarray | None = None
         if self.geometry is not None:
             at_vertices = probes.decode(self.geometry.position.astype(np.float64))
-            self._surface = _facing(at_vertices.reshape(-1, probes.coefficients, 3), _normals(self.geometry)) / math.pi
+            weights = irradiance_weights(_normals(self.geometry), probes.coefficients)
+            self._surface = np.einsum("vc,vcd->vd", weights, at_vertices.reshape(*weights.shape, 3)) / math.pi
 
     def draw(self, canvas: Canvas, state: State) -> None:
         display = state.display(self._brightness)
@@ -293,9 +294,8 @@ def _mean(values: np.ndarray) -> str:
 
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns vertices [V, 3] of unit length and triangles [F, 3] of a sphere."""
-    sphere = need("pyvista", "view").Icosphere(nsub=subdivisions)
-    points = np.asarray(sphere.points, np.float64)
-    return points / np.linalg.norm(points, axis=1, keepdims=True), sphere.regular_faces
+    sphere = icosphere(subdivisions=subdivisions)
+    return np.array(sphere.vertices), np.array(sphere.faces)
 
 
 def _block() -> tuple[np.ndarray, np.ndarray]:
@@ -314,12 +314,4 @@ def _normals(geometry: Geometry) -> np.ndarray:
     total = np.zeros(geometry.position.shape)
     for corner in range(3):
         np.add.at(total, geometry.triangle[:, corner], normal)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.maximum(length, 1e-30), [0.0, 1.0, 0.0])
-
-
-def _facing(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Returns the irradiance, float64 [V, 3], of spherical harmonics [V, C, 3] at normals [V, 3]."""
-    count = values.shape[1]
-    factors = [cosine_factor(band) for band in coefficient_bands(count).tolist()]
-    return np.einsum("vc,vcd->vd", basis(normals, count) * factors, values)
+    return np.where(total.any(1, keepdims=True), unit_or_zero(total), [0.0, 1.0, 0.0])

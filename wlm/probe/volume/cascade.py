@@ -22,6 +22,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
+from wlm.probe.sphere import unit_or_zero
 from wlm.probe.volume.index import BlockIndex, finest_side
 from wlm.probe.volume.light import Light
 from wlm_kernels.probe import volume as kernels
@@ -352,8 +353,7 @@ def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     normal = np.asarray(normal, np.float64)
     if normal.shape != shape or not np.isfinite(normal).all():
         raise ValueError(f"normal: expected finite numbers {list(shape)}, got {list(normal.shape)}")
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return (normal / np.where(length > 0, length, 1.0)).astype(np.float32)
+    return unit_or_zero(normal).astype(np.float32)
 
 
 def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, rows: int) -> None:
