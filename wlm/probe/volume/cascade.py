@@ -278,9 +278,7 @@ class Volume:
     def _work(self) -> None:
         """Runs the part of a frame that a CUDA graph contains."""
         work, windows = self._frame_work, self._windows
-        frame_kernels.scroll(self._index, windows, self._pool_rows, self.side, work)
-        frame_kernels.choose(windows, self.side, work)
-        frame_kernels.allocate(windows, self._pool_rows, work)
+        frame_kernels.select(self._index, windows, self._pool_rows, self.side, work)
         if self.index.count == 0 or (self.device == "cpu" and not (work.taken.numpy() >= 0).any()):
             return
         frame_kernels.search(self._index, windows, self.side, work)
