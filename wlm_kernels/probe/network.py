@@ -87,18 +87,9 @@ class NetworkKernels:
             base, count: Index of the first probe and number of probes of this launch, on the CPU alone; default all.
         """
         probes = groups.x.shape[0]
-        if self.device_kind == "cuda":
-            dims = (probes // self.probes, THREADS)
-        else:
-            dims = probes if count is None else count
-        wp.launch(
-            self._kernel,
-            dims,
-            inputs=[groups.x, groups.count, f, target, weight, net, base],
-            outputs=[grad_f, partial, loss],
-            device=net.device,
-            block_dim=THREADS,
-        )
+        dims = (probes // self.probes, THREADS) if self.device_kind == "cuda" else count or probes
+        inputs, outputs = [groups.x, groups.count, f, target, weight, net, base], [grad_f, partial, loss]
+        wp.launch(self._kernel, dims, inputs=inputs, outputs=outputs, device=net.device, block_dim=THREADS)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Packs Gaussians and their network into GPU buffers, in the layout that the shader reads.
 
-The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here the Gaussians are stored as the model's
-16-bit codes, which take as many bytes and decode exactly to the model's numbers; the network is in half floats.
+The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here a number of a Gaussian is the model's
+16-bit code, as many bytes, which decodes exactly to the model's number; a weight of the network is a half float.
 """
 
 import numpy as np

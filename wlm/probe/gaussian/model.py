@@ -20,6 +20,7 @@ ellipsoid with its axes in another order. The rotation with the smallest angle i
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -156,7 +157,7 @@ class Gaussians(Content):
 
     def layers(self) -> list[np.ndarray]:
         """Returns the three layers of `net`, float16, as `layer_shapes` describes them."""
-        return _split(self.net, layer_shapes(self.latent, self.hidden, self.outputs))
+        return split_layers(self.net, layer_shapes(self.latent, self.hidden, self.outputs))
 
     def facts(self) -> dict[str, Any]:
         return {"gaussians": self.count, "dropped": self.dropped, "latent": self.latent, "hidden": self.hidden}
@@ -197,7 +198,7 @@ class Gaussians(Content):
         steps = (stored["steps"].astype(np.uint32) << 16).view(np.float32).astype(np.float64)
         if not (np.isfinite(steps).all() and (steps > 0).all()):
             raise ValueError("part steps: expected finite quantisation steps above 0")
-        first, second, third = _split(stored["network"].astype(np.int64), layer_shapes(latent, hidden, outputs))
+        first, second, third = split_layers(stored["network"].astype(np.int64), layer_shapes(latent, hidden, outputs))
         whole = WholeNumbers(
             gaussians=stored["gaussians"].T.astype(np.int64) + stored["lowest"],
             step=steps[: STORED_LATENT.start + latent],
@@ -226,9 +227,10 @@ class Gaussians(Content):
             raise ValueError("parts network, gaussians and gain: expected light within the range of float32")
 
 
-def _split(net: np.ndarray, shapes: list[tuple[int, int]]) -> list[np.ndarray]:
-    parts = np.split(net, np.cumsum([rows * columns for rows, columns in shapes])[:-1])
-    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+def split_layers(net: Any, shapes: list[tuple[int, int]]) -> list[Any]:
+    """Splits an array or a tensor of all weights, [P], into layers of these shapes."""
+    ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
+    return [net[start:end].reshape(shape) for (start, end), shape in zip(pairwise(ends), shapes, strict=True)]
 
 
 def gaussian_bytes(count: int, latent: int, hidden: int, outputs: int) -> int:
