@@ -115,7 +115,7 @@ def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]
     textures = {AMBIENT_FILE: (ambient, _AMBIENT)}
     textures |= {name: (np.ascontiguousarray(ratios[:, i]), _RATIOS) for i, name in enumerate(SH_FILES)}
     for name, (texels, form) in textures.items():
-        write_dds(folder / name, texels.tobytes(), width, height, depth, form, volume=True)
+        write_dds(folder / name, texels.tobytes(), width, height, form, depth)
     text = _SHADER
     for mark, numbers in (("@CORNER@", corner), ("@SIZE@", size)):
         text = text.replace(mark, ", ".join(f"{number:.9e}" for number in numbers))
