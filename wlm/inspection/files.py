@@ -260,7 +260,7 @@ def _kind_of_json(path: Path) -> str:
         if "lightmaps" in content:
             return "set"
     # This imports scipy.
-    from wlm.probe.json_fields import holds_probes
+    from wlm.probe.fields import holds_probes
 
     return "probes" if holds_probes(content) else "json"
 
