@@ -272,7 +272,7 @@ def _kind_of_json(path: Path) -> str:
                 return kind
     # This imports scipy.
     from wlm.probe.data import load_positions
-    from wlm.probe.json_fields import holds_probes
+    from wlm.probe.fields import holds_probes
 
     if holds_probes(content):
         return "probes"
