@@ -8,7 +8,7 @@ It shares no code with the kernels: streaming finds for each cell and direction 
 collision uses Hermite polynomials.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,14 +26,14 @@ class Box:
         c, w: Velocities [Q, 3] and weights [Q].
         solid: int [X, Y, Z], 0 is fluid.
         faces: For some of `FACES`: one of `RANKS`, and the velocity or the density (None: mass is conserved).
-        motion: (body, position in cells) -> velocity of its surface.
+        velocity: Velocity of the solids.
     """
 
     c: np.ndarray
     w: np.ndarray
     solid: np.ndarray
     faces: dict[str, tuple[str, object]] = field(default_factory=dict)
-    motion: Callable = lambda body, x: np.zeros(3)
+    velocity: Sequence[float] = (0.0, 0.0, 0.0)
 
     def crossed(self, source: np.ndarray) -> list[int]:
         """The faces, by their numbers in `FACES`, beyond which a cell lies; periodic ones don't count."""
@@ -104,10 +104,8 @@ def stream(box: Box, f: np.ndarray) -> np.ndarray:
             face = box.face_of(source)
             if face is None:
                 inside = tuple(source % shape)
-                body = int(box.solid[inside])
-                if body:
-                    velocity = box.motion(body, np.array(cell) + 0.5 - 0.5 * c[q])
-                    out[cell][q] = leaves + 2 * w[q] * (c[q] @ velocity) / CS2
+                if box.solid[inside]:
+                    out[cell][q] = leaves + 2 * w[q] * (c[q] @ np.asarray(box.velocity)) / CS2
                     balance += out[cell][q] - leaves
                 else:
                     out[cell][q] = f[inside][q]
