@@ -13,7 +13,7 @@ from wlm_kernels.fluid.lattice import CAUSES, Spec, step_kernel, trouble_of
 from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import LATTICES
 
-STEPS = 4
+STEPS = 3
 SHAPE = (5, 4, 3)
 TOLERANCE = 3e-7  # of a velocity of 0.05 and a density of 1
 HALF_TOLERANCE = 3e-5
