@@ -9,7 +9,7 @@ from reference import lattice as reference
 
 from wlm.fluid import engine
 from wlm.fluid.lattice import Lattice
-from wlm_kernels.fluid.lattice import CAUSES, Spec, step_kernel, trouble_of
+from wlm_kernels.fluid.lattice import CAUSES, trouble_of
 from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import LATTICES
 
@@ -224,17 +224,6 @@ def test_thin_domains(device: str):
     for shape in ((1, 1, 1), (2, 1, 3), (1, 4, 2)):
         _run(Pair("D3Q19", device, shape=shape))
         _run(Pair("D3Q19", device, faces=BOXES["lids"], shape=shape))
-
-
-def test_spec_is_checked():
-    for wrong in (
-        {"lattice": "D3Q19", "operator": "trt"},
-        {"lattice": "D3Q19", "storage": "bfloat16"},
-        {"lattice": "D3Q15"},
-    ):
-        with pytest.raises(ValueError):
-            Spec(**wrong)
-    assert step_kernel(Spec("D2Q9")) is step_kernel(Spec("D2Q9")), "a kernel is built once"
 
 
 def test_trouble_of_decodes_a_key():
