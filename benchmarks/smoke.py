@@ -38,7 +38,7 @@ from benchmarks.runner import Bench, Note
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream, to_warp, torch_memory
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import RULES, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.coarse import Guide, guide
