@@ -30,6 +30,15 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
     Raises:
         WlmError: One line with the file, the field, what was expected and what was found.
     """
+    return check_settings(cls, read_yaml(path), f"{path}: ")
+
+
+def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
+    """Reads a YAML file that is one mapping.
+
+    Raises:
+        WlmError: The file cannot be read, or has other content.
+    """
     try:
         text = read_file(path, SETTINGS_BYTES, "the settings").decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -50,7 +59,7 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
         raise WlmError(f"{path}: expected a mapping of settings, found an empty file")
     if not isinstance(values, dict):
         raise WlmError(f"{path}: expected a mapping of settings, found {_shown(values)}")
-    return check_settings(cls, values, f"{path}: ")
+    return values
 
 
 def check_settings(

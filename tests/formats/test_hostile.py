@@ -388,7 +388,7 @@ def test_a_mask_is_a_png_whatever_else_its_name_hides(tmp_path, kind):
 
 
 def test_pictures_that_claim_more_than_they_hold(tmp_path):
-    assert "expected at most 268435456 texels" in refused(read_exr, FILES / "b44-wide.exr")
+    assert "at most 268435456 texels" in refused(read_exr, FILES / "b44-wide.exr")
     write_exr(tmp_path / "a.exr", np.ones((4, 4, 3), np.float32))
     content = (tmp_path / "a.exr").read_bytes()
     at = content.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4

@@ -62,7 +62,7 @@ def test_grid():
     for index in (-1, 6):
         with pytest.raises(WlmError, match="outside the grid"):
             grid.origin(index)
-    with pytest.raises(WlmError, match="at least 1x1"):
+    with pytest.raises(WlmError, match="at least one texel"):
         TileGrid.of(0, 5)
 
 
