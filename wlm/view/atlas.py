@@ -75,7 +75,9 @@ def comparison(
         WlmError: The mesh is visible in no view, or the file cannot be written.
     """
     if not samplers or not views:
-        raise ValueError("expected at least one decoder and one view")
+        raise ValueError(
+            f"expected at least one decoder and one view, got {len(samplers)} decoders and {len(views)} views"
+        )
     drawn = {}
     for number, view in enumerate(views, 1):
         pictures, hit = draw(scene, {"original": original(scene, device), **samplers}, view, resolution, device)
@@ -84,7 +86,7 @@ def comparison(
             window = tuple(slice(int(line.argmax()), len(line) - int(line[::-1].argmax())) for line in lines)
             drawn[f"view {number}"] = {name: picture[window] for name, picture in pictures.items()}, hit[window]
     if not drawn:
-        raise WlmError(f"{scene.name}: cannot draw it: no view shows it")
+        raise WlmError(f"{scene.name}: cannot draw the scene: none of the cameras sees a surface with a lightmap")
     white = white_of(np.concatenate([pictures["original"][hit] for pictures, hit in drawn.values()]))
     rows = {}
     for label, (pictures, hit) in drawn.items():

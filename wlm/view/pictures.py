@@ -27,7 +27,7 @@ def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray
         ValueError: `white` is not above 0.
     """
     if not 0 < white < math.inf:
-        raise ValueError(f"white: expected a number above 0, got {white}")
+        raise ValueError(f"white: expected the radiance to show as white, a number above 0, got {white}")
     pixels = np.asarray(light.cpu() if isinstance(light, torch.Tensor) else light, np.float32)
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
@@ -74,10 +74,12 @@ def contact_sheet(
     counts = {len(row) for row in rows.values()}
     uneven = any(len({cell.shape for cell in row}) > 1 for row in rows.values())
     if len(counts) != 1 or 0 in counts or columns < 1 or uneven:
-        raise ValueError(f"expected rows of as many pictures of one size, got {sorted(counts)}")
+        raise ValueError(
+            f"rows: expected as many pictures in each row, of one size in a row, got rows of {sorted(counts)} pictures"
+        )
     (count,) = counts
     if titles and len(titles) != count:
-        raise ValueError(f"titles: expected {count}, got {len(titles)}")
+        raise ValueError(f"titles: expected a title for each of a row's {count} pictures, got {len(titles)} titles")
     chosen = [int(i) for i in np.unique(np.linspace(0, count - 1, min(columns, count)).round())]
     width, heights = max(row[0].shape[1] for row in rows.values()), [row[0].shape[0] for row in rows.values()]
     font = ImageFont.load_default(_FONT)
