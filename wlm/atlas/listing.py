@@ -165,10 +165,8 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
         if each.sheet >= len(checked.sheets):
             raise WlmError(f"{path}: objects[{i}].sheet: expected 0 to {len(checked.sheets) - 1}, found {each.sheet}")
     objects = None if checked.objects is None else tuple(checked.objects)
-    line = (
-        f"{path}: {unlit} objects have no lightmap (Unity's number -1, 65534 or 65535): they are not compressed, and "
-    )
-    notes = (f"{line}only hide others in the views of wlm evaluate",) * (unlit > 0)
+    line = f"{path}: {unlit} objects have no lightmap (their lightmap's number is -1, 65534 or 65535)"
+    notes = (f"{line}: in rendered views they hide what is behind them",) * (unlit > 0)
     return Listing(str(path), tuple(states), tuple(checked.sheets), objects, checked.uv_set, notes=notes)
 
 
