@@ -88,16 +88,16 @@ def compress(
         if choice in _PACKAGES:  # a missing package is reported now, not after minutes
             need(_PACKAGES[choice], "atlas")
     stages = Stages(device, progress, checkpoint)
-    if method == "shared":
-        try:
+    try:
+        if method == "shared":
             with one_thread(device):
                 model = fit_shared(scene, profile, seed, stages)
-        except KeyboardInterrupt:
-            if checkpoint is not None:
-                checkpoint.flush()  # finished batches that are not written yet
-            raise
-    else:
-        model = _fit_one(scene, profile, method, seed, stages)
+        else:
+            model = _fit_one(scene, profile, method, seed, stages)
+    except KeyboardInterrupt:
+        if checkpoint is not None:
+            checkpoint.flush()  # finished batches that are not written yet
+        raise
     for place in model.rows:
         texels = model.texels.size + model.block_texels.size
         check_area(place.size, texels // 3, model.lut[..., 0].size)

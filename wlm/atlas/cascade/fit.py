@@ -69,26 +69,26 @@ def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters 
         return None
     # A black lightmap may use any number, since its triangles are all alike.
     brightest = float(sheet.lightmap[sheet.mask].max()) or 1.0
+    triangle = Part(np.int32, (count := len(sheet.triangle),), least=0, most=count - 1)
+    table = {
+        "group": triangle,
+        "representative": Part(np.int32, (None,), least=0, most=count - 1),
+        "order": Part(np.int8, (count,), least=0, most=len(ORDERS) - 1),
+        "distance": Part(np.float64, (count,), least=0.0),
+        "excluded": Part(np.bool_, (count,)),
+    }
+
+    def make() -> dict[str, np.ndarray]:
+        limits = {"threshold": profile.threshold, "colour_threshold": profile.colour_threshold}
+        limits["max_radiance"] = brightest if profile.max_radiance is None else profile.max_radiance
+        options = {"active": sheet.active, "device": stages.device, "progress": stages.progress}
+        return vars(cluster(sheet.uv, sheet.triangle, sheet.lightmap, **limits, **options))
+
     with stages("cluster"):
-        if (
-            stages.checkpoint is not None
-            and (kept := _kept_clusters(stages.checkpoint, len(sheet.triangle))) is not None
-        ):
-            return kept
-        clusters = cluster(
-            sheet.uv,
-            sheet.triangle,
-            sheet.lightmap,
-            threshold=profile.threshold,
-            colour_threshold=profile.colour_threshold,
-            max_radiance=brightest if profile.max_radiance is None else profile.max_radiance,
-            active=sheet.active,
-            device=stages.device,
-            progress=stages.progress,
-        )
-        if stages.checkpoint is not None:
-            stages.checkpoint.add_finished(0, vars(clusters))
-        return clusters
+        clusters = Clusters(**stages.batch(0, table, make))
+    if clusters.group.max() >= len(clusters.representative):
+        raise WlmError(f"{stages.checkpoint.path}: the groups of triangles are damaged: a group has no representative")
+    return clusters
 
 
 def fit_cascade(
@@ -215,22 +215,6 @@ def tune(
     return tuned
 
 
-def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
-    triangle = Part(np.int32, (count,), least=0, most=count - 1)
-    table = {
-        "group": triangle,
-        "representative": Part(np.int32, (None,), least=0, most=count - 1),
-        "order": Part(np.int8, (count,), least=0, most=len(ORDERS) - 1),
-        "distance": Part(np.float64, (count,), least=0.0),
-        "excluded": Part(np.bool_, (count,)),
-    }
-    if (kept := checkpoint.finished(0, table)) is None:
-        return None
-    if kept["group"].max() >= len(kept["representative"]):
-        raise WlmError(f"{checkpoint.path}: the groups of triangles are damaged: a group has no representative")
-    return Clusters(**kept)
-
-
 def _sides(height: int, width: int, scale: float) -> tuple[int, int]:
     return max(1, round(scale * height)), max(1, round(scale * width))
 
@@ -258,9 +242,8 @@ class _Step:
         rates = np.outer(final + (1.0 - final) * cosine, [profile.colour_rate, profile.lut_rate])
         self._rates = torch.tensor(rates, dtype=torch.float32, device=device)
         self._rate = [torch.zeros((), device=device) for _ in range(2)]
-        groups = [{"params": [self._colour], "lr": self._rate[0]}]
-        if textures.lut.size:
-            groups.append({"params": [self._lut], "lr": self._rate[1]})
+        self._tuned = {"colour": self._colour} | ({"lut": self._lut} if textures.lut.size else {})
+        groups = [{"params": [each], "lr": rate} for each, rate in zip(self._tuned.values(), self._rate, strict=False)]
         self._grads = [torch.zeros_like(self._colour), torch.zeros_like(self._lut)]
         self._colour.grad, self._lut.grad = self._grads
         on_cuda = device != "cpu"
@@ -311,11 +294,9 @@ class _Step:
     def state(self) -> dict[str, np.ndarray]:
         """Returns the arrays that later steps depend on, by name: the textures and Adam's state."""
         tensors = {"step": self._step}
-        for group in self._adam.param_groups:
-            for parameter in group["params"]:
-                name = "colour" if parameter is self._colour else "lut"
-                moments = self._adam.state[parameter]
-                tensors |= {name: parameter} | {f"{name}.{key}": moments[key] for key in _MOMENTS}
+        for name, parameter in self._tuned.items():
+            moments = self._adam.state[parameter]
+            tensors |= {name: parameter} | {f"{name}.{key}": moments[key] for key in _MOMENTS}
         return {name: np.array(value.detach().cpu().numpy()) for name, value in tensors.items()}
 
     @torch.no_grad()
@@ -326,23 +307,20 @@ class _Step:
             ValueError: The state belongs to another fit; nothing has changed.
         """
         table = {"step": Part(np.int32, (1,), least=0, most=len(self._rates))}
-        for group in self._adam.param_groups:
-            for parameter in group["params"]:
-                name, shape = "colour" if parameter is self._colour else "lut", tuple(parameter.shape)
-                table |= {name: Part(np.float32, shape), f"{name}.step": Part(np.float32, (), least=0.0)}
-                table |= {f"{name}.{key}": Part(np.float32, shape) for key in _MOMENTS[1:]}
+        for name, parameter in self._tuned.items():
+            shapes = {name: parameter.shape} | {f"{name}.{key}": parameter.shape for key in _MOMENTS[1:]}
+            table |= {each: Part(np.float32, tuple(shape)) for each, shape in shapes.items()}
+            table[f"{name}.step"] = Part(np.float32, (), least=0.0)
         check_parts(state, table)
         values = {name: torch.from_numpy(np.array(value)) for name, value in state.items()}
         self._step.copy_(values["step"])
-        for group in self._adam.param_groups:
-            for parameter in group["params"]:
-                name = "colour" if parameter is self._colour else "lut"
-                parameter.copy_(values[name])
-                moments = self._adam.state[parameter]
-                moments["step"] = values[f"{name}.step"].to(parameter.device)
-                for key in _MOMENTS[1:]:
-                    # Both use the parameter's memory layout, which the fused step expects.
-                    moments[key] = torch.zeros_like(parameter).copy_(values[f"{name}.{key}"])
+        for name, parameter in self._tuned.items():
+            parameter.copy_(values[name])
+            moments = self._adam.state[parameter]
+            moments["step"] = values[f"{name}.step"].to(parameter.device)
+            for key in _MOMENTS[1:]:
+                # Both use the parameter's memory layout, which the fused step expects.
+                moments[key] = torch.zeros_like(parameter).copy_(values[f"{name}.{key}"])
 
     @property
     def done(self) -> int:

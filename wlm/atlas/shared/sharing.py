@@ -31,12 +31,12 @@ from wlm.atlas.model import (
     tile_counts,
 )
 from wlm.atlas.resize import box
-from wlm.atlas.shared.allocation import NO_ROOM, WIDTHS, Allocated, allocated
+from wlm.atlas.shared.allocation import NO_ROOM, Allocated, allocated
 from wlm.atlas.shared.balance import ViewShares, balance, tile_shares
 from wlm.atlas.shared.curves import Candidate, SceneTiles, candidates, costs
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import patches, weighted
-from wlm.atlas.tiles.layout import allocate, place, sizes_of
+from wlm.atlas.tiles.layout import allocate, packed, sizes_of
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 
@@ -277,19 +277,12 @@ def _allocated(
 
 def _laid_out(planes: list[Plane], tile: int) -> Layout:
     grid = [tile_counts(*plane.frames.shape[1:3], tile) for plane in planes]
-    across = np.array([(columns, rows) for rows, columns in grid])
-    best = None
-    for share in WIDTHS:
-        width = max(int(across[:, 0].max()), round(share * math.sqrt(across.prod(1).sum())))
-        first, height = place(across, width)
-        width = int((first[:, 0] + across[:, 0]).max())
-        if best is None or width * height < best[0]:
-            best = width * height, first, (height, width)
+    first, shape = packed(np.array([(columns, rows) for rows, columns in grid]))
     places = [
         SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *counts, plane.smaller)
-        for plane, (column, row), counts in zip(planes, best[1].tolist(), grid, strict=True)
+        for plane, (column, row), counts in zip(planes, first.tolist(), grid, strict=True)
     ]
-    return Layout(places, best[2])
+    return Layout(places, shape)
 
 
 def _tiles(planes: list[Plane], units: list[np.ndarray], tile: int, device: str) -> SceneTiles:
