@@ -103,7 +103,7 @@ class Decoder:
         model = self.model
         if model.method == "tiles":
             size, tile = model.sheets[0].size, model.profile.tile
-            textures = self._lut, self._texels[0], interop.to_warp(out, wp.vec3), self._blocks[0]
+            textures = self._lut, self._texels, interop.to_warp(out, wp.vec3), self._blocks
             decode.decode(uv, *size, tile, *textures, model.first_block_code)
         else:
             cascade.sample(self._texels, self._lut, uv, interop.to_warp(out))

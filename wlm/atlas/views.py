@@ -95,6 +95,13 @@ def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
     return torch.cat([barycentric, 1.0 - barycentric.sum(1, keepdim=True)], dim=1)
 
 
+def cells_at(uv: torch.Tensor, height: int | torch.Tensor, width: int | torch.Tensor) -> torch.Tensor:
+    """Returns the numbers of the cells, row by row, at N UVs in a grid of `height` x `width` cells over UV space, int64
+    [N]; a UV of 1 is in the last row or column. The size of the grid may differ from UV to UV, int64 [N]."""
+    column, row = ((uv[:, axis].double() * side).long() for axis, side in ((0, width), (1, height)))
+    return row.clamp(min=0).clamp(max=height - 1) * width + column.clamp(min=0).clamp(max=width - 1)
+
+
 def visibility(
     scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, height: int, width: int, device: str
 ) -> torch.Tensor:
@@ -120,11 +127,8 @@ def visibility(
     # Pixels without a triangle add 0, each to a separate cell: selecting the other pixels would wait for the GPU.
     own = torch.arange(resolution**2, device=count.device) % count.numel()
     for visible, _, uv in visible_uv(scene, views, resolution, device):
-        u, v = uv.reshape(-1, 2).double().T
-        column = (u * width).long().clamp(0, width - 1)
-        row = (v * height).long().clamp(0, height - 1)
         shown = visible.reshape(-1) >= 0
-        count.index_add_(0, torch.where(shown, row * width + column, own), shown.long())
+        count.index_add_(0, torch.where(shown, cells_at(uv.reshape(-1, 2), height, width), own), shown.long())
     return count.reshape(height, width).double()
 
 

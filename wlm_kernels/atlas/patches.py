@@ -164,7 +164,8 @@ def _dominant(
     # out:
     patches: wp.array1d[Patch],
 ):
-    """Finds the dominant colour of one patch per thread: counts the samples in each histogram bin, in rising order."""
+    """Finds the dominant colour of one patch per thread: goes through the histogram bins that have samples, from the
+    lowest to the highest, counts the samples in each, and takes the colour of the fullest bin."""
     t = wp.tid()
     p = patches[t]
     size = size_of(p.level)

@@ -12,6 +12,7 @@ component has a separate curve, and the last ones, which have the least energy, 
 import functools
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -63,6 +64,11 @@ class SceneTiles:
     index: np.ndarray
     size: int
     device: str
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """The weight of each tile, float64 [T]."""
+        return self.weight.double().sum(1).cpu().numpy()
 
     def light(self, at: np.ndarray | slice) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the texels of the tiles `at` and the weights of their points, copied to the device."""
