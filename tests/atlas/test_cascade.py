@@ -209,7 +209,9 @@ def test_a_fit_that_diverged():
     mesh, profile = _box(), _profile(steps=1)
     uv, start = _start(mesh, profile)
     start.colour[0, 0] = np.nan
-    with pytest.raises(WlmError, match="array: the fit diverged; use smaller learning rates than profile test"):
+    with pytest.raises(
+        WlmError, match="array: the fit diverged; use smaller learning rates than those of profile test"
+    ):
         tune(mesh, uv, start, profile)
 
 

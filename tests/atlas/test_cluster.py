@@ -72,7 +72,7 @@ def _sound(clusters: Clusters, count: int) -> None:
 @pytest.mark.parametrize(("threshold", "colour_threshold"), [(0.03, 0.09), (0.01, 0.09), (0.05, 2.0), (0.05, 0.0)])
 def test_against_naive(device: str, threshold: float, colour_threshold: float):
     """The same groups, representatives, edges, orders and distances."""
-    count = 90
+    count = 50
     (uv, triangle), lightmap = _mesh(count), _lightmap()
     active = np.arange(count) % 7 != 0
     reports = []
@@ -89,7 +89,7 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
     )
     patches, edges, groups = _naive(uv, triangle, lightmap, threshold, colour_threshold, 2.0, active)
     _sound(clusters, count)
-    assert edges.sum() // 2 > 20
+    assert edges.sum() // 2 > 5
     members = [np.flatnonzero(clusters.group == group).tolist() for group in range(len(clusters.representative))]
     assert list(zip(clusters.representative.tolist(), members, strict=True)) == groups
     np.testing.assert_array_equal(clusters.excluded, ~active)
@@ -103,17 +103,17 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
 
 def test_many_triangles_are_grouped_by_samples(device: str, monkeypatch: pytest.MonkeyPatch):
     """Each is like its representative, no two representatives are alike, and there are few more of them."""
-    count = 200
+    count = 100
     (uv, triangle), lightmap = _mesh(count), _lightmap()
     exact = cluster(uv, triangle, lightmap, largest=65, device=device)
-    monkeypatch.setattr(clustering, "SAMPLE", 40)
+    monkeypatch.setattr(clustering, "SAMPLE", 20)
     reports = []
     clusters = cluster(uv, triangle, lightmap, largest=65, device=device, progress=reports.append)
     _sound(clusters, count)
     assert clusters.distance.max() < 0.03
     patches, edges, _ = _naive(uv, triangle, lightmap, 0.03, 0.09, 2.0, np.ones(count, bool))
     assert not edges[np.ix_(clusters.representative, clusters.representative)].any()
-    assert len(clusters.representative) <= 1.2 * len(exact.representative) < 0.7 * count
+    assert len(clusters.representative) <= 1.2 * len(exact.representative) < 0.8 * count
     assert {report.stage for report in reports} == {"compare patches", "cluster"}
     assert reports[-1].done == reports[-1].total == count
 

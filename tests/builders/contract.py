@@ -76,7 +76,7 @@ def _smoke(model: Any) -> dict[str, np.ndarray]:
 
 
 def _atlas(kind: str) -> Subject:
-    settings = {"method": "cascade", "steps": 40, "resolution": 32, "fallback": False} if kind == "cascade" else {}
+    settings = {"method": "cascade", "steps": 40, "resolution": 32, "fallback": False} if kind == "cascade" else {"tile": 4}
 
     def decode(model: Any) -> dict[str, np.ndarray]:
         with np.load(FILES / f"atlas-{kind}.npz") as stored:

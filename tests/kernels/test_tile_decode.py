@@ -21,7 +21,7 @@ def _table(height: int, width: int, size: int, largest: int, seed: int = 0) -> t
 def _decode(uv, height: int, width: int, size: int, lut: np.ndarray, texels: np.ndarray, device: str) -> np.ndarray:
     uv = array(np.asarray(uv, np.float32), wp.vec2, device)
     out = wp.full(len(uv), wp.vec3(-1.0), dtype=wp.vec3, device=device)
-    decode.decode(uv, height, width, size, array(lut, wp.uint16, device), array(texels, wp.vec3h, device), out)
+    decode.decode(uv, height, width, size, array(lut, wp.uint16, device), array(texels[None], wp.vec3h, device), out)
     return out.numpy()
 
 

@@ -59,7 +59,7 @@ class Decoder:
         """
         last = len(self.model.states) - 1
         if not 0 <= state <= last:
-            raise ValueError(f"state: expected 0 to {last}, got {state}")
+            raise ValueError(f"state: expected a number of 0 to {last}, got {state}")
         low = min(int(state), max(last - 1, 0))
         near, far = self.model.factor[low], self.model.factor[min(low + 1, last)]
         return (near + np.float32(state - low) * (far - near)).astype(np.float32)
@@ -86,7 +86,7 @@ class Decoder:
             ValueError: No such state, or the model has no mips.
         """
         if lod is not None and not self.model.mips:
-            raise ValueError("lod: expected a model with mips, or None")
+            raise ValueError("lod: expected None for a model without mip levels, got numbers")
         if self.model.method == "shared":
             return self._read_shared(uv, sheet, state, lod)
         if state != 0:
@@ -170,7 +170,7 @@ class Decoder:
         """
         height, width = sheet.mask.shape
         if (height, width) != self.model.sheets[number].size:
-            raise WlmError(f"{sheet.name}: expected the sheet that the model was made of, found another size")
+            raise WlmError(f"{sheet.name}: expected a sheet of the size in the model, found {width}x{height} texels")
         if len(self._corner):
             return torch.from_numpy(self._under_new_uvs(sheet)[sheet.mask]).to(self.device)
         step, parts = max(1, _TEXELS_AT_ONCE // width), []

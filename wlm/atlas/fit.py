@@ -44,7 +44,7 @@ from wlm.texels import check_size
 
 _CELLS_AT_ONCE = 1 << 24
 _FEWER_VIEWS = 4  # one view of the comparison with a plain lightmap per this number of the profile's views
-_NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take; give more"
+_NO_ROOM = "budget: {:g} of the bits of {}x{} texels is less than the smallest tiles and lookup texture take; give more"
 _PACKAGES = {"cascade": "uvunwrap", "astc": "astc_encoder"}  # packages of the extra, by method and colour
 
 

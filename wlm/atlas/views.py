@@ -56,7 +56,7 @@ def visible_uv(
     Args:
         scene: The scene.
         views: The cameras.
-        resolution: Pixels along a side, 1 to 16,384.
+        resolution: Width and height of a camera's picture in pixels, 1 to 16,384.
         device: "cpu" or "cuda:N".
 
     Yields:
@@ -110,19 +110,20 @@ def visibility(
     Args:
         scene: The scene.
         views: The cameras.
-        resolution: Pixels along a side of a camera's picture.
-        height, width: Size of a grid over UV space, row 0 at v = 0. It may be finer than the lightmap.
+        resolution: Width and height, in pixels, of the square picture of each camera.
+        height, width: Rows and columns of the grid's cells, row 0 at v = 0. They may be smaller than texels.
         device: "cpu" or "cuda:N".
 
     Returns:
-        float64 [height, width] on the device, pixels of all views whose UVs lie in each cell; a UV of 1 is in the last.
+        float64 [height, width] on the device: for each cell the number of pixels, in the pictures of all cameras, whose
+        UV lies in it; a UV of 1 lies in the last cell.
 
     Raises:
         WlmError: There is no such device.
         ValueError: A size is out of range.
     """
     if height < 1 or width < 1:
-        raise ValueError(f"height, width: expected at least 1, got {height} and {width}")
+        raise ValueError(f"height, width: expected at least 1 cell each, got {height} and {width}")
     count = torch.zeros(height * width, dtype=torch.int64, device=check_device(device))
     # Pixels without a triangle add 0, each to a separate cell: selecting the other pixels would wait for the GPU.
     own = torch.arange(resolution**2, device=count.device) % count.numel()

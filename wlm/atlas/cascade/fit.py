@@ -87,7 +87,7 @@ def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters 
     with stages("cluster"):
         clusters = Clusters(**stages.batch(0, table, make))
     if clusters.group.max() >= len(clusters.representative):
-        raise WlmError(f"{stages.checkpoint.path}: the groups of triangles are damaged: a group has no representative")
+        raise WlmError(f"{stages.checkpoint.path}: the checkpoint is damaged: a group has no representative triangle")
     return clusters
 
 
@@ -128,7 +128,7 @@ def fit_cascade(
         facts = {
             "groups": int(np.count_nonzero(shares)),
             "shared": int(shares[shares > 1].sum()),
-            "charts": len(packed.to_lightmap),
+            "charts": len(packed.rotation),
             "packed": [packed.height, packed.width],
         }
     else:
@@ -211,7 +211,9 @@ def tune(
                 checkpoint.save_running(1, step.state())
         tuned = step.textures()
     if not (np.isfinite(tuned.colour).all() and np.isfinite(tuned.lut).all()):
-        raise WlmError(f"{sheet.name}: the fit diverged; use smaller learning rates than profile {profile.name}")
+        raise WlmError(
+            f"{sheet.name}: the fit diverged; use smaller learning rates than those of profile {profile.name}"
+        )
     return tuned
 
 

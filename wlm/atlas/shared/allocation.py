@@ -14,7 +14,7 @@ _TRIES, _FULL = 12, 0.995  # attempts to place all tiles, and the used fraction 
 _LEAST_GAIN = 2.0**-24
 _LESS = 0.95  # fraction of the bits at which the error is measured again, for the value of a bit
 _DROPPED = 8  # one in eight of the mixtures that aren't worth their factors is removed per round
-NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take; give more"
+NO_ROOM = "budget: {:g} of the lightmaps' bits is less than the smallest tiles and lookup texture take; give more"
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,4 +150,6 @@ def _on_pages(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]
         first, shape = packed(size, [np.flatnonzero(page == number) for number in range(pages)])
         if max(shape) <= MOST_SIZE:
             return first, page, shape
-    raise WlmError(f"budget: too large for {MOST_PAGES} pages of {MOST_SIZE} texels along a side; give less")
+    raise WlmError(
+        f"budget: too large: tiles fill more than {MOST_PAGES} pages of {MOST_SIZE} x {MOST_SIZE} texels; give less"
+    )

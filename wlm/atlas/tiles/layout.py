@@ -1,8 +1,9 @@
 """Chooses the sizes of tiles within a budget of bits, and their places in the texture.
 
-Each tile has a curve of error against bits. At the optimum one more bit reduces the error by the same amount in every
-tile. That gain, a Lagrange multiplier, is found by bisection. With colour "mixed" a tile's sizes have two formats, each
-with its own texture: blocks where the block format is accurate, RGB9E5 for other light and for small tiles.
+A tile has an error at each size that it may have, and a size takes a number of bits. In the best choice of sizes one
+more bit would reduce the error by about the same amount in every tile. That amount, a Lagrange multiplier, is found by
+bisection. With colour "mixed" there are two textures, one of BC6H blocks and one of RGB9E5 texels, and the chosen size
+of a tile says which one it is in.
 """
 
 import math
@@ -75,9 +76,9 @@ def sizes_of(profile: Profile) -> list[Size]:
 
 
 def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
-    """Chooses sizes whose rectangles fit in textures of `room` bits, and places the rectangles; returns None if not
-    even the smallest sizes fit. `error` is float64 [sizes, T] on any device; `least` is the smallest error that a bit
-    must save.
+    """Chooses a size for each of T tiles, and places the tiles' rectangles in textures that take at most `room` bits;
+    returns None if not even the smallest sizes fit. `error`, float64 [sizes, T] on any device, is the error of each
+    tile at each size; a bit is only spent where it reduces the error by at least `least`.
 
     Raises:
         WlmError: A texture has more texels along a side than an entry of T_c can name.
@@ -97,7 +98,8 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
             most = MOST_SIZE * texture.step
             if max(shape) > most:
                 raise WlmError(
-                    f"budget: too large, T_p would have {max(shape)} texels along a side; expected at most {most}"
+                    f"budget: too large: a colour texture would have {max(shape)} texels along a side, expected at "
+                    f"most {most}; give less"
                 )
             bits += math.prod(shape) * COLOUR_BITS[texture.format]
         if bits <= room:
