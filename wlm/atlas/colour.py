@@ -65,11 +65,10 @@ def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Te
         return samples
     if colour == "rgb9e5":
         return _rounded(samples)
+    count, ny, nx, _ = samples.shape
     if colour == "bc6h":
-        count, ny, nx, _ = samples.shape
         _, decoded = bc6h_blocks(_by_block(samples), _by_block(weight[..., None])[..., 0])
         return _of_blocks(decoded, count, ny, nx)
-    count, ny, nx, _ = samples.shape
     _, decoded = encode(samples.reshape(count * ny, nx, 3), colour, device=str(samples.device))
     return torch.from_numpy(decoded.reshape(count, ny, nx, 3)).to(samples)
 
@@ -156,9 +155,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
 
 
 def _on(values: np.ndarray | torch.Tensor, device: str) -> torch.Tensor:
-    return (
-        values.to(device) if isinstance(values, torch.Tensor) else torch.tensor(np.ascontiguousarray(values)).to(device)
-    )
+    return torch.as_tensor(values if isinstance(values, torch.Tensor) else np.array(values), device=device)
 
 
 def _astc() -> hdr_blocks.Astc:

@@ -10,7 +10,8 @@ from wlm.atlas.model import LUT_STEPS, MIP_OCTAVES, AtlasModel
 from wlm.atlas.views import Points, corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
-from wlm_kernels.atlas import cascade, decode
+from wlm_kernels.atlas import decode
+from wlm_kernels.raster import texture
 
 _TEXELS_AT_ONCE = 1 << 24
 
@@ -106,7 +107,12 @@ class Decoder:
             textures = self._lut, self._texels, interop.to_warp(out, wp.vec3), self._blocks
             decode.decode(uv, *size, tile, *textures, model.first_block_code)
         else:
-            cascade.sample(self._texels, self._lut, uv, interop.to_warp(out))
+            if model.lut.size:
+                place = torch.empty((len(out), 2), device=out.device)
+                texture.sample(self._lut, uv, interop.to_warp(place))
+                # The triangle wave of eq. 8 is the identity on what 16 bits without a sign hold.
+                uv = interop.to_warp(place, wp.vec2)
+            texture.sample(self._texels, uv, interop.to_warp(out))
 
     def __call__(self, points: Points, state: float = 0.0) -> torch.Tensor:
         """Returns light at points of the scene, float32 [N, 3]."""

@@ -4,6 +4,7 @@ One lightmap is compressed by the method of the profile, `tiles` or `cascade`; a
 replaces the model if its error is no larger. Several lightmaps, of several sheets or states, share tiles (`shared`).
 """
 
+import functools
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -89,11 +90,9 @@ def compress(
             need(_PACKAGES[choice], "atlas")
     stages = Stages(device, progress, checkpoint)
     try:
-        if method == "shared":
-            with one_thread(device):
-                model = fit_shared(scene, profile, seed, stages)
-        else:
-            model = _fit_one(scene, profile, method, seed, stages)
+        with one_thread(device):
+            fit = fit_shared if method == "shared" else functools.partial(_fit_one, method)
+            model = fit(scene, profile, seed, stages)
     except KeyboardInterrupt:
         if checkpoint is not None:
             checkpoint.flush()  # finished batches that are not written yet
@@ -139,7 +138,7 @@ def open_checkpoint(
     return Checkpoint(os.path.realpath(output), AtlasModel.SYSTEM, fit, scene.source, resume=resume, every=every)
 
 
-def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, stages: Stages) -> AtlasModel:
+def _fit_one(method: str, scene: LightmappedScene, profile: Profile, seed: int, stages: Stages) -> AtlasModel:
     """Compresses one lightmap by `tiles` or `cascade`, or by a plain smaller lightmap if that is no worse."""
     (sheet,), device = scene.sheets, stages.device
     grid = FineGrid(sheet, device)
