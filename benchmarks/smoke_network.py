@@ -36,7 +36,7 @@ from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.evaluation import coarse, of_decoder

@@ -51,7 +51,7 @@ from benchmarks.smoke import make_cloud
 from benchmarks.timing import Timing
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
-from wlm.metrics.flip import flip_display
+from wlm.metrics import flip_display
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.march.motion import motion
 from wlm.smoke.network.losses import warp

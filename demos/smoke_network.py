@@ -27,7 +27,7 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.codec import open_network
 from wlm.smoke.data import load_frames, open_frames

@@ -13,7 +13,7 @@ from builders.smoke_samples import random_model, small_pool
 import wlm
 from wlm.errors import WlmError
 from wlm.fluid.volume import save_volume
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.evaluation import COARSE, HALF, NETWORK, coarse, compare, evaluate, of_decoder, of_network, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.dataset import make_validation

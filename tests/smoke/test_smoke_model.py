@@ -15,7 +15,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke import codec
 from wlm.smoke.camera import Camera
 from wlm.smoke.codec import open_network, shipped

@@ -16,7 +16,7 @@ import torch
 from wlm import system
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import DIRECTIONS
 from wlm.smoke.decode import Decoder
 from wlm.smoke.model import SmokeModel

@@ -256,7 +256,7 @@ class _Run:
             "counts": np.array([self.best_step, self.first_skipped]),
             "curve": self.curve,
         }
-        self.checkpoint.save_running(0, {**self.trainer.state(), **state})
+        self.checkpoint.save({0: {**self.trainer.state(), **state}})
 
     def result(self, finished: bool) -> Training:
         step, skipped = self.trainer.step, self.trainer.skipped

@@ -3,13 +3,13 @@
 import astc_encoder
 import numpy as np
 import pytest
+from builders.checks import psnr
 from builders.lightmaps import smooth_light
 
 from benchmarks.rivals import lightmap_blocks
 from benchmarks.rivals.lightmap import RIVALS
 from benchmarks.rivals.lightmap_blocks import encode_8bit, encode_astc, encode_bc6h, encode_bc7
 from wlm.errors import WlmError
-from wlm.metrics import psnr
 
 BLOCKS = {name: method.encode for name, method in RIVALS.items() if method.alone}
 BITS = {f"astc{side}": 128.0 / side**2 for side in (4, 5, 6, 8, 10, 12)} | {"8bit": 24.0}
@@ -79,9 +79,9 @@ def test_eight_bits_by_hand():
 
 
 @pytest.mark.parametrize("name", BLOCKS)
-@pytest.mark.parametrize("shape", [(130, 70), (1, 1), (5, 3)])
+@pytest.mark.parametrize("shape", [(53, 34), (1, 1), (5, 3)])
 def test_sizes_that_no_block_divides(name, shape):
-    image = smooth_light(130, 70)[: shape[0], : shape[1]]
+    image = smooth_light(53, 34)[: shape[0], : shape[1]]
     result = BLOCKS[name](image, np.ones(shape, bool))
     assert result.decoded.shape == image.shape
     np.testing.assert_allclose(result.decoded, image, atol=0.25)

@@ -36,7 +36,7 @@ from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace, snapped
 from wlm.atlas.resize import resized
-from wlm.atlas.stages import Stages
+from wlm.atlas.stages import Stages, one_thread
 from wlm.atlas.views import corner_weights
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
@@ -189,7 +189,7 @@ def tune(
         WlmError: There is no such device, or the textures became NaN or infinite (the fit diverged).
     """
     device = interop.check_device(device)
-    with interop.stream(device):
+    with interop.stream(device), one_thread(device):
         step = _Step(sheet, uv, textures, profile, seed, device)
         graph = interop.StepGraph(step, device)
         meter, done = Meter(progress, "fit", profile.steps), 0
@@ -207,10 +207,10 @@ def tune(
                     meter.report(done)
                 except KeyboardInterrupt:
                     if checkpoint is not None:
-                        checkpoint.save_running(1, step.state())
+                        checkpoint.save({1: step.state()})
                     raise
             if checkpoint is not None and checkpoint.due():
-                checkpoint.save_running(1, step.state())
+                checkpoint.save({1: step.state()})
         tuned = step.textures()
     if not (np.isfinite(tuned.colour).all() and np.isfinite(tuned.lut).all()):
         raise WlmError(
