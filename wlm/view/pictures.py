@@ -27,7 +27,7 @@ def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray
         ValueError: `white` is not above 0.
     """
     if not 0 < white < math.inf:
-        raise ValueError(f"white: expected the radiance to show as white, a number above 0, got {white}")
+        raise ValueError(f"white: expected a number above 0, got {white}")
     pixels = np.asarray(light.cpu() if isinstance(light, torch.Tensor) else light, np.float32)
     if pixels.ndim == 2:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
@@ -56,16 +56,17 @@ def contact_sheet(
     *,
     columns: int = MOST_COLUMNS,
 ) -> tuple[int, ...]:
-    """Writes a PNG of pictures in labelled rows; if there are too many for a row, evenly spread ones are chosen.
+    """Writes a PNG of rows of pictures, with a label on the left of each row. If the rows have more than `columns`
+    pictures, that many are chosen, evenly spread and at the same places in each row.
 
     Args:
         path: The PNG to write; its folder must exist.
         rows: Pictures uint8 [H, W, 3] by label, the same number in each row, those of a row of one size.
         titles: Titles of the columns, one for each picture of a row; or none.
-        columns: Most pictures in a row.
+        columns: The largest number of pictures in a row.
 
     Returns:
-        Indices of the chosen pictures.
+        The places in a row of the chosen pictures, from 0.
 
     Raises:
         ValueError: There is no picture, or they differ in size or number.
@@ -74,12 +75,10 @@ def contact_sheet(
     counts = {len(row) for row in rows.values()}
     uneven = any(len({cell.shape for cell in row}) > 1 for row in rows.values())
     if len(counts) != 1 or 0 in counts or columns < 1 or uneven:
-        raise ValueError(
-            f"rows: expected as many pictures in each row, of one size in a row, got rows of {sorted(counts)} pictures"
-        )
+        raise ValueError(f"rows: expected equally many pictures in each row, of one size, got rows of {sorted(counts)}")
     (count,) = counts
     if titles and len(titles) != count:
-        raise ValueError(f"titles: expected a title for each of a row's {count} pictures, got {len(titles)} titles")
+        raise ValueError(f"titles: expected one for each of {count} columns, got {len(titles)}")
     chosen = [int(i) for i in np.unique(np.linspace(0, count - 1, min(columns, count)).round())]
     width, heights = max(row[0].shape[1] for row in rows.values()), [row[0].shape[0] for row in rows.values()]
     font = ImageFont.load_default(_FONT)
