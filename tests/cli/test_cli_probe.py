@@ -8,6 +8,7 @@ from builders.probe_sets import synthetic
 from builders.running import call, check_a_stop_is_resumed, fails
 
 import wlm.cli.console
+import wlm.probe.volume.walk
 from wlm.probe import data, evaluate, save_probes
 
 PROBES, DEAD = 160, 5
@@ -260,7 +261,8 @@ def test_a_volume_takes_the_normals_of_probes(carrying, room, tmp_path):
     assert len(pools[0]) == len(pools[1]) and pools[0] != pools[1]
 
 
-def test_evaluate_scores_walks_and_pictures(fitted, room, tmp_path):
+def test_evaluate_scores_walks_and_pictures(fitted, room, tmp_path, monkeypatch):
+    monkeypatch.setattr(wlm.probe.volume.walk, "_STEP", 2.0)  # sides of a block per frame
     text = call("evaluate", fitted, room, "--views", 2, "--volume", "--json", tmp_path / "r.json")
     report = json.loads((tmp_path / "r.json").read_text())
     views, walked = report["views"], report["volume"]

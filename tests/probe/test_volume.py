@@ -72,10 +72,10 @@ def _settle(volume: Volume, viewpoint: object) -> list[FrameStats]:
     return frames
 
 
-@pytest.mark.parametrize("budget", [7, 64, 1024])
+@pytest.mark.parametrize("budget", [7, 64])
 def test_teleport_converges_in_the_frames_of_the_budget(device: str, budget: int):
     """ceil(blocks near a probe / budget) frames, each full but the last; empty blocks cost nothing."""
-    position = _surface(300)
+    position = _surface(150)
     volume = _volume(position, device, budget=budget)
     decoded = set()
     for viewpoint in ([0.0, 2.0, 0.0], [700.0, 0.0, 0.0], [-40.0, 3.0, 41.0]):
@@ -111,7 +111,7 @@ def test_nearest_blocks_first(device: str):
 
 def test_blocks_have_the_stated_light(device: str):
     """Those that few probes decide, against a dense system; of the others the probes are spread over their reach."""
-    position = _surface(500)
+    position = _surface(250)
     values = _field(position)
     volume = _volume(position, device, budget=1024)
     stats = _settle(volume, [1.0, 2.0, 3.0])
@@ -166,6 +166,9 @@ def test_normals_keep_light_from_leaking(device: str):
         reading = volume.read(position[inner], known if known is None else normal[inner])
         leaks.append(float(np.sqrt((reading.values**2).mean())))
     assert leaks[0] > 0.3 and leaks[1] < 0.4 * leaks[0]
+    sets = [from_arrays(position, bright[:, None] + 0.1, normal=known) for known in (None, normal)]
+    psnr = [score_volume(each, StoredLight(each.values, device), frames=2)["psnr"] for each in sets]
+    assert psnr[1] > psnr[0] + 1.5
     with pytest.raises(ValueError, match="normal"):
         Volume(position, light, normal=normal[1:])
 
@@ -190,15 +193,17 @@ def test_any_way_leads_to_the_same_volume(device: str):
 
 def test_no_read_of_a_block_that_is_not_there(device: str):
     """In every frame of a hurried walk what is there lies in the windows and is right, and a read takes that alone."""
-    position = _surface(600)
-    volume = _volume(position, device, budget=5, rows=900)
-    whole = _volume(position, side=32, budget=1024)
+    position = _surface(250)
+    volume = _volume(position, device, budget=3, rows=400)
+    whole = _volume(position, side=16, budget=1024)
     settle(whole, np.zeros(3))
     truth = _there(whole)
     random = np.random.default_rng(6)
-    viewpoint, dropped, cached = np.array([0.0, 1.0, 0.0]), 0, 0
-    for step in range(12):
-        viewpoint = random.uniform(-50, 50, 3) if step % 4 == 3 else viewpoint + random.normal(size=3) * [4, 1, 4]
+    home, dropped, cached = np.array([0.0, 1.0, 0.0]), 0, 0
+    for step in range(9):
+        if step % 3 == 0:
+            viewpoint = np.array([40.0, 3.0, -30.0]) if step == 3 else home
+        viewpoint = viewpoint + random.normal(size=3) * [4, 1, 4]
         stats = volume.update(viewpoint)
         dropped, cached = dropped + stats.dropped, cached + stats.cached
         there = _there(volume)
@@ -232,7 +237,7 @@ def test_the_pool_gives_away_the_least_recently_used(device: str):
 
 def test_a_pool_too_small_keeps_what_it_has(device: str):
     """The nearest blocks fill it; the others wait, and nothing that is seen is taken away."""
-    position = _surface()
+    position = _surface(200)
     volume = _volume(position, device, budget=8, rows=40)
     stats = [volume.update([0.0, 1.0, 0.0]) for _ in range(30)]
     there = _there(volume)
@@ -539,19 +544,6 @@ def test_walk_refuses():
         walk(volume, _line(1, 0.0), light[1:])
     with pytest.raises(WlmError, match="viewpoint"):
         walk(volume, np.array([[0.0, np.nan, 0.0]]), light)
-
-
-def test_normals_of_a_set_keep_rooms_apart():
-    """A bright room and a dark one, with a wall between that is thinner than a block."""
-    along = np.stack(np.meshgrid(np.arange(-3.0, 3.1, 0.3), np.arange(0.0, 3.1, 0.3)), -1).reshape(-1, 2)
-    side = np.repeat([-1.0, 1.0], len(along))
-    position, normal = np.column_stack([0.05 * side, np.tile(along, (2, 1))]), side[:, None] * [7.0, 0.0, 0.0]
-    values = np.where(side < 0, 1.0, 0.1)[:, None]
-    psnr = []
-    for known in (None, normal):
-        probes = from_arrays(position, values, normal=known)
-        psnr.append(score_volume(probes, StoredLight(probes.values), frames=3)["psnr"])
-    assert psnr[1] > psnr[0] + 1.5
 
 
 def _cells(key: np.ndarray) -> np.ndarray:

@@ -304,7 +304,7 @@ _READERS = {
 def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
     """Returns the name of the array of values: `key`, with or without "sh_", or else the only one that begins "sh"."""
     if _POSITION not in names:
-        raise WlmError(f"{path}: {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
+        raise WlmError(f"{path}: the field {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
     fields = [name for name in names if name not in (_POSITION, _CONVENTION, *_BESIDE)]
     listed = ", ".join(fields) or "nothing"
     if key is not None:
@@ -314,7 +314,9 @@ def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
         raise WlmError(f"{path}: expected values named {key} or {_SH}_{key}; found {listed}")
     candidates = [name for name in fields if name.startswith(_SH)]
     if not candidates:
-        raise WlmError(f"{path}: expected an array whose name begins with {_SH}, or the key of one; found {listed}")
+        raise WlmError(
+            f"{path}: expected an array of light, whose name begins with {_SH} or is given as --key; found {listed}"
+        )
     if len(candidates) > 1:
         raise WlmError(f"{path}: found several arrays of values; choose one by its key: {', '.join(candidates)}")
     return candidates[0]
@@ -355,8 +357,8 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
     fits = values.ndim == 2 or (values.ndim == 3 and (values.shape[2] == 3 or by_channel))
     if not fits or len(values) != count or values.size == 0:
         raise WlmError(
-            f"{where}: {key}: expected ({count}, C, 3) with RGB last or ({count}, D), a row for each position, "
-            f"got {values.shape}"
+            f"{where}: {key}: expected the shape ({count}, C, 3) with RGB last or ({count}, D), a row for each "
+            f"position, got {values.shape}"
         )
     if values.size > NUMBERS * count:
         raise WlmError(f"{where}: {key}: expected at most {NUMBERS} numbers a probe, got {values.size // count}")
@@ -366,7 +368,7 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
             f"{values.size // count}"
         )
     if raw.reading and (convention or order):
-        raise WlmError(f"{where}: convention and order have no meaning for this kind of file: {raw.reading}")
+        raise WlmError(f"{where}: --convention and --order have no meaning for this kind of file: {raw.reading}")
     origin = "as given" if convention else "as the file states" if raw.convention else ""
     convention = convention or raw.convention or CANONICAL
     doubts: tuple[str, ...] = ()
@@ -394,7 +396,7 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
         if len(beyond):
             worst = np.abs(wide[beyond[0]]).max()
             raise WlmError(
-                f"{where}: {key}[{start + beyond[0]}]: expected numbers within {LARGEST:.2g}, got {worst:.3g}"
+                f"{where}: {key}[{start + beyond[0]}]: expected numbers of at most {LARGEST:.2g}, got {worst:.3g}"
             )
         wide[~finite[rows]] = 0.0
         checked[rows] = wide
@@ -427,7 +429,7 @@ def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
     if count == 0:
         raise WlmError(f"{where}: {_POSITION}: expected at least one probe, found none")
     if position.shape != (count, 3):
-        raise WlmError(f"{where}: {_POSITION}: expected (N, 3), got {position.shape}")
+        raise WlmError(f"{where}: {_POSITION}: expected the shape (N, 3), got {position.shape}")
     if count > PROBES:
         raise WlmError(f"{where}: {_POSITION}: expected at most {PROBES} probes, got {count}")
     position = position.astype(np.float64)

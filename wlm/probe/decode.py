@@ -68,7 +68,8 @@ class Decoder(ABC):
         """Returns a source that decodes the light of probes at positions [N, 3] whenever a volume asks for it.
 
         Raises:
-            WlmError: A position is not finite; or principal components are read at other positions than their probes'.
+            WlmError: A position is not finite; or the model stores principal components, which are only known at its
+                own probes, and `position` has other points.
         """
 
     def own_positions(self) -> np.ndarray:
@@ -79,4 +80,4 @@ class Decoder(ABC):
         """Raises a WlmError if the positions differ from those of the model's own probes in number or bounding box."""
         if not self.model.has_probes_at(np.asarray(position, np.float64)):
             expected = f"expected the positions of its own {self.model.probes} probes, in their order"
-            raise WlmError(f"{self.model.name}: {expected}")
+            raise WlmError(f"{self.model.name}: {expected}, got {len(position)} in another number or bounding box")

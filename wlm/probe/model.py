@@ -36,7 +36,7 @@ class Profile(Settings):
     hidden: int = Field(64, ge=8, le=128, multiple_of=8)
     """Width of both hidden layers of the network."""
     support: Literal["ellipsoid", "sphere"] = "ellipsoid"
-    """Support of a Gaussian: its ellipsoid at three standard deviations, or the sphere of its longest axis (eq. 6)."""
+    """Support of a Gaussian: ellipsoid, at three standard deviations, or sphere, of its longest half axis (eq. 6)."""
     optimiser: Literal["adam", "adan"] = "adam"
     """Optimiser of the Gaussians; the network is always trained by Adam."""
     steps: int = Field(12000, ge=10)
@@ -52,11 +52,11 @@ class Profile(Settings):
     net_rate: float = Field(2e-2, gt=0.0, lt=1.0)
     """Initial learning rate of the network."""
     detail: float = Field(1.0, ge=0.0, le=4.0)
-    """Initial centres are denser where light varies, by this power of its local variance; 0: uniformly distributed."""
+    """Initial centres are denser where light varies, by this power of its local standard deviation; 0: uniform."""
     first_scale: float = Field(0.7, gt=0.0, le=4.0)
     """Initial scale of a Gaussian as a share of the distance to the nearest other centre."""
     gain: float = Field(3.0, gt=0.0, le=10.0)
-    """Magnitude of the network's initial weights, relative to uniform random numbers of variance 1 / (3 * inputs)."""
+    """Magnitude of the hidden layers' initial weights; 1: uniform random numbers of variance 1 / (3 * inputs)."""
 
 
 class Content(ABC):
@@ -190,7 +190,7 @@ class ProbeModel(Model):
         """
         if not self.has_positions:
             raise WlmError(
-                f"{self.name}: the file stores no positions: give the probes' positions, or store them in the fit"
+                f"{self.name}: the file stores no positions: pass those of its probes, or store them in the fit"
             )
         return self.origin + self.extent * self.size * (self.positions / CODES)
 

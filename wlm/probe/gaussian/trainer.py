@@ -346,7 +346,9 @@ class Trainer:
         done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         state = check_parts(state, self.table(int(done[0])))
         if not state["kept"].any() or (state["bounds"][0] > state["bounds"][1]).any():
-            raise ValueError("parts kept, bounds: expected a kept Gaussian, and lowest values at most the highest")
+            raise ValueError(
+                "parts kept, bounds: expected at least one Gaussian to be kept, and lower bounds up to the upper ones"
+            )
         for key in _STATE:
             self._tensors[key].copy_(torch.from_numpy(np.array(state[key])))
         self.needed, self._entered = np.array(state["kept"]), int(state["entered"])
