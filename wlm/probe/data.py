@@ -401,11 +401,16 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
         wide[~finite[rows]] = 0.0
         checked[rows] = wide
     if _VALID in beside:
-        checked[~_check_valid(where, beside[_VALID], count)] = 0.0
+        valid = _check_beside(where, _VALID, beside[_VALID], "biuf", (count,))
+        for bad in np.flatnonzero((valid < 0) | (valid > 1))[:1]:
+            raise WlmError(f"{where}: {_VALID}[{bad}]: expected true or false, or 0 to 1, got {valid[bad]:g}")
+        checked[valid < 0.5] = 0.0
     live = (checked != 0.0).any(axis=1)
     if not live.any():
         raise WlmError(f"{where}: {key}: every probe is zero, not finite or not valid: there is nothing to fit")
-    normal = _check_normal(where, beside[_NORMAL], count) if _NORMAL in beside else None
+    normal = None
+    if _NORMAL in beside:
+        normal = unit_or_zero(_check_beside(where, _NORMAL, beside[_NORMAL], "iuf", (count, 3)))
 
     warnings = [f"{name}: {key}: {doubt}" for doubt in doubts]
     broken = np.flatnonzero(~finite)
@@ -458,26 +463,14 @@ def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def _check_valid(where: str, valid: np.ndarray, count: int) -> np.ndarray:
-    """Returns which of `count` probes are valid, bool [N]. `valid`, [N], has booleans or numbers from 0 to 1."""
-    _check_field(where, _VALID, valid, "biuf", (count,))
-    bad = np.flatnonzero(~((valid >= 0) & (valid <= 1)))
-    if len(bad):
-        raise WlmError(f"{where}: {_VALID}[{bad[0]}]: expected true or false, or 0 to 1, got {float(valid[bad[0]]):g}")
-    return valid >= 0.5
-
-
-def _check_normal(where: str, normal: np.ndarray, count: int) -> np.ndarray:
-    """Returns the unit normals of `count` probes, float64 [N, 3]; normals of length 0 stay 0."""
-    _check_field(where, _NORMAL, normal, "iuf", (count, 3))
-    normal = normal.astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(normal).all(1))
-    if len(bad):
-        raise WlmError(f"{where}: {_NORMAL}[{bad[0]}]: expected finite numbers, got {normal[bad[0]].tolist()}")
-    return unit_or_zero(normal)
-
-
-def _check_field(where: str, field: str, array: np.ndarray, kinds: str, shape: tuple[int, ...]) -> None:
+def _check_beside(where: str, field: str, array: np.ndarray, kinds: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns a field beside the values as float64, after checking its type, its shape and that it is finite."""
     if array.dtype.kind not in kinds or array.shape != shape:
         expected = "numbers" if kinds == "iuf" else "numbers, or true and false,"
         raise WlmError(f"{where}: {field}: expected {expected} {list(shape)}, got {array.dtype} {list(array.shape)}")
+    array = array.astype(np.float64)
+    finite = np.isfinite(array)
+    bad = np.flatnonzero(~(finite.all(1) if array.ndim > 1 else finite))
+    if len(bad):
+        raise WlmError(f"{where}: {field}[{bad[0]}]: expected finite numbers, got {array[bad[0]].tolist()}")
+    return array
