@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 
 import numpy as np
+import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
@@ -29,15 +30,21 @@ class Decoder(ABC):
             WlmError: The device does not exist, or the positions are not those of the model's probes.
         """
         self.model, self.device = model, interop.check_device(device)
+        self._arrays: list[wp.array] = []
         self._position = None
         if position is not None:
             self.check_own(position)
             self._position = np.array(position, np.float64)
 
+    def _put(self, array: np.ndarray, dtype: type) -> wp.array:
+        """Copies a part of the model to the device."""
+        self._arrays.append(wp.array(array, dtype=dtype, device=self.device))
+        return self._arrays[-1]
+
     @property
-    @abstractmethod
     def device_bytes(self) -> int:
         """The bytes of memory that the model takes on the device."""
+        return sum(array.capacity for array in self._arrays)
 
     @abstractmethod
     def decode(self, position: np.ndarray) -> np.ndarray:

@@ -212,12 +212,11 @@ def box_of(position: np.ndarray) -> dict[str, Any]:
     return {"origin": low, "extent": extent, "size": np.minimum((high - low) / extent, 1.0)}
 
 
-def check_points(position: np.ndarray, letter: str = "M") -> np.ndarray:
+def check_points(position: np.ndarray) -> np.ndarray:
     """Checks points in space and returns them as float64.
 
     Args:
         position: [M, 3].
-        letter: Name of the first axis in error messages.
 
     Returns:
         float64 [M, 3].
@@ -228,7 +227,7 @@ def check_points(position: np.ndarray, letter: str = "M") -> np.ndarray:
     """
     position = np.asarray(position, np.float64)
     if position.ndim != 2 or position.shape[1] != 3:
-        raise ValueError(f"position: expected [{letter}, 3], got {position.shape}")
+        raise ValueError(f"position: expected [M, 3], got {position.shape}")
     bad = np.flatnonzero(~np.isfinite(position).all(1))
     if len(bad):
         raise WlmError(f"position {bad[0]}: expected finite numbers, got {position[bad[0]].tolist()}")
