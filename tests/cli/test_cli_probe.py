@@ -235,15 +235,6 @@ def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path)
     assert "viewpoint: expected" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", 1, 2, "nan")
 
 
-def test_shaders_in_other_languages(fitted, tmp_path):
-    for language, name in (("hlsl", "probe.hlsl"), ("wgsl", "probe.wgsl"), ("glsl", "probe.glsl")):
-        assert name in call("export", fitted, "-o", tmp_path / "out", "--shader", language)
-        assert "wlm_probe_sh(" in (tmp_path / "out" / name).read_text()
-    words = ["export", fitted, "-o", tmp_path / "no", "--engine"]
-    assert "--shader: has no meaning" in fails(*words, "three", "--shader", "hlsl")
-    assert "'--engine': 'any' is not one of 'three'" in fails(*words, "any")
-
-
 @pytest.mark.parametrize(("engine", "index", "file"), [("three", "grid", "grid.ktx2"), ("unreal", "light", "sh5.dds")])
 def test_lattices_of_engines(engine, index, file, fitted, tmp_path):
     text = call("export", fitted, "--engine", engine, "-o", tmp_path / "out", "--cells", 5)

@@ -109,7 +109,7 @@ def test_nearest_blocks_first(device: str):
     assert {level for _, level in ranks[:90]} == {0, 1, 2, 3}
 
 
-def test_blocks_have_the_stated_light(device: str):
+def test_blocks_have_the_stated_field(device: str):
     """Those that few probes decide, against a dense system; of the others the probes are spread over their reach."""
     position = _surface(250)
     values = _field(position)
@@ -135,7 +135,7 @@ def test_blocks_have_the_stated_light(device: str):
     )
 
 
-def test_read_at_a_probe_is_that_probes_light(device: str):
+def test_read_at_a_probe_is_that_probes_field(device: str):
     """Most of a light without likeness from probe to probe comes back, where a mean leaves little; a constant all."""
     random = np.random.default_rng(3)
     grid = np.stack(np.meshgrid(np.arange(30.0), 0.0, np.arange(30.0)), -1).reshape(-1, 3)
@@ -421,14 +421,6 @@ def _ground(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     return 5.0 + 2.0 * np.sin(x / 20.0) + z / 15.0
 
 
-def _light(position: np.ndarray) -> np.ndarray:
-    return np.stack([np.sin(position[:, 0] / 3), np.cos(position[:, 2] / 4)], 1).astype(np.float32)
-
-
-def _walked_volume(position: np.ndarray, device: str = "cpu", **settings: object) -> Volume:
-    return Volume(position, StoredLight(_light(position), device), **({"block": 2.0, "side": 16} | settings))
-
-
 def _line(frames: int, step: float) -> np.ndarray:
     path = np.zeros((frames, 3))
     path[:, 0], path[:, 1] = np.arange(frames) * step, 7.0
@@ -479,8 +471,8 @@ def test_figures_are_those_of_the_readings(device: str):
     """The figures of one frame follow from the volume, its light and the original, dead probes left out."""
     position = _hills()
     live = np.arange(len(position)) % 9 > 0
-    original = _light(position) + np.random.default_rng(1).normal(size=(len(position), 2)).astype(np.float32) / 10
-    volume = _walked_volume(position, device, live=live, budget=40)
+    original = _field(position) + np.random.default_rng(1).normal(size=(len(position), 5)).astype(np.float32) / 10
+    volume = _volume(position, device, side=16, live=live, budget=40)
     reports = []
     path = _line(12, 1.0)
     figures = walk(volume, path, original, samples=60, progress=reports.append)
@@ -492,7 +484,7 @@ def test_figures_are_those_of_the_readings(device: str):
     last = walk(volume, path[-1:], original, samples=10**6)
     inside = (np.abs(position - path[-1]) < 16.0).all(1)
     near, far = np.flatnonzero(live & inside), np.flatnonzero(live & ~inside)
-    reading, light, peak = volume.read(position[near]), _light(position[near]), np.ptp(original)
+    reading, light, peak = volume.read(position[near]), _field(position[near]), np.ptp(original)
 
     def rms(values: np.ndarray) -> float:
         return float(np.sqrt((values.astype(np.float64) ** 2).mean()))
@@ -506,27 +498,17 @@ def test_figures_are_those_of_the_readings(device: str):
         assert last[name] == pytest.approx(20.0 * np.log10(peak / rms(error)))
 
 
-def test_points_that_nothing_covers_count_as_black():
-    position = _hills()
-    light = np.full((len(position), 1), 2.0, np.float32)
-    volume = Volume(position, StoredLight(light), block=2.0, ratios=(1,), side=16, budget=1)
-    figures = walk(volume, _line(1, 0.0), light, samples=10**6)
-    covered = figures["coverage"]["mean"]
-    assert 0.0 < covered < 0.2
-    assert figures["rmse"]["mean"] == pytest.approx(2.0 * math.sqrt(1.0 - covered), rel=1e-5)
-
-
 def test_a_second_lap_decodes_nothing():
     position = _hills()
-    path, volume = camera_path(position, 30), _walked_volume(position, budget=1024)
-    first, second = (walk(volume, path, _light(position)) for _ in range(2))
+    path, volume = camera_path(position, 30), _volume(position, side=16, budget=1024)
+    first, second = (walk(volume, path, _field(position)) for _ in range(2))
     assert first["updated"]["max"] > 0 and second["updated"]["max"] == second["probes"]["max"] == 0
     assert second["left"]["max"] == 0 and second["light_psnr"] == first["light_psnr"] == 120.0
 
 
 def test_a_walk_outside_of_the_scene():
     """Frames without a near sample have no coverage and no error."""
-    volume, light = _walked_volume(_hills(), budget=1024), _light(_hills())
+    volume, light = _volume(_hills(), side=16, budget=1024), _field(_hills())
     figures = walk(volume, _line(2, 1.0) + 1e6, light)
     assert json.loads(json.dumps(figures, allow_nan=False)) == figures
     assert all(figures[key] is None for key in ("coverage", "rmse", "rms", "psnr", "light_psnr"))
@@ -536,7 +518,7 @@ def test_a_walk_outside_of_the_scene():
 
 
 def test_walk_refuses():
-    volume, light = _walked_volume(_hills(50)), _light(_hills(50))
+    volume, light = _volume(_hills(50), side=16), _field(_hills(50))
     for path, options in [(np.zeros(3), {}), (np.zeros((0, 3)), {}), (_line(1, 0.0), {"samples": 0})]:
         with pytest.raises(ValueError, match="walk: expected"):
             walk(volume, path, light, **options)
