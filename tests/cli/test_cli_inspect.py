@@ -100,7 +100,8 @@ def test_all_folders_that_are_written_are_known():
     """Textures of an unknown export would be taken for lightmaps that can be compressed."""
     package = Path(wlm.__file__).parent
     texts = (path.read_text(encoding="utf-8") for path in package.rglob("*.py"))
-    formats = {name for text in texts for name in re.findall(r'^[A-Z][A-Z_]+ = "(wlm-[^"]+)"$', text, re.MULTILINE)}
+    stated = re.compile(r'^(?:[A-Z][A-Z_]+ = |write_kit = lattice_kit\()"(wlm-[^"]+)"', re.MULTILINE)
+    formats = {name for text in texts for name in stated.findall(text)}
     assert len(formats) > 3 and formats <= set(files._EXPORTS)
 
 
