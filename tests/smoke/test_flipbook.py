@@ -213,17 +213,17 @@ def test_wrong_files(tmp_path: Path):
         with pytest.raises(WlmError, match=message):
             read_flipbook(paths, layout, rows=cells, columns=cells)
 
-    refused("a_1.png: cannot read the picture")
+    refused("a_1.png: cannot read the PNG")
     write_book(_book(_frames(1)), tmp_path / "a.png")
     refused("expected sides that divide into 4 rows and 4 columns, found 6 x 9", cells=4)
     refused("expected sides that divide into 12 rows and 12 columns, found 6 x 9", cells=12)
     Image.new("RGB", (9, 5)).save(paths[1])
     refused("textures of one size")
     Image.new("L", (9, 6)).save(paths[1])
-    refused("a_2.png: expected RGB or RGBA with 8 bits per channel, found L")
+    refused("a_2.png: expected a texture of RGB or RGBA, found one of L")
     whole = paths[0].read_bytes()
     paths[0].write_bytes(whole[: len(whole) // 2])
-    refused("a_1.png: cannot read the picture")
+    refused("a_1.png: cannot read the PNG")
     # The header alone states the size; the rest of the file is as before.
     header = b"IHDR" + struct.pack(">2I", 9400, 9400) + whole[24:29]
     paths[0].write_bytes(whole[:12] + header + struct.pack(">I", zlib.crc32(header)) + whole[33:])

@@ -230,9 +230,9 @@ class Camera:
         return across + position, (-toward).expand_as(across)
 
     def in_world(self) -> View:
-        """Returns the camera in world coordinates, as the structure that ray march kernels take."""
+        """Returns the camera in the world's unit and axes, with its position as the origin, for kernels."""
         right, up, toward = self.axes
-        return make_view(self.position, right, up, -toward, self.pitch, self.width, self.height, self.perspective)
+        return make_view(np.zeros(3), right, up, -toward, self.pitch, self.width, self.height, self.perspective)
 
     def view(self, volume: DensityVolume) -> View:
         """Returns the camera in the voxel coordinates of a volume, as the structure that ray march kernels take.

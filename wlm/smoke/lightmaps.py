@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from wlm.smoke.camera import DIRECTIONS, Camera, weights
-from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.shading import Light, Ramp, glow_of
 from wlm.smoke.transport.lights import checked_albedo, checked_colour
 
 _DARKEST = 1e-20
@@ -110,7 +110,7 @@ class SixWay:
             grey = torch.einsum("c,chw->hw", torch.tensor(share).to(self.lightmaps), self.lightmaps)
             image += grey[..., None] * torch.tensor(irradiance * scattered).to(image)
         if self.emission is not None:
-            image += self.emission[..., None] if ramp is None else ramp(self.emission)
+            image += glow_of(self.emission, ramp)
         if background is None:
             return image
         if self.transparency is None:

@@ -1,13 +1,11 @@
 """Directional lights and the colours of emission, for the shading of smoke in linear light."""
 
+import functools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-
-from wlm.smoke.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -43,13 +41,27 @@ class Ramp:
 
     def __call__(self, emission: torch.Tensor) -> torch.Tensor:
         """Returns the colours [..., 3] for a tensor [...] of emissions."""
-        stops = torch.tensor(self.stops, dtype=emission.dtype, device=emission.device)
-        colours = torch.tensor(self.colours, dtype=emission.dtype, device=emission.device)
+        stops, colours = _on_device(self, emission.dtype, emission.device)
         after = torch.searchsorted(stops, emission.contiguous()).clamp(1, len(self.stops) - 1)
         share = ((emission - stops[after - 1]) / (stops[after] - stops[after - 1])).clamp(0, 1)[..., None]
         return (1 - share) * colours[after - 1] + share * colours[after]
 
 
-def light_axes(toward: Sequence[float] | np.ndarray) -> list[float]:
-    """Returns three orthogonal unit axes, of which the third points to the light, as a list of 9 numbers."""
-    return Camera.look_at(toward, np.zeros(3), extent=1.0, height=1, width=1).axes.ravel().tolist()
+@functools.lru_cache(maxsize=8)
+def _on_device(ramp: Ramp, dtype: torch.dtype, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns a ramp's stops and colours as tensors; they are kept, since a CUDA graph cannot copy them to the GPU."""
+    return torch.tensor(ramp.stops, dtype=dtype, device=device), torch.tensor(ramp.colours, dtype=dtype, device=device)
+
+
+def glow_of(emission: torch.Tensor, ramp: Ramp | None, thrown: torch.Tensor | None = None) -> torch.Tensor:
+    """Returns the light of fire, [H, W, 3], or [H, W, 1] if it is grey.
+
+    Args:
+        emission: [H, W], light that the smoke emits.
+        ramp: Colour of the emission; None: grey.
+        thrown: [H, W, 3], emitted light that the smoke scatters, which gets the mean colour of the visible fire.
+    """
+    glow = emission[..., None] if ramp is None else ramp(emission)
+    if thrown is None:
+        return glow
+    return glow + thrown * (1.0 if ramp is None else glow.sum((0, 1)) / emission.sum().clamp(min=1e-12))
