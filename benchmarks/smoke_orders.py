@@ -48,6 +48,7 @@ from benchmarks.rivals.smoke_orders import FITTED, diffused, filter_planes, octa
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from benchmarks.smoke import make_cloud
+from benchmarks.smoke_learning import FAINT, draw_view, psnr
 from benchmarks.timing import Timing
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
@@ -60,7 +61,6 @@ from wlm.smoke.scene import load_scene
 from wlm.smoke.shading import Light
 from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.synthetic import make_plume
-from wlm.smoke.transport.learning import FAINT, draw_view, psnr
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
 from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import OrdersModel, load_orders, make_inputs, orders_march, scatter

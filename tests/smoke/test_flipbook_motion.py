@@ -7,6 +7,7 @@ from PIL import Image
 from reference.flipbook import between
 from typer.testing import CliRunner
 
+from benchmarks.smoke_learning import psnr
 from wlm import smoke
 from wlm.cli.smoke import app
 from wlm.errors import WlmError
@@ -24,7 +25,6 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.motion import read_velocity, velocity_file
 from wlm.smoke.scene import load_scene
 from wlm.smoke.simulation import simulate
-from wlm.smoke.transport.learning import psnr
 
 FRAMES = 26
 

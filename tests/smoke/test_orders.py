@@ -9,22 +9,14 @@ import torch
 from builders.smoke_plumes import plume
 
 from benchmarks.smoke import make_cloud
+from benchmarks.smoke_learning import Lesson, draw_view, fit_orders, learn, make_lessons, psnr, save_orders
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light
 from wlm.smoke.synthetic import make_plume
-from wlm.smoke.transport.learning import (
-    ALBEDOS,
-    Lesson,
-    draw_view,
-    fit_orders,
-    learn,
-    make_lessons,
-    psnr,
-)
 from wlm.smoke.transport.lights import PointLight
-from wlm.smoke.transport.orders import Inputs, OrdersModel, load_orders, make_inputs, orders_march, scatter
+from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, load_orders, make_inputs, orders_march, scatter
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.orders import FEATURES, MIXES
 from wlm_kernels.smoke.settings import March

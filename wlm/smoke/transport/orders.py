@@ -7,7 +7,7 @@ Light scattered many times diffuses, except at the smoke's edges, where it leave
 predicted per pixel as a weighted sum of features: light from diffusion, light scattered once from the light and from
 the opposite direction, opacity, and the shares of light and opacity from thin smoke. The weights depend on the angle
 between light and camera and on the smoke's mean optical depth. They were fitted to path-traced light by least squares
-(`learning`) at `ALBEDOS`, and are interpolated linearly in between."""
+(`benchmarks/smoke_learning.py`) at `ALBEDOS`, and are interpolated linearly in between."""
 
 import functools
 import os
@@ -20,7 +20,6 @@ import torch
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.formats.atomic import atomic_path
 from wlm.formats.npz import read_npz
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import Camera, unit
@@ -213,17 +212,6 @@ class OrdersModel:
             orders.light(*map(to_warp, (*planes, *learned)), *settings)
         return out
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the model as `.npz`, atomically.
-
-        Raises:
-            WlmError: The suffix is wrong, or the file cannot be written.
-        """
-        if Path(path).suffix.lower() != ".npz":
-            raise WlmError(f"{path}: expected a file name that ends in .npz")
-        with atomic_path(path) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, weights=self.weights.cpu().numpy(), range=self.known.cpu().numpy())
-
 
 def _between(albedo: float) -> tuple[int, float]:
     """Returns the index of the last of `ALBEDOS` below an albedo, and the share of the way to the next, 0 to 1."""
@@ -233,7 +221,7 @@ def _between(albedo: float) -> tuple[int, float]:
 
 
 def load_orders(path: str | os.PathLike[str] | None = None) -> OrdersModel:
-    """Reads the weights that `OrdersModel.save` wrote.
+    """Reads the fitted weights.
 
     Args:
         path: The file; None: the weights that ship with wlm.

@@ -1,8 +1,9 @@
-"""Fits the weights of `transport.orders` to path-traced light of random smoke, cameras and lights, by least squares.
+"""Fits the weights of `wlm.smoke.transport.orders` to path-traced light of random smoke, cameras and lights.
 
-The traced light may be noisy as long as it has no bias: least squares fits its mean."""
+The traced light may be noisy as long as it has no bias: least squares fits its mean.
+"""
 
-import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,12 +11,14 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from wlm.fluid.volume import DensityVolume
+from wlm.fluid.volume import DensityVolume, from_array
+from wlm.formats.atomic import atomic_path
 from wlm.interop import device_name, stream
+from wlm.metrics.error import psnr_from_mse
 from wlm.smoke.camera import Camera
 from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.shading import Light
-from wlm.smoke.synthetic import make_billows, make_plume
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, make_inputs, orders_march
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.orders import FEATURES, MIXES
@@ -30,10 +33,46 @@ _SMALL, _HAZY = 0.4, 0.4  # probabilities of smoke that fills a part of its box,
 _RIDGE = 1e-5
 _RARE, _NARROWEST = 0.02, 0.1  # share of depths at either end outside the range, and the least range
 _CLEAR = 1e-3  # opacity below which pixels are ignored
+_OCTAVES = range(1, 6)
+_SHAPES = ("ball", "column", "shell", "fog")
 _CURVE = 1.16  # exponent of the light in the weight, from the slope of sRGB's curve
 
 FAINT = 0.03
 """Light below which errors have the same weight."""
+
+
+def make_billows(n: int = 48, *, seed: int = 1, extinction: float = 1.0, device: str = "cpu") -> DensityVolume:
+    """Makes smoke in the shape of a ball, column, shell or fog, rotated and stretched, with edges perturbed by noise.
+
+    Args:
+        n, extinction, device: As for `make_plume`.
+        seed: Seed of the shape, its softness, and the noise.
+
+    Raises:
+        WlmError: The device does not exist.
+    """
+    random = np.random.default_rng(seed)
+    shape = _SHAPES[int(random.integers(len(_SHAPES)))]
+    roughness, wisps = random.uniform(0.35, 0.75), random.uniform(0.0, 0.6)
+    sharpness = float(np.exp(random.uniform(np.log(0.7), np.log(8.0))))
+    noise = torch.zeros(1, 1, n, n, n)
+    for octave in _OCTAVES:
+        k = min(2**octave + 1, n)
+        coarse = torch.from_numpy(random.standard_normal((1, 1, k, k, k), np.float32))
+        noise += roughness**octave * F.interpolate(coarse, (n, n, n), mode="trilinear", align_corners=k > 1)
+    noise /= noise.std(correction=0).clamp(min=1e-6)
+    turn, _ = np.linalg.qr(random.standard_normal((3, 3)))
+    radii = random.uniform(0.2, 0.5, 3)
+    axis = (np.arange(n) + 0.5) / n
+    place = np.stack(np.meshgrid(axis, axis, axis, indexing="ij")) - random.uniform(0.4, 0.6, (3, 1, 1, 1))
+    along = np.einsum("ij,jxyz->ixyz", turn, place) / radii[:, None, None, None]
+    across = np.sqrt((along[:2] ** 2).sum(0))
+    away = np.sqrt(across**2 + along[2] ** 2)
+    distance = {"ball": away, "column": across, "shell": 2.5 * np.abs(away - 0.7), "fog": np.full_like(away, 0.5)}[
+        shape
+    ]
+    density = np.clip(sharpness * (1.0 - distance + wisps * noise[0, 0].numpy()), 0.0, 1.0).astype(np.float32)
+    return from_array(density, extinction=extinction, voxel=1.0 / n, device=device)
 
 
 def draw_view(
@@ -190,7 +229,16 @@ def learn(
     return fit_orders(lessons)
 
 
+def save_orders(model: OrdersModel, path: str | os.PathLike[str]) -> None:
+    """Writes weights as `.npz` for `load_orders`, atomically.
+
+    Raises:
+        WlmError: The file cannot be written.
+    """
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, weights=model.weights.cpu().numpy(), range=model.known.cpu().numpy())
+
+
 def psnr(light: torch.Tensor, reference: torch.Tensor) -> float:
     """Returns the PSNR in dB of two linear images, computed in sRGB with a peak of 1."""
-    error = (to_srgb(light) - to_srgb(reference)).double().square().mean()
-    return -10.0 * math.log10(max(float(error), 1e-12))
+    return psnr_from_mse(float((to_srgb(light) - to_srgb(reference)).double().square().mean()), 1.0)
