@@ -172,7 +172,7 @@ def test_every_route_keeps_the_scene(tmp_path):
     assert kept == load_frames(folder).scene.looks(2) and bool((six.depth > 0).any())
     assert kept.albedo == (0.9, 0.5, 0.7)
     # What has light of all orders has its albedo.
-    words = ("--fit", "sphere", "--albedo", 0.8, "--step", 2, "--resolution", 20)
+    words = ("--fit", "sphere", "--albedo", 0.8, "--step", 4, "--resolution", 8)
     call("smoke", "bake", folder, "-o", tmp_path / "sphere", *words)
     assert read_shaded(tmp_path / "sphere" / "six_0002.exr")[1] == kept.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
 

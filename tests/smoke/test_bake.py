@@ -71,9 +71,9 @@ def test_halving_the_step(device: str):
     """Halving the step at least halves the error, until rounding; the estimate exceeds the remaining error."""
     volume = _plume(device, extinction=0.8)
     camera = facing(volume, (0.4, 0.3, 1.0))
-    fine = bake(volume, camera, step=1 / 32, estimate=False)
+    fine = bake(volume, camera, step=1 / 16, estimate=False)
     errors, stated = [], []
-    for step in (2.0, 1.0, 0.5, 0.25, 0.125):
+    for step in (2.0, 1.0, 0.5, 0.25):
         maps = bake(volume, camera, step=step)
         off = (maps.lightmaps - fine.lightmaps).double()
         errors.append(float((off.square().mean() / fine.lightmaps.double().square().mean()).sqrt()))
@@ -146,7 +146,7 @@ def test_wrong_settings():
         weights((1.0, 0.0, 0.0), "cubed")
     with pytest.raises(ValueError, match="directions"):
         weights((0.0, 0.0, np.nan))
-    with pytest.raises(ValueError, match=r"lightmaps: expected \[6, H, W\]"):
+    with pytest.raises(ValueError, match=r"lightmaps: expected shape \[6, H, W\]"):
         SixWay(torch.zeros(5, 2, 2), None)
     with pytest.raises(ValueError, match="transparency: expected shape"):
         SixWay(torch.zeros(6, 2, 2), torch.zeros(2, 3))

@@ -89,20 +89,21 @@ def test_hidden_smoke(device: str, thickness: float):
     assert not moved[1].any()
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float16])
-def test_against_a_loop(device: str, dtype: type):
+def test_against_a_loop(device: str):
     """An oblique view, air with other cells than the smoke, and a step that divides no length."""
     random = np.random.default_rng(5)
-    density = np.maximum(random.normal(0.1, 0.5, (9, 14, 11)), 0).astype(dtype)
+    density = np.maximum(random.normal(0.1, 0.5, (9, 14, 11)), 0).astype(np.float16)
     density[:, :5, :4] = 0
     air = random.normal(size=(3, 5, 4, 3)).astype(np.float32)
-    volume = from_array(density, extinction=0.4, voxel=0.5, origin=(1.0, -2.0, 3.0), device=device)
-    assert volume.density.dtype == (torch.float16 if dtype is np.float16 else torch.float32)
-    camera = facing(volume, (0.7, 0.3, 1.0), 9)
-    moved = motion(volume, _velocity(air, device), camera, reach=0.6, step=1.37).cpu().numpy()
-    expected, opacity = _loop(density.astype(np.float64), 0.2, air, 1.2, camera, volume, 1.37)
-    np.testing.assert_allclose(moved, expected, atol=2e-4)
-    assert (opacity > 0.01).sum() > 30 and np.abs(expected).max() > 0.5
+    place = {"extinction": 0.4, "voxel": 0.5, "origin": (1.0, -2.0, 3.0), "device": device}
+    half, whole = from_array(density, **place), from_array(density.astype(np.float32), **place)
+    assert (half.density.dtype, whole.density.dtype) == (torch.float16, torch.float32)
+    camera = facing(half, (0.7, 0.3, 1.0), 7)
+    expected, opacity = _loop(density.astype(np.float64), 0.2, air, 1.2, camera, half, 1.37)
+    assert (opacity > 0.01).sum() > 20 and np.abs(expected).max() > 0.5
+    for volume in (half, whole):
+        moved = motion(volume, _velocity(air, device), camera, reach=0.6, step=1.37).cpu().numpy()
+        np.testing.assert_allclose(moved, expected, atol=2e-4)
 
 
 def _loop(density, extinction, air, reach, camera, volume, h):

@@ -30,7 +30,7 @@ def lessons() -> list[Lesson]:
 
 
 def diffused(inputs: Inputs, albedo: float) -> torch.Tensor:
-    """Returns the input of the prediction, [H, W]: single scattering and diffusion."""
+    """Returns single scattering and diffusion, the input of the prediction, [H, W]."""
     return inputs.by_diffusion(albedo)[0]
 
 
@@ -90,8 +90,8 @@ def test_on_no_grid_is_the_mix_worse_than_its_input(cells: int):
 @pytest.mark.parametrize("extinction", [0.3, 400.0])
 def test_smoke_thinner_and_thicker_than_any_that_was_learned(extinction: float):
     """Outside the fitted range the result is no worse than its input."""
-    volume = make_plume(32, seed=3, hot=False, extinction=extinction)
-    camera = Camera.around(volume, toward=(0.3, 0.1, 1.0), pixels=20)
+    volume = make_plume(24, seed=3, hot=False, extinction=extinction)
+    camera = Camera.around(volume, toward=(0.3, 0.1, 1.0), pixels=14)
     lights = [Light((1.0, 0.6, 0.2)), Light((-0.4, 0.5, -0.8))]
     traced = trace(volume, camera, lights, samples=4096 if extinction < 1.0 else 256).planes.sum(1)[..., 0]
     _, inputs = make_inputs(volume, camera, lights, [1.0], orders_march(volume))
@@ -226,20 +226,18 @@ def test_a_light_and_a_camera_in_the_smoke(device: str, within: str):
 def test_files_of_models(tmp_path):
     """A saved model is read back; each wrong file is an error that names the part."""
     model = load_orders()
-    model.save(tmp_path / "a.npz")
+    save_orders(model, tmp_path / "a.npz")
     again = load_orders(tmp_path / "a.npz")
     assert torch.equal(model.weights, again.weights) and torch.equal(model.known, again.known)
-    with pytest.raises(WlmError, match="npz"):
-        model.save(tmp_path / "a.bin")
     wrong = {
         "weights": (torch.zeros(3, 3), model.known),
         "range": (model.weights, torch.tensor([2.0, 1.0])),
     }
     for name, arrays in wrong.items():
-        OrdersModel(*arrays).save(tmp_path / "b.npz")
+        save_orders(OrdersModel(*arrays), tmp_path / "b.npz")
         with pytest.raises(WlmError, match=rf"b.npz: {name}: expected"):
             load_orders(tmp_path / "b.npz")
-    OrdersModel(model.weights * math.inf, model.known).save(tmp_path / "b.npz")
+    save_orders(OrdersModel(model.weights * math.inf, model.known), tmp_path / "b.npz")
     with pytest.raises(WlmError, match="weights: expected finite"):
         load_orders(tmp_path / "b.npz")
     np.savez(tmp_path / "b.npz", weights=model.weights.numpy())
@@ -253,9 +251,9 @@ def test_inputs_hold_for_any_image(device: str):
     """The light does not depend on the number of pixels."""
     volume, model = plume(device=device), load_orders().to(device)
     made = []
-    for pixels in (24, 48, 96):
+    for pixels in (24, 48):
         camera = Camera.around(volume, pixels=pixels)
         _, inputs = make_inputs(volume, camera, [Light((1.0, 0.5, 0.6))], [1.0], orders_march(volume))
         made.append(torch.nn.functional.avg_pool2d(model.light(inputs, (1.0,) * 3)[..., 0], pixels // 24))
-    for finer in made[1:]:
-        assert float((made[0] - finer).square().mean().sqrt() / finer.square().mean().sqrt()) < 0.12
+    rough, finer = made
+    assert float((rough - finer).square().mean().sqrt() / finer.square().mean().sqrt()) < 0.12

@@ -116,7 +116,7 @@ def test_a_camera_so_far_away_that_all_depths_are_one_is_refused(kind):
     volume = plume()
     camera = view_of(volume)
     camera = replace(camera, position=tuple(1e20 * np.asarray(camera.position)))
-    with pytest.raises(ValueError, match="expected near < far"):
+    with pytest.raises(ValueError, match="expected a near distance below the far one"):
         render_guide(volume, camera, kind, MARCH)
 
 

@@ -85,7 +85,7 @@ def test_wrong_settings():
         replace(six, camera=None).shade([Light((0, 0, 1))])
     with pytest.raises(ValueError, match="transparency: the lightmaps have no"):
         replace(six, transparency=None).shade([], background=(0, 0, 0))
-    with pytest.raises(ValueError, match="camera: expected .height, width. .8, 8."):
+    with pytest.raises(ValueError, match="camera: expected the height and width of the lightmaps, .8, 8."):
         replace(six, camera=six.camera.finer(2))
     with pytest.raises(ValueError, match="depth: expected"):
         replace(six, depth=torch.ones(2, 2))

@@ -76,7 +76,9 @@ class Decoder:
         """
         if encoded.shape != self._guide.shape[1:] or encoded.device != self._guide.device:
             expected = f"{list(self._guide.shape[1:])} on {self.device}"
-            raise ValueError(f"encoded: expected {expected}, got {list(encoded.shape)} on {encoded.device}")
+            raise ValueError(
+                f"encoded: expected a guiding map {expected}, got {list(encoded.shape)} on {encoded.device}"
+            )
         self._guide[0].copy_(encoded)
         self._run()
         return self._planes

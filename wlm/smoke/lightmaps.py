@@ -60,14 +60,15 @@ class SixWay:
 
     def __post_init__(self) -> None:
         if self.lightmaps.ndim != 3 or self.lightmaps.shape[0] != 6:
-            raise ValueError(f"lightmaps: expected [6, H, W], got {tuple(self.lightmaps.shape)}")
+            raise ValueError(f"lightmaps: expected shape [6, H, W], got {tuple(self.lightmaps.shape)}")
         size = tuple(self.lightmaps.shape[1:])
         for name in ("transparency", "emission", "depth"):
             plane = getattr(self, name)
             if plane is not None and tuple(plane.shape) != size:
                 raise ValueError(f"{name}: expected shape {size}, as the lightmaps have, got {tuple(plane.shape)}")
         if self.camera is not None and (self.camera.height, self.camera.width) != size:
-            raise ValueError(f"camera: expected (height, width) {size}, got {(self.camera.height, self.camera.width)}")
+            seen = (self.camera.height, self.camera.width)
+            raise ValueError(f"camera: expected the height and width of the lightmaps, {size}, got {seen}")
 
     def __getitem__(self, direction: str) -> torch.Tensor:
         """Returns the lightmap of a direction, such as "front", [H, W]."""

@@ -37,7 +37,7 @@ class Ramp:
         if len(self.stops) < 2 or np.shape(self.colours) != (len(self.stops), 3):
             raise ValueError("ramp: expected at least two stops and a colour R, G, B for each of them")
         if not (np.isfinite(self.stops).all() and np.isfinite(self.colours).all() and (np.diff(self.stops) > 0).all()):
-            raise ValueError(f"ramp: expected finite colours and increasing finite stops, got {self.stops}")
+            raise ValueError(f"ramp: expected finite colours and increasing stops, got {self.colours} at {self.stops}")
 
     def __call__(self, emission: torch.Tensor) -> torch.Tensor:
         """Returns the colours [..., 3] for a tensor [...] of emissions."""

@@ -84,7 +84,7 @@ def read_flipbook(
     """
     where, lines, said = ", ".join(map(str, paths)), [] if notes is None else notes, []
     if not (len(paths) in (2, 3) or (len(paths) == 1 and Path(paths[0]).suffix.lower() == ".exr")):
-        raise WlmError(f"{where}: expected two textures, or three with one of opacity, got {len(paths)}")
+        raise WlmError(f"{where}: expected two textures, or three with one of opacity, got {len(paths)} file(s)")
     stated: dict[str, Any] = {}
     if len(paths) == 1:
         planes = read_layers(paths[0], lines)
@@ -120,7 +120,7 @@ def read_flipbook(
     if len(paths) == 1:
         lines += [f"{where}: {fault}" for fault in axis_faults(maps)]
     if straight and alpha is None:
-        raise WlmError(f"{where}: expected an alpha channel or a third texture for straight alpha, found none")
+        raise WlmError(f"{where}: expected an alpha channel or a texture of opacity for straight alpha, found none")
     if alpha is not None:
         source = "as given"
         if straight is None and (stated or len(paths) == 1):
@@ -234,7 +234,8 @@ def _cells(
     cell = height // rows, width // columns
     if (height, width) != (rows * cell[0], columns * cell[1]) or min(cell) <= 2 * padding:
         raise WlmError(
-            f"{where}: expected sides that divide into {rows} rows and {columns} columns, found {height} x {width}"
+            f"{where}: expected textures that divide into {rows} rows and {columns} columns of cells, found a height "
+            f"of {height} and a width of {width} pixels"
         )
     said.append(f"{rows} x {columns} cells, {source}")
     return rows, columns, padding

@@ -99,7 +99,7 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
     """
     for name in ("spacing", "light_step"):
         if getattr(march, name) is not None:
-            raise ValueError(f"{name}: expected None, a guiding map uses the step, got {getattr(march, name)}")
+            raise ValueError(f"{name}: expected None, since a guiding map uses the step, got {getattr(march, name)}")
     return Guide(run(marches.guide, volume, camera, (3,), march, shared=shared), camera)
 
 

@@ -66,7 +66,7 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
         ValueError: The number of planes is wrong, or `near` is not less than `far`.
     """
     if maps.ndim < 3 or maps.shape[-3] != 3:
-        raise ValueError(f"maps: expected [..., 3, H, W], got {tuple(maps.shape)}")
+        raise ValueError(f"maps: expected shape [..., 3, H, W], got {tuple(maps.shape)}")
     _check_span(near, far)
     light, transparency, depth = maps.unbind(-3)
     share = ((far - depth) / (far - near)).clamp(0.0, 1.0)
@@ -75,7 +75,7 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
 
 def _check_span(near: float, far: float) -> None:
     if not near < far:
-        raise ValueError(f"near, far: expected near < far, got {near} and {far}")
+        raise ValueError(f"near, far: expected a near distance below the far one, got {near} and {far}")
 
 
 def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March) -> torch.Tensor:
@@ -136,7 +136,7 @@ def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera |
         ValueError: The number of planes is wrong.
     """
     if planes.ndim != 3 or planes.shape[0] != len(PLANES):
-        raise ValueError(f"planes: expected [{len(PLANES)}, H, W], got {tuple(planes.shape)}")
+        raise ValueError(f"planes: expected shape [{len(PLANES)}, H, W], got {tuple(planes.shape)}")
     with stream(device_name(planes.device)):
         planes = planes.detach().float().contiguous()
         light = torch.empty_like(planes)

@@ -30,7 +30,9 @@ class Pool:
         count, size = len(self.guides), tuple(self.guides.shape[-2:])
         channels = self.guides.shape[2] if self.guides.ndim == 5 else 0
         if channels not in map(len, GUIDES.values()):
-            raise ValueError(f"guides: expected [N, 2, C, H, W] of a kind in GUIDES, got {list(self.guides.shape)}")
+            raise ValueError(
+                f"guides: expected shape [N, 2, C, H, W] with C planes of a kind in GUIDES, got {[*self.guides.shape]}"
+            )
         shapes = {
             "guides": (count, 2, channels, *size),
             "targets": (count, 2, len(PLANES), *size),
