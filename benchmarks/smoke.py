@@ -38,17 +38,15 @@ from benchmarks.runner import Bench, Note
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream, to_warp
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import RULES, Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import Guide, guide
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import Guide, bake, guide
 from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera
-from wlm.smoke.shading import Light
+from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.simulation import make_solver, volume_of
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
 from wlm.view.smoke import Drawing

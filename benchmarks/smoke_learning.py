@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.formats.atomic import atomic_path
 from wlm.interop import device_name, stream
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import Camera
 from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.shading import Light

@@ -52,17 +52,16 @@ from benchmarks.smoke_learning import FAINT, draw_view, psnr
 from benchmarks.timing import Timing
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
-from wlm.metrics.flip import flip_display
+from wlm.metrics import flip_display
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.march.motion import motion
 from wlm.smoke.network.losses import warp
 from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.scene import load_scene
-from wlm.smoke.shading import Light
+from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
-from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import OrdersModel, load_orders, make_inputs, orders_march, scatter
 from wlm.smoke.transport.tracing import Transport, trace
 

@@ -27,14 +27,13 @@ from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.codec import open_network
 from wlm.smoke.data import load_frames, open_frames
 from wlm.smoke.fit import train
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse, guide
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, bake_coarse, guide
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.planes import EMISSION_PLANE, encode_lightmaps
 from wlm.smoke.network.prediction import SmokePredictor

@@ -1,12 +1,15 @@
 """README: its size, its links, and all of its snippets and commands, run as written in a temporary folder."""
 
+import json
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
 from builders.running import call
 
+from wlm.formats.exr import read_exr, write_exr
 from wlm.system import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,8 +28,14 @@ def checkout(tmp_path, monkeypatch) -> None:
 
 
 @pytest.fixture
-def few_steps(monkeypatch) -> None:
-    """Shortens every fit to some steps."""
+def few_steps(tmp_path, monkeypatch) -> None:
+    """Changes to a folder with a part of the demos' data, and shortens every fit to some steps."""
+    shutil.copytree(ROOT / "demos" / "data", tmp_path / "demos" / "data")
+    city, room = (tmp_path / "demos" / "data" / name for name in ("city/set.json", "atlas/room.exr"))
+    listed = json.loads(city.read_text())
+    city.write_text(json.dumps(listed | {"lightmaps": listed["lightmaps"][::8]}))
+    write_exr(room, read_exr(room)[0][::2, ::2])
+    monkeypatch.chdir(tmp_path)
     override = Settings.override
 
     def short(self, values, prefix=""):
@@ -39,7 +48,7 @@ def few_steps(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("number", range(len(PYTHON)))
-def test_python(number, checkout, few_steps):
+def test_python(number, few_steps):
     exec(compile(PYTHON[number], f"README.md, block {number}", "exec"), {"__name__": "__main__"})
 
 
@@ -54,7 +63,7 @@ def run(commands: list[str]) -> None:
         assert call(*shlex.split(command)[1:])
 
 
-def test_commands(checkout, few_steps):
+def test_commands(few_steps):
     assert len(COMMANDS) >= 8
     run([command for command in COMMANDS if not command.startswith(SLOW)])
 

@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.rivals.lightmap_levels import TileRanges, clear_unseen, prepare, seen_texels, to_codes
 from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure
 from wlm.errors import WlmError
-from wlm.formats import bc7_modes, hdr_blocks
+from wlm.formats import bc7, hdr_blocks
 from wlm.formats.block_reuse import reuse_blocks
 from wlm.formats.hdr_blocks import need
 from wlm.lightmap.tiles import TILE
@@ -86,7 +86,7 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival:
         return need("imagecodecs", EXTRA).bcn_decode(data, 7, shape=(*padded.shape[:2], 4))[..., :3]
 
     def encode() -> bytes:
-        data = bc7_modes.encode_image(padded, EXTRA, _BC_PROFILE).tobytes()
+        data = bc7.encode_image(padded, EXTRA, _BC_PROFILE).tobytes()
         if loss == 0.0:
             return data
         weight = _weight(mask)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from wlm.errors import WlmError
+from wlm.metrics import psnr_from_mse
 
 
 def error_of(call: Callable, *args: Any, **options: Any) -> str:
@@ -43,6 +44,11 @@ def _assert_same(x: Any, y: Any, name: str) -> None:
             _assert_same(mine, other, name)
     else:
         assert x == y, name
+
+
+def psnr(reference: np.ndarray, decoded: np.ndarray) -> float:
+    """PSNR of all numbers together, with the range of the reference as the peak."""
+    return psnr_from_mse(float(np.mean(np.square(reference - decoded))), float(np.ptp(reference)))
 
 
 def put(index: Any, value: Any) -> Callable[[np.ndarray], np.ndarray]:

@@ -97,7 +97,7 @@ def test_compress_prints_one_table(folder, profile, tmp_path):
     assert f"{out.stat().st_size:,}" in text and "0/light RGB" in text and "1 dynamic" in text
     assert re.search(r"fit: 10 of 10, loss [\d.]+, PSNR -?[\d.]+ dB", call.stderr)
     model = wlm.load(out)
-    assert (model.profile.steps, model.profile.samples, model.period) == (10, 128, None)
+    assert (model.profile.steps, model.profile.samples, model.period) == (10, 128, 24.0)
     assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"], "no checkpoint is left"
 
 

@@ -6,6 +6,7 @@ import re
 import shutil
 from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import pytest
 from builders import atlas_meshes, small_sets
@@ -52,7 +53,7 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
     for state, seed in (("night", 1), ("day", 2)):
         (tmp_path / "unity" / state).mkdir(parents=True)
         write_exr(tmp_path / "unity" / state / "Lightmap-0_comp_light.exr", chart(16, seed, alpha=True))
-        Image.new("RGBA", (64, 64)).save(tmp_path / "unity" / state / "Lightmap-0_comp_dir.png")
+        Image.new("RGBA", (32, 32)).save(tmp_path / "unity" / state / "Lightmap-0_comp_dir.png")
     Image.new("RGBA", (64, 64)).save(tmp_path / "unity" / "day" / "Lightmap-0_comp_shadowmask.png")
     write_exr(tmp_path / "unity" / "day" / "ReflectionProbe-0.exr", np.ones((8, 48, 3), np.float32))
     write_set(tmp_path / "set")
@@ -70,10 +71,9 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
     model.save(tmp_path / "other" / "atlas.wlm")
     text = told(tmp_path)
     for said in (
-        "unity: 2 states of light from Unity, 1 map of 64x64, with light, dir -> "
-        "wlm compress HERE/unity --times 0:2:1 --layers light,dir -o OUT.wlm",
+        "unity: 2 states of light from Unity, 1 map of 64x64, with light, dir, shadowmask -> "
+        "wlm compress HERE/unity --times 0:2:1 -o OUT.wlm",
         "the hours of day, night are unknown",
-        "night has no Lightmap-0_comp_shadowmask",
         "unity/day/ReflectionProbe-0.exr: six faces of a cube, 48x8",
         "set: a set of lightmaps at 5 times, 128x128 -> wlm compress HERE/set -o OUT.wlm",
         "room.lmbake: 9 light probes of 9 RGB coefficients, 9 of them lit; SH of radiance in the file's unit; "
@@ -87,6 +87,9 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
         "atlas.wlm: compressed lightmaps of meshes",
     ):
         assert said in text, said
+    # Compression prints the same lines.
+    lines = wlm.lightmap.load(tmp_path / "unity", times=[0, 1]).warnings
+    assert len(lines) == 4 and all(line.removeprefix(f"{tmp_path}/unity: ") in text.splitlines() for line in lines)
     assert "LICENSE" not in text and text.count("set") < 20
     export(model, tmp_path / "engine", "unity")
     # No command takes it.
@@ -104,7 +107,15 @@ def test_all_folders_that_are_written_are_known():
 def test_pictures_of_several_atlases_are_no_times(tmp_path):
     for hour, width in ((6, 16), (12, 16), (18, 16)):
         write_exr(tmp_path / f"map_{hour}h.exr", chart(width, hour))
-    assert told(tmp_path) == ".: 3 lightmaps of 64x64 -> wlm compress HERE -o OUT.wlm"
+    what, hours = told(tmp_path).splitlines()
+    assert what == ".: 3 lightmaps of 64x64 -> wlm compress HERE -o OUT.wlm" and "map_18h.exr = 18" in hours
+    for hour in (6, 12):
+        (tmp_path / f"map_{hour}h.hdr").write_bytes(imagecodecs.rgbe_encode(chart(16, hour)[..., :3], header=True))
+        (tmp_path / f"map_{hour}h.exr").unlink()
+    assert told(tmp_path).splitlines()[0] == what, "the size of a Radiance picture is known only when it is read"
+    for hour in (6, 12):
+        (tmp_path / f"map_{hour}h.hdr").unlink()
+        write_exr(tmp_path / f"map_{hour}h.exr", chart(16, hour))
     write_exr(tmp_path / "map_18h.exr", chart(11, 18))
     text = told(tmp_path)
     assert "3 lightmaps of different UV layouts" in text and "compress them with their meshes ->" in text

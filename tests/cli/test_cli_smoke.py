@@ -16,8 +16,7 @@ from wlm.fluid.volume import load_volume, save_volume
 from wlm.formats.exr import read_planes
 from wlm.smoke.data import load_frames, read_shaded, read_six_way
 from wlm.smoke.lightmaps import axis_faults
-from wlm.smoke.march.coarse import with_surface
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, with_surface
 from wlm.smoke.scene import CameraSettings, LightSettings, make_camera
 from wlm.view.pictures import to_bytes
 from wlm.view.smoke import picture
@@ -47,8 +46,8 @@ def camera_of(volume, **settings):
 @pytest.mark.parametrize(
     ("words", "place", "other"),
     [
-        (["bake", "--step", 1], "wlm.smoke.march.fine.bake", ["--step", 2]),
-        (["predict", "--coarse"], "wlm.smoke.march.coarse.bake_coarse", ["--seed", 7]),
+        (["bake", "--step", 1], "wlm.smoke.march.six_way.bake", ["--step", 2]),
+        (["predict", "--coarse"], "wlm.smoke.march.six_way.bake_coarse", ["--seed", 7]),
     ],
 )
 def test_frames_that_were_made_are_not_made_again(words, place, other, frames, tmp_path, monkeypatch):

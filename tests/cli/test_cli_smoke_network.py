@@ -17,7 +17,7 @@ import wlm
 from wlm.smoke import codec
 from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.data import load_frames, read_six_way
-from wlm.smoke.march.coarse import bake_coarse
+from wlm.smoke.march.six_way import bake_coarse
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network import onnx_file
 from wlm.smoke.network.planes import GUIDES, encode_lightmaps, render_guide

@@ -1,12 +1,17 @@
+"""BC7 against two other decoders, bit for bit, and against the format's interpolation."""
+
+import sys
+
 import imagecodecs
 import numpy as np
 import pytest
 import texture2ddecoder
+from builders.synthetic import any_blocks
 
 from wlm.errors import WlmError
-from wlm.formats.bc7 import WEIGHTS, decode_image, decode_mode6, pack_mode6, unpack_mode6
+from wlm.formats.bc7 import SHARES, decode_image, encode_image, pack_mode6, unpack_mode6
 
-ROWS, COLUMNS = 64, 80
+ROWS, COLUMNS = 64, 96
 
 
 def _parameters(*shape: int) -> tuple[np.ndarray, np.ndarray]:
@@ -17,25 +22,14 @@ def _parameters(*shape: int) -> tuple[np.ndarray, np.ndarray]:
     return upper << 1 | parity, rng.integers(0, 16, (*shape, 16), np.uint8)
 
 
-def _random_blocks(*shape: int) -> np.ndarray:
+def _mode_6(*shape: int) -> np.ndarray:
     """Any 128 bits are a valid block once the mode's 7 are set."""
     blocks = np.random.default_rng(6).integers(0, 256, (*shape, 16), np.uint8)
     blocks[..., 0] = blocks[..., 0] & 0x80 | 0x40
     return blocks
 
 
-def _mix(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """The format's interpolation in Python integers."""
-    texels = np.empty((*indices.shape, 4), np.uint8)
-    for place in np.ndindex(*indices.shape):
-        weight = int(WEIGHTS[indices[place]])
-        for channel in range(4):
-            first, second = (int(endpoints[(*place[:-1], end, channel)]) for end in range(2))
-            texels[(*place, channel)] = ((64 - weight) * first + weight * second + 32) >> 6
-    return texels
-
-
-@pytest.mark.parametrize("blocks", [_random_blocks(ROWS, COLUMNS), pack_mode6(*_parameters(ROWS, COLUMNS))])
+@pytest.mark.parametrize("blocks", [any_blocks(ROWS, COLUMNS, seed=3), pack_mode6(*_parameters(ROWS, COLUMNS))])
 def test_two_other_decoders_agree_bit_for_bit(blocks):
     ours = decode_image(blocks)
     shape = (4 * ROWS, 4 * COLUMNS, 4)
@@ -44,12 +38,27 @@ def test_two_other_decoders_agree_bit_for_bit(blocks):
     assert np.array_equal(ours, np.frombuffer(bgra, np.uint8).reshape(shape)[..., [2, 1, 0, 3]])
 
 
+@pytest.mark.parametrize("mode", [0, 1, 2, 3, 7])
+def test_every_partition_is_read(mode):
+    """The number of a partition is in the bits above those of the mode."""
+    rng, count = np.random.default_rng(mode), 16 if mode == 0 else 64
+    blocks = rng.integers(0, 256, (count, 64, 16), np.uint8)
+    number = np.arange(count, dtype=np.uint16)[:, None] << mode + 1
+    low = blocks[..., 0].astype(np.uint16) | blocks[..., 1].astype(np.uint16) << 8
+    low = low & ~np.uint16((2 * count << mode) - 1) | number | np.uint16(1 << mode)
+    blocks[..., 0], blocks[..., 1] = low & 255, low >> 8
+    assert np.array_equal(decode_image(blocks), imagecodecs.bcn_decode(blocks.tobytes(), 7, shape=(4 * count, 256, 4)))
+
+
 def test_packing_keeps_the_texels():
     endpoints, indices = _parameters(4, 5)
     assert np.any(indices[..., 0] >= 8) and np.any(indices[..., 0] < 8)
     blocks = pack_mode6(endpoints, indices)
     assert blocks.shape == (4, 5, 16) and blocks.dtype == np.uint8
-    assert np.array_equal(decode_mode6(blocks), _mix(endpoints, indices))
+    share, ends = SHARES[2][indices][..., None], endpoints.astype(int)[..., None, :, :]
+    mixed = ((64 - share) * ends[..., 0, :] + share * ends[..., 1, :] + 32) >> 6  # [4, 5, 16, 4]
+    image = mixed.reshape(4, 5, 4, 4, 4).swapaxes(1, 2).reshape(16, 20, 4)
+    assert np.array_equal(decode_image(blocks), image)
 
 
 def test_unpacking_gives_back_what_was_packed():
@@ -57,26 +66,29 @@ def test_unpacking_gives_back_what_was_packed():
     indices[:, 0] &= 7
     found = unpack_mode6(pack_mode6(endpoints, indices))
     assert np.array_equal(found[0], endpoints) and np.array_equal(found[1], indices)
-    blocks = _random_blocks(1000)
+    blocks = _mode_6(1000)
     assert np.array_equal(pack_mode6(*unpack_mode6(blocks)), blocks)
 
 
-def test_a_view_and_no_blocks_at_all_work():
-    blocks = _random_blocks(6, 4)
-    assert np.array_equal(decode_mode6(blocks[::2, ::-1]), decode_mode6(blocks)[::2, ::-1])
-    assert decode_mode6(np.empty((0, 16), np.uint8)).shape == (0, 16, 4)
+def test_views_several_images_and_no_blocks_at_all_work():
+    blocks = any_blocks(2, 6, 4)
+    images = decode_image(blocks[:, ::2, ::-1])
+    assert images.shape == (2, 12, 16, 4)
+    assert np.array_equal(images[1], decode_image(np.ascontiguousarray(blocks[1, ::2, ::-1])))
+    assert decode_image(np.empty((0, 3, 16), np.uint8)).shape == (0, 12, 4)
     assert pack_mode6(np.empty((0, 2, 4), np.uint8), np.empty((0, 16), np.uint8)).shape == (0, 16)
 
 
 @pytest.mark.parametrize("mode", [0, 1, 2, 3, 4, 5, 7])
 def test_another_mode_is_named(mode):
-    blocks = _random_blocks(3, 4)
+    blocks = _mode_6(3, 4)
     blocks[1, 2, 0] = 0xFF << mode & 0xFF
     with pytest.raises(WlmError, match=f"^BC7 block 6: expected mode 6, found mode {mode}$"):
-        decode_image(blocks)
+        unpack_mode6(blocks)
     blocks[1, 2, 0] = 0
     with pytest.raises(WlmError, match="block 6: expected mode 6, found a reserved mode"):
         unpack_mode6(blocks)
+    assert not decode_image(blocks)[4:8, 8:12, :3].any()
 
 
 def test_wrong_arguments_are_value_errors():
@@ -90,9 +102,22 @@ def test_wrong_arguments_are_value_errors():
     endpoints[1, 0, 2] ^= 1
     with pytest.raises(ValueError, match="share their lowest bit"):
         pack_mode6(endpoints, indices)
-    with pytest.raises(ValueError, match="expected blocks uint8"):
-        unpack_mode6(np.zeros((3, 15), np.uint8))
-    with pytest.raises(ValueError, match="expected blocks uint8"):
-        unpack_mode6(np.zeros((3, 16), np.int8))
+    for wrong in (np.zeros((3, 15), np.uint8), np.zeros((3, 16), np.int8)):
+        with pytest.raises(ValueError, match="expected blocks uint8"):
+            unpack_mode6(wrong)
+        with pytest.raises(ValueError, match="expected blocks uint8"):
+            decode_image(wrong[None])
     with pytest.raises(ValueError, match="H/4"):
         decode_image(np.zeros((3, 16), np.uint8))
+
+
+def test_an_encoded_picture_is_near(monkeypatch):
+    v, u = np.mgrid[:64, :32] / 64.0
+    picture = (255 * np.stack([u, v, u * v], 2)).astype(np.uint8)
+    blocks = encode_image(picture, "frames")
+    assert blocks.shape == (16, 8, 16)
+    assert np.abs(decode_image(blocks).astype(int)[..., :3] - picture).max() <= 3 and blocks[..., 0].all()
+    monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
+    message = r"^frames: ispc_texcomp is missing; needs the extra: pip install 'wlm.frames.'$"
+    with pytest.raises(WlmError, match=message):
+        encode_image(picture, "frames")

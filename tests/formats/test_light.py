@@ -137,7 +137,7 @@ def test_what_the_atlas_exports_is_read(tmp_path):
     np.testing.assert_array_equal(read_light(tmp_path / "a")[0], light)
     blocks = ispc_bc6h(light[..., :3])
     write_ktx2(tmp_path / "a", blocks, 8, 8, "BC6H_UFLOAT_BLOCK")
-    write_dds(tmp_path / "b", blocks, 8, 8, fmt="BC6H_UF16")
+    write_dds(tmp_path / "b", blocks, 8, 8, "BC6H_UF16")
     np.testing.assert_array_equal(read_light(tmp_path / "a")[0], read_light(tmp_path / "b")[0])
 
 
@@ -193,17 +193,17 @@ def test_kinds_are_told_by_content(tmp_path):
         (FORMAT, 37, "BC6H or ASTC SFLOAT, found 37"),
         (FORMAT, 83, "BC6H or ASTC SFLOAT, found 83 (R16G16_SFLOAT)"),
         (FORMAT, 9999, "found 9999"),
-        (FORMAT, 97, "byteLength of level 0: 5 x 3 R16G16B16A16_SFLOAT need 120 bytes, found 90"),
+        (FORMAT, 97, "byteLength of level 0: expected 120 for 5 x 3 texels of R16G16B16A16_SFLOAT, found 90"),
         (WIDTH, 0, "expected at least one texel, found 0 x 3"),
         (HEIGHT, 0, "pixelHeight: expected at least 1 (2D), found 0"),
         (HEIGHT, 2**31, "65536 along a side, found 5 x 2147483648"),
-        (WIDTH, 2**16, "_SFLOAT need 1179648 bytes"),
+        (WIDTH, 2**16, "byteLength of level 0: expected 1179648 for 65536 x 3 texels of R16G16B16_SFLOAT"),
         (DEPTH, 2, "pixelDepth: expected 0 (no volume), found 2"),
         (LAYERS, 3, "layerCount: expected 0 (no array), found 3"),
         (FACES, 6, "faceCount: expected 1 (no cube), found 6"),
         (SCHEME, 1, "supercompressionScheme: expected none (0), zstd (2) or zlib (3), found 1"),
-        (SCHEME, 2, "cannot unpack zstd"),
-        (SCHEME, 3, "level 0: Error -3 while decompressing"),
+        (SCHEME, 2, "level 0: cannot unpack: zstd: "),
+        (SCHEME, 3, "level 0: cannot unpack: zlib: Error -3 while decompressing"),
         (LEVEL, 500, "level 0: the file is cut short: expected 590 bytes"),
         (DESCRIPTOR_AT, 2**31, "the data format descriptor: the file is cut short"),
         (PAIRS_BYTES, 2**31, "the key/value data: the file is cut short"),
@@ -236,7 +236,7 @@ def test_other_orders_are_refused(tmp_path, pairs, words):
     ("at", "value", "words"),
     [
         (DDS_SIZE, 125, "header size: expected 124, found 125"),
-        (DDS_HEIGHT, 4, "the file is cut short: expected 308 bytes, of 5 x 4 R16G16B16A16_FLOAT, found 268"),
+        (DDS_HEIGHT, 4, "5 x 4 texels of R16G16B16A16_FLOAT: the file is cut short: expected 308 bytes, found 268"),
         (DDS_HEIGHT, 0, "expected at least one texel, found 5 x 0"),
         (DDS_HEIGHT, 2**24, "65536 along a side"),
         (DDS_FLAGS, 0x40, "pixel format: expected DX10, or FourCC 113 (A16B16G16R16F) or 116 (A32B32G32R32F), found"),
@@ -275,8 +275,7 @@ def test_supercompressed_data_of_another_size_is_refused(tmp_path, scheme):
         content = bytearray(make_ktx2(90, 5, 3, [bytes(size)], scheme))
         struct.pack_into("<Q", content, LEVEL_SIZE, 90)
         path.write_bytes(content)
-        message = error_of(read_light, path)
-        assert "cannot unpack" in message or "level 0: expected 90 bytes once unpacked" in message
+        assert "a.ktx2: level 0: cannot unpack: z" in error_of(read_light, path)
 
 
 def test_a_missing_package_is_named_with_the_file(tmp_path, monkeypatch):
@@ -302,7 +301,7 @@ def test_pfm_of_either_byte_order_and_of_grey(tmp_path):
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"PF\n2 2\n-1\n" + bytes(47), "cut short: expected 48 bytes of texels, found 47"),
+        (b"PF\n2 2\n-1\n" + bytes(47), "the texels: the file is cut short: expected 58 bytes, found 57"),
         (b"PF\n2 2\n0\n" + bytes(48), "expected a PFM header"),
         (b"PF\n2 2\n1e+e\n" + bytes(48), "expected a PFM header"),
         (b"PF\n0 2\n-1\n", "expected at least one texel"),

@@ -3,7 +3,6 @@
 import struct
 import sys
 import tracemalloc
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
@@ -30,7 +29,7 @@ def unity(monkeypatch, tmp_path):
 
     def give(*objects):
         size = sum(len(each[2]) for each in objects)
-        monkeypatch.setattr(unity_asset, "run_child", lambda data: unity_child.encode(objects, size))
+        monkeypatch.setattr(unity_asset, "run_child", lambda reader, data: unity_child.encode(objects, size))
         path = tmp_path / "LightingData.asset"
         path.write_bytes(b"".join(each[2] for each in objects) or b"none")
         return path
@@ -86,11 +85,12 @@ def test_others_are_refused(unity, objects, said):
         read_lighting_data(path)
 
 
-def test_no_room_is_made_for_what_a_file_claims(unity):
+def test_no_room_is_made_for_what_a_file_claims(unity, monkeypatch):
+    monkeypatch.setattr(unity_child, "_MOST_STEPS", 1 << 12)
     kind, tree, content, order = probes(PLACES, SH)
     many = struct.pack("<i", 2**31 - 1)
     # A name of that many bytes; then that many empty arrays, each of which takes four bytes.
-    for damaged in (many + content[4:], content[:12] + many + bytes(1 << 23)):
+    for damaged in (many + content[4:], content[:12] + many + bytes(1 << 20)):
         path = unity((kind, tree, damaged, order))
         tracemalloc.start()
         with pytest.raises(WlmError, match="damaged, or UnityPy cannot read its version"):
@@ -116,29 +116,24 @@ def test_without_the_extra(monkeypatch, tmp_path):
     assert inspect(path)[0].problems == ("unity: UnityPy is missing; needs the extra: pip install 'wlm[unity]'",)
 
 
-def test_a_reader_that_ends_is_told(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        ("import os; os.abort()", "UnityPy crashed"),
+        ("print('no array'); raise EOFError('no more')", "EOFError: no more"),
+        ("while True: pass", "exceeded its limits of 1 s"),
+        ("return {'a': bytes(1 << 40)}", "MemoryError"),
+    ],
+)
+def test_a_reader_that_ends_is_told(tmp_path, monkeypatch, program, said):
     path, child = tmp_path / "LightingData.asset", tmp_path / "child.py"
-    limits = Path(unity_child.__file__).parent
     path.write_bytes(bytes(64))
     monkeypatch.setitem(sys.modules, "UnityPy", ModuleType("UnityPy"))
-    monkeypatch.setattr(unity_asset.unity_child, "__file__", str(child))
-    for program, said in (
-        ("import os; os.abort()", "UnityPy crashed"),
-        ("raise EOFError('no more')", "EOFError: no more"),
-        ("print('[[], []]')", "found neither"),
-        ("print('[')", "damaged, or UnityPy cannot read its version"),
-        (
-            'print(\'[["LightProbes"], [["m_BakedCoefficients", 9, 27]]]\')',
-            "damaged, or UnityPy cannot read its version",
-        ),
-        ("while True: pass", "exceeded its limits"),
-        ("print(len(bytes(1 << 40)))", "MemoryError"),
-    ):
-        child.write_text(
-            f"import sys; sys.path.insert(0, {str(limits)!r})\nimport unity_child; unity_child._limit()\n{program}"
-        )
-        with pytest.raises(WlmError, match=said):
-            read_lighting_data(path)
+    for name, value in (("__file__", str(child)), ("PACKAGE", "UnityPy"), ("SECONDS", 1)):
+        monkeypatch.setattr(unity_child, name, value)
+    child.write_text(f"PACKAGE, MEMORY, SECONDS = 'json', 1 << 28, 1\ndef main(data):\n    {program}\n")
+    with pytest.raises(WlmError, match=f"damaged, or UnityPy cannot read its version.*{said}"):
+        read_lighting_data(path)
 
 
 def test_layouts_are_walked_once_and_objects_count_once():

@@ -18,9 +18,10 @@ from PIL import Image
 import wlm
 from wlm.formats import scratch
 from wlm.formats.channels import read_channels
-from wlm.formats.exr import read_exr, write_exr, write_part
+from wlm.formats.exr import read_exr, write_exr, write_planes
 from wlm.formats.light import read_light
 from wlm.lightmap.data import Layer, LightmapSet, from_layers, parse_times
+from wlm.lightmap.hours import hours_of_names
 
 HEIGHT, WIDTH = 5, 7
 TIMES = (0.0, 6.5, 18.55)
@@ -350,7 +351,10 @@ def test_plain_folder_takes_files_in_natural_order(tmp_path):
     (tmp_path / "._x1.exr").write_bytes(b"another program's")
     lightmaps = load(tmp_path, times=[1, 2, 3])
     np.testing.assert_array_equal(lightmaps.frames, frames[::-1])
-    assert (lightmaps.name, lightmaps.period, lightmaps.warnings) == (tmp_path.name, None, ())
+    assert (lightmaps.name, lightmaps.period) == (tmp_path.name, None)
+    times, period = lightmaps.warnings
+    assert "times given, in the order of the names: x1.EXR = 1, x2.exr = 2, x10.exr = 3" in times
+    assert "no period is stated: before 1 and after 3 the first and the last lightmap stay" in period
     assert "2 times for 3 lightmaps" in error_of(load, tmp_path, times=[1, 2])
 
 
@@ -392,7 +396,34 @@ def test_plain_folder_reads_hours_from_names(tmp_path):
     lightmaps = load(tmp_path)
     np.testing.assert_array_equal(lightmaps.times, [5.45, 5.5, 7, 18.55, 20.25])
     np.testing.assert_array_equal(lightmaps.frames, frames[[1, 0, 3, 2, 4]])
-    assert lightmaps.warnings == ()  # nobody gave an order that could be wrong
+    (hours,) = lightmaps.warnings
+    assert hours.endswith("m_07h.exr = 7, m_18_55h.exr = 18.55, m_20.25.exr = 20.25; period 24")
+
+
+@pytest.mark.parametrize(
+    ("names", "hours", "doubt"),
+    [
+        ("m_06_00h m_18_30h m_23_45h", [6, 18.5, 23.75], "m_18_30h is read as 18:30 h; if it means 18.30 h"),
+        ("m_06_00h m_18_55h", [6, 18.55], "m_18_55h is read as 18.55 h; if it means 18:55 h"),
+        ("m_18h30 m_6h05m 7-00h", [18.5, 6 + 5 / 60, 7], ""),
+        ("m_1830h m_0000h", [18.5, 0], ""),
+        ("m_6pm m_6_30PM m_12am m_12pm m-11-15am", [18, 18.5, 0, 12, 11.25], ""),
+        ("m_2_06h m_2_18h", [6, 18], ""),
+        ("m_18.5 m.7h 9h", [18.5, 7, 9], ""),
+        ("m_18 m18h m_6_75pm", [None] * 3, ""),
+    ],
+)
+def test_hours_of_names(names, hours, doubt):
+    read, line = hours_of_names(names.split())
+    assert read == pytest.approx(hours) and line.startswith(doubt) and bool(line) == bool(doubt)
+
+
+def test_equal_files_at_several_times_are_told(tmp_path):
+    for hour, brightness in ((0, 1.0), (6, 2.0), (12, 1.0), (30, 3.0)):
+        write_exr(tmp_path / f"m_{hour}h.exr", brightness * _frames()[0])
+    hours, period, equal = load(tmp_path).warnings
+    assert hours.endswith("= 30") and "no period" in period, "hours of more than a day do not wrap"
+    assert equal == f"{tmp_path}: 0/light of m_0h.exr, m_12h.exr: equal files: was one bake saved under several times?"
 
 
 @pytest.mark.parametrize("odd", ["m_12", "noon", "m12h"])
@@ -467,7 +498,9 @@ def test_unitys_folders_are_states_of_atlases(tmp_path):
     lightmaps = wlm.lightmap.load(tmp_path / "scene")
     labels = [sheet.label for sheet in lightmaps.sheets]
     assert labels == [f"Lightmap-{n}/{rest}" for n in (0, 1) for rest in ("light RGB", "dir RGB", "dir A")]
-    assert lightmaps.times.tolist() == [0.0, 12.0] and lightmaps.name == "scene" and not lightmaps.warnings
+    assert lightmaps.times.tolist() == [0.0, 12.0] and lightmaps.name == "scene"
+    (hours,) = lightmaps.warnings
+    assert lightmaps.period == 24.0 and hours.endswith("hours from the names: day_0h = 0, day_12h = 12; period 24")
     for i, hour in enumerate((0, 12)):
         for atlas in ("Lightmap-0", "Lightmap-1"):
             state = tmp_path / "scene" / f"day_{hour}h"
@@ -490,16 +523,55 @@ def test_a_plain_folder_stays_one_whatever_lies_beside_it(tmp_path):
     assert len(lightmaps.sheets) == 1 and lightmaps.times.tolist() == [3.0]
 
 
+def test_a_map_that_a_state_lacks_is_that_of_the_nearest_time(tmp_path):
+    folder = tmp_path / "scene"
+    write_unity(folder, hours=(0.0, 10.0, 20.0))
+    whole, late = wlm.lightmap.load(folder), folder / "day_20h"
+    (late / "Lightmap-1_comp_light.exr").unlink()
+    Image.open(late / "Lightmap-1_comp_dir.png").resize((6, 9)).save(late / "Lightmap-1_comp_shadowmask.png")
+    (late / "Lightmap-1_comp_dir.png").unlink()
+    lightmaps = wlm.lightmap.load(folder)
+    told = "\n".join(lightmaps.warnings)
+    assert "Lightmap-1/light is not in day_20h: the nearest time's is used there, and not scored" in told
+    assert "Lightmap-1/shadowmask is not in day_0h, day_10h" in told and "in only some" not in told
+    assert "Lightmap-0/shadowmask is in no state: left out" in told
+    assert "Lightmap-1/shadowmask is 6x9, but the first layer of Lightmap-1 is 12x24: each keeps its size" in told
+    for (sheet, own), kept in zip(lightmaps.sheets.items(), (True,) * 3 + (False,) * 3 + (None,) * 2, strict=True):
+        assert own.frames.shape[1:3] == own.mask.shape == ((9, 6) if kept is None else whole.sheets[sheet].mask.shape)
+        if kept is not None:
+            np.testing.assert_array_equal(own.frames[:2], whole.sheets[sheet].frames[:2])
+            late = whole.sheets[sheet].frames[2] if kept else own.frames[0]  # 20 h is nearer to 0 h than to 10 h
+            np.testing.assert_array_equal(own.frames[2][own.mask], late[own.mask])
+            assert kept == (own.covered is None) and (kept or not own.covered[2].any())
+        else:
+            # The first two of 24 rows are outside the charts, and so is a row of nine that covers only them.
+            assert not own.mask[0].any() and own.mask[1:].all() and not own.covered[:2].any()
+            np.testing.assert_array_equal(own.frames[0][own.mask], own.frames[2][own.mask])
+    assert len(wlm.lightmap.load(folder, layers=["light"]).sheets) == 2
+    assert "expected names among light, dir, got 'ao'" in error_of(wlm.lightmap.load, folder / "day_0h", layers=["ao"])
+
+
+def test_grey_stands_for_red_green_and_blue(tmp_path):
+    write_exr(tmp_path / "a.exr", np.ones((2, 5, 3)))
+    colours = np.repeat(np.arange(10, dtype=np.uint8).reshape(2, 5, 1), 3, axis=2)
+    Image.fromarray(colours).save(tmp_path / "colours.png")
+    Image.fromarray(colours[..., 0]).save(tmp_path / "grey.png")
+    entries = [
+        {"time_hours": i, "files": {"0": {"light": "a.exr", "mask": f"{name}.png", "dir": f"{name}.png"}}}
+        for i, name in enumerate(("colours", "grey"))
+    ]
+    layers = {"light": "radiance", "mask": {"encoding": "unit", "channels": ["R"]}, "dir": "unit"}
+    lightmaps = wlm.lightmap.load(write_set_json(tmp_path, layers=layers, lightmaps=entries))
+    for layer, count in (("mask", 1), ("dir", 3)):
+        values = values_of(lightmaps, "0", layer)
+        np.testing.assert_allclose(values, np.stack([colours[..., :count] / 255.0] * 2), atol=1e-7)
+    assert any(line.endswith("/grey.png: its grey is taken as red, green and blue") for line in lightmaps.warnings)
+
+
 def test_states_that_differ_are_one_line(tmp_path):
     folder = tmp_path / "scene"
     write_unity(folder, hours=(0.0, 12.0))
     late = folder / "day_12h"
-    (late / "Lightmap-1_comp_dir.png").rename(late / "Lightmap-1_comp_shadowmask.png")
-    text = error_of(wlm.lightmap.load, folder)
-    assert "day_12h has no Lightmap-1_comp_dir, but day_0h has it" in text and "--layers" in text
-    assert len(wlm.lightmap.load(folder, layers=["light"]).sheets) == 2
-    assert "expected names among light, dir, got 'ao'" in error_of(wlm.lightmap.load, folder / "day_0h", layers=["ao"])
-    (late / "Lightmap-1_comp_shadowmask.png").rename(late / "Lightmap-1_comp_dir.png")
     write_exr(late / "Lightmap-0_comp_light.exr", np.ones((4, 12, 4)))
     assert "has 12x4 pixels, but" in error_of(wlm.lightmap.load, folder)
     write_unity(tmp_path / "other", hours=(3.0, 9.0))
@@ -521,7 +593,7 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
     write_exr(tmp_path / "stacked.exr", stacked, half=False)
     names = ("x.R", "x.G", "y.R", "B", "G", "R")
     planes = {name: random.uniform(-1.0, 1.0, (6, 8)).astype(np.float32) for name in names}
-    write_part(tmp_path / "more.exr", planes, read_channels)
+    write_planes(tmp_path / "more.exr", planes, whole=names)
     small = random.random((3, 5, 3)).astype(np.float32)
     write_exr(tmp_path / "small.exr", small, half=False)
     Image.fromarray(np.uint8([[0, 255, 255, 0, 128]] * 3)).save(tmp_path / "grey.png")
@@ -544,7 +616,7 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
     np.testing.assert_array_equal(values_of(chosen, "small", "L0")[0], small)
     assert values_of(chosen, "small", "L1").shape == (1, 3, 5, 1)
     assert [own.mask.sum() for own in chosen.sheets.values()] == [40, 40, 15, 15]
-    write_part(tmp_path / "order.exr", dict.fromkeys(("A", "B", "BA", "G", "R"), planes["R"]), read_channels)
+    write_planes(tmp_path / "order.exr", dict.fromkeys(("A", "B", "BA", "G", "R"), planes["R"]))
     assert read_channels(tmp_path / "order.exr")[1] == ("R", "G", "B", "A", "BA")
     layers["dir"]["channels"] = ["G", "R"]
     both = write_set_json(
@@ -567,9 +639,12 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
         ({"atlases": None}, "atlases is missing"),
         ({"atlases": {"0": {"width": 3, "height": 4}}}, "a.exr: has 5x2 pixels, but"),
         ({"atlases": {"0": {"width": 3}}}, "atlases.0.height is missing"),
-        ({"atlases": {"0": {}, "1": {}}}, "lightmaps[0].files.1 is missing"),
+        ({"atlases": {"0": {}, "1": {}}}, "atlas 1: expected a picture of it in an entry of lightmaps, found none"),
         ({"atlases": {"0": {"mask": "alpha"}}}, "expected a channel A"),
-        ({"lightmaps": [{"time_hours": 1.0, "files": {"0": {}}}]}, "lightmaps[0].files.0.light is missing"),
+        (
+            {"lightmaps": [{"time_hours": 1.0, "files": {"0": {}}}]},
+            "lightmaps[0].files: expected a picture, found none of the atlases",
+        ),
         ({"lightmaps": [{"time_hours": 1.0, "file": "a.exr"}]}, "lightmaps[0].files is missing"),
         ({"lightmaps": [{"time_hours": 1.0, "files": {"0": {"light": "../a.exr"}}}]}, "found ../a.exr; trust=True"),
         ({"lightmaps": [{"time_hours": 1.0, "files": {"0": {"light": "a.png"}}}]}, "expected a lightmap, EXR"),
@@ -612,8 +687,8 @@ def test_twelve_channels_and_no_more():
     assert "at most 12 channels, found 13" in error_of(from_layers, [*layers, more], [0.0])
     other = Layer(np.zeros((1, 5, 4, 1)), "c", "1")
     assert len(from_layers([*layers, other], [0.0]).sheets) == 5
-    wrong = Layer(np.zeros((1, 5, 4, 1)), "c")
-    assert "0/c R has 4x5 texels, but atlas 0 has 4x4" in error_of(from_layers, [*layers, wrong], [0.0])
+    wrong = Layer(np.zeros((1, 5, 4, 6)), "b", encoding="unit", channels=tuple("RGBxyz"))
+    assert "0/b RGB has 4x5 texels, but others of its layer have 4x4" in error_of(from_layers, [*layers, wrong], [0.0])
     # Not the second in place of the first.
     assert "0/b: expected every channel once" in error_of(from_layers, [*layers, layers[1]], [0.0])
 

@@ -66,7 +66,7 @@ def test_files_that_claim_too_much_are_one_line(tmp_path):
     refused({"sheets": [*sheets, sheets[0]]}, {}, "found one twice")
     refused({"sheets": sheets[:3]}, {}, "part 3.")
     refused(changed(2, channels=["G"]), {}, "every channel once")
-    refused(changed(1, size=[119, 107]), {}, "texels, but atlas")
+    refused(changed(1, size=[119, 107]), {}, "texels, but others of its layer")
     refused(changed(1, encoding="srgb"), {}, "setting sheets.1.encoding")
     refused({}, {"1.mask": stored.tensors["0.mask"]}, "part 1.mask: expected a mask only with the first sheet")
 

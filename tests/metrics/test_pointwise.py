@@ -4,55 +4,22 @@ import math
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from scipy.ndimage import distance_transform_edt
 
 from wlm import texels
 from wlm.errors import WlmError
-from wlm.metrics import PSNR_CAP_DB, dynamic_range, half_ulp, mse, psnr
+from wlm.metrics import PSNR_CAP_DB, evaluate_frame, half_ulp, psnr_from_mse
 from wlm.texels import fill_gaps
 
 
-def test_psnr_of_four_numbers_by_hand():
-    ref = np.array([[[0.0, 1.0, 2.0]], [[3.0, 4.0, 5.0]]])
-    test = ref + np.array([[[0.5, 0.0, 0.0]], [[0.0, -0.5, 1.0]]])
-    # Squared errors 0.25, 0.25 and 1 over six values; the peak is 5.
-    assert mse(ref, test) == pytest.approx(1.5 / 6.0, rel=1e-15)
-    assert psnr(ref, test) == pytest.approx(10.0 * math.log10(25.0 / 0.25), rel=1e-14)
-    assert psnr(ref, test, peak=1.0) == pytest.approx(10.0 * math.log10(1.0 / 0.25), rel=1e-14)
-    assert dynamic_range(ref) == 5.0
-
-
-def test_mask_chooses_texels_for_error_and_range():
-    ref = np.array([[[0.0], [1.0], [9.0]]])
-    test = np.array([[[0.5], [1.0], [0.0]]])
-    mask = np.array([[True, True, False]])
-    assert psnr(ref, test, mask) == pytest.approx(10.0 * math.log10(1.0 / 0.125), rel=1e-14)
-    assert dynamic_range(ref, mask) == 1.0
-
-
-def test_sums_are_float64():
-    # 2**24 + 1 is no float32: an error of 1 would vanish in float32 arithmetic.
-    ref = np.full((2, 2, 3), 2.0**24)
-    assert mse(ref, ref + 1.0) == 1.0
-    # And a million float16 ones overflow if summed in their own type.
-    ones = np.ones((1000, 1000, 1), np.float16)
-    assert mse(ones, np.zeros_like(ones)) == 1.0
-
-
-def test_exact_and_nearly_exact_are_capped():
-    ref = np.linspace(0.0, 1.0, 48).reshape(4, 4, 3)
-    assert psnr(ref, ref) == PSNR_CAP_DB
-    assert psnr(ref, ref + 1e-12) == PSNR_CAP_DB
-    assert psnr(ref, ref + 1e-5) == pytest.approx(100.0)
-
-
-def test_nothing_to_measure_is_nan():
-    image = np.ones((3, 3, 3))
-    empty = np.zeros((3, 3), bool)
-    assert math.isnan(mse(image, image, empty))
-    assert math.isnan(psnr(image, image, empty))
-    assert math.isnan(dynamic_range(image, empty))
-    assert math.isnan(psnr(image, image + 1.0))  # constant: no range
+def test_psnr_of_an_error_and_its_cap():
+    assert psnr_from_mse(0.25, 5.0) == pytest.approx(10.0 * math.log10(25.0 / 0.25), rel=1e-14)
+    assert psnr_from_mse(1e-10, 1.0) == pytest.approx(100.0)
+    assert psnr_from_mse(0.0, 1.0) == psnr_from_mse(1e-24, 1.0) == PSNR_CAP_DB
+    for error, peak in ((math.nan, 1.0), (1.0, 0.0), (1.0, math.nan), (1.0, -1.0)):
+        assert math.isnan(psnr_from_mse(error, peak))
+    assert psnr_from_mse(1e-300, 1e-200) == pytest.approx(-1000.0)  # the square of the peak would be 0
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -60,23 +27,15 @@ def test_bad_values_are_named_and_only_inside_the_mask(value):
     good = np.ones((4, 5, 3))
     bad = good.copy()
     bad[2, 3, 1] = value
-    with pytest.raises(WlmError, match=r"test image .* 1 valid texels, first at row 2, column 3"):
-        mse(good, bad)
-    with pytest.raises(WlmError, match="reference"):
-        mse(bad, good)
-    mask = np.ones((4, 5), bool)
-    mask[2, 3] = False
-    assert mse(good, bad, mask) == 0.0
-    assert mse(bad, good, mask) == 0.0
-
-
-def test_shapes_and_peak_are_checked():
-    with pytest.raises(WlmError, match="one shape"):
-        mse(np.ones((4, 4, 3)), np.ones((4, 5, 3)))
-    with pytest.raises(WlmError, match="mask"):
-        mse(np.ones((4, 4, 3)), np.ones((4, 4, 3)), np.ones((4, 5)))
-    with pytest.raises(WlmError, match="peak"):
-        psnr(np.ones((4, 4, 3)), np.zeros((4, 4, 3)), peak=math.inf)
+    whole, part = np.ones((4, 5), bool), np.ones((4, 5), bool)
+    part[2, 3] = False
+    text = error_of(evaluate_frame, good, bad, whole, name="noon")
+    assert text == "noon: the test image is NaN or infinite at 1 valid texels, first at row 2, column 3"
+    assert "noon: the reference is NaN" in error_of(evaluate_frame, bad, good, whole, name="noon")
+    for pair in ((good, bad), (bad, good)):
+        assert evaluate_frame(*pair, part).max_abs_error == 0.0
+    assert "images [H, W, C] of one shape" in error_of(evaluate_frame, good, good[:3], whole)
+    assert "expected a mask of (4, 5), got (3, 5)" in error_of(evaluate_frame, good, good, whole[:3])
 
 
 @pytest.mark.parametrize(

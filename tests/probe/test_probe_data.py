@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.checks import error_of
+from builders.godot_bakes import Writer, bake
 from builders.probe_sets import synthetic
 
-from wlm.probe import data
 from wlm.probe.conventions import CONVENTIONS, from_canonical
 from wlm.probe.data import LARGEST, ProbeSet, from_arrays, load, load_positions, save_probes
 
@@ -169,11 +169,9 @@ def test_conventions_that_do_not_fit(tmp_path):
     assert "expected a string, got an object" in error_of(load, _write_json(tmp_path / "b.json", content))
 
 
-def test_godot_file(tmp_path, monkeypatch):
-    # What its reader returns; the reader has its own tests.
+def test_godot_file(tmp_path):
     path = tmp_path / "level.lmbake"
-    path.write_bytes(b"RSRC")
-    monkeypatch.setattr(data, "read_lmbake", lambda path: (_position(), _values(N, 9, 3)))
+    path.write_bytes(Writer().file(bake(Writer(), _position(), _values(N, 9, 3))))
     loaded = load(path)
     assert (loaded.name, loaded.key) == ("level", "sh")
     _same(loaded, from_arrays(_position(), _values(N, 9, 3), convention="godot"))
@@ -358,13 +356,12 @@ def test_malformed_json_names_the_field(tmp_path, content, expected):
     assert message.startswith(f"{path}: ") and expected in message
 
 
-def test_positions_of_any_file(tmp_path, monkeypatch):
+def test_positions_of_any_file(tmp_path):
     points = _position().tolist()
     lists = {"a.json": points, "b.json": {"position": points}, "c.txt": {"probes": [{"position": x} for x in points]}}
     paths = [_write_json(tmp_path / name, content) for name, content in lists.items()]
     np.savez(tmp_path / "d.npz", position=_position().astype(np.float32), other=1)
-    (tmp_path / "e.lmbake").write_bytes(b"RSRC")
-    monkeypatch.setattr(data, "read_lmbake", lambda path: (_position().astype(np.float32), None))
+    (tmp_path / "e.lmbake").write_bytes(Writer().file(bake(Writer(), _position(), _values(N, 9, 3))))
     for path in (*paths, tmp_path / "d.npz", tmp_path / "e.lmbake"):
         position = load_positions(path)
         assert position.dtype == np.float64

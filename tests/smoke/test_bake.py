@@ -13,7 +13,7 @@ from benchmarks.path_tracer import PathTracer
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import DIRECTIONS, RULES, VECTORS, Camera, weights
 from wlm.smoke.lightmaps import SixWay, axis_faults
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 
 
 def _plume(device: str = "cpu", n: int = 28, extinction: float = 0.25, seed: int = 2) -> DensityVolume:

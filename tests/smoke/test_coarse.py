@@ -11,8 +11,7 @@ from builders.smoke_plumes import facing, plume
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse, guide, march_planes
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, bake_coarse, guide, march_planes
 from wlm_kernels.smoke import depth_lattice, marches
 from wlm_kernels.smoke import march as kernels
 from wlm_kernels.smoke.settings import March

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from wlm.errors import WlmError
 from wlm.fluid.solver import LEAST_HALF_LOSS
 from wlm.smoke.lightmaps import axis_faults
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 from wlm.smoke.network import dataset
 from wlm.smoke.network.dataset import (
     ATTEMPTS,
@@ -20,8 +20,7 @@ from wlm.smoke.network.dataset import (
     make_validation,
     pool_of_volume,
 )
-from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, Pool
 from wlm.smoke.network.scenes import Tilted, draw_scene
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Air

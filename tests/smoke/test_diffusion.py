@@ -12,11 +12,10 @@ from builders.smoke_plumes import plume
 from benchmarks.smoke_learning import psnr
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera, unit
-from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.shading import Light, PointLight, Ramp, half_sphere
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.diffusion import CoarseSmoke, share_of
 from wlm.smoke.transport.lighting import light_smoke, marching
-from wlm.smoke.transport.lights import PointLight, half_sphere
 from wlm.smoke.transport.orders import orders_march, scatter
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke import diffusion as kernels

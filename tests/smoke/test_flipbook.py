@@ -19,7 +19,7 @@ from wlm.smoke.flipbook.book import Book, Shot, pack_book, write_book
 from wlm.smoke.flipbook.naming import parse_layout, second_names
 from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.lightmaps import SixWay, axis_faults
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 
 KINDS = {".exr": 6e-4, ".png": 0.51 / 255, ".tga": 0.51 / 255}
 

@@ -7,7 +7,7 @@ from builders.smoke_plumes import unit_grid
 
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
-from wlm.smoke.march.coarse import guide
+from wlm.smoke.march.six_way import guide
 from wlm_kernels.smoke.settings import March
 
 

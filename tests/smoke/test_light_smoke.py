@@ -10,11 +10,10 @@ from reference.single_light import lit
 
 from wlm.fluid.volume import from_array
 from wlm.smoke.camera import Camera
-from wlm.smoke.march.fine import bake
-from wlm.smoke.shading import Light
+from wlm.smoke.march.six_way import bake
+from wlm.smoke.shading import Light, PointLight, sky_lights
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import fine_march, light_smoke
-from wlm.smoke.transport.lights import PointLight, sky_lights
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.settings import March
 

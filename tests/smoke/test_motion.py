@@ -9,8 +9,8 @@ from reference.marching import span as clip
 from reference.marching import trilinear
 
 from wlm.fluid.volume import from_array
-from wlm.smoke.march.fine import bake
 from wlm.smoke.march.motion import motion
+from wlm.smoke.march.six_way import bake
 
 SIZE = 24
 

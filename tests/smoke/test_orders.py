@@ -13,9 +13,8 @@ from benchmarks.smoke_learning import Lesson, draw_view, fit_orders, learn, make
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
-from wlm.smoke.shading import Light
+from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.synthetic import make_plume
-from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, load_orders, make_inputs, orders_march, scatter
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.orders import FEATURES, MIXES
@@ -90,8 +89,8 @@ def test_on_no_grid_is_the_mix_worse_than_its_input(cells: int):
 @pytest.mark.parametrize("extinction", [0.3, 400.0])
 def test_smoke_thinner_and_thicker_than_any_that_was_learned(extinction: float):
     """Outside the fitted range the result is no worse than its input."""
-    volume = make_plume(24, seed=3, hot=False, extinction=extinction)
-    camera = Camera.around(volume, toward=(0.3, 0.1, 1.0), pixels=14)
+    volume = make_plume(32, seed=3, hot=False, extinction=extinction)
+    camera = Camera.around(volume, toward=(0.3, 0.1, 1.0), pixels=20 if extinction < 1.0 else 12)
     lights = [Light((1.0, 0.6, 0.2)), Light((-0.4, 0.5, -0.8))]
     traced = trace(volume, camera, lights, samples=4096 if extinction < 1.0 else 256).planes.sum(1)[..., 0]
     _, inputs = make_inputs(volume, camera, lights, [1.0], orders_march(volume))

@@ -11,8 +11,7 @@ from builders.smoke_samples import view_of
 
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse, guide
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, bake_coarse, guide
 from wlm.smoke.network.planes import (
     GUIDES,
     OPACITY_PLANE,

@@ -29,7 +29,7 @@ from wlm.smoke.data import (
     spread,
     write_six_way,
 )
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 from wlm.smoke.scene import (
     CameraSettings,
     LightSettings,

@@ -7,10 +7,9 @@ from builders.smoke_plumes import facing, plume
 
 from wlm.fluid.volume import from_array
 from wlm.smoke.camera import weights
-from wlm.smoke.march.fine import bake
-from wlm.smoke.shading import Light
+from wlm.smoke.march.six_way import bake
+from wlm.smoke.shading import Light, half_sphere
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.lights import half_sphere
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.sphere import bake_sphere
 from wlm_kernels.smoke.settings import March

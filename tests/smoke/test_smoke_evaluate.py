@@ -13,12 +13,11 @@ from builders.smoke_samples import random_model, small_pool
 import wlm
 from wlm.errors import WlmError
 from wlm.fluid.volume import save_volume
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.evaluation import COARSE, HALF, NETWORK, coarse, compare, evaluate, of_decoder, of_network, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.dataset import make_validation
-from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
 from wlm.smoke.network.settings import DatasetSettings
 
 FEW = DatasetSettings(

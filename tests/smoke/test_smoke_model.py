@@ -15,13 +15,12 @@ import wlm
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke import codec
 from wlm.smoke.camera import Camera
 from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, bake_coarse
 from wlm.smoke.model import SmokeModel, parameter_count
 from wlm.smoke.network.onnx_file import export_onnx
 from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, encode_lightmaps

@@ -14,8 +14,7 @@ from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.smoke.evaluation import of_network, score
 from wlm.smoke.fit import train
-from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
 from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 from wlm.smoke.network.trainer import Plan, Trainer, plan_round
 from wlm.smoke.network.unet import SixWayNetwork

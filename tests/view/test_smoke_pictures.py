@@ -12,9 +12,8 @@ from PIL import Image
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera
-from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.shading import Light, PointLight, Ramp
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
 from wlm.view.pictures import contact_sheet, to_bytes
 from wlm.view.smoke import Drawing, picture

@@ -11,7 +11,7 @@ from wlm.atlas.shader import EXACT, glsl
 from wlm.atlas.stored import mesh_file
 from wlm.bundle import Bundle, Texture
 from wlm.errors import WlmError
-from wlm.formats.dds import MOST_SIDE
+from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.shared_exponent import pack_rgb9e5
 
 MESH_FILE = "mesh.glb"

@@ -24,7 +24,7 @@ from wlm.atlas.charts import charts, welded
 from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.atlas.listing import Listing, SheetFiles, is_listing, lone_lightmap, read_listing
 from wlm.atlas.matching import all_by_name, chart_map, choose_mesh, fits_flipped, misfits, named, replace_strays
-from wlm.atlas.materials import Readings, own_lightmaps, settle, slot_readings
+from wlm.atlas.materials import Readings, Rectangle, own_lightmaps, settle, slot_readings
 from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
 from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf
@@ -41,10 +41,6 @@ _TEXELS = 12.0  # UDIM tiles and repeated textures reach less far
 _EDGE = 1e-6  # width of the border of the UV square that counts as inside
 _WHOLE = (1.0, 1.0, 0.0, 0.0)
 _MISSED = 0.01  # fraction of covered texels that a mask may miss without a warning
-
-
-Rectangle = tuple[float, float, float, float]
-"""Scale and offset of UVs, v down."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,8 +224,8 @@ def load(
     known = uv_set if uv_set in sets else None
     readings: Readings = {}
     if lights_path is None:
-        own = own_lightmaps(document, primitives, slot, encoding, known)
-        listing, readings, notes = own.listing, own.readings, own.notes
+        listing, readings = own_lightmaps(document, primitives, slot, encoding, known)
+        notes = listing.notes
     else:
         listing = lone_lightmap(lights_path, path.stem, mask_path, encoding, flip) if alone else None
         listing = read_listing(lights_path) if listing is None else listing

@@ -43,8 +43,7 @@ from wlm.atlas.views import (
 )
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.metrics import SSIM_WINDOW, picture_error, ssim
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import SSIM_WINDOW, picture_error, psnr_from_mse, ssim
 from wlm.ops import raster
 from wlm.ops.views import View, Viewpoint
 from wlm.system import Meter, OnProgress

@@ -32,11 +32,11 @@ from wlm.formats.godot import GodotUser, read_users
 from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import INDEX_BYTES
 from wlm.formats.reading import named_file, read_json_file
+from wlm.formats.unity_asset import has_lightmap
 
 _Three = Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)]
 _Four = Annotated[list[float], Field(min_length=4, max_length=4)]
 _SET_FILE = "set.json"
-_NO_LIGHTMAP = (-1, 65534, 65535)
 
 
 class SheetFiles(BaseModel):
@@ -181,11 +181,6 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
     line = f"{path}: {unlit} objects without a lightmap (their number is -1, 65534 or 65535): they only hide others"
     sheets, notes = tuple(checked.sheets), (line,) * (unlit > 0)
     return Listing(str(path), tuple(states), sheets, objects, checked.uv_set, notes=notes)
-
-
-def has_lightmap(number: Any) -> bool:
-    """Tests whether the number of a renderer's lightmap names one; Unity writes -1, 65534 or 65535 for none."""
-    return number is not None and number not in _NO_LIGHTMAP
 
 
 def _object(entry: Any, convention: str, where: str) -> Any:

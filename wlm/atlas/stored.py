@@ -11,6 +11,7 @@ import numpy as np
 
 from wlm.atlas.data import LightmappedScene, Placed, place_objects
 from wlm.atlas.model import AtlasModel
+from wlm.errors import WlmError
 from wlm.formats.gltf import parse_gltf
 from wlm.formats.gltf_writer import Replacement, encode_glb
 
@@ -58,6 +59,11 @@ def restore(model: AtlasModel) -> LightmappedScene:
         raise ValueError(f"{model.name}: expected a model that stores the triangles of its scene, found none")
     document, primitives = parse_gltf(model.name, stored.glb)
     sheets, blocker = place_objects(model.name, primitives, stored.uv_set, stored.objects, stored.masks)
+    if len(model.uv) and len(model.uv) != len(sheets[0].triangle):
+        raise WlmError(
+            f"{model.name}: the file's mesh has {len(sheets[0].triangle)} triangles, but its new UVs are for "
+            f"{len(model.uv)}: the file is damaged"
+        )
     sheets = tuple(replace(sheet, name=place.name) for sheet, place in zip(sheets, model.sheets, strict=True))
     blocker = blocker if stored.hides else blocker[:0]
     settings = stored.uv_set, stored.metres, model.source, document

@@ -55,9 +55,31 @@ class Group(TyperGroup):
                 sys.exit(1)
             if error.errno is None:
                 raise
-            line = one_line(f"{error.filename or 'the system'}: {error.strerror}")
+            line = one_line(f"{error.filename or 'the system'}: {error.strerror}{_cache_hint(error)}")
+        except ImportError as error:
+            # An import of the program's own is a bug.
+            if not error.name or error.name.split(".")[0] == "wlm":
+                raise
+            line = one_line(f"the package {error.name.split('.')[0]} cannot be imported: {error}; install it again")
+        except RuntimeError as error:
+            # Python before 3.13 raises this where it follows symbolic links.
+            if not str(error).startswith("Symlink loop"):
+                raise
+            line = one_line(str(error))
         sys.stderr.write(f"error: {line}\n")
         sys.exit(BAD_INPUT)
+
+
+def _cache_hint(error: OSError) -> str:
+    """Tells how to move the cache of compiled kernels if the error can come from it."""
+    if "warp" not in sys.modules or error.errno not in (errno.ENOSPC, errno.EROFS, errno.EACCES):
+        return ""
+    import warp as wp
+
+    cache = str(wp.config.kernel_cache_dir or "")
+    if not cache or (error.filename and not str(error.filename).startswith(cache)):
+        return ""
+    return f"; compiled kernels are kept in {cache}: WARP_CACHE_PATH names another folder"
 
 
 app = typer.Typer(
@@ -123,8 +145,20 @@ def main() -> None:
     run(app)
 
 
+def _open_streams() -> None:
+    """Opens the null device in place of each standard stream that the caller closed, so that writing to it works."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_WRONLY)
+            if null != number:
+                os.dup2(null, number)
+                os.close(null)
+            setattr(sys, name, open(number, "w"))  # noqa: SIM115
+
+
 def run(command: Callable[[], Any]) -> None:
     """Runs a command line with the signals and exit codes that the module describes."""
+    _open_streams()
     try:
         # At the end everything is written. A late signal can stop nothing and must not change the exit code.
         with handled(after=signal.SIG_IGN):

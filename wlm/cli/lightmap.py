@@ -53,11 +53,18 @@ _Set = Annotated[
     ),
 ]
 _Times = Annotated[
-    str | None, typer.Option(help="Times of the lightmaps in order, such as 0,6.5,12 or 0:24:1 for 0,1,...,23.")
+    str | None,
+    typer.Option(
+        help="Times of the lightmaps in the order of set.json or of their names, such as 0,6.5,12 or 0:24:1 for "
+        "0,1,...,23; default as set.json or the names state."
+    ),
 ]
 _Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as set.json states.')]
 _Period = Annotated[
-    float | None, typer.Option(help="Length of the day, in the times' unit; default as set.json states.")
+    float | None,
+    typer.Option(
+        help="Length of the day, in the unit of the times; default that of set.json, or 24 for hours in names."
+    ),
 ]
 _Layers = Annotated[
     str | None, typer.Option(metavar="NAMES", help="Layers of the set to read, separated by commas; default all.")
@@ -191,8 +198,7 @@ def decode(
     quiet_warp()
     import numpy as np
 
-    from wlm.formats.channels import read_channels
-    from wlm.formats.exr import HALF_MAX, write_part
+    from wlm.formats.exr import write_planes
     from wlm.lightmap.runtime_texture import write_texture
     from wlm.system import load
 
@@ -203,9 +209,7 @@ def decode(
     decoder = model.decoder(device)
     frame = decoder.frame(time, layer, atlas)
     names = [name for sheet in sheets for name in sheet.channels]
-    planes = np.moveaxis(np.clip(frame, -HALF_MAX, HALF_MAX).astype(np.float16), 2, 0)
-    channels = {name: np.ascontiguousarray(plane) for name, plane in zip(names, planes, strict=True)}
-    write_part(output, channels, read_channels)
+    write_planes(output, dict(zip(names, np.moveaxis(frame, 2, 0), strict=True)))
     if texture is not None:
         write_texture(texture, model.sheets[sheets[0]], time, device)
     facts = {"file": output, "time": time, "layer": sheets[0].layer, "atlas": sheets[0].atlas, "channels": names}

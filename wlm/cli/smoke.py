@@ -177,7 +177,7 @@ def bake(
     if albedo is not None and fit == "axes":
         raise WlmError("--albedo needs --fit sphere: with --fit axes lightmaps have single scattering only")
     quiet_warp()
-    from wlm.smoke.march.fine import bake
+    from wlm.smoke.march.six_way import bake
 
     frames = options.open(smoke)
     settings = {"step": step, "g": g, "supersample": supersample}
@@ -213,7 +213,7 @@ def predict(
         raise WlmError("--coarse: expected no --network, since --coarse uses no network")
     quiet_warp()
     from wlm.smoke.codec import open_network
-    from wlm.smoke.march.coarse import bake_coarse, coarse_march
+    from wlm.smoke.march.six_way import bake_coarse, coarse_march
 
     frames = options.open(smoke)
     made: dict[str, Any] = {"made": "coarse", "seed": seed}

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from wlm.smoke.data import Frames
     from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.scene import CameraSettings
-    from wlm.smoke.shading import Light
-    from wlm.smoke.transport.lights import AnyLight
+    from wlm.smoke.shading import AnyLight, Light
 
 SHEET = "sheet.png"
 _CAMERA = ("toward", "turn", "extent", "distance", "perspective")
@@ -169,7 +168,7 @@ def parse_lights(
     """Parses the texts of `--light` and `--point`; returns these lights, and those that stand for a sky."""
     from wlm.config import check_settings
     from wlm.smoke.scene import LightSettings
-    from wlm.smoke.transport.lights import PointLight, sky_lights
+    from wlm.smoke.shading import PointLight, sky_lights
 
     made: list[AnyLight] = []
     for text in directions or ():
@@ -233,7 +232,7 @@ def write_lightmaps(
     """
     from wlm.smoke.data import NumberedFiles, write_six_way
     from wlm.smoke.lightmaps import axis_faults
-    from wlm.smoke.march.coarse import with_surface
+    from wlm.smoke.march.six_way import with_surface
 
     files = None
     if frames.single:

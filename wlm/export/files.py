@@ -7,10 +7,10 @@ import numpy as np
 
 from wlm.bundle import Texture
 from wlm.errors import WlmError
-from wlm.formats.bc7 import blocks_image
-from wlm.formats.bc7_modes import decode_blocks
-from wlm.formats.dds import DXGI_FORMATS, MOST_SIDE, write_dds
+from wlm.formats.bc7 import decode_image
+from wlm.formats.dds import DXGI_FORMATS, write_dds
 from wlm.formats.exr import write_exr
+from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.ktx2 import write_ktx2
 from wlm.formats.shared_exponent import unpack_rgb9e5
 
@@ -87,7 +87,7 @@ def decode_texture(texture: Texture) -> np.ndarray:
     raw = np.frombuffer(texture.data.tobytes(), np.uint8)
     if texture.fmt == "BC7_UNORM":
         columns = -(-texture.width // 4)
-        pixels = blocks_image(decode_blocks(raw.reshape(-1, columns, 16)))
+        pixels = decode_image(raw.reshape(-1, columns, 16))
         return pixels.reshape(*size[:-2], -1, 4 * columns, 4)[..., : texture.height, : texture.width, :]
     if texture.fmt == "R9G9B9E5_SHAREDEXP":
         return unpack_rgb9e5(raw.view("<u4").reshape(size))

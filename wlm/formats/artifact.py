@@ -15,7 +15,6 @@ An artifact without a source is stored in a compact form that is no safetensors 
 import hashlib
 import json
 import math
-import mmap
 import os
 import struct
 from collections.abc import Mapping
@@ -40,21 +39,9 @@ _HEADER_LIMIT = 16 << 20  # bytes: settings, names and times of a set of the mos
 
 _MOST_AXES, _MOST_NUMBERS = 8, 1 << 48  # of a part
 
-_TYPES = {
-    "BOOL": np.bool_,
-    "U8": np.uint8,
-    "I8": np.int8,
-    "U16": np.uint16,
-    "I16": np.int16,
-    "F16": np.float16,
-    "U32": np.uint32,
-    "I32": np.int32,
-    "F32": np.float32,
-    "U64": np.uint64,
-    "I64": np.int64,
-    "F64": np.float64,
-}
-_TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
+_NUMBERS = ("U8", "I8", "U16", "I16", "F16", "U32", "I32", "F32", "U64", "I64", "F64")
+_TYPES = {"BOOL": np.dtype(bool)} | {name: np.dtype(f"<{name[0].lower()}{int(name[1:]) // 8}") for name in _NUMBERS}
+_TYPE_NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
 def _finite(text: str) -> float:
@@ -76,7 +63,7 @@ class Artifact:
         version: Version of the format.
         settings: Settings of the fit; for a compact artifact only `name`, the file's name without its ending.
         source: Hash of the input, as given by the writer; empty for a compact artifact.
-        tensors: The parts by name, as read-only views of the mapped file.
+        tensors: The parts by name, as read-only views of the file's content.
         parts: Sizes of the parts by name, in bytes.
         file_bytes: Size of the file.
         header_bytes: Size of everything before the parts: the length, the header and its padding.
@@ -129,7 +116,9 @@ def encode_artifact(
     """
     if not source:
         if settings:
-            raise ValueError(f"settings: a compact artifact, one without a source, stores none, got {dict(settings)}")
+            raise ValueError(
+                f"settings: expected none for an artifact without a source, which is compact, got {', '.join(settings)}"
+            )
         return encode_compact(system, tensors)
     for what, word in (("system", system), ("source", source)):
         if not word or not word.isascii() or not word.isprintable() or " " in word:
@@ -168,28 +157,28 @@ def encode_artifact(
 
 
 def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Artifact:
-    """Maps an artifact into memory and checks all its bytes against its digest.
+    """Reads an artifact and checks all its bytes against its digest.
 
-    `system` is the system that must have written it; None accepts any. The tensors stay valid while they are
-    referenced, even if the file is replaced.
+    `system` is the system that must have written it; None accepts any. The tensors are views of the bytes read, which
+    no later change of the file reaches.
 
     Raises:
         WlmError: The file is missing, not an artifact, cut short, damaged, from a newer version or from another
             system.
     """
-    mapped = _map(path)
-    size = len(mapped)
-    if is_compact(mapped[: _LENGTH.size]):
-        return _compact(path, mapped, system)
+    content = _read(path)
+    size = len(content)
+    if is_compact(content[: _LENGTH.size]):
+        return _compact(path, content, system)
     if size < _LENGTH.size:
         raise WlmError(f"{path}: expected an artifact (safetensors), found a file of {size} bytes")
-    (length,) = _LENGTH.unpack_from(mapped)
+    (length,) = _LENGTH.unpack_from(content)
     start = _LENGTH.size + length
-    if length > _HEADER_LIMIT or mapped[_LENGTH.size : _LENGTH.size + 1] not in (b"{", b""):
+    if length > _HEADER_LIMIT or content[_LENGTH.size : _LENGTH.size + 1] not in (b"{", b""):
         raise WlmError(f"{path}: expected an artifact (safetensors), found other content")
     if start > size:
         raise WlmError(f"{path}: the artifact is cut short: expected a header of {length} bytes, found fewer")
-    encoded = mapped[_LENGTH.size : start]
+    encoded = content[_LENGTH.size : start]
     check_json(f"{path}: the artifact's header", encoded)
     header = _parse_json(path, encoded, "header")
     stated, settings_text = _metadata(path, header)
@@ -201,10 +190,10 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
         raise WlmError(f"{path}: artifact version {version}: expected {FORMAT_VERSION}")
     entries = {name: _entry(path, name, entry) for name, entry in header.items() if name != "__metadata__"}
     _check_extents(path, entries, size - start)
-    _check_digest(path, mapped, encoded, digest)
+    _check_digest(path, content, encoded, digest)
     _check_system(path, found_system, system)
     settings = _parse_json(path, settings_text.translate(_EXCHANGED_QUOTES), "settings")
-    tensors = {name: _view(mapped, start, *entry) for name, entry in entries.items()}
+    tensors = {name: _view(content, start, *entry) for name, entry in entries.items()}
     return Artifact(
         system=found_system,
         version=version,
@@ -217,13 +206,11 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
     )
 
 
-def _compact(path: str | os.PathLike[str], mapped: mmap.mmap | bytes, system: str | None) -> Artifact:
-    found_system, version, tensors, start = parse_compact(path, mapped)
-    _check_system(path, found_system, system)
+def _compact(path: str | os.PathLike[str], content: bytes, system: str | None) -> Artifact:
+    found, version, tensors, start = parse_compact(path, content)
+    _check_system(path, found, system)
     parts = {name: array.nbytes for name, array in tensors.items()}
-    # It has no name of its own.
-    settings = {"name": Path(path).stem}
-    return Artifact(found_system, version, settings, "", tensors, parts, len(mapped), start)
+    return Artifact(found, version, {"name": Path(path).stem}, "", tensors, parts, len(content), start)
 
 
 def _check_system(path: str | os.PathLike[str], found: str, expected: str | None) -> None:
@@ -238,12 +225,17 @@ def _little_endian(name: str, array: np.ndarray) -> np.ndarray:
     return np.asarray(array, dtype=dtype, order="C")
 
 
-def _map(path: str | os.PathLike[str]) -> mmap.mmap | bytes:
-    with open_file(path, "the artifact") as file:
-        # An empty file can't be mapped.
-        if os.fstat(file.fileno()).st_size == 0:
-            return b""
-        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+def _read(path: str | os.PathLike[str]) -> bytes:
+    # A mapping would show what another process writes after the digest was checked, or end this one where it is cut.
+    try:
+        with open_file(path, "the artifact") as file:
+            head = file.read(_LENGTH.size + 1)
+            if not is_compact(head) and (head[_LENGTH.size :] != b"{" or _LENGTH.unpack_from(head)[0] > _HEADER_LIMIT):
+                return head  # which is enough to refuse it
+            file.seek(0)
+            return file.read()
+    except MemoryError as error:
+        raise WlmError(f"{path}: the artifact does not fit into memory") from error
 
 
 def _parse_json(path: str | os.PathLike[str], text: bytes | str, what: str) -> dict[str, Any]:
@@ -288,7 +280,7 @@ def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tu
         raise WlmError(
             f"{path}: part {one_line(name, 60)}: the shape {shape} exceeds {_MOST_AXES} axes or {_MOST_NUMBERS} numbers"
         )
-    expected = math.prod(shape) * np.dtype(_TYPES[kind]).itemsize
+    expected = math.prod(shape) * _TYPES[kind].itemsize
     if end - begin != expected:
         raise WlmError(f"{path}: part {one_line(name, 60)}: expected {expected} bytes, found {end - begin}")
     return kind, shape, begin, end
@@ -309,7 +301,7 @@ def _check_extents(
         raise WlmError(f"{path}: expected the end of the file, found {payload - reached} more bytes")
 
 
-def _check_digest(path: str | os.PathLike[str], mapped: Any, encoded: bytes, digest: str) -> None:
+def _check_digest(path: str | os.PathLike[str], content: Any, encoded: bytes, digest: str) -> None:
     stated = digest.encode(errors="replace")
     # Exactly as the writer spells it, at its one place: anything else is a change that it did not make.
     place = encoded.find(b" " + stated + b'"') + 1
@@ -317,7 +309,7 @@ def _check_digest(path: str | os.PathLike[str], mapped: Any, encoded: bytes, dig
     if place > 0 and len(stated) == len(_NO_DIGEST):
         at = _LENGTH.size + place
         hasher = hashlib.blake2b(digest_size=16)
-        with memoryview(mapped) as view:
+        with memoryview(content) as view:
             hasher.update(view[:at])
             hasher.update(_NO_DIGEST.encode())
             hasher.update(view[at + len(stated) :])
@@ -326,10 +318,7 @@ def _check_digest(path: str | os.PathLike[str], mapped: Any, encoded: bytes, dig
         raise WlmError(f"{path}: the artifact is damaged: its content does not match its digest")
 
 
-def _view(mapped: Any, start: int, kind: str, shape: tuple[int, ...], begin: int, end: int) -> np.ndarray:
-    dtype = np.dtype(_TYPES[kind]).newbyteorder("<")
-    if begin == end:
-        empty = np.empty(shape, dtype)
-        empty.flags.writeable = False
-        return empty
-    return np.frombuffer(mapped, dtype, math.prod(shape), start + begin).reshape(shape)
+def _view(content: Any, start: int, kind: str, shape: tuple[int, ...], begin: int, end: int) -> np.ndarray:
+    # An empty array at the end of the file would begin behind its last byte.
+    source = content[:0] if begin == end else content
+    return np.frombuffer(source, _TYPES[kind], math.prod(shape), start + begin if begin < end else 0).reshape(shape)

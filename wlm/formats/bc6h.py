@@ -11,7 +11,7 @@ Khronos' Data Format Specification 1.3, chapter 20.2 ("BC6H"), specifies the for
 
 import numpy as np
 
-from wlm.formats.bc7_modes import ANCHORS, PARTITIONS, SHARES
+from wlm.formats.bc7 import ANCHORS, PARTITIONS, SHARES
 
 BLOCK_BYTES = 16
 SIDE = 4

@@ -8,8 +8,7 @@ import contextlib
 import io
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,7 +52,7 @@ def read_exr(
             several layers of it.
     """
     notes = [] if notes is None else notes
-    channels = _channels(_flat_parts(path))
+    channels = _channels(path)
     chosen = _light_channels(path, list(channels), layer, notes)
     pixels = _pixels(path, channels, list(chosen.values()), notes)
     header = channels[chosen["R"]][0].header
@@ -79,17 +78,17 @@ def read_every_channel(
         WlmError: See `read_exr`, but no layer of colour is needed.
     """
     notes = [] if notes is None else notes
-    channels, first = _channels(_flat_parts(path)), (*_COLOUR, _ALPHA)
+    channels, first = _channels(path), (*_COLOUR, _ALPHA)
     names = sorted(channels, key=lambda name: (first.index(name) if name in first else len(first), name))
     if not names:
         raise WlmError(f"{path}: expected channels, found none")
     pixels = _pixels(path, channels, names, notes)
     for layer in _layers(names).values() if light else ():
         chromaticities = _chromaticities(path, channels[layer["R"]][0].header, notes)
-        if not np.allclose(chromaticities, REC709):
-            places, lines = [names.index(layer[letter]) for letter in _COLOUR], []
-            colour = pixels[..., places]
-            to_rec709(colour, chromaticities, f"{path}: chromaticities", lines)
+        places, lines = [names.index(layer[letter]) for letter in _COLOUR], []
+        colour = pixels[..., places]
+        to_rec709(colour, chromaticities, f"{path}: chromaticities", lines)
+        if lines:
             pixels[..., places] = colour
             notes += [line for line in lines if line not in notes]
     return pixels, tuple(names)
@@ -98,8 +97,23 @@ def read_every_channel(
 _Channels = Mapping[str, tuple[OpenEXR.Part, Any]]  # the part and the channel of each name
 
 
-def _channels(parts: Sequence[OpenEXR.Part]) -> _Channels:
-    """Returns the channels of all parts; in a file of several parts, a name begins with that of its part."""
+def _channels(path: str | os.PathLike[str]) -> _Channels:
+    """Reads all channels of an EXR file; in a file of several parts, a name begins with that of its part.
+
+    Raises:
+        WlmError: The file is missing, is not an EXR file, is cut short or damaged, or has deep data.
+    """
+    check_header(path)
+    parts, reason = [], "no pixels found"
+    with _captured_chatter() as chatter:
+        try:
+            # Channels are kept separate, since joined ones have other names in RGB, RGBA and layered files.
+            parts = list(OpenEXR.File(str(path), separate_channels=True).parts)
+        except (RuntimeError, ValueError, MemoryError) as error:
+            reason = one_line(error)
+    # A part that cannot be read is missing from the list; only the printed message reports it.
+    if not parts or chatter.text:
+        raise WlmError(f"{path}: the EXR file is cut short or damaged: {chatter.text or reason}")
     found = {}
     for part in parts:
         prefix = f"{part.name()}." if len(parts) > 1 else ""
@@ -159,13 +173,15 @@ def _pixels(path: str | os.PathLike[str], channels: _Channels, names: Sequence[s
     """Returns the pixels of channels over the display window, float32 [H, W, C]."""
     pixels = np.zeros(0, np.float32)
     for index, name in enumerate(names):
-        part, channel = channels[name]
-        (plane,) = float_planes(path, {name: channel}, [name])
-        plane = _framed(f"{path}: channel {name}", part, plane, notes)
+        (part, channel), where = channels[name], f"{path}: channel {name}"
+        plane = channel.pixels
+        if plane is None or plane.dtype not in (np.float16, np.float32):
+            raise WlmError(f"{where}: expected half or float, found {'no pixels' if plane is None else plane.dtype}")
+        plane = _framed(where, part, plane.astype(np.float32, copy=False), notes)
         if not index:
             pixels = np.empty((*plane.shape, len(names)), np.float32)
         if plane.shape != pixels.shape[:2]:
-            raise WlmError(f"{path}: channel {name}: expected {pixels.shape[:2]} pixels, found {plane.shape}")
+            raise WlmError(f"{where}: expected {pixels.shape[:2]} pixels (height, width), found {plane.shape}")
         pixels[..., index] = plane
     return pixels
 
@@ -222,26 +238,6 @@ def _chromaticities(path: str | os.PathLike[str], header: Mapping[str, Any], not
     return ACES_AP0 if header.get("acesImageContainerFlag") else REC709
 
 
-def float_planes(
-    path: str | os.PathLike[str], channels: Mapping[str, Any], names: Iterable[str]
-) -> Iterator[np.ndarray]:
-    """Yields the pixels of the channels `names` of an EXR part, float32 [H, W] each.
-
-    Raises:
-        WlmError: A channel is neither half nor float, or has another shape than the first.
-    """
-    shape = None
-    for name in names:
-        pixels = channels[name].pixels
-        if pixels is None or pixels.dtype not in (np.float16, np.float32):
-            content = "no pixels" if pixels is None else pixels.dtype
-            raise WlmError(f"{path}: channel {name}: expected half or float, found {content}")
-        shape = pixels.shape if shape is None else shape
-        if pixels.shape != shape:
-            raise WlmError(f"{path}: channel {name}: expected {shape} pixels, found {pixels.shape}")
-        yield pixels.astype(np.float32, copy=False)
-
-
 def write_exr(
     path: str | os.PathLike[str], pixels: np.ndarray, half: bool = True, note: Mapping[str, Any] | None = None
 ) -> None:
@@ -256,10 +252,8 @@ def write_exr(
     """
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or 0 in pixels.shape:
         raise ValueError(f"expected pixels [H, W, 3 or 4], got {pixels.shape}")
-    pixels = np.clip(pixels, -HALF_MAX, HALF_MAX).astype(np.float16) if half else pixels.astype(np.float32, copy=False)
-    planes = zip((*_COLOUR, _ALPHA), np.moveaxis(pixels, -1, 0), strict=False)
-    # The library requires contiguous planes.
-    write_part(path, {name: np.ascontiguousarray(plane) for name, plane in planes}, read_exr, _attributes(note))
+    planes = dict(zip((*_COLOUR, _ALPHA), np.moveaxis(pixels, -1, 0), strict=False))
+    write_planes(path, planes, note, whole=() if half else tuple(planes))
 
 
 def write_planes(
@@ -286,61 +280,49 @@ def write_planes(
         raise ValueError(f"expected planes [H, W] of one shape, got {sorted(shapes)}")
     channels = {}
     for name, plane in planes.items():
-        plane = np.asarray(plane)
-        if name not in whole:
-            plane = np.clip(plane, -HALF_MAX, HALF_MAX)
+        plane = plane if name in whole else np.clip(plane, -HALF_MAX, HALF_MAX)
         channels[name] = np.ascontiguousarray(plane, np.float32 if name in whole else np.float16)
-    write_part(path, channels, read_planes, _attributes(note))
-
-
-def _attributes(note: Mapping[str, Any] | None) -> dict[str, str]:
-    return {} if note is None else {_NOTE: json.dumps(note, allow_nan=False)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if note is not None:
+        header[_NOTE] = json.dumps(note, allow_nan=False)
+    with atomic_path(path) as temporary:
+        with _captured_chatter() as chatter:
+            try:
+                OpenEXR.File(header, channels).write(str(temporary))
+            except (RuntimeError, ValueError) as error:
+                reason = one_line(error).replace(str(temporary), str(path))
+                raise WlmError(f"{path}: cannot write: {reason}") from error
+        if chatter.text:
+            raise WlmError(f"{path}: cannot write: {chatter.text}")
+        # The library reports no error if the disk is full when it flushes its buffer at the end.
+        try:
+            read_every_channel(temporary)
+        except WlmError as error:
+            reason = str(error).replace(str(temporary), "the file as written")
+            raise WlmError(f"{path}: cannot write: {reason}; is the disk full?") from error
 
 
 def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Reads all channels of a single-part EXR file.
+    """Reads all channels of an EXR file of one part, over its display window, and the note that `write_planes` stored.
 
     Returns:
-        The planes by name, float32 [H, W], unchanged, NaN included; and the note of the header, empty if the file has
-        none.
+        The planes by name, float32 [H, W], NaN included; and the note of the header, empty if the file has none.
 
     Raises:
         WlmError: The file is missing, is not an EXR file, is damaged, has several parts or deep data, or a channel is
             neither half nor float.
     """
-    part = read_part(path)
-    planes = dict(zip(part.channels, float_planes(path, part.channels, part.channels), strict=True))
+    header, *others = check_header(path)
+    if others:
+        raise WlmError(f"{path}: expected an EXR file of one part, found {1 + len(others)}")
+    pixels, names = read_every_channel(path)
     try:
-        note = json.loads(part.header.get(_NOTE, "{}"))
-    except (ValueError, TypeError, RecursionError):
+        note = json.loads(header.attributes.get(_NOTE, ("string", b"{}"))[1])
+    except (ValueError, RecursionError):
         note = None
     if not isinstance(note, dict):
         raise WlmError(f"{path}: header attribute {_NOTE}: expected a JSON object")
-    return planes, note
-
-
-def read_part(path: str | os.PathLike[str]) -> OpenEXR.Part:
-    """Reads an EXR file of one flat part.
-
-    Returns:
-        The part as an object of the OpenEXR module, with separate channels.
-
-    Raises:
-        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has several parts or deep data.
-    """
-    parts = _flat_parts(path)
-    if len(parts) > 1:
-        raise WlmError(f"{path}: expected an EXR file of one part, found {len(parts)}")
-    return parts[0]
-
-
-def _flat_parts(path: str | os.PathLike[str]) -> list[OpenEXR.Part]:
-    """Reads all parts of an EXR file. Raises `WlmError` as `read_part` does, but for several parts."""
-    file, complaints = _open(path)
-    parts = file.parts if file is not None else []
-    if not parts or complaints:
-        raise WlmError(f"{path}: the EXR file is cut short or damaged: {complaints or 'no pixels found'}")
-    return list(parts)
+    return dict(zip(names, np.moveaxis(pixels, -1, 0), strict=True)), note
 
 
 def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]]:
@@ -353,54 +335,6 @@ def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]
     """
     parts = check_header(path)
     return *parts[0].size, tuple(name for part in parts for name in part.full_names(len(parts) > 1))
-
-
-def write_part(
-    path: str | os.PathLike[str],
-    channels: Mapping[str, np.ndarray],
-    read: Callable[[Path], object],
-    attributes: Mapping[str, Any] | None = None,
-) -> None:
-    """Writes channels as an EXR file of scan lines with lossless ZIP compression, atomically.
-
-    Args:
-        path: The file to write; its folder must exist.
-        channels: half or float [H, W] each, contiguous, not empty.
-        read: Called with the new file before it replaces an old one; raises WlmError if the file cannot be read.
-        attributes: Further header attributes.
-
-    Raises:
-        WlmError: The file cannot be written; the old content stays.
-    """
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
-    with atomic_path(path) as temporary:
-        with _captured_chatter() as chatter:
-            try:
-                OpenEXR.File(header, dict(channels)).write(str(temporary))
-            except (RuntimeError, ValueError) as error:
-                reason = one_line(error).replace(str(temporary), str(path))
-                raise WlmError(f"{path}: cannot write: {reason}") from error
-        if chatter.text:
-            raise WlmError(f"{path}: cannot write: {chatter.text}")
-        # The library reports no error if the disk is full when it flushes its buffer at the end.
-        try:
-            read(temporary)
-        except WlmError as error:
-            reason = str(error).replace(str(temporary), "the file as written")
-            raise WlmError(f"{path}: cannot write: {reason}; is the disk full?") from error
-
-
-def _open(path: str | os.PathLike[str]) -> tuple["OpenEXR.File | None", str]:
-    """Returns the opened file and the library's messages; on failure the file is None or has no parts."""
-    check_header(path)
-    with _captured_chatter() as chatter:
-        try:
-            # Channels are kept separate, since joined ones have other names in RGB, RGBA and layered files.
-            file = OpenEXR.File(str(path), separate_channels=True)
-        except (RuntimeError, ValueError, MemoryError) as error:
-            return None, chatter.text or one_line(error)
-    # A part that cannot be read is missing from the list; only the printed message reports it.
-    return file, chatter.text
 
 
 class _Chatter:

@@ -1,19 +1,20 @@
-"""Decoding of HDR texel formats to float32: plain floats, floats packed into 32 bits, and blocks.
+"""Texel formats of DDS and KTX2: their sizes, and decoding of light to float32.
 
 Shared exponents follow OpenGL's EXT_texture_shared_exponent, floats of 11 and 10 bits EXT_packed_float. Optional
 packages decode blocks.
 """
 
 import os
-import threading
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import BinaryIO
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.hdr_blocks import ASTC_BLOCKS, ASTC_MEDIUM, astc, decode_bc6h, need
+from wlm.formats.hdr_blocks import ASTC_BLOCKS, ASTC_MEDIUM, astc, decode_bc6h
 from wlm.formats.limits import PICTURE_BYTES, PICTURE_GROWTH, check_growth, check_sides
 from wlm.formats.shared_exponent import unpack_rgb9e5
 
@@ -22,7 +23,11 @@ EXTRA = "atlas"
 
 _BAND = 1 << 20  # texels decoded at once, which bounds the temporary memory
 _HALF_BYTES = 2
-_ASTC_LOCK = threading.Lock()  # a context decodes one picture at a time
+MOST_SIDE = 16384
+"""Largest side of a 2D texture in Direct3D 11 and 12 and on desktop GPUs, in texels."""
+
+MOST_SLICES = 2048
+"""Most slices of a volume and layers of an array."""
 
 
 @dataclass(frozen=True)
@@ -97,16 +102,78 @@ def decode_texels(
     return pixels
 
 
-def unpack_zstd(path: str | os.PathLike[str], data: bytes, size: int) -> bytes:
-    """Decompresses zstd to at most `size` bytes.
+def check_fields(path: str | os.PathLike[str], *fields: tuple[str, object, bool, object]) -> None:
+    """Checks fields of a header: name, value found, whether it fits, and words for what is expected.
 
     Raises:
-        WlmError: The data is damaged or larger, or the package is missing.
+        WlmError: A value doesn't fit.
     """
-    try:
-        return need("imagecodecs", EXTRA).zstd_decode(data, out=size)
-    except (WlmError, RuntimeError, ValueError) as error:
-        raise WlmError(f"{path}: cannot unpack zstd: {error}") from error
+    for field, found, fits, expected in fields:
+        if not fits:
+            raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
+
+
+def layout_of(
+    path: str | os.PathLike[str],
+    field: str,
+    number: int,
+    layouts: Mapping[int, tuple[str, Layout]],
+    others: Mapping[str, int],
+    expected: str,
+) -> tuple[str, Layout]:
+    """Returns the name and the layout of a format by its number.
+
+    Raises:
+        WlmError: It is not in `layouts`; the line names the field, what is expected, and a format of `others`.
+    """
+    if number not in layouts:
+        name = next((f" ({name})" for name, written in others.items() if written == number), "")
+        raise WlmError(f"{path}: {field}: expected {expected}, found {number}{name}")
+    return layouts[number]
+
+
+def read_part(path: str | os.PathLike[str], file: BinaryIO, start: int, size: int, part: str) -> bytes:
+    """Reads `size` bytes of an open file from `start` on; `path` and `part` name the file and the part in messages.
+
+    Raises:
+        WlmError: The file ends before.
+    """
+    held = os.fstat(file.fileno()).st_size
+    if start + size > held:
+        raise WlmError(f"{path}: {part}: the file is cut short: expected {start + size} bytes, found {held}")
+    file.seek(start)
+    data = file.read(size)
+    if len(data) != size:
+        raise WlmError(f"{path}: {part}: expected {size} bytes, found {len(data)}; has the file changed?")
+    return data
+
+
+def channel_bits(fmt: str) -> list[int]:
+    """Returns the bits of each channel of a format, which its name states, such as "R16G16_FLOAT"; none for blocks."""
+    return [] if fmt.startswith(("BC", "ASTC")) else [int(bits) for bits in re.findall(r"\d+", fmt.partition("_")[0])]
+
+
+def format_bytes(fmt: str, width: int, height: int) -> int:
+    """Returns the bytes of a picture in a format of Direct3D or Vulkan: of its texels, or of its blocks of 4 x 4."""
+    if bits := channel_bits(fmt):
+        return width * height * sum(bits) // 8
+    return -(-width // 4) * -(-height // 4) * 16
+
+
+def mip_bytes(fmt: str, width: int, height: int, mips: int, most: int | None = None) -> list[int]:
+    """Returns the bytes of each mip level of a picture, the largest first.
+
+    `mips` is the number of levels after the largest one, and `most` their largest number; None: down to one texel.
+
+    Raises:
+        ValueError: A side is not 1 to `MOST_SIDE`, or `mips` is out of range.
+    """
+    if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
+        raise ValueError(f"expected a width and a height of 1 to {MOST_SIDE} texels, got {width}x{height}")
+    most = max(width, height).bit_length() - 1 if most is None else most
+    if not 0 <= mips <= most:
+        raise ValueError(f"mips: expected 0 to {most}, got {mips}")
+    return [format_bytes(fmt, max(width >> level, 1), max(height >> level, 1)) for level in range(mips + 1)]
 
 
 def _plain(data: memoryview, rows: int, columns: int, *, dtype: str) -> np.ndarray:
@@ -129,9 +196,7 @@ def _bc6h(data: memoryview, rows: int, columns: int, *, signed: bool) -> np.ndar
 
 
 def _astc(data: memoryview, rows: int, columns: int, *, block: tuple[int, int]) -> np.ndarray:
-    codec = astc(block, ASTC_MEDIUM, EXTRA)
-    with _ASTC_LOCK:
-        return codec.decode(bytes(data), rows, columns)
+    return astc(block, ASTC_MEDIUM, EXTRA).decode(bytes(data), rows, columns)
 
 
 HALF_RGB = Layout(3, 6, partial(_plain, dtype="<f2"))

@@ -102,11 +102,16 @@ def staged(folder: Path, index: str, format_name: str) -> Iterator[Path]:
 def _move(made: Path, folder: Path, index: str, format_name: str) -> None:
     names = sorted(path.relative_to(made).as_posix() for path in made.rglob("*") if path.is_file())
     names.remove(index)
-    folder.mkdir(exist_ok=True)
     old = set(_listed(folder, index))
     write_index(made / index, read_index(made / index) | {"files": names})
-    # An old index must not seem to describe new files, and a later run must be able to write the folder.
-    write_index(folder / index, {"format": format_name, UNFINISHED: True, "files": sorted(old | set(names))})
+    try:
+        folder.mkdir(exist_ok=True)
+        # An old index must not seem to describe new files, and a later run must be able to write the folder.
+        write_index(folder / index, {"format": format_name, UNFINISHED: True, "files": sorted(old | set(names))})
+    except WlmError:
+        with suppress(OSError):
+            folder.rmdir()  # only if it is empty, so that a full disk leaves no new folder
+        raise
     for name in sorted(old - set(names)):
         (folder / name).unlink(missing_ok=True)
     for parent in {(folder / name).parent for name in old} - {folder}:

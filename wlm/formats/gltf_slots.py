@@ -9,12 +9,11 @@ from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.gltf import GltfDocument, GltfPrimitive, reported, texture_image, texture_transform
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, image_file, reported, texture_image, texture_transform
 
 SLOTS = ("occlusion", "emissive")
 """Material slots that may hold a lightmap."""
@@ -48,12 +47,11 @@ def lightmap_transform(
     found = []
     material = {} if primitive.material is None else document.item("materials", primitive.material)
     for slot, info in islice(_slots(material), _MOST_SLOTS):
-        transform = info.get("extensions", {}).get("KHR_texture_transform", {})
-        if transform.get("texCoord", info.get("texCoord", 0)) != uv_set:
+        stated, rows = texture_transform(f"{document.path}: materials[{primitive.material}]", info)
+        if (stated or 0) != uv_set:
             continue
         named = _stem(document, info) == lightmap
         lit = slot.startswith(SLOTS) or "lightmap" in slot.lower()
-        rows = texture_transform(f"{document.path}: materials[{primitive.material}]", info)
         if not quantised:
             moved = primitive.uv[uv_set] @ rows[:, :2].T + rows[:, 2]
             if not (named or lit) or moved.min() < -_NEAR or moved.max() > 1.0 + _NEAR:
@@ -89,7 +87,8 @@ def _slots(holder: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
 def _stem(document: GltfDocument, info: dict[str, Any]) -> str:
     """Returns the name of a slot's image without its suffix."""
     try:
-        image = document.item("images", texture_image(document, info["index"]))
+        number = texture_image(document, info["index"])
+        image = document.item("images", number)
+        return image_file(document, number).stem if "uri" in image else Path(str(image.get("name", ""))).stem
     except WlmError:
         return ""
-    return Path(unquote(str(image.get("uri", image.get("name", ""))))).stem

@@ -8,18 +8,17 @@ Format specification 1.3, basic descriptor block.
 import math
 import os
 import struct
-from typing import BinaryIO
 
 import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats import float_texels as texels
 from wlm.formats.atomic import atomic_write
-from wlm.formats.deflate import inflate
-from wlm.formats.float_texels import Layout, check_picture, decode_texels, unpack_zstd
+from wlm.formats.float_texels import MOST_SLICES, Layout, channel_bits, check_fields, format_bytes, read_part
 from wlm.formats.hdr_blocks import ASTC_BLOCKS
 from wlm.formats.primaries import ACES_AP0, ACES_AP1, ADOBE_RGB, CIE_XYZ, P3_D65, REC709, REC2020, to_rec709
-from wlm.formats.reading import open_file
+from wlm.formats.reading import damaged, open_file
+from wlm.formats.zstd import decompress, inflate
 
 VK_FORMATS = {
     "R16G16_UNORM": 77,
@@ -41,17 +40,6 @@ VOLUME_HEAD = 32
 # length of the descriptor, of the key/value data and of the supercompression data.
 _HEADER = struct.Struct("<12s 9I 4I 2Q")
 _LEVEL = struct.Struct("<3Q")  # a level's offset, length and length without supercompression
-_BLOCK_BYTES = 16
-_MAX_SIDE = 16384  # texels; the limit of desktop GPUs
-_MAX_DEPTH = 2048  # slices, likewise
-_CHANNELS = {
-    "R16G16_UNORM": 2,
-    "R16G16_UINT": 2,
-    "R16G16_SFLOAT": 2,
-    "R16G16B16_SFLOAT": 3,
-    "R16G16B16A16_SFLOAT": 4,
-    "R32G32_SFLOAT": 2,
-}
 _RGBSDA, _BC6H, _ASTC = 1, 133, 162  # colour models
 _CHANNEL_IDS = (0, 1, 2, 15)  # red, green, blue, alpha
 _VERSION, _BT709, _LINEAR = 2, 1, 1
@@ -61,7 +49,7 @@ _SHARED = "E5B9G9R9_UFLOAT_PACK32"
 _SHARED_UNITY, _SHARED_MIDDLE, _SHARED_MOST = 8448, 15, 31
 
 # The header and the first entry of the level index, which describes the largest level.
-_READ_HEADER = struct.Struct("<12s 9I 4I 2Q 3Q")
+_READ_HEADER = struct.Struct(_HEADER.format + " 3Q")
 _PAIRS_BYTES = 1 << 20  # limit of the key/value data
 # The primaries of Khronos Data Format 1.3; 0 is unspecified.
 _PRIMARIES = {0: REC709, 1: REC709, 4: REC2020, 5: CIE_XYZ, 6: ACES_AP0, 7: ACES_AP1, 10: P3_D65, 11: ADOBE_RGB}
@@ -95,8 +83,7 @@ def write_ktx2(
         path: The file to write; its folder must exist.
         data: Rows from the top: texels of 16- or 32-bit channels, little-endian, or ceil(width / 4) * ceil(height / 4)
             blocks of 16 bytes; for RGB9E5 one word of 32 bits per texel.
-        width: Width in texels, 1 to 16384.
-        height: Height in texels, 1 to 16384.
+        width, height: Size in texels, 1 to 16384.
         fmt: Texel format, a key of `VK_FORMATS`.
         depth: Slices of a 3D texture of texels, 1 to 2048, each with its rows in `data`; 0: a 2D texture.
         mips: Number of mip levels after the full-size one, each of half the size rounded down; they follow in `data`.
@@ -111,14 +98,11 @@ def write_ktx2(
     """
     if fmt not in VK_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")
-    if not (1 <= width <= _MAX_SIDE and 1 <= height <= _MAX_SIDE):
-        raise ValueError(f"expected a width and a height of 1 to {_MAX_SIDE} texels, got {width}x{height}")
-    if not 0 <= depth <= _MAX_DEPTH or (depth and fmt not in (*_CHANNELS, _SHARED)):
-        raise ValueError(f"depth: expected 0 to {_MAX_DEPTH}, and 0 for a format of blocks, got {depth} for {fmt}")
-    most = 0 if depth else max(width, height).bit_length() - 1
-    if not 0 <= mips <= most:
-        raise ValueError(f"mips: expected 0 to {most}, got {mips}")
-    sizes = [_size(fmt, max(width >> level, 1), max(height >> level, 1)) * max(depth, 1) for level in range(mips + 1)]
+    bits = channel_bits(fmt)
+    if not 0 <= depth <= MOST_SLICES or (depth and not bits):
+        raise ValueError(f"depth: expected 0 to {MOST_SLICES}, and 0 for a format of blocks, got {depth} for {fmt}")
+    sizes = texels.mip_bytes(fmt, width, height, mips, 0 if depth else None)
+    sizes = [size * max(depth, 1) for size in sizes]
     if len(data) != sum(sizes):
         raise ValueError(f"data: expected {sum(sizes)} bytes, got {len(data)}")
     descriptor = _descriptor(fmt)
@@ -127,7 +111,7 @@ def write_ktx2(
     begin = _HEADER.size + _LEVEL.size * len(sizes)
     end = begin + len(descriptor) + len(pairs)
     # A level starts at a multiple of both 4 and the bytes of a texel or block; the smallest level comes first.
-    step = math.lcm(4, _texel_bytes(fmt))
+    step = math.lcm(4, format_bytes(fmt, 1, 1))
     index, pieces, place = [], [], end
     for level in reversed(range(len(sizes))):
         first = sum(sizes[:level])
@@ -138,33 +122,11 @@ def write_ktx2(
     header = _HEADER.pack(
         MAGIC,
         VK_FORMATS[fmt],
-        4 if fmt == _SHARED else _channel_bytes(fmt) if fmt in _CHANNELS else 1,
-        width,
-        height,
-        *(depth, 0, 1, 1 + mips, 0),
-        begin,
-        len(descriptor),
-        begin + len(descriptor),
-        len(pairs),
-        *(0, 0),
+        4 if fmt == _SHARED else bits[0] // 8 if bits else 1,
+        *(width, height, depth, 0, 1, 1 + mips, 0),
+        *(begin, len(descriptor), begin + len(descriptor), len(pairs), 0, 0),
     )
     return atomic_write(path, [header, *index, descriptor, pairs, *pieces])
-
-
-def _texel_bytes(fmt: str) -> int:
-    if fmt == _SHARED:
-        return 4
-    return _channel_bytes(fmt) * _CHANNELS[fmt] if fmt in _CHANNELS else _BLOCK_BYTES
-
-
-def _channel_bytes(fmt: str) -> int:
-    return 4 if fmt.startswith("R32") else 2
-
-
-def _size(fmt: str, width: int, height: int) -> int:
-    if fmt in _CHANNELS or fmt == _SHARED:
-        return width * height * _texel_bytes(fmt)
-    return -(-width // 4) * -(-height // 4) * _BLOCK_BYTES
 
 
 def _pair(key: str, value: str) -> bytes:
@@ -182,13 +144,14 @@ def _descriptor(fmt: str) -> bytes:
             shared.append(struct.pack("<H2B4x2I", 9 * i, 8, channel, 0, _SHARED_UNITY))
             shared.append(struct.pack("<H2B4x2I", 27, 4, channel | _EXPONENT, _SHARED_MIDDLE, _SHARED_MOST))
         return _basic_block(_RGBSDA, 0, 4, shared)
-    if fmt in _CHANNELS:
+    if sizes := channel_bits(fmt):
         model, side = _RGBSDA, 0
-        bits = 8 * _channel_bytes(fmt)
-        samples = [(bits * i, bits, channel) for i, channel in enumerate(_CHANNEL_IDS[: _CHANNELS[fmt]])]
+        samples = [
+            (bits * i, bits, channel) for i, (bits, channel) in enumerate(zip(sizes, _CHANNEL_IDS, strict=False))
+        ]
     else:
         model, side = (_BC6H if fmt.startswith("BC6H") else _ASTC), 3  # sides are stored less one
-        samples = [(0, 8 * _BLOCK_BYTES, 0)]
+        samples = [(0, 8 * format_bytes(fmt, 1, 1), 0)]
     if fmt.endswith(("_UNORM", "_UINT")):  # the codes of 0 and of 1
         unity = 0xFFFF if fmt.endswith("_UNORM") else 1
         qualifiers, lowest, highest = 0, struct.pack("<I", 0), struct.pack("<I", unity)
@@ -200,7 +163,7 @@ def _descriptor(fmt: str) -> bytes:
         struct.pack("<H2B4x", offset, bits - 1, channel | qualifiers) + lowest + highest
         for offset, bits, channel in samples
     ]
-    return _basic_block(model, side, _texel_bytes(fmt), packed)
+    return _basic_block(model, side, format_bytes(fmt, 1, 1), packed)
 
 
 def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) -> bytes:
@@ -258,63 +221,40 @@ def _read(path: str | os.PathLike[str], volume: bool, notes: list[str]) -> tuple
         number, _, width, height, depth, layers, faces, _, scheme = fields[1:10]
         descriptor, pairs = fields[10:12], fields[12:14]
         start, stored, size = fields[16:19]
-        if number not in _LAYOUTS:
-            name = next((name for name, written in VK_FORMATS.items() if written == number), None)
-            found = f"{number} ({name})" if name else number
-            raise WlmError(f"{path}: vkFormat: expected {_EXPECTED}, found {found}")
-        name, layout = _LAYOUTS[number]
-        for field, found, fits, expected in (
+        name, layout = texels.layout_of(path, "vkFormat", number, _LAYOUTS, VK_FORMATS, _EXPECTED)
+        check_fields(
+            path,
             ("pixelHeight", height, height > 0, "at least 1 (2D)"),
             ("pixelDepth", depth, volume or depth <= 1, "0 (no volume)"),
             ("layerCount", layers, layers <= 1, "0 (no array)"),
             ("faceCount", faces, faces == 1, "1 (no cube)"),
             ("supercompressionScheme", scheme, scheme in (_NONE, _ZSTD, _ZLIB), "none (0), zstd (2) or zlib (3)"),
-        ):
-            if not fits:
-                raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
+        )
         slices = max(depth, 1)
         if slices > 1 and height % layout.block[1]:
             raise WlmError(f"{path}: pixelHeight: expected a multiple of {layout.block[1]} in a volume, found {height}")
-        check_picture(path, held, width, height, layout.unpacked * slices)
-        expected = layout.bytes_of(width, height * slices)
-        for field, found in (("byteLength", stored), ("uncompressedByteLength", size))[scheme != _NONE :]:
-            if found != expected:
-                raise WlmError(
-                    f"{path}: {field} of level 0: {width} x {height} {name} need {expected} bytes, found {found}"
-                )
-        if stored > 2 * expected + 1024:  # no compressor expands data further
-            raise WlmError(f"{path}: byteLength of level 0: expected at most {2 * expected + 1024}, found {stored}")
-        primaries = _primaries(
-            path, _part(path, file, held, *descriptor, "the data format descriptor", _DESCRIPTOR_BYTES)
+        texels.check_picture(path, held, width, height, layout.unpacked * slices)
+        expected, most = layout.bytes_of(width, height * slices), 2 * layout.bytes_of(width, height * slices) + 1024
+        words = f"{expected} for {width} x {height} texels of {name}"
+        check_fields(
+            path,
+            ("byteLength of level 0", stored, scheme != _NONE or stored == expected, words),
+            ("uncompressedByteLength of level 0", size, scheme == _NONE or size == expected, words),
+            ("byteLength of level 0", stored, stored <= most, f"at most {most}"),  # no compressor expands data further
         )
-        words = _part(path, file, held, *pairs, "the key/value data", _PAIRS_BYTES)
+        part = "the data format descriptor"
+        head = read_part(path, file, descriptor[0], min(descriptor[1], _DESCRIPTOR_BYTES), part)
+        primaries = _primaries(path, head)
+        words = read_part(path, file, pairs[0], min(pairs[1], _PAIRS_BYTES), "the key/value data")
         right, down = _orientation(path, words, layout.channels, volume)
-        data = _part(path, file, held, start, stored, "level 0", stored)
-    if scheme == _ZSTD:
-        data = unpack_zstd(path, data, expected)
-    elif scheme == _ZLIB:
-        try:
-            data = inflate(data, expected, f"{path}: level 0", f"{expected} bytes once unpacked")
-        except ValueError as error:
-            raise WlmError(str(error)) from error
-    if len(data) != expected:
-        raise WlmError(f"{path}: level 0: expected {expected} bytes once unpacked, found {len(data)}")
-    pixels = decode_texels(path, layout, data, width, height * slices)
+        data = read_part(path, file, start, stored, "level 0")
+    if scheme != _NONE:
+        unpack, kind = (decompress, "zstd") if scheme == _ZSTD else (inflate, "zlib")
+        with damaged(f"{path}: level 0: cannot unpack", ValueError):
+            data = unpack(data, expected, kind)
+    pixels = texels.decode_texels(path, layout, data, width, height * slices)
     to_rec709(pixels, primaries, f"{path}: the data format descriptor", notes)
     return pixels.reshape(slices, height, width, -1), layout, right, down
-
-
-def _part(
-    path: str | os.PathLike[str], file: BinaryIO, held: int, start: int, size: int, what: str, most: int
-) -> bytes:
-    """Reads `size` bytes of the file from `start` on, but at most `most`; `what` names this part in messages."""
-    if start + size > held:
-        raise WlmError(f"{path}: {what}: the file is cut short: expected {start + size} bytes, found {held}")
-    file.seek(start)
-    data = file.read(min(size, most))
-    if len(data) != min(size, most):
-        raise WlmError(f"{path}: {what}: expected {min(size, most)} bytes, found {len(data)}; has the file changed?")
-    return data
 
 
 def _primaries(path: str | os.PathLike[str], data: bytes) -> tuple[float, ...]:

@@ -10,7 +10,7 @@ import re
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.float_texels import check_picture
+from wlm.formats.float_texels import check_picture, read_part
 from wlm.formats.reading import open_file
 
 MAGIC = (b"PF", b"Pf")
@@ -51,11 +51,7 @@ def read_pfm(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarray
         held = os.fstat(file.fileno()).st_size
         width, height, channels, scale, start = header_of(path, file.read(_HEADER_BYTES))
         check_picture(path, held, width, height, channels * _NUMBER)
-        file.seek(start)
-        size = width * height * channels * _NUMBER
-        data = file.read(size)
-    if len(data) != size:
-        raise WlmError(f"{path}: cut short: expected {size} bytes of texels, found {len(data)}")
+        data = read_part(path, file, start, width * height * channels * _NUMBER, "the texels")
     stored = np.frombuffer(data, "<f4" if scale < 0 else ">f4").reshape(height, width, channels)[::-1]
     if abs(scale) != 1.0:
         notes.append(f"the scale of its header, {abs(scale):g}, is not applied")

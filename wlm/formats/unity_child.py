@@ -1,25 +1,19 @@
-"""A program that reads the arrays of a Unity file by UnityPy, in a process of its own with limits of memory and time.
+"""A program for `wlm.formats.child` that reads the arrays of a Unity file by UnityPy.
 
-UnityPy lists the objects and their layouts, which the file contains. Its C code ends its process on some damaged files,
-and a layout can describe endless work, so this process reads the values too, and prints only arrays. UnityPy would
-allocate as many values as a file claims. This program imports nothing of this package.
+UnityPy lists the objects and their layouts, which the file contains. A layout can describe endless work, and UnityPy
+would allocate as many values as a file claims, so this program reads the values itself.
 """
 
-import contextlib
-import io
-import json
 import struct
-import sys
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
-MEMORY = 768 << 20
-"""Limit of its memory beyond the imported packages, in bytes, on systems that can set one."""
+PACKAGE, MEMORY, SECONDS = "UnityPy", 768 << 20, 2
 
-SECONDS = 2
-"""Limit of its CPU time beyond the imports, in seconds, on systems that can set one."""
+KINDS = "kinds"
+"""Name of the array of the types of all objects."""
 
 POSITIONS, LIGHT, RENDERERS = "m_Data.m_Positions", "m_BakedCoefficients", "m_LightmappedRendererData"
 """Paths of the arrays that are read."""
@@ -62,45 +56,40 @@ Object = tuple[str, Any, bytes | memoryview, str]
 """Type, layout, bytes and byte order of an object; a layout is a list: type, name, flags, the children's layouts."""
 
 
-def main() -> None:
-    """Reads a file from the standard input, and prints what `encode` returns."""
+def main(data: bytes) -> dict[str, np.ndarray]:
+    """Returns what `encode` returns for the objects of a file."""
     # `UnityPy.load` would decompress by any method that a file names.
     from UnityPy.files import SerializedFile
     from UnityPy.streams import EndianBinaryReader
 
-    _limit()
-    data = sys.stdin.buffer.read()
-    # UnityPy prints messages about data that it cannot read.
-    with contextlib.redirect_stdout(io.StringIO()):
-        asset = SerializedFile(EndianBinaryReader(data), name="asset")
-        found: list[Object] = []
-        for item in asset.objects.values():
-            kind, start, size = item.type.name, item.byte_start, item.byte_size
-            if kind not in WANTED:
-                found.append((kind, None, b"", ""))
-                continue
-            if not 0 <= start <= start + size <= len(data):
-                raise ValueError(f"an object of {size} bytes at {start} exceeds the file of {len(data)} bytes")
-            content = memoryview(data)[start : start + size]
-            found.append((kind, _tree(item.serialized_type.node), content, asset.header.endian))
-        printed = encode(found, len(data))
-    sys.stdout.buffer.write(printed)
+    asset = SerializedFile(EndianBinaryReader(data), name="asset")
+    found: list[Object] = []
+    for item in asset.objects.values():
+        kind, start, size = item.type.name, item.byte_start, item.byte_size
+        if kind not in WANTED:
+            found.append((kind, None, b"", ""))
+            continue
+        if not 0 <= start <= start + size <= len(data):
+            raise ValueError(f"an object of {size} bytes at {start} exceeds the file of {len(data)} bytes")
+        content = memoryview(data)[start : start + size]
+        found.append((kind, _tree(item.serialized_type.node), content, asset.header.endian))
+    return encode(found, len(data))
 
 
-def encode(objects: Iterable[Object], most: int) -> bytes:
-    """Returns the types of the objects, and their arrays as float64: a line of JSON, and the numbers behind it.
+def encode(objects: Iterable[Object], most: int) -> dict[str, np.ndarray]:
+    """Returns the types of the objects, `KINDS`, and their arrays by path, float64 [N, columns], empty without objects.
 
     The arrays together may come from at most `most` bytes: objects may overlap in the file.
 
     Raises:
         ValueError: An object is damaged, or lacks an array.
     """
-    kinds, heads, numbers = set(), [], []
+    kinds: set[str] = set()
+    tables = {path: [np.empty((0, len(columns)))] for path, columns in _COLUMNS.items()}
     for kind, tree, content, order in objects:
         kinds.add(kind)
         arrays = _Walk(content, order, WANTED[kind]).arrays(tree) if kind in WANTED else {}
-        for path in WANTED.get(kind, ()):
-            rows = arrays[path]
+        for path, rows in arrays.items():
             most -= rows.nbytes
             if most < 0:
                 raise ValueError("expected objects at different places, found several at one")
@@ -110,25 +99,8 @@ def encode(objects: Iterable[Object], most: int) -> bytes:
                 for name in names:
                     column = column[name]
                 table[:, index] = column
-            heads.append([path, *table.shape])
-            numbers.append(table.tobytes())
-    return b"".join((json.dumps([sorted(kinds), heads]).encode(), b"\n", *numbers))
-
-
-def _limit() -> None:
-    with contextlib.suppress(ImportError, OSError):
-        import resource
-
-        with open("/proc/self/statm") as file:
-            taken = int(file.read().split()[0]) * resource.getpagesize()
-        used = resource.getrusage(resource.RUSAGE_SELF)
-        seconds = int(used.ru_utime + used.ru_stime) + SECONDS
-        for kind, most in (
-            (resource.RLIMIT_AS, taken + MEMORY),
-            (resource.RLIMIT_CPU, seconds),
-            (resource.RLIMIT_CORE, 0),
-        ):
-            resource.setrlimit(kind, (most, most))
+            tables[path].append(table)
+    return {KINDS: np.array(sorted(kinds), str)} | {path: np.concatenate(rows) for path, rows in tables.items()}
 
 
 def _tree(node: Any) -> Any:
@@ -214,7 +186,3 @@ class _Walk:
             raise ValueError(f"expected {size} bytes at byte {self._at}, found {len(self._data) - self._at}")
         self._at += size
         return self._data[self._at - size : self._at]
-
-
-if __name__ == "__main__":
-    main()

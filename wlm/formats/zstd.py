@@ -1,6 +1,7 @@
-"""Zstandard frames of a known size, and parts of an artifact that are stored as such frames."""
+"""Zstandard frames and zlib streams of a known size, and parts of an artifact that are stored as Zstandard frames."""
 
 import math
+import zlib
 from collections.abc import Mapping
 
 import numpy as np
@@ -39,14 +40,30 @@ def decompress(frame: bytes, size: int, name: str) -> bytes:
     """
     try:
         stated = zstandard.frame_content_size(frame)
-        if stated != size:
-            raise ValueError(f"{name}: expected a frame of {size} decompressed bytes, found {stated}")
-        reader = zstandard.ZstdDecompressor().decompressobj(read_across_frames=False)
-        unpacked = reader.decompress(frame)
+        if stated in (size, -1):  # -1: the frame doesn't state it
+            reader = zstandard.ZstdDecompressor()
+            unpacked = reader.decompress(frame, max_output_size=size, allow_extra_data=False)
+            if len(unpacked) == size:
+                return unpacked
+            stated = len(unpacked)
     except zstandard.ZstdError as error:
         raise ValueError(f"{name}: {error}") from error
+    raise ValueError(f"{name}: expected a frame of {size} decompressed bytes, found {stated}")
+
+
+def inflate(data: bytes, size: int, name: str) -> bytes:
+    """Decompresses one zlib stream to `size` bytes, and allocates at most one byte more; `name` is for messages.
+
+    Raises:
+        ValueError: The stream is damaged or has another size.
+    """
+    reader = zlib.decompressobj()
+    try:
+        unpacked = reader.decompress(data, size + 1)
+    except zlib.error as error:
+        raise ValueError(f"{name}: {error}") from error
     if len(unpacked) != size or not reader.eof or reader.unused_data:
-        raise ValueError(f"{name}: expected one complete frame of {size} decompressed bytes, found other data")
+        raise ValueError(f"{name}: expected {size} decompressed bytes, found more or fewer")
     return unpacked
 
 

@@ -235,10 +235,10 @@ def _own_lightmaps(
         other = f", or with that of a material slot (--slot {' or '.join(slots)})" if slots else ""
         return f"compress it together with its lightmap{other}", "", ()
     try:
-        own = own_lightmaps(document, primitives)
+        listing, _ = own_lightmaps(document, primitives)
     except WlmError as error:
         return f"its lightmaps are named by {name}", "", (said(error, path),)
-    notes = tuple(note.removeprefix(f"{path}: ") for note in own.notes)
+    notes = tuple(note.removeprefix(f"{path}: ") for note in listing.notes)
     return f"with {notes[0]}", compress_command(path), notes[1:]
 
 
@@ -260,7 +260,7 @@ def _kind_of_json(path: Path) -> str:
         if "lightmaps" in content:
             return "set"
     # This imports scipy.
-    from wlm.probe.json_fields import holds_probes
+    from wlm.probe.fields import holds_probes
 
     return "probes" if holds_probes(content) else "json"
 

@@ -22,9 +22,10 @@ from wlm.inspection.files import (
     kind_of,
 )
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
-from wlm.inspection.pictures import Picture, picture_of, said
-from wlm.inspection.sets import UNREADABLE_SET, inspect_set, named, together
-from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders, time_of_name
+from wlm.inspection.pictures import Picture, picture_of, said, size_of
+from wlm.inspection.sets import UNREADABLE_SET, assumed, inspect_set, named, together
+from wlm.lightmap.hours import hours_of_names
+from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders
 
 MOST = 256
 """Most findings of `inspect`, and most folders that it visits."""
@@ -162,26 +163,19 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
     if not states or (folder / SET_FILE).is_file():
         return []
     held = {state: [entry for entry in _entries(state) if "_comp_" in entry.name.lower()] for state in states}
-    times = [time_of_name(state.name) for state in states]
     problems: list[str] = []
-    options: list[str] = []
-    if len(states) > 1 and None in times:
-        options += ["--times", f"0:{len(states)}:1"]
+    times, options = None, list[str]()
+    if len(states) > 1 and None in hours_of_names([state.name for state in states])[0]:
+        times, options = range(len(states)), ["--times", f"0:{len(states)}:1"]
         problems.append(f"the hours of {', '.join(state.name for state in states[:8])} are unknown: change --times")
-    stated: list[float] = [float(i) for i in range(len(states))]
-    try:
-        listing = list_set(folder, stated)
-    except WlmError as error:
-        problems.append(said(error, folder))
-        shared = ["light", *(name for name in ("dir", "shadowmask") if _lists(folder, stated, ["light", name]))]
-        options += ["--layers", ",".join(shared)]
-        listing = list_set(folder, stated, shared)
+    listing = list_set(folder, times)
     sizes = []
     for atlas in listing.atlases:
-        paths = [one[atlas.name, "light"].path for one in listing.states]
+        paths = [one[key].path for one in listing.states for key in [(atlas.name, "light")] if key in one]
         heads = [picture_of(path) for path in paths]
-        sizes += sorted({head.size for head in heads if head is not None})
+        sizes += sorted({size_of(path) for path in paths})
         problems += [f"{atlas.name}: {text}" for text in together(paths, heads)[0]]
+    problems += assumed(listing)
     names = ", ".join(layer.name for layer in listing.layers)
     size = " and ".join(dict.fromkeys(sizes))
     maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"
@@ -198,14 +192,6 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
         if entry not in its and entry.is_file() and not _is_ignored(entry)
     ]
     return [(finding, set(states)), *((inspect_file(entry), set()) for entry in rest)]
-
-
-def _lists(folder: Path, times: list[float], layers: list[str]) -> bool:
-    try:
-        list_set(folder, times, layers)
-    except WlmError:
-        return False
-    return True
 
 
 def _godot(folder: Path, files: Sequence[Path]) -> _Found:
@@ -312,11 +298,13 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
             words = compress_command(meshes[0], folder)
             return [(Finding(folder, f"{what}, with {meshes[0].name}", words, tuple(problems)), {*pictures, *meshes})]
         return [(Finding(folder, f"{what}; compress them with their meshes", problems=tuple(problems)), set(pictures))]
-    options: tuple[str, ...] = ()
-    if any(time_of_name(file.stem) is None for file in pictures):
-        options = ("--times", f"0:{len(pictures)}:1")
+    times, options = None, list[str]()
+    if None in hours_of_names([file.stem for file in pictures])[0]:
+        times, options = range(len(pictures)), ["--times", f"0:{len(pictures)}:1"]
         problems.append("the names state no hours: are they one lightmap at several times? Then change --times")
-    what = f"{count_of(pictures, 'lightmap')} of {heads[pictures[0]].size}"
+    with suppress(WlmError):  # other files in the folder, which are described by themselves
+        problems += assumed(list_set(folder, times))
+    what = f"{count_of(pictures, 'lightmap')} of {size_of(pictures[0])}"
     taken = {*pictures, folder / "mask.png"} & set(files)
     return [(Finding(folder, what, compress_command(folder, *options), tuple(problems)), taken)]
 

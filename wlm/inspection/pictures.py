@@ -95,6 +95,19 @@ def picture_of(path: Path) -> Picture | None:
     return None if other is None else Picture(other)
 
 
+def size_of(path: Path, slices: int = 1) -> str:
+    """Returns the size in pixels, such as "512x256", of each of the slices of a picture, which is read if its beginning
+    does not state it; "" if it cannot be read."""
+    try:
+        head = picture_of(path)
+        if head is None or head.width:
+            return "" if head is None else f"{head.width}x{head.height // slices}"
+        height, width = read_channels(path)[0].shape[:2]
+    except WlmError:
+        return ""
+    return f"{width}x{height // slices}"
+
+
 def inspect_picture(path: Path) -> Finding:
     """Describes a single picture.
 

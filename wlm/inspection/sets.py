@@ -6,7 +6,8 @@ from pathlib import Path
 from wlm.errors import WlmError
 from wlm.formats.light import noted
 from wlm.inspection.finding import Finding, compress_command
-from wlm.inspection.pictures import Picture, picture_of, read_lit, said
+from wlm.inspection.pictures import Picture, picture_of, read_lit, said, size_of
+from wlm.lightmap.assumptions import set_lines, size_line
 from wlm.lightmap.layout import PICTURES, odd_layout, spread
 from wlm.lightmap.listing import Listing, count_of, list_set
 from wlm.lightmap.sheet import LIGHT
@@ -24,7 +25,8 @@ def inspect_set(path: Path) -> Finding:
                 {f"{s.path.name} is missing" for one in listing.states for s in one.values() if not s.path.is_file()}
             )
             what = f"a set of lightmaps with layers at {count_of(listing.states, 'time')}: {sheets}"
-            return Finding(path.parent, what, compress_command(path.parent), tuple(problems[:4]))
+            problems = [*problems[:4], *assumed(listing)]
+            return Finding(path.parent, what, compress_command(path.parent), tuple(problems))
         return _checked(path.parent, listing)
     except WlmError as error:
         return Finding(path.parent, UNREADABLE_SET, problems=(said(error, path),))
@@ -44,12 +46,29 @@ def _checked(folder: Path, listing: Listing) -> Finding:
     problems = [f"{missing[0]} is missing" + f", and {len(missing) - 1} more" * (len(missing) > 1)] if missing else []
     files = list(dict.fromkeys(file for file in listing.files if file.is_file()))
     heads = [picture_of(file) for file in files]
-    size = next((head.size for head in heads if head is not None and head.width), "an unknown size")
-    what = f"a set of lightmaps at {count_of(listing.files, 'time')}, {size}"
+    size = size_of(files[0]) if files else ""
+    what = f"a set of lightmaps at {count_of(listing.files, 'time')}, {size or 'an unknown size'}"
+    problems += assumed(listing)
     if (stored := listing.layers[0].stored) is not None:
         return Finding(folder, f"{what}, stored as {stored}", compress_command(folder), tuple(problems))
     problems += together(files, heads)[0]
     return Finding(folder, what, compress_command(folder), tuple(problems))
+
+
+def assumed(listing: Listing) -> list[str]:
+    """Returns the lines about times, states and sizes of a set that `wlm compress` prints, too."""
+    lines = list(set_lines(listing))
+    for atlas in listing.atlases:
+        lead = ""
+        for layer in listing.light_first:
+            source = next(
+                (state[atlas.name, layer.name] for state in listing.states if (atlas.name, layer.name) in state), None
+            )
+            size = "" if source is None else size_of(source.path, source.slices)
+            if lead and size and size != lead:
+                lines.append(size_line(atlas.name, layer.name, size, lead))
+            lead = lead or size
+    return lines
 
 
 def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[list[str], bool]:

@@ -65,7 +65,7 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
     Returns:
         The settings, the parts by name, and the hash of the input that the model was made from.
     """
-    headers, parts, atlases = [], {"times": _shortened(model.times)}, set()
+    headers, parts, masks = [], {"times": _shortened(model.times)}, set()
     for number, (sheet, own) in enumerate(model.sheets.items()):
         headers.append(
             {
@@ -79,9 +79,10 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, np.ndarray],
         )
         stored = {name: value for name, value in own.parts.items() if name not in PACKED and value.size}
         stored |= _pack_tiles(own)
-        if sheet.atlas not in atlases and not own.mask.all():
+        key = sheet.atlas, own.mask.shape
+        if key not in masks and not own.mask.all():
             stored["mask"] = np.frombuffer(zstd.compress(np.packbits(own.mask).tobytes()), np.uint8)
-        atlases.add(sheet.atlas)
+        masks.add(key)
         parts |= {f"{number}.{name}": value for name, value in stored.items()}
     settings = {"name": model.name, "period": model.period, "profile": model.profile.changes(), "sheets": headers}
     return settings, parts, model.source
@@ -113,15 +114,15 @@ def decode(artifact: Artifact) -> LightmapModel:
         unpacked += sum(math.prod(tables[-1][name].shape) for name in PACKED)
     # Before memory is allocated for any sheet.
     check_growth("the file", sum(value.nbytes for value in artifact.tensors.values()), unpacked)
-    masks: dict[str, np.ndarray] = {}
+    masks: dict[tuple[str, tuple[int, int]], np.ndarray] = {}
     models: dict[Sheet, SheetModel] = {}
     for number, (sheet, item, table) in enumerate(zip(sheets, header.sheets, tables, strict=True)):
-        own = parts[number]
-        if sheet.atlas in masks and "mask" in own:
-            raise ValueError(f"part {number}.mask: expected a mask only with the first sheet of its atlas")
+        own, key = parts[number], (sheet.atlas, sizes[number])
+        if key in masks and "mask" in own:
+            raise ValueError(f"part {number}.mask: expected a mask only with the first sheet of its atlas and size")
         with _named(number):
-            if sheet.atlas not in masks:
-                masks[sheet.atlas] = _mask(own, *sizes[number])
+            if key not in masks:
+                masks[key] = _mask(own, *sizes[number])
             plain = {name: part for name, part in table.items() if name not in PACKED}
             packed = {name: own[name] for name in ("tiles", "tile_sizes") if name in own}
             rest = {name: value for name, value in own.items() if name not in ("kind", "mask", *packed)}
@@ -134,7 +135,7 @@ def decode(artifact: Artifact) -> LightmapModel:
                 times=times,
                 period=header.period,
                 profile=header.profile.for_sheet(sheet),
-                mask=masks[sheet.atlas],
+                mask=masks[key],
                 kind=own["kind"],
                 **arrays,
             )

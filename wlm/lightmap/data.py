@@ -13,10 +13,13 @@ These are the rules for input; each repair adds a line with the number of texels
 - Frames whose chart borders differ may belong to different atlases, which gives a warning (`wlm.lightmap.layout`).
 - Unless it is trusted, a set may only name files in its own folder, and a small file may not claim frames beyond 1 GiB.
   Frames of more than 1 GiB are kept in an unnamed file in the folder for temporary files (TMPDIR).
-- Frames, mask and `set.json` must agree in size. A file that does not hold light is an error that says what it holds.
+- The frames of a layer, the light's mask and `set.json` must agree in size; another layer of the atlas may have another
+  size, and its mask is that of the light, resampled. A file that does not hold light is an error that says what it
+  holds.
+- A picture of a layer may be missing at some times, which are fitted to the nearest time that has it and not scored.
 - Layers that are not light (directions, masks) have a fixed range; values outside it are clamped. A PNG of such a layer
-  maps black to the range's lower end and white to its upper end. All states must have the same layers and channels, at
-  most 12 channels in an atlas.
+  maps black to the range's lower end and white to its upper end. All pictures of a layer must have the same channels,
+  at most 12 in an atlas.
 
 The layout of a set and its evaluation follow neural-dynamic-gi, section 10.1.
 """
@@ -38,6 +41,7 @@ from wlm.formats.light import noted, read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, Budget, check_growth
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
+from wlm.lightmap.assumptions import set_lines, size_line
 from wlm.lightmap.layout import odd_layout
 from wlm.lightmap.listing import AtlasInfo, LayerInfo, Listing, Source, is_name, list_set
 from wlm.lightmap.sheet import LIGHT, MOST_NAME, VALUE_RANGES, Sheet, check_sheets, first_light, sheets_of
@@ -174,9 +178,9 @@ def load(
     The keys of a `set.json` are described in docs/formats.md. File names in it are relative to its folder.
 
     The files of a plain folder that end in `.exr`, `.hdr`, `.pfm`, `.tif`, `.ktx2` or `.dds` are read in natural order
-    of their names ("2" before "10"). Without `times`, the hours are read from the names if every name ends like
-    `_18_55h`, `_18.55h`, `_18h` or `_18.55`; the digits after the second separator are decimals, not minutes. A
-    `mask.png` among them is the mask unless `mask` says otherwise.
+    of their names ("2" before "10"). Without `times`, the hours are read from the names if every name ends in one
+    (`wlm.lightmap.hours`); if all are within a day, the period is 24. A `mask.png` among them is the mask unless `mask`
+    says otherwise.
 
     A folder with `NAME_comp_light.exr`, as Unity writes it, is one state of light; a folder of such folders has a state
     for each, in natural order of their names. NAME is the atlas; `_comp_dir` and `_comp_shadowmask` are linear layers.
@@ -186,7 +190,7 @@ def load(
         times: A time for each state, in the order of `set.json` or of the file names; replaces the times of `set.json`.
         mask: A PNG (a texel is valid if any colour channel is above 0), "alpha" (valid if the alpha channel of a frame
             is above 0; frames may differ) or "all"; None uses the mask of the set. It applies to all atlases.
-        period: Length of the day in the unit of the times; None uses the set's `period_hours`, if any.
+        period: Length of the day in the unit of the times; None uses the set's `period_hours`, or that of names.
         trust: Whether a `set.json` may name files outside its folder, and small files may hold large frames
             (`wlm.formats.limits`).
         layers: Names of the layers to read; None reads all.
@@ -201,27 +205,38 @@ def load(
     """
     listing = list_set(Path(path), times, layers, trust, encoding)
     stamps = np.asarray(listing.times, np.float64)
-    period = listing.period if period is None else period
+    given, period = period, listing.period if period is None else period
     # Before any file is read, since a wrong list makes that useless.
     check_times(str(listing.where), listing.labels, stamps, period)
+    lines = [f"{listing.where}: {line}" for line in set_lines(listing, given)]
     reader = _Reader(listing, np.argsort(stamps, kind="stable"), trust)
     sheets: dict[Sheet, SheetFrames] = {}
     for atlas in listing.atlases:
         valid = mask_from = None
         chosen = str(mask) if mask is not None else atlas.mask
-        # Light first: its alpha is the mask of the atlas.
-        for layer in sorted(listing.layers, key=lambda layer: layer.encoding != LIGHT.encoding):
-            light = layer.encoding == LIGHT.encoding
-            wanted = chosen if light and valid is None and chosen in (_FROM_ALPHA, None) else _ALL
-            stack = reader.read(atlas, layer, wanted)
+        for layer in listing.light_first:
+            leads = valid is None
+            wanted = chosen if leads and layer.encoding == LIGHT.encoding and chosen in (_FROM_ALPHA, None) else _ALL
+            stack = reader.read(atlas, layer, wanted, leads)
+            if stack is None:
+                continue
+            sources = [state.get((atlas.name, layer.name)) for state in listing.states]
+            size = next(iter(stack.frames.values())).shape[1:3]
             if valid is None:
-                valid = _valid(listing, atlas, layer, stack, chosen)
+                first = next(source.path for source in sources if source)
+                valid = _valid(first, size, stack, chosen)
                 mask_from = "the alpha of the light; --mask all takes all" if stack.alpha is not None else str(chosen)
-            labels = [state[atlas.name, layer.name].label for state in listing.states]
-            states = _States(labels, stamps, period, str(listing.where), mask_from, listing.warn_order)
+            elif size != valid.shape[-2:]:
+                line = size_line(atlas.name, layer.name, _size(size), _size(valid.shape[-2:]))
+                stack.warnings.append(f"{listing.where}: {line}")
+            own = _resized(valid, *size)
+            if not stack.present.all():
+                own = own & stack.present[:, None, None]
+            labels = [source.label if source else text for source, text in zip(sources, listing.labels, strict=True)]
+            states = _States(labels, stamps, period, str(listing.where), mask_from, not listing.origin, stack.present)
             for sheet, frames in stack.frames.items():
                 mesh = None if sheet.linear else atlas.mesh
-                sheets[sheet] = states.checked(listing.name, sheet, frames, valid, stack.warnings, mesh)
+                sheets[sheet] = states.checked(listing.name, sheet, frames, own, [*lines, *stack.warnings], mesh)
     atlas_of = {atlas.name: i for i, atlas in enumerate(listing.atlases)}
     layer_of = {layer.name: i for i, layer in enumerate(listing.layers)}
     ordered = sorted(sheets, key=lambda sheet: (atlas_of[sheet.atlas], layer_of[sheet.layer]))
@@ -266,7 +281,7 @@ def from_layers(
     """Makes a checked set of several layers from arrays, under the same rules as `load`.
 
     Args:
-        layers: The layers in the order in which they are stored; those of one atlas have the same height and width.
+        layers: The layers in the order in which they are stored.
         times: `[T]`, in any order.
         masks: Masks by the name of their atlas, as for `from_arrays`. In an atlas without a mask all texels are valid.
         period, name: As for `from_arrays`.
@@ -303,10 +318,12 @@ def from_layers(
         raise WlmError(f"{name}: masks: expected names of atlases that have layers, got {sorted(unknown)[0]!r}")
     labels = [f"frame {i} (time {time:g})" for i, time in enumerate(stamps)]
     check_times(name, labels, stamps, period)
-    states = _States(labels, stamps, period, name, "the mask", True)
+    states = _States(labels, stamps, period, name, "the mask", True, np.ones(stamps.shape, bool))
     sheets, made = {}, 0
     for sheet, (frames, chosen) in sources.items():
         valid = np.asarray((masks or {}).get(sheet.atlas, np.ones(sizes[sheet], bool))).astype(bool)
+        if valid.shape[-2:] in [size for other, size in sizes.items() if other.atlas == sheet.atlas]:
+            valid = _resized(valid, *sizes[sheet])
         if valid.shape not in (frames.shape[1:3], frames.shape[:3]):
             raise WlmError(f"{name}: expected a mask of the shape {frames.shape[1:3]}, got {valid.shape}")
         copied = room((*frames.shape[:3], 3), np.float32, name, made)
@@ -378,6 +395,7 @@ def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: fl
 class _Stack:
     frames: dict[Sheet, np.ndarray]
     alpha: np.ndarray | None
+    present: np.ndarray  # bool [T], in the order of the times
     warnings: list[str]
 
 
@@ -393,16 +411,27 @@ class _Reader:
         most = max(FRAMES, PICTURE_GROWTH * self._held)
         self._budget = Budget(f"{listing.where}: lightmaps", most, "decoded bytes")
 
-    def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None) -> _Stack:
-        sources = [state[atlas.name, layer.name] for state in self._listing.states]
-        first, files, notes = sources[0], {}, [[] for _ in sources]
-        for index, source in enumerate(sources):
+    def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None, leads: bool) -> _Stack | None:
+        """Reads the pictures of a layer; None if there is none. `leads`: whether the set may state their size."""
+        key = atlas.name, layer.name
+        sources = {i: state[key] for i, state in enumerate(self._listing.states) if key in state}
+        if not sources:
+            return None
+        start, first = next(iter(sources.items()))
+        files: dict[str, list[int]] = {}
+        for index, source in sources.items():
             files.setdefault(os.path.normpath(source.path), []).append(index)
-        whole, names = self._file(first.path, layer, notes[0])
+        notes: dict[int, list[str]] = {index: [] for index in sources}
+        whole, names = self._file(first.path, layer, layer.channels, notes[start])
         pixels = _part(whole, first)
         has_alpha = mask == _FROM_ALPHA or (mask is None and _ALPHA in names)
         size, known = pixels.shape[:2], names
+        if leads and atlas.size not in (None, size):
+            raise WlmError(
+                f"{first.path}: has {_size(size)} pixels, but {self._listing.where} states {_size(atlas.size)}"
+            )
         stack = self._stack(atlas, layer, size, names, has_alpha, first.path)
+        stack.present[self._place[list(sources)]] = True
 
         def put(index: int, pixels: np.ndarray, names: tuple[str, ...]) -> int:
             place, source = self._place[index], sources[index]
@@ -424,22 +453,26 @@ class _Reader:
         def put_all(path: str) -> None:
             """Reads a file once, for all times that it serves."""
             indices = files[path]
-            start = indices[0]
-            read = self._file(sources[start].path, layer, notes[start]) if start else (whole, names)
+            at, read = indices[0], (whole, names)
+            if at != start:
+                read = self._file(sources[at].path, layer, layer.channels or names, notes[at])
             for index in indices:
                 broken[index] = put(index, _part(read[0], sources[index]), read[1])
 
-        broken = [0] * len(sources)
+        broken = dict.fromkeys(sources, 0)
         pool = ThreadPoolExecutor(_READERS)
         try:
             # In order, so that the error names the first of several bad files.
             list(pool.map(put_all, files))
         finally:
             pool.shutdown(cancel_futures=True)
-        stack.warnings.extend(noted([source.label for source in sources], notes))
-        for source, count in zip(sources, broken, strict=True):
+        stack.warnings.extend(noted([source.label for source in sources.values()], list(notes.values())))
+        for index, count in broken.items():
             if count:
-                stack.warnings.append(f"{source.label}: {count} texels are not valid: alpha is NaN or infinite")
+                label = sources[index].label
+                stack.warnings.append(f"{label}: {count} texels are not valid: alpha is NaN or infinite")
+        if stack.alpha is not None:
+            stack.alpha[~stack.present] = stack.alpha.any(0)
         return stack
 
     def _stack(
@@ -457,8 +490,6 @@ class _Reader:
             found = ", ".join(names)
             raise WlmError(f"{first}: layer {layer.name}: expected a channel {missing[0]}, found the channels {found}")
         where = self._listing.where
-        if atlas.size not in (None, size):
-            raise WlmError(f"{first}: has {_size(size)} pixels, but {where} states {_size(atlas.size)}")
         sheets = sheets_of(atlas.name, layer.name, channels, layer.encoding)
         self._sizes |= dict.fromkeys(sheets, size)
         check_sheets(str(where), self._sizes)
@@ -471,10 +502,18 @@ class _Reader:
         for sheet in sheets:
             frames[sheet] = room((count, *size, 3), np.float32, text, self._made)
             self._made += frames[sheet].nbytes
-        return _Stack(frames, np.zeros((count, *size), bool) if alpha else None, [])
+        return _Stack(frames, np.zeros((count, *size), bool) if alpha else None, np.zeros(count, bool), [])
 
-    def _file(self, path: Path, layer: LayerInfo, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    def _file(
+        self, path: Path, layer: LayerInfo, wanted: tuple[str, ...] | None, notes: list[str]
+    ) -> tuple[np.ndarray, tuple[str, ...]]:
         pixels, names = _read(path, layer, notes)
+        grey = next((name for name in ("L", "Y") if name in names), None)
+        if grey is not None and "R" in (wanted or ()) and "R" not in names:
+            at = names.index(grey)
+            rest = [i for i in range(len(names)) if i != at]
+            pixels, names = pixels[..., [at, at, at, *rest]], (*_LIGHT_CHANNELS, *(names[i] for i in rest))
+            notes.append("its grey is taken as red, green and blue")
         if not self._trust:
             self._budget.spend(pixels.nbytes)
         return pixels, names
@@ -511,9 +550,8 @@ def _read(path: Path, layer: LayerInfo, notes: list[str]) -> tuple[np.ndarray, t
     return pixels, names
 
 
-def _valid(listing: Listing, atlas: AtlasInfo, layer: LayerInfo, stack: _Stack, mask: str | None) -> np.ndarray:
+def _valid(first: Path, size: tuple[int, int], stack: _Stack, mask: str | None) -> np.ndarray:
     """Returns the valid texels of an atlas, bool [H, W] or [T, H, W] in the order of the times."""
-    size, first = next(iter(stack.frames.values())).shape[1:3], listing.states[0][atlas.name, layer.name].path
     if stack.alpha is not None:
         return stack.alpha
     if mask == _FROM_ALPHA:
@@ -523,9 +561,23 @@ def _valid(listing: Listing, atlas: AtlasInfo, layer: LayerInfo, stack: _Stack, 
     return read_mask(Path(mask), first, size, ', "alpha" or "all"')
 
 
+def _resized(mask: np.ndarray, *size: int) -> np.ndarray:
+    """Resamples a mask [..., H, W] to another height and width: a texel is valid if it overlaps a valid one."""
+    for axis, count in zip((-2, -1), size, strict=True):
+        old = mask.shape[axis]
+        if old != count:
+            at = np.arange(count)
+            sums = np.insert(np.cumsum(mask, axis), 0, 0, axis)
+            mask = sums.take(-(-(at + 1) * old // count), axis) > sums.take(at * old // count, axis)
+    return mask
+
+
 @dataclass(frozen=True, eq=False)
 class _States:
-    """Times and labels of a set's lightmaps, in the order given; `where` and `mask_from` are words for messages."""
+    """Times and labels of a set's lightmaps, in the order given; `where` and `mask_from` are words for messages.
+
+    `present`, bool [T], states at which of the sorted times there is a picture.
+    """
 
     labels: Sequence[str]
     times: np.ndarray
@@ -533,6 +585,7 @@ class _States:
     where: str
     mask_from: str
     warn_order: bool
+    present: np.ndarray
 
     @property
     def order(self) -> np.ndarray:
@@ -548,7 +601,7 @@ class _States:
         warnings: Sequence[str] = (),
         mesh: Path | None = None,
     ) -> SheetFrames:
-        """Sorts, checks and repairs the frames of a sheet by the module's rules."""
+        """Checks and repairs the frames of a sheet by the module's rules."""
         where, period = self.where, self.period
         if not mask.any():
             raise WlmError(f"{where}: the mask is empty: no texel is valid ({self.mask_from})")
@@ -562,7 +615,8 @@ class _States:
         mask = mask.any(0) if mask.ndim == 3 else mask
         for i, (label, frame) in enumerate(zip(labels, frames, strict=True)):
             inside = mask if covered is None else covered[i]
-            warnings += [f"{label}: {text}" for text in repair(frame, inside, f"{where}: {label}")]
+            if self.present[i]:
+                warnings += [f"{label}: {text}" for text in repair(frame, inside, f"{where}: {label}")]
         odd = odd_layout(len(frames), lambda i: frames[i].any(-1) if covered is None else covered[i])
         if odd is not None:
             warnings.append(
@@ -572,11 +626,11 @@ class _States:
         if covered is not None:
             covered = covered & mask
             _fill_in_time(frames, covered, times, period)
-            missing = np.count_nonzero(mask & ~covered.all(0))
-            warnings.append(
-                f"{where}: {missing} texels are valid in only some lightmaps: at other times they are fitted to the "
-                "light of the nearest time at which they are valid, and are not scored"
-            )
+            if missing := np.count_nonzero(mask & ~covered[self.present].all(0)):
+                warnings.append(
+                    f"{where}: {missing} texels are valid in only some lightmaps: at other times they are fitted to "
+                    "the light of the nearest time at which they are valid, and are not scored"
+                )
         return SheetFrames(
             name=name if sheet == LIGHT else f"{name} {sheet.label}",
             times=times,

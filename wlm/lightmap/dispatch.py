@@ -14,7 +14,7 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.lightmap.tiles import TileKind
 from wlm.lightmap.trainer import CPU_LANES, Advance, Fitter
-from wlm.metrics.tiled import nanmean
+from wlm.metrics import nanmean
 from wlm.system import Meter
 from wlm.workers import Actors, Here, Lost, Processes, Workers, cores
 

@@ -21,8 +21,7 @@ from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.sheet import Sheet, first_light
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.view_scores import VIEWS, ShownScore, Tally, views_of
-from wlm.metrics import METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
-from wlm.metrics.tiled import nanmean
+from wlm.metrics import METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, nanmean, summarise
 from wlm.system import Meter, OnProgress
 
 SCORES = (*METRICS, "seen")

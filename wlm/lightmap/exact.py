@@ -5,8 +5,7 @@ import math
 import numpy as np
 from scipy.special import erf
 
-from wlm.formats.bc7 import blocks_image, decode_image
-from wlm.formats.bc7_modes import decode_blocks
+from wlm.formats.bc7 import decode_image
 from wlm.lightmap.model import SheetModel, decode_scale
 from wlm.lightmap.tiles import TILE, TileKind
 
@@ -93,7 +92,7 @@ def _check(model: SheetModel, number: int, time: float) -> None:
 def _frame(model: SheetModel, number: int, at: int) -> np.ndarray:
     """Decodes the frame of a tile at stored time `at` to gamma space, [128, 128, 3]."""
     row = model.row(number)
-    levels = blocks_image(decode_blocks(model.frames[row, at]))[..., :3] / 255.0
+    levels = decode_image(model.frames[row, at])[..., :3] / 255.0
     least, greatest = model.ranges[row, at].astype(np.float64)
     return least + levels * (greatest - least)
 
@@ -119,7 +118,7 @@ def _network_output(model: SheetModel, number: int, place: int, time: float) -> 
         periodic = model.axis.periodic
         tau = model.axis.place(time)
         centres = (np.arange(TILE) + 0.5) / TILE
-        slices = np.stack([decode_image(s) for s in model.uvt[row]]) / 255.0  # [S, R, R, 4]
+        slices = decode_image(model.uvt[row]) / 255.0  # [S, R, R, 4]
         volume = _along(slices, np.array([tau]), periodic)[0]
         volume = _along(_along(volume, centres).swapaxes(0, 1), centres).swapaxes(0, 1)
         maps.append(volume)

@@ -96,10 +96,10 @@ def compress(
             if checkpoint is not None:
                 checkpoint.flush()
             raise
-    # Sheets of an atlas share one mask.
-    masks = {sheet.atlas: own.mask for sheet, own in reversed(sheets.items())}
+    # Sheets of an atlas and a size share one mask.
+    masks = {(sheet.atlas, own.mask.shape): own.mask for sheet, own in reversed(sheets.items())}
     for sheet, own in sheets.items():
-        own.mask = masks[sheet.atlas]
+        own.mask = masks[sheet.atlas, own.mask.shape]
     warnings = tuple(dict.fromkeys(fit.warning for fit in fits.values() if fit.warning))
     stored = profile.for_times(len(lightmaps.times))
     return LightmapModel(lightmaps.name, lightmaps.source, stored, sheets, warnings)

@@ -16,13 +16,10 @@ from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
 from wlm.formats.reading import named_file, read_json_file
+from wlm.lightmap.hours import DAY, hours_of_names
 from wlm.lightmap.sheet import LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS, VALUE_RANGES
 
 SET_FILE = "set.json"
-
-# The hour at the end of a file's name: `_18_55h` and `_18.55h` are 18.55, `_18h` is 18. A bare `_18` may be the number
-# of a frame and is not read as an hour.
-_NAME_TIME = re.compile(r"_([0-9]+)(?:[_.]([0-9]+))?h$|_([0-9]+\.[0-9]+)$", re.IGNORECASE)
 
 # Names that Unity gives: Lightmap-0_comp_light.exr, Lightmap-0_comp_dir.png, Lightmap-0_comp_shadowmask.png.
 _UNITY = re.compile(r"(.+)_comp_(light|dir|shadowmask)(\.exr|\.hdr|\.png|\.ktx2|\.dds)", re.IGNORECASE)
@@ -30,6 +27,7 @@ _UNITY_ENCODING = {"light": "radiance", "dir": "unit", "shadowmask": "unit"}
 _UNITY_SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds", ".png")  # the first format that all states have is read
 
 _MASK_WORDS = ("all", "alpha")
+_GIVEN = "the times given, in the order of the names"
 
 
 @dataclass(frozen=True)
@@ -95,9 +93,10 @@ class Listing:
         times: A time for each state, not yet checked.
         period: Length of the day in the unit of the times; None if the set is not periodic.
         layers, atlases: The layers and atlases, in the order of the set.
-        states: For each time, the pictures by names of atlas and layer.
+        states: For each time, the pictures by names of atlas and layer; a picture may be missing at some times.
         labels: Name of each state (the pictures of one time) in messages.
-        warn_order: Whether times that are out of order deserve a warning.
+        origin: Where times come from that no `set.json` states, for messages; else "".
+        doubt: A line about names whose hours may be read differently, or "".
     """
 
     name: str
@@ -108,7 +107,13 @@ class Listing:
     atlases: tuple[AtlasInfo, ...]
     states: list[dict[tuple[str, str], Source]]
     labels: list[str]
-    warn_order: bool = True
+    origin: str = ""
+    doubt: str = ""
+
+    @property
+    def light_first(self) -> list[LayerInfo]:
+        """The layers in the order in which they are read: the light's alpha and size are those of the atlas's mask."""
+        return sorted(self.layers, key=lambda layer: layer.encoding != LIGHT.encoding)
 
     @property
     def files(self) -> list[Path]:
@@ -127,7 +132,7 @@ def list_set(
 
     Raises:
         WlmError: The set cannot be read, a field is missing or wrong, a file lies outside the folder, there are too
-            many states, or the states do not have the same pictures.
+            many states, or a state has no picture.
     """
     if path.is_dir() and (path / SET_FILE).is_file():
         path = path / SET_FILE
@@ -157,15 +162,6 @@ def list_set(
 def natural(name: str) -> list[str | int]:
     """Returns a sort key that compares digits in a name as numbers, so that "2" sorts before "10"."""
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"([0-9]+)", name))]
-
-
-def time_of_name(stem: str) -> float | None:
-    """Returns the hour at the end of a file's name, such as 18.55 of "map_18_55h"; None if it has none."""
-    match = _NAME_TIME.search(stem)
-    if not match:
-        return None
-    whole, decimals, bare = match.groups()
-    return float(bare or f"{whole}.{decimals or 0}")
 
 
 def count_of(items: Sequence[object], noun: str) -> str:
@@ -199,6 +195,22 @@ def _check_count(where: Path, items: Sequence[object], times: Sequence[float], n
         raise WlmError(f"{where}: {count_of(times, 'time')} for {count_of(items, noun)}; expected a time for each")
 
 
+def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, noun: str) -> dict[str, Any]:
+    """Returns the times of lightmaps, given or of their names without suffixes, as fields of a `Listing`."""
+    if times is not None:
+        _check_count(folder, stems, times, noun)
+        return {"times": times, "period": None, "origin": _GIVEN}
+    hours, doubt = hours_of_names(stems)
+    if None in hours:
+        order = ", ".join(stems[:8]) + ", ..." * (len(stems) > 8)
+        raise WlmError(
+            f"{folder}: {count_of(stems, noun)} and no {SET_FILE}: give {count_of(stems, 'time')} with --times, in the "
+            f"order {order} ({stems[hours.index(None)]} does not end in an hour such as _18h)"
+        )
+    a_day = len(hours) > 1 and all(0 <= hour < DAY for hour in hours)
+    return {"times": hours, "period": DAY if a_day else None, "origin": "hours from the names", "doubt": doubt}
+
+
 def _list_folder(folder: Path, times: Sequence[float] | None, levels: bool) -> Listing:
     """Lists a folder of lightmaps, also of integers if `levels`; a "mask.png" in it is the mask."""
     suffixes = SUFFIXES + LEVEL_SUFFIXES * levels
@@ -210,27 +222,15 @@ def _list_folder(folder: Path, times: Sequence[float] | None, levels: bool) -> L
     files = sorted((f for f in files if f.name[0] != "."), key=lambda f: (natural(f.name), f.name))
     if not files:
         raise WlmError(f"{folder}: expected a {SET_FILE} or lightmaps ({', '.join(SUFFIXES)}), found none of them")
-    stamps = times
-    if stamps is None:
-        stamps = [time_of_name(f.stem) for f in files]
-        if None in stamps:
-            raise WlmError(
-                f"{folder}: {count_of(files, 'lightmap')} and no {SET_FILE}: give {count_of(files, 'time')} with "
-                f"--times ({files[stamps.index(None)].name} does not end in an hour such as _18_55h)"
-            )
-    _check_count(folder, files, stamps, "lightmap")
     mask = folder / "mask.png"
     return Listing(
         name=folder.resolve().name,
         where=folder,
-        times=stamps,
-        period=None,
         layers=(LayerInfo(LIGHT.layer, LIGHT.encoding),),
         atlases=(AtlasInfo(LIGHT.atlas, str(mask) if mask.is_file() else "all"),),
         states=[{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)} for file in files],
         labels=[file.name for file in files],
-        # Names do not have to sort by their hours ("_5.5h" before "_5.45h"): only times from the caller have an order.
-        warn_order=times is not None,
+        **_timed(folder, [f.stem for f in files], times, "lightmap"),
     )
 
 
@@ -258,48 +258,21 @@ def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[s
     layers = [name for name in _UNITY_ENCODING if any(key[1] == name for key in everywhere)]
     sources: list[dict[tuple[str, str], Source]] = [{} for _ in states]
     keys = [(atlas, layer) for layer in layers if chosen is None or layer in chosen for atlas in atlases]
-    # Pictures that one state lacks and another has are reported first.
-    for key in sorted(keys, key=lambda key: key not in everywhere):
-        suffixes = [suffix for suffix in _UNITY_SUFFIXES if all(suffix in files.get(key, ()) for files in found)]
-        if not suffixes:
-            _refuse(folder, key, states, found)
+    for key in keys:
+        common = [suffix for suffix in _UNITY_SUFFIXES if all(suffix in files[key] for files in found if key in files)]
         for files, source in zip(found, sources, strict=True):
-            source[key] = _labelled(files[key][suffixes[0]])
-    stamps = times
-    if stamps is None:
-        stamps = [0.0] if len(states) == 1 else [time_of_name(state.name) for state in states]
-        if None in stamps:
-            names = ", ".join(state.name for state in states)
-            raise WlmError(
-                f"{folder}: {count_of(states, 'state')} of light and no {SET_FILE}: give {count_of(states, 'time')} "
-                f"with --times, in the order {names}"
-            )
-    _check_count(folder, states, stamps, "state")
+            if key in files:
+                suffix = next(suffix for suffix in (*common, *_UNITY_SUFFIXES) if suffix in files[key])
+                source[key] = _labelled(files[key][suffix])
+    labels = [state.name for state in states]
     return Listing(
         name=folder.resolve().name,
         where=folder,
-        times=stamps,
-        period=None,
         layers=tuple(LayerInfo(name, _UNITY_ENCODING[name]) for name in layers),
         atlases=tuple(AtlasInfo(name, None) for name in atlases),
         states=sources,
-        labels=[state.name for state in states],
-        warn_order=times is not None,
-    )
-
-
-def _refuse(
-    folder: Path, key: tuple[str, str], states: list[Path], found: list[dict[tuple[str, str], dict[str, Path]]]
-) -> None:
-    """Raises an error about states with different files; it names a picture, and a state that does not have it."""
-    name, has = f"{key[0]}_comp_{key[1]}", [bool(files.get(key)) for files in found]
-    if all(has):
-        raise WlmError(f"{folder}: {name}: expected one format in all states, found different formats")
-    without = states[has.index(False)].name
-    there = f"{states[has.index(True)].name} has it" if any(has) else "another atlas has that layer"
-    raise WlmError(
-        f"{folder}: {without} has no {name}, but {there}: all states and atlases need the same layers; choose some "
-        f"with --layers, or name the files in a {SET_FILE}"
+        labels=labels,
+        **_timed(folder, labels, [0.0] if times is None and len(states) == 1 else times, "state"),
     )
 
 
@@ -350,13 +323,23 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
             files = _field(path, entry, "files", f"{place}.", _is_object, "an object of atlases")
             states.append({})
             for atlas in atlases:
+                if atlas.name not in files:
+                    continue
                 of_atlas = _field(path, files, atlas.name, f"{place}.files.", _is_object, "an object of layers")
                 for layer in layers:
+                    if layer.name not in of_atlas:
+                        continue
                     at, expected = f"{place}.files.{atlas.name}.", "a file, or an object (file, slice, slices)"
                     value = _field(path, of_atlas, layer.name, at, _is_source, expected)
                     states[-1][atlas.name, layer.name] = _source(path, value, at + layer.name, found, trust)
+            if not states[-1]:
+                raise WlmError(f"{path}: {place}.files: expected a picture, found none of the atlases and layers")
         if times is None:
             stamps.append(float(_field(path, entry, "time_hours", f"{place}.", _is_number, "a finite number")))
+    held = [key for state in states for key in state]
+    for i, noun, infos in ((0, "atlas", atlases), (1, "layer", layers)):
+        if lone := sorted({info.name for info in infos} - {key[i] for key in held}):
+            raise WlmError(f"{path}: {noun} {lone[0]}: expected a picture of it in an entry of lightmaps, found none")
     if times is not None:
         _check_count(path, states, times, "lightmap" if plain else "state")
     labels = [source.label for state in states for source in state.values()] if plain else None
@@ -369,6 +352,7 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
         atlases=atlases,
         states=states,
         labels=labels or [f"lightmaps[{i}]" for i in range(len(states))],
+        origin="" if times is None else _GIVEN,
     )
 
 

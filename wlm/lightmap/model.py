@@ -13,7 +13,6 @@ normalises with the rounded values, so that rounding adds no error.
 A `LightmapModel` is a collection of sheets (`wlm.lightmap.sheet`); the arrays of each sheet are a `SheetModel`.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -197,7 +196,7 @@ class LightmapModel(Model):
         name: Name of the set.
         source: Hash of the input, see `wlm.lightmap.data.LightmapSet.source`.
         profile: The settings of the fit; each sheet's own settings follow from them (`Profile.for_sheet`).
-        sheets: The sheets, with the same times; those of one atlas share the size and the mask.
+        sheets: The sheets, with the same times; those of one atlas and size share the mask.
         warnings: Settings that the fit could not follow, one line each; they are not saved to the file.
     """
 
@@ -223,11 +222,6 @@ class LightmapModel(Model):
     def period(self) -> float | None:
         """Length of the day in the unit of the times; None if the set is not periodic."""
         return self.light.period
-
-    @property
-    def atlases(self) -> Mapping[str, tuple[int, int]]:
-        """Height and width in texels of each atlas, by name."""
-        return {sheet.atlas: (own.height, own.width) for sheet, own in self.sheets.items()}
 
     @property
     def memory_bytes(self) -> int:

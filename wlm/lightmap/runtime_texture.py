@@ -11,7 +11,8 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.formats.dds import MOST_SIDE, write_dds
+from wlm.formats.dds import write_dds
+from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.encodings.constant import ConstantTiles
 from wlm.lightmap.model import SheetModel

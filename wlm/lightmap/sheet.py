@@ -132,16 +132,16 @@ def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
 
     Raises:
         WlmError: There is no sheet; there are too many sheets, channels in an atlas, or texels in all sheets together;
-            a channel occurs twice; or sheets of an atlas differ in size.
+            a channel occurs twice; or sheets of a layer of an atlas differ in size.
     """
     if not 1 <= len(sizes) <= MOST_SHEETS:
         raise WlmError(f"{where}: expected 1 to {MOST_SHEETS} sheets of three channels, found {len(sizes)}")
     channels: dict[str, list[tuple[str, str]]] = {}
-    found: dict[str, tuple[int, int]] = {}
+    found: dict[tuple[str, str], tuple[int, int]] = {}
     for sheet, size in sizes.items():
-        if found.setdefault(sheet.atlas, size) != size:
-            first, second = (f"{width}x{height}" for height, width in (found[sheet.atlas], size))
-            raise WlmError(f"{where}: {sheet.label} has {second} texels, but atlas {sheet.atlas} has {first}")
+        if (known := found.setdefault((sheet.atlas, sheet.layer), size)) != size:
+            first, second = (f"{width}x{height}" for height, width in (known, size))
+            raise WlmError(f"{where}: {sheet.label} has {second} texels, but others of its layer have {first}")
         channels.setdefault(sheet.atlas, []).extend((sheet.layer, name) for name in sheet.channels)
     for atlas, names in channels.items():
         if len(set(names)) < len(names):

@@ -1,6 +1,6 @@
 """Error of a decoded lightmap as a renderer shows it: filtered, between stored hours, over time, in views of a mesh.
 
-The paper's protocol (`wlm.metrics.tiled`) compares the centres of valid texels at the stored times. A renderer reads
+The paper's protocol (`wlm.metrics`) compares the centres of valid texels at the stored times. A renderer reads
 filtered light at any hour, so that texels of gaps between charts and of neighbouring tiles matter too. The scores of
 this module cover the same tiles and times, and errors are relative to a tile's range at a time, too. The scores are
 described in docs/lightmap.md and at `ShownScore`. Random points and times are the same in every run, and reads are
@@ -36,8 +36,7 @@ from wlm.formats.geometry import Geometry, read_geometry
 from wlm.interop import check_device
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.tiles import TILE, TileGrid, valid_texels
-from wlm.metrics import MIN_VALID_TEXELS, FrameMetrics, Pictures, evaluate_frame, psnr_from_mse
-from wlm.metrics.tiled import nanmean
+from wlm.metrics import MIN_VALID_TEXELS, FrameMetrics, Pictures, evaluate_frame, nanmean, psnr_from_mse
 from wlm.ops import raster
 from wlm.ops.views import sphere_views, visible_points
 from wlm.texels import exposure, filmic, nearest_valid, to_srgb

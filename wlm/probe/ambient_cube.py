@@ -18,15 +18,14 @@ from wlm.errors import WlmError
 from wlm.formats.ktx2 import read_ktx2_volume, write_ktx2
 from wlm.formats.limits import PROBES
 from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5
-from wlm.probe.sphere import basis, coefficient_bands, cosine_factor
+from wlm.probe.sphere import irradiance_weights
 
 _STACKS, _SIDES = 3, 2
 _COEFFICIENTS = 9
 _USED = [0, 1, 2, 3, 6, 8]  # 1; y, z, x; 3z2-1, x2-y2
 
 # Irradiance over pi in the directions +x, -x, +y, -y, +z, -z for each coefficient of radiance.
-_SEEN = basis(np.repeat(np.eye(3), 2, 0) * np.tile([[1.0], [-1.0]], (3, 1)), _COEFFICIENTS)
-_SEEN = _SEEN * np.array([cosine_factor(int(band)) / np.pi for band in coefficient_bands(_COEFFICIENTS)])
+_SEEN = irradiance_weights(np.repeat(np.eye(3), 2, 0) * np.tile([[1.0], [-1.0]], (3, 1)), _COEFFICIENTS) / np.pi
 
 READING = (
     "an irradiance volume of Bevy: irradiance over pi in six directions, in the file's unit (Bevy multiplies by its "
@@ -60,8 +59,7 @@ def read_irradiance_volume(path: str | os.PathLike[str]) -> tuple[np.ndarray, np
     light = np.zeros((int(count.prod()), _COEFFICIENTS, 3))
     with np.errstate(invalid="ignore"):  # NaN and infinity
         light[:, _USED] = np.linalg.inv(_SEEN[:, _USED]) @ faces.reshape(-1, _STACKS * _SIDES, 3).astype(np.float64)
-    z, y, x = np.meshgrid(*((np.arange(n) + 0.5) / n - 0.5 for n in count[::-1]), indexing="ij")
-    return np.stack([x, y, z], -1).reshape(-1, 3), light
+    return (np.indices(count[::-1])[::-1].reshape(3, -1).T + 0.5) / count - 0.5, light
 
 
 def write_irradiance_volume(path: str | os.PathLike[str], values: np.ndarray, count: np.ndarray) -> float:

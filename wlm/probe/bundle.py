@@ -1,5 +1,8 @@
 """Makes the bundle of a model for GPUs: buffers, shader, description and reference values."""
 
+from dataclasses import replace
+from pkgutil import resolve_name
+
 import numpy as np
 
 from wlm.bundle import Bundle
@@ -33,11 +36,11 @@ def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:
     Raises:
         WlmError: The device does not exist, the decoded light is not finite, or a number exceeds float32.
     """
-    form = model.content.gpu_form(model, model.decoder(device))
+    form = resolve_name(model.content.BUNDLE)(model, model.decoder(device))
     if not np.isfinite(form.reference["values"]).all():
         raise WlmError(f"{model.name}: cannot export: the model decodes to NaN or infinity")
     document = {
-        "about": form.about | _ABOUT,
+        "about": form.document["about"] | _ABOUT,
         "source": model.source,
         "method": model.method,
         "probes": model.probes,
@@ -49,14 +52,5 @@ def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:
         "size": model.size.tolist(),
         "dead": np.flatnonzero(model.dead).tolist(),
     }
-    buffers = dict(form.buffers)
-    if model.has_positions:
-        buffers["positions"] = np.ascontiguousarray(model.positions, "<u2")
-    return Bundle(
-        system=ProbeModel.SYSTEM,
-        name=model.name,
-        shader=form.shader,
-        document=document | form.document,
-        buffers=buffers,
-        reference=form.reference,
-    )
+    positions = {"positions": np.ascontiguousarray(model.positions, "<u2")} if model.has_positions else {}
+    return replace(form, document=form.document | document, buffers=form.buffers | positions)

@@ -29,13 +29,12 @@ from wlm.formats.artifact import Artifact
 from wlm.formats.compact import BODY
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
-from wlm.probe.gaussian import codec as gaussian_codec
-from wlm.probe.model import ProbeModel, Profile
-from wlm.probe.pca import codec as pca_codec
+from wlm.probe.gaussian.model import Gaussians
+from wlm.probe.model import Content, ProbeModel, Profile
+from wlm.probe.pca.model import Components
 from wlm.system import Header, Name
 
-_METHODS = {"gaussians": gaussian_codec, "pca": pca_codec}
-"""The module that reads and writes the models of each compression method."""
+_METHODS: dict[str, type[Content]] = {each.METHOD: each for each in (Gaussians, Components)}
 
 _LENGTH = struct.Struct("<H")
 _FARTHEST = 1e150
@@ -67,16 +66,15 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     Raises:
         ValueError: The model's Gaussians have not been quantised to integers.
     """
-    method = _METHODS[model.method]
     live = int(model.live.sum())
     header: dict[str, Any] = {"probes": model.probes}
     if model.outputs != _Header.model_fields["outputs"].default:
         header["outputs"] = model.outputs
     header |= {"source": model.source[:_SOURCE], "profile": model.profile.changes()}
-    header |= method.settings(model.content)
+    header |= model.content.settings()
     header |= {"live": live} if live < model.probes else {}
     header |= {"positions": True} if model.has_positions else {}
-    parts = {"box": np.array([*model.origin, model.extent, *model.size])} | method.parts(model.content)
+    parts = {"box": np.array([*model.origin, model.extent, *model.size])} | model.content.parts()
     if live < model.probes:
         parts["dead"] = np.packbits(model.dead)
     if model.has_positions:
@@ -112,6 +110,7 @@ def decode(artifact: Artifact) -> ProbeModel:
     stored = check_parts(_split(body[start:], table, len(body)), table)
     box = stored["box"]
     origin, extent, size = box[:3].copy(), float(box[3]), box[4:].copy()
+    profile, outputs = header.profile, header.outputs
     if not (extent > 0 and (np.abs(box) <= _FARTHEST).all() and (size >= 0).all() and (size <= 1).all()):
         raise ValueError("part box: expected finite numbers, a longest side above 0, and relative sides from 0 to 1")
     dead = np.zeros(0, bool)
@@ -122,19 +121,9 @@ def decode(artifact: Artifact) -> ProbeModel:
     positions = np.zeros((0, 3), np.uint16)
     if "positions" in table:
         positions = np.cumsum(stored["positions"].T, axis=0, dtype=np.uint16)
-    return ProbeModel(
-        name=name,
-        source=header.source,
-        profile=header.profile,
-        probes=header.probes,
-        outputs=header.outputs,
-        origin=origin,
-        extent=extent,
-        size=size,
-        dead=dead,
-        positions=positions,
-        content=_METHODS[header.profile.method].content(header.profile, header.outputs, stored, header.dropped),
-    )
+    content = _METHODS[profile.method].from_parts(profile, outputs, stored, header.dropped)
+    place = {"origin": origin, "extent": extent, "size": size, "positions": positions}
+    return ProbeModel(name, header.source, profile, header.probes, outputs, dead=dead, content=content, **place)
 
 
 def _table(header: _Header) -> dict[str, Part]:
@@ -145,9 +134,7 @@ def _table(header: _Header) -> dict[str, Part]:
         table["dead"] = Part(np.uint8, (-(-header.probes // 8),))
     if header.positions:
         table["positions"] = Part(np.uint16, (3, header.probes))
-    if header.profile.method == "pca":
-        return table | pca_codec.table(live, header.outputs, header.count)
-    return table | gaussian_codec.table(header.profile, header.outputs, header.count)
+    return table | _METHODS[header.profile.method].table(header.profile, header.outputs, header.count, live)
 
 
 def _planes(part: np.ndarray) -> bytes:

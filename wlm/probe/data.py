@@ -29,10 +29,9 @@ from wlm.probe.conventions import (
     from_canonical,
     to_canonical,
 )
-from wlm.probe.json_fields import fields_of, kind_of, positions_of, read_json
+from wlm.probe.fields import read_fields, read_positions, read_table
 from wlm.probe.layouts import COEFFICIENT, ORDERS, choose_order, coefficients_first, described
-from wlm.probe.sphere import sh_count
-from wlm.probe.table import read_table
+from wlm.probe.sphere import sh_count, unit_or_zero
 
 LARGEST = float(np.sqrt(np.finfo(np.float32).max))
 """Largest number whose square fits float32."""
@@ -41,8 +40,6 @@ _ROWS = 1 << 16  # probes per piece, so that float64 copies stay at some tens of
 _FARTHEST = 1e150  # squares of distances fit float64
 _POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
 _NORMAL, _VALID = _BESIDE = "normal", "valid"
-_GODOT_AXES = "Godot's axes, right-handed, y up, in metres"
-_UNITY_AXES = "Unity's axes, left-handed, y up, in metres"
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +108,7 @@ def load(
       canonical; optionally `normal` (N, 3) and `valid` (N), as for `from_arrays`.
     - `.json`: `{"position": [[x, y, z], ...], "sh": [[[r, g, b], ...], ...]}`, or
       `{"probes": [{"position": [x, y, z], "sh": [[r, g, b], ...]}, ...]}`; optional fields as for `.npz`. The names
-      and forms of other writers are known too (`wlm.probe.json_fields`), and scenes of three.js.
+      and forms of other writers are known too (`wlm.probe.fields`), and scenes of three.js.
     - `.csv`, `.tsv`: a probe in each line, x, y, z and its numbers, below an optional line of names.
     - `.lmbake`, `.res`: a lightmap bake of Godot 4.
     - `.ktx2`: an irradiance volume of Bevy (`wlm.probe.ambient_cube`).
@@ -160,7 +157,7 @@ def load_positions(path: str | os.PathLike[str]) -> np.ndarray:
     elif kind in _READERS and kind != ".json":
         position = _READERS[kind](path, None).position
     else:
-        position = positions_of(path, read_json(path))
+        position = read_positions(path)
     return _check_positions(str(path), position)
 
 
@@ -263,50 +260,44 @@ def _read_npz(path: Path, key: str | None) -> _Raw:
 
 
 def _read_json(path: Path, key: str | None) -> _Raw:
-    content = read_json(path)
-    fields = fields_of(path, content)
+    fields = read_fields(path)
     name = _choose(path, fields.names, key)
     beside = {field: fields.read(field) for field in _BESIDE if field in fields.names}
-    stated = content.get(_CONVENTION, fields.convention) if isinstance(content, dict) else fields.convention
-    if not isinstance(stated, str):
-        raise WlmError(f"{path}: {_CONVENTION}: expected a string, got {kind_of(stated)}")
     position, values = fields.read(_POSITION), fields.read(name)
     if values.ndim == 1 and len(position) and len(values) % len(position) == 0:
         values = values.reshape(len(position), -1)
-    return _Raw(position, values, name, stated, beside, fields.axes)
+    return _Raw(position, values, name, fields.convention, beside, fields.axes)
 
 
-def _read_table(path: Path, key: str | None) -> _Raw:
-    position, values, remark = read_table(path)
-    return _Raw(position, values, _choose(path, (_POSITION, _SH), key), axes=remark)
-
-
-def _read_godot(path: Path, key: str | None) -> _Raw:
-    position, values = read_lmbake(path)
-    return _Raw(position, values, _choose(path, (_POSITION, _SH), key), "godot", axes=_GODOT_AXES)
-
-
-def _read_unity(path: Path, key: str | None) -> _Raw:
+def _lighting_data(path: Path) -> tuple[np.ndarray, np.ndarray]:
     data = read_lighting_data(path)
     if not len(data.position):
         raise WlmError(f"{path}: expected light probes, found none: the scene has no baked LightProbeGroup")
-    return _Raw(data.position, data.values, _choose(path, (_POSITION, _SH), key), "unity", axes=_UNITY_AXES)
+    return data.position, data.values
 
 
-def _read_volume(path: Path, key: str | None) -> _Raw:
-    position, values = read_irradiance_volume(path)
-    return _Raw(position, values, _choose(path, (_POSITION, _SH), key), reading=READING)
+def _only_sh(read: Callable[[Path], tuple], **known: str) -> Callable[[Path, str | None], _Raw]:
+    """Returns a reader of a kind of file with one array of values; `known` are fields of `_Raw` that hold for it."""
+
+    def reader(path: Path, key: str | None) -> _Raw:
+        position, values, *remark = read(path)
+        name = _choose(path, (_POSITION, _SH), key)
+        return _Raw(position, values, name, **known | ({"axes": remark[0]} if remark else {}))
+
+    return reader
 
 
+_GODOT = _only_sh(read_lmbake, convention="godot", axes="Godot's axes, right-handed, y up, in metres")
+_UNITY = _only_sh(_lighting_data, convention="unity", axes="Unity's axes, left-handed, y up, in metres")
 _READERS = {
     ".npz": _read_npz,
     ".json": _read_json,
-    ".lmbake": _read_godot,
-    ".res": _read_godot,
-    ".asset": _read_unity,
-    ".csv": _read_table,
-    ".tsv": _read_table,
-    ".ktx2": _read_volume,
+    ".lmbake": _GODOT,
+    ".res": _GODOT,
+    ".asset": _UNITY,
+    ".csv": _only_sh(read_table),
+    ".tsv": _only_sh(read_table),
+    ".ktx2": _only_sh(read_irradiance_volume, reading=READING),
 }
 
 
@@ -421,8 +412,8 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
             f"{name}: {_probes(len(broken))} with a NaN or infinite number in {key}, first probe {broken[0]}: "
             "set to zero and left out"
         )
-    repeated = _repeated(position)
-    if repeated:
+    ordered = position[np.lexsort(position.T)]
+    if repeated := int((ordered[1:] == ordered[:-1]).all(axis=1).sum()):
         warnings.append(f"{name}: {_probes(repeated)} at the position of another: Gaussians decode them to one value")
     source = _hash(position, checked, live)
     return ProbeSet(name, position, checked, key, live, source, tuple(warnings), normal, reading)
@@ -449,12 +440,6 @@ def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
     if not extent <= _FARTHEST:
         raise WlmError(f"{where}: {_POSITION}: expected positions within {_FARTHEST:g} of each other, got {extent:.3g}")
     return position
-
-
-def _repeated(position: np.ndarray) -> int:
-    """Returns how many probes have the same position as an earlier probe."""
-    ordered = position[np.lexsort(position.T)]
-    return int((ordered[1:] == ordered[:-1]).all(axis=1).sum())
 
 
 def _probes(count: int) -> str:
@@ -487,13 +472,7 @@ def _check_normal(where: str, normal: np.ndarray, count: int) -> np.ndarray:
     bad = np.flatnonzero(~np.isfinite(normal).all(1))
     if len(bad):
         raise WlmError(f"{where}: {_NORMAL}[{bad[0]}]: expected finite numbers, got {normal[bad[0]].tolist()}")
-    # Divided by the largest number first, since squares of very long or short vectors do not fit float64.
-    normal = _divided(normal, np.abs(normal).max(1, keepdims=True))
-    return _divided(normal, np.linalg.norm(normal, axis=1, keepdims=True))
-
-
-def _divided(normal: np.ndarray, length: np.ndarray) -> np.ndarray:
-    return normal / np.where(length > 0, length, 1.0)
+    return unit_or_zero(normal)
 
 
 def _check_field(where: str, field: str, array: np.ndarray, kinds: str, shape: tuple[int, ...]) -> None:

@@ -16,6 +16,7 @@ from wlm.metrics import LostLight, psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
+from wlm.probe.places import nearest_weights
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
 from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
@@ -227,10 +228,5 @@ def between_psnr(decoder: Decoder, probes: ProbeSet) -> float:
 def by_distance(probes: ProbeSet, position: np.ndarray, count: int) -> np.ndarray:
     """Interpolates the `count` nearest live probes at points [M, 3] with weights 1 / distance^2; float64 [M, D]."""
     place, values = probes.position[probes.live], probes.values[probes.live].astype(np.float64)
-    count = min(count, len(place))
-    distance, index = cKDTree(place).query(position, k=np.arange(1, count + 1))
-    # A probe at the point itself takes all of the weight.
-    least = np.maximum(distance[:, :1], np.finfo(np.float64).tiny)
-    weight = np.square(least / np.maximum(distance, least * 1e-9))
-    weight /= weight.sum(1, keepdims=True)
+    index, weight = nearest_weights(cKDTree(place), position, count)
     return (values[index] * weight[..., None]).sum(1)

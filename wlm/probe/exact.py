@@ -1,4 +1,4 @@
-"""Decodes a model's stored codes to light in float64, as the reference for the float32 kernels."""
+"""Decodes Gaussians' stored codes to light in float64, as the reference for the float32 kernels."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -45,14 +45,3 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
             h = expit(h @ weight + bias)
         out[start : start + piece] = h @ net[2][0] + net[2][1]
     return content.gain * out
-
-
-def components64(model: ProbeModel) -> np.ndarray:
-    """Returns the light of all probes of a model of principal components (`wlm.probe.pca.model`), float64 [N, D]."""
-    content = model.content
-    low, step = content.bounds.astype(np.float64)
-    number = low + content.code * step
-    basis = content.basis.astype(np.float64) if len(content.basis) else np.eye(model.outputs)
-    out = np.zeros((model.probes, model.outputs))
-    out[model.live] = np.exp(number[:, :1]) * (number[:, 1:] @ basis)
-    return out

@@ -5,13 +5,16 @@ The method of compression is data: `ProbeModel.content` holds the light, either 
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from pkgutil import resolve_name
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import ConfigDict, Field
 
 from wlm.errors import WlmError
+from wlm.formats.parts import Part
 from wlm.system import Model, Settings
 
 CODES = 65535
@@ -56,32 +59,19 @@ class Profile(Settings):
     """Magnitude of the network's initial weights, relative to uniform random numbers of variance 1 / (3 * inputs)."""
 
 
-class GpuForm(NamedTuple):
-    """The part of a model's GPU bundle (`wlm.probe.bundle`) that depends on the compression method.
-
-    Attributes:
-        shader: GLSL that decodes the buffers.
-        buffers: Arrays by name.
-        document: Entries that describe the buffers, as JSON values.
-        about: Explanations of the entries, by name.
-        reference: Decoded examples to test a shader with, arrays by name; `values` is their light.
-    """
-
-    shader: str
-    buffers: dict[str, np.ndarray]
-    document: dict[str, Any]
-    about: dict[str, str]
-    reference: dict[str, np.ndarray]
-
-
 class Content(ABC):
     """The compressed light of a model, in the form of one compression method.
 
     Attributes:
         METHOD: Name of the method in files and reports.
+        DECODER: Class of its decoder, a `wlm.probe.decode.Decoder`, as `module:name`.
+        BUNDLE: Function that makes the part of a model's GPU bundle which depends on the method, as `module:name`. It
+            takes the model and a decoder, which computes the reference; `wlm.probe.bundle` adds the rest.
     """
 
     METHOD: ClassVar[str]
+    DECODER: ClassVar[str]
+    BUNDLE: ClassVar[str]
 
     @property
     @abstractmethod
@@ -89,16 +79,38 @@ class Content(ABC):
         """The bytes of the content's GPU buffers, as `wlm.probe.bundle` makes them."""
 
     @abstractmethod
-    def decoder(self, model: "ProbeModel", device: str, **options: Any) -> Any:
-        """Loads a model with this content onto a device and returns its decoder."""
-
-    @abstractmethod
-    def gpu_form(self, model: "ProbeModel", decoder: Any) -> GpuForm:
-        """Returns the shader, buffers and examples for a model with this content; `decoder` computes the examples."""
-
-    @abstractmethod
     def facts(self) -> dict[str, Any]:
         """Returns values that `wlm info` shows, as JSON values by name."""
+
+    @abstractmethod
+    def settings(self) -> dict[str, int]:
+        """Returns entries of a file's header: `count` of Gaussians or components, and `dropped` Gaussians."""
+
+    @abstractmethod
+    def parts(self) -> dict[str, np.ndarray]:
+        """Returns the arrays that a file stores, by name.
+
+        Raises:
+            ValueError: The numbers have not been quantised for a file.
+        """
+
+    @classmethod
+    @abstractmethod
+    def table(cls, profile: Profile, outputs: int, count: int, live: int) -> dict[str, Part]:
+        """Returns the types and shapes of these arrays, by name, for `count` Gaussians or components and `live` probes.
+
+        Raises:
+            ValueError: There are more components than numbers of a probe.
+        """
+
+    @classmethod
+    @abstractmethod
+    def from_parts(cls, profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Self:
+        """Builds the content from a file's arrays, whose types and shapes have been checked.
+
+        Raises:
+            ValueError: The numbers contradict each other, or exceed what a decoder can compute in float32.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +173,7 @@ class ProbeModel(Model):
         Raises:
             WlmError: The device does not exist, or the options do not fit the model.
         """
-        return self.content.decoder(self, device, **options)
+        return resolve_name(self.content.DECODER)(self, device, **options)
 
     def normalise(self, position: np.ndarray) -> np.ndarray:
         """Returns positions relative to the probes' box, float32 [M, 3] in [0, 1], clamped to the box. Positions [M, 3]

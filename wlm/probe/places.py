@@ -71,6 +71,19 @@ def positions_of(model: ProbeModel, original: str | os.PathLike[str] | None) -> 
     return position
 
 
+def nearest_weights(tree: cKDTree, points: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Finds the nearest probes at points [M, 3], and their weights by the inverse square of the distance.
+
+    Returns:
+        Indices of the `count` nearest probes in the tree, or of all if there are fewer, int [M, K]; and their weights,
+        float64 [M, K], with the sum 1 at each point. A probe at the point itself takes all of the weight.
+    """
+    distance, index = tree.query(points, k=np.arange(1, min(count, tree.n) + 1))
+    least = np.maximum(distance[:, :1], np.finfo(np.float64).tiny)
+    weight = np.square(least / np.maximum(distance, least * 1e-9))
+    return index, weight / weight.sum(1, keepdims=True)
+
+
 def ball_exposure(values: np.ndarray) -> float:
     """Returns the exposure at which white diffuse balls, lit by SH radiance [N, C, 3], are hardly anywhere clipped."""
     return exposure(irradiance(values, fibonacci_sphere(_NORMALS)) / np.pi)

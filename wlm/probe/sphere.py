@@ -101,8 +101,20 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
     values = np.asarray(values, np.float64)
     if values.ndim < 2 or values.shape[-1] != 3:
         raise ValueError(f"values: expected [..., C, 3], got {values.shape}")
-    factors = [cosine_factor(band) for band in coefficient_bands(values.shape[-2]).tolist()]
-    return (basis(normals, values.shape[-2]) * factors) @ values
+    return irradiance_weights(normals, values.shape[-2]) @ values
+
+
+def irradiance_weights(normals: np.ndarray, coefficients: int) -> np.ndarray:
+    """Returns the factors, float64 [M, C], by which SH of radiance add up to the irradiance at M unit normals."""
+    return basis(normals, coefficients) * [cosine_factor(int(band)) for band in coefficient_bands(coefficients)]
+
+
+def unit_or_zero(vectors: np.ndarray) -> np.ndarray:
+    """Returns vectors [M, 3] of any finite length with length 1, float64; vectors of length 0 stay 0."""
+    for order in (np.inf, 2):  # squares of very long or short vectors would not fit float64
+        length = np.linalg.norm(vectors, order, axis=1, keepdims=True)
+        vectors = vectors / np.where(length > 0, length, 1.0)
+    return vectors
 
 
 def fibonacci_sphere(count: int) -> np.ndarray:

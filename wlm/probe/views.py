@@ -20,7 +20,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import cKDTree
+from trimesh.creation import icosphere
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
@@ -29,8 +30,8 @@ from wlm.metrics import Pictures
 from wlm.ops import raster
 from wlm.ops.views import clip_from
 from wlm.probe.data import ProbeSet
-from wlm.probe.places import ball_exposure, ball_radius
-from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, fibonacci_sphere, sh_count
+from wlm.probe.places import ball_exposure, ball_radius, nearest_weights
+from wlm.probe.sphere import irradiance_weights, sh_count, unit_or_zero
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.walk import camera_path, settle
@@ -43,7 +44,7 @@ VIEWS, RESOLUTION = 50, 128
 KINDS = ("decoded", "lossless, volume", "decoded, volume")
 
 _BALLS = 256
-_BALL_POINTS = 162
+_SUBDIVISIONS = 2  # of a ball's icosahedron: 162 points
 _NEIGHBOURS = 8
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _DOWN = 0.2  # downward part of the viewing direction
@@ -140,8 +141,7 @@ class _Mesh:
 
 def _split(geometry: Geometry) -> _Mesh:
     corners = geometry.position.astype(np.float64)[geometry.triangle]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    normal = unit_or_zero(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     return _Mesh(corners.reshape(-1, 3), normal.repeat(3, 0), np.full(len(corners), -1))
 
 
@@ -161,16 +161,11 @@ class _Scene:
     def balls(self) -> _Mesh:
         """Returns a mesh of separate balls at a subset of the probes, evenly spaced by index."""
         chosen = np.unique(np.linspace(0, len(self._position) - 1, min(len(self._position), _BALLS)).astype(int))
-        unit = fibonacci_sphere(_BALL_POINTS)
-        hull = ConvexHull(unit)
-        triangle = hull.simplices
-        a, b, c = unit[triangle].transpose(1, 0, 2)
-        turned = (np.cross(b - a, c - a) * a).sum(1) < 0
-        triangle[turned] = triangle[turned][:, ::-1]
-        directions = unit[triangle].reshape(-1, 3)
+        directions = icosphere(subdivisions=_SUBDIVISIONS).triangles.reshape(-1, 3)
         centres = self._position[chosen]
         points = centres[:, None] + ball_radius(centres) * directions
-        return _Mesh(points.reshape(-1, 3), np.tile(directions, (len(chosen), 1)), chosen.repeat(len(triangle)))
+        owner = chosen.repeat(len(directions) // 3)
+        return _Mesh(points.reshape(-1, 3), np.tile(directions, (len(chosen), 1)), owner)
 
     def stand(self, eye: np.ndarray) -> None:
         """Moves the volumes to a viewer's position."""
@@ -189,9 +184,7 @@ class _Scene:
         else:
             if self._normal is not None:
                 ahead = normal
-            away, near = self._tree.query(place, k=np.arange(1, min(_NEIGHBOURS, len(self._position)) + 1))
-            weight = 1.0 / np.maximum(away, 1e-6 * ball_radius(self._position)) ** 2
-            weight /= weight.sum(1, keepdims=True)
+            near, weight = nearest_weights(self._tree, place, _NEIGHBOURS)
             direct = [np.einsum("pk,pkd->pd", weight, values[near]) for values in self._values]
         for values in (*direct, *(volume.read(place, ahead).values for volume in self._volumes)):
             yield values.reshape(len(place), self._count, 3).astype(np.float64)
@@ -221,7 +214,7 @@ def _look(
     corner = 3 * number[:, None] + np.arange(3)
     weight = np.concatenate([weight, 1.0 - weight.sum(1, keepdims=True)], 1)[..., None]
     place, normal = ((weight * values[corner]).sum(1) for values in (mesh.position, mesh.normal))
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
+    normal = unit_or_zero(normal)
     # Normals are turned towards the viewer, since a mesh may be wound either way.
     normal *= np.where(((eye - place) * normal).sum(1, keepdims=True) < 0, -1.0, 1.0)
     return seen, place, normal, mesh.owner[number]
@@ -230,9 +223,7 @@ def _look(
 def _shown(values: np.ndarray, normal: np.ndarray, seen: np.ndarray, exposure: float) -> np.ndarray:
     """Returns a picture, sRGB [H, W, 3], of white diffuse points lit by SH radiance [P, C, 3], at the pixels `seen`;
     the other pixels are black."""
-    count = values.shape[1]
-    factor = np.array([cosine_factor(band) for band in coefficient_bands(count).tolist()])
-    light = np.einsum("pc,pcd->pd", basis(normal, count) * factor, values) / math.pi * exposure
+    light = np.einsum("pc,pcd->pd", irradiance_weights(normal, values.shape[1]), values) / math.pi * exposure
     picture = np.zeros((*seen.shape, 3))
     picture[seen] = to_srgb(filmic(np.maximum(light, 0.0)))
     return picture

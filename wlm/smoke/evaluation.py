@@ -16,14 +16,13 @@ import torch
 from wlm import system
 from wlm.errors import WlmError
 from wlm.interop import check_device
-from wlm.metrics.error import psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import DIRECTIONS
 from wlm.smoke.decode import Decoder
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.dataset import make_validation, pool_of_volume
 from wlm.smoke.network.losses import residual
-from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.system import Meter, OnProgress
 

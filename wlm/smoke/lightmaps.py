@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from wlm.smoke.camera import DIRECTIONS, Camera, weights
-from wlm.smoke.shading import Light, Ramp, glow_of
-from wlm.smoke.transport.lights import checked_albedo, checked_colour
+from wlm.smoke.shading import Light, Ramp, checked_albedo, checked_colour, glow_of
 
 _DARKEST = 1e-20
 _LEAST_SHIFT = 1e-3  # of the image, between the centres of light of opposite lightmaps

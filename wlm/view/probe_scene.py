@@ -8,16 +8,16 @@ from typing import Self
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+from trimesh import Trimesh, creation
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
-from wlm.formats.hdr_blocks import need
 from wlm.ops.plain import rotations
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
 from wlm.probe.model import ProbeModel
 from wlm.probe.places import ball_exposure, ball_radius
-from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, irradiance, sh_count
+from wlm.probe.sphere import irradiance, irradiance_weights, sh_count, unit_or_zero
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import Light, StoredLight
 from wlm.probe.volume.walk import camera_path, settle
@@ -30,16 +30,8 @@ _DETAIL = ((64, 3), (1024, 2), (8192, 1), (10**9, 0))  # number of balls, and su
 _LOOP = 120  # frames of the default walk
 _SIGMAS = Slider("sigma", 0.1, 3.0, 1.0, 0.1, views=("gaussians",))
 _GREY = 40  # grey level of the mesh in the error panel, which shows only probes
-_WINDOWS = (
-    (1.0, 1.0, 1.0),
-    (1.0, 0.8, 0.3),
-    (1.0, 0.5, 0.3),
-    (0.8, 0.3, 0.9),
-)  # colours of the levels' windows, the finest first
-# Corners of the six faces of a block.
-_SIDES = np.array(
-    [[axis, end, *corner] for axis in range(3) for end in (0, 1) for corner in ((0, 0), (1, 0), (1, 1), (0, 1))]
-)
+# Colours of the levels' windows, the finest first.
+_WINDOWS = ((1.0, 1.0, 1.0), (1.0, 0.8, 0.3), (1.0, 0.5, 0.3), (0.8, 0.3, 0.9))
 _SHRUNK = 0.8  # drawn size of a block, so that neighbours stay apart
 
 
@@ -173,7 +165,8 @@ class _ProbeScene(Scene):
         self._surface: np.ndarray | None = None
         if self.geometry is not None:
             at_vertices = probes.decode(self.geometry.position.astype(np.float64))
-            self._surface = _facing(at_vertices.reshape(-1, probes.coefficients, 3), _normals(self.geometry)) / math.pi
+            weights = irradiance_weights(_normals(self.geometry), probes.coefficients)
+            self._surface = np.einsum("vc,vcd->vd", weights, at_vertices.reshape(*weights.shape, 3)) / math.pi
 
     def draw(self, canvas: Canvas, state: State) -> None:
         display = state.display(self._brightness)
@@ -266,13 +259,11 @@ class _ProbeScene(Scene):
             sides.append(np.full(seen.sum(), _SHRUNK * size))
             light.append(values[level][tuple(place[seen].T)])
         centre, size, values = np.concatenate(centres), np.concatenate(sides), np.concatenate(light)
-        offsets, normals = _block()
-        points = centre[:, None] + size[:, None, None] * offsets
-        shown = irradiance(values.reshape(len(values), -1, 3), normals) / math.pi
+        cube = creation.box()  # of side 1; its triangles share no corners, so that each face has its own colour
+        points = centre[:, None] + size[:, None, None] * cube.triangles.reshape(-1, 3)
+        shown = irradiance(values.reshape(len(values), -1, 3), cube.face_normals.repeat(3, 0)) / math.pi
         colours = state.display(self._brightness).picture(shown).reshape(-1, 3)
-        quads = np.arange(len(points) * len(offsets)).reshape(-1, 4)
-        triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-        canvas.coloured(0, _BLOCKS, points.reshape(-1, 3), triangles, colours)
+        canvas.coloured(0, _BLOCKS, points.reshape(-1, 3), np.arange(len(colours)).reshape(-1, 3), colours)
         if len(self.path) > 1:
             canvas.line(0, _PATH, self.path, "#ff4040")
         ball, faces = _icosphere(2)
@@ -293,33 +284,11 @@ def _mean(values: np.ndarray) -> str:
 
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns vertices [V, 3] of unit length and triangles [F, 3] of a sphere."""
-    sphere = need("pyvista", "view").Icosphere(nsub=subdivisions)
-    points = np.asarray(sphere.points, np.float64)
-    return points / np.linalg.norm(points, axis=1, keepdims=True), sphere.regular_faces
-
-
-def _block() -> tuple[np.ndarray, np.ndarray]:
-    """Returns the corners [24, 3] of the six faces of a unit cube around the origin, and the faces' normals there."""
-    offsets, normals = np.zeros((len(_SIDES), 3)), np.zeros((len(_SIDES), 3))
-    for number, (axis, end, first, second) in enumerate(_SIDES):
-        offsets[number, [axis, (axis + 1) % 3, (axis + 2) % 3]] = np.array([end, first, second]) - 0.5
-        normals[number, axis] = 2.0 * end - 1.0
-    return offsets, normals
+    sphere = creation.icosphere(subdivisions=subdivisions)
+    return np.array(sphere.vertices), np.array(sphere.faces)
 
 
 def _normals(geometry: Geometry) -> np.ndarray:
-    """Returns area-weighted vertex normals, float64 [V, 3]; upwards at vertices without triangles."""
-    corners = geometry.position.astype(np.float64)[geometry.triangle]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    total = np.zeros(geometry.position.shape)
-    for corner in range(3):
-        np.add.at(total, geometry.triangle[:, corner], normal)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 0, total / np.maximum(length, 1e-30), [0.0, 1.0, 0.0])
-
-
-def _facing(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Returns the irradiance, float64 [V, 3], of spherical harmonics [V, C, 3] at normals [V, 3]."""
-    count = values.shape[1]
-    factors = [cosine_factor(band) for band in coefficient_bands(count).tolist()]
-    return np.einsum("vc,vcd->vd", basis(normals, count) * factors, values)
+    """Returns vertex normals, float64 [V, 3]; upwards at vertices without triangles."""
+    normals = unit_or_zero(Trimesh(geometry.position, geometry.triangle, process=False).vertex_normals)
+    return np.where(normals.any(1, keepdims=True), normals, [0.0, 1.0, 0.0])

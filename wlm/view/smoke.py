@@ -11,9 +11,8 @@ from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import DIRECTIONS, Camera, unit, weights
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
-from wlm.smoke.shading import Light, Ramp, glow_of
+from wlm.smoke.shading import AnyLight, Light, Ramp, checked_albedo, checked_colour, glow_of
 from wlm.smoke.transport.lighting import LitSmoke
-from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour
 from wlm.smoke.transport.orders import ScatteredSmoke
 from wlm_kernels.smoke import picture as kernels
 

@@ -14,12 +14,12 @@ import warp as wp
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse, coarse_march, guide
 from wlm.smoke.march.launch import VolumeGraph
+from wlm.smoke.march.six_way import bake_coarse, coarse_march, guide
 from wlm.smoke.network.prediction import SmokePredictor
 from wlm.smoke.scene import Scene, make_camera
+from wlm.smoke.shading import AnyLight
 from wlm.smoke.simulation import advance, make_solver, volume_of
-from wlm.smoke.transport.lights import AnyLight
 from wlm.smoke.transport.orders import ScatteredSmoke, scatter
 from wlm.system import Meter, OnProgress
 from wlm.view.pictures import to_bytes

@@ -2,7 +2,7 @@
 
 A block's values 0 to 1 stand for the range between two colours that are stored for each frame. Blocks are uint64
 `[N T, 32, 32, 2]` for N tiles at T times, the T frames of a tile one after another. The last axis is the low and the
-high half of a block's 16 little-endian bytes. `wlm.formats.bc7_modes` defines and describes the tables of BC7.
+high half of a block's 16 little-endian bytes. `wlm.formats.bc7` defines and describes the tables of BC7.
 """
 
 import warp as wp
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Tables:
-    """The tables of the BC7 format, see `wlm.formats.bc7_modes`."""
+    """The tables of the BC7 format, see `wlm.formats.bc7`."""
 
     modes: wp.array2d[int]  # [8, 10], by mode: bits and counts
     partitions: wp.array2d[wp.uint32]  # [3, 64], by subsets: the subset of each texel, two bits

@@ -1,4 +1,4 @@
-"""Decodes light probes from principal components, one thread per number; `wlm/probe/exact.py` is the reference."""
+"""Decodes light probes from principal components, one thread per number. Reference: `tests/reference/components.py`."""
 
 import warp as wp
 

@@ -216,13 +216,17 @@ def _candidates(
 
 
 @wp.kernel(enable_backward=False)
-def _count(
+def _list(
     # in:
     shapes: wp.array1d[Shape],
     cubes: Cubes,
+    offsets: wp.array1d[int],
     # out:
     counts: wp.array1d[int],
+    keys: wp.array1d[int],
+    items: wp.array1d[int],
 ):
+    """Counts the cubes of each Gaussian and, unless `keys` is empty, writes its pairs from its offset on."""
     k = wp.tid()
     shape = shapes[k]
     limit = _limit(shape)
@@ -231,34 +235,13 @@ def _count(
     for x in range(first[0], last[0] + 1):
         for y in range(first[1], last[1] + 1):
             for z in range(first[2], last[2] + 1):
-                if _meets(cubes, shape, limit, wp.vec3i(x, y, z)):
-                    count += 1
-    counts[k] = count
-
-
-@wp.kernel(enable_backward=False)
-def _emit(
-    # in:
-    shapes: wp.array1d[Shape],
-    cubes: Cubes,
-    offsets: wp.array1d[int],
-    # out:
-    keys: wp.array1d[int],
-    items: wp.array1d[int],
-):
-    k = wp.tid()
-    shape = shapes[k]
-    limit = _limit(shape)
-    first, last = span(cubes, shape.centre, shape.reach)
-    place = offsets[k]
-    for x in range(first[0], last[0] + 1):
-        for y in range(first[1], last[1] + 1):
-            for z in range(first[2], last[2] + 1):
                 cell = wp.vec3i(x, y, z)
                 if _meets(cubes, shape, limit, cell):
-                    keys[place] = _number(cubes, cell)
-                    items[place] = k
-                    place += 1
+                    if keys.shape[0] > 0:
+                        keys[offsets[k] + count] = _number(cubes, cell)
+                        items[offsets[k] + count] = k
+                    count += 1
+    counts[k] = count
 
 
 @wp.kernel(enable_backward=False)
@@ -323,13 +306,12 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
         raise ValueError(f"size: {cubes.size:g} makes {tested} pairs (cube, Gaussian), expected at most {MOST_PAIRS}")
 
     device, gaussians = shapes.device, shapes.shape[0]
-    counts = wp.empty(gaussians, dtype=int, device=device)
-    wp.launch(_count, gaussians, inputs=[shapes, cubes], outputs=[counts], device=device)
+    counts, offsets, none = (wp.empty(size, dtype=int, device=device) for size in (gaussians, gaussians, 0))
+    wp.launch(_list, gaussians, inputs=[shapes, cubes, offsets], outputs=[counts, none, none], device=device)
     pairs = int(counts.numpy().sum(dtype=np.int64))
-    offsets = wp.empty_like(counts)
     wp.utils.array_scan(counts, offsets, inclusive=False)
     keys, items = (wp.empty(2 * pairs, dtype=int, device=device) for _ in range(2))
-    wp.launch(_emit, gaussians, inputs=[shapes, cubes, offsets], outputs=[keys, items], device=device)
+    wp.launch(_list, gaussians, inputs=[shapes, cubes, offsets], outputs=[counts, keys, items], device=device)
     cubes.start = wp.empty(total + 1, dtype=int, device=device)
     sort_by_cube(keys, items, pairs, total, cubes.start)
     cubes.item = wp.empty(pairs, dtype=int, device=device)

@@ -45,14 +45,8 @@ class DecodeKernels:
         """
         count = x.shape[0]
         dims = (-(-count // self.points), THREADS) if self.device_kind == "cuda" else count
-        wp.launch(
-            self._kernel,
-            dims,
-            inputs=[rows, shapes, cubes, cut, net, gain, x],
-            outputs=[out],
-            device=x.device,
-            block_dim=THREADS,
-        )
+        inputs = [rows, shapes, cubes, cut, net, gain, x]
+        wp.launch(self._kernel, dims, inputs=inputs, outputs=[out], device=x.device, block_dim=THREADS)
 
 
 @functools.cache

@@ -87,70 +87,9 @@ class NetworkKernels:
             base, count: Index of the first probe and number of probes of this launch, on the CPU alone; default all.
         """
         probes = groups.x.shape[0]
-        if self.device_kind == "cuda":
-            dims = (probes // self.probes, THREADS)
-        else:
-            dims = probes if count is None else count
-        wp.launch(
-            self._kernel,
-            dims,
-            inputs=[groups.x, groups.count, f, target, weight, net, base],
-            outputs=[grad_f, partial, loss],
-            device=net.device,
-            block_dim=THREADS,
-        )
-
-
-@functools.cache
-def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> NetworkKernels:
-    """Builds (once) the kernels for one size of network.
-
-    Args:
-        latent: Length L of a latent vector, at least 1.
-        hidden: Number H of units of a hidden layer, a multiple of 8.
-        outputs: Numbers D of a probe, at least 1.
-        device_kind: "cpu" or "cuda".
-    """
-    options = {"enable_backward": False}
-    probes = probes_at_once(latent, hidden, outputs)
-    snippet = layer_code(latent, hidden, outputs, probes) + native_source(__package__, "network")
-    if device_kind == "cuda":
-
-        @wp.func_native(snippet)
-        def network(
-            x: wp.array1d[wp.vec3],
-            count: int,
-            f: wp.array3d[float],
-            target: wp.array2d[float],
-            weight: wp.array1d[float],
-            net: wp.array1d[float],
-            grad_f: wp.array2d[float],
-            partial: wp.array2d[float],
-            loss: wp.array1d[float],
-            block: int,
-        ): ...
-
-        @wp.kernel(module="unique", module_options=options, launch_bounds=(THREADS, 2))
-        def kernel(
-            # in:
-            x: wp.array1d[wp.vec3],
-            count: int,
-            f: wp.array3d[float],
-            target: wp.array2d[float],
-            weight: wp.array1d[float],
-            net: wp.array1d[float],
-            base: int,
-            # out:
-            grad_f: wp.array2d[float],
-            partial: wp.array2d[float],
-            loss: wp.array1d[float],
-        ):
-            block, thread = wp.tid()
-            network(x, count, f, target, weight, net, grad_f, partial, loss, block)
-
-    else:
-        kernel = _cpu_kernel(latent, hidden, outputs)
-    return NetworkKernels(device_kind, probes, kernel)
+        dims = (probes // self.probes, THREADS) if self.device_kind == "cuda" else count or probes
+        inputs, outputs = [groups.x, groups.count, f, target, weight, net, base], [grad_f, partial, loss]
+        wp.launch(self._kernel, dims, inputs=inputs, outputs=outputs, device=net.device, block_dim=THREADS)
 
 
 @dataclass(frozen=True)
@@ -223,7 +162,18 @@ def _add_to(vec, n: int):
     return add_row
 
 
-def _cpu_kernel(latent: int, hidden: int, outputs: int):
+@functools.cache
+def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> NetworkKernels:
+    """Builds (once) the kernels for one size of network.
+
+    Args:
+        latent: Length L of a latent vector, at least 1.
+        hidden: Number H of units of a hidden layer, a multiple of 8.
+        outputs: Numbers D of a probe, at least 1.
+        device_kind: "cpu" or "cuda".
+    """
+    cuda = device_kind == "cuda"
+    probes = probes_at_once(latent, hidden, outputs)
     inputs, wide = latent + 3, padded(outputs)
     second = (inputs + 1) * hidden
     third = second + (hidden + 1) * hidden
@@ -232,7 +182,23 @@ def _cpu_kernel(latent: int, hidden: int, outputs: int):
     forward, hidden_row, output_row = net_of.forward, net_of.hidden_row, net_of.output_row
     add_hidden, add_output = _add_to(vec_hidden, hidden), _add_to(vec_out, wide)
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False, "max_unroll": 1})
+    @wp.func_native(layer_code(latent, hidden, outputs, probes) + native_source(__package__, "network"))
+    def network(
+        x: wp.array1d[wp.vec3],
+        count: int,
+        f: wp.array3d[float],
+        target: wp.array2d[float],
+        weight: wp.array1d[float],
+        net: wp.array1d[float],
+        grad_f: wp.array2d[float],
+        partial: wp.array2d[float],
+        loss: wp.array1d[float],
+        block: int,
+    ): ...
+
+    options = {"enable_backward": False} | ({} if cuda else {"max_unroll": 1})
+
+    @wp.kernel(module="unique", module_options=options, launch_bounds=(THREADS, 2) if cuda else None)
     def kernel(
         # in:
         x: wp.array1d[wp.vec3],
@@ -247,37 +213,41 @@ def _cpu_kernel(latent: int, hidden: int, outputs: int):
         partial: wp.array2d[float],
         loss: wp.array1d[float],
     ):
-        i = base + wp.tid()
-        lane = wp.where(base == 0, 0, 1)
-        v = vec_in()
-        for c in range(wp.static(latent)):
-            v[c] = f[0, c, i]
-        for c in range(3):
-            v[wp.static(latent) + c] = x[i][c]
-        h1, h2, y = forward(net, v)
-        d3 = vec_out()
-        error = float(0.0)
-        if i < count:
-            for j in range(wp.static(outputs)):
-                e = y[j] - target[j, i]
-                d = weight[j] * e
-                error += d * e
-                d3[j] = 2.0 * d
-        loss[lane] = loss[lane] + error
-        d2 = vec_hidden()
-        for c in range(wp.static(hidden)):
-            d2[c] = wp.dot(output_row(net, wp.static(third) + c * wp.static(wide)), d3) * h2[c] * (1.0 - h2[c])
-            add_output(partial, lane, wp.static(third) + c * wp.static(wide), d3, h2[c])
-        add_output(partial, lane, wp.static(third + hidden * wide), d3, 1.0)
-        d1 = vec_hidden()
-        for c in range(wp.static(hidden)):
-            d1[c] = wp.dot(hidden_row(net, wp.static(second) + c * wp.static(hidden)), d2) * h1[c] * (1.0 - h1[c])
-            add_hidden(partial, lane, wp.static(second) + c * wp.static(hidden), d2, h1[c])
-        add_hidden(partial, lane, wp.static(second + hidden * hidden), d2, 1.0)
-        for c in range(wp.static(inputs)):
-            if c < wp.static(latent):
-                grad_f[c, i] = wp.dot(hidden_row(net, c * wp.static(hidden)), d1)
-            add_hidden(partial, lane, c * wp.static(hidden), d1, v[c])
-        add_hidden(partial, lane, wp.static(inputs * hidden), d1, 1.0)
+        if wp.static(cuda):
+            block, _thread = wp.tid()
+            network(x, count, f, target, weight, net, grad_f, partial, loss, block)
+        else:
+            i = base + wp.tid()
+            lane = wp.where(base == 0, 0, 1)
+            v = vec_in()
+            for c in range(wp.static(latent)):
+                v[c] = f[0, c, i]
+            for c in range(3):
+                v[wp.static(latent) + c] = x[i][c]
+            h1, h2, y = forward(net, v)
+            d3 = vec_out()
+            error = float(0.0)
+            if i < count:
+                for j in range(wp.static(outputs)):
+                    e = y[j] - target[j, i]
+                    d = weight[j] * e
+                    error += d * e
+                    d3[j] = 2.0 * d
+            loss[lane] = loss[lane] + error
+            d2 = vec_hidden()
+            for c in range(wp.static(hidden)):
+                d2[c] = wp.dot(output_row(net, wp.static(third) + c * wp.static(wide)), d3) * h2[c] * (1.0 - h2[c])
+                add_output(partial, lane, wp.static(third) + c * wp.static(wide), d3, h2[c])
+            add_output(partial, lane, wp.static(third + hidden * wide), d3, 1.0)
+            d1 = vec_hidden()
+            for c in range(wp.static(hidden)):
+                d1[c] = wp.dot(hidden_row(net, wp.static(second) + c * wp.static(hidden)), d2) * h1[c] * (1.0 - h1[c])
+                add_hidden(partial, lane, wp.static(second) + c * wp.static(hidden), d2, h1[c])
+            add_hidden(partial, lane, wp.static(second + hidden * hidden), d2, 1.0)
+            for c in range(wp.static(inputs)):
+                if c < wp.static(latent):
+                    grad_f[c, i] = wp.dot(hidden_row(net, c * wp.static(hidden)), d1)
+                add_hidden(partial, lane, c * wp.static(hidden), d1, v[c])
+            add_hidden(partial, lane, wp.static(inputs * hidden), d1, 1.0)
 
-    return kernel
+    return NetworkKernels(device_kind, probes, kernel)

@@ -195,13 +195,8 @@ class StepKernels:
             used: float [K, 10 + L], the rounded parameters, written.
             shapes: Shape [K], written.
         """
-        wp.launch(
-            self._shapes,
-            rows.shape[0],
-            inputs=[rows, bounds, quantised, levels, cut, sphere],
-            outputs=[used, shapes],
-            device=rows.device,
-        )
+        inputs = [rows, bounds, quantised, levels, cut, sphere]
+        wp.launch(self._shapes, rows.shape[0], inputs=inputs, outputs=[used, shapes], device=rows.device)
 
     def features(self, groups, shapes, used, by_group, cut, f, base=0, count=None) -> None:
         """Sums the Gaussians at each probe.
@@ -213,14 +208,8 @@ class StepKernels:
         """
         probes = groups.x.shape[0]
         dims = (probes // GROUP, SPLITS, GROUP) if self.device_kind == "cuda" else count or probes
-        wp.launch(
-            self._features,
-            dims,
-            inputs=[groups, shapes, used, by_group, cut, base],
-            outputs=[f],
-            device=f.device,
-            block_dim=GROUP,
-        )
+        inputs = [groups, shapes, used, by_group, cut, base]
+        wp.launch(self._features, dims, inputs=inputs, outputs=[f], device=f.device, block_dim=GROUP)
 
     def collect(self, groups, shapes, used, by_gaussian, grad_f, cut, sums, base=0, count=None) -> None:
         """Computes for each Gaussian the sums over the probes from which its gradient follows.
@@ -234,14 +223,8 @@ class StepKernels:
         """
         gaussians = used.shape[0]
         dims = (gaussians, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
-        wp.launch(
-            self._collect,
-            dims,
-            inputs=[groups, shapes, used, by_gaussian, grad_f, cut, base],
-            outputs=[sums],
-            device=sums.device,
-            block_dim=_COLLECTORS,
-        )
+        inputs = [groups, shapes, used, by_gaussian, grad_f, cut, base]
+        wp.launch(self._collect, dims, inputs=inputs, outputs=[sums], device=sums.device, block_dim=_COLLECTORS)
 
     def update(self, optimiser, rows, used, shapes, sums, moments, net, net_moments, partial) -> None:
         """Takes a step of Adan or Adam for the Gaussians and of Adam for the network.
@@ -257,13 +240,9 @@ class StepKernels:
             net_moments: float [2, P], Adam's running means for the network, updated.
             partial: float [B, P], partial gradients with respect to `net`, see `network.NetworkKernels.launch`.
         """
-        wp.launch(
-            self._update,
-            net.shape[0] + (rows.size if optimiser.move else 0),
-            inputs=[optimiser, used, shapes, sums, partial],
-            outputs=[rows, moments, net, net_moments],
-            device=net.device,
-        )
+        numbers = net.shape[0] + (rows.size if optimiser.move else 0)
+        inputs, outputs = [optimiser, used, shapes, sums, partial], [rows, moments, net, net_moments]
+        wp.launch(self._update, numbers, inputs=inputs, outputs=outputs, device=net.device)
 
 
 @functools.cache

@@ -3,12 +3,12 @@ decodes the nearest ones, and stores their light in rows of the array `pool`.
 
 The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 
-1. `Look` copies the new windows; `scroll` finds for each slot its block, whether a probe is near the block, and whether
+1. `Look` copies the new windows; `select` finds for each slot its block, whether a probe is near the block, and whether
    the pool still has its light. The blocks near probes that the pool lacks wait, counted by distance to the viewer.
-2. `choose` finds the distance within which enough blocks wait, gathers these blocks and ranks them. The nearest are
-   decoded, by distances in units of their own edge; at equal distances first the finer block, then the lower slot.
-3. `allocate` gives each chosen block a row of the pool: the least recently used row of a group of rows; each block
-   takes from another group, and groups take turns. A row whose block is in a window is never given away.
+2. `select` then finds the distance within which enough blocks wait, gathers these blocks and ranks them. The nearest
+   are decoded, by distances in units of their own edge; at equal distances first the finer block, then the lower slot.
+3. Each chosen block gets a row of the pool: the least recently used row of a group of rows; each block takes from
+   another group, and groups take turns. A row whose block is in a window is never given away.
 4. `search` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell; `volume_weights`
    computes weights of at most 16 of these probes.
 5. `combine` computes a block's light as the weighted sum of these probes, clamped to the range of their values, which
@@ -27,7 +27,7 @@ TOTALS = BINS + BINS // 16 + BINS // 256  # with the sums over 16 bins, and over
 GROUP = 64  # rows of the pool from which one is chosen
 MOST = 4096  # most blocks that are ranked
 QUEUED, DROPPED, CACHED, LEFT, UPDATED, DECODED, GATHERED = range(7)
-"""Counters of a frame; the last is that of `choose`."""
+"""Counters of a frame; the last is that of the gathered blocks."""
 
 _PROBES = wp.constant(PROBES)
 _QUEUED, _DROPPED, _CACHED, _LEFT, _UPDATED, _GATHERED = (
@@ -37,11 +37,10 @@ _BINS = wp.constant(BINS)
 _SIXTEENS = wp.constant(BINS + BINS // 16)
 _BEYOND = wp.constant(0.5)  # share of the probes' range by which light is extrapolated at most
 _LIMIT = wp.constant(1 << 20)  # blocks along an axis of the finest level
-# Morton keys: steps that spread 21 bits out to every third one.
-_M0, _M1, _M2, _M3, _M4 = (
-    wp.constant(wp.int64(mask))
-    for mask in (0x001F00000000FFFF, 0x001F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
-)
+SPREAD = (0x001F00000000FFFF, 0x001F0000FF0000FF, 0x100F00F00F00F00F, 0x10C30C30C30C30C3, 0x1249249249249249)
+"""Masks of Morton keys: after shifts by 32, 16, 8, 4 and 2, they spread 21 bits out to every third bit."""
+
+_M0, _M1, _M2, _M3, _M4 = (wp.constant(wp.int64(mask)) for mask in SPREAD)
 
 vec16i = wp.types.vector(length=16, dtype=int)
 
@@ -410,7 +409,8 @@ class Look:
     A volume makes one such object, since packing all arguments again takes longer than the launch.
 
     Args:
-        windows, work: Arrays that every launch writes.
+        windows, work: Every launch writes `windows.bases`, `windows.views` and `work.clock`, and resets `work.counters`
+            and `work.chosen`.
     """
 
     def __init__(self, windows: Windows, work: Work) -> None:
@@ -425,7 +425,7 @@ class Look:
 
         Args:
             bases: Integers [L, 3], coordinates of the first block of each level's window.
-            views: [L, 4], see `wlm_kernels.probe.volume`.
+            views: [L, 4], origin of the points in each grid and 1 / edge of a block; see `wlm_kernels.probe.volume`.
             frame: Number of the frame, higher than in the frame before.
         """
         self._bases[: len(bases)], self._views[: len(views)] = bases, views
@@ -435,25 +435,16 @@ class Look:
         self._launch.launch()
 
 
-def scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:
-    """Finds the block of each slot of the windows, and which blocks have to be decoded, in this frame or later."""
-    inputs = [index, windows, pool, side, work]
-    wp.launch(_scroll, windows.held.shape, inputs=inputs, device=work.clock.device)
-
-
-def choose(windows: Windows, side: int, work: Work) -> None:
-    """Chooses the blocks to decode in this frame."""
-    device = work.clock.device
+def select(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:
+    """Finds the block of each slot of the windows, chooses the blocks to decode in this frame, and gives each a row of
+    the pool, from a group of rows of its own; a block whose group has no free row waits for a later frame."""
+    device, slots = work.clock.device, windows.held.shape
+    wp.launch(_scroll, slots, inputs=[index, windows, pool, side, work], device=device)
     wp.launch(_find_limit, 1, inputs=[work], device=device)
-    wp.launch(_gather, windows.held.shape, inputs=[windows, side, work], device=device)
+    wp.launch(_gather, slots, inputs=[windows, side, work], device=device)
     wp.launch(_rank, max(MOST, work.histogram.shape[0]), inputs=[work], device=device)
-
-
-def allocate(windows: Windows, pool: Pool, work: Work) -> None:
-    """Gives each chosen block a row of the pool, from a group of rows of its own; a block whose group has no free row
-    waits for a later frame."""
     size = max(1, min(GROUP, pool.stamp.shape[0] // work.chosen.shape[0]))
-    wp.launch(_allocate, work.chosen.shape, inputs=[windows, pool, size, work], device=work.clock.device)
+    wp.launch(_allocate, work.chosen.shape, inputs=[windows, pool, size, work], device=device)
 
 
 def search(index: Index, windows: Windows, side: int, work: Work) -> None:

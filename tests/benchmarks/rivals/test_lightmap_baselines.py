@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from builders.checks import psnr
 from builders.small_sets import moving_light
 from builders.small_sets import sheet_from_arrays as from_arrays
 
 from benchmarks.rivals.lightmap import encode_set
 from benchmarks.rivals.rival import disk_size, measure
 from wlm.errors import WlmError
-from wlm.metrics import psnr
 
 
 def test_a_set_goes_through_a_method_time_by_time():

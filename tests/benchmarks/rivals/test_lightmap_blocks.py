@@ -3,13 +3,13 @@
 import astc_encoder
 import numpy as np
 import pytest
+from builders.checks import psnr
 from builders.lightmaps import smooth_light
 
 from benchmarks.rivals import lightmap_blocks
 from benchmarks.rivals.lightmap import RIVALS
 from benchmarks.rivals.lightmap_blocks import encode_8bit, encode_astc, encode_bc6h, encode_bc7
 from wlm.errors import WlmError
-from wlm.metrics import psnr
 
 BLOCKS = {name: method.encode for name, method in RIVALS.items() if method.alone}
 BITS = {f"astc{side}": 128.0 / side**2 for side in (4, 5, 6, 8, 10, 12)} | {"8bit": 24.0}

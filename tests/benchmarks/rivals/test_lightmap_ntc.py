@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from builders.checks import psnr
 from builders.small_sets import moving_light
 
 from benchmarks.rivals.lightmap import FEW, RIVALS, encode_set, usual
 from benchmarks.rivals.lightmap_ntc import LADDER, Latents, encode_ntc
 from wlm.errors import WlmError
-from wlm.metrics import psnr_from_mse
 
 SMALL = Latents(2, 4, 4, 4)
 NETWORK = 28 * 64 + 64 + 64 * 64 + 64  # weights and biases of two layers, of 4 * 4 + 4 + 8 inputs
@@ -16,11 +16,6 @@ NETWORK = 28 * 64 + 64 + 64 * 64 + 64  # weights and biases of two layers, of 4 
 def encode(frames: np.ndarray, mask: np.ndarray | None = None, latents=SMALL, steps: int = 150, **options):
     mask = np.ones(frames.shape[1:3], bool) if mask is None else mask
     return encode_ntc(frames, mask, latents, steps=steps, samples=256, **options)
-
-
-def psnr(frames: np.ndarray, decoded: np.ndarray) -> float:
-    """Of all hours together."""
-    return psnr_from_mse(float(np.mean(np.square(frames - decoded))), float(np.ptp(frames)))
 
 
 def bytes_of(height: int, width: int, times: int, latents: Latents = SMALL) -> int:

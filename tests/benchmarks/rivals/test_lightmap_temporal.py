@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from builders.checks import psnr
 from builders.lightmaps import smooth_light
 
 from benchmarks.rivals.lightmap import RIVALS
 from benchmarks.rivals.lightmap_pca import encode_pca, encode_pca_bc4
 from benchmarks.rivals.lightmap_video import encode_av1, fill_smoothly
 from wlm.errors import WlmError
-from wlm.metrics import psnr_from_mse
 
 # One of each kind; the rest differ in a number.
 KINDS = ("pca-bc4-4", "pca-0.04", "av1-85")
@@ -21,11 +21,6 @@ def day(height=72, width=140, hours=5, seed=0) -> np.ndarray:
     share = 1.0 + np.sin(np.arange(hours)[:, None] * [1.0, 2.0, 0.7])
     noise = np.random.default_rng(seed).normal(1.0, 0.01, (hours, height, width, 3))
     return (np.einsum("tk,khwc->thwc", share, lights) * noise).astype(np.float32)
-
-
-def psnr(frames: np.ndarray, decoded: np.ndarray) -> float:
-    """Of all hours together."""
-    return psnr_from_mse(float(np.mean(np.square(frames - decoded))), float(np.ptp(frames)))
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -205,10 +205,10 @@ def tune(
                     meter.report(done)
                 except KeyboardInterrupt:
                     if checkpoint is not None:
-                        checkpoint.save_running(1, step.state())
+                        checkpoint.save({1: step.state()})
                     raise
             if checkpoint is not None and checkpoint.due():
-                checkpoint.save_running(1, step.state())
+                checkpoint.save({1: step.state()})
         tuned = step.textures()
     if not (np.isfinite(tuned.colour).all() and np.isfinite(tuned.lut).all()):
         raise WlmError(f"{sheet.name}: the fit diverged; use smaller learning rates than profile {profile.name}")

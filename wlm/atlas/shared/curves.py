@@ -27,7 +27,7 @@ from wlm.atlas.shared.mixture import Mixtures, find_mixtures, moments
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import Tiles, errors, sample_weights, solve, tile_light
 from wlm.atlas.tiles.layout import Size, allocate
-from wlm.formats.dds import MOST_SIDE
+from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.parts import Part
 from wlm.system import Meter
 

@@ -308,7 +308,7 @@ def curves(
                 meter.report(i)
             except KeyboardInterrupt:
                 if checkpoint is not None:
-                    checkpoint.save_running(0, {"error": result[:i]})
+                    checkpoint.save({0: {"error": result[:i]}})
                 raise
         rounds = _ROUGH if size.step == 1 else _MEDIUM
         for part, piece in pieces:
@@ -316,7 +316,7 @@ def curves(
             weight = sample_weights(piece, size.nx, size.ny)
             result[i, part] = errors(piece, colour.stored(samples, weight, size.format)).cpu().numpy()
         if checkpoint is not None and checkpoint.due():
-            checkpoint.save_running(0, {"error": result[: i + 1]})
+            checkpoint.save({0: {"error": result[: i + 1]}})
     return result
 
 

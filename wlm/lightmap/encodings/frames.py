@@ -19,8 +19,8 @@ from scipy.ndimage import binary_dilation
 
 from wlm.bundle import Texture
 from wlm.errors import WlmError
-from wlm.formats import bc7_modes
-from wlm.formats.bc7 import BLOCK_BYTES, blocks_image
+from wlm.formats import bc7
+from wlm.formats.bc7 import BLOCK_BYTES
 from wlm.formats.block_reuse import by_block, reuse_in_order
 from wlm.formats.folder import rounded
 from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, rgba, side_by_side
@@ -118,11 +118,11 @@ def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> 
     least, greatest = ranges.astype(np.float32).swapaxes(0, 1)[:, :, None, None]
     span = np.where(greatest > least, greatest - least, np.float32(1.0))
     levels = np.clip((colour - least) / span, 0.0, 1.0).reshape(-1, TILE, 3)
-    blocks = bc7_modes.encode_image((levels * 255.0 + 0.5).astype(np.uint8), EXTRA)
+    blocks = bc7.encode_image((levels * 255.0 + 0.5).astype(np.uint8), EXTRA)
     ring = binary_dilation(valid, np.ones((3, 3), bool))
     weight = np.where(valid, 1.0, np.where(ring, _RING_WEIGHT, 0.0)).astype(np.float32)
     weight = np.tile(np.repeat(weight[..., None], 3, axis=2), (len(colour), 1, 1))
-    decoded = blocks_image(bc7_modes.decode_blocks(blocks))[..., :3] / np.float32(255.0)
+    decoded = bc7.decode_image(blocks)[..., :3] / np.float32(255.0)
     kept = np.tile(needed, (len(colour), 1))
     images = decoded, levels, weight, weight * np.float32(_LOSS)
     values = (by_block(image)[kept.ravel()] for image in images)
@@ -155,10 +155,10 @@ class FrameTiles(DeviceTiles):
         stored.span = wp.array(np.ascontiguousarray(ends[:, 1] - ends[:, 0]), dtype=wp.vec3, device=device)
         stored.times, stored.gamma = len(sheet.times), sheet.profile.gamma
         tables = frame_kernels.Tables()
-        tables.modes = wp.array(bc7_modes.MODES, dtype=int, device=device)
-        tables.partitions = wp.array(bc7_modes.PARTITIONS, dtype=wp.uint32, device=device)
-        tables.anchors = wp.array(bc7_modes.ANCHORS, dtype=int, device=device)
-        tables.shares = wp.array(bc7_modes.SHARES, dtype=int, device=device)
+        tables.modes = wp.array(bc7.MODES, dtype=int, device=device)
+        tables.partitions = wp.array(bc7.PARTITIONS, dtype=wp.uint32, device=device)
+        tables.anchors = wp.array(bc7.ANCHORS, dtype=int, device=device)
+        tables.shares = wp.array(bc7.SHARES, dtype=int, device=device)
         stored.tables = tables
         self._stored = stored
         self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
@@ -244,5 +244,5 @@ class Frames(Encoding):
 
 
 def _check_modes(blocks: np.ndarray, number: int) -> None:
-    if (bc7_modes.block_modes(blocks) == bc7_modes.RESERVED).any():
+    if (blocks[..., 0] == 0).any():  # the modes 0 to 7 set one of the bits
         raise WlmError(f"frames: tile {number}: expected BC7 blocks of modes 0 to 7, found a reserved mode")

@@ -1,19 +1,14 @@
 """Exports light to Bevy: an `IrradianceVolume` over the probes' box (see `wlm.probe.ambient_cube`)."""
 
-import os
 from pathlib import Path
 from typing import Any
 
-from wlm.bundle import Bundle
-from wlm.formats.folder import write_index
-from wlm.probe.ambient_cube import write_irradiance_volume
-from wlm.probe.engines.lattice import CELLS, lattice_of
-from wlm.probe.places import positions_of
+import numpy as np
 
-FORMAT = "wlm-bevy-irradiance-volume"
-_VERSION = 1
-INFO_FILE = "light.json"
-VOLUME_FILE = "light.vxgi.ktx2"
+from wlm.probe.ambient_cube import write_irradiance_volume
+from wlm.probe.engines.lattice import Lattice, lattice_kit
+
+_VOLUME_FILE = "light.vxgi.ktx2"
 _MOST_CELLS = 512  # 3 * 512 slices are within the 2,048 of most GPUs
 
 _ABOUT = (
@@ -24,38 +19,14 @@ _ABOUT = (
 )
 
 
-def write_kit(
-    bundle: Bundle,
-    folder: Path,
-    engine: str,
-    *,
-    cells: int = CELLS,
-    original: str | os.PathLike[str] | None = None,
-    device: str = "cpu",
-) -> dict[str, Any]:
-    """Writes second-order spherical harmonics as an irradiance volume for Bevy, `light.vxgi.ktx2`, and `light.json`.
-
-    Voxels are cubes that fill the probes' box, 1 to 512 `cells` along its longest side. `original` is the file that was
-    compressed, required if the decoder needs positions and the model stores none.
-
-    Raises:
-        WlmError: A probe has other than 9 coefficients, `cells` is out of range, the light exceeds RGB9E5, or the
-            device does not exist.
-    """
-    model = bundle.model
-    lattice = lattice_of(model, cells, _MOST_CELLS, positions_of(model, original), device)
+def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]:
     size = lattice.count * lattice.size
-    light = lattice.light(lattice.centres()).reshape(-1, 9, 3)
-    document = {
-        "format": FORMAT,
-        "version": _VERSION,
-        "about": _ABOUT,
-        "name": model.name,
-        "volume": VOLUME_FILE,
-        "resolution": lattice.count.tolist(),
+    return {
+        "volume": _VOLUME_FILE,
         "translation": (lattice.low + size / 2).tolist(),
         "scale": size.tolist(),
-        "clamped": write_irradiance_volume(folder / VOLUME_FILE, light, lattice.count),
+        "clamped": write_irradiance_volume(folder / _VOLUME_FILE, values.reshape(-1, 9, 3), lattice.count),
     }
-    write_index(folder / INFO_FILE, document)
-    return {"about": _ABOUT}
+
+
+write_kit = lattice_kit("wlm-bevy-irradiance-volume", "light.json", _ABOUT, _MOST_CELLS, _write)

@@ -19,7 +19,7 @@ from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.godot import lmbake_bytes, relit
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of
+from wlm.probe.engines.lattice import CELLS, cells_of, check_numbers, lattice_of
 from wlm.probe.places import positions_of
 
 BAKE_FILE = "light.lmbake"
@@ -69,19 +69,12 @@ def write_kit(
         values = _godot(model.name, lattice.light(points))
         if not np.abs(points).max() < _LARGEST:
             raise WlmError(f"{model.name}: cannot export: the probes' box is too large for 32-bit floats")
-        tetrahedra = tetrahedra_of(count)
-        content = lmbake_bytes(points, values, tetrahedra, *tree_of(lattice.low, lattice.size, count))
-        info = {
-            "probes": len(points),
-            "low": lattice.low.tolist(),
-            "size": lattice.size,
-            "cells": count.tolist(),
-        }
+        content = lmbake_bytes(points, values, tetrahedra_of(count), *tree_of(lattice.low, lattice.size, count))
+        info = {"probes": len(points), "low": lattice.low.tolist(), "size": lattice.size, "cells": count.tolist()}
     else:
         if cells is not None:
             raise WlmError(f"cells: expected none with {bake}: the light goes to the probes of this bake")
-        if model.outputs != NUMBERS:
-            raise WlmError(f"{model.name}: expected {NUMBERS} numbers per probe (RGB SH, L0-L2), got {model.outputs}")
+        check_numbers(model)
         places = positions_of(model, bake)
         content = relit(bake, _godot(model.name, model.decoder(device, position=places).decode_probes()))
     (folder / BAKE_FILE).write_bytes(content)
@@ -92,8 +85,7 @@ def tetrahedra_of(count: np.ndarray) -> np.ndarray:
     """Returns six tetrahedra for each of C cells, as corner indices int32 [6 C, 4]; `count`: cells along x, y, z."""
     nx, ny, _ = (int(n) + 1 for n in count)
     step = np.array([1, nx, nx * ny])
-    z, y, x = (axis.ravel() for axis in np.meshgrid(*(np.arange(n) for n in count[::-1]), indexing="ij"))
-    first = np.stack([x, y, z], 1) @ step
+    first = cells_of(count) @ step
     paths = np.array([[0, *np.cumsum(step[list(order)])] for order in _ORDERS])
     return (first[:, None, None] + paths).reshape(-1, 4).astype(np.int32)
 
@@ -128,8 +120,7 @@ def tree_of(low: np.ndarray, size: float, count: np.ndarray) -> tuple[np.ndarray
         return node
 
     place((0, 0, 0), tuple(int(n) for n in count))
-    z, y, x = (axis.ravel() for axis in np.meshgrid(*(np.arange(n) for n in count[::-1]), indexing="ij"))
-    corner = low + size * np.stack([x, y, z], 1)
+    corner = low + size * cells_of(count)
     for number, ((first, second), following) in enumerate(zip(_COMPARED, _NEXT, strict=True)):
         nodes = inner + 5 * np.arange(cells) + number
         planes[nodes, first], planes[nodes, second] = math.sqrt(0.5), -math.sqrt(0.5)

@@ -1,12 +1,19 @@
 """Decodes a model on a lattice of cubic cells over its probes' box, for engines that store light on lattices."""
 
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from wlm.bundle import Bundle
 from wlm.errors import WlmError
+from wlm.formats.folder import write_index
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
+from wlm.probe.places import positions_of
 
 CELLS = 24
 """Default number of cells along the longest side of the box."""
@@ -22,12 +29,14 @@ class Lattice:
     """A lattice of cubic cells over the bounding box of a model's probes.
 
     Attributes:
+        name: Name of the model, for messages.
         decoder: Decoder of the model.
         low: float64 [3], lowest corner.
         size: Side of a cell, in the unit of the probes' positions.
         count: int [3], cells along x, y and z.
     """
 
+    name: str
     decoder: Decoder
     low: np.ndarray
     size: float
@@ -35,20 +44,20 @@ class Lattice:
 
     def centres(self) -> np.ndarray:
         """Returns the centres of the cells, float64 [nz ny nx, 3], with x varying fastest."""
-        return self._places(self.count, 0.5)
+        return self.low + self.size * (cells_of(self.count) + 0.5)
 
     def corners(self) -> np.ndarray:
         """Returns the corners of the cells, float64 [(nz + 1) (ny + 1) (nx + 1), 3], with x varying fastest."""
-        return self._places(self.count + 1, 0.0)
+        return self.low + self.size * cells_of(self.count + 1)
 
     def light(self, place: np.ndarray) -> np.ndarray:
         """Returns the light at points [M, 3], float32 [M, 27]."""
         return np.concatenate([self.decoder.decode(place[i : i + _ROWS]) for i in range(0, len(place), _ROWS)])
 
-    def _places(self, count: np.ndarray, shift: float) -> np.ndarray:
-        axes = [low + self.size * (np.arange(n) + shift) for low, n in zip(self.low, count, strict=True)]
-        z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
-        return np.stack([x, y, z], -1).reshape(-1, 3)
+
+def cells_of(count: np.ndarray) -> np.ndarray:
+    """Returns the indices of nx, ny, nz = `count` cells along x, y and z, int [nz ny nx, 3], with x varying fastest."""
+    return np.indices(count[::-1])[::-1].reshape(3, -1).T
 
 
 def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | None, device: str) -> Lattice:
@@ -65,11 +74,59 @@ def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | 
         WlmError: A probe has other than 9 coefficients, `cells` is out of range, the device does not exist, or the
             decoder needs the probes' positions and none are known.
     """
-    if model.outputs != NUMBERS:
-        raise WlmError(f"{model.name}: expected {NUMBERS} numbers per probe (RGB SH, L0-L2), got {model.outputs}")
+    check_numbers(model)
     if not 1 <= cells <= most:
         raise WlmError(f"cells: expected 1 to {most} along the longest side, got {cells}")
     span = model.extent * model.size
     size = float(span.max()) / cells or 1.0  # one cell if all probes coincide
     count = np.clip(np.ceil(span / size - 1e-6), 1, cells).astype(int)
-    return Lattice(model.decoder(device, position=position), model.origin + span / 2 - count * size / 2, size, count)
+    decoder = model.decoder(device, position=position)
+    return Lattice(model.name, decoder, model.origin + span / 2 - count * size / 2, size, count)
+
+
+def check_numbers(model: ProbeModel) -> None:
+    """Raises a WlmError if the model's probes are not second-order spherical harmonics in three colours."""
+    if model.outputs != NUMBERS:
+        raise WlmError(f"{model.name}: expected {NUMBERS} numbers per probe (RGB SH, L0-L2), got {model.outputs}")
+
+
+def lattice_kit(
+    form: str, index: str, about: str, most: int, write: Callable[[Path, Lattice, np.ndarray], dict[str, Any]]
+) -> Callable[..., dict[str, Any]]:
+    """Makes the function `write_kit` of an engine that stores light at the centres of a lattice's cells.
+
+    Args:
+        form: Value of `format` in the index, by which a folder is recognised.
+        index: Name of the index, a JSON file.
+        about: Explanation of the files, an entry of the index.
+        most: Largest number of cells along a side in the engine's format.
+        write: Writes the other files to a folder, given the lattice and the light at the centres of its cells, float32
+            [nz ny nx, 27], x fastest; returns further entries of the index. Raises a WlmError if the light exceeds the
+            range of the engine's numbers.
+    """
+
+    def write_kit(
+        bundle: Bundle,
+        folder: Path,
+        engine: str,
+        *,
+        cells: int = CELLS,
+        original: str | os.PathLike[str] | None = None,
+        device: str = "cpu",
+    ) -> dict[str, Any]:
+        """Writes second-order spherical harmonics at the centres of cubic cells that fill the probes' box.
+
+        There are `cells` cells along its longest side, 1 to the engine's limit. `original` is the file that was
+        compressed, required if the decoder needs positions and the model stores none.
+
+        Raises:
+            WlmError: A probe has other than 9 coefficients, `cells` is out of range, the light exceeds the range of the
+                engine's numbers, or the device does not exist.
+        """
+        lattice = lattice_of(bundle.model, cells, most, positions_of(bundle.model, original), device)
+        document = {"format": form, "version": 1, "about": about, "name": lattice.name}
+        document |= {"resolution": lattice.count.tolist()}
+        write_index(folder / index, document | write(folder, lattice, lattice.light(lattice.centres())))
+        return {"about": about}
+
+    return write_kit

@@ -8,24 +8,16 @@ signs plus. Since r187 a probe is at the centre of its cell of the box; up to r1
 faces. The export has both boxes, and its loader uses the one that fits the version of three.js in which it runs.
 """
 
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wlm.bundle import Bundle
 from wlm.errors import WlmError
-from wlm.formats.folder import write_index
 from wlm.formats.ktx2 import write_ktx2
-from wlm.probe.engines.lattice import CELLS, NUMBERS, lattice_of
-from wlm.probe.places import positions_of
+from wlm.probe.engines.lattice import NUMBERS, Lattice, lattice_kit
 
-FORMAT = "wlm-light-probe-grid"
-_VERSION = 1
-INFO_FILE = "grid.json"
-TEXTURE_FILE = "grid.ktx2"
-LOADER_FILE = "grid.js"
+_TEXTURE_FILE, _LOADER_FILE = "grid.ktx2", "grid.js"
 _PARTS = 7
 _MOST_CELLS = 256
 _ABOUT = (
@@ -63,54 +55,23 @@ export async function loadLightProbeGrid(url, renderer, THREE, KTX2Loader, Grid)
 """
 
 
-def write_kit(
-    bundle: Bundle,
-    folder: Path,
-    engine: str,
-    *,
-    cells: int = CELLS,
-    original: str | os.PathLike[str] | None = None,
-    device: str = "cpu",
-) -> dict[str, Any]:
-    """Writes a model of second-order spherical harmonics for three.js: `grid.ktx2`, `grid.json`, and loader `grid.js`.
-
-    The grid's probes are at the centres of cubic cells that fill the probes' box, 1 to 256 `cells` along its longest
-    side, with light in half floats. `original` is the file that was compressed; it is required if the decoder needs
-    the probes' positions and the model stores none.
-
-    Raises:
-        WlmError: A probe has other than 9 coefficients, `cells` is out of range, the light exceeds half floats, or the
-            device does not exist.
-    """
-    model = bundle.model
-    lattice = lattice_of(model, cells, _MOST_CELLS, positions_of(model, original), device)
+def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]:
+    """Writes `grid.ktx2`, with light in half floats, and its loader `grid.js`."""
     low, size, count = lattice.low, lattice.size, lattice.count
     box = np.stack([low, low + count * size])
-    values = lattice.light(lattice.centres())
     if not np.abs(values).max() <= np.finfo(np.float16).max:
-        raise WlmError(f"{model.name}: expected light within the range of half floats, got {np.abs(values).max():.3g}")
-    texels = pack(values, count)
-    document = {
-        "format": FORMAT,
-        "version": _VERSION,
-        "about": _ABOUT,
-        "name": model.name,
-        "texture": TEXTURE_FILE,
-        "resolution": count.tolist(),
-        "box": box.tolist(),
-        "corners": [(box[0] + size / 2).tolist(), (box[1] - size / 2).tolist()],
-    }
-    depth, height, width, _ = texels.shape
-    write_ktx2(folder / TEXTURE_FILE, texels.tobytes(), width, height, "R16G16B16A16_SFLOAT", depth)
-    (folder / LOADER_FILE).write_text(_LOADER, encoding="utf-8")
-    write_index(folder / INFO_FILE, document)
-    return {"about": _ABOUT}
-
-
-def pack(values: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Packs probes, [nz * ny * nx, 27] as `Lattice.centres`, to the texels, float16 [7 (nz + 2), ny, nx, 4]."""
+        raise WlmError(
+            f"{lattice.name}: expected light within the range of half floats, got {np.abs(values).max():.3g}"
+        )
     nx, ny, nz = (int(n) for n in count)
     padded = np.zeros((nz, ny, nx, 4 * _PARTS), "<f2")
-    padded[..., :NUMBERS] = np.asarray(values).reshape(nz, ny, nx, NUMBERS)
+    padded[..., :NUMBERS] = values.reshape(nz, ny, nx, NUMBERS)
     parts = np.moveaxis(padded.reshape(nz, ny, nx, _PARTS, 4), 3, 0)
-    return np.concatenate([parts[:, :1], parts, parts[:, -1:]], 1).reshape(-1, ny, nx, 4)
+    texels = np.concatenate([parts[:, :1], parts, parts[:, -1:]], 1)
+    write_ktx2(folder / _TEXTURE_FILE, texels.tobytes(), nx, ny, "R16G16B16A16_SFLOAT", _PARTS * (nz + 2))
+    (folder / _LOADER_FILE).write_text(_LOADER, encoding="utf-8")
+    corners = [(box[0] + size / 2).tolist(), (box[1] - size / 2).tolist()]
+    return {"texture": _TEXTURE_FILE, "box": box.tolist(), "corners": corners}
+
+
+write_kit = lattice_kit("wlm-light-probe-grid", "grid.json", _ABOUT, _MOST_CELLS, _write)

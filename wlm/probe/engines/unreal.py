@@ -7,26 +7,18 @@ itself can build such bricks, so the export has seven volume textures over a lat
 read them.
 """
 
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
-from wlm.formats.folder import write_index
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines.lattice import CELLS, lattice_of
-from wlm.probe.places import positions_of
+from wlm.probe.engines.lattice import Lattice, lattice_kit
 
-FORMAT = "wlm-unreal-light"
-_VERSION = 1
-INFO_FILE = "light.json"
 AMBIENT_FILE = "ambient.dds"
 SH_FILES = tuple(f"sh{number}.dds" for number in range(6))
-SHADER_FILE = "WlmProbes.usf"
 _MOST_CELLS = 128
 _AMBIENT, _RATIOS = "R11G11B10_FLOAT", "R8G8B8A8_UNORM"
 
@@ -107,54 +99,31 @@ float3 WlmProbeDiffuse(Texture3D ambient, Texture3D sh0, Texture3D sh1, Texture3
 """
 
 
-def write_kit(
-    bundle: Bundle,
-    folder: Path,
-    engine: str,
-    *,
-    cells: int = CELLS,
-    original: str | os.PathLike[str] | None = None,
-    device: str = "cpu",
-) -> dict[str, Any]:
-    """Writes second-order spherical harmonics as volume textures in Unreal's packing, and a reader, `WlmProbes.usf`.
+def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]:
+    """Writes seven volume textures in Unreal's packing, and a reader, `WlmProbes.usf`.
 
-    Probes are at the centres of cubic cells that fill the probes' box, 1 to 128 `cells` along its longest side. A
-    coefficient beyond the bound of non-negative light is clamped, and a negative ambient colour becomes 0. `original`
-    is the file that was compressed, required if the decoder needs positions and the model stores none.
-
-    Raises:
-        WlmError: A probe has other than 9 coefficients, `cells` is out of range, the light exceeds 11-bit floats, or
-            the device does not exist.
+    A coefficient beyond the bound of non-negative light is clamped, and a negative ambient colour becomes 0.
     """
-    model = bundle.model
-    lattice = lattice_of(model, cells, _MOST_CELLS, positions_of(model, original), device)
     corner, size = lattice.low, lattice.count * lattice.size
-    sh = from_canonical(lattice.light(lattice.centres()).reshape(-1, 9, 3).astype(np.float64), "unreal")
+    sh = from_canonical(values.reshape(-1, 9, 3).astype(np.float64), "unreal")
     if not np.abs(sh[:, 0]).max() <= _PACKED_MAX.min():
-        raise WlmError(f"{model.name}: expected light within {_PACKED_MAX.min():g}, got {np.abs(sh[:, 0]).max():.3g}")
+        found = np.abs(sh[:, 0]).max()
+        raise WlmError(f"{lattice.name}: expected light within {_PACKED_MAX.min():g}, got {found:.3g}")
     width, height, depth = (int(count) for count in lattice.count)
     ambient, level = packed(sh)
-    textures = {AMBIENT_FILE: (_AMBIENT, ambient)}
-    textures |= {
-        name: (_RATIOS, np.ascontiguousarray(level[:, number // 2, 4 * (number % 2) :][:, :4]))
-        for number, name in enumerate(SH_FILES)
-    }
+    ratios = level.reshape(-1, 6, 4)  # of each colour coefficients 1 to 4, then 5 to 8
+    textures = {AMBIENT_FILE: (ambient, _AMBIENT)}
+    textures |= {name: (np.ascontiguousarray(ratios[:, i]), _RATIOS) for i, name in enumerate(SH_FILES)}
+    for name, (texels, form) in textures.items():
+        write_dds(folder / name, texels.tobytes(), width, height, form, depth)
     text = _SHADER
     for mark, numbers in (("@CORNER@", corner), ("@SIZE@", size)):
         text = text.replace(mark, ", ".join(f"{number:.9e}" for number in numbers))
-    document = {
-        "format": FORMAT,
-        "version": _VERSION,
-        "about": _ABOUT,
-        "name": model.name,
-        "box": [corner.tolist(), (corner + size).tolist()],
-        "resolution": lattice.count.tolist(),
-    }
-    for name, (fmt, texels) in textures.items():
-        write_dds(folder / name, texels.tobytes(), width, height, depth, fmt, volume=True)
-    (folder / SHADER_FILE).write_text(text, encoding="utf-8")
-    write_index(folder / INFO_FILE, document)
-    return {"about": _ABOUT}
+    (folder / "WlmProbes.usf").write_text(text, encoding="utf-8")
+    return {"box": [corner.tolist(), (corner + size).tolist()]}
+
+
+write_kit = lattice_kit("wlm-unreal-light", "light.json", _ABOUT, _MOST_CELLS, _write)
 
 
 def packed(sh: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

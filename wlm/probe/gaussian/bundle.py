@@ -1,17 +1,18 @@
 """Packs Gaussians and their network into GPU buffers, in the layout that the shader reads.
 
-The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here the Gaussians are stored as the model's
-16-bit codes, which take as many bytes and decode exactly to the model's numbers; the network is in half floats.
+The paper stores half floats (gaussian-probe-compression, section 5.3.2). Here a number of a Gaussian is the model's
+16-bit code, as many bytes, which decodes exactly to the model's number; a weight of the network is a half float.
 """
 
 import numpy as np
 
+from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.folder import rounded
 from wlm.probe.decode import Decoder
 from wlm.probe.gaussian.model import CENTRE, CUT, SCALE, Gaussians
 from wlm.probe.gaussian.shader import HEAD_WORDS, gaussian_words, probe_glsl
-from wlm.probe.model import GpuForm, ProbeModel
+from wlm.probe.model import ProbeModel
 
 _REFERENCES = 64  # positions of the reference, and one outside the box
 _FOUR = 4
@@ -35,7 +36,7 @@ _ABOUT = {
 }
 
 
-def gaussian_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
+def gaussian_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     """Returns the shader, buffers and examples for a model of Gaussians; `decoder` computes the examples' light.
 
     Raises:
@@ -45,6 +46,7 @@ def gaussian_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
     position = _reference_positions(model, content)
     scale = np.exp(content.rows()[:, SCALE]).astype(np.float64)
     document = {
+        "about": _ABOUT,
         "gaussians": content.count,
         "latent": content.latent,
         "hidden": content.hidden,
@@ -57,13 +59,9 @@ def gaussian_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
         "words_per_gaussian": gaussian_words(content.latent),
         "slenderness": float(f"{(scale.max(1) / scale.min(1)).max():.3g}"),
     }
-    return GpuForm(
-        shader=probe_glsl(content),
-        buffers={"gaussians": _gaussian_words(model, content), "network": _network_words(content)},
-        document=document,
-        about=_ABOUT,
-        reference={"position": position, "values": decoder.decode(position)},
-    )
+    buffers = {"gaussians": _gaussian_words(model, content), "network": _network_words(content)}
+    reference = {"position": position, "values": decoder.decode(position)}
+    return Bundle("probe", model.name, probe_glsl(content), document, buffers=buffers, reference=reference)
 
 
 def _gaussian_words(model: ProbeModel, content: Gaussians) -> np.ndarray:

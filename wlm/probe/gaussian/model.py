@@ -18,16 +18,17 @@ ellipsoid with its axes in another order. The rotation with the smallest angle i
 (Shuster, A Survey of Attitude Representations, 1993).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any, ClassVar
+from itertools import pairwise
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from wlm.errors import WlmError
-from wlm.probe.decode import Decoder
-from wlm.probe.model import CODES, Content, GpuForm, ProbeModel
+from wlm.formats.parts import Part
+from wlm.probe.model import CODES, Content, Profile
 from wlm_kernels.probe.network import most_outputs
 
 # Channels of a Gaussian as a GPU holds it: centre, logarithm of the scale, quaternion, latent.
@@ -43,6 +44,7 @@ LARGEST = (1 << 24) - 1
 """Largest magnitude of an integer of the quantised network."""
 
 _FARTHEST = 3e38  # bounds beyond this are clamped, and refused when a file is read
+_MOST, _MOST_LOG = 1e38, 40.0  # largest magnitudes of a file's numbers, and of logarithms of scales
 _SHORTEST = 1e-12  # length of a quaternion that has a direction
 _SAME = 1e-12  # difference of two angles that only rounding separates
 
@@ -118,6 +120,8 @@ class Gaussians(Content):
     """
 
     METHOD: ClassVar[str] = "gaussians"
+    DECODER: ClassVar[str] = "wlm.probe.gaussian.decode:GaussianDecoder"
+    BUNDLE: ClassVar[str] = "wlm.probe.gaussian.bundle:gaussian_bundle"
 
     latent: int
     hidden: int
@@ -153,18 +157,80 @@ class Gaussians(Content):
 
     def layers(self) -> list[np.ndarray]:
         """Returns the three layers of `net`, float16, as `layer_shapes` describes them."""
-        shapes = layer_shapes(self.latent, self.hidden, self.outputs)
-        parts = np.split(self.net, np.cumsum([rows * columns for rows, columns in shapes])[:-1])
-        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
-
-    def decoder(self, model: ProbeModel, device: str, **options: Any) -> Decoder:
-        return import_module("wlm.probe.gaussian.decode").GaussianDecoder(model, device, **options)
-
-    def gpu_form(self, model: ProbeModel, decoder: Decoder) -> GpuForm:
-        return import_module("wlm.probe.gaussian.bundle").gaussian_form(model, decoder)
+        return split_layers(self.net, layer_shapes(self.latent, self.hidden, self.outputs))
 
     def facts(self) -> dict[str, Any]:
         return {"gaussians": self.count, "dropped": self.dropped, "latent": self.latent, "hidden": self.hidden}
+
+    def settings(self) -> dict[str, int]:
+        return {"count": self.count, "dropped": self.dropped}
+
+    @classmethod
+    def table(cls, profile: Profile, outputs: int, count: int, live: int) -> dict[str, Part]:
+        channels = STORED_LATENT.start + profile.latent
+        weights = sum(rows * columns for rows, columns in layer_shapes(profile.latent, profile.hidden, outputs))
+        return {
+            "gain": Part(np.float64, (1,), least=0.0, most=float(np.finfo(np.float32).max)),
+            "lowest": Part(np.int32, (channels,)),
+            "gaussians": Part(np.uint16, (channels, count)),
+            "steps": Part(np.uint16, (channels + profile.latent + 6,)),
+            "network": Part(np.int32, (weights,), least=-LARGEST, most=LARGEST),
+        }
+
+    def parts(self) -> dict[str, np.ndarray]:
+        whole = self.whole
+        if whole is None:
+            raise ValueError("expected Gaussians quantised to integers, as `compress` returns them")
+        # Channel by channel, minus the lowest number of each; of a step, the upper 16 bits of the float32.
+        lowest = whole.gaussians.min(0)
+        steps = np.concatenate([whole.step, whole.net_step]).astype(np.float32)
+        return {
+            "gain": np.array([self.gain]),
+            "lowest": lowest.astype(np.int32),
+            "gaussians": (whole.gaussians - lowest).T.astype(np.uint16),
+            "steps": (steps.view(np.uint32) >> 16).astype(np.uint16),
+            "network": np.concatenate([layer.ravel() for layer in whole.net]).astype(np.int32),
+        }
+
+    @classmethod
+    def from_parts(cls, profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Self:
+        latent, hidden = profile.latent, profile.hidden
+        steps = (stored["steps"].astype(np.uint32) << 16).view(np.float32).astype(np.float64)
+        if not (np.isfinite(steps).all() and (steps > 0).all()):
+            raise ValueError("part steps: expected finite quantisation steps above 0")
+        first, second, third = split_layers(stored["network"].astype(np.int64), layer_shapes(latent, hidden, outputs))
+        whole = WholeNumbers(
+            gaussians=stored["gaussians"].T.astype(np.int64) + stored["lowest"],
+            step=steps[: STORED_LATENT.start + latent],
+            net=(first, second, third),
+            net_step=steps[STORED_LATENT.start + latent :],
+        )
+        gain, support = float(stored["gain"][0]), profile.support
+        content = cls(latent, hidden, outputs, support, gain, dropped=dropped, whole=whole, **whole.codes())
+        content._check_range()
+        return content
+
+    def _check_range(self) -> None:
+        """Raises a ValueError if a number in the decoding can exceed float32."""
+        # The difference of any two bounds must be finite, and so must the squares of scales and of their inverses.
+        if not np.abs(self.bounds).max() <= _MOST:
+            raise ValueError(f"part gaussians: expected numbers of at most {_MOST:g} in magnitude")
+        if np.abs(self.bounds[:, SCALE]).max() > _MOST_LOG:
+            raise ValueError(f"part gaussians: expected logarithms of scales of at most {_MOST_LOG:g} in magnitude")
+        if not self.gain > 0:
+            raise ValueError("part gain: expected a positive number")
+        first, _, third = (np.abs(layer.astype(np.float64)) for layer in self.layers())
+        sums = self.count * np.abs(self.bounds[:, LATENT].astype(np.float64)).max(0)
+        first *= np.concatenate([np.maximum(sums, 1.0), np.ones(4)])[:, None]
+        most = max(first.sum(0).max(), self.gain * third.sum(0).max())
+        if not most <= np.finfo(np.float32).max:
+            raise ValueError("parts network, gaussians and gain: expected light within the range of float32")
+
+
+def split_layers(net: Any, shapes: list[tuple[int, int]]) -> list[Any]:
+    """Splits an array or a tensor of all weights, [P], into layers of these shapes."""
+    ends = np.cumsum([0, *(rows * columns for rows, columns in shapes)])
+    return [net[start:end].reshape(shape) for (start, end), shape in zip(pairwise(ends), shapes, strict=True)]
 
 
 def gaussian_bytes(count: int, latent: int, hidden: int, outputs: int) -> int:

@@ -11,7 +11,17 @@ from scipy.spatial import cKDTree
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.parts import Part, all_finite, check_part, check_parts
-from wlm.probe.gaussian.model import CENTRE, CUT, LATENT, ROTATION, SCALE, Gaussians, gaussian_count, layer_shapes
+from wlm.probe.gaussian.model import (
+    CENTRE,
+    CUT,
+    LATENT,
+    ROTATION,
+    SCALE,
+    Gaussians,
+    gaussian_count,
+    layer_shapes,
+    split_layers,
+)
 from wlm.probe.model import Profile
 from wlm.probe.morton import morton_order
 from wlm_kernels.probe import network as probe_network
@@ -189,47 +199,33 @@ class Trainer:
 
     def _make_shapes(self, quantised: bool) -> None:
         a = self._arrays
-        self._step_kernels.shapes(
-            a["rows"],
-            a["bounds"],
-            int(quantised),
-            self._levels,
-            CUT,
-            int(self._support == "sphere"),
-            a["used"],
-            self._shapes,
-        )
+        sphere, used = int(self._support == "sphere"), (a["used"], self._shapes)
+        self._step_kernels.shapes(a["rows"], a["bounds"], int(quantised), self._levels, CUT, sphere, *used)
         probe_step.touch(self._groups, self._shapes, self._by_group, self._by_gaussian)
 
     def _step(self, stage: int) -> None:
-        k, a, t = self._step_kernels, self._arrays, self._tensors
+        a, t = self._arrays, self._tensors
         move = stage < 2
         probe_step.count_step(a["control"])
         if move:
             self._make_shapes(quantised=stage > 0)
+            self._features()
         if not self._cuda:
             # The two threads on the CPU add to these arrays.
             t["partial"].zero_()
             t["loss"].zero_()
-        if move:
-            self._features()
         network = (self._groups, a["f"], self._target, self._weight, a["net"], a["grad_f"], a["partial"], a["loss"])
         self._share(self._groups.x.shape[0], lambda *lane: self._network.launch(*network, *lane))
         if move:
-            collect = (self._groups, self._shapes, a["used"], self._by_gaussian, a["grad_f"], CUT, a["sums"])
-            self._share(self.count, lambda *lane: k.collect(*collect, *lane))
+            self._collect()
         self._optimiser.keep, self._optimiser.move = int(stage > 0), int(move)
-        k.update(
-            self._optimiser,
-            a["rows"],
-            a["used"],
-            self._shapes,
-            a["sums"],
-            a["moments"],
-            a["net"],
-            a["net_moments"],
-            a["partial"],
-        )
+        moving = [a[name] for name in ("sums", "moments", "net", "net_moments", "partial")]
+        self._step_kernels.update(self._optimiser, a["rows"], a["used"], self._shapes, *moving)
+
+    def _collect(self) -> None:
+        a = self._arrays
+        args = (self._groups, self._shapes, a["used"], self._by_gaussian, a["grad_f"], CUT, a["sums"])
+        self._share(self.count, lambda *lane: self._step_kernels.collect(*args, *lane))
 
     def _features(self) -> None:
         a = self._arrays
@@ -252,9 +248,7 @@ class Trainer:
         # With a gradient of one in one channel, the first sum of the latent is the sum of the Gaussian's weights.
         t["grad_f"].zero_()
         t["grad_f"][0, : self._probes] = 1.0
-        a = self._arrays
-        collect = (self._groups, self._shapes, a["used"], self._by_gaussian, a["grad_f"], CUT, a["sums"])
-        self._share(self.count, lambda *lane: self._step_kernels.collect(*collect, *lane))
+        self._collect()
         influence = t["sums"][:, SHAPE_NUMBERS] * latent.norm(dim=1)
         order = influence.argsort(stable=True)
         stored = latent.clone()
@@ -283,8 +277,7 @@ class Trainer:
 
     def _decoded(self) -> torch.Tensor:
         """Returns the network's output at all probes before it is scaled to the probes' numbers, float32 [N, D]."""
-        parts = self._tensors["net"].split([rows * columns for rows, columns in self._layers])
-        first, second, third = (part.view(shape) for part, shape in zip(parts, self._layers, strict=True))
+        first, second, third = split_layers(self._tensors["net"], self._layers)
         x = wp.to_torch(self._groups.x)[: self._probes]
         h = torch.cat([self._tensors["f"].sum(0).T[: self._probes], x], 1)
         h = torch.sigmoid(h @ first[:-1] + first[-1])
@@ -304,12 +297,11 @@ class Trainer:
         span = np.where(high > low, high - low, 1.0)
         code = np.rint((t["used"][self.needed] - low) / span * self._levels.numpy())
         code = np.where(high > low, code, 0).astype(np.uint16)
-        *others, last = self._layers
-        before = sum(rows * columns for rows, columns in others)
-        third = t["net"][before:].reshape(last)[:, :d] * self.spread
+        first, second, third = split_layers(t["net"], self._layers)
+        third = third[:, :d] * self.spread
         third[-1] += self.mean
         gain = float(np.abs(third).max()) or 1.0
-        net = np.concatenate([t["net"][:before], (third / gain).ravel()])
+        net = np.concatenate([first.ravel(), second.ravel(), third.ravel() / gain])
         return Gaussians(
             latent=self._latent,
             hidden=self._hidden,
@@ -345,10 +337,11 @@ class Trainer:
         }
 
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores the arrays that `state` returned.
+        """Continues from the arrays that `state` of a trainer with the same arguments returned, exactly as that one.
 
         Raises:
-            ValueError: A part is missing, has another shape or is out of its range; the trainer is unchanged.
+            ValueError: An array is missing, has another type or shape, or a number is out of its range; the trainer is
+                unchanged.
         """
         done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         state = check_parts(state, self.table(int(done[0])))

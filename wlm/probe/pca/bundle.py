@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from wlm.bundle import Bundle
 from wlm.probe.decode import Decoder
 from wlm.probe.glsl import buffer_glsl
-from wlm.probe.model import GpuForm, ProbeModel
+from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import sh_count
 
 _REFERENCES = 64
@@ -86,7 +87,7 @@ void wlm_probe_sh(int probe, out vec3 sh[{coefficients}])
 """
 
 
-def component_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
+def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     """Returns the shader, buffers and examples for a model of principal components; `decoder` decodes the examples."""
     content = model.content
     values = decoder.decode_probes()[model.live]
@@ -102,13 +103,11 @@ def component_form(model: ProbeModel, decoder: Decoder) -> GpuForm:
         codes.view("<u4"),
     ]
     has_basis = bool(len(content.basis))
-    return GpuForm(
-        shader=component_glsl(content.count, model.outputs, has_basis),
-        buffers={"probes": np.concatenate(words)},
-        document={"live": len(values), "components": content.count, "basis": has_basis},
-        about=_ABOUT,
-        reference={"live": chosen.astype(np.int32), "values": values[chosen]},
-    )
+    shader = component_glsl(content.count, model.outputs, has_basis)
+    document = {"about": _ABOUT, "live": len(values), "components": content.count, "basis": has_basis}
+    reference = {"live": chosen.astype(np.int32), "values": values[chosen]}
+    buffers = {"probes": np.concatenate(words)}
+    return Bundle("probe", model.name, shader, document, buffers=buffers, reference=reference)
 
 
 def component_glsl(count: int, outputs: int, basis: bool) -> str:

@@ -9,19 +9,20 @@ unit vectors, which take no memory. This is the method of Sloan et al., Clustere
 Radiance Transfer, 2003, with one cluster.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from wlm.probe.decode import Decoder
-from wlm.probe.model import Content, GpuForm, ProbeModel
+from wlm.formats.parts import Part
+from wlm.probe.model import Content, Profile
 
 ENOUGH = 0.02
 """Relative error at which no component is added: RMS over all probes of the error divided by the probe's norm."""
 
 _LEVELS = 255
+_MOST_LOG = 88.0  # largest logarithm in a file: the exponential still fits float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,8 @@ class Components(Content):
     """
 
     METHOD: ClassVar[str] = "pca"
+    DECODER: ClassVar[str] = "wlm.probe.pca.decode:ComponentDecoder"
+    BUNDLE: ClassVar[str] = "wlm.probe.pca.bundle:component_bundle"
 
     outputs: int
     code: np.ndarray
@@ -51,14 +54,35 @@ class Components(Content):
     def nbytes(self) -> int:
         return component_bytes(len(self.code), self.outputs, self.count, identity=not len(self.basis))
 
-    def decoder(self, model: ProbeModel, device: str, **options: Any) -> Decoder:
-        return import_module("wlm.probe.pca.decode").ComponentDecoder(model, device, **options)
-
-    def gpu_form(self, model: ProbeModel, decoder: Decoder) -> GpuForm:
-        return import_module("wlm.probe.pca.bundle").component_form(model, decoder)
-
     def facts(self) -> dict[str, Any]:
         return {"components": self.count, "basis": "principal components" if len(self.basis) else "unit vectors"}
+
+    def settings(self) -> dict[str, int]:
+        return {"count": self.count}
+
+    @classmethod
+    def table(cls, profile: Profile, outputs: int, count: int, live: int) -> dict[str, Part]:
+        if count > outputs:
+            raise ValueError(f"setting count: expected at most {outputs} components, found {count}")
+        return {
+            "code": Part(np.uint8, (1 + count, live)),
+            "bounds": Part(np.float16, (2, 1 + count)),
+            "basis": Part(np.float16, (0 if count == outputs else count, outputs)),
+        }
+
+    def parts(self) -> dict[str, np.ndarray]:
+        return {"code": self.code.T, "bounds": self.bounds, "basis": self.basis}
+
+    @classmethod
+    def from_parts(cls, profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Self:
+        bounds = stored["bounds"].astype(np.float64)
+        most = np.maximum(np.abs(bounds[0]), np.abs(bounds[0] + 255.0 * bounds[1]))
+        largest = float(np.abs(stored["basis"].astype(np.float64)).max(initial=0.0)) if stored["basis"].size else 1.0
+        if (bounds[1] < 0).any() or most[0] > _MOST_LOG:
+            raise ValueError(f"part bounds: expected steps of at least 0, and log magnitudes within {_MOST_LOG:g}")
+        if not np.exp(most[0]) * most[1:].sum() * largest <= np.finfo(np.float32).max:
+            raise ValueError("parts bounds and basis: expected light within the range of float32")
+        return cls(outputs, np.ascontiguousarray(stored["code"].T), stored["bounds"], stored["basis"])
 
 
 def component_bytes(live: int, outputs: int, count: int, *, identity: bool) -> int:

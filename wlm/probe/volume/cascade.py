@@ -15,13 +15,15 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
+from wlm.probe.sphere import unit_or_zero
 from wlm.probe.volume.index import BlockIndex, finest_side
 from wlm.probe.volume.light import Light
 from wlm_kernels.probe import volume as kernels
@@ -172,50 +174,43 @@ class Volume:
 
     def _make(self, rows: int, normal: np.ndarray) -> None:
         """Allocates all arrays on the device."""
-        device, levels, budget = self.device, len(self.sizes), self.budget
-        slots = levels * self.side**3
-
+        host, levels = self.index, len(self.sizes)
+        slots, block = levels * self.side**3, (self.budget, frame_kernels.PROBES)
         self._arrays: list[wp.array] = []
 
-        def full(shape: int | tuple[int, ...], dtype: type, value: object) -> wp.array:
-            self._arrays.append(wp.full(shape, value, dtype=dtype, device=device))
-            return self._arrays[-1]
+        def struct(kind: Any, value: int, **contents: Any) -> Any:
+            """Makes a Warp struct of copies of NumPy arrays, or of arrays of given shapes, filled with a value."""
+            made = kind()
+            for name, content in contents.items():
+                copied, dtype = isinstance(content, np.ndarray), kind.vars[name].type.dtype
+                allocate = wp.array if copied else partial(wp.full, value=value)
+                setattr(made, name, allocate(content, dtype=dtype, device=self.device))
+                self._arrays.append(getattr(made, name))
+            return made
 
-        def put(array: np.ndarray, dtype: type) -> wp.array:
-            self._arrays.append(wp.array(array, dtype=dtype, device=device))
-            return self._arrays[-1]
-
-        index, host = frame_kernels.Index(), self.index
-        index.key, index.number = put(host.key, wp.int64), put(self.numbers[host.number].astype(np.int32), int)
-        index.cell, index.place = put(host.cell, wp.vec3i), put(host.place, wp.vec3)
-        index.normal = put(normal[host.number], wp.vec3)
-        index.block, index.level_start = put(host.block, wp.int64), put(host.level_start, int)
-        index.ratios = put(np.array(host.ratios, np.int32), int)
-        windows = frame_kernels.Windows()
-        windows.bases, windows.views = full(levels, wp.vec3i, wp.vec3i()), full(levels, wp.vec4, wp.vec4())
-        windows.held = full(slots, wp.vec3i, wp.vec3i(kernels.NOTHING))
-        windows.wanted, windows.pages = full(slots, int, -1), full(slots, int, -1)
-        windows.away = full(slots, float, -1.0)
-        pool = frame_kernels.Pool()
-        pool.stamp, pool.owner = full(rows, int, -1), full(rows, int, -1)
-        pool.rows = full(len(host.block), int, -1)
-        work = frame_kernels.Work()
-        work.clock, work.counters, work.limit = full(1, int, 0), full(7, int, 0), full(1, int, 0)
-        work.histogram = full(frame_kernels.TOTALS, int, 0)
-        work.gathered, work.distance = full(frame_kernels.MOST, int, 0), full(frame_kernels.MOST, float, 0.0)
-        work.chosen, work.taken = full(budget, int, -1), full(budget, int, -1)
-        work.begin = full((budget, frame_kernels.HALVES), int, 0)
-        work.count = full((budget, frame_kernels.HALVES), int, 0)
-        work.picked, work.noise = full(budget, int, 0), full(budget, float, 0.0)
-        block = (budget, frame_kernels.PROBES)
-        work.places, work.hats = full(block, wp.vec4, wp.vec4()), full(block, float, 0.0)
-        work.rows = full(block, frame_kernels.Row, frame_kernels.Row())
-        work.numbers, work.weights = full(math.prod(block), int, 0), full(block, float, 0.0)
-        self._read_light = full((math.prod(block), self.channels), float, 0.0)
-        self._index, self._windows, self._pool_rows, self._frame_work = index, windows, pool, work
-        self._look = frame_kernels.Look(windows, work)
-        self._nowhere = full(0, wp.vec3, wp.vec3())
-        self._pool = full((rows, self.channels), float, 0.0)
+        self._index = struct(
+            frame_kernels.Index,
+            0,
+            **{name: getattr(host, name) for name in ("key", "cell", "place", "block", "level_start")},
+            number=self.numbers[host.number].astype(np.int32),
+            normal=normal[host.number],
+            ratios=np.array(host.ratios, np.int32),
+        )
+        by_slot = dict.fromkeys(("held", "wanted", "pages", "away"), slots)
+        self._windows = struct(frame_kernels.Windows, -1, bases=levels, views=levels, **by_slot)
+        self._windows.held.fill_(kernels.NOTHING)
+        self._pool_rows = struct(frame_kernels.Pool, -1, stamp=rows, owner=rows, rows=len(host.block))
+        by_block = dict.fromkeys(("chosen", "taken", "picked", "noise"), self.budget)
+        by_probe = dict.fromkeys(("places", "hats", "rows", "weights"), block)
+        ranges = dict.fromkeys(("begin", "count"), (self.budget, frame_kernels.HALVES))
+        ranked = dict.fromkeys(("gathered", "distance"), frame_kernels.MOST)
+        frame = {"clock": 1, "counters": 7, "limit": 1, "histogram": frame_kernels.TOTALS, "numbers": math.prod(block)}
+        self._frame_work = struct(frame_kernels.Work, 0, **frame, **ranked, **ranges, **by_block, **by_probe)
+        self._look = frame_kernels.Look(self._windows, self._frame_work)
+        self._nowhere = wp.zeros(0, dtype=wp.vec3, device=self.device)
+        self._read_light = wp.zeros((math.prod(block), self.channels), dtype=float, device=self.device)
+        self._pool = wp.zeros((rows, self.channels), dtype=float, device=self.device)
+        self._arrays += [self._read_light, self._pool]
 
     @property
     def memory_bytes(self) -> int:
@@ -277,9 +272,7 @@ class Volume:
     def _work(self) -> None:
         """Runs the part of a frame that a CUDA graph contains."""
         work, windows = self._frame_work, self._windows
-        frame_kernels.scroll(self._index, windows, self._pool_rows, self.side, work)
-        frame_kernels.choose(windows, self.side, work)
-        frame_kernels.allocate(windows, self._pool_rows, work)
+        frame_kernels.select(self._index, windows, self._pool_rows, self.side, work)
         if self.index.count == 0 or (self.device == "cpu" and not (work.taken.numpy() >= 0).any()):
             return
         frame_kernels.search(self._index, windows, self.side, work)
@@ -352,8 +345,7 @@ def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     normal = np.asarray(normal, np.float64)
     if normal.shape != shape or not np.isfinite(normal).all():
         raise ValueError(f"normal: expected finite numbers {list(shape)}, got {list(normal.shape)}")
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return (normal / np.where(length > 0, length, 1.0)).astype(np.float32)
+    return unit_or_zero(normal).astype(np.float32)
 
 
 def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, rows: int) -> None:

@@ -17,8 +17,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
-from wlm.smoke.shading import Light, Ramp, glow_of
-from wlm.smoke.transport.lights import AnyLight, checked_albedo, in_voxels
+from wlm.smoke.shading import AnyLight, Light, Ramp, checked_albedo, glow_of, in_voxels
 from wlm_kernels.smoke import depth_lattice, marches
 from wlm_kernels.smoke.march import Medium, View
 from wlm_kernels.smoke.settings import March

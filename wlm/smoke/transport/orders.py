@@ -23,10 +23,9 @@ from wlm.fluid.volume import DensityVolume
 from wlm.formats.npz import read_npz
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import Camera, unit
-from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.shading import AnyLight, Light, PointLight, Ramp, checked_albedo
 from wlm.smoke.transport.diffusion import Spreading, share_of, thrown_by_fire
 from wlm.smoke.transport.lighting import LitSmoke, light_in, light_smoke, marching
-from wlm.smoke.transport.lights import AnyLight, PointLight, checked_albedo
 from wlm_kernels.smoke import orders
 from wlm_kernels.smoke.orders import FEATURES, MIXES, THINNEST
 from wlm_kernels.smoke.settings import March

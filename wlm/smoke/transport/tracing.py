@@ -16,7 +16,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, free_memory, stream, to_warp
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
-from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour, in_voxels
+from wlm.smoke.shading import AnyLight, checked_albedo, checked_colour, in_voxels
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke import path
 from wlm_kernels.smoke.march import View
