@@ -10,10 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 import torch.nn.functional as F
+import warp as wp
 
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.formats.atomic import atomic_path
-from wlm.interop import device_name, stream
+from wlm.interop import device_name, stream, to_warp
 from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import Camera
 from wlm.smoke.network.planes import to_srgb
@@ -21,6 +22,7 @@ from wlm.smoke.shading import Light
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, make_inputs, orders_march
 from wlm.smoke.transport.tracing import trace
+from wlm_kernels.smoke import orders
 from wlm_kernels.smoke.orders import FEATURES, MIXES
 
 _ORDERS = 40
@@ -187,7 +189,7 @@ def fit_orders(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) 
     right = torch.zeros(len(ALBEDOS), MIXES, FEATURES, dtype=torch.float64, device=device)
     random = torch.Generator().manual_seed(seed)
     for lesson in lessons:
-        features = lesson.inputs.features(0).flatten(2).double()
+        features = features(lesson.inputs, 0).flatten(2).double()
         chosen = torch.randperm(features.shape[2], generator=random)[:pixels].to(device)
         features = features[..., chosen]
         target, weights = (part.flatten(1)[:, chosen].double() for part in (lesson.multiple(), lesson.weights()))
@@ -227,6 +229,41 @@ def learn(
             report(number)
         lessons += make_lessons(draw_lesson(seed, number), samples=samples, seed=number, device=device)
     return fit_orders(lessons)
+
+
+@wp.kernel(enable_backward=False)
+def _features(
+    # in:
+    single: wp.array2d[float],
+    opposite: wp.array2d[float],
+    diffused: wp.array3d[float],
+    from_thin: wp.array3d[float],
+    transparency: wp.array2d[float],
+    thin: wp.array2d[float],
+    # out:
+    out: wp.array4d[float],
+):
+    a, i, j = wp.tid()
+    d, e = diffused[a, i, j], from_thin[a, i, j]
+    x = orders.features(single[i, j], opposite[i, j], d, e, transparency[i, j], thin[i, j])
+    for n in range(FEATURES):
+        out[a, n, i, j] = x[n]
+
+
+def features(inputs: Inputs, light: int) -> torch.Tensor:
+    """Returns the features of one light for the weighted sum, float32 [A, FEATURES, H, W]."""
+    out = torch.empty((len(inputs.albedos), FEATURES, *inputs.thin.shape), device=inputs.thin.device)
+    of_light = (part[light] for part in (inputs.single, inputs.opposite, inputs.diffused, inputs.from_thin))
+    planes = [to_warp(plane) for plane in (*of_light, inputs.transparency, inputs.thin)]
+    wp.launch(_features, (len(out), *inputs.thin.shape), planes, [to_warp(out)], device=planes[0].device)
+    return out
+
+
+def at(inputs: Inputs, albedo: float) -> Inputs:
+    """Returns the inputs at one of their albedos alone."""
+    n = inputs.albedos.index(albedo)
+    planes = {name: getattr(inputs, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
+    return replace(inputs, **planes, albedos=(albedo,))
 
 
 def save_orders(model: OrdersModel, path: str | os.PathLike[str]) -> None:

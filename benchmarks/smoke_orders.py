@@ -48,7 +48,7 @@ from benchmarks.rivals.smoke_orders import FITTED, diffused, filter_planes, octa
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from benchmarks.smoke import make_cloud
-from benchmarks.smoke_learning import FAINT, draw_view, psnr
+from benchmarks.smoke_learning import FAINT, at, draw_view, psnr
 from benchmarks.timing import Timing
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
@@ -435,7 +435,7 @@ def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> It
             _, inputs = make_inputs(volume, camera, lights, ALBEDOS, orders_march(volume))
             for albedo in ALBEDOS:
                 diffused = inputs.by_diffusion(albedo)
-                mixed = model.light(inputs.at(albedo), (albedo,) * 3)[..., 0]
+                mixed = model.light(at(inputs, albedo), (albedo,) * 3)[..., 0]
                 truth = _at_albedo(traced, albedo).sum(1)[..., 0]
                 for one, other, wanted in zip(diffused, mixed, truth, strict=True):
                     yield psnr(one, wanted), psnr(other, wanted)

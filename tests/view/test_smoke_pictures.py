@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from builders.smoke_plumes import plume
+from builders.smoke_plumes import plume, rays
 from PIL import Image
 
 from wlm.smoke.camera import Camera
@@ -65,7 +65,7 @@ def test_an_obstacle_is_drawn_where_it_is(device, toward, perspective):
     camera = _camera(48, toward=toward, perspective=perspective)
     ball = _ball(0.1, -0.05, 0.2)
     _, depth = draw_obstacles([ball], camera, [], device)
-    origin, way = (part.numpy() for part in camera.rays())
+    origin, way = rays(camera)
     middle = ball.centre(0.0) - origin
     along = (middle * way).sum(-1)
     gap = 0.2**2 - ((middle**2).sum(-1) - along**2)
@@ -134,7 +134,7 @@ def test_shadow_of_a_box(device, toward, perspective):
     camera = Camera.look_at(
         10 * np.array(way) / np.linalg.norm(way), (0, 0, 0), extent=extent, height=40, width=40, perspective=perspective
     )
-    origin, ray = (part.numpy() for part in camera.rays())
+    origin, ray = rays(camera)
     # The surface of the smoke is the plane x + 2 y + 2 z = 0.3, which cuts the box.
     normal = np.array([1.0, 2.0, 2.0])
     depth = (0.3 - origin @ normal) / (ray @ normal)

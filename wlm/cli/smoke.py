@@ -1,6 +1,5 @@
 """`wlm smoke`: simulates and lights smoke, and makes six-way lightmaps by ray marching or with a network."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -46,7 +45,6 @@ if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
     from wlm.smoke.camera import Camera
     from wlm.smoke.lightmaps import SixWay
-    from wlm.smoke.model import SmokeModel
     from wlm.smoke.scene import Scene
 
 __all__ = ["INSTEAD", "app", "evaluate", "info"]
@@ -214,35 +212,23 @@ def predict(
     quiet_warp()
     from wlm.smoke.codec import open_network
     from wlm.smoke.march.six_way import bake_coarse, coarse_march
+    from wlm.smoke.network.prediction import SmokePredictor
 
     frames = options.open(smoke)
-    made: dict[str, Any] = {"made": "coarse", "seed": seed}
+    predictor = None
     if coarse:
+        made: dict[str, Any] = {"made": "coarse", "seed": seed}
 
         def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
             return bake_coarse(volume, camera, coarse_march(volume, seed))
     else:
         model = open_network(network)
-        made |= {"made": "network", "of": dict(model.summary)}
-        make = _predicted(model, seed, frames.device)
+        made = {"made": "network", "seed": seed, "of": dict(model.summary)}
+        predictor = SmokePredictor(model, frames.device)
+        make = partial(predictor, seed=seed)
     write_lightmaps(frames, options.view(frames), output, make, made, resume=resume)
-
-
-def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Returns a function that predicts lightmaps with a network; the first call may print the predictor's note."""
-    from wlm.smoke.network.prediction import SmokePredictor
-
-    predictor, first = SmokePredictor(model, device), True
-
-    def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-        nonlocal first
-        six = predictor(volume, camera, seed)
-        if first and (line := predictor.note()):
-            note(line)
-        first = False
-        return six
-
-    return make
+    if predictor is not None and (line := predictor.note()):
+        note(line)
 
 
 @app.command()

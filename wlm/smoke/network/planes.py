@@ -67,12 +67,10 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
         [..., 3, H, W]: light in sRGB; opacity; depth, from 1 at `near` to 0 at `far`, and 0 without a surface.
 
     Raises:
-        ValueError: The number of planes is wrong, or `near` is not less than `far`.
+        ValueError: The number of planes is wrong.
     """
     if maps.ndim < 3 or maps.shape[-3] != 3:
         raise ValueError(f"maps: expected shape [..., 3, H, W], got {tuple(maps.shape)}")
-    if not near < far:
-        raise ValueError(f"near, far: expected a near distance below the far one, got {near} and {far}")
     light, transparency, depth = maps.unbind(-3)
     share = ((far - depth) / (far - near)).clamp(0.0, 1.0)
     return torch.stack([to_srgb(light), 1.0 - transparency, share * (depth > 0)], -3)
@@ -92,9 +90,11 @@ def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March)
         smoke.
 
     Raises:
-        ValueError: The kind is unknown, or the camera is in perspective.
+        ValueError: The kind is unknown, or the camera is in perspective or too far away for float64.
     """
     near, far = span(volume, camera)
+    if not near < far:
+        raise ValueError(f"camera: expected a near distance below the far one, got {near} and {far}")
     if kind == "paper":
         return encode_guide(guide(volume, camera, march).maps, near, far)
     if kind not in GUIDES:

@@ -65,15 +65,6 @@ class Inputs:
     cosines: tuple[float, ...]
     depth: torch.Tensor
 
-    def features(self, light: int) -> torch.Tensor:
-        """Returns the features of one light for the weighted sum, float32 [A, FEATURES, H, W]."""
-        size = (len(self.albedos), FEATURES, *self.transparency.shape)
-        out = torch.empty(size, device=self.transparency.device)
-        of_light = (part[light] for part in (self.single, self.opposite, self.diffused, self.from_thin))
-        planes = (*of_light, self.transparency, self.thin)
-        orders.features(*map(to_warp, planes), to_warp(out))
-        return out
-
     def by_diffusion(self, albedo: float) -> torch.Tensor:
         """Returns all light, [L, H, W], by diffusion without fitted weights, at an albedo that is one of `albedos`."""
         return albedo * self.single + albedo**2 * self.diffused[:, self.albedos.index(albedo)]
@@ -83,12 +74,6 @@ class Inputs:
         names = ("single", "opposite", "diffused", "from_thin")
         planes = {name: getattr(self, name)[light : light + 1] for name in names}
         return replace(self, **planes, cosines=self.cosines[light : light + 1])
-
-    def at(self, albedo: float) -> "Inputs":
-        """Returns the inputs at `albedo` alone, which must be one of `albedos`."""
-        n = self.albedos.index(albedo)
-        planes = {name: getattr(self, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
-        return replace(self, **planes, albedos=(albedo,))
 
 
 def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
