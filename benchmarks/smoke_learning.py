@@ -189,14 +189,14 @@ def fit_orders(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) 
     right = torch.zeros(len(ALBEDOS), MIXES, FEATURES, dtype=torch.float64, device=device)
     random = torch.Generator().manual_seed(seed)
     for lesson in lessons:
-        features = features(lesson.inputs, 0).flatten(2).double()
-        chosen = torch.randperm(features.shape[2], generator=random)[:pixels].to(device)
-        features = features[..., chosen]
+        x = features(lesson.inputs, 0).flatten(2).double()
+        chosen = torch.randperm(x.shape[2], generator=random)[:pixels].to(device)
+        x = x[..., chosen]
         target, weights = (part.flatten(1)[:, chosen].double() for part in (lesson.multiple(), lesson.weights()))
         # All pixels of a lesson have the same polynomial terms, so that the normal matrix is a product.
         mix = model.mixes(lesson.inputs)[0].double()
-        weighed = features * weights[:, None]
-        squares = weighed @ features.transpose(1, 2)
+        weighed = x * weights[:, None]
+        squares = weighed @ x.transpose(1, 2)
         left += (mix[:, None] * mix)[None, :, None, :, None] * squares[:, None, :, None, :]
         right += mix[None, :, None] * (weighed @ target[..., None])[:, None, :, 0]
     left, right = left.reshape(len(ALBEDOS), size, size), right.reshape(len(ALBEDOS), size)

@@ -20,6 +20,7 @@ from wlm.formats.exr import read_every_channel, read_exr
 from wlm.formats.exr_header import check_header
 from wlm.formats.folder import read_index
 from wlm.formats.levels import read_levels
+from wlm.formats.limits import SURE_BYTES
 from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS, Camera
 from wlm.smoke.flipbook.naming import TRANSPARENCY, Layout, layout_name, parse_layout, second_names, six_way_channels
 from wlm.smoke.lightmaps import SixWay, axis_faults, axis_shifts, light_centres
@@ -368,7 +369,7 @@ def _read(path: Path, *, grey: bool = False) -> tuple[np.ndarray, bytes | str]:
             raise WlmError(f"{path}: expected finite light, found NaN or infinity")
         return page, check_header(path)[0].attributes.get(NOTE, ("", b""))[1]
     entries: dict[Any, Any] = {}
-    page, names = read_levels(path, suffix[1:].upper(), [], entries)
+    page, names = read_levels(path, suffix[1:].upper(), [], entries, SURE_BYTES)
     if len(names) < 3 and not grey:
         raise WlmError(f"{path}: expected a texture of RGB or RGBA, found one of {', '.join(names)}")
     return page, entries.get(NOTE) or entries.get("id_section") or b""
