@@ -365,7 +365,7 @@ def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Call
     def step() -> None:
         advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS)
         if scheme == "maccormack":
-            advection.correct(box, velocity, walls, *fields, _SUBSTEPS)
+            advection.advect(box, velocity, walls, fields[0], fields[2], _SUBSTEPS, predicted=fields[1])
 
     return bench.replay(step)
 
@@ -400,7 +400,7 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
             advection_sources.empty_retired(box, bricks, field)
         advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, bricks=bricks)
         if scheme == "maccormack":
-            advection.correct(box, velocity, walls, *fields, _SUBSTEPS, bricks=bricks)
+            advection.advect(box, velocity, walls, fields[0], fields[2], _SUBSTEPS, bricks=bricks, predicted=fields[1])
 
     return bench.replay(step), bricks
 
@@ -429,7 +429,7 @@ def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
         for _ in range(steps):
             advection.advect(box, velocity, nothing, fields[0], fields[1], 1.0)
             if scheme == "maccormack":
-                advection.correct(box, velocity, nothing, *fields, 1.0)
+                advection.advect(box, velocity, nothing, fields[0], fields[2], 1.0, predicted=fields[1])
                 fields[1], fields[2] = fields[2], fields[1]
             fields[0], fields[1] = fields[1], fields[0]
         error = (wp.to_torch(fields[0].density).reshape(ball.shape).float() - ball).double()

@@ -8,7 +8,6 @@ from scipy.ndimage import distance_transform_edt
 
 from wlm.errors import WlmError
 from wlm.formats.exr import HALF_MAX
-from wlm.formats.limits import PICTURE_SIDE, PICTURE_TEXELS
 
 REACH = 2
 """Distance from a chart, in texels, that filters read: 1 for a bilinear read, 2 for one of the half-size mip."""
@@ -27,19 +26,6 @@ _FILMIC_WHITE = 4.0
 # radiance; the numbers of a lightmap that are compared, and the fewest texels for the test of levels.
 _AT_ONE, _BRIGHT, _DARK, _LEVELS, _NEAR_LEVEL = 0.02, 1000.0, 1e-4, 255.0, 0.08
 _SAMPLES, _MANY = 6144, 1000
-
-
-def check_size(height: int, width: int) -> None:
-    """Checks the size of a lightmap before memory is allocated for it.
-
-    Raises:
-        WlmError: It has no texel, or more than `PICTURE_SIDE` along a side or `PICTURE_TEXELS` in all.
-    """
-    if min(height, width) < 1 or max(height, width) > PICTURE_SIDE or height * width > PICTURE_TEXELS:
-        raise WlmError(
-            f"size: expected at least 1x1 texels, at most {PICTURE_SIDE} along a side and {PICTURE_TEXELS} in all, "
-            f"found {width}x{height}"
-        )
 
 
 def exposure(light: np.ndarray) -> float:

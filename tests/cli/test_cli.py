@@ -190,7 +190,7 @@ def test_a_set_that_names_files_elsewhere_needs_trust(folder, fitted, tmp_path):
     entries = [{"time_hours": hour, "file": str(folder / f"light_{hour:g}h.exr")} for hour in HOURS]
     path = tmp_path / "set.json"
     path.write_text(json.dumps({"width": 24, "height": 40, "period_hours": 24, "lightmaps": entries}))
-    assert "lightmaps[0].file: expected a file within" in fails("evaluate", fitted, path)
+    assert "lightmaps.0.file: expected a file within" in fails("evaluate", fitted, path)
     assert "PSNR" in call("evaluate", fitted, path, "--trust")
 
 

@@ -10,6 +10,7 @@ from builders.checks import error_of
 
 from wlm.bundle import RESERVED, Bundle, Texture
 from wlm.export import ENGINES, LANGUAGES, export
+from wlm.export.engines.kit import filled
 from wlm.export.files import decode_texture
 from wlm.formats.exr import read_exr
 from wlm.formats.light import read_light
@@ -139,3 +140,8 @@ def test_textures_of_shared_exponents_and_coordinates_decode_to_floats():
     np.testing.assert_array_equal(decoded, unpack_rgb9e5(words))
     places = decode_texture(Texture.from_texels(np.array([[[0, 65535]]], "<u2"), "R16G16_UNORM"))
     assert places.tolist() == [[[0.0, 1.0]]] and places.dtype == np.float32
+
+
+def test_a_name_is_text_in_a_readme():
+    text = filled("three_atlas.md", NAME="<b>a_1</b> [x](y)\n`", PLACE="")
+    assert text.startswith(r"# \<b\>a_1\</b\> \[x\](y)\\x0a\` for three.js" + "\n")

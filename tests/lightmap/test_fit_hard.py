@@ -169,8 +169,7 @@ def test_maps_that_are_no_multiple_of_a_tile(tmp_path, height, width, tiles):
     lightmaps = moving_light(height, width)
     decoder = through_file(tmp_path, lightmaps)
     assert len(decoder.model.kind) == tiles
-    assert decoder.tile(tiles - 1, 3.0).shape == (128, 128, 3)
-    assert decoder.tile(0, 3.0, border=4).shape == (136, 136, 3)
+    assert decoder.tiles([tiles - 1], 3.0).shape == (1, 128, 128, 3)
     report = evaluate(wlm.load(tmp_path / "a.wlm"), lightmaps, metrics=("psnr",))
     assert report.bytes == (tmp_path / "a.wlm").stat().st_size
     assert report.bpp == report.bytes * 8 / (height * width * len(HOURS))
@@ -228,7 +227,7 @@ def test_a_tile_alone_is_the_tile_of_a_batch(make):
     for name in ("uv", "uvt", "ut", "vt", "net", "net_static", "scale", "scale_static", "peak", "affine"):
         # A part that the tile hasn't is empty in both.
         np.testing.assert_array_equal(getattr(batch, name)[:1], getattr(alone, name)[:1], err_msg=name)
-    np.testing.assert_array_equal(SheetDecoder(batch).tile(0, 9.0), SheetDecoder(alone).tile(0, 9.0))
+    np.testing.assert_array_equal(SheetDecoder(batch).tiles([0], 9.0), SheetDecoder(alone).tiles([0], 9.0))
 
 
 # Not the paper's axis over a day: it is clamped at midnight, and the jump there is its own.

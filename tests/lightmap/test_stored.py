@@ -76,7 +76,7 @@ def test_integers_with_an_encoding(tmp_path, suffix):
         (tmp_path / "set.json").write_text(json.dumps(content))
         np.testing.assert_array_equal(wlm.lightmap.load(tmp_path).light.frames, sheet.frames)
     (tmp_path / "set.json").write_text(json.dumps(plain))
-    assert "stored as linear" in inspect(tmp_path)[0].what and not inspect(tmp_path)[0].problems
+    assert "stored as linear" in inspect(tmp_path)[0].what
     (tmp_path / "set.json").write_text(json.dumps({key: value for key, value in plain.items() if key != "stored"}))
     assert "state what light its numbers stand for with --encoding" in error_of(wlm.lightmap.load, tmp_path)
     (tmp_path / "set.json").write_text(json.dumps(plain | {"stored": 5}))

@@ -36,12 +36,11 @@ from wlm.atlas.model import (
 from wlm.atlas.stored import StoredScene
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact, encode_artifact
-from wlm.formats.limits import PICTURE_SIDE
+from wlm.formats.limits import PICTURE_SIDE, check_sides
 from wlm.formats.parts import Part, check_parts
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.formats.zstd import pack_parts, unpack_parts
 from wlm.system import Header, Name
-from wlm.texels import check_size
 
 _MOST_FACTOR = 1e30  # sums of 255 texels times a factor are finite
 _MOST_NUMBERS = 1 << 31  # limit on the length of an axis of a part
@@ -145,7 +144,7 @@ def decode(artifact: Artifact) -> AtlasModel:
     """
     header = check_settings(_Header, artifact.settings, "setting ")
     for size in header.sizes:
-        check_size(*size)
+        check_sides("size", *size[::-1])
     parts = _checked_parts(header, artifact)
     texels, second = tuple(header.texels), tuple(header.block_texels or (0, 0))
     stored, blocks = parts["colour"], parts["blocks"]

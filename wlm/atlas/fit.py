@@ -37,10 +37,10 @@ from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.hdr_blocks import need
+from wlm.formats.limits import check_sides
 from wlm.metrics import LostLight
 from wlm.ops.raster import texture
 from wlm.system import OnProgress
-from wlm.texels import check_size
 
 _CELLS_AT_ONCE = 1 << 24
 _FEWER_VIEWS = 4  # one view of the comparison with a plain lightmap per this number of the profile's views
@@ -83,7 +83,7 @@ def compress(
     device = interop.check_device(device)
     profile, method = Profile.load(profile).override(settings).checked(len(scene.sheets) * len(scene.states))
     for sheet in scene.sheets:
-        check_size(*sheet.mask.shape)
+        check_sides("size", *sheet.mask.shape[::-1])
     for choice in (method, profile.colour):
         if choice in _PACKAGES:  # a missing package is reported now, not after minutes
             need(_PACKAGES[choice], "atlas")

@@ -33,8 +33,8 @@ import numpy as np
 from pydantic import Field
 
 from wlm.errors import WlmError
+from wlm.formats.limits import check_sides
 from wlm.system import Model, Settings
-from wlm.texels import check_size
 
 SOURCE_BITS = 48
 """Bits per texel of a lightmap: three half floats (eq. 9)."""
@@ -337,10 +337,10 @@ def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
     since a file of a few bytes must not claim gigabytes.
 
     Raises:
-        WlmError: The lightmap exceeds the limits of `wlm.texels.check_size`; or it has more than 2^24 texels and also
-            more than 65,536 for each texel of T_p and T_c.
+        WlmError: The lightmap exceeds the limits of `wlm.formats.limits.check_sides`; or it has more than 2^24 texels
+            and also more than 65,536 for each texel of T_p and T_c.
     """
-    check_size(*size)
+    check_sides("size", *size[::-1])
     stored = texels + entries
     if math.prod(size) > max(_FREE_TEXELS, _MOST_SHARE * stored):
         raise WlmError(

@@ -13,8 +13,9 @@ from enum import IntEnum
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats.limits import check_sides
 from wlm.lightmap.data import SheetFrames
-from wlm.texels import check_size, fill_gaps
+from wlm.texels import fill_gaps
 from wlm.workers import each
 
 TILE = 128
@@ -48,7 +49,7 @@ class TileGrid:
     @classmethod
     def of(cls, height: int, width: int) -> TileGrid:
         """Makes the grid of a map of `height` x `width` texels; raises WlmError if the size is out of range."""
-        check_size(height, width)
+        check_sides("size", width, height)
         return cls(height, width, -(-height // TILE), -(-width // TILE))
 
     @property
