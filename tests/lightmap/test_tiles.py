@@ -21,6 +21,7 @@ from wlm.lightmap.tiles import (
     TileKind,
     channel_means,
     classify,
+    cut,
     place,
     split,
     static_pattern,
@@ -108,6 +109,15 @@ def test_map_end_is_edge_padded_and_not_valid(lightmaps):
     expected = np.pad(inside, ((0, 0), (0, TILE - rows), (0, TILE - columns), (0, 0)), mode="edge")
     np.testing.assert_array_equal(colour, expected)
     assert (inside > 0).all()
+
+
+def test_a_tile_of_its_own_size(lightmaps):
+    last = TileGrid.of(*lightmaps.mask.shape).count - 1
+    own = cut(lightmaps, np.array([last])).encoded(2.2, padded=False)
+    (rows, columns), padded = own.mask.shape[1:], split(lightmaps, 2.2, [last])
+    np.testing.assert_allclose(own.colour, padded.colour[:, :, :rows, :columns], rtol=1e-6)
+    np.testing.assert_array_equal(own.mask, padded.mask[:, :rows, :columns])
+    assert own.mask.size < padded.mask.size
 
 
 def test_split_refuses(lightmaps):

@@ -125,7 +125,7 @@ def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
 
 
 def _make(path: Path, folder: bool) -> int | None:
-    """Makes a file or folder and locks it; returns its handle, or None if it can't be opened."""
+    """Makes a file or folder and locks it; returns its handle, or None if it can't be locked."""
     if folder:
         path.mkdir()
     else:
