@@ -37,18 +37,16 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import stream, to_warp, torch_memory
+from wlm.interop import stream, to_warp
 from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import RULES, Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import Guide, guide
-from wlm.smoke.march.fine import bake
-from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera, obstacle_mesh
-from wlm.smoke.shading import Light, light_axes
+from wlm.smoke.march.six_way import Guide, bake, guide
+from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera
+from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.simulation import make_solver, volume_of
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
 from wlm.view.smoke import Drawing
@@ -57,7 +55,6 @@ from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.smoke.settings import March
-from wlm_kernels.smoke.shadow import visibility
 
 PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("guide", "six ways")))
 """The panels of a plot: PSNR and error of guiding maps and of the fine march against their time."""
@@ -368,7 +365,7 @@ def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Call
     def step() -> None:
         advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS)
         if scheme == "maccormack":
-            advection.correct(box, velocity, walls, *fields, _SUBSTEPS)
+            advection.advect(box, velocity, walls, fields[0], fields[2], _SUBSTEPS, predicted=fields[1])
 
     return bench.replay(step)
 
@@ -403,7 +400,7 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
             advection_sources.empty_retired(box, bricks, field)
         advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, bricks=bricks)
         if scheme == "maccormack":
-            advection.correct(box, velocity, walls, *fields, _SUBSTEPS, bricks=bricks)
+            advection.advect(box, velocity, walls, fields[0], fields[2], _SUBSTEPS, bricks=bricks, predicted=fields[1])
 
     return bench.replay(step), bricks
 
@@ -432,7 +429,7 @@ def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
         for _ in range(steps):
             advection.advect(box, velocity, nothing, fields[0], fields[1], 1.0)
             if scheme == "maccormack":
-                advection.correct(box, velocity, nothing, *fields, 1.0)
+                advection.advect(box, velocity, nothing, fields[0], fields[2], 1.0, predicted=fields[1])
                 fields[1], fields[2] = fields[2], fields[1]
             fields[0], fields[1] = fields[1], fields[0]
         error = (wp.to_torch(fields[0].density).reshape(ball.shape).float() - ball).double()
@@ -589,17 +586,11 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
     surface = guide(volume, camera)
     six = bake(volume, camera, estimate=False)
     lights = [settings.light() for settings in scene.lights]
-    corners, triangles, _ = obstacle_mesh(scene.obstacles, scene.time(sizes.frames))
-    corners, triangles = (torch.from_numpy(part).to(device) for part in (corners, triangles))
-
-    seen = torch.ones_like(surface.depth)
+    drawing = Drawing(camera, lights, obstacles=scene.obstacles, device=device)
 
     def shadows() -> None:
-        with stream(device):
-            mesh, view = (to_warp(corners, wp.vec3), to_warp(triangles)), camera.in_world()
-            for light in lights:
-                maps = to_warp(surface.depth), to_warp(seen)
-                visibility(*mesh, light_axes(light.toward), view, *maps, empty=torch_memory(seen.device))
+        drawing.move(scene.time(sizes.frames))
+        drawing.draw_shadows(surface.depth)
 
     def shading() -> torch.Tensor:
         return six.shade(lights, background=scene.background)

@@ -18,7 +18,7 @@ from wlm.bake.daylight import sun_direction
 from wlm.bake.geometry import Geometry, read_geometry
 from wlm.bake.lightmaps import BakedLightmaps, write_lightmaps
 from wlm.bake.probes import BakedProbes, place_probes, write_probes
-from wlm.bake.settings import Lamp, LightmapSettings, ProbeSettings, load_scene
+from wlm.bake.settings import Lamp, LightmapSettings, ProbeSettings
 from wlm.bake.texels import place_texels
 from wlm.bake.work import each_hour, open_checkpoint, open_task
 from wlm.cli import app
@@ -50,7 +50,7 @@ def test_a_wrong_scene_is_refused_in_a_line(tmp_path, change, said):
     path = tmp_path / "a" / "scene.yaml"
     path.write_text(json.dumps({"geometry": "room.gltf"} | change))
     with pytest.raises(WlmError, match="scene.yaml: .*" + said.replace("[", r"\[")):
-        load_scene(path)
+        open_task(path)
 
 
 def test_lamps_are_lit_past_midnight():

@@ -5,7 +5,7 @@ from builders.bake_rooms import ROOM
 
 from wlm.bake.geometry import read_geometry
 from wlm.bake.probes import place_probes
-from wlm.bake.settings import load_scene
+from wlm.bake.work import open_task
 from wlm.lightmap import load
 from wlm.probe.data import load as load_probes
 
@@ -13,7 +13,7 @@ BAKED = ROOM.parent / "data" / "cornell"
 
 
 def test_lightmaps_are_of_the_scenes_hours():
-    scene, _, _ = load_scene(ROOM / "room.yaml", False)
+    scene = open_task(ROOM / "room.yaml").scene
     lightmaps = load(BAKED).light
     assert lightmaps.times.tolist() == list(scene.hours) and lightmaps.period == scene.period
     assert lightmaps.mask.shape == (scene.lightmap.resolution, scene.lightmap.resolution)
@@ -24,7 +24,8 @@ def test_lightmaps_are_of_the_scenes_hours():
 
 
 def test_probes_are_where_the_scene_has_them():
-    scene, path, _ = load_scene(ROOM / "room.yaml", False)
+    task = open_task(ROOM / "room.yaml")
+    scene, path = task.scene, task.geometry
     places = place_probes(scene.probes, read_geometry(path, None), scene.seed)
     for hour in scene.hours:
         probes = load_probes(BAKED / "probes.npz", key=f"{hour:g}")

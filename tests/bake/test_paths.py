@@ -42,17 +42,17 @@ SPOT = quad([-0.001, 0, 0.001], [0.002, 0, 0], [0, 0, -0.002])  # a point, nearl
 def lit(surfaces, samples=1024, bounces=2, picture=None, hour=12.0, directional=False, **lights) -> np.ndarray:
     """Irradiance of the texels of the surfaces with UVs, [T, 3], or [T, 6]."""
     scene = BakeScene(geometry="-", samples=samples, bounces=bounces, seed=1, **lights)
-    now = world.make_hour(scene, Geometry(None, tuple(surfaces), ()), picture, hour)
+    now, tracing = world.make_hour(scene, Geometry(None, tuple(surfaces), ()), picture, hour)
     texels = place_texels("here", surfaces, 8, 2)
-    return paths.irradiance(now.scene, texels, now.tracing, directional=directional).mean
+    return paths.irradiance(now, texels, tracing, directional=directional).mean
 
 
 def harmonics(position, surfaces=(), samples=1024, picture=None, hour=12.0, **lights) -> np.ndarray:
     """[N, 9, 3]."""
     scene = BakeScene(geometry="-", samples=samples, bounces=2, seed=1, **lights)
     far = quad([1000, 1000, 1000], [1, 0, 0], [0, 0, 1], uv=None)
-    now = world.make_hour(scene, Geometry(None, (*surfaces, far), ()), picture, hour)
-    gathered = paths.harmonics(now.scene, np.array(position, float), now.tracing)
+    now, tracing = world.make_hour(scene, Geometry(None, (*surfaces, far), ()), picture, hour)
+    gathered = paths.harmonics(now, np.array(position, float), tracing)
     return gathered.mean.reshape(-1, 9, 3)
 
 

@@ -9,15 +9,13 @@ from benchmarks import Row
 HERE = Path(__file__).parent
 MEASURED = {"rows", "made"}
 """Fixtures that run a whole benchmark, which takes up to a minute."""
-QUICK = ("test_bench_atlas_scene",)
-"""Modules whose benchmarks take seconds; their tests stay in the quick run."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are selected by their marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks tests of measured rows as slow."""
     for item in items:
-        if item.path.parent == HERE and MEASURED & set(item.fixturenames) and item.path.stem not in QUICK:
+        if item.path.parent == HERE and MEASURED & set(item.fixturenames):
             item.add_marker(pytest.mark.slow)
 
 

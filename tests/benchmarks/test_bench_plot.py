@@ -52,28 +52,23 @@ def as_text(monkeypatch):
     monkeypatch.setitem(matplotlib.rcParams, "svg.fonttype", "none")
 
 
-def test_both_panels_name_every_row(tmp_path, as_text):
-    path = tmp_path / "p.svg"
-    plot(ROWS, path)
-    texts = svg_texts(path)
-    for row in ROWS:
-        assert texts.count(f"{row.method} {row.option}") == 2
-    for words in ("decode time (ms)", "size (bpp)"):
-        assert texts.count(words) == 1
-    assert texts.count("Pareto front") == 2
-    assert [p.name for p in tmp_path.iterdir()] == ["p.svg"]
-
-
-def test_rows_without_a_value_are_left_out_of_that_panel(tmp_path, as_text):
+def test_panels_name_the_rows_that_have_their_values(tmp_path, as_text):
+    """Both panels those that have both; a row without a size only that of times, one without an error none."""
     path = tmp_path / "p.svg"
     other = Row("lightmap", "night", "ours", "M", {"decode_ms": 1.0, "psnr": 30.0})
     gone, half = (replace(ROWS[0], method=method) for method in ("gone", "half"))
     gone, half = gone.with_figures(psnr=None), half.with_figures(bpp=None)
     plot([*ROWS, gone, half, other], path)
     texts = svg_texts(path)
+    for row in ROWS:
+        assert texts.count(f"{row.method} {row.option}") >= 2
     assert "gone slow" not in texts
-    assert texts.count("half slow") == 1
-    assert texts.count("not measured") == 1
+    # A row of panels for each of the two scenes.
+    for words in ("decode time (ms)", "size (bpp)"):
+        assert texts.count(words) == 2
+    assert texts.count("half slow") == texts.count("not measured") == 1
+    assert texts.count("Pareto front") >= 2
+    assert [p.name for p in tmp_path.iterdir()] == ["p.svg"]
 
 
 def test_a_panel_of_errors_shows_its_methods_and_falls(tmp_path, as_text, monkeypatch):
@@ -151,7 +146,6 @@ def test_zero_cost_one_point_and_equal_points(tmp_path):
     for rows in ([ROWS[0].with_figures(bpp=0.0), ROWS[1]], ROWS[:1], [ROWS[0]] * 3):
         errors = [row.with_figures(max_error=0.1 * i) for i, row in enumerate(rows)]
         path = tmp_path / "p.png"
-        for x in ("bpp", Panel("bpp", "max_error")):
-            plot(errors, path, x=x)
-            with Image.open(path) as picture:
-                assert picture.size == (750, 585)
+        plot(errors, path, x=(Panel("bpp"), Panel("bpp", "max_error")))
+        with Image.open(path) as picture:
+            assert picture.height == 585

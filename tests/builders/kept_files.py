@@ -28,7 +28,7 @@ from wlm.lightmap.fit import SheetFit
 from wlm.probe.gaussian import trainer as probe_trainer
 from wlm.probe.model import box_of
 from wlm.smoke.fit import train
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import Pool
 from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 
 
@@ -100,7 +100,7 @@ def _opened(path: Path, system: str) -> Checkpoint:
 
 def _lightmap_running() -> Kept:
     _, trainer = lightmap_fit()
-    content = _written(lambda path: Checkpoint(path, "lightmap", {}, "0f").save_running(0, trainer.state()))
+    content = _written(lambda path: Checkpoint(path, "lightmap", {}, "0f").save({0: trainer.state()}))
     ranges = {"control": (0, 21), "adam_net.0.exp_avg_sq": (0, -1.0), "adam_maps.0.step": ((), 9.0)}
     return Kept(
         content,
@@ -124,7 +124,7 @@ def _probe_running() -> Kept:
     x = ((probes.position - box["origin"]) / box["extent"]).astype(np.float32)
     trainer = probe_trainer.Trainer(x, probes.values, profile, 0, "cpu")
     trainer.run(52)
-    content = _written(lambda path: Checkpoint(path, "probe", {}, "0f").save_running(0, trainer.state()))
+    content = _written(lambda path: Checkpoint(path, "probe", {}, "0f").save({0: trainer.state()}))
     ranges = {"control": (0, -1), "entered": ((), 2), "bounds": ((0, 0), 9.0)}
     return Kept(
         content,

@@ -10,6 +10,7 @@ from builders.checks import error_of
 
 from wlm.bundle import RESERVED, Bundle, Texture
 from wlm.export import ENGINES, LANGUAGES, export
+from wlm.export.engines.kit import filled
 from wlm.export.files import decode_texture
 from wlm.formats.exr import read_exr
 from wlm.formats.light import read_light
@@ -114,7 +115,7 @@ def test_what_cannot_be_exported(tmp_path):
     assert "numbers: cannot export: a number is NaN or infinite" in error_of(export, broken, out)
     wide = Texture(np.zeros(16385, np.uint8), "R8_UNORM", 16385, 1)
     assert "expected at most 16384 texels" in error_of(export, random_bundle(textures={"wide": wide}), out)
-    with pytest.raises(ValueError, match="reserved keys, got files"):
+    with pytest.raises(ValueError, match="writes itself, got files"):
         export(random_bundle(document={"files": []}), out)
     unknown = random_bundle(system="other")
     for engine in ENGINES:
@@ -139,3 +140,8 @@ def test_textures_of_shared_exponents_and_coordinates_decode_to_floats():
     np.testing.assert_array_equal(decoded, unpack_rgb9e5(words))
     places = decode_texture(Texture.from_texels(np.array([[[0, 65535]]], "<u2"), "R16G16_UNORM"))
     assert places.tolist() == [[[0.0, 1.0]]] and places.dtype == np.float32
+
+
+def test_a_name_is_text_in_a_readme():
+    text = filled("three_atlas.md", NAME="<b>a_1</b> [x](y)\n`", PLACE="")
+    assert text.startswith(r"# \<b\>a_1\</b\> \[x\](y)\\x0a\` for three.js" + "\n")

@@ -106,19 +106,15 @@ def test_one_voxel(inlet: bool, device: str):
 
 
 def test_too_fast(device: str):
-    """Walls, inlets, and bodies by their translation or their spin."""
+    """Walls, inlets and bodies."""
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     for wrong in (lambda: box.set_wall("-y", (0.5, 0.0, 0.0)), lambda: box.set_inlet("-x", (0.31, 0.0, 0.0))):
         with pytest.raises(WlmError, match=f"at most {MAX_SPEED}: use a shorter step"):
             wrong()
     mask = np.zeros(SHAPE, bool)
     mask[4:8, 2:6, 3] = True
-    with pytest.raises(WlmError, match="a solid's surface moves at 0.4 cells per step"):
+    with pytest.raises(WlmError, match="a body moves at 0.4 cells per step"):
         box.set_solid(mask, (0.0, 0.4, 0.0))
-    box = Lattice(SHAPE, viscosity=0.02, device=device)
-    box.set_solid(mask, spin=(0.0, 0.0, 0.05), centre=(6.0, 4.0, 3.5))
-    with pytest.raises(WlmError, match="a solid's surface"):
-        box.set_solid(mask, spin=(0.0, 0.0, 0.2), centre=(6.0, 4.0, 3.5))
 
 
 def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
@@ -234,12 +230,12 @@ def test_states_are_checked(device: str):
 
 def test_a_body_that_moves_pushes_air(device: str):
     """A sphere voxelised again at every step: no voids, no excess of air, and a drag against its motion."""
-    shape = (40, 20, 20)
+    shape = (32, 16, 16)
     box = _box(device, shape, inlet=False, viscosity=0.05)
     solid = wp.zeros(shape, dtype=wp.uint8, device=device)
     forces = []
-    for k in range(150):
-        voxelise_sphere(solid, 1, (8.0 + 0.1 * k, 10.0, 10.0), 4.0)
+    for k in range(110):
+        voxelise_sphere(solid, 1, (7.0 + 0.1 * k, 8.0, 8.0), 3.0)
         box.set_solid(solid, (0.1, 0.0, 0.0))
         box.step()
         forces.append(box.force_on_solid())
@@ -248,7 +244,7 @@ def test_a_body_that_moves_pushes_air(device: str):
     assert np.abs(density - 1).max() <= 0.1
     assert np.linalg.norm(u, axis=-1).max() <= 0.2
     # The wake follows it.
-    assert u[12:16, 8:12, 8:12, 0].mean() >= 0.02
+    assert u[10:13, 7:9, 7:9, 0].mean() >= 0.02
     fluid = shape[0] * shape[1] * shape[2] - np.count_nonzero(solid.numpy())
     assert box.mass() == pytest.approx(fluid, rel=3e-3)
 
@@ -305,19 +301,6 @@ def test_freed_cells_get_the_mean_of_their_neighbours(device: str):
     np.testing.assert_array_equal(box.velocity().numpy(), 0.0)
 
 
-def test_a_rotor_turns_the_air(device: str):
-    """A disc that spins drags air round with it, and feels no push along its axis."""
-    box = Lattice((20, 20, 6), viscosity=0.05, device=device)
-    place = np.indices((20, 20)) + 0.5 - 10
-    mask = np.repeat((np.hypot(*place) < 4)[:, :, None], 6, axis=2)
-    box.set_solid(mask, spin=(0.0, 0.0, 0.02), centre=(10.0, 10.0, 3.0))
-    box.step(300)
-    u = box.velocity().numpy()
-    assert u[15, 10, 3, 1] == pytest.approx(-u[4, 10, 3, 1], rel=0.05)
-    assert u[15, 10, 3, 1] >= 0.02
-    np.testing.assert_allclose(box.force_on_solid(), 0.0, atol=1e-4)
-
-
 def test_domain_converts():
     domain = Domain(0.05, 0.1 * 0.05 / 4.0)
     assert domain.speed(4.0) == pytest.approx(0.1)
@@ -367,32 +350,22 @@ def _cavity_error(reynolds: int, cells: int, steps: int, device: str, **settings
 
 
 @pytest.mark.slow
-def test_cavity_at_100(device: str):
-    """0.0030 when it no longer changes."""
-    assert _cavity_error(100, 64, 8000, device) <= 0.006
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("reynolds", "cells", "steps"), [(400, 64, 24000), (400, 128, 60000), (1000, 128, 100000)])
-def test_cavity_at_higher_reynolds(reynolds: int, cells: int, steps: int, device: str):
-    """0.0044 at Re 400 with 64 cells."""
-    assert _cavity_error(reynolds, cells, steps, device) <= 0.02
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("lattice", "operator", "smagorinsky"),
+    ("reynolds", "cells", "steps", "settings", "most"),
     [
-        ("D3Q19", "regularised", 0.0),
-        ("D3Q19", "regularised", 0.17),
-        ("D3Q27", "regularised", 0.0),
-        ("D2Q9", "bgk", 0.0),
+        (100, 64, 8000, {}, 0.006),  # 0.0030 when it no longer changes
+        (400, 64, 24000, {}, 0.02),  # 0.0044
+        (400, 128, 60000, {}, 0.02),
+        (1000, 128, 100000, {}, 0.02),
+        # The lattices in three dimensions are one cell thick.
+        (400, 64, 24000, {"lattice": "D3Q19"}, 0.02),
+        (400, 64, 24000, {"lattice": "D3Q19", "smagorinsky": 0.17}, 0.02),
+        (400, 64, 24000, {"lattice": "D3Q27"}, 0.02),
+        (400, 64, 24000, {"operator": "bgk"}, 0.02),
     ],
 )
-def test_cavity_in_every_way(lattice: str, operator: str, smagorinsky: float, device: str):
-    """The lattices in three dimensions are one cell thick."""
-    settings = {"lattice": lattice, "operator": operator, "smagorinsky": smagorinsky}
-    assert _cavity_error(400, 64, 24000, device, **settings) <= 0.02
+def test_cavity(reynolds: int, cells: int, steps: int, settings: dict, most: float, device: str):
+    assert _cavity_error(reynolds, cells, steps, device, **settings) <= most
 
 
 def _vortex_ratio(cells: int, device: str, **settings) -> float:
@@ -468,14 +441,14 @@ def test_channel_is_of_second_order(lattice: str, operator: str, device: str):
 
 def test_sphere_in_a_cubic_array(device: str):
     """Stokes drag, and that momentum exchange gives the force that drives the air."""
-    cells, viscosity, push = 16, 1 / 6, 1e-5
+    cells, viscosity, push = 12, 1 / 6, 1e-5
     radius = cells * (3 / 8 / (4 * np.pi)) ** (1 / 3)
     solid = wp.zeros((cells,) * 3, dtype=wp.uint8, device=device)
     voxelise_sphere(solid, 1, (cells / 2,) * 3, radius)
     box = Lattice((cells,) * 3, viscosity=viscosity, smagorinsky=0.0, device=device)
     box.set_solid(solid)
     box.set_force((push, 0.0, 0.0))
-    box.step(1500)
+    box.step(800)
     force = box.force_on_solid()
     assert force[0] == pytest.approx(push * (solid.numpy() == 0).sum(), rel=1e-3)
     np.testing.assert_allclose(force[1:], 0.0, atol=1e-4 * force[0])

@@ -35,14 +35,7 @@ def test_bytes_and_pieces_are_written(tmp_path, target):
     assert sorted(os.listdir(tmp_path)) == ["file.bin", "new.bin"]
 
 
-def test_a_write_that_takes_less_than_given_goes_on(target, monkeypatch):
-    whole_write = os.write
-    monkeypatch.setattr(os, "write", lambda handle, data: whole_write(handle, data[:3]))
-    atomic_write(target, [b"0123456789", b"abcdef"])
-    assert target.read_bytes() == b"0123456789abcdef"
-
-
-@pytest.mark.parametrize("call", ["write", "fsync", "replace", "open"])
+@pytest.mark.parametrize("call", ["fsync", "replace", "open"])
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
 def test_a_refusing_system_leaves_nothing_behind(target, monkeypatch, call, number):
     def refuse(*args, **kwargs):

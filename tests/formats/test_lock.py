@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from wlm.errors import WlmError
-from wlm.formats import lock
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.folder import claim, staged, write_index
 from wlm.formats.lock import is_passing, locked
@@ -120,20 +119,6 @@ def test_what_is_in_the_making_is_no_file_of_others(tmp_path):
             claim(tmp_path, "index.json", "f")
         with locked(tmp_path):
             (tmp_path / mine).unlink()
-
-
-def test_a_system_without_locks(tmp_path, monkeypatch):
-    """Nobody is kept out, and nothing is removed, since nobody can tell whose it is."""
-    with another_process(f"with atomic_path({str(tmp_path / 'a')!r}):"):
-        left = os.listdir(tmp_path)
-    monkeypatch.setattr(lock, "fcntl", None)
-    before = len(os.listdir("/dev/fd"))
-    with locked(tmp_path / "a"), atomic_path(tmp_path / "a") as part:
-        part.write_text("a")
-        assert len(os.listdir("/dev/fd")) == before, "Windows renames no file that is open"
-    with staged(tmp_path / "out", "index.json", "f") as made:
-        write_index(made / "index.json", {"format": "f"})
-    assert sorted(os.listdir(tmp_path)) == [*left, "a", "out"]
 
 
 def test_a_file_system_without_locks(tmp_path, monkeypatch):

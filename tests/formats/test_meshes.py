@@ -109,8 +109,16 @@ def test_a_damaged_file_is_one_line(tmp_path, text):
     assert line.startswith(f"{tmp_path / 'a.obj'}: malformed OBJ: ")
 
 
+def test_many_corners_and_materials_are_refused_before_they_are_read(tmp_path):
+    for text, words in (
+        ("f" + " 1" * 5_000_000, "expected at most 4194304 numbers for the size of the file"),
+        ("".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(1025)), r"expected at most 1,024 materials"),
+    ):
+        assert words in error_of(_read, tmp_path, SQUARE + text)
+
+
 def test_a_missing_file_and_another_format(tmp_path):
     with pytest.raises(WlmError, match="No such file"):
         read_mesh(tmp_path / "a.obj")
-    with pytest.raises(WlmError, match="expected a mesh"):
+    with pytest.raises(WlmError, match="expected a mesh file"):
         read_mesh(tmp_path / "a.fbx")

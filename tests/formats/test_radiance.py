@@ -107,7 +107,7 @@ def test_exposures_and_colours_multiply(tmp_path):
         (HEAD + b"COLORCORR=1 2\n", "-Y 1 +X 1", b"abcd", "COLORCORR: expected 3 finite number(s) above 0"),
         (HEAD, "-Y 1 -Y 1", b"abcd", "expected a size like -Y 512 +X 512"),
         (HEAD, "1 1", b"abcd", "expected a size like -Y 512 +X 512"),
-        (HEAD, "-Y 0 +X 1", b"abcd", "expected at least one texel, found 1 x 0"),
+        (HEAD, "-Y 0 +X 1", b"abcd", "65536 along a side, found 1 x 0"),
         (HEAD, "-Y 65537 +X 1", b"abcd", "65536 along a side, found 1 x 65537"),
         (HEAD, "-Y 16384 +X 16384", b"abcd", "expected at most 2048 times its"),
         (HEAD, "-Y 2 +X 1", b"abcd", "cut short or damaged"),

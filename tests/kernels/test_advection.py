@@ -6,7 +6,7 @@ import warp as wp
 from reference.advection import Domain
 
 from wlm_kernels.fluid import advection_sources
-from wlm_kernels.fluid.advection import STORAGES, Fields, advect, correct
+from wlm_kernels.fluid.advection import STORAGES, Fields, advect
 from wlm_kernels.fluid.advection_places import (
     BRICK,
     CLOSED,
@@ -79,7 +79,7 @@ class Grid:
                     advection_sources.empty_retired(self.box, self.bricks, buffer)
             if self.scheme == "maccormack":
                 advect(*at, fields, spare[0], dt, bricks=self.bricks)
-                correct(*at, fields, spare[0], spare[1], dt, decay, self.bricks)
+                advect(*at, fields, spare[1], dt, decay, self.bricks, spare[0])
                 fields, spare[1] = spare[1], fields
             else:
                 advect(*at, fields, spare[0], dt, decay, self.bricks)

@@ -41,8 +41,8 @@ LATENTS = (1, 9, 12, 32)
 LATTICE_STEPS = (
     {"lattice": "D3Q19", "solids": True, "walls": (True, True, True)},
     {"lattice": "D3Q19", "solids": True, "storage": "float16"},
-    {"lattice": "D3Q19", "operator": "bgk", "force": "field"},
-    {"lattice": "D3Q27", "solids": True, "force": "uniform"},
+    {"lattice": "D3Q19", "operator": "bgk", "forced": True},
+    {"lattice": "D3Q27", "solids": True, "forced": True},
     {"lattice": "D3Q27", "storage": "float16", "eddies": False},
     {"lattice": "D2Q9"},
 )
@@ -91,7 +91,7 @@ def _boundaries(kind: tuple[str, str], balance: bool) -> list:
 
 def _advection(bricks: bool, solids: bool, stored: type) -> list:
     carry = [advection.carry_kernel(correcting, stored, bricks, solids, not solids) for correcting in BOTH]
-    return _members(carry, advection_sources.source_kernels(stored))
+    return _members(carry, list(advection_sources.source_kernels(stored).values()))
 
 
 def _planes(half: bool) -> list:
@@ -130,7 +130,7 @@ FACTORIES = [
         (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")),
         BOTH,
     ),
-    *_cases("advection", _advection, [(True, True, wp.float16)], BOTH, BOTH, FLOATS),
+    *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
     *_cases("planes", _planes, [(True,)], BOTH),
     *_cases(
         "naf_block",

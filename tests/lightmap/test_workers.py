@@ -322,7 +322,7 @@ def test_what_is_kept_comes_back(tmp_path):
     table = {"uv": Part(np.uint8, (2, 3, 4)), "net": Part(np.float16, (2, 5))}
     parts = {"uv": np.arange(24, dtype=np.uint8).reshape(2, 3, 4), "net": np.ones((2, 5), np.float16)}
     checkpoint.add_finished(0, parts)
-    checkpoint.save_running(1, {"maps": np.arange(5.0, dtype=np.float32), "adam.0.step": np.array(7.0, np.float32)})
+    checkpoint.save({1: {"maps": np.arange(5.0, dtype=np.float32), "adam.0.step": np.array(7.0, np.float32)}})
 
     back = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
     assert back.resumed
@@ -344,7 +344,7 @@ def test_it_is_due_a_while_after_the_last_save(tmp_path, monkeypatch):
     for now[0] in (101.0, 102.0, 103.0, 104.0, 105.0, 106.0):
         dues.append(checkpoint.due())
         if dues[-1]:
-            checkpoint.save_running(0, {"step": np.array(now[0])})
+            checkpoint.save({0: {"step": np.array(now[0])}})
     assert dues == [False, True, False, True, False, True]
     checkpoint.add_finished(0, {"uv": np.zeros(4, np.uint8)})
     assert not checkpoint.due()
@@ -405,7 +405,7 @@ def test_the_order_of_tiles_and_the_number_of_the_gpu_do_not_matter(tmp_path):
 
 def test_a_checkpoint_of_another_system_is_refused(tmp_path):
     fit_of = {"input": "0f", "levels": (1, 2)}
-    Checkpoint(tmp_path / "a.wlm", "probe", fit_of, "0f").save_running(0, {"step": np.array(3)})
+    Checkpoint(tmp_path / "a.wlm", "probe", fit_of, "0f").save({0: {"step": np.array(3)}})
     assert Checkpoint(tmp_path / "a.wlm", "probe", fit_of, "0f", resume=True).running(0)["step"] == 3
     with pytest.raises(WlmError, match="expected an artifact of lightmap-checkpoint, found one of probe-checkpoint"):
         open_checkpoint(tmp_path / "a.wlm", moving_light(40, 24), PROFILE, resume=True)

@@ -28,6 +28,10 @@ class Domain:
     ends: tuple[tuple[int, int], ...]
 
     @cached_property
+    def ends_of_traces(self) -> dict:
+        return {}
+
+    @cached_property
     def shape(self) -> np.ndarray:
         return np.array(self.solid.shape) * self.refinement
 
@@ -75,7 +79,13 @@ class Domain:
         return bool(cells[tuple(np.minimum(cell, np.array(cells.shape) - 1))])
 
     def departure_point(self, x: np.ndarray, dt: float) -> np.ndarray:
-        """x - dt u(x - dt u(x) / 2), cut where the trace meets a solid."""
+        """x - dt u(x - dt u(x) / 2), cut where the trace meets a solid; each is computed once."""
+        key = *x, dt
+        if key not in self.ends_of_traces:
+            self.ends_of_traces[key] = self._trace(x, dt)
+        return self.ends_of_traces[key]
+
+    def _trace(self, x: np.ndarray, dt: float) -> np.ndarray:
         middle = x - 0.5 * dt * self.velocity(x)
         away = middle / self.refinement - 0.5 - np.floor(x / self.refinement - 0.5)
         v = self.velocity(middle)

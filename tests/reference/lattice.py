@@ -1,4 +1,4 @@
-"""A lattice Boltzmann step in float64, cell by cell and with complete populations f (not f - w).
+"""A lattice Boltzmann step in float64, with complete populations f (not f - w).
 
     f = equilibrium(c, w, rho, u)
     while True:
@@ -8,7 +8,7 @@ It shares no code with the kernels: streaming finds for each cell and direction 
 collision uses Hermite polynomials.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,21 +26,21 @@ class Box:
         c, w: Velocities [Q, 3] and weights [Q].
         solid: int [X, Y, Z], 0 is fluid.
         faces: For some of `FACES`: one of `RANKS`, and the velocity or the density (None: mass is conserved).
-        motion: (body, position in cells) -> velocity of its surface.
+        velocity: Velocity of the solids.
     """
 
     c: np.ndarray
     w: np.ndarray
     solid: np.ndarray
     faces: dict[str, tuple[str, object]] = field(default_factory=dict)
-    motion: Callable = lambda body, x: np.zeros(3)
+    velocity: Sequence[float] = (0.0, 0.0, 0.0)
 
-    def crossed(self, source: np.ndarray) -> list[int]:
+    def crossed(self, source: Sequence[int]) -> list[int]:
         """The faces, by their numbers in `FACES`, beyond which a cell lies; periodic ones don't count."""
-        beyond = np.stack([source < 0, source >= self.solid.shape], 1).ravel()
-        return [number for number in np.flatnonzero(beyond) if FACES[number] in self.faces]
+        beyond = [out for at, n in zip(source, self.solid.shape, strict=True) for out in (at < 0, at >= n)]
+        return [number for number in range(6) if beyond[number] and FACES[number] in self.faces]
 
-    def face_of(self, source: np.ndarray) -> tuple[str, object] | None:
+    def face_of(self, source: Sequence[int]) -> tuple[str, object] | None:
         """The condition of a population that comes from `source`; None inside or across a periodic face."""
         ranked = []
         for number in self.crossed(source):
@@ -65,49 +65,47 @@ def fields(box: Box, f: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.n
 
 def collide(box: Box, f: np.ndarray, operator: str, viscosity: float, smagorinsky: float, force) -> np.ndarray:
     """The populations that leave each cell, from those that have arrived."""
-    c, w, out = box.c, box.w, np.empty_like(f)
+    c, w, fluid = box.c, box.w, box.solid == 0
     traceless = np.einsum("qa,qb->qab", c, c) - CS2 * np.eye(3) * c.any(0)
-    for cell in zip(*np.nonzero(box.solid == 0), strict=True):
-        rho = f[cell].sum()
-        u = f[cell] @ c / rho
-        after = u + force[cell] / rho
-        f_eq = equilibrium(c, w, rho, u)
-        stress = np.einsum("q,qa,qb->ab", f[cell] - f_eq, c, c)
-        # |S| = sqrt(2) 3 |Pi| / (2 rho tau) and tau = tau_0 + 3 C^2 |S|, by iteration to the fixed point.
-        tau, previous = 0.5 + 3.0 * viscosity, 0.0
-        while abs(tau - previous) > 1e-15:
-            rate = np.sqrt(2.0) * 1.5 / (rho * tau) * np.linalg.norm(stress)
-            previous, tau = tau, 0.5 + 3.0 * viscosity + 3.0 * smagorinsky**2 * rate
-        keep = 1.0 - 1.0 / tau
-        axes = np.diag(c.any(0).astype(float))
-        shear = stress - axes * np.trace(stress) / np.trace(axes)
-        if operator == "bgk":
-            out[cell] = f[cell] - (f[cell] - f_eq) / tau + equilibrium(c, w, rho, after) - f_eq
-        else:
-            second = w * np.einsum("qab,ab->q", traceless, shear) / (2 * CS2**2)
-            out[cell] = equilibrium(c, w, rho, after) + keep * second
+    came, push = f[fluid], force[fluid]
+    rho = came.sum(1)
+    u = came @ c / rho[:, None]
+    f_eq, after = equilibrium(c, w, rho, u), equilibrium(c, w, rho, u + push / rho[:, None])
+    stress = np.einsum("nq,qa,qb->nab", came - f_eq, c, c)
+    # |S| = sqrt(2) 3 |Pi| / (2 rho tau) and tau = tau_0 + 3 C^2 |S|, by iteration to the fixed point.
+    tau, previous = np.full(len(rho), 0.5 + 3.0 * viscosity), 0.0
+    while np.abs(tau - previous).max() > 1e-15:
+        rate = np.sqrt(2.0) * 1.5 / (rho * tau) * np.linalg.norm(stress, axis=(1, 2))
+        previous, tau = tau, 0.5 + 3.0 * viscosity + 3.0 * smagorinsky**2 * rate
+    keep = 1.0 - 1.0 / tau[:, None]
+    axes = np.diag(c.any(0).astype(float))
+    shear = stress - axes * np.trace(stress, axis1=1, axis2=2)[:, None, None] / np.trace(axes)
+    out = np.empty_like(f)
+    if operator == "bgk":
+        out[fluid] = after + keep * (came - f_eq)
+    else:
+        out[fluid] = after + keep * w * np.einsum("qab,nab->nq", traceless, shear) / (2 * CS2**2)
     return out
 
 
 def stream(box: Box, f: np.ndarray) -> np.ndarray:
     """The populations that arrive in each cell, from those that left."""
-    c, w, shape = box.c, box.w, np.array(box.solid.shape)
+    c, w, shape = box.c, box.w, box.solid.shape
+    directions = c.tolist()
     opposite = [int(np.flatnonzero((c == -velocity).all(1))[0]) for velocity in c]
     out = np.zeros_like(f)
     balance, open_weight, balanced = 0.0, 0.0, []
     for cell in np.ndindex(f.shape[:3]):
         if box.solid[cell]:
             continue
-        for q in range(len(c)):
-            source = np.array(cell) - c[q]
+        for q, direction in enumerate(directions):
+            source = [at - step for at, step in zip(cell, direction, strict=True)]
             leaves = f[cell][opposite[q]]
             face = box.face_of(source)
             if face is None:
-                inside = tuple(source % shape)
-                body = int(box.solid[inside])
-                if body:
-                    velocity = box.motion(body, np.array(cell) + 0.5 - 0.5 * c[q])
-                    out[cell][q] = leaves + 2 * w[q] * (c[q] @ velocity) / CS2
+                inside = tuple(at % n for at, n in zip(source, shape, strict=True))
+                if box.solid[inside]:
+                    out[cell][q] = leaves + 2 * w[q] * (c[q] @ np.asarray(box.velocity)) / CS2
                     balance += out[cell][q] - leaves
                 else:
                     out[cell][q] = f[inside][q]

@@ -23,17 +23,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import unquote
 
 import numpy as np
 
-from wlm.atlas.listing import Listing, SheetFiles, has_lightmap, numbers
+from wlm.atlas.listing import Listing, SheetFiles, numbers
 from wlm.errors import WlmError, one_line
 from wlm.formats.gltf import (
     GltfDocument,
     GltfPrimitive,
     held_image,
-    local_file,
+    image_file,
     parse_gltf,
     reported,
     texture_image,
@@ -43,18 +42,24 @@ from wlm.formats.gltf_slots import IDENTITY, SLOTS, lightmap_transform
 from wlm.formats.gltf_writer import Replacement, encode_glb
 from wlm.formats.levels import HEAD, level_kind
 from wlm.formats.reading import open_file
+from wlm.formats.unity_asset import has_lightmap
 
-# Extensions of materials: the field of the texture (None: the extension itself), the field of the factor, the UV set
-# without texCoord.
-_MATERIALS: dict[str, tuple[str | None, str, int]] = {
-    "MOZ_lightmap": (None, "intensity", 1),
-    "XR3_lightmap": (None, "intensity", 1),
+_MX, _EPIC, _NEEDLE = "MX_lightmap", "EPIC_lightmap_textures", "NEEDLE_lightmaps"
+# Extensions of materials, and MX of nodes: the field of the texture ("": the extension itself), the field of the
+# factor, the UV set without texCoord.
+_FIELDS = {
+    "MOZ_lightmap": ("", "intensity", 1),
+    "XR3_lightmap": ("", "intensity", 1),
     "FB_materials_lightmap": ("lightmapTexture", "lightmapFactor", 0),
     "WEBGI_materials_lightmap": ("lightMapTexture", "lightMapIntensity", 0),
+    _MX: ("lightMapTexture", "intensity", 1),
 }
-_MX, _EPIC, _NEEDLE = "MX_lightmap", "EPIC_lightmap_textures", "NEEDLE_lightmaps"
-EXTENSIONS = (*_MATERIALS, _MX, _EPIC, _NEEDLE)
+EXTENSIONS = (*_FIELDS, _EPIC, _NEEDLE)
 """Extensions whose lightmaps are read."""
+
+
+Rectangle = tuple[float, float, float, float]
+"""Scale and offset of UVs, v down."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,7 @@ class Reading:
     transform: tuple[float, ...] = IDENTITY
 
     @property
-    def rectangle(self) -> tuple[float, float, float, float] | None:
+    def rectangle(self) -> Rectangle | None:
         """The transform as a rectangle: scale and offset; None if it turns or shears."""
         a, b, x, c, d, y = self.transform
         return None if b or c else (a, d, x, y)
@@ -77,26 +82,7 @@ Readings = dict[tuple[int, int], Reading]
 """The readings by node and number of the primitive in its mesh."""
 
 
-@dataclass(frozen=True, eq=False)
-class OwnLightmaps:
-    """The lightmaps that a file names: its list without objects, the readings, and one line for each assumption."""
-
-    listing: Listing
-    readings: Readings
-    notes: tuple[str, ...]
-
-
-class Settled(NamedTuple):
-    """A document whose primitives read one UV set: the document, its primitives, n of the set, and by node the number
-    of its sheet and its rectangle."""
-
-    document: GltfDocument
-    primitives: list[GltfPrimitive]
-    uv_set: int
-    places: dict[int, tuple[int, tuple[float, float, float, float]]]
-
-
-class _Entry(NamedTuple):
+class _Slot(NamedTuple):
     """A texture slot that holds a lightmap; `rectangle` is scale and offset, v down."""
 
     info: dict[str, Any]
@@ -125,7 +111,7 @@ def own_lightmaps(
     slot: str | None = None,
     encoding: str | None = None,
     uv_set: int | None = None,
-) -> OwnLightmaps:
+) -> tuple[Listing, Readings]:
     """Lists the lightmaps that a file names.
 
     Args:
@@ -133,6 +119,9 @@ def own_lightmaps(
         slot: One of `SLOTS`, to read it instead of an extension.
         encoding: Encoding of images of 8 bits; None: that of the table.
         uv_set: Replaces the stated UV set of all slots.
+
+    Returns:
+        The list, without objects and with a note for each assumption; and the readings.
 
     Raises:
         WlmError: The file names no lightmap that can be read; the line names the extension or the slots that it has.
@@ -161,101 +150,78 @@ def _none(document: GltfDocument) -> str:
 
 def _own(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], name: str, encoding: str | None, uv_set: int | None
-) -> OwnLightmaps:
-    sheets: dict[tuple, SheetFiles] = {}
+) -> tuple[Listing, Readings]:
+    sheets: dict[tuple, tuple[int, SheetFiles]] = {}
     held: dict[str, bytes | memoryview] = {}
+    images: dict[int, tuple[str, str | None]] = {}
     readings: Readings = {}
-    lacking, defaults, order = 0, set(), {}
-    images: dict[int, tuple[str, Path | None]] = {}
-    parents = {
-        child: number for number, node in enumerate(document.content["nodes"]) for child in node.get("children", [])
-    }
+    lacking, defaults = 0, set()
+    nodes = document.content["nodes"]
+    parents = {child: number for number, node in enumerate(nodes) for child in node.get("children", [])}
     for each in primitives:
-        entry = _entry(document, each, name, parents.get(each.node, each.node))
-        if entry is None:
+        slot = _slot(document, each, name, parents.get(each.node, each.node))
+        if slot is None:
             continue
         where = f"{document.path}: nodes[{each.node}]: {name}"
-        info = entry.info
-        stated = info.get("extensions", {}).get("KHR_texture_transform", {}).get("texCoord", info.get("texCoord"))
+        stated, inner = texture_transform(where, slot.info)
         number = stated if uv_set is None else uv_set
         if number is None:
-            number = entry.uv_set if entry.uv_set in each.uv else 0
+            number = slot.uv_set if slot.uv_set in each.uv else 0
             defaults.add(number)
         if number not in each.uv:
             lacking += 1
             continue
-        image = texture_image(document, info["index"])
-        factor = _factor(entry.factor, where)
+        image, factor = texture_image(document, slot.info["index"]), _factor(slot.factor, where)
         if image not in images:
-            images[image] = _image(document, image, held)
-        label, path = images[image]
+            images[image] = _picture(document, image, name, encoding, held)
+        label, stored = images[image]
         key = label, tuple(np.ravel(factor))
         if key not in sheets:
-            order[key] = len(sheets)
             title = document.item("images", image).get("name")
-            sheets[key] = SheetFiles(
-                files=[label],
-                name=title if isinstance(title, str) and title else None,
-                encoding=_encoding(document, name, held.get(label), path, encoding),
-                intensity=factor,
-            )
-        sx, sy, x, y = numbers(list(entry.rectangle), where, ("x", "y", "z", "w"))
-        inner = texture_transform(where, info)
-        moved = np.array([[sx, 0.0], [0.0, sy]]) @ inner + np.array([[0.0, 0.0, x], [0.0, 0.0, y]])
-        readings[each.node, each.primitive] = Reading(order[key], number, tuple(map(float, moved.ravel())))
+            title = title if isinstance(title, str) and title else None
+            files = SheetFiles(files=[label], name=title, encoding=stored, intensity=factor)
+            sheets[key] = len(sheets), files
+        sx, sy, x, y = numbers(list(slot.rectangle), where, ("x", "y", "z", "w"))
+        moved = np.array([[sx], [sy]]) * inner + [[0.0, 0.0, x], [0.0, 0.0, y]]
+        readings[each.node, each.primitive] = Reading(sheets[key][0], number, tuple(map(float, moved.ravel())))
     if not readings:
         reason = f"the UVs that it names are missing in {lacking} primitives" if lacking else "no lit mesh is drawn"
         raise WlmError(f"{document.path}: {name}: {reason}")
-    listing = Listing(document.path, ("light",), tuple(sheets.values()), held=held)
-    return OwnLightmaps(listing, readings, _notes(document, name, sheets, defaults, lacking))
-
-
-def _notes(
-    document: GltfDocument, name: str, sheets: dict[tuple, SheetFiles], defaults: set[int], lacking: int
-) -> tuple[str, ...]:
-    """Returns one line for each assumption about the lightmaps of a document."""
-    many = f"{len(sheets)} lightmap{'s' if len(sheets) > 1 else ''}"
+    files = tuple(files for _, files in sheets.values())
+    many = f"{len(files)} lightmap{'s' if len(files) > 1 else ''}"
     notes = [f"{document.path}: {many} of {'the slot ' if name in SLOTS else ''}{name}"]
-    for encoding in sorted({each.encoding for each in sheets.values() if each.encoding}):
-        notes.append(f"{document.path}: {name}: images of 8 bits are read as {encoding} (see --encoding)")
+    for stored in sorted({each.encoding for each in files if each.encoding}):
+        notes.append(f"{document.path}: {name}: images of 8 bits are read as {stored} (see --encoding)")
     if defaults:
         names = ", ".join(f"TEXCOORD_{number}" for number in sorted(defaults))
         notes.append(f"{document.path}: {name}: texCoord is not stated: {names} is read (see --uv-set)")
     if lacking:
         notes.append(f"{document.path}: {name}: {lacking} primitives lack the UVs that it names: left out")
-    return tuple(notes)
+    return Listing(document.path, ("light",), files, held=held, notes=tuple(notes)), readings
 
 
-def _entry(document: GltfDocument, primitive: GltfPrimitive, name: str, parent: int) -> _Entry | None:
+def _slot(document: GltfDocument, primitive: GltfPrimitive, name: str, parent: int) -> _Slot | None:
     """Returns the slot with which a primitive names its lightmap by the extension or the slot `name`; `parent` is the
     node above its own, on which Needle writes the renderer of a mesh of several materials."""
     material = {} if primitive.material is None else document.item("materials", primitive.material)
     if name in SLOTS:
         info = material.get(f"{name}Texture")
-        return None if info is None else _Entry(info, 0, _emission(material) if name == "emissive" else 1.0)
-    if name in _MATERIALS:
-        field, factor, uv_set = _MATERIALS[name]
-        extension = material.get("extensions", {}).get(name)
-        info = extension if field is None or extension is None else extension.get(field)
-        return None if info is None else _Entry(info, uv_set, extension.get(factor, 1.0))
+        return None if info is None else _Slot(info, 0, _emission(material) if name == "emissive" else 1.0)
     node = document.item("nodes", primitive.node).get("extensions", {})
     if name == _NEEDLE:
         return _needle(document, node) or _needle(document, document.item("nodes", parent).get("extensions", {}))
-    if name not in node:
+    own = (node if name in (_MX, _EPIC) else material.get("extensions", {})).get(name)
+    if own is None:
         return None
-    if name == _MX:
-        own = node[name]
-        return _Entry(
-            own["lightMapTexture"],
-            1,
-            own.get("intensity", 1.0),
-            (*own.get("scale", (1.0, 1.0)), *own.get("offset", (0.0, 0.0))),
-        )
-    own = document.content["extensions"][name]["lightmaps"][node[name]["lightmap"]]
-    plain = list(own.get("lightmapScale", [1] * 4)) == [1] * 4 and list(own.get("lightmapAdd", [0] * 4)) == [0] * 4
-    if not plain:
-        raise WlmError(f"{document.path}: nodes[{primitive.node}]: {_UNREAL}")
-    return _Entry(own["texture"], 0, 1.0, own.get("coordinateScaleBias", (1.0, 1.0, 0.0, 0.0)))
+    if name == _EPIC:
+        own = document.content["extensions"][name]["lightmaps"][own["lightmap"]]
+        if [*own.get("lightmapScale", [1] * 4), *own.get("lightmapAdd", [0] * 4)] != [1] * 4 + [0] * 4:
+            raise WlmError(f"{document.path}: nodes[{primitive.node}]: {_UNREAL}")
+        return _Slot(own["texture"], 0, 1.0, own.get("coordinateScaleBias", (1.0, 1.0, 0.0, 0.0)))
+    field, factor, uv_set = _FIELDS[name]
+    info = own.get(field) if field else own
+    rectangle = (*own.get("scale", (1.0, 1.0)), *own.get("offset", (0.0, 0.0)))
+    return None if info is None else _Slot(info, uv_set, own.get(factor, 1.0), rectangle)
 
 
 _UNREAL = (
@@ -264,7 +230,7 @@ _UNREAL = (
 )
 
 
-def _needle(document: GltfDocument, node: dict[str, Any]) -> _Entry | None:
+def _needle(document: GltfDocument, node: dict[str, Any]) -> _Slot | None:
     """Returns the lightmap of Needle's renderer on a node."""
     textures = document.content.get("extensions", {}).get(_NEEDLE, {}).get("textures", [])
     for component in node.get("NEEDLE_components", {}).get("builtin_components", []):
@@ -280,7 +246,7 @@ def _needle(document: GltfDocument, node: dict[str, Any]) -> _Entry | None:
             raise WlmError(f"{document.path}: {_NEEDLE}.pointer: expected textures/NUMBER, found {where}")
         place = component.get("lightmapScaleOffset", {"x": 1.0, "y": 1.0, "z": 0.0, "w": 0.0})
         sx, sy, x, y = numbers(place, f"{document.path}: {_NEEDLE}", ("x", "y", "z", "w"))
-        return _Entry({"index": int(pointer[1])}, 1, 1.0, (sx, sy, x, 1.0 - sy - y))
+        return _Slot({"index": int(pointer[1])}, 1, 1.0, (sx, sy, x, 1.0 - sy - y))
     return None
 
 
@@ -299,35 +265,26 @@ def _factor(value: Any, where: str) -> float | list[float]:
     return float(factor.ravel()[0]) if (factor == factor.ravel()[0]).all() else factor.tolist()
 
 
-def _image(document: GltfDocument, number: int, held: dict[str, bytes | memoryview]) -> tuple[str, Path | None]:
-    """Returns the name of an image, which tells it from others: that of its file with the path, or of its place in the
-    document, whose bytes are added to `held`."""
+def _picture(
+    document: GltfDocument, number: int, name: str, stated: str | None, held: dict[str, bytes | memoryview]
+) -> tuple[str, str | None]:
+    """Returns the name of an image, that of its file or of its place in the document, whose bytes are added to `held`;
+    and its encoding, None for a format that defines its light itself."""
     data = held_image(document, number)
-    if data is not None:
+    if data is None:
+        path = image_file(document, number)
+        label = path.relative_to(Path(document.path).parent).as_posix()
+        with open_file(path, "the lightmap") as file:
+            data = file.read(HEAD)
+    else:
         image = document.item("images", number)
         label = f"bufferViews[{image['bufferView']}]" if "bufferView" in image else f"images[{number}]"
         held[label] = data
-        return label, None
-    uri = str(document.item("images", number)["uri"])
-    path = local_file(document.path, uri, f"{document.path}: images[{number}].uri", document.trust)
-    name = unquote(uri)
-    # Some writers don't encode a percent sign of the name.
-    raw = Path(document.path).parent / uri
-    return (uri, raw) if not path.exists() and raw.exists() else (name, path)
-
-
-def _encoding(
-    document: GltfDocument, name: str, data: bytes | memoryview | None, path: Path | None, stated: str | None
-) -> str | None:
-    """Returns the encoding of an image, None for a format that defines its light itself."""
-    if data is None:
-        with open_file(path, "the lightmap") as file:
-            data = file.read(HEAD)
-    kind = level_kind(path or "", bytes(data[:HEAD]))
+    kind = level_kind(label, bytes(data[:HEAD]))
     if kind is None or kind == "TIFF":
-        return None
+        return label, None
     if stated is not None:
-        return stated
+        return label, stated
     if name == _NEEDLE:
         raise WlmError(
             f"{document.path}: {_NEEDLE}: an image of 8 bits in Needle's RGBM, whose range differs between versions: "
@@ -336,7 +293,7 @@ def _encoding(
     alpha = kind == "PNG" and len(data) > 25 and data[25] in (4, 6)  # colour types with alpha
     if name == _EPIC and alpha:
         raise WlmError(f"{document.path}: {_UNREAL}")
-    return "rgbm" if name == _MX and alpha else "srgb"
+    return label, "rgbm" if name == _MX and alpha else "srgb"
 
 
 def slot_readings(
@@ -374,11 +331,16 @@ def slot_readings(
     return readings, (line,)
 
 
-def settle(document: GltfDocument, primitives: Sequence[GltfPrimitive], readings: Readings) -> Settled:
+def settle(
+    document: GltfDocument, primitives: Sequence[GltfPrimitive], readings: Readings
+) -> tuple[GltfDocument, list[GltfPrimitive], int, dict[int, tuple[int, Rectangle]]]:
     """Makes all readings of a node one rectangle of one UV set.
 
     Where they are not, because a transform turns, a node's materials have different transforms, or slots read different
     sets, the moved UVs are added to a copy of the document as a new UV set.
+
+    Returns:
+        The document, its primitives, n of the UV set, and by node the number of its sheet and its rectangle.
 
     Raises:
         WlmError: The materials of one node read different lightmaps.
@@ -393,15 +355,12 @@ def settle(document: GltfDocument, primitives: Sequence[GltfPrimitive], readings
                 "the mesh by material"
             )
     sets = {each.uv_set for each in readings.values()}
-    places = {}
     if len(sets) == 1 and all(len(its) == 1 for its in by_node.values()):
-        for node, (reading,) in by_node.items():
-            if reading is not None:
-                places[node] = reading.sheet, reading.rectangle
-        if all(rectangle is not None for _, rectangle in places.values()):
-            return Settled(document, list(primitives), sets.pop(), places)
-    number = 1 + max(number for each in primitives for number in each.uv)
-    replacements = []
+        found = {node: reading for node, (reading,) in by_node.items() if reading is not None}
+        if all(reading.rectangle for reading in found.values()):
+            places = {node: (reading.sheet, reading.rectangle) for node, reading in found.items()}
+            return document, list(primitives), sets.pop(), places
+    number, places, replacements = 1 + max(number for each in primitives for number in each.uv), {}, []
     for each in primitives:
         reading = readings.get((each.node, each.primitive))
         if reading is not None:
@@ -409,6 +368,7 @@ def settle(document: GltfDocument, primitives: Sequence[GltfPrimitive], readings
             uv = (each.uv[reading.uv_set] @ rows[:, :2].T + rows[:, 2]).astype(np.float32)
             replacements.append(Replacement(each, np.arange(len(uv)), each.triangle, uv))
             places[each.node] = reading.sheet, (1.0, 1.0, 0.0, 0.0)
-    data = b"".join(encode_glb(document, replacements, number))
-    document, primitives = parse_gltf(document.path, data, document.trust)
-    return Settled(document, primitives, number, places)
+    document, primitives = parse_gltf(
+        document.path, b"".join(encode_glb(document, replacements, number)), document.trust
+    )
+    return document, primitives, number, places

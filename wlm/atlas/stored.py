@@ -11,6 +11,7 @@ import numpy as np
 
 from wlm.atlas.data import LightmappedScene, Placed, place_objects
 from wlm.atlas.model import AtlasModel
+from wlm.errors import WlmError
 from wlm.formats.gltf import parse_gltf
 from wlm.formats.gltf_writer import Replacement, encode_glb
 
@@ -55,21 +56,18 @@ def restore(model: AtlasModel) -> LightmappedScene:
     """
     stored = model.stored
     if stored is None:
-        raise ValueError(f"{model.name}: expected a model that stores the triangles of its scene, found none")
+        raise ValueError(f"{model.name}: the model has no triangles: expected one that compress or load made")
     document, primitives = parse_gltf(model.name, stored.glb)
     sheets, blocker = place_objects(model.name, primitives, stored.uv_set, stored.objects, stored.masks)
+    if len(model.uv) and len(model.uv) != len(sheets[0].triangle):
+        raise WlmError(
+            f"{model.name}: the file's mesh has {len(sheets[0].triangle)} triangles, but its new UVs are for "
+            f"{len(model.uv)}: the file is damaged"
+        )
     sheets = tuple(replace(sheet, name=place.name) for sheet, place in zip(sheets, model.sheets, strict=True))
     blocker = blocker if stored.hides else blocker[:0]
     settings = stored.uv_set, stored.metres, model.source, document
     return LightmappedScene(model.name, model.states, sheets, stored.objects, blocker, *settings)
-
-
-def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
-    """Makes the mesh for an engine. Returns the bytes of the stored `.glb`, with an additional UV set if the model has
-    new UVs, and n of the UV set `TEXCOORD_n` for which the model is made."""
-    if not len(model.uv):
-        return model.stored.glb, model.stored.uv_set
-    return with_uvs(model.scene, model.uv)
 
 
 def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int]:
@@ -82,7 +80,9 @@ def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int
     (sheet,) = scene.sheets
     corner_uv = np.asarray(corner_uv, np.float32)
     if corner_uv.shape != (len(sheet.triangle), 3, 2) or not np.isfinite(corner_uv).all():
-        raise ValueError(f"corner_uv: expected finite numbers [{len(sheet.triangle)}, 3, 2], got {corner_uv.shape}")
+        raise ValueError(
+            f"corner_uv: expected finite numbers, shape [{len(sheet.triangle)}, 3, 2], got {corner_uv.shape}"
+        )
     uv_set = 1 + max(number for part in sheet.parts for number in part.primitive.uv)
     replacements = []
     for part in sheet.parts:

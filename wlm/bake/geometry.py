@@ -3,7 +3,7 @@
 import copy
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +16,19 @@ from wlm.formats.gltf import (
     GltfDocument,
     GltfPrimitive,
     held_image,
-    local_file,
+    image_file,
     read_gltf,
     reported,
     texture_image,
     texture_transform,
     vertex_normals,
 )
-from wlm.formats.gltf_slots import lightmap_uv
+from wlm.formats.gltf_slots import lightmap_uv, usual_set
 from wlm.formats.gltf_writer import Replacement
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import MESH_BYTES
 from wlm.formats.reading import read_file
 
-_TRANSFORM = "KHR_texture_transform"
 _UNWRAPPED = 1  # n of the new `TEXCOORD_n`
 _MOST_IMAGE = 1 << 26  # pixels
 _STRONGEST = 1e9  # radiance
@@ -47,7 +46,7 @@ class Material:
         colour: Linear RGB albedo, multiplied by the texture's if there is one.
         texture: Linear RGB albedo, float32 [H, W, 3], or None.
         uv_set: The number n of the UV set `TEXCOORD_n` that the texture uses.
-        placed: Matrix of `KHR_texture_transform`, [2, 3], applied to (u, v, 1); None for the identity.
+        placed: Matrix of `KHR_texture_transform`, [2, 3], that moves the UVs (u, v, 1) of the texture.
         emission: Radiance on the front, RGB.
         double: Whether the back reflects as well; otherwise it absorbs all light.
     """
@@ -56,7 +55,7 @@ class Material:
     colour: tuple[float, float, float] = (0.8, 0.8, 0.8)
     texture: np.ndarray | None = None
     uv_set: int = 0
-    placed: np.ndarray | None = None
+    placed: np.ndarray = field(default_factory=lambda: np.eye(2, 3))
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
     double: bool = False
 
@@ -126,11 +125,10 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
         replacements = unwrap(document, primitives, settings)
         number = _UNWRAPPED
     elif settings is not None:
-        sets = {each for one in primitives for each in one.uv}
-        own = 1 if 1 in sets else 0
+        own = usual_set(primitives)
         number = own if settings.uv_set is None else settings.uv_set
         usual = number == own
-        if number not in sets:
+        if not any(number in each.uv for each in primitives):
             raise WlmError(f"{path}: expected lightmap UVs in TEXCOORD_{number}; lightmap.unwrap: true creates UVs")
     cache: dict[int | None, Material] = {}
     surfaces = []
@@ -188,9 +186,8 @@ def _surface(
     texture_uv = None
     if material.texture is not None:
         texture_uv = primitive.uv.get(material.uv_set)
-        texture_uv = None if texture_uv is None else texture_uv[gather]
-        if texture_uv is not None and material.placed is not None:
-            texture_uv = (texture_uv @ material.placed[:, :2].T + material.placed[:, 2]).astype(np.float32)
+        if texture_uv is not None:
+            texture_uv = (texture_uv[gather] @ material.placed[:, :2].T + material.placed[:, 2]).astype(np.float32)
     return Surface(position, triangle, normal, uv, texture_uv, material)
 
 
@@ -288,19 +285,16 @@ def _material(document: GltfDocument, number: int | None) -> Material:
         )
     if factor.shape != (3,) or np.isnan(factor).any():
         raise WlmError(f"{document.path}: materials[{number}]: expected a base colour of three numbers, none NaN")
-    texture, uv_set, placed = None, 0, None
+    texture, uv_set, placed = None, None, np.eye(2, 3)
     if "baseColorTexture" in surface:
         used = surface["baseColorTexture"]
         texture = _texture(document, used["index"])
-        uv_set = used.get("texCoord", 0)
-        if _TRANSFORM in used.get("extensions", {}):
-            uv_set = used["extensions"][_TRANSFORM].get("texCoord", uv_set)
-            placed = texture_transform(f"{document.path}: materials[{number}]", used)
+        uv_set, placed = texture_transform(f"{document.path}: materials[{number}]", used)
     return Material(
         str(content.get("name", "")),
         tuple(map(float, factor)),
         texture,
-        uv_set,
+        uv_set or 0,
         placed,
         tuple(map(float, emission)),
         bool(content.get("doubleSided", False)),
@@ -313,8 +307,7 @@ def _texture(document: GltfDocument, number: int) -> np.ndarray:
     source = texture_image(document, number)
     data = held_image(document, source)
     if data is None:
-        file = local_file(document.path, document.item("images", source)["uri"], where, document.trust)
-        data = read_file(file, MESH_BYTES, where)
+        data = read_file(image_file(document, source), MESH_BYTES, f"the image of {where}")
     try:
         with Image.open(io.BytesIO(data), formats=["PNG", "JPEG", "WEBP"]) as picture:
             if picture.width * picture.height > _MOST_IMAGE:

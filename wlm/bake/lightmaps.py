@@ -10,11 +10,11 @@ import numpy as np
 from wlm.bake.backend import start
 from wlm.bake.geometry import Geometry, read_geometry
 from wlm.bake.texels import Texels, place_texels
-from wlm.bake.work import Task, each_hour
+from wlm.bake.work import Task, each_hour, noise_share
 from wlm.errors import WlmError, one_line
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX, write_exr, write_planes
-from wlm.formats.folder import claim, compact_json, staged
+from wlm.formats.folder import compact_json, staged
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.hdr_blocks import need
 from wlm.formats.mask import write_mask
@@ -69,14 +69,10 @@ class BakedLightmaps:
 
     @property
     def error(self) -> list[float]:
-        """Returns the RMS of the noise divided by the RMS of the light for each hour; 0 if all light is 0."""
-        shares = []
-        for light, noise in zip(self.light, self.noise, strict=True):
-            power = float(np.square(light[self.mask].astype(np.float64)).mean())
-            shares.append(
-                (float(np.square(noise[self.mask].astype(np.float64)).mean()) / power) ** 0.5 if power else 0.0
-            )
-        return shares
+        """The RMS of the noise divided by the RMS of the light for each hour; 0 if all light is 0."""
+        return [
+            noise_share(light[self.mask], noise[self.mask]) for light, noise in zip(self.light, self.noise, strict=True)
+        ]
 
 
 def bake_lightmaps(
@@ -113,8 +109,8 @@ def bake_lightmaps(
     hours, directional = sorted(scene.hours), scene.lightmap.directional
 
     def make(hour: float, report) -> dict[str, np.ndarray]:
-        now = make_hour(scene, geometry, task.sky, hour)
-        gathered = irradiance(now.scene, texels, now.tracing, directional=directional, report=report)
+        world, tracing = make_hour(scene, geometry, task.sky, hour)
+        gathered = irradiance(world, texels, tracing, directional=directional, report=report)
         light, noise = (np.minimum(values[:, :3], HALF_MAX) for values in (gathered.mean, gathered.noise))
         made = {"light": light, "noise": noise, "back": gathered.back}
         if directional:
@@ -178,15 +174,6 @@ def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> 
             raise WlmError(f"bake: Open Image Denoise: {one_line(error)}") from error
         picture = fill_gaps(np.clip(picture, 0.0, HALF_MAX), mask)
     return picture
-
-
-def check_folder(folder: str | os.PathLike[str]) -> None:
-    """Checks, before a long bake, that lightmaps can be written to a folder.
-
-    Raises:
-        WlmError: The folder isn't writable, or contains files other than an earlier bake.
-    """
-    claim(Path(folder), INDEX, FORMAT)
 
 
 def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLightmaps) -> list[Path]:

@@ -46,31 +46,20 @@ class Sun:
 
 
 @dataclass(frozen=True)
-class Outside:
-    """Lights that are handled outside Mitsuba's scene, so that they need no random light selection.
+class Tracing:
+    """Settings of the path tracer, and the lights outside Mitsuba's scene, which need no random light selection.
 
     Attributes:
         sun: The sun; None if there is none or if it is below the horizon.
         ambient: Radiance of rays that hit no surface, R, G, B.
-    """
-
-    sun: Sun | None = None
-    ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Tracing:
-    """Settings of the path tracer.
-
-    Attributes:
-        outside: The sun and the ambient light.
         sun_direct: Whether the sun's direct light is included.
         samples: Number of paths per texel or probe, rounded up to a multiple of 8.
         bounces: Maximum number of reflections.
         seed: Seed of the random numbers.
     """
 
-    outside: Outside
+    sun: Sun | None
+    ambient: tuple[float, float, float]
     sun_direct: bool
     samples: int
     bounces: int
@@ -96,10 +85,10 @@ class Gathered:
 class _Outside:
     """The sun and the ambient light as Mitsuba variables, not constants, so that all hours share the same kernels."""
 
-    def __init__(self, outside: Outside) -> None:
-        self.ambient = mi.Color3f(*outside.ambient)
-        self.has_sun = outside.sun is not None
-        sun = outside.sun or Sun((0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
+    def __init__(self, tracing: Tracing) -> None:
+        self.ambient = mi.Color3f(*tracing.ambient)
+        self.has_sun = tracing.sun is not None
+        sun = tracing.sun or Sun((0.0, 1.0, 0.0), (0.0, 0.0, 0.0))
         self.frame = mi.Frame3f(mi.Vector3f(*sun.direction))
         self.irradiance = mi.Color3f(*sun.irradiance)
         dr.make_opaque(self.frame, self.irradiance, self.ambient)
@@ -122,7 +111,7 @@ def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool =
     places = [mi.Point3f(texels.position.T), mi.Vector3f(texels.normal.T), mi.Vector3f(texels.face.T)]
     first = mi.UInt32(texels.first[:-1].astype(np.uint32))
     count = mi.UInt32(np.diff(texels.first).astype(np.uint32))
-    sky = _Outside(tracing.outside)
+    sky = _Outside(tracing)
 
     def one(number: mi.UInt32, at: tuple, rng: mi.PCG32) -> tuple[list, mi.Float]:
         held = dr.gather(mi.UInt32, count, number)
@@ -167,7 +156,7 @@ def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any
         Estimates with 27 channels: red, green and blue of each coefficient.
     """
     place = mi.Point3f(np.asarray(position, np.float32).T)
-    sky = _Outside(tracing.outside)
+    sky = _Outside(tracing)
 
     def one(number: mi.UInt32, at: tuple, rng: mi.PCG32) -> tuple[list, mi.Float]:
         it = _interaction(dr.gather(mi.Point3f, place, number), mi.Vector3f(0.0))

@@ -1,6 +1,5 @@
 """Bakes a scene's light probes for each hour: RGB radiance in spherical harmonics, on surfaces or in a lattice."""
 
-import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 from wlm.bake.backend import start
 from wlm.bake.geometry import Geometry, read_geometry
 from wlm.bake.settings import ProbeSettings
-from wlm.bake.work import Task, each_hour
+from wlm.bake.work import Task, each_hour, noise_share
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.checkpoint import Checkpoint
@@ -38,6 +37,12 @@ class BakedProbes:
     position: np.ndarray
     values: np.ndarray
     noise: np.ndarray
+
+    @property
+    def error(self) -> list[float]:
+        """The RMS of the noise divided by the RMS of the values for each hour; 0 if all values are 0."""
+        lit = [values.any(axis=(1, 2)) for values in self.values]
+        return [noise_share(v[on], e[on]) for v, e, on in zip(self.values, self.noise, lit, strict=True)]
 
 
 def place_probes(settings: ProbeSettings, geometry: Geometry, seed: int = 0) -> np.ndarray:
@@ -106,8 +111,8 @@ def bake_probes(
     hours = sorted(scene.hours)
 
     def make(hour: float, report) -> dict[str, np.ndarray]:
-        now = make_hour(scene, geometry, task.sky, hour)
-        gathered = harmonics(now.scene, position, now.tracing, report=report)
+        world, tracing = make_hour(scene, geometry, task.sky, hour)
+        gathered = harmonics(world, position, tracing, report=report)
         return {"values": gathered.mean, "noise": gathered.noise, "back": gathered.back}
 
     count = len(position)
@@ -137,13 +142,3 @@ def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
         arrays |= {f"sh{key}": values, f"noise{key}": noise}
     with atomic_path(Path(path)) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **arrays)
-
-
-def noise_share(baked: BakedProbes) -> list[float]:
-    """Returns the RMS of the noise divided by the RMS of the values for each hour; 0 if all values are 0."""
-    shares = []
-    for values, noise in zip(baked.values, baked.noise, strict=True):
-        live = values.any(axis=(1, 2))
-        power = float(np.square(values[live], dtype=np.float64).mean()) if live.any() else 0.0
-        shares.append(math.sqrt(float(np.square(noise[live], dtype=np.float64).mean()) / power) if power else 0.0)
-    return shares

@@ -14,14 +14,10 @@ Lengths are in metres, as in the glTF file; +y is up. Light is linear RGB: dayli
 model (about 1.5 at a clear noon), times `scale`; other lights use the same unit or any other.
 """
 
-import os
-from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from wlm.config import load_settings
-from wlm.formats.reading import named_file
 from wlm.system import Name
 
 _MOST_LAMPS = 256
@@ -190,20 +186,3 @@ class BakeScene(_Settings):
     def sun_direct(self) -> bool:
         """Whether the result includes the sun's direct light."""
         return self.daylight is not None and self.daylight.direct
-
-
-def load_scene(path: str | os.PathLike[str], trust: bool = False) -> tuple[BakeScene, Path, Path | None]:
-    """Reads a scene from its YAML file; with `trust` it may refer to files outside its folder.
-
-    Returns:
-        The settings, the path of the glTF file, and the path of the environment map or None.
-
-    Raises:
-        WlmError: The file can't be read, or a setting is wrong.
-    """
-    scene = load_settings(BakeScene, path)
-    geometry = named_file(path, scene.geometry, f"{path}: geometry", trust)
-    picture = None
-    if scene.sky is not None and scene.sky.file is not None:
-        picture = named_file(path, scene.sky.file, f"{path}: sky.file", trust)
-    return scene, geometry, picture

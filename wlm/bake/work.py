@@ -1,6 +1,7 @@
 """Shared code of bakes: reading the scene, and computing the hours in order with a checkpoint."""
 
 import hashlib
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from wlm.bake.settings import BakeScene, load_scene
+from wlm.bake.settings import BakeScene
+from wlm.config import load_settings
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.light import read_light
 from wlm.formats.limits import MESH_BYTES
 from wlm.formats.parts import Part
-from wlm.formats.reading import read_file
+from wlm.formats.reading import named_file, read_file
 from wlm.system import Meter, OnProgress
 
 _REPORTS = 100  # progress reports per hour
@@ -50,13 +52,15 @@ def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bo
     Raises:
         WlmError: A file can't be read, a setting is wrong, or the image isn't an environment map.
     """
-    scene, geometry, picture = load_scene(path, trust)
+    scene = load_settings(BakeScene, path)
+    geometry = named_file(path, scene.geometry, f"{path}: geometry", trust)
     if directional:
         lightmap = scene.lightmap.model_copy(update={"directional": True})
         scene = scene.model_copy(update={"lightmap": lightmap})
     digest = hashlib.blake2b(read_file(geometry, MESH_BYTES, "the glTF file"), digest_size=16)
     sky = None
-    if picture is not None:
+    if scene.sky is not None and scene.sky.file is not None:
+        picture = named_file(path, scene.sky.file, f"{path}: sky.file", trust)
         sky = np.ascontiguousarray(read_light(picture)[0][..., :3])
         if not np.isfinite(sky).all() or (sky < 0).any():
             raise WlmError(f"{picture}: expected finite light of at least 0, found other values")
@@ -79,6 +83,12 @@ def open_checkpoint(
     fit = {"input": task.source, "scene": settings, "device": device}
     path = os.path.realpath(output)
     return Checkpoint(path, f"bake-{what}", fit, task.source, resume=resume)
+
+
+def noise_share(values: np.ndarray, noise: np.ndarray) -> float:
+    """Returns the RMS of the noise divided by the RMS of the values; 0 if all values are 0."""
+    power, error = (float(np.square(each, dtype=np.float64).sum()) for each in (values, noise))
+    return math.sqrt(error / power) if power else 0.0
 
 
 def each_hour(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from wlm.bake.daylight import sun_direction
 from wlm.bake.geometry import Geometry, Surface
-from wlm.bake.paths import SUN_ANGLE, Outside, Sun, Tracing
+from wlm.bake.paths import SUN_ANGLE, Sun, Tracing
 from wlm.bake.settings import BakeScene, Daylight
 from wlm.errors import WlmError
 
@@ -23,19 +22,6 @@ with suppress(ImportError):  # `wlm.bake.backend.start`, which runs first, repor
 _SKY_ROWS = 128
 _DISC_SAMPLES = 1 << 12
 _DAY = 24.0
-
-
-@dataclass(frozen=True, eq=False)
-class Hour:
-    """A scene and its lights at an hour.
-
-    Attributes:
-        scene: The Mitsuba scene, with all lights except the sun and uniform ambient light.
-        tracing: Settings of the path tracer, which include these two lights.
-    """
-
-    scene: Any
-    tracing: Tracing
 
 
 def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
@@ -50,7 +36,7 @@ def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
             raise WlmError(f"{path}: lamps.{i}.material: expected one of {', '.join(names)}, got {lamp.material!r}")
 
 
-def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, hour: float) -> Hour:
+def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, hour: float) -> tuple[Any, Tracing]:
     """Builds the Mitsuba scene with the lights of one hour.
 
     Args:
@@ -58,6 +44,9 @@ def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, 
         geometry: The surfaces.
         picture: The environment map, float32 [H, W, 3], or None.
         hour: The hour of the day, as in `scene.hours`.
+
+    Returns:
+        Mitsuba's scene with all lights except the sun and uniform ambient light, and settings that include these two.
     """
     content: dict[str, Any] = {"type": "scene"}
     glowing = {lamp.material: lamp.radiance if lamp.is_lit(hour) else (0.0, 0.0, 0.0) for lamp in scene.lamps}
@@ -80,8 +69,8 @@ def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, 
         # Mitsuba's middle column is +z, and columns to the right of it turn towards -x.
         turned = np.roll(sky, sky.shape[1] // 2, axis=1)
         content["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(turned, np.float32))}
-    tracing = Tracing(Outside(sun, ambient), scene.sun_direct, scene.samples, scene.bounces, scene.seed)
-    return Hour(mi.load_dict(content), tracing)
+    tracing = Tracing(sun, ambient, scene.sun_direct, scene.samples, scene.bounces, scene.seed)
+    return mi.load_dict(content), tracing
 
 
 def daylight(settings: Daylight, hour: float, period: float) -> tuple[Sun | None, np.ndarray]:

@@ -13,7 +13,10 @@ app = typer.Typer(
 )
 
 _Scene = Annotated[
-    Path, typer.Argument(metavar="SCENE.yaml", help="YAML settings: a glTF file, its lights by hour, the resolution.")
+    Path,
+    typer.Argument(
+        metavar="SCENE.yaml", help="YAML file of the scene: its glTF file, its lights by hour, and the resolution."
+    ),
 ]
 
 
@@ -35,10 +38,11 @@ def lightmaps(
     Finished hours are kept in DIR.partial; repeat the command with --resume to continue with the next hour.
     """
     quiet_warp()
-    from wlm.bake.lightmaps import bake_lightmaps, check_folder, write_lightmaps
+    from wlm.bake.lightmaps import FORMAT, INDEX, bake_lightmaps, write_lightmaps
     from wlm.bake.work import open_checkpoint, open_task
+    from wlm.formats.folder import claim
 
-    check_folder(output)
+    claim(output, INDEX, FORMAT)
     task = open_task(scene, trust, directional)
     checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
     note_start(checkpoint, resume, "from the beginning")
@@ -70,7 +74,7 @@ def probes(
     """
     check_output(output, ".npz")
     quiet_warp()
-    from wlm.bake.probes import bake_probes, noise_share, write_probes
+    from wlm.bake.probes import bake_probes, write_probes
     from wlm.bake.work import open_checkpoint, open_task
 
     task = open_task(scene, trust)
@@ -81,7 +85,7 @@ def probes(
         write_probes(output, baked)
         checkpoint.remove()
     rows = table(str(output), ["hour", "probes", "lit probes", "mean L00", "relative noise"])
-    for hour, values, error in zip(baked.hours, baked.values, noise_share(baked), strict=True):
+    for hour, values, error in zip(baked.hours, baked.values, baked.error, strict=True):
         lit = values.any(axis=(1, 2))
         mean = f"{values[lit, 0].mean():.4g}" if lit.any() else "–"
         rows.add_row(f"{hour:g}", f"{len(values):,}", f"{int(lit.sum()):,}", mean, f"{error:.2%}")
@@ -92,7 +96,10 @@ def probes(
 @exclusive
 def sixway(
     scene: Annotated[
-        Path, typer.Argument(metavar="SCENE.yaml", help="YAML settings: smoke, camera, number of samples.")
+        Path,
+        typer.Argument(
+            metavar="SCENE.yaml", help="YAML file of the scene: its smoke, its camera, and the paths per pixel."
+        ),
     ],
     output: Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")],
     device: Device = "cpu",

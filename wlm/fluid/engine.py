@@ -10,7 +10,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid.faces import Face, bounded_axes, face_links, walled_axes
 from wlm.interop import free_memory, no_collection
-from wlm_kernels.fluid import lattice_fields, lattice_links
+from wlm_kernels.fluid import lattice_links
 from wlm_kernels.fluid.lattice import QUIET, Spec, step_kernel
 from wlm_kernels.fluid.lattice_fields import fluid_kernels
 from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, tables
@@ -48,7 +48,7 @@ class Engine:
         done: Steps that this object launched itself; replays of a user's CUDA graph are counted only in `clock`.
         clock, trouble: Step counter and first error, see `wlm_kernels.fluid.lattice.step_kernel`.
         solid: uint8 [N], number of the body of each cell, 0 for fluid; [0] while no cell has ever been solid.
-        bodies: Velocities and rotations of the solid bodies.
+        velocity: vec3 [BODIES], velocity of each body in cells per step; element 0 is not used.
     """
 
     def __init__(self, shape: tuple[int, int, int], spec: Spec, tau: float, eddy: float, rise: float, device) -> None:
@@ -65,10 +65,8 @@ class Engine:
         self.trouble = wp.full(1, QUIET, dtype=wp.int64, device=device)
         self._sums = self.zeros(2, wp.float64)
         self.solid = self.zeros(0, wp.uint8)
-        self.bodies = lattice_fields.Bodies()
-        for field in ("velocity", "spin", "centre"):
-            setattr(self.bodies, field, self.zeros(BODIES, wp.vec3))
-        self._force, self._forces = wp.vec3(), self.zeros(0, wp.vec3)
+        self.velocity = self.zeros(BODIES, wp.vec3)
+        self._forces = self.zeros(0, wp.vec3)
         self.set_faces({})
         self.done = 0
 
@@ -94,11 +92,9 @@ class Engine:
         self._links: lattice_links.Links | None = None
         self._graph: wp.Graph | None = None
 
-    def set_force(self, force: wp.vec3 | None, forces: wp.array | None) -> None:
-        """Sets one force for all cells, a force per cell, or no force."""
-        kind = "uniform" if force is not None else "field" if forces is not None else "none"
-        self.spec = replace(self.spec, force=kind)
-        self._force = wp.vec3() if force is None else force
+    def set_force(self, forces: wp.array | None) -> None:
+        """Sets a force per cell, vec3 [N], or no force."""
+        self.spec = replace(self.spec, forced=forces is not None)
         self._forces = self.zeros(0, wp.vec3) if forces is None else forces
         self._graph = None
 
@@ -144,8 +140,8 @@ class Engine:
         return fastest
 
     def restore(self, populations: np.ndarray, solid: np.ndarray, done: int) -> float:
-        """Sets a stored state and returns the speed of the fastest solid in cells per step; the motion of the bodies
-        must be set before."""
+        """Sets a stored state and returns the speed of the fastest solid in cells per step; the velocities of the
+        bodies must be set before."""
         self.done, self._graph = done, None
         self.clock.fill_(done)
         self.trouble.fill_(QUIET)
@@ -186,7 +182,7 @@ class Engine:
         return links
 
     def _search(self) -> tuple[int, float]:
-        where = [self._tables, self._n, self._bounded, self.solid, self.bodies, self._links]
+        where = [self._tables, self._n, self._bounded, self.solid, self.velocity, self._links]
         count, fastest = lattice_links.find_links(*where)
         return int(count.numpy()[0]), float(fastest.numpy()[0])
 
@@ -216,7 +212,7 @@ class Engine:
 
     def fields(self, drho: wp.array, u: wp.array) -> None:
         """Writes the density minus 1 of each cell to `drho` and the velocity to `u`; an array of size 0 is skipped."""
-        inputs = [self._n, self.buffers[0], self.solid, self.bodies, self._force, self._forces]
+        inputs = [self._n, self.buffers[0], self.solid, self.velocity, self._forces]
         self._launch(self._fluid_kernels.fields, self.cells, inputs, [drho, u])
 
     def force_on_bodies(self) -> np.ndarray:
@@ -229,8 +225,7 @@ class Engine:
 
     def _step(self) -> None:
         now, out = self.buffers
-        collision = [self._tau, self._eddy, self._force, self._forces]
-        inputs = [self._n, now, self.solid, *collision, self.done % 2]
+        inputs = [self._n, now, self.solid, self._tau, self._eddy, self._forces, self.done % 2]
         self._launch(step_kernel(self.spec), self.cells, inputs, [self.clock, self.trouble, self._sums, out])
         self._apply_links(0, out)
         self.done += 1

@@ -13,7 +13,8 @@ FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 """The faces, by the axis that they close and the end of it."""
 
 # A link along an edge of the domain crosses two faces: the face of lower rank decides, then the order of FACES.
-_STILL, _MOVING, _INLET, _OUTLET, _SLIP = range(5)
+_RANKS = {BOUNCE: 1, INLET: 2, OUTLET: 3, PRESSURE: 3, SLIP: 4}
+_STILL = 0  # a wall at rest
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,8 +22,8 @@ class Face:
     """The boundary condition on a face of A x B cells, along the two axes of the face in the order x, y, z.
 
     Attributes:
-        rank: uint8 [A, B], precedence at the edges of the box, where two faces meet: the lower rank decides.
-        kind: uint8 [A, B], kind of boundary of each cell, such as `lattice_links.BOUNCE`.
+        rank: int [A, B], precedence at the edges of the box, where two faces meet: the lower rank decides.
+        kind: int [A, B], kind of boundary of each cell, such as `lattice_links.BOUNCE`.
         velocity: float64 [A, B, 3], velocity of a wall or an inlet, cells per step.
         excess: Density minus 1 to which an outlet with a given density relaxes.
     """
@@ -33,50 +34,36 @@ class Face:
     excess: float = 0.0
 
 
-def _size(shape: tuple[int, int, int], face: str) -> tuple[int, int]:
-    if face not in FACES:
-        raise ValueError(f"face: expected one of {', '.join(FACES)}, got {face!r}")
-    axis = FACES.index(face) // 2
-    first, second = (size for a, size in enumerate(shape) if a != axis)
-    return first, second
+def make_face(
+    shape: tuple[int, int, int], name: str, kind: int, velocity=(0.0, 0.0, 0.0), density=None, where=None
+) -> Face:
+    """Makes the condition of kind `kind`, such as `lattice_links.BOUNCE`, on a face of a box of `shape` cells.
 
-
-def _velocity(size: tuple[int, int], velocity) -> np.ndarray:
+    Args:
+        shape: Cells of the box along x, y and z.
+        name: One of `FACES`.
+        kind: The kind of boundary.
+        velocity: Velocity of a wall or an inlet in cells per step, (3,) or [A, B, 3].
+        density: Density to which an outlet relaxes, above 0; None for the other kinds.
+        where: bool [A, B], false where the face is a wall at rest instead; None: true everywhere.
+    """
+    if name not in FACES:
+        raise ValueError(f"face: expected one of {', '.join(FACES)}, got {name!r}")
+    size = tuple(np.delete(shape, FACES.index(name) // 2).tolist())
     velocity = np.asarray(velocity, np.float64)
     if velocity.shape not in ((3,), (*size, 3)):
         raise ValueError(f"velocity: expected shape (3,) or {(*size, 3)}, got {velocity.shape}")
     if not np.isfinite(velocity).all():
         raise ValueError("velocity: expected finite numbers, got NaN or infinity")
-    return np.broadcast_to(velocity, (*size, 3))
-
-
-def wall(shape: tuple[int, int, int], face: str, velocity=(0.0, 0.0, 0.0), slip: bool = False) -> Face:
-    """Makes a no-slip wall that moves tangentially at `velocity` (cells per step), or a wall without friction."""
-    size = _size(shape, face)
-    velocity = _velocity(size, velocity)
-    if slip:
-        return Face(np.full(size, _SLIP), np.full(size, SLIP, np.uint8), velocity)
-    return Face(np.where(velocity.any(-1), _MOVING, _STILL), np.full(size, BOUNCE, np.uint8), velocity)
-
-
-def inlet(shape: tuple[int, int, int], face: str, velocity, where=None) -> Face:
-    """Makes an inlet (velocity in cells per step) where `where`, bool [A, B], is true, and a wall elsewhere; None: an
-    inlet everywhere."""
-    size = _size(shape, face)
+    if density is not None and not (np.isfinite(density) and density > 0.0):
+        raise ValueError(f"density: expected a positive number, got {density}")
     opened = np.ones(size, bool) if where is None else np.asarray(where, bool)
     if opened.shape != size:
         raise ValueError(f"where: expected the shape {size} of the face, got {opened.shape}")
-    velocity = np.where(opened[..., None], _velocity(size, velocity), 0.0)
-    return Face(np.where(opened, _INLET, _STILL), np.where(opened, INLET, BOUNCE).astype(np.uint8), velocity)
-
-
-def outlet(shape: tuple[int, int, int], face: str, density: float | None = None) -> Face:
-    """Makes an outlet that conserves mass or, with `density`, an outlet whose density relaxes to this number."""
-    size = _size(shape, face)
-    if density is not None and not (np.isfinite(density) and density > 0.0):
-        raise ValueError(f"density: expected a positive number, got {density}")
-    kind = np.full(size, OUTLET if density is None else PRESSURE, np.uint8)
-    return Face(np.full(size, _OUTLET), kind, np.zeros((*size, 3)), 0.0 if density is None else density - 1.0)
+    velocity = np.where(opened[..., None], velocity, 0.0)
+    still = ~opened | ((kind == BOUNCE) & ~velocity.any(-1))
+    rank = np.where(still, _STILL, _RANKS[kind])
+    return Face(rank, np.where(opened, kind, BOUNCE), velocity, 0.0 if density is None else density - 1.0)
 
 
 def bounded_axes(faces: Mapping[str, Face]) -> tuple[int, int, int]:

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-import warp as wp
+from scipy import ndimage
 
 from wlm.errors import WlmError, one_line
 from wlm.formats.vdb import GridHead, VdbGrid
-from wlm.interop import device_name, to_warp
-from wlm_kernels.fluid import grids as kernels
 
 UPS = {
     "x": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
@@ -197,7 +195,10 @@ def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
 def _on(lattice: Lattice, grid: Grid, matrix: np.ndarray) -> torch.Tensor:
     turn, shift = _between(lattice.voxel, np.asarray(lattice.origin), matrix)
     if not _is_kept((turn, shift)):
-        return _resampled(lattice, grid.values, turn, shift)
+        # The index of a voxel is its centre minus a half.
+        offset = shift + 0.5 * turn.sum(1) - 0.5
+        options = {"output_shape": lattice.shape, "order": 1, "mode": "grid-constant"}
+        return torch.from_numpy(ndimage.affine_transform(grid.values.numpy(), turn, offset, **options))
     signs = turn.round().astype(int)
     order = np.abs(signs).argmax(0).tolist()  # the grid's axis for each axis of the lattice
     begin = (shift + 0.5 * signs.sum(1) - 0.5).round().astype(int)  # the grid's voxel at the lattice's first voxel
@@ -210,12 +211,4 @@ def _on(lattice: Lattice, grid: Grid, matrix: np.ndarray) -> torch.Tensor:
         return values.contiguous()
     out = torch.zeros(lattice.shape, dtype=torch.float32, device=values.device)
     out[tuple(slice(int(a), int(a) + n) for a, n in zip(first, values.shape, strict=True))] = values
-    return out
-
-
-def _resampled(lattice: Lattice, values: torch.Tensor, turn: np.ndarray, shift: np.ndarray) -> torch.Tensor:
-    out = torch.empty(lattice.shape, dtype=torch.float32, device=values.device)
-    inputs = [to_warp(values.contiguous()), wp.mat33(*turn.ravel().tolist()), wp.vec3(*shift.tolist())]
-    device = device_name(values.device)
-    wp.launch(kernels.resample, lattice.shape, inputs, [to_warp(out)], device=device)
     return out

@@ -13,10 +13,11 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from wlm.errors import WlmError
-from wlm.fluid import faces as fluid_faces
 from wlm.fluid.engine import BODIES, PERIOD, Engine, require_free
+from wlm.fluid.faces import Face, make_face
 from wlm.formats.parts import Part, check_parts
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, trouble_of
+from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
 
 CHECK_EVERY = 48
 """Steps between two checks for a flow that blew up; a multiple of the steps in a graph."""
@@ -26,7 +27,6 @@ MAX_SPEED = 0.3
 is a quarter."""
 
 _MOST_STEPS = 2**31 - 1  # limit of the device's counter
-_MOTION = ("velocity", "spin", "centre")
 # Least number of steps for which capturing a graph saves time.
 _GRAPH_FROM = 16
 
@@ -116,7 +116,7 @@ class Lattice:
         tau, eddy = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky)
         # A ramp of one step is no ramp: inflow begins after it.
         self._engine = Engine(self.shape, spec, tau, eddy, 1.0 / max(ramp, 1), self.device)
-        self._faces: dict[str, fluid_faces.Face] = {}
+        self._faces: dict[str, Face] = {}
         self._begun = False
 
     @staticmethod
@@ -134,7 +134,7 @@ class Lattice:
             velocity: Tangential velocity of the wall in cells per step; (3,), or [A, B, 3] for each cell of the face.
             slip: Whether the wall has no friction, and therefore no velocity.
         """
-        self._set_face(face, fluid_faces.wall(self.shape, face, velocity, slip))
+        self._set_face(face, SLIP if slip else BOUNCE, velocity)
 
     def set_inlet(self, face: str, velocity: ArrayLike, where: ArrayLike | None = None) -> None:
         """Makes a face, or a part of it, an inlet.
@@ -144,7 +144,7 @@ class Lattice:
             velocity: Velocity of the air in cells per step; (3,), or [A, B, 3] for each cell of the face.
             where: bool [A, B], true in the open part of the face; elsewhere it is a wall. None: the whole face is open.
         """
-        self._set_face(face, fluid_faces.inlet(self.shape, face, velocity, where))
+        self._set_face(face, INLET, velocity, where=where)
 
     def set_outlet(self, face: str, density: float | None = None) -> None:
         """Makes a face an outlet.
@@ -155,16 +155,9 @@ class Lattice:
                 conserved. None: the outflow through all outlets without a density equals the inflow, so that mass is
                 conserved.
         """
-        self._set_face(face, fluid_faces.outlet(self.shape, face, density))
+        self._set_face(face, OUTLET if density is None else PRESSURE, density=density)
 
-    def set_solid(
-        self,
-        mask: ArrayLike | wp.array,
-        velocity: ArrayLike = (0.0, 0.0, 0.0),
-        *,
-        spin: ArrayLike = (0.0, 0.0, 0.0),
-        centre: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> None:
+    def set_solid(self, mask: ArrayLike | wp.array, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Sets which cells are solid and how they move; must be called again after they have moved.
 
         Cells that become fluid get the mean density and velocity of their neighbours. The call waits for the device
@@ -173,24 +166,21 @@ class Lattice:
         Args:
             mask: [X, Y, Z], true where a cell is solid; or the number of the body that covers each cell, 1 to 255, and
                 0 for fluid. A NumPy array, or a Warp array of uint8 on the lattice's device.
-            velocity: Velocity of the bodies' centres, cells per step; (3,) for body 1, or [K, 3] for bodies 1 to K.
-            spin: Angular velocity of the bodies, radians per step, (3,) or [K, 3].
-            centre: Centres of rotation in cells, (3,) or [K, 3].
+            velocity: Velocity of the bodies, cells per step; (3,) for body 1, or [K, 3] for bodies 1 to K. Bodies do
+                not rotate.
 
         Raises:
-            WlmError: A surface is faster than `MAX_SPEED`.
+            WlmError: A body is faster than `MAX_SPEED`.
         """
-        new, bodies = self._mask(mask), self._engine.bodies
-        for field, value in (("velocity", velocity), ("spin", spin), ("centre", centre)):
-            vectors = np.atleast_2d(np.asarray(value, np.float32))
-            if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) >= BODIES or not np.isfinite(vectors).all():
-                shapes = f"(3,) or [K, 3] for at most {BODIES - 1} bodies"
-                raise ValueError(f"{field}: expected finite numbers of shape {shapes}, got shape {np.shape(value)}")
-            rows = np.zeros((BODIES, 3), np.float32)
-            rows[1 : len(vectors) + 1] = vectors
-            getattr(bodies, field).assign(rows)
+        new, vectors = self._mask(mask), np.atleast_2d(np.asarray(velocity, np.float32))
+        if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) >= BODIES or not np.isfinite(vectors).all():
+            shapes = f"(3,) or [K, 3] for at most {BODIES - 1} bodies"
+            raise ValueError(f"velocity: expected finite numbers of shape {shapes}, got shape {np.shape(velocity)}")
+        rows = np.zeros((BODIES, 3), np.float32)
+        rows[1 : len(vectors) + 1] = vectors
+        self._engine.velocity.assign(rows)
         self._prepare()
-        _check_speed(self._engine.cover(new), "a solid's surface")
+        _check_speed(self._engine.cover(new), "a body")
 
     def set_force(self, force: ArrayLike | wp.array | None) -> None:
         """Sets the force on the air.
@@ -201,21 +191,14 @@ class Lattice:
                 force.
         """
         if force is None:
-            self._engine.set_force(None, None)
-            return
-        if isinstance(force, wp.array):
+            self._engine.set_force(None)
+        elif isinstance(force, wp.array):
             if force.shape != self.shape or force.dtype != wp.vec3 or force.device != self.device:
                 found = f"{force.shape} on {force.device}"
                 raise ValueError(f"force: expected an array of vec3 {self.shape} on {self.device}, got {found}")
-            self._engine.set_force(None, force.flatten())
-            return
-        vectors = np.asarray(force, np.float32)
-        if vectors.shape not in ((3,), (*self.shape, 3)) or not np.isfinite(vectors).all():
-            raise ValueError(f"force: expected finite numbers of shape (3,) or {(*self.shape, 3)}, got {vectors.shape}")
-        if vectors.ndim == 1:
-            self._engine.set_force(wp.vec3(*vectors.tolist()), None)
+            self._engine.set_force(force.flatten())
         else:
-            self._engine.set_force(None, wp.array(vectors.reshape(-1, 3), dtype=wp.vec3, device=self.device))
+            self._engine.set_force(self._vectors("force", force))
 
     def set_flow(self, velocity: ArrayLike = (0.0, 0.0, 0.0), density: ArrayLike = 1.0) -> None:
         """Sets all air to the equilibrium of a velocity and a density.
@@ -225,16 +208,14 @@ class Lattice:
             density: Density, one number or [X, Y, Z]; 1 is the density of air at rest.
         """
         self._prepare()
-        u = np.broadcast_to(np.asarray(velocity, np.float32), (*self.shape, 3)).reshape(-1, 3)
         drho = (np.broadcast_to(np.asarray(density, np.float64), self.shape) - 1.0).astype(np.float32).ravel()
-        if not (np.isfinite(u).all() and np.isfinite(drho).all()):
-            raise ValueError("velocity, density: expected finite numbers, got NaN or infinity")
-        u = wp.array(np.ascontiguousarray(u), dtype=wp.vec3, device=self.device)
-        self._engine.start(wp.array(drho, device=self.device), u)
+        if not np.isfinite(drho).all():
+            raise ValueError("density: expected finite numbers, got NaN or infinity")
+        self._engine.start(wp.array(drho, device=self.device), self._vectors("velocity", velocity))
         self._begun = True
 
     @property
-    def faces(self) -> dict[str, fluid_faces.Face]:
+    def faces(self) -> dict[str, Face]:
         """The faces that have been set, by name; an axis without faces is periodic."""
         return dict(self._faces)
 
@@ -333,7 +314,7 @@ class Lattice:
         return {
             "populations": engine.buffers[0].numpy().copy(),
             "solid": engine.solid.numpy().copy(),
-            "bodies": np.stack([getattr(engine.bodies, field).numpy() for field in _MOTION]),
+            "bodies": engine.velocity.numpy().copy(),
             "steps": np.array(self.steps, np.int64),
         }
 
@@ -352,7 +333,7 @@ class Lattice:
             "populations": Part(wp.dtype_to_numpy(now.dtype), now.shape),
             # Empty while no cell has ever been solid.
             "solid": Part(np.uint8, (0 if np.shape(state.get("solid")) == (0,) else engine.cells,)),
-            "bodies": Part(np.float32, (len(_MOTION), BODIES, 3)),
+            "bodies": Part(np.float32, (BODIES, 3)),
             "steps": Part(np.int64, (), least=0, most=_MOST_STEPS),
         }
         try:
@@ -360,13 +341,22 @@ class Lattice:
         except ValueError as error:
             raise WlmError(f"lattice state: {error}") from error
         self._prepare()
-        for field, rows in zip(_MOTION, state["bodies"], strict=True):
-            getattr(engine.bodies, field).assign(rows)
+        engine.velocity.assign(state["bodies"])
         self._begun = True
         fastest = engine.restore(state["populations"], state["solid"], int(state["steps"]))
-        _check_speed(fastest, "a solid's surface")
+        _check_speed(fastest, "a body")
 
-    def _set_face(self, name: str, face: fluid_faces.Face) -> None:
+    def _vectors(self, name: str, value: ArrayLike) -> wp.array:
+        """Returns vectors, (3,) for all cells or [X, Y, Z, 3], as a vec3 [N] on the device."""
+        vectors = np.asarray(value, np.float32)
+        if vectors.shape not in ((3,), (*self.shape, 3)) or not np.isfinite(vectors).all():
+            shapes = f"(3,) or {(*self.shape, 3)}"
+            raise ValueError(f"{name}: expected finite numbers of shape {shapes}, got shape {vectors.shape}")
+        vectors = np.ascontiguousarray(np.broadcast_to(vectors, (*self.shape, 3)).reshape(-1, 3))
+        return wp.array(vectors, dtype=wp.vec3, device=self.device)
+
+    def _set_face(self, name: str, kind: int, *args, **settings) -> None:
+        face = make_face(self.shape, name, kind, *args, **settings)
         _check_speed(float(np.linalg.norm(face.velocity, axis=-1).max()), f"face {name!r}")
         if name not in self._faces and self._begun:
             raise ValueError(f"face {name!r}: expected faces to be set before the flow and before the first step")
@@ -374,7 +364,7 @@ class Lattice:
         self._engine.set_faces(self._faces)
 
     def _prepare(self) -> None:
-        _check_speed(self._engine.prepare(), "a solid's surface")
+        _check_speed(self._engine.prepare(), "a body")
 
     def _mask(self, mask) -> wp.array:
         if isinstance(mask, wp.array):

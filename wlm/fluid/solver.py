@@ -442,7 +442,7 @@ class Solver:
         if self.scheme == "maccormack":
             predicted, out = spare
             advection.advect(*where, predicted, self.substeps, bricks=self._bricks)
-            advection.correct(*where, predicted, out, self.substeps, self._decay, self._bricks)
+            advection.advect(*where, out, self.substeps, self._decay, self._bricks, predicted)
             self._fields = [out, predicted, now]
         else:
             advection.advect(*where, spare[0], self.substeps, self._decay, self._bricks)

@@ -39,21 +39,9 @@ _HEADER_LIMIT = 16 << 20  # bytes: settings, names and times of a set of the mos
 
 _MOST_AXES, _MOST_NUMBERS = 8, 1 << 48  # of a part
 
-_TYPES = {
-    "BOOL": np.bool_,
-    "U8": np.uint8,
-    "I8": np.int8,
-    "U16": np.uint16,
-    "I16": np.int16,
-    "F16": np.float16,
-    "U32": np.uint32,
-    "I32": np.int32,
-    "F32": np.float32,
-    "U64": np.uint64,
-    "I64": np.int64,
-    "F64": np.float64,
-}
-_TYPE_NAMES = {np.dtype(kind): name for name, kind in _TYPES.items()}
+_NUMBERS = ("U8", "I8", "U16", "I16", "F16", "U32", "I32", "F32", "U64", "I64", "F64")
+_TYPES = {"BOOL": np.dtype(bool)} | {name: np.dtype(f"<{name[0].lower()}{int(name[1:]) // 8}") for name in _NUMBERS}
+_TYPE_NAMES = {kind: name for name, kind in _TYPES.items()}
 
 
 def _finite(text: str) -> float:
@@ -128,7 +116,9 @@ def encode_artifact(
     """
     if not source:
         if settings:
-            raise ValueError(f"settings: a compact artifact, one without a source, stores none, got {dict(settings)}")
+            raise ValueError(
+                f"settings: expected none for an artifact without a source, which is compact, got {', '.join(settings)}"
+            )
         return encode_compact(system, tensors)
     for what, word in (("system", system), ("source", source)):
         if not word or not word.isascii() or not word.isprintable() or " " in word:
@@ -217,12 +207,10 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
 
 
 def _compact(path: str | os.PathLike[str], content: bytes, system: str | None) -> Artifact:
-    found_system, version, tensors, start = parse_compact(path, content)
-    _check_system(path, found_system, system)
+    found, version, tensors, start = parse_compact(path, content)
+    _check_system(path, found, system)
     parts = {name: array.nbytes for name, array in tensors.items()}
-    # It has no name of its own.
-    settings = {"name": Path(path).stem}
-    return Artifact(found_system, version, settings, "", tensors, parts, len(content), start)
+    return Artifact(found, version, {"name": Path(path).stem}, "", tensors, parts, len(content), start)
 
 
 def _check_system(path: str | os.PathLike[str], found: str, expected: str | None) -> None:
@@ -292,7 +280,7 @@ def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tu
         raise WlmError(
             f"{path}: part {one_line(name, 60)}: the shape {shape} exceeds {_MOST_AXES} axes or {_MOST_NUMBERS} numbers"
         )
-    expected = math.prod(shape) * np.dtype(_TYPES[kind]).itemsize
+    expected = math.prod(shape) * _TYPES[kind].itemsize
     if end - begin != expected:
         raise WlmError(f"{path}: part {one_line(name, 60)}: expected {expected} bytes, found {end - begin}")
     return kind, shape, begin, end
@@ -331,9 +319,6 @@ def _check_digest(path: str | os.PathLike[str], content: Any, encoded: bytes, di
 
 
 def _view(content: Any, start: int, kind: str, shape: tuple[int, ...], begin: int, end: int) -> np.ndarray:
-    dtype = np.dtype(_TYPES[kind]).newbyteorder("<")
-    if begin == end:
-        empty = np.empty(shape, dtype)
-        empty.flags.writeable = False
-        return empty
-    return np.frombuffer(content, dtype, math.prod(shape), start + begin).reshape(shape)
+    # An empty array at the end of the file would begin behind its last byte.
+    source = content[:0] if begin == end else content
+    return np.frombuffer(source, _TYPES[kind], math.prod(shape), start + begin if begin < end else 0).reshape(shape)

@@ -42,7 +42,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes renames in a folder survive a crash of the machine, on systems that can (Windows cannot)."""
+    """Makes renames in a folder survive a crash of the machine, on file systems that can."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -57,23 +57,8 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) ->
     `data` is the content, or its pieces in order, as objects with the buffer protocol.
     """
     chunks = [data] if isinstance(data, bytes | bytearray | memoryview) else data
-    total = 0
-    with atomic_path(path) as part:
-        handle = os.open(part, os.O_WRONLY)
-        try:
-            for chunk in chunks:
-                view = memoryview(chunk)
-                if view.nbytes == 0:
-                    continue
-                view = view.cast("B")
-                # The system may write fewer bytes than requested, for example when a disk fills up.
-                while view:
-                    written = os.write(handle, view)
-                    view = view[written:]
-                    total += written
-        finally:
-            os.close(handle)
-    return total
+    with atomic_path(path) as part, open(part, "wb") as file:
+        return sum(map(file.write, chunks))
 
 
 @contextmanager

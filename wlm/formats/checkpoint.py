@@ -155,14 +155,6 @@ class Checkpoint:
         """Returns whether the time of the next save has come."""
         return self._pace.due()
 
-    def save_running(self, number: int, state: Mapping[str, np.ndarray]) -> None:
-        """Writes the state of an unfinished batch in place of its older state.
-
-        Raises:
-            WlmError: The file cannot be written; the old content stays.
-        """
-        self.save({number: state})
-
     def save(self, states: Mapping[int, Mapping[str, np.ndarray]]) -> None:
         """Writes the states of unfinished batches, by number, in place of their older states.
 

@@ -1,46 +1,34 @@
-"""A program that decompresses meshes by DracoPy, in a process of its own.
+"""A program for `wlm.formats.child` that decompresses meshes by DracoPy (Google's Draco library)."""
 
-Google's Draco library may end its process on damaged data, and allocates what the data claims. This program imports
-nothing of this package. It reads from standard input, and writes to standard output, a line of JSON and bytes:
-
-- in: a list with the number of bytes of each mesh; the bytes of all meshes
-- out: for each mesh a list of arrays: the id of the attribute (-1 for the corners of the triangles), the NumPy type,
-  and the shape; the bytes of all arrays
-"""
-
-import contextlib
 import json
-import sys
 
-MEMORY = 2 << 30
-"""Limit of its memory, in bytes, on systems that can set one."""
+import numpy as np
 
-SECONDS = 10
-"""Limit of its CPU time, in seconds, on systems that can set one."""
+PACKAGE, MEMORY, SECONDS = "DracoPy", 2 << 30, 10
 
 
-def main(most: int) -> None:
-    """Decompresses all meshes; ends with an error if they have more than `most` bytes together."""
-    with contextlib.suppress(ImportError):
-        import resource
+def main(data: bytes, most: str) -> dict[str, np.ndarray]:
+    """Decompresses all meshes.
 
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-        resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    Args:
+        data: A line of JSON, the number of bytes of each mesh, and the bytes of all meshes.
+        most: Largest allowed number of bytes of all arrays.
+
+    Returns:
+        The arrays of mesh i by the names "i,j": j is the id of an attribute, or -1 for the corners of the triangles.
+
+    Raises:
+        ValueError: The arrays have more bytes.
+    """
     import DracoPy
 
-    sizes = json.loads(sys.stdin.buffer.readline())
-    heads, arrays, total = [], [], 0
-    for size in sizes:
-        mesh = DracoPy.decode(sys.stdin.buffer.read(size))
-        found = [(each["unique_id"], each["data"]) for each in mesh.attributes] + [(-1, mesh.faces)]
-        heads.append([[int(number), data.dtype.str, list(data.shape)] for number, data in found])
-        arrays += [data.tobytes() for _, data in found]
-        total += sum(data.nbytes for _, data in found)
-        if total > most:
+    head, _, body = data.partition(b"\n")
+    arrays, at = {}, 0
+    for number, size in enumerate(json.loads(head)):
+        mesh = DracoPy.decode(body[at : at + size])
+        at += size
+        arrays |= {f"{number},{each['unique_id']}": each["data"] for each in mesh.attributes}
+        arrays[f"{number},-1"] = mesh.faces
+        if sum(each.nbytes for each in arrays.values()) > int(most):
             raise ValueError(f"the meshes have more than {most} bytes")
-    sys.stdout.buffer.write(json.dumps(heads).encode() + b"\n" + b"".join(arrays))
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    return arrays

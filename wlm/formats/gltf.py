@@ -553,39 +553,30 @@ def _load_buffers(
 ) -> tuple[bytes, ...]:
     """Returns the bytes of each buffer, from files in the document's folder or, with `trust`, in any folder."""
     files: dict[Path, int] = {}
-    return tuple(_load_buffer(path, number, buffer, binary, trust, files) for number, buffer in enumerate(buffers))
-
-
-def _load_buffer(
-    path: str | os.PathLike[str],
-    number: int,
-    buffer: dict[str, Any],
-    binary: bytes | None,
-    trust: bool,
-    files: dict[Path, int],
-) -> bytes:
-    uri, length = buffer.get("uri"), buffer["byteLength"]
-    where = f"{path}: buffers[{number}]"
-    if is_fallback(buffer):
-        return b""
-    if uri is None:
-        if number or binary is None:
-            raise WlmError(f"{where}: has no uri, and the file has no binary chunk")
-        data = binary
-    elif uri.startswith("data:"):
-        data = _data_uri(f"{where}.uri", uri)
-    else:
-        if not isinstance(length, int) or length < 1:
-            raise WlmError(f"{where}.byteLength: expected at least 1, found {length}")
-        file = local_file(str(path), uri, f"{where}.uri", trust).resolve()
-        # Thousands of buffers of one file, each read separately, would exhaust the memory.
-        earlier = files.setdefault(file, number)
-        if earlier != number:
-            raise WlmError(f"{where}.uri: expected another file, since buffers[{earlier}] already names {uri}")
-        data = read_file(file, MESH_BYTES, f"buffers[{number}] of {path}", first=length)
-    if len(data) < length:
-        raise WlmError(f"{where}: expected {length} bytes, found {len(data)}")
-    return data
+    loaded = []
+    for number, buffer in enumerate(buffers):
+        uri, length, where = buffer.get("uri"), buffer["byteLength"], f"{path}: buffers[{number}]"
+        if is_fallback(buffer):
+            data, length = b"", 0
+        elif uri is None:
+            if number or binary is None:
+                raise WlmError(f"{where}: has no uri, and the file has no binary chunk")
+            data = binary
+        elif uri.startswith("data:"):
+            data = _data_uri(f"{where}.uri", uri)
+        else:
+            if not isinstance(length, int) or length < 1:
+                raise WlmError(f"{where}.byteLength: expected at least 1, found {length}")
+            file = _local_file(str(path), uri, f"{where}.uri", trust).resolve()
+            # Thousands of buffers of one file, each read separately, would exhaust the memory.
+            earlier = files.setdefault(file, number)
+            if earlier != number:
+                raise WlmError(f"{where}.uri: expected another file, since buffers[{earlier}] already names {uri}")
+            data = read_file(file, MESH_BYTES, f"buffers[{number}] of {path}", first=length)
+        if len(data) < length:
+            raise WlmError(f"{where}: expected {length} bytes, found {len(data)}")
+        loaded.append(data)
+    return tuple(loaded)
 
 
 def _data_uri(where: str, uri: str) -> bytes:
@@ -633,11 +624,12 @@ def held_image(document: GltfDocument, number: int) -> bytes | memoryview | None
     return None
 
 
-def texture_transform(where: str, info: dict) -> np.ndarray:
-    """Returns the KHR_texture_transform of a texture slot, float64 [2, 3]: UV' = transform[:, :2] UV + transform[:, 2].
+def texture_transform(where: str, info: dict) -> tuple[int | None, np.ndarray]:
+    """Returns how a texture slot reads UVs: n of its `TEXCOORD_n`, None if the slot does not state it; and its
+    KHR_texture_transform, float64 [2, 3]: UV' = transform[:, :2] UV + transform[:, 2].
 
     Raises:
-        WlmError: It is malformed; `where` names the slot.
+        WlmError: The transform is malformed; `where` names the slot.
     """
     transform = info.get("extensions", {}).get("KHR_texture_transform", {})
     names = {"scale": [1.0, 1.0], "rotation": 0.0, "offset": [0.0, 0.0]}
@@ -645,13 +637,25 @@ def texture_transform(where: str, info: dict) -> np.ndarray:
     numbers = [*scale.ravel(), *turn.ravel(), *offset.ravel()]
     if (scale.shape, turn.shape, offset.shape) != ((2,), (), (2,)) or not np.abs(numbers).max() <= _LARGEST_TRANSFORM:
         raise WlmError(
-            f"{where}: KHR_texture_transform: expected two numbers each for scale and offset, and one for rotation"
+            f"{where}: KHR_texture_transform: expected two numbers each for scale and offset, and one for rotation, of "
+            f"at most {_LARGEST_TRANSFORM:g}"
         )
     cosine, sine = np.cos(turn), np.sin(turn)
-    return np.column_stack([np.array([[cosine, sine], [-sine, cosine]]) * scale, offset])
+    matrix = np.column_stack([np.array([[cosine, sine], [-sine, cosine]]) * scale, offset])
+    return transform.get("texCoord", info.get("texCoord")), matrix
 
 
-def local_file(document_path: str, uri: str, where: str, trust: bool) -> Path:
+def image_file(document: GltfDocument, number: int) -> Path:
+    """Returns the path of an image that is a file of its own.
+
+    Raises:
+        WlmError: There is no such image, or its URI is wrong, see `_local_file`.
+    """
+    where = f"{document.path}: images[{number}].uri"
+    return _local_file(document.path, document.item("images", number)["uri"], where, document.trust)
+
+
+def _local_file(document_path: str, uri: str, where: str, trust: bool) -> Path:
     """Returns the path of the file that a URI names, relative to the document.
 
     Raises:
@@ -660,5 +664,8 @@ def local_file(document_path: str, uri: str, where: str, trust: bool) -> Path:
     """
     name = unquote(uri)
     if _URI_SCHEME.match(uri) or Path(name).is_absolute():
-        raise WlmError(f"{where}: expected a path relative to the document, found {uri}")
-    return named_file(document_path, name, where, trust)
+        raise WlmError(f"{where}: expected a path relative to the document, found {one_line(uri, _LABEL)}")
+    path = named_file(document_path, name, where, trust)
+    # Some writers don't encode a percent sign of the name.
+    raw = path if name == uri else named_file(document_path, uri, where, trust)
+    return raw if not path.exists() and raw.exists() else path

@@ -7,21 +7,20 @@ result is a document without the extension, whose compressed parts are in new bu
 import copy
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from wlm.errors import WlmError, one_line
+from wlm.errors import WlmError
 from wlm.formats import draco_child
+from wlm.formats.child import run_child
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import GROWTH, SURE_BYTES, check_growth
 from wlm.formats.reading import damaged
 
 DRACO, MESHOPT = "KHR_draco_mesh_compression", ("EXT_meshopt_compression", "KHR_meshopt_compression")
-_EXTRA, _SECONDS = "gltf", 120.0
+_EXTRA = "gltf"
 
 
 def is_fallback(buffer: dict[str, Any]) -> bool:
@@ -136,45 +135,21 @@ def _unpack_primitives(
         pieces.append(buffers[view["buffer"]][start : start + view["byteLength"]])
         if sum(map(len, pieces)) > held:
             raise WlmError(f"{path}: {where}: expected meshes in bytes of their own, found the same ones again")
+    sizes = json.dumps([len(each) for each in pieces]).encode()
     with damaged(f"{path}: {DRACO}: damaged", ValueError):
-        meshes = _decode(pieces, max(SURE_BYTES, GROWTH * held))
-    for (where, primitive, packed), arrays in zip(found, meshes, strict=True):
+        arrays = run_child(draco_child, b"\n".join((sizes, b"".join(pieces))), str(max(SURE_BYTES, GROWTH * held)))
+    for mesh, (where, primitive, packed) in enumerate(found):
         places = [(name, primitive["attributes"][name], number) for name, number in packed["attributes"].items()]
         for name, place, number in [*places, ("indices", primitive.get("indices"), -1)]:
-            if place is None or number not in arrays:
-                raise WlmError(f"{path}: {where}: {name}: expected an accessor and compressed data for it")
-            accessor = content["accessors"][place]
-            data = arrays[number].reshape(-1, 1) if number == -1 else arrays[number]
+            if place is None or f"{mesh},{number}" not in arrays:
+                raise WlmError(
+                    f"{path}: {where}: {name}: expected both an accessor and compressed data, found at most one"
+                )
+            accessor, data = content["accessors"][place], arrays[f"{mesh},{number}"]
+            data = data.reshape(-1, 1) if number == -1 else data
             if len(data) != accessor["count"]:
                 raise WlmError(f"{path}: {where}: {name}: expected {accessor['count']} elements, found {len(data)}")
             content["bufferViews"].append(
                 _add(content, buffers, data.astype(components[accessor["componentType"]]).tobytes())
             )
             accessor |= {"bufferView": len(content["bufferViews"]) - 1, "byteOffset": 0}
-
-
-def _decode(pieces: Sequence[bytes], most: int) -> list[dict[int, np.ndarray]]:
-    """Decompresses meshes of Draco: for each its arrays by the id of the attribute, -1 for the corners.
-
-    Raises:
-        ValueError: They are damaged or too large.
-    """
-    command = [sys.executable, "-P", draco_child.__file__, str(most)]
-    data = json.dumps([len(each) for each in pieces]).encode() + b"\n" + b"".join(pieces)
-    try:
-        run = subprocess.run(command, input=data, capture_output=True, timeout=_SECONDS, check=False)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise ValueError(str(error)) from error
-    if run.returncode:
-        lines = run.stderr.decode(errors="replace").strip().splitlines()
-        raise ValueError(one_line(lines[-1], 120) if run.returncode > 0 and lines else "DracoPy crashed")
-    head, _, body = run.stdout.partition(b"\n")
-    meshes, at = [], 0
-    for entries in json.loads(head):
-        arrays = {}
-        for number, kind, shape in entries:
-            size = int(np.prod(shape)) * np.dtype(kind).itemsize
-            arrays[number] = np.frombuffer(body[at : at + size], kind).reshape(shape)
-            at += size
-        meshes.append(arrays)
-    return meshes

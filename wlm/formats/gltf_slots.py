@@ -5,16 +5,15 @@ them; others store tiling and offset there. Integer UVs take the transform of an
 of a slot for light if it keeps them in [0, 1]. A slot whose image has the name of the lightmap comes first.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.gltf import GltfDocument, GltfPrimitive, reported, texture_image, texture_transform
+from wlm.formats.gltf import GltfDocument, GltfPrimitive, image_file, reported, texture_image, texture_transform
 
 SLOTS = ("occlusion", "emissive")
 """Material slots that may hold a lightmap."""
@@ -25,6 +24,12 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 _FLOAT = 5126
 _MOST_SLOTS = 64  # texture slots of a material that are examined
 _NEAR = 0.01  # a transform for lightmaps leaves UVs this near to [0, 1]
+
+
+def usual_set(primitives: Sequence[GltfPrimitive]) -> int:
+    """Returns n of the `TEXCOORD_n` that is read without a stated set: 1, where engines look for lightmap UVs, if any
+    primitive has it; else 0."""
+    return int(any(1 in each.uv for each in primitives))
 
 
 def lightmap_transform(
@@ -48,12 +53,11 @@ def lightmap_transform(
     found = []
     material = {} if primitive.material is None else document.item("materials", primitive.material)
     for slot, info in islice(_slots(material), _MOST_SLOTS):
-        transform = info.get("extensions", {}).get("KHR_texture_transform", {})
-        if transform.get("texCoord", info.get("texCoord", 0)) != uv_set:
+        stated, rows = texture_transform(f"{document.path}: materials[{primitive.material}]", info)
+        if (stated or 0) != uv_set:
             continue
         named = _stem(document, info) == lightmap
         lit = slot.startswith(SLOTS) or "lightmap" in slot.lower()
-        rows = texture_transform(f"{document.path}: materials[{primitive.material}]", info)
         if not quantised:
             moved = primitive.uv[uv_set] @ rows[:, :2].T + rows[:, 2]
             if not (named or lit) or moved.min() < -_NEAR or moved.max() > 1.0 + _NEAR:
@@ -89,7 +93,8 @@ def _slots(holder: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
 def _stem(document: GltfDocument, info: dict[str, Any]) -> str:
     """Returns the name of a slot's image without its suffix."""
     try:
-        image = document.item("images", texture_image(document, info["index"]))
+        number = texture_image(document, info["index"])
+        image = document.item("images", number)
+        return image_file(document, number).stem if "uri" in image else Path(str(image.get("name", ""))).stem
     except WlmError:
         return ""
-    return Path(unquote(str(image.get("uri", image.get("name", ""))))).stem

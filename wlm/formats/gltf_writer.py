@@ -23,7 +23,7 @@ from wlm.formats.gltf import (
     GltfDocument,
     GltfPrimitive,
     elements,
-    local_file,
+    image_file,
     reported,
 )
 from wlm.formats.limits import MESH_BYTES
@@ -164,10 +164,8 @@ class _Tree:
         for number, image in enumerate(self.content.get("images", [])):
             if "uri" not in image:
                 continue
-            where = f"{self._document.path}: images[{number}].uri"
             try:
-                file = local_file(self._document.path, image["uri"], where, self._document.trust)
-                data = read_file(file, MESH_BYTES, where)
+                data = read_file(image_file(self._document, number), MESH_BYTES, "the image")
             except WlmError:
                 continue
             kind = next((kind for head, kind in _IMAGE_TYPES.items() if re.match(head, data, re.DOTALL)), None)

@@ -35,6 +35,12 @@ BAKE_BYTES = 1 << 30
 MODEL_BYTES = 2 << 30
 """Largest OBJ, PLY, STL or OFF file. Ten million vertices of an OBJ take about 1.5 GB."""
 
+NUMBER_BYTES = 3
+"""Bytes of an OBJ, PLY, STL or OFF file per number in it, beyond `SURE_CORNERS` numbers; large meshes have 6 to 8."""
+
+MATERIALS = 1024
+"""Most materials of an OBJ file."""
+
 MESH_BYTES = (4 << 30) - 1
 """Largest `.glb`, by its format, and largest buffer or image beside a glTF file."""
 
@@ -51,7 +57,7 @@ CORNERS_A_BYTE = 8
 """Drawn corners and vertices of a glTF file per byte of the file and its buffers; below 1 without instances."""
 
 SURE_CORNERS = 4 << 20
-"""Drawn corners and vertices that are allowed for any size of file."""
+"""Drawn corners and vertices of a glTF file, and numbers of an OBJ, that are allowed for any size of file."""
 
 CORNERS = 1 << 28
 """Largest number of drawn corners and vertices."""
@@ -103,11 +109,12 @@ def check_sides(where: str, width: int, height: int) -> None:
     """Checks the claimed size of a picture.
 
     Raises:
-        WlmError: The picture has more than `PICTURE_TEXELS`, or more than `PICTURE_SIDE` along a side.
+        WlmError: The picture has no texel, more than `PICTURE_TEXELS`, or more than `PICTURE_SIDE` along a side.
     """
-    if max(width, height) > PICTURE_SIDE or width * height > PICTURE_TEXELS:
+    if not 0 < min(width, height) <= max(width, height) <= PICTURE_SIDE or width * height > PICTURE_TEXELS:
         raise WlmError(
-            f"{where}: expected at most {PICTURE_TEXELS} texels, {PICTURE_SIDE} along a side, found {width} x {height}"
+            f"{where}: expected at least one texel, at most {PICTURE_TEXELS} texels and {PICTURE_SIDE} along a side, "
+            f"found {width} x {height}"
         )
 
 

@@ -8,6 +8,7 @@ in glTF.
 
 import io
 import os
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.limits import MODEL_BYTES
+from wlm.formats.limits import MATERIALS, MODEL_BYTES, NUMBER_BYTES, SURE_CORNERS, Budget
 from wlm.formats.reading import damaged, read_file
 
 SUFFIXES = (".obj", ".ply", ".stl", ".off")
@@ -48,8 +49,15 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
 
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise WlmError(f"{path}: expected a mesh ({', '.join(SUFFIXES)}), found {suffix or 'a name without an ending'}")
+        raise WlmError(
+            f"{path}: expected a mesh file ({', '.join(SUFFIXES)}), found {suffix or 'a name without an ending'}"
+        )
     data = read_file(path, MODEL_BYTES, f"the {suffix[1:].upper()} file")
+    # A number of a text takes trimesh up to 100 bytes, and a file of many materials the square of their number in time.
+    numbers = sum(map(data.count, (b" ", b"\n", b"\r", b"\t")))
+    Budget(str(path), max(SURE_CORNERS, len(data) // NUMBER_BYTES), "numbers").spend(numbers)
+    if len(set(re.findall(rb"usemtl[^\n]*", data))) > MATERIALS:
+        raise WlmError(f"{path}: expected at most {MATERIALS:,} materials (usemtl), found more: join some of them")
     # trimesh's readers raise any NumPy error on damaged text.
     with damaged(f"{path}: malformed {suffix[1:].upper()}", Exception):
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -59,14 +67,12 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
         parts = [_checked(each) for each in meshes]
     if not parts:
         return MeshArrays(np.empty((0, 3)), None, np.empty((0, 3), np.int32))
-    first = np.cumsum([0, *(len(position) for position, _, _ in parts)])
-    has_uv = all(uv is not None for _, uv, _ in parts)
+    position, uv, triangle = zip(*parts, strict=True)
+    first = np.cumsum([0, *map(len, position[:-1])])
     return MeshArrays(
-        np.concatenate([position for position, _, _ in parts]),
-        np.concatenate([uv for _, uv, _ in parts]) if has_uv else None,
-        np.concatenate([triangle + start for (_, _, triangle), start in zip(parts, first, strict=False)]).astype(
-            np.int32
-        ),
+        np.concatenate(position),
+        None if any(each is None for each in uv) else np.concatenate(uv),
+        np.concatenate([each + start for each, start in zip(triangle, first, strict=True)], dtype=np.int32),
     )
 
 
@@ -74,16 +80,14 @@ def _checked(mesh) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """Returns the positions, UVs (None if it has none) and triangles of a trimesh; ValueError for wrong numbers."""
     position, triangle = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     uv = getattr(mesh.visual, "uv", None)
-    if uv is not None and len(uv):
-        uv = np.asarray(uv, np.float64)[:, :2]
-        if uv.shape != (len(position), 2):
-            raise ValueError(f"expected a UV for each of {len(position)} vertices, found {uv.shape}")
-        uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], 1)
-    else:
-        uv = None
+    uv = None if uv is None or not len(uv) else np.asarray(uv, np.float64)[:, :2] * [1.0, -1.0] + [0.0, 1.0]
+    if uv is not None and uv.shape != (len(position), 2):
+        raise ValueError(f"expected UVs [{len(position)}, 2], one for each vertex, found {list(uv.shape)}")
     for name, values in (("positions", position), ("UVs", uv)):
         if values is not None and not np.isfinite(values).all():
             raise ValueError(f"expected finite {name}, found NaN or infinity")
     if triangle.size and not 0 <= triangle.min() <= triangle.max() < len(position):
-        raise ValueError(f"expected vertices below {len(position)}, found {triangle.min()} to {triangle.max()}")
+        raise ValueError(
+            f"expected vertex numbers 0 to {len(position) - 1}, found {triangle.min()} to {triangle.max()}"
+        )
     return position, uv, triangle.reshape(-1, 3)

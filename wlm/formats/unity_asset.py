@@ -1,32 +1,43 @@
 """Reading of light probes and lightmap rectangles from Unity's `LightingData.asset` and `LightProbes.asset`.
 
 UnityPy (extra `unity`) and all work by the layouts that a file contains run in a separate process (`unity_child`).
-Unity's editor writes lighting data in binary whatever the serialization mode of the project; text assets
-(`unity_text`) come from scripts and from other tools.
+Unity's editor writes lighting data in binary whatever the serialization mode of the project; text assets, a regular
+kind of YAML, come from scripts and from other tools.
 """
 
-import json
 import os
-import struct
-import subprocess
-import sys
+import re
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats import unity_child, unity_text
+from wlm.formats import unity_child
+from wlm.formats.child import run_child
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import PROBES
 from wlm.formats.reading import damaged, read_file
-from wlm.formats.unity_child import LIGHT, POSITIONS, RENDERERS, WANTED
+from wlm.formats.unity_child import KINDS, LIGHT, LIGHTING, POSITIONS, RENDERERS
 
 _EXTRA = "unity"
 _BYTES = 1 << 28
-_SECONDS = 60.0  # wall-clock limit of the process; its CPU time is limited further
 _COEFFICIENTS, _CHANNELS = 9, 3
-_NO_LIGHTMAP = 65534  # indices from here on mean that the renderer has no lightmap
+_NO_LIGHTMAP = (-1, 65534, 65535)
 _TEXT, _BUNDLE = b"%YAML", b"Unity"
+
+# The lines of a text asset that are read, with a value each. No YAML is parsed: a file costs no more than its length.
+_OBJECT = re.compile(rb"^--- !u!\d+ &-?\d+[^\n]*\r?\n(\w+):", re.MULTILINE)
+_TEXT_POSITIONS, _TEXT_LIGHT = b"m_Positions", b"m_BakedCoefficients"
+_NUMBER = rb"([-+.\w]{1,32})"
+_VECTOR = re.compile(rb"\{x: " + _NUMBER + rb",\s+y: " + _NUMBER + rb",\s+z: " + _NUMBER + rb"\}")
+_COEFFICIENT = re.compile(rb"^[ -]+sh\[ ?(\d{1,2})\]: " + _NUMBER + rb"\r?$", re.MULTILINE)
+_NUMBERS = _COEFFICIENTS * _CHANNELS
+
+
+def has_lightmap(number: Any) -> bool:
+    """Tests whether the number of a renderer's lightmap names one; Unity writes -1, 65534 or 65535 for none."""
+    return number is not None and number not in _NO_LIGHTMAP
 
 
 @dataclass(frozen=True)
@@ -69,24 +80,22 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
     if data.startswith(_BUNDLE):
         raise WlmError(f"{path}: expected an asset of Unity's editor, found an asset bundle")
     need("UnityPy", _EXTRA)
-    with damaged(f"{path}: the asset is damaged, or UnityPy cannot read its version", *_DAMAGE):
-        kinds, tables = _decoded(run_child(data))
-        if not WANTED.keys() & kinds:
-            raise WlmError(f"{path}: expected Unity's lighting data or light probes, found neither")
-        position, light = (np.concatenate(tables[name]) for name in (POSITIONS, LIGHT))
-        if len(position) != len(light):
-            raise WlmError(f"{path}: expected light for each of {len(position)} probes, found light for {len(light)}")
-        if len(position) > PROBES:
-            raise WlmError(f"{path}: expected at most {PROBES:,} light probes, found {len(position):,}")
-        rows = np.concatenate(tables[RENDERERS])
-        rows = rows[rows[:, 0] < _NO_LIGHTMAP].tolist()
-        rectangles = tuple(Rectangle(int(number), (x, y, z, w)) for number, x, y, z, w in rows)
-        values = light.reshape(-1, _CHANNELS, _COEFFICIENTS).transpose(0, 2, 1)
-    return LightingData(position, values, rectangles)
+    with damaged(f"{path}: the asset is damaged, or UnityPy cannot read its version", ValueError):
+        tables = run_child(unity_child, data)
+    position, light = tables[POSITIONS], tables[LIGHT]
+    if not {unity_child.PROBES, LIGHTING} & set(tables[KINDS].tolist()):
+        raise WlmError(f"{path}: expected Unity's lighting data or light probes, found neither")
+    if len(position) != len(light):
+        raise WlmError(f"{path}: expected light for each of {len(position)} probes, found light for {len(light)}")
+    if len(position) > PROBES:
+        raise WlmError(f"{path}: expected at most {PROBES:,} light probes, found {len(position):,}")
+    rows = [(int(number), tuple(place)) for number, *place in tables[RENDERERS].tolist() if has_lightmap(number)]
+    values = light.reshape(-1, _CHANNELS, _COEFFICIENTS).transpose(0, 2, 1)
+    return LightingData(position, values, tuple(Rectangle(*row) for row in rows))
 
 
 def _read_text(path: str | os.PathLike[str], data: bytes) -> LightingData:
-    objects = unity_text.objects(data)
+    objects = _objects(data)
     texts = [text for kind, text in objects if kind == "LightProbes"]
     if not texts:
         found = ", ".join(sorted({kind for kind, _ in objects})[:4]) or "nothing"
@@ -95,39 +104,38 @@ def _read_text(path: str | os.PathLike[str], data: bytes) -> LightingData:
             "in .bytes files, which wlm does not read: bake a Light Probe Group)"
         )
     with damaged(f"{path}: the asset is damaged", ValueError):
-        positions, values = zip(*map(unity_text.probes, texts), strict=True)
+        positions, values = zip(*map(_probes, texts), strict=True)
     return LightingData(np.concatenate(positions), np.concatenate(values), ())
 
 
-_DAMAGE = (ValueError, LookupError, TypeError, AttributeError, RecursionError, MemoryError, struct.error)
+def _objects(data: bytes) -> list[tuple[str, bytes]]:
+    """Returns the type and the text of each object of an asset."""
+    starts = list(_OBJECT.finditer(data))
+    ends = [*(start.start() for start in starts), len(data)][1:]
+    return [(start[1].decode(), data[start.end() : end]) for start, end in zip(starts, ends, strict=True)]
 
 
-def run_child(data: bytes) -> bytes:
-    """Returns what `unity_child` prints for the content of a file.
+def _probes(text: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Reads the positions, float64 [N, 3], and the coefficients, float64 [N, 9, 3], of a `LightProbes` object.
 
     Raises:
-        ValueError: UnityPy cannot read the file.
+        ValueError: The lines are damaged or incomplete.
     """
-    # With -P, a module beside the program cannot replace a package.
-    command = [sys.executable, "-P", unity_child.__file__]
-    try:
-        run = subprocess.run(command, input=data, capture_output=True, timeout=_SECONDS, check=False)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise ValueError(str(error)) from error
-    if run.returncode:
-        lines = run.stderr.decode(errors="replace").strip().splitlines()
-        crashed = f"UnityPy crashed, or exceeded its limits of {unity_child.SECONDS} s and {unity_child.MEMORY} bytes"
-        raise ValueError(lines[-1] if run.returncode > 0 and lines else crashed)
-    return run.stdout
+    places = (float(number) for match in _VECTOR.finditer(_member(text, _TEXT_POSITIONS)) for number in match.groups())
+    position, light = np.fromiter(places, np.float64).reshape(-1, 3), _member(text, _TEXT_LIGHT)
+    values = np.fromiter((float(match[2]) for match in _COEFFICIENT.finditer(light)), np.float64)
+    if len(values) != _NUMBERS * len(position):
+        raise ValueError(f"expected {_NUMBERS} coefficients for each of {len(position)} probes, found {len(values)}")
+    numbers = np.fromiter((int(match[1]) for match in _COEFFICIENT.finditer(light)), np.int64)
+    if (numbers.reshape(-1, _NUMBERS) != np.arange(_NUMBERS)).any():
+        raise ValueError(f"expected the coefficients sh[ 0] to sh[{_NUMBERS - 1}] of each probe in this order")
+    return position, values.reshape(-1, 3, 9).transpose(0, 2, 1)
 
 
-def _decoded(printed: bytes) -> tuple[set[str], dict[str, list[np.ndarray]]]:
-    """Returns the types of the objects and the tables of each path, float64 [N, columns], from the child's output."""
-    head, _, numbers = printed.partition(b"\n")
-    kinds, heads = json.loads(head)
-    tables = {POSITIONS: [np.empty((0, 3))], LIGHT: [np.empty((0, 27))], RENDERERS: [np.empty((0, 5))]}
-    at = 0
-    for path, count, columns in heads:
-        tables[path].append(np.frombuffer(numbers, np.float64, count * columns, at).reshape(count, columns))
-        at += 8 * count * columns
-    return set(kinds), tables
+def _member(text: bytes, name: bytes) -> bytes:
+    """Returns the lines of a member: those that are indented more than its name, or begin with - at its column."""
+    start = re.search(rb"^( *)" + name + rb":[^\n]*\n", text, re.MULTILINE)
+    if start is None:
+        raise ValueError(f"{name.decode()} is missing")
+    end = re.compile(rb"^ {0,%d}[^\s-]" % len(start[1]), re.MULTILINE).search(text, start.end())
+    return text[start.end() : end.start() if end else len(text)]

@@ -196,7 +196,7 @@ def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, chec
                 meter.report(step, PSNR_dB=psnr_from_mse(trainer.mse() * live, peak))
             except KeyboardInterrupt:
                 if checkpoint is not None:
-                    checkpoint.save_running(0, trainer.state())
+                    checkpoint.save({0: trainer.state()})
                 raise
         if checkpoint is not None and checkpoint.due():
-            checkpoint.save_running(0, trainer.state())
+            checkpoint.save({0: trainer.state()})

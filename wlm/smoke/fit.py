@@ -28,8 +28,7 @@ from wlm.interop import check_device
 from wlm.smoke.evaluation import Score, of_network, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network import dataset
-from wlm.smoke.network.planes import PLANES
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import PLANES, Pool
 from wlm.smoke.network.settings import Profile
 from wlm.smoke.network.trainer import Trainer, plan_round
 from wlm.system import Meter, OnProgress, Progress, load
@@ -256,7 +255,7 @@ class _Run:
             "counts": np.array([self.best_step, self.first_skipped]),
             "curve": self.curve,
         }
-        self.checkpoint.save_running(0, {**self.trainer.state(), **state})
+        self.checkpoint.save({0: {**self.trainer.state(), **state}})
 
     def result(self, finished: bool) -> Training:
         step, skipped = self.trainer.step, self.trainer.skipped

@@ -271,7 +271,7 @@ class _ProbeScene(Scene):
 def _coefficients(outputs: int, title: str) -> int:
     count = sh_count(outputs)
     if count is None:
-        raise WlmError(f"{title}: expected spherical harmonics, found {outputs} numbers a probe")
+        raise WlmError(f"{title}: expected probes of RGB spherical harmonics, found {outputs} numbers a probe")
     return count
 
 

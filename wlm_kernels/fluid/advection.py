@@ -30,7 +30,6 @@ A trace shorter than a coarse cell cannot jump over a wall. There are no gradien
 """
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,19 +44,17 @@ from wlm_kernels.fluid.advection_places import (
     SOLID,
     Box,
     Bricks,
-    FlatStencil,
+    Stencil,
     TrilinearVelocity,
     beyond_open_face,
     clip_at_solid,
+    corner,
     evaluate,
     fetch,
-    flat_stencil,
     in_domain,
     into_domain,
     is_solid,
     stencil,
-    stencil_index,
-    stencil_weight,
     trace_back,
     wall_at,
 )
@@ -131,7 +128,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return float(peek(field, i))
 
     @wp.func
-    def interpolate(field: wp.array1d[stored], at: FlatStencil) -> float:
+    def interpolate(field: wp.array1d[stored], at: Stencil) -> float:
         i00 = at.base
         i01 = at.base + at.step[1]
         i10 = at.base + at.step[0]
@@ -148,16 +145,15 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         total = float(0.0)
         weight = float(0.0)
         for k in range(8):
-            cell = stencil_index(at, k)
-            if not is_solid(box, walls, cell):
-                w = stencil_weight(at, k)
-                total += w * value_at(field, index_of(box.n, cell))
+            i, w = corner(at, k)
+            if not is_solid(box, walls, cell_of(box.n, i)):
+                total += w * value_at(field, i)
                 weight += w
         # The result is 0 if all eight cells are solid.
         return total / wp.max(weight, 1.0e-6)
 
     @wp.func
-    def limited(field: wp.array1d[stored], at: FlatStencil, value: float) -> float:
+    def limited(field: wp.array1d[stored], at: Stencil, value: float) -> float:
         """Clamps a value to the range of the eight stored values around a point."""
         i00 = at.base
         i01 = at.base + at.step[1]
@@ -253,7 +249,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 f = box.voxel * x - wp.vec3(0.5, 0.5, 0.5)
                 least = wp.vec3(wp.floor(f[0]), wp.floor(f[1]), wp.floor(f[2]))
                 if least[0] != around_x:
-                    around = fetch(u, box.coarse, stencil(box.coarse, box.periodic, box.voxel * x))
+                    around = fetch(u, stencil(box.coarse, box.periodic, box.voxel * x))
                     around_x = least[0]
                 f -= least
                 v = evaluate(around, f)
@@ -261,8 +257,8 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 if wp.static(correcting):
                     q, left_q, beside_q = departure_point(box, u, walls, around, f, x, v, -dt, wall)
                     if not (left or left_q or beside or beside_q):
-                        origin = flat_stencil(box, p)
-                        target = flat_stencil(box, q)
+                        origin = stencil(box.n, box.periodic, p)
+                        target = stencil(box.n, box.periodic, q)
                         back = interpolate(predicted.density, target)
                         change = 0.5 * (value_at(fields.density, i) - back)
                         smoke = limited(fields.density, origin, smoke + change)
@@ -277,7 +273,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                             if wp.static(hot):
                                 heat = interpolate_beside(fields.temperature, walls, box, p)
                     if not beside:
-                        at = flat_stencil(box, p)
+                        at = stencil(box.n, box.periodic, p)
                         smoke = interpolate(fields.density, at)
                         if wp.static(hot):
                             heat = interpolate(fields.temperature, at)
@@ -318,25 +314,6 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
     return carry
 
 
-def _launch(
-    box: Box,
-    velocity: wp.array,
-    walls: wp.array,
-    fields: Fields,
-    predicted: Fields | None,
-    out: Fields,
-    dt: float,
-    decay: Sequence[float],
-    bricks: Bricks,
-) -> None:
-    stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0
-    kernel = carry_kernel(predicted is not None, stored, bricks.workers > 0, solids, hot)
-    threads = bricks.workers * int(_BRICK_RUNS) or -(-box.n[0] // RUN) * box.n[1] * box.n[2]
-    # A semi-Lagrangian step does not read the prediction.
-    inputs = [box, velocity, walls, fields.arrays, (predicted or fields).arrays, float(dt), wp.vec2(*decay), bricks]
-    wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=fields.density.device)
-
-
 def advect(
     box: Box,
     velocity: wp.array,
@@ -346,8 +323,9 @@ def advect(
     dt: float,
     decay: tuple[float, float] = (1.0, 1.0),
     bricks: Bricks = DENSE,
+    predicted: Fields | None = None,
 ) -> None:
-    """Does a semi-Lagrangian step, or the first half of a MacCormack step.
+    """Does a semi-Lagrangian step, which is also the first half of a MacCormack step, or with `predicted` the second.
 
     Args:
         box: The domain, see `advection_places.make_box`.
@@ -359,23 +337,11 @@ def advect(
         decay: Factors by which density and temperature are multiplied, at most 1; (1, 1) in the first half of a
             MacCormack step.
         bricks: The bricks to compute, listed by `advection_places.relist`; default all cells.
+        predicted: The result of the first half, in a third set of arrays.
     """
-    _launch(box, velocity, walls, fields, None, out, dt, decay, bricks)
-
-
-def correct(
-    box: Box,
-    velocity: wp.array,
-    walls: wp.array,
-    fields: Fields,
-    predicted: Fields,
-    out: Fields,
-    dt: float,
-    decay: tuple[float, float] = (1.0, 1.0),
-    bricks: Bricks = DENSE,
-) -> None:
-    """Does the second half of a MacCormack step; for the other arguments see `advect`.
-
-    `predicted` is the result of `advect` for the smoke `fields`; the result is written to a third set of arrays, `out`.
-    """
-    _launch(box, velocity, walls, fields, predicted, out, dt, decay, bricks)
+    stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0
+    kernel = carry_kernel(predicted is not None, stored, bricks.workers > 0, solids, hot)
+    threads = bricks.workers * int(_BRICK_RUNS) or -(-box.n[0] // RUN) * box.n[1] * box.n[2]
+    # A semi-Lagrangian step does not read the prediction.
+    inputs = [box, velocity, walls, fields.arrays, (predicted or fields).arrays, float(dt), wp.vec2(*decay), bricks]
+    wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=fields.density.device)

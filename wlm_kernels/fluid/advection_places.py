@@ -96,15 +96,6 @@ DENSE = Bricks()
 
 @wp.struct
 class Stencil:
-    """The eight cells around a point: the lower and the upper cell of each axis, and the fraction between the two."""
-
-    low: wp.vec3i
-    high: wp.vec3i
-    f: wp.vec3
-
-
-@wp.struct
-class FlatStencil:
     """Memory offsets of the eight cells around a point: index of the lowest cell, step to the next cell along each
     axis, and the fractions between them."""
 
@@ -139,41 +130,6 @@ def _neighbour(i: int, n: int, periodic: int) -> int:
 
 
 @wp.func
-def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
-    at = Stencil()
-    half = wp.vec3(0.5, 0.5, 0.5)
-    lowest = wp.vec3(wp.floor(p[0] - half[0]), wp.floor(p[1] - half[1]), wp.floor(p[2] - half[2]))
-    at.f = p - half - lowest
-    x = int(lowest[0])
-    y = int(lowest[1])
-    z = int(lowest[2])
-    at.low = wp.vec3i(
-        _neighbour(x, n[0], periodic[0]), _neighbour(y, n[1], periodic[1]), _neighbour(z, n[2], periodic[2])
-    )
-    at.high = wp.vec3i(
-        _neighbour(x + 1, n[0], periodic[0]), _neighbour(y + 1, n[1], periodic[1]), _neighbour(z + 1, n[2], periodic[2])
-    )
-    return at
-
-
-@wp.func
-def stencil_index(at: Stencil, k: int) -> wp.vec3i:
-    return wp.vec3i(
-        wp.where(k // 4 == 0, at.low[0], at.high[0]),
-        wp.where(k // 2 % 2 == 0, at.low[1], at.high[1]),
-        wp.where(k % 2 == 0, at.low[2], at.high[2]),
-    )
-
-
-@wp.func
-def stencil_weight(at: Stencil, k: int) -> float:
-    x = wp.where(k // 4 == 0, 1.0 - at.f[0], at.f[0])
-    y = wp.where(k // 2 % 2 == 0, 1.0 - at.f[1], at.f[1])
-    z = wp.where(k % 2 == 0, 1.0 - at.f[2], at.f[2])
-    return x * y * z
-
-
-@wp.func
 def _pair(i: int, n: int, periodic: int):
     """Wraps or clamps the cells i and i + 1 of an axis; returns the first, and the second minus the first."""
     low = i
@@ -186,18 +142,28 @@ def _pair(i: int, n: int, periodic: int):
 
 
 @wp.func
-def flat_stencil(box: Box, p: wp.vec3) -> FlatStencil:
-    """Finds the eight fine cells around a point of the domain."""
+def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
+    """Finds the eight cells around a point of a domain of n cells."""
     at = p - wp.vec3(0.5, 0.5, 0.5)
     least = wp.vec3(wp.floor(at[0]), wp.floor(at[1]), wp.floor(at[2]))
-    x, along_x = _pair(int(least[0]), box.n[0], box.periodic[0])
-    y, along_y = _pair(int(least[1]), box.n[1], box.periodic[1])
-    z, along_z = _pair(int(least[2]), box.n[2], box.periodic[2])
-    out = FlatStencil()
-    out.base = (x * box.n[1] + y) * box.n[2] + z
-    out.step = wp.vec3i(along_x * box.n[1] * box.n[2], along_y * box.n[2], along_z)
+    x, along_x = _pair(int(least[0]), n[0], periodic[0])
+    y, along_y = _pair(int(least[1]), n[1], periodic[1])
+    z, along_z = _pair(int(least[2]), n[2], periodic[2])
+    out = Stencil()
+    out.base = (x * n[1] + y) * n[2] + z
+    out.step = wp.vec3i(along_x * n[1] * n[2], along_y * n[2], along_z)
     out.f = at - least
     return out
+
+
+@wp.func
+def corner(at: Stencil, k: int):
+    """Returns the index of the cell k of eight around a point, and its trilinear weight."""
+    side = wp.vec3i(k // 4, k // 2 % 2, k % 2)
+    weight = float(1.0)
+    for a in range(3):
+        weight *= wp.where(side[a] == 0, 1.0 - at.f[a], at.f[a])
+    return at.base + wp.dot(side, at.step), weight
 
 
 @wp.func_native("return u.data[i];")
@@ -205,20 +171,19 @@ def _velocity(u: wp.array1d[wp.vec3], i: int) -> wp.vec3: ...
 
 
 @wp.func
-def fetch(u: wp.array1d[wp.vec3], n: wp.vec3i, at: Stencil) -> TrilinearVelocity:
+def fetch(u: wp.array1d[wp.vec3], at: Stencil) -> TrilinearVelocity:
     """Reads the velocities of eight coarse cells and returns the polynomial that interpolates them."""
-    row00 = (at.low[0] * n[1] + at.low[1]) * n[2]
-    row01 = (at.low[0] * n[1] + at.high[1]) * n[2]
-    row10 = (at.high[0] * n[1] + at.low[1]) * n[2]
-    row11 = (at.high[0] * n[1] + at.high[1]) * n[2]
-    a = _velocity(u, row00 + at.low[2])
-    b = _velocity(u, row00 + at.high[2]) - a
-    c = _velocity(u, row01 + at.low[2])
-    d = _velocity(u, row01 + at.high[2]) - c
-    e = _velocity(u, row10 + at.low[2])
-    f = _velocity(u, row10 + at.high[2]) - e
-    g = _velocity(u, row11 + at.low[2])
-    h = _velocity(u, row11 + at.high[2]) - g
+    row01 = at.base + at.step[1]
+    row10 = at.base + at.step[0]
+    row11 = row10 + at.step[1]
+    a = _velocity(u, at.base)
+    b = _velocity(u, at.base + at.step[2]) - a
+    c = _velocity(u, row01)
+    d = _velocity(u, row01 + at.step[2]) - c
+    e = _velocity(u, row10)
+    f = _velocity(u, row10 + at.step[2]) - e
+    g = _velocity(u, row11)
+    h = _velocity(u, row11 + at.step[2]) - g
     out = TrilinearVelocity()
     out.c = a
     out.z = b
@@ -309,7 +274,7 @@ def trace_back(
         w = evaluate(around, half)
     else:
         at = stencil(box.coarse, box.periodic, box.voxel * into_domain(box, x - 0.5 * fine * v))
-        w = evaluate(fetch(u, box.coarse, at), at.f)
+        w = evaluate(fetch(u, at), at.f)
     return x - fine * w
 
 

@@ -17,7 +17,6 @@ cells that a solid frees        mean of the nearest cell of each neighbouring fl
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import warp as wp
 
@@ -36,23 +35,6 @@ _BRICK = wp.constant(BRICK)
 _BRICK_CELLS = wp.constant(BRICK**3)
 
 
-@dataclass(frozen=True)
-class SourceKernels:
-    """The kernels for smoke stored as floats or as half floats.
-
-    Attributes:
-        source: Adds or sets the smoke of a source; a thread for each fine cell of a box around the source.
-        cover: Empties cells that become solid and fills cells that become fluid; a thread for each coarse cell.
-        lift: Computes the acceleration of the air; a thread for each coarse cell.
-        empty: Sets the retired bricks of `Bricks` to 0; a thread for each cell of a brick and each worker.
-    """
-
-    source: wp.Kernel
-    cover: wp.Kernel
-    lift: wp.Kernel
-    empty: wp.Kernel
-
-
 @wp.func
 def _mark_busy(box: Box, p: wp.vec3i, value: float, bricks: Bricks):
     if bricks.workers > 0 and value > bricks.threshold:
@@ -60,8 +42,10 @@ def _mark_busy(box: Box, p: wp.vec3i, value: float, bricks: Bricks):
 
 
 @functools.cache
-def source_kernels(stored: type) -> SourceKernels:
-    """Builds (once) the kernels for smoke stored as `wp.float32` or `wp.float16`."""
+def source_kernels(stored: type) -> dict[str, wp.Kernel]:
+    """Builds (once) the kernels for smoke stored as `wp.float32` or `wp.float16`, by their names: "source" has a thread
+    for each fine cell of a box, "cover" and "lift" for each coarse cell, "empty" for each cell of a brick and worker.
+    """
     fields_type = fields_struct(stored)
 
     @wp.func
@@ -212,11 +196,11 @@ def source_kernels(stored: type) -> SourceKernels:
                 if fields.temperature.shape[0] > 0:
                     fields.temperature[at] = stored(0.0)
 
-    return SourceKernels(source, cover, lift, empty)
+    return {"source": source, "cover": cover, "lift": lift, "empty": empty}
 
 
 def _launch(name: str, size: int, inputs: list, output, fields: Fields) -> None:
-    kernel = getattr(source_kernels(fields.density.dtype), name)
+    kernel = source_kernels(fields.density.dtype)[name]
     wp.launch(kernel, size, inputs=inputs, outputs=[output], device=fields.density.device)
 
 

@@ -31,10 +31,9 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.fluid.lattice_sets import STORAGES, cell_of, lattice, memory_functions
+from wlm_kernels.fluid.lattice_sets import PAIRS, STORAGES, cell_of, lattice, memory_functions
 
 OPERATORS = ("bgk", "regularised")
-FORCES = ("none", "uniform", "field")
 
 CAUSES = ("the density is not positive", "the speed exceeds that of sound", "not a number")
 """Reasons why a run stops, in the order of their codes."""
@@ -73,7 +72,7 @@ class Spec:
         storage: "float32" or "float16".
         eddies: Whether Smagorinsky's C is above 0.
         solids: Whether any cell may be solid.
-        force: One of `FORCES`.
+        forced: Whether a force acts on the fluid.
         walls: For each axis whether both of its faces are walls at rest.
         wide: Whether elements are indexed in 64 bits, see `lattice_sets.memory_functions`.
     """
@@ -83,7 +82,7 @@ class Spec:
     storage: str = "float32"
     eddies: bool = True
     solids: bool = False
-    force: str = "none"
+    forced: bool = False
     walls: tuple[bool, bool, bool] = (False, False, False)
     wide: bool = False
 
@@ -92,7 +91,6 @@ class Spec:
         for name, value, allowed in (
             ("operator", self.operator, OPERATORS),
             ("storage", self.storage, tuple(STORAGES)),
-            ("force", self.force, FORCES),
         ):
             if value not in allowed:
                 raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}")
@@ -121,12 +119,8 @@ def _relax(spec: Spec) -> Any:
                 if wp.static(c[2 * h + 1][a] != 0):
                     even += 4.5 * diagonal[a]
                     odd += wp.static(3.0 * c[2 * h + 1][a]) * j[a]
-            if wp.static(c[2 * h + 1][0] * c[2 * h + 1][1] != 0):
-                even += wp.static(9.0 * c[2 * h + 1][0] * c[2 * h + 1][1]) * off[0]
-            if wp.static(c[2 * h + 1][0] * c[2 * h + 1][2] != 0):
-                even += wp.static(9.0 * c[2 * h + 1][0] * c[2 * h + 1][2]) * off[1]
-            if wp.static(c[2 * h + 1][1] * c[2 * h + 1][2] != 0):
-                even += wp.static(9.0 * c[2 * h + 1][1] * c[2 * h + 1][2]) * off[2]
+                if wp.static(c[2 * h + 1][PAIRS[a][0]] * c[2 * h + 1][PAIRS[a][1]] != 0):
+                    even += wp.static(9.0 * c[2 * h + 1][PAIRS[a][0]] * c[2 * h + 1][PAIRS[a][1]]) * off[a]
             out[2 * h + 1] = wp.static(w[2 * h + 1] * scale) * (even + odd)
             out[2 * h + 2] = wp.static(w[2 * h + 1] * scale) * (even - odd)
         return out
@@ -139,7 +133,6 @@ def _relax(spec: Spec) -> Any:
         # The only division by the density in the step.
         inverse = 1.0 / rho
         u = inverse * j
-        after = inverse * (j + force)
         third = wp.static(1.0 / 3.0) * drho
         # The equilibrium stress, and the non-equilibrium stress, which the strain of the flow causes.
         eq_diagonal = wp.cw_mul(j, u)
@@ -156,18 +149,17 @@ def _relax(spec: Spec) -> Any:
         if wp.static(spec.operator == "regularised"):
             mean = wp.static(1.0 / axes) * (neq_diagonal[0] + neq_diagonal[1] + neq_diagonal[2])
             neq_diagonal -= wp.vec3(mean, mean, wp.static(0.0 if flat else 1.0) * mean)
+        # The equilibrium after the force has acted; rho (u + F / rho) is j + F.
+        momentum = wp.vec3(j)
+        if wp.static(spec.forced):
+            momentum = j + force
+        after = inverse * momentum
+        after_diagonal = wp.cw_mul(momentum, after)
+        after_off = wp.vec3(momentum[0] * after[1], momentum[0] * after[2], momentum[1] * after[2])
         if wp.static(spec.operator == "bgk"):
             equilibrium = hermite(drho, j, eq_diagonal, eq_off)
-            if wp.static(spec.force == "none"):
-                return equilibrium + keep * (g - equilibrium)
-            cross = wp.vec3(after[0] * after[1], after[0] * after[2], after[1] * after[2])
-            forced = hermite(drho, rho * after, rho * wp.cw_mul(after, after), rho * cross)
-            return forced + keep * (g - equilibrium)
-        if wp.static(spec.force == "none"):
-            return hermite(drho, j, eq_diagonal + keep * neq_diagonal, eq_off + keep * neq_off)
-        cross = wp.vec3(after[0] * after[1], after[0] * after[2], after[1] * after[2])
-        stress = rho * wp.cw_mul(after, after) + keep * neq_diagonal
-        return hermite(drho, rho * after, stress, rho * cross + keep * neq_off)
+            return hermite(drho, momentum, after_diagonal, after_off) + keep * (g - equilibrium)
+        return hermite(drho, momentum, after_diagonal + keep * neq_diagonal, after_off + keep * neq_off)
 
     return relax
 
@@ -182,8 +174,7 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         solid: uint8 [N], above 0 where a cell is solid; used if `spec.solids`.
         tau: Relaxation time, 1/2 + 3 nu.
         eddy: `eddy_factor`, used if `spec.eddies`.
-        force: Acceleration of all cells' fluid in cells per step squared, used if `spec.force` is "uniform".
-        forces: vec3 [N], acceleration of each cell's fluid, used if `spec.force` is "field".
+        forces: vec3 [N], acceleration of each cell's fluid in cells per step squared, used if `spec.forced`.
         parity: 0 or 1: `clock[parity]` is the number of steps done; the step writes one more to the other element.
         clock: int [2], counts steps.
         trouble: int64 [1], lowered to the key of the first cell in which the flow blew up, see `trouble_of`.
@@ -202,7 +193,6 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         solid: wp.array1d[wp.uint8],
         tau: float,
         eddy: float,
-        force: wp.vec3,
         forces: wp.array1d[wp.vec3],
         parity: int,
         # out:
@@ -232,9 +222,7 @@ def step_kernel(spec: Spec) -> wp.Kernel:
             key = wp.int64(clock[parity]) * _CELLS + wp.int64(i)
             wp.atomic_min(trouble, 0, key * _CODES + wp.int64(code))
         push = wp.vec3()
-        if wp.static(spec.force == "uniform"):
-            push = force
-        if wp.static(spec.force == "field"):
+        if wp.static(spec.forced):
             push = forces[i]
         g = relax(g, drho, j, diagonal, off, push, tau, eddy)
         for q in range(wp.static(count_q)):

@@ -4,7 +4,8 @@ Read `fields` and `equilibrium` of `tests/reference/lattice.py`, and `test_spher
 `tests/kernels/test_lattice.py` first: they compute the same in NumPy.
 
 An array of uint8 stores for each cell the number of its body, 1 to 255, or 0 for fluid. Cell centres are at half
-integers, in units of a cell. Bodies are rigid: u(x) = velocity + spin x (x - centre).
+integers, in units of a cell. Bodies do not rotate; an array of velocities, vec3, has that of body k at index k, in
+cells per step.
 """
 
 import functools
@@ -30,31 +31,18 @@ wp.set_module_options({"enable_backward": False})
 _INSIDE = wp.constant(0.5)
 
 
-@wp.struct
-class Bodies:
-    """Motion of K rigid bodies; element k belongs to body k, and element 0 stands for the fluid and is 0.
-
-    Attributes:
-        velocity: vec3 [K + 1], velocity of the body's centre, cells per step.
-        spin: vec3 [K + 1], angular velocity, radians per step.
-        centre: vec3 [K + 1], position of the body's centre, cells.
-    """
-
-    velocity: wp.array1d[wp.vec3]
-    spin: wp.array1d[wp.vec3]
-    centre: wp.array1d[wp.vec3]
+@wp.func
+def _centre(n: wp.vec3i, i: int) -> wp.vec3:
+    p = cell_of(n, i)
+    return wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
 
 
 @wp.func
-def velocity_at(bodies: Bodies, k: int, x: wp.vec3) -> wp.vec3:
-    """Computes the velocity of body k at a point x, both in units of cells."""
-    return bodies.velocity[k] + wp.cross(bodies.spin[k], x - bodies.centre[k])
-
-
-@wp.func
-def body_velocity(bodies: Bodies, k: int, p: wp.vec3i) -> wp.vec3:
-    """Computes the velocity of body k at the centre of cell p."""
-    return velocity_at(bodies, k, wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5))
+def _put(solid: wp.array1d[wp.uint8], i: int, body: wp.uint8, inside: bool):
+    if inside:
+        solid[i] = body
+    elif solid[i] == body:
+        solid[i] = wp.uint8(0)
 
 
 @wp.kernel
@@ -68,13 +56,7 @@ def _sphere(
     solid: wp.array1d[wp.uint8],
 ):
     i = wp.tid()
-    p = cell_of(n, i)
-    x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
-    inside = wp.length(x - centre) < radius
-    if inside:
-        solid[i] = body
-    elif solid[i] == body:
-        solid[i] = wp.uint8(0)
+    _put(solid, i, body, wp.length(_centre(n, i) - centre) < radius)
 
 
 @wp.kernel
@@ -83,20 +65,16 @@ def _mesh(
     n: wp.vec3i,
     body: wp.uint8,
     mesh: wp.uint64,
-    to_mesh: wp.transform,
+    position: wp.vec3,
     scale: float,
     reach: float,
     # out:
     solid: wp.array1d[wp.uint8],
 ):
     i = wp.tid()
-    p = cell_of(n, i)
-    x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
-    query = wp.mesh_query_point_sign_winding_number(mesh, wp.transform_point(to_mesh, x) / scale, reach, 2.0, _INSIDE)
-    if query.result and query.sign < 0.0:
-        solid[i] = body
-    elif solid[i] == body:
-        solid[i] = wp.uint8(0)
+    x = (_centre(n, i) - position) / scale
+    query = wp.mesh_query_point_sign_winding_number(mesh, x, reach, 2.0, _INSIDE)
+    _put(solid, i, body, query.result and query.sign < 0.0)
 
 
 def voxelise_sphere(solid, body: int, centre, radius: float) -> None:
@@ -112,7 +90,7 @@ def voxelise_sphere(solid, body: int, centre, radius: float) -> None:
     wp.launch(_sphere, solid.size, inputs=inputs, outputs=[solid.flatten()], device=solid.device)
 
 
-def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position=(0.0, 0.0, 0.0), rotation=None, scale: float = 1.0) -> None:
+def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position, scale: float) -> None:
     """Marks the cells whose centres are in a closed mesh with a body's number, and clears the body's other cells.
 
     Args:
@@ -120,14 +98,12 @@ def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position=(0.0, 0.0, 0.0), rot
         body: The body's number, 1 to 255.
         mesh: Mesh on the device of `solid`, made with `support_winding_number=True`.
         position: Position of the mesh's origin, in cells.
-        rotation: Rotation of the mesh about its origin, a `wp.quat`; None: no rotation.
         scale: Cells per unit of the mesh.
     """
     n = wp.vec3i(*solid.shape)
-    placed = wp.transform(wp.vec3(*position), wp.quat_identity() if rotation is None else rotation)
     # No cell is farther away than the domain's diagonal.
     reach = 4.0 * float(sum(solid.shape)) / scale
-    inputs = [n, wp.uint8(body), mesh.id, wp.transform_inverse(placed), float(scale), reach]
+    inputs = [n, wp.uint8(body), mesh.id, wp.vec3(*position), float(scale), reach]
     wp.launch(_mesh, solid.size, inputs=inputs, outputs=[solid.flatten()], device=solid.device)
 
 
@@ -162,28 +138,25 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         n: wp.vec3i,
         f: wp.array2d[stored],
         solid: wp.array1d[wp.uint8],
-        bodies: Bodies,
-        force: wp.vec3,
+        velocity: wp.array1d[wp.vec3],
         forces: wp.array1d[wp.vec3],
         # out:
         drho: wp.array1d[float],
         u: wp.array1d[wp.vec3],
     ):
         i = wp.tid()
-        p = cell_of(n, i)
         excess = float(0.0)
         v = wp.vec3()
         body = int(0)
         if solid.shape[0] > 0:
             body = int(solid[i])
         if body > 0:
-            v = body_velocity(bodies, body, p)
+            v = velocity[body]
         else:
-            excess, j, _diagonal, _off = moments(gather(f, n, p))
-            half = 0.5 * force
+            excess, j, _diagonal, _off = moments(gather(f, n, cell_of(n, i)))
             if forces.shape[0] > 0:
-                half += 0.5 * forces[i]
-            v = (j + half) / (1.0 + excess)
+                j += 0.5 * forces[i]
+            v = j / (1.0 + excess)
         if drho.shape[0] > 0:
             drho[i] = excess
         if u.shape[0] > 0:

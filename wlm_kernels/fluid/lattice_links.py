@@ -23,7 +23,6 @@ from dataclasses import dataclass
 
 import warp as wp
 
-from wlm_kernels.fluid.lattice_fields import Bodies, velocity_at
 from wlm_kernels.fluid.lattice_sets import (
     STORAGES,
     Tables,
@@ -256,7 +255,7 @@ def _find(
     n: wp.vec3i,
     bounded: wp.vec3i,
     solid: wp.array1d[wp.uint8],
-    bodies: Bodies,
+    velocity: wp.array1d[wp.vec3],
     # in, out:
     links: Links,
     # out:
@@ -272,20 +271,18 @@ def _find(
         if not crosses(n, bounded, source):
             k = int(solid[index_of(n, wrapped(n, source))])
             if k > 0:
-                # The wall is halfway between the centres of the two cells.
-                c = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
-                x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5) - 0.5 * c
-                u = velocity_at(bodies, k, x)
+                u = velocity[k]
                 if wp.dot(u, u) > 0.0:
                     wp.atomic_max(fastest, 0, wp.length(u))
                 at = links.faces + wp.atomic_add(count, 0, 1)
                 if at < links.cell.shape[0]:
                     links.cell[at] = i
                     links.code[at] = wp.uint8(q)
+                    c = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
                     links.term[at] = 6.0 * t.w[q] * wp.dot(c, u)
 
 
-def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, bodies: Bodies, links: Links):
+def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, velocity: wp.array, links: Links):
     """Lists the links of solid cells, in any order, after the links of faces; `links.used` is not changed.
 
     Args:
@@ -293,15 +290,15 @@ def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, 
         n: Cells along x, y and z; N in all.
         bounded: 1 for each axis that is not periodic, else 0.
         solid: uint8 [N], number of the body of each cell, 0 for fluid.
-        bodies: Motion of the bodies.
+        velocity: vec3 [256], velocity of each body.
         links: The links, modified.
 
     Returns:
         Number of the solids' links, int [1], which may exceed the room in the arrays: the other links are then missing;
-        speed of the fastest point of a surface in cells per step, float [1].
+        speed of the fastest body that has links, in cells per step, float [1].
     """
     count, fastest = (wp.zeros(1, dtype=dtype, device=solid.device) for dtype in (int, float))
-    inputs = [tables, n, bounded, solid, bodies, links]
+    inputs = [tables, n, bounded, solid, velocity, links]
     wp.launch(_find, solid.shape[0], inputs=inputs, outputs=[count, fastest], device=solid.device)
     return count, fastest
 

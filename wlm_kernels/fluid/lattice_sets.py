@@ -21,6 +21,9 @@ HALF_SCALE = 32768.0
 
 STORAGES = {"float32": (wp.float32, 1.0), "float16": (wp.float16, HALF_SCALE)}
 
+PAIRS = ((0, 1), (0, 2), (1, 2))
+"""The pairs of axes of the off-diagonal components xy, xz and yz."""
+
 
 @dataclass(frozen=True)
 class VelocitySet:
@@ -190,14 +193,9 @@ def memory_functions(
         walls: For each axis whether walls at rest close it.
         wide: Whether populations are indexed in 64 bits, which adds a sixth to a step's instructions; otherwise there
             may be at most `NARROW` of them.
-
-    Raises:
-        ValueError: The lattice or the storage is unknown.
     """
-    velocities = lattice(lattice_name)
-    if storage not in STORAGES:
-        raise ValueError(f"storage: expected one of {', '.join(STORAGES)}, got {storage!r}")
-    c, count = velocities.c, len(velocities.c)
+    c = lattice(lattice_name).c
+    count = len(c)
     stored, scale = STORAGES[storage]
     vec = wp.types.vector(count, float)
     index_type = wp.int64 if wide else wp.int32
@@ -235,13 +233,11 @@ def memory_functions(
         # Warp's hash of a function excludes `wp.static` expressions of loop variables: without these constants a gather
         # with other walls would have the same hash, and would be loaded instead.
         closed = wp.vec3i(wp.static(int(walls[0])), wp.static(int(walls[1])), wp.static(int(walls[2])))
-        low = wp.cw_mul(
-            closed, wp.vec3i(wp.where(p[0] == 0, 1, 0), wp.where(p[1] == 0, 1, 0), wp.where(p[2] == 0, 1, 0))
-        )
-        top = n - wp.vec3i(1, 1, 1) - p
-        high = wp.cw_mul(
-            closed, wp.vec3i(wp.where(top[0] == 0, 1, 0), wp.where(top[1] == 0, 1, 0), wp.where(top[2] == 0, 1, 0))
-        )
+        low = wp.vec3i()
+        high = wp.vec3i()
+        for a in range(3):
+            low[a] = wp.where(p[a] == 0, closed[a], 0)
+            high[a] = wp.where(p[a] == n[a] - 1, closed[a], 0)
         g = vec()
         for q in range(wp.static(count)):
             row = x[wp.static(1 - c[q][0])] * n[1] + y[wp.static(1 - c[q][1])]
@@ -261,33 +257,18 @@ def memory_functions(
     @wp.func
     def moments(g: vec):
         drho = float(g[0])
-        jx = float(0.0)
-        jy = float(0.0)
-        jz = float(0.0)
-        xx = float(0.0)
-        yy = float(0.0)
-        zz = float(0.0)
-        xy = float(0.0)
-        xz = float(0.0)
-        yz = float(0.0)
+        momentum = wp.vec3()
+        diagonal = wp.vec3()
+        off = wp.vec3()
         for q in range(1, wp.static(count)):
             drho += g[q]
-            if wp.static(c[q][0] != 0):
-                jx += wp.static(float(c[q][0])) * g[q]
-                xx += g[q]
-            if wp.static(c[q][1] != 0):
-                jy += wp.static(float(c[q][1])) * g[q]
-                yy += g[q]
-            if wp.static(c[q][2] != 0):
-                jz += wp.static(float(c[q][2])) * g[q]
-                zz += g[q]
-            if wp.static(c[q][0] * c[q][1] != 0):
-                xy += wp.static(float(c[q][0] * c[q][1])) * g[q]
-            if wp.static(c[q][0] * c[q][2] != 0):
-                xz += wp.static(float(c[q][0] * c[q][2])) * g[q]
-            if wp.static(c[q][1] * c[q][2] != 0):
-                yz += wp.static(float(c[q][1] * c[q][2])) * g[q]
+            for a in range(3):
+                if wp.static(c[q][a] != 0):
+                    momentum[a] += wp.static(float(c[q][a])) * g[q]
+                    diagonal[a] += g[q]
+                if wp.static(c[q][PAIRS[a][0]] * c[q][PAIRS[a][1]] != 0):
+                    off[a] += wp.static(float(c[q][PAIRS[a][0]] * c[q][PAIRS[a][1]])) * g[q]
         unit = wp.static(1.0 / scale)
-        return unit * drho, unit * wp.vec3(jx, jy, jz), unit * wp.vec3(xx, yy, zz), unit * wp.vec3(xy, xz, yz)
+        return unit * drho, unit * momentum, unit * diagonal, unit * off
 
     return MemoryFunctions(vec, gather, moments, put, load, store)

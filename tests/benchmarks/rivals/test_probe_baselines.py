@@ -167,7 +167,7 @@ def test_hard_cases(name, bits):
     }
     for case, (place, light) in cases.items():
         for components in (1, 12):
-            result = METHODS[name](place, light, components, 8, bits=bits)
+            result = _make(name, place, light, components, bits=bits)
             assert np.isfinite(result.decoded).all(), case
             if components == 12 or case in ("one probe", "zero", "constant"):
                 limit = (4 * HALF if bits is None else 0.02) * np.abs(light).max()
@@ -241,14 +241,14 @@ def test_unreal_refuses():
 
 @pytest.mark.parametrize("name", RIVALS)
 def test_at_bytes_keeps_the_size_and_uses_it(name):
-    position, values = _probes(count=150)
-    budgets = [int(share * values.nbytes) for share in (0.15, 0.28, 0.5)]
+    position, values = _probes(count=100)
+    budgets = [int(share * values.nbytes) for share in (0.15, 0.4)]
     results = [at_bytes(name, position, values, budget) for budget in budgets]
     for result, budget in zip(results, budgets, strict=True):
         assert result.name == name and result.bytes <= budget
     errors = [_error(values, result.decoded) for result in results]
-    assert errors[0] > errors[1] >= errors[2]
-    with pytest.raises(WlmError, match=f"{name}: no settings fit 150 probes into 20 bytes"):
+    assert errors[0] > errors[1]
+    with pytest.raises(WlmError, match=f"{name}: no settings fit 100 probes into 20 bytes"):
         at_bytes(name, position, values, 20)
 
 

@@ -86,14 +86,14 @@ def test_the_last_sixth_is_on_levels_and_gradients_pass_through():
 def test_loss_falls_and_seeds_repeat():
     x, values = room()
 
-    def losses(seed):
+    def losses(seed, count=10):
         fit = dense(x, values, steps=300, seed=seed)
-        return [float(fit.step()) for _ in range(300)]
+        return [float(fit.step()) for _ in range(count)]
 
-    first = losses(3)
+    first = losses(3, 300)
     # From the variance that there is to about a third.
     assert first[-1] < 0.4 * first[0]
-    assert losses(3) == first and losses(4) != first
+    assert losses(3) == first[:10] and losses(4) != first[:10]
 
 
 def test_one_probe_and_probes_at_one_place():

@@ -1,6 +1,7 @@
 """Pages: what they carry, and what a page can't be made of."""
 
 import base64
+import hashlib
 import json
 import re
 import zlib
@@ -49,6 +50,9 @@ def test_a_name_is_text_and_never_a_script(tmp_path):
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "alert(1)</script>" not in text
     assert parts(tmp_path / "page.html")[0]["title"] == name
+    script = re.search("<script>(.*?)</script>", text, re.S)[1]
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    assert f"default-src 'none'; script-src 'sha256-{digest}'" in text, "no other script runs"
 
 
 def test_a_page_loads_nothing_from_elsewhere(tmp_path):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, printable
 
 ENGINES = ("three", "godot", "unity", "unreal")
 """Engines for which kits are written: three.js, Godot 4, Unity, Unreal Engine 5."""
@@ -20,6 +20,7 @@ README_FILE = "README.md"
 # Most texels along a side of a picture that the editor imports, or that WebGL2 supports on most machines.
 _MOST_SIDE = {"unreal": 8192, "godot": 16384, "unity": 16384, "three": 16384}
 
+_MARKDOWN = re.compile(r"[\\`*<>&!\[\]]")
 _MARK = re.compile(r"@(\w+)@")
 _SAMPLER = re.compile(
     r"#ifndef (\w+)\n#ifndef \1_BINDING\nuniform (\w+) (\w+);\n#else\n.*\n#endif\n#define \1 \3\n#endif\n"
@@ -29,10 +30,14 @@ _SAMPLER = re.compile(
 def filled(asset: str, **parts: str) -> str:
     """Reads a template from `assets` and replaces its marks `@NAME@` by `parts`.
 
+    In Markdown, the characters of NAME that have a meaning there, or in HTML, are escaped.
+
     Raises:
         KeyError: A mark of the template is not among `parts`.
     """
     text = (resources.files("wlm.export.engines") / "assets" / asset).read_text(encoding="utf-8")
+    if asset.endswith(".md"):
+        parts["NAME"] = _MARKDOWN.sub(r"\\\g<0>", printable(parts["NAME"]))
     return _MARK.sub(lambda match: parts[match[1]].rstrip("\n"), text)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 import json
 import os
@@ -72,13 +73,17 @@ class Page:
             # Without "<" no name can end the script element.
             text = json.dumps(manifest, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
         except ValueError as error:
-            raise WlmError(f"{self.title}: cannot be shown: a number is NaN or infinite") from error
+            raise WlmError(f"{self.title}: cannot make the page: a number for its script is NaN or infinite") from error
+        scripts = [*map(_asset, _COMMON), *self.scripts, *map(_asset, (f"{self.kind}.js", "main.js"))]
+        script = "\n".join(["'use strict';", *scripts])
         pieces = {
+            # The browser runs this script alone, whatever a name brought into the page.
+            "SCRIPT-HASH": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
             "TITLE": html.escape(self.title),
             "STYLE": _asset("page.css"),
             "MANIFEST": text,
             "CONTENT": base64.b64encode(zlib.compress(bytes(content), 9)).decode(),
-            "SCRIPT": "\n".join([*map(_asset, _COMMON), *self.scripts, *map(_asset, (f"{self.kind}.js", "main.js"))]),
+            "SCRIPT": script,
         }
         # The template is split before it is filled, since the parts may contain marks.
         first, *rest = _asset("page.html").split("@")
