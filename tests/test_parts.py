@@ -208,7 +208,9 @@ def test_a_few_bytes_that_claim_a_large_atlas(path):
     mask = np.full(1 << 23, 255, np.uint8)
     frame = np.frombuffer(compress(mask.tobytes()), np.uint8)
     rewrite(path, {"sizes": [[8192, 8192]], "parts": {"mask": [1 << 23]}}, {"mask": frame})
-    refused(kept, path, "at most 65536 texels per stored texel, of which there are 1, found 8192x8192")
+    refused(
+        kept, path, "at most 65536 texels of a lightmap for each texel of its textures, which have 1, found 8192x8192"
+    )
 
 
 def test_a_few_bytes_that_claim_a_large_network(path):

@@ -40,7 +40,7 @@ class Lost(Exception):
 
 def cores() -> int:
     """Returns the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def each(call: Callable[[_Item], _Answer], items: Iterable[_Item]) -> Iterator[_Answer]:
@@ -177,12 +177,13 @@ class Processes(Workers):
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
         # Without this, NumPy would start one thread per core in each process.
         environment.setdefault("OPENBLAS_NUM_THREADS", str(max(1, cores() // self.count)))
+        # Ctrl-C in a terminal signals the whole process group; workers must survive it to return their state.
+        group = {"process_group": 0} if os.name == "posix" else {}
         command = [sys.executable, "-P", "-c", f"from {__name__} import serve; serve()"]
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         try:
             errors = tempfile.TemporaryFile()  # noqa: SIM115  (closed with its process)
-            # Ctrl-C in a terminal signals the whole process group; workers must survive it to return their state.
-            process = subprocess.Popen(command, stderr=errors, env=environment, process_group=0, **pipes)
+            process = subprocess.Popen(command, stderr=errors, env=environment, **pipes, **group)
         except OSError as error:
             raise WlmError(f"workers: cannot start process {number}: {error.strerror or error}") from error
         self._processes[number], self._errors[number] = process, errors

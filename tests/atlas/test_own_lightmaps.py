@@ -428,7 +428,7 @@ def test_renderers_without_a_lightmap(tmp_path, number):
         (tmp_path / "lights.json").write_text(json.dumps(lists))
         found = load(path, tmp_path / "lights.json")
         assert [each.label for each in found.objects] == ["crate"] and len(found.blocker) == 12
-        assert "1 objects without a lightmap" in found.warnings[0]
+        assert "1 objects have no lightmap" in found.warnings[0]
 
 
 def test_a_mirrored_node_keeps_its_front(tmp_path):

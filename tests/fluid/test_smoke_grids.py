@@ -17,7 +17,7 @@ from wlm.formats.vdb import GridHead
 from wlm.inspection import inspect
 from wlm.inspection.folders import input_system
 from wlm.smoke.data import load_frames
-from wlm.smoke.march.coarse import coarse_march
+from wlm.smoke.march.six_way import coarse_march
 from wlm.smoke.network.settings import DatasetSettings
 
 FILES = Path(__file__).resolve().parents[1] / "files"

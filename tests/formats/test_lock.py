@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from wlm.errors import WlmError
+from wlm.formats import lock
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.folder import claim, staged, write_index
 from wlm.formats.lock import is_passing, locked
@@ -124,20 +125,28 @@ def test_what_is_in_the_making_is_no_file_of_others(tmp_path):
             (tmp_path / mine).unlink()
 
 
-def test_a_file_system_without_locks(tmp_path, monkeypatch):
-    """Nobody is kept out, and nothing of others is removed, since nobody can tell whose it is."""
+def test_a_system_without_locks(tmp_path, monkeypatch):
+    """Nobody is kept out, and nothing is removed, since nobody can tell whose it is."""
+    with another_process(f"with atomic_path({str(tmp_path / 'a')!r}):"):
+        left = os.listdir(tmp_path)
+    monkeypatch.setattr(lock, "fcntl", None)
+    before = len(os.listdir("/dev/fd"))
+    with locked(tmp_path / "a"), atomic_path(tmp_path / "a") as part:
+        part.write_text("a")
+        assert len(os.listdir("/dev/fd")) == before, "Windows renames no file that is open"
+    with staged(tmp_path / "out", "index.json", "f") as made:
+        write_index(made / "index.json", {"format": "f"})
+    assert sorted(os.listdir(tmp_path)) == [*left, "a", "out"]
 
+
+def test_a_file_system_without_locks(tmp_path, monkeypatch):
     def flock(handle, how):
         raise OSError(95, "Operation not supported")
 
-    (tmp_path / "other").mkdir()
-    with another_process(f"with atomic_path({str(tmp_path / 'other' / 'a')!r}):"):
-        pass
-    left = os.listdir(tmp_path / "other")
     monkeypatch.setattr(fcntl, "flock", flock)
     with locked(tmp_path / "a"), atomic_path(tmp_path / "a") as part:
         part.write_text("a")
-        assert len(os.listdir(tmp_path)) == 2
-    assert sorted(os.listdir(tmp_path)) == ["a", "other"]
-    with locked(tmp_path / "none" / "a"), locked(tmp_path / "other" / "a"):
-        assert os.listdir(tmp_path / "other") == left != []
+        assert len(os.listdir(tmp_path)) == 1
+    assert os.listdir(tmp_path) == ["a"]
+    with locked(tmp_path / "none" / "a"):
+        assert os.listdir(tmp_path) == ["a"]

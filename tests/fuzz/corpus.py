@@ -22,8 +22,8 @@ from wlm.formats.exr import write_exr
 from wlm.probe.ambient_cube import write_irradiance_volume
 from wlm.probe.data import save_probes
 from wlm.smoke.data import open_frames, write_six_way
-from wlm.smoke.march.coarse import with_surface
-from wlm.smoke.march.fine import bake as bake_smoke
+from wlm.smoke.march.six_way import bake as bake_smoke
+from wlm.smoke.march.six_way import with_surface
 from wlm.smoke.scene import Scene
 
 _HEIGHT, _WIDTH = 12, 10  # of every picture

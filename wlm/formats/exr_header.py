@@ -51,7 +51,8 @@ def check_header(path: str | os.PathLike[str]) -> list[ExrHeader]:
             attributes and channels, or claims more pixels than the limits or the size of the file allow.
     """
     with open_file(path, "the EXR file") as file:
-        data, size = file.read(_HEADER_BYTES), os.fstat(file.fileno()).st_size
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(min(size, _HEADER_BYTES))
     if not data.startswith(MAGIC):
         raise WlmError(f"{path}: expected an EXR file, found other content")
     with damaged(f"{path}: the EXR file is cut short or damaged", ValueError, LookupError, struct.error):

@@ -12,6 +12,9 @@ from typing import Any, BinaryIO
 from wlm.errors import WlmError, one_line
 from wlm.formats.limits import INDEX_BYTES, INTEGER, JSON_GROWTH, SURE_JSON, Budget
 
+# Windows lacks the first two, and no file name blocks there. The last one disables newline translation.
+_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
+
 _POINTER = b"version https://git-lfs"  # the first bytes of the text that stands for a file which was not fetched
 _MANY_DIGITS = re.compile(rb"\d{19}")
 _LONGEST_INTEGER = 40  # characters
@@ -30,7 +33,7 @@ def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
     """
     try:
         # Opened without blocking, since a pipe without a writer would never open.
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY)
+        handle = os.open(path, _FLAGS)
     except OSError as error:
         raise WlmError(f"{path}: cannot read {what}: {error.strerror or error}") from error
     except ValueError as error:  # a NUL or an unpaired surrogate

@@ -26,7 +26,7 @@ def decode_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.CONSTANT:
-        return _filled(_constant(model, number, time))
+        return np.broadcast_to(_constant(model, number, time), (TILE, TILE, 3)).copy()
     if model.kind[number] == TileKind.FRAMES:
         before, after, share = model.axis.neighbours(time)
         early, late = (_frame(model, number, at) ** model.profile.gamma for at in (before, after))
@@ -36,17 +36,6 @@ def decode_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
 
 def colour_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
     """Decodes one tile to gamma space, radiance ** (1 / gamma), float64 [128, 128, 3]; see `decode_tile64`."""
-    _check(model, number, time)
-    kind = model.kind[number]
-    if kind == TileKind.EMPTY:
-        return np.zeros((TILE, TILE, 3))
-    if kind == TileKind.CONSTANT:
-        return _filled(_constant(model, number, time) ** (1.0 / model.profile.gamma))
-    reads = model.axis.reads(time)
-    if kind == TileKind.FRAMES and model.axis.neighbours(time)[2] == 0:
-        return _frame(model, number, model.axis.neighbours(time)[0])
-    if kind != TileKind.FRAMES and len(reads) == 1:
-        return _colour(model, number, reads[0][0])
     return decode_tile64(model, number, time) ** (1.0 / model.profile.gamma)
 
 
@@ -102,10 +91,6 @@ def _constant(model: SheetModel, number: int, time: float) -> np.ndarray:
     before, after, share = model.axis.neighbours(time)
     rows = model.constant[model.row(number)].astype(np.float64)
     return (1.0 - share) * rows[before] + share * rows[after]
-
-
-def _filled(colour: np.ndarray) -> np.ndarray:
-    return np.broadcast_to(colour, (TILE, TILE, 3)).copy()
 
 
 def _network_output(model: SheetModel, number: int, place: int, time: float) -> np.ndarray:

@@ -302,7 +302,7 @@ def _classify(
     """Classifies tiles and computes the numbers that normalise each (section 4); for the settings see `Profile`."""
 
     def look(number: int) -> _Facts:
-        tile = split(lightmaps, gamma, [number])
+        tile = cut(lightmaps, np.array([number])).encoded(gamma, padded=False)
         kind = TileKind(int(classify(tile, gamma, budget_db, peak)[0]))
         if kind == TileKind.EMPTY:
             return _Facts(kind)
