@@ -189,7 +189,7 @@ def test_a_factor_for_each_channel(tmp_path):
     assert_lit(load(scene(tmp_path, {"extensions": {"FB_materials_lightmap": factor}})), light() * [2.0, 1.0, 0.5])
     factor["lightmapFactor"] = [2.0, -1.0, 0.5]
     text = error_of(load, scene(tmp_path, {"extensions": {"FB_materials_lightmap": factor}}))
-    assert "expected a factor of one number or three, of 0 or more" in text
+    assert "expected a factor of the light, one number or three, of 0 or more" in text
 
 
 def test_lightmaps_that_are_named_and_cannot_be_read(tmp_path):
@@ -203,7 +203,7 @@ def test_lightmaps_that_are_named_and_cannot_be_read(tmp_path):
     assert "NEEDLE_lightmaps: an image of 8 bits in Needle's RGBM" in error_of(load, path)
     with changed(path) as content:
         content["nodes"][0]["extensions"]["NEEDLE_components"]["builtin_components"][0]["lightmapIndex"] = 65535
-    assert "NEEDLE_lightmaps: no lit mesh is drawn" in error_of(load, path)
+    assert "NEEDLE_lightmaps: no mesh of the scene has such" in error_of(load, path)
     assert "its extension ABC_lightmap is not known" in error_of(
         load, scene(tmp_path, {}, extensionsUsed=["ABC_lightmap"])
     )
@@ -218,7 +218,7 @@ def test_a_material_slot_as_a_choice(tmp_path):
     path = scene(tmp_path, slots, images=[{"uri": "a.png"}])
     assert "or read that of a material slot: --slot emissive" in error_of(load, path)
     assert_lit(load(path, slot="emissive"), 0.5 * light(), atol=0.02)
-    assert "occlusion: no lit mesh is drawn" in error_of(load, path, slot="occlusion")
+    assert "occlusion: no mesh of the scene has such" in error_of(load, path, slot="occlusion")
     assert "slot: expected one of occlusion, emissive, got 'base'" in error_of(load, path, slot="base")
     assert "slot: only allowed without lightmaps" in error_of(load, path, tmp_path / EXR, slot="emissive")
     linear = load(path, slot="emissive", encoding="linear")

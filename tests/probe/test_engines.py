@@ -257,7 +257,7 @@ def test_what_unreal_refuses(model, tmp_path):
     for made, settings, message in [
         (random_model(outputs=12, positions=True), {}, "expected 27 numbers per probe"),
         (model, {"cells": 129}, "cells: expected 1 to 128"),
-        (bright, {}, "expected light within 64512"),
+        (bright, {}, "expected constant coefficients .L00. of at most 64512"),
     ]:
         with pytest.raises(WlmError, match=message):
             export(made, tmp_path / "out", "unreal", **settings)
