@@ -194,7 +194,7 @@ def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
     all_finite = bool(finite.all())
     good = mask if all_finite else mask & finite
     if not good.any():
-        raise WlmError(f"{where}: no texel inside the mask is finite")
+        raise WlmError(f"{where}: expected a finite texel inside the mask, found only NaN and infinity")
     if not all_finite:
         broken = np.count_nonzero(mask & ~finite)
         if broken:

@@ -86,7 +86,8 @@ def _attributes(data: bytes, at: int, most: int) -> tuple[dict[str, tuple[str, b
         if not 0 <= length <= len(data) - at:
             raise ValueError(f"attribute {name[:60]}: expected at most {len(data) - at} bytes, found {length}")
         if name in attributes or len(attributes) >= most:
-            raise ValueError(f"expected at most {_FIELDS} different attributes, found {name[:60]} beyond them")
+            fault = "twice the attribute" if name in attributes else "also"
+            raise ValueError(f"expected at most {_FIELDS} attributes of different names, found {fault} {name[:60]}")
         attributes[name] = kind, data[at : at + length]
         at += length
     return attributes, at + 1

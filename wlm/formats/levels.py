@@ -91,7 +91,7 @@ def read_levels(
             if kind == "JPEG" and (turned := image.getexif().get(_ORIENTATION, 1)) != 1:
                 notes.append(f"its EXIF orientation, {turned}, is ignored: rows are read as they are stored")
     if pixels.dtype.kind == "f":
-        raise WlmError(f"{path}: encoding: expected a picture of integers, found floats, which are linear light")
+        raise WlmError(f"{path}: encoding: expected a picture of integers, found floats, which need no encoding")
     levels = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
     return levels.reshape(*pixels.shape[:2], -1), names
 
@@ -108,6 +108,6 @@ def _pixels(path: str | os.PathLike[str], kind: str, data: bytes, image: Image) 
         image = image.convert("RGBA" if image.mode == "PA" or "transparency" in image.info else "RGB")
     if image.mode not in _DIRECT:
         raise WlmError(
-            f"{path}: expected a {kind} of grey, RGB or a palette, with alpha or without, found {image.mode}"
+            f"{path}: expected a {kind} of grey, RGB or a palette, with alpha or without, found mode {image.mode}"
         )
     return np.asarray(image), ("L",) if image.mode == "I;16" else tuple(image.getbands())
