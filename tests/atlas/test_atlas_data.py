@@ -189,7 +189,7 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
         ({"position": _with(POSITION, (1, 0), 1e39)}, "POSITION of vertex 1: expected finite numbers, got (inf, 0, 0)"),
         ({"uv": _with(UV, (2, 0), np.nan)}, "TEXCOORD_0 of vertex 2: expected finite numbers, got (nan, "),
         ({"uv": _with(UV, (0, 1), -np.inf)}, "TEXCOORD_0 of vertex 0: expected finite numbers, got (0.25, -inf)"),
-        ({"lightmap": _with(_lightmap(), np.s_[:3], np.nan)}, "lightmap: no texel inside the mask is finite"),
+        ({"lightmap": _with(_lightmap(), np.s_[:3], np.nan)}, "lightmap: expected a finite texel inside the mask"),
     ],
 )
 def test_what_is_refused(change, words):

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from wlm.errors import WlmError
+from wlm.formats import lock
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.folder import claim, staged, write_index
 from wlm.formats.lock import is_passing, locked
@@ -46,7 +47,10 @@ def test_one_process_writes_an_output(folder, tmp_path):
     (tmp_path / "link").symlink_to(output)
     with another_process(f"with locked({str(output)!r}):"):
         for name in (output, tmp_path / "link"):
-            with pytest.raises(WlmError, match=f"{name.name}: another process is writing it$"), locked(name):
+            with (
+                pytest.raises(WlmError, match=f"{name.name}: another process is writing it: wait until it ends$"),
+                locked(name),
+            ):
                 pytest.fail("two have the lock")
         with locked(tmp_path / "other"), locked(tmp_path):
             assert len([name for name in os.listdir(tmp_path) if name.endswith(".lock")]) == 2
@@ -119,6 +123,20 @@ def test_what_is_in_the_making_is_no_file_of_others(tmp_path):
             claim(tmp_path, "index.json", "f")
         with locked(tmp_path):
             (tmp_path / mine).unlink()
+
+
+def test_a_system_without_locks(tmp_path, monkeypatch):
+    """Nobody is kept out, and nothing is removed, since nobody can tell whose it is."""
+    with another_process(f"with atomic_path({str(tmp_path / 'a')!r}):"):
+        left = os.listdir(tmp_path)
+    monkeypatch.setattr(lock, "fcntl", None)
+    before = len(os.listdir("/dev/fd"))
+    with locked(tmp_path / "a"), atomic_path(tmp_path / "a") as part:
+        part.write_text("a")
+        assert len(os.listdir("/dev/fd")) == before, "Windows renames no file that is open"
+    with staged(tmp_path / "out", "index.json", "f") as made:
+        write_index(made / "index.json", {"format": "f"})
+    assert sorted(os.listdir(tmp_path)) == [*left, "a", "out"]
 
 
 def test_a_file_system_without_locks(tmp_path, monkeypatch):

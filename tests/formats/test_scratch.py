@@ -28,7 +28,10 @@ def test_a_large_array_is_in_a_file_and_a_small_one_in_memory(folder):
     assert list(folder.iterdir()) == [], "the file has no name"
 
 
-def test_a_full_disk_is_one_line(folder):
+@pytest.mark.parametrize("portable", [False, True])
+def test_a_full_disk_is_one_line(folder, portable, monkeypatch):
+    if portable:
+        monkeypatch.delattr("os.posix_fallocate")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
     try:

@@ -10,7 +10,6 @@ time; and `main`, which gets the data and returns arrays by name.
 import contextlib
 import importlib
 import io
-import resource
 import runpy
 import subprocess
 import sys
@@ -43,6 +42,8 @@ def run_child(reader: ModuleType, data: bytes, *arguments: str) -> dict[str, np.
 
 
 def _limit(memory: int, seconds: int) -> None:
+    import resource  # which Windows lacks: it can import this file, not run a child
+
     with open("/proc/self/statm") as file:
         memory += int(file.read().split()[0]) * resource.getpagesize()
     used = resource.getrusage(resource.RUSAGE_SELF)

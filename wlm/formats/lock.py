@@ -4,10 +4,9 @@ A temporary file is beside its destination and has a name such as `.wlm-01234567
 of the name of the destination, and a random number. Its process locks it, so a temporary file without a lock was left
 by a killed process, and the next write to that destination removes it.
 
-On file systems without such locks (some of networks) outputs are not protected and nothing is removed.
+On systems without such locks (Windows, some network file systems) outputs are not protected and nothing is removed.
 """
 
-import fcntl
 import hashlib
 import os
 import re
@@ -19,6 +18,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from wlm.errors import WlmError
+
+try:
+    import fcntl
+except ImportError:
+    fcntl = None
 
 _PASSING = re.compile(r"\.wlm-[0-9a-f-]+\.(tmp|lock)")
 _held: Counter[Path] = Counter()  # how many times this process has locked each output
@@ -100,7 +104,7 @@ def _stem(target: Path) -> str:
 
 def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
     """Locks a file, which is made if it does not exist; returns its handle, or None if it can't be locked."""
-    while True:
+    while fcntl is not None:
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
         except OSError:
@@ -112,7 +116,7 @@ def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
                 return handle
         except BlockingIOError:
             os.close(handle)
-            raise WlmError(f"{output}: another process is writing it") from None
+            raise WlmError(f"{output}: another process is writing it: wait until it ends") from None
         except FileNotFoundError:
             # Its owner removed it after it was opened here.
             os.close(handle)
@@ -122,14 +126,18 @@ def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
             lock.unlink(missing_ok=True)
             return None
         os.close(handle)
+    return None
 
 
 def _make(path: Path, folder: bool) -> int | None:
-    """Makes a file or folder and locks it; returns its handle, or None if it can't be locked."""
+    """Makes a file or folder and locks it; returns its handle, or None on a system without locks."""
     if folder:
         path.mkdir()
     else:
         os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+    # Windows cannot rename an open file.
+    if fcntl is None:
+        return None
     handle = None
     with suppress(OSError):
         handle = os.open(path, os.O_RDONLY if folder else os.O_RDWR)
@@ -138,6 +146,8 @@ def _make(path: Path, folder: bool) -> int | None:
 
 
 def _remove_if_dead(path: Path) -> None:
+    if fcntl is None:
+        return
     with suppress(OSError):
         folder = path.is_dir()
         handle = os.open(path, os.O_RDONLY if folder else os.O_RDWR)

@@ -12,7 +12,8 @@ from typing import Any, BinaryIO
 from wlm.errors import WlmError, one_line
 from wlm.formats.limits import INDEX_BYTES, INTEGER, JSON_GROWTH, SURE_JSON, Budget
 
-_FLAGS = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY
+# Windows lacks the first two, and no file name blocks there. The last one disables newline translation.
+_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
 
 _POINTER = b"version https://git-lfs"  # the first bytes of the text that stands for a file which was not fetched
 _MANY_DIGITS = re.compile(rb"\d{19}")

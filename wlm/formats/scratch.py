@@ -12,6 +12,8 @@ from wlm.errors import WlmError
 IN_MEMORY = 1 << 30
 """Largest array in memory, in bytes; a larger one is mapped from a file in the temporary folder (TMPDIR)."""
 
+_PIECE = 1 << 24
+
 
 def room(shape: tuple[int, ...], dtype: type[np.generic] | np.dtype, where: str, beside: int = 0) -> np.ndarray:
     """Makes an array of zeros, in memory or mapped from a file.
@@ -37,10 +39,19 @@ def room(shape: tuple[int, ...], dtype: type[np.generic] | np.dtype, where: str,
         if size + beside <= IN_MEMORY:
             return np.zeros(shape, dtype)
         with tempfile.TemporaryFile() as file:
-            os.posix_fallocate(file.fileno(), 0, size)
+            _fill(file.fileno(), size)
             return np.frombuffer(mmap.mmap(file.fileno(), size), dtype).reshape(shape)
     except MemoryError as error:
         raise WlmError(f"{where}: needs {size:,} bytes of memory: {error}") from error
     except OSError as error:
         reason = error.strerror or error
         raise WlmError(f"{where}: needs {size:,} bytes in {tempfile.gettempdir()} (TMPDIR): {reason}") from error
+
+
+def _fill(handle: int, size: int) -> None:
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(handle, 0, size)
+        return
+    zeros = bytes(_PIECE)
+    while size:
+        size -= os.write(handle, zeros[: min(size, _PIECE)])

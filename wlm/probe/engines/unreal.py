@@ -109,7 +109,7 @@ def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]
     if not np.abs(sh[:, 0]).max() <= _PACKED_MAX.min():
         found = np.abs(sh[:, 0]).max()
         raise WlmError(
-            f"{lattice.name}: expected constant coefficients (L00) of at most {_PACKED_MAX.min():g}, got {found:.3g}"
+            f"{lattice.name}: expected light within {_PACKED_MAX.min():g}, as R11G11B10F holds, got {found:.3g}"
         )
     width, height, depth = (int(count) for count in lattice.count)
     ambient, level = packed(sh)
