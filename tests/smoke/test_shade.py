@@ -8,7 +8,7 @@ import pytest
 import torch
 from builders.smoke_shadows import shadow_of
 
-from wlm.fluid.obstacles import sphere
+from wlm.fluid.obstacles import surface
 from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light, Ramp
@@ -133,7 +133,7 @@ def test_shadow_falls_behind_only(device: str):
 @pytest.mark.parametrize("far", [0.0, 1000.0])
 def test_shadow_of_a_sphere(device: str, far: float):
     """The shadow has the area of a circle, also a thousand radii from the origin."""
-    points, triangles = sphere()
+    points, triangles = surface("sphere")
     corners = torch.from_numpy((points + [far, 0, far]).astype(np.float32)).to(device)
     camera = Camera.look_at((far, 8, far), (far, 0, far), extent=4.0, height=100, width=100, world_up=(0, 0, 1))
     depths = torch.full((100, 100), 12.0, device=device)

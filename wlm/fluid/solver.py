@@ -18,9 +18,8 @@ import numpy as np
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid.engine import require_free
 from wlm.fluid.faces import axis_ends
-from wlm.fluid.lattice import Lattice
+from wlm.fluid.lattice import Lattice, require_free
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact, write_artifact

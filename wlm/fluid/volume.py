@@ -26,7 +26,7 @@ from wlm.formats.nanovdb import NanoVdbFile
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import FileBytes, open_file, read_file
 from wlm.formats.vdb import LARGEST, GridHead, VdbFile
-from wlm.interop import check_device, device_name, to_warp
+from wlm.interop import check_device, to_warp
 
 EDGE = 8
 """Voxels along an edge of a brick."""
@@ -223,10 +223,11 @@ def load_volume(
         volume = _turned(volume, up) if up != "y" else volume
     else:
         grids, warnings = _read_grids(path, names, trust)
-        volume = _from_parts(grids, up, trust, **factors)
+        most = LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * sum(g.values.numel() for g in grids)))
+        lattice, (smoke, *heat) = on_one_lattice(grids, most, up)
+        place = {"voxel": lattice.voxel, "origin": lattice.origin, "device": device}
+        volume = from_array(smoke, temperature=heat[0] if heat else None, **place, **factors)
         volume = replace(volume, warnings=(*warnings, *volume.warnings))
-        heat = None if volume.temperature is None else volume.temperature.to(device)
-        volume = replace(volume, density=volume.density.to(device), temperature=heat)
         if not told and is_long_along_z(volume):
             warning = f"{path}: longest along z: if that is up, as in Blender and Unreal, say so (--volume up=z)"
             volume = replace(volume, warnings=(*volume.warnings, warning))
@@ -272,9 +273,8 @@ def _turned(volume: DensityVolume, up: str) -> DensityVolume:
     parts = [Grid(_DENSITY, volume.density, matrix)]
     if volume.temperature is not None:
         parts.append(Grid(_TEMPERATURE, volume.temperature, matrix))
-    lattice, values = on_one_lattice(parts, LARGEST, up)
-    heat = values[1] if len(values) > 1 else None
-    return replace(volume, density=values[0], temperature=heat, origin=lattice.origin)
+    lattice, (smoke, *heat) = on_one_lattice(parts, LARGEST, up)
+    return replace(volume, density=smoke, temperature=heat[0] if heat else None, origin=lattice.origin)
 
 
 def save_volume(path: str | os.PathLike[str], volume: DensityVolume, *, bricks: bool = False) -> None:
@@ -410,14 +410,6 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
             raise WlmError(f"{path}: {name}: expected {len(numbers)} bricks of floats, found {cut.dtype} {cut.shape}")
         arrays[name.removesuffix("_bricks")] = scatter(places, torch.from_numpy(cut).to(device), sides)
     return arrays
-
-
-def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> DensityVolume:
-    voxels = sum(part.values.numel() for part in parts)
-    lattice, values = on_one_lattice(parts, LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * voxels)), up)
-    place = {"voxel": lattice.voxel, "origin": lattice.origin, "device": device_name(values[0].device)}
-    heat = values[1] if len(values) > 1 else None
-    return from_array(values[0], temperature=heat, **place, **factors)
 
 
 def grid_heads(path: Path) -> tuple[GridHead, ...]:
