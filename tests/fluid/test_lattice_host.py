@@ -169,7 +169,7 @@ def test_wrong_calls(device: str):
         box.step()
     box.set_wall("+x")
     box.step()
-    with pytest.raises(ValueError, match="before the flow"):
+    with pytest.raises(ValueError, match="before set_flow"):
         box.set_wall("-y")
 
 

@@ -213,7 +213,9 @@ class Lattice:
         new, vectors = self._mask(mask), np.atleast_2d(np.asarray(velocity, np.float32))
         if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) >= BODIES or not np.isfinite(vectors).all():
             shapes = f"(3,) or [K, 3] for at most {BODIES - 1} bodies"
-            raise ValueError(f"velocity: expected finite numbers of shape {shapes}, got shape {np.shape(velocity)}")
+            raise ValueError(
+                f"velocity: expected finite numbers of shape {shapes}, got NaN or shape {np.shape(velocity)}"
+            )
         rows = np.zeros((BODIES, 3), np.float32)
         rows[1 : len(vectors) + 1] = vectors
         self._velocity.assign(rows)
@@ -242,7 +244,7 @@ class Lattice:
         forces = self._zeros(0, wp.vec3)
         if isinstance(force, wp.array):
             if force.shape != self.shape or force.dtype != wp.vec3 or force.device != self.device:
-                found = f"{force.shape} on {force.device}"
+                found = f"{force.dtype.__name__} {force.shape} on {force.device}"
                 raise ValueError(f"force: expected an array of vec3 {self.shape} on {self.device}, got {found}")
             forces = force.flatten()
         elif force is not None:
@@ -288,7 +290,7 @@ class Lattice:
             raise ValueError(f"steps: expected at least 0, got {steps}")
         if self.device.is_cuda and self.device.is_capturing:
             if not self._begun or steps % self.period or self._done % self.period:
-                found = f"got {steps} in it and {self._done} before it"
+                found = f"got {steps} in the graph and {self._done} before it"
                 raise ValueError(f"steps: expected a multiple of {self.period} in a CUDA graph and before it, {found}")
             self._run(steps)
             return
@@ -411,7 +413,7 @@ class Lattice:
         vectors = np.asarray(value, np.float32)
         if vectors.shape not in ((3,), (*self.shape, 3)) or not np.isfinite(vectors).all():
             shapes = f"(3,) or {(*self.shape, 3)}"
-            raise ValueError(f"{name}: expected finite numbers of shape {shapes}, got shape {vectors.shape}")
+            raise ValueError(f"{name}: expected finite numbers of shape {shapes}, got NaN or shape {vectors.shape}")
         vectors = np.ascontiguousarray(np.broadcast_to(vectors, (*self.shape, 3)).reshape(-1, 3))
         return wp.array(vectors, dtype=wp.vec3, device=self.device)
 
@@ -419,21 +421,21 @@ class Lattice:
         face = make_face(self.shape, name, kind, *args, **settings)
         _check_speed(float(np.linalg.norm(face.velocity, axis=-1).max()), f"face {name!r}")
         if name not in self._faces and self._begun:
-            raise ValueError(f"face {name!r}: expected faces to be set before the flow and before the first step")
+            raise ValueError(f"face {name!r}: expected this face to be set before set_flow and before the first step")
         self._faces[name] = face
         self._links = self._graph = None
 
     def _mask(self, mask) -> wp.array:
         if isinstance(mask, wp.array):
             if mask.shape != self.shape or mask.dtype != wp.uint8 or mask.device != self.device:
-                found = f"{mask.shape} on {mask.device}"
+                found = f"{mask.dtype.__name__} {mask.shape} on {mask.device}"
                 raise ValueError(f"mask: expected an array of uint8 {self.shape} on {self.device}, got {found}")
             return mask.flatten()
         mask = np.asarray(mask)
         if mask.shape != self.shape or mask.dtype.kind not in "biu":
             raise ValueError(f"mask: expected bool or integers {self.shape}, got {mask.dtype} {mask.shape}")
         if mask.min() < 0 or mask.max() >= BODIES:
-            raise ValueError(f"mask: expected numbers of bodies, 0 to {BODIES - 1}, got {mask.min()} to {mask.max()}")
+            raise ValueError(f"mask: expected 0 (fluid) or a body, 1 to {BODIES - 1}, got {mask.min()} to {mask.max()}")
         return wp.array(mask.astype(np.uint8).ravel(), dtype=wp.uint8, device=self.device)
 
     # On the device.
@@ -541,7 +543,7 @@ def _checked_shape(shape, lattice: str) -> tuple[int, int, int]:
     if lattice == "D2Q9" and z != 1:
         raise ValueError(f"shape: expected one cell along z for D2Q9, got {z}")
     if x * y * z >= 2**31:
-        raise WlmError(f"lattice: {x} x {y} x {z} cells: expected fewer than 2^31")
+        raise WlmError(f"lattice: {x} x {y} x {z} cells: expected fewer than 2^31 cells in all")
     return x, y, z
 
 

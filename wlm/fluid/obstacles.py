@@ -55,7 +55,7 @@ class Trajectory:
         """
         p, t = np.atleast_2d(np.asarray(positions, np.float64)), np.asarray(times, np.float64)
         if t.ndim != 1 or len(t) == 0 or p.shape != (len(t), 3):
-            raise ValueError(f"path: expected positions [K, 3] and times [K], got {p.shape} and {t.shape}")
+            raise ValueError(f"path: expected positions [K, 3] and times [K], got shapes {p.shape} and {t.shape}")
         if not (np.isfinite(p).all() and np.isfinite(t).all()):
             raise ValueError("path: expected finite positions and times, got NaN or infinity")
         if (np.diff(t) <= 0).any():
@@ -129,7 +129,7 @@ class Mesh:
     def __post_init__(self) -> None:
         v, t = np.asarray(self.vertices), np.asarray(self.triangles)
         if v.ndim != 2 or v.shape[1] != 3 or not np.isfinite(v).all():
-            raise ValueError(f"vertices: expected finite numbers of shape [V, 3], got shape {v.shape}")
+            raise ValueError(f"vertices: expected finite numbers of shape [V, 3], got NaN or shape {v.shape}")
         if t.ndim != 2 or t.shape[1] != 3 or len(t) == 0:
             raise ValueError(f"triangles: expected indices of vertices of shape [T, 3], T >= 1, got shape {t.shape}")
         if t.min() < 0 or t.max() >= len(v):

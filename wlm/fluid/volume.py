@@ -167,7 +167,7 @@ def from_array(
         # Kernels take both in one type.
         heat = _check(name, _TEMPERATURE, temperature, device, warnings, smoke.dtype)
         if heat.shape != smoke.shape:
-            raise WlmError(f"{name}: {_TEMPERATURE}: expected {tuple(smoke.shape)} voxels, found {tuple(heat.shape)}")
+            raise WlmError(f"{name}: {_TEMPERATURE}: expected shape {tuple(smoke.shape)}, found {tuple(heat.shape)}")
         heat = _dimmed(name, heat, emission, voxel, warnings)
     corner = tuple(float(o) for o in origin)
     return DensityVolume(smoke, float(extinction), float(voxel), corner, heat, float(emission), tuple(warnings))
@@ -316,14 +316,14 @@ def _check(
     if not isinstance(values, torch.Tensor):
         values = np.asarray(values)
         if values.dtype.kind not in "iuf" or values.dtype == np.longdouble:
-            raise WlmError(f"{name}: {field}: expected numbers, found {values.dtype}")
+            raise WlmError(f"{name}: {field}: expected an array of real numbers, found the type {values.dtype}")
         kept = np.float16 if values.dtype == np.float16 else np.float32
         with np.errstate(over="ignore"):  # values too large become infinite, which is repaired below
             values = torch.from_numpy(np.array(values, kept, order="C"))
     elif values.dtype.is_complex or values.dtype == torch.bool:
-        raise WlmError(f"{name}: {field}: expected numbers, found {values.dtype}")
+        raise WlmError(f"{name}: {field}: expected an array of real numbers, found the type {values.dtype}")
     if values.ndim != 3 or 0 in values.shape or values.numel() > LARGEST:
-        raise WlmError(f"{name}: {field}: expected [X, Y, Z] voxels, found {tuple(values.shape)}")
+        raise WlmError(f"{name}: {field}: expected [X, Y, Z], 1 to {LARGEST} voxels, found {tuple(values.shape)}")
     dtype = dtype or (torch.float16 if values.dtype == torch.float16 else torch.float32)
     values = values.detach().to(device, dtype).contiguous()
     low, high = torch.aminmax(values)
@@ -378,7 +378,7 @@ def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, tru
         if value is None:
             continue
         if value.dtype.kind not in "iuf" or value.size != size or not np.isfinite(value).all():
-            raise WlmError(f"{path}: {field}: expected {size} finite numbers, found {value.dtype} {value.shape}")
+            raise WlmError(f"{path}: {field}: expected {size} finite numbers, found {value.dtype} {value.shape} or NaN")
         arrays[field] = float(value.item()) if size == 1 else tuple(map(float, value.ravel()))
     for field in (_DENSITY, _TEMPERATURE):
         if isinstance(arrays.get(field), np.ndarray) and arrays[field].dtype in (np.float16, np.float32):
@@ -391,7 +391,7 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
     """Returns a file's arrays with fields that are stored as bricks expanded to tensors [X, Y, Z] on a device."""
     shape, numbers = arrays.pop("shape", np.zeros(0)), arrays.pop(_BRICKS)
     if shape.shape != (3,) or shape.dtype.kind not in "iu" or not (shape.min() >= 1 and shape.max() <= most):
-        raise WlmError(f"{path}: shape: expected 3 whole numbers from 1 to {most}, found {shape.dtype} {shape.shape}")
+        raise WlmError(f"{path}: shape: expected 3 whole numbers from 1 to {most}, found {shape.ravel()[:4].tolist()}")
     sides = shape.tolist()
     counts = [-(-n // EDGE) for n in sides]
     if math.prod(sides) > most:
@@ -400,14 +400,16 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
         stored = sum(array.nbytes for array in arrays.values())
         check_growth(f"{path}: shape", stored, 4 * math.prod(counts) * EDGE**3, sure=4 * SURE_VOXELS)
     if numbers.ndim != 1 or numbers.dtype != np.int32 or (np.diff(numbers.astype(np.int64)) < 1).any():
-        raise WlmError(f"{path}: {_BRICKS}: expected increasing int32 [N], found {numbers.dtype} {numbers.shape}")
+        raise WlmError(f"{path}: {_BRICKS}: expected rising int32 [N], found {numbers.dtype} {numbers.shape}")
     if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < math.prod(counts)):
-        raise WlmError(f"{path}: {_BRICKS}: expected 0 to {math.prod(counts) - 1}, found {numbers[0]} to {numbers[-1]}")
+        raise WlmError(
+            f"{path}: {_BRICKS}: expected numbers from 0 to {math.prod(counts) - 1}, found {numbers[[0, -1]]}"
+        )
     places = torch.from_numpy(numbers).to(device)
     for name in [name for name in arrays if name.endswith("_bricks")]:
         cut = arrays.pop(name)
         if cut.shape != (len(numbers), EDGE, EDGE, EDGE) or cut.dtype not in (np.float16, np.float32):
-            raise WlmError(f"{path}: {name}: expected {len(numbers)} bricks of floats, found {cut.dtype} {cut.shape}")
+            raise WlmError(f"{path}: {name}: expected floats [{len(numbers)}, 8, 8, 8], found {cut.dtype} {cut.shape}")
         arrays[name.removesuffix("_bricks")] = scatter(places, torch.from_numpy(cut).to(device), sides)
     return arrays
 
@@ -440,7 +442,7 @@ def _read_grids(path: Path, names: tuple[str | None, str | None], trust: bool) -
         matrix[:3, 3] += matrix[:3, :3] @ grid.low
         if name == density and is_level_set(grid, same[0].group):
             if names[0] is None:
-                raise WlmError(f"{where}: expected density, found a level set: --volume density={name} fills it")
+                raise WlmError(f"{where}: expected a density, found a level set: --volume density={name} fills it")
             # Smoke fills the inside, and fades to the surface within the narrow band.
             values = np.clip(-values / grid.background, 0.0, 1.0)
             warnings.append(f"{where}: a level set, which is filled with smoke of density 1")
