@@ -10,7 +10,7 @@ The results table has these kinds of rows:
   against the input, and largest error against a float64 decode, where 1 stands for 255 levels. Rounding to 8 bits
   alone errs by 0.00196, half a level.
 - method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
-  (`wlm.lightmap.runtime_texture`): its errors, and the time to decode it.
+  (`wlm.lightmap.runtime`): its errors, and the time to decode it.
 - the rivals of `benchmarks.rivals.lightmap`, on the same lightmaps: block codecs, temporal PCA, a neural texture codec
   and a video codec; between stored times their lightmaps are interpolated linearly.
 - method "fit", one row for each profile: the speed of the fit alone. Method "fit in plain torch" has the speed of the
@@ -51,12 +51,12 @@ from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.runtime import (
     ExactDecoder,
     FrameDecoder,
+    MapDecoder,
     MatrixDecoder,
     RuntimeDecoder,
     StripDecoder,
     fast_decoder,
 )
-from wlm.lightmap.runtime_texture import MapDecoder
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, place
 from wlm.lightmap.view_scores import VIEWS, Tally, views_of
 from wlm.metrics import METRICS, FrameMetrics, evaluate_frame, summarise

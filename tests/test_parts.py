@@ -155,7 +155,11 @@ def _sized(*size) -> dict:
         ("atlas-tiles", {"sizes": [[4096, 4096]]}, "part lut is uint16"),
         ("atlas-tiles", {"sizes": [[0, 48]]}, "setting sizes.0.0"),
         ("atlas-bc6h", {"sizes": [[16384, 16384]]}, "part mask is uint8 (240,), expected uint8 (33554432)"),
-        ("atlas-cascade", {"sizes": [[65536, 65536]]}, "and 268435456 in all, found 65536x65536"),
+        (
+            "atlas-cascade",
+            {"sizes": [[65536, 65536]]},
+            "at most 268435456 texels and 65536 along a side, found 65536 x 65536",
+        ),
         ("smoke", {"network": {"width": 64, "levels": 6}}, "part encoder.5.2.weight is missing"),
         ("smoke", {"network": {"width": 2**70}}, "setting network.width"),
     ],
@@ -200,11 +204,13 @@ def test_a_few_bytes_that_claim_a_large_atlas(path):
     kept = written(path, "atlas-bc6h")
     settings = {"sizes": [[65536, 65536]], "texels": [1, 1], "colour": "half"}
     rewrite(path, settings, {"colour": np.zeros((1, 1, 1, 3), np.float16)})
-    refused(kept, path, "found 65536x65536")
+    refused(kept, path, "found 65536 x 65536")
     mask = np.full(1 << 23, 255, np.uint8)
     frame = np.frombuffer(compress(mask.tobytes()), np.uint8)
     rewrite(path, {"sizes": [[8192, 8192]], "parts": {"mask": [1 << 23]}}, {"mask": frame})
-    refused(kept, path, "at most 65536 texels per stored texel, of which there are 1, found 8192x8192")
+    refused(
+        kept, path, "at most 65536 texels of a lightmap for each texel of its textures, which have 1, found 8192x8192"
+    )
 
 
 def test_a_few_bytes_that_claim_a_large_network(path):

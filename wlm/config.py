@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -30,6 +30,15 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
     Raises:
         WlmError: One line with the file, the field, what was expected and what was found.
     """
+    return check_settings(cls, read_yaml(path), f"{path}: ")
+
+
+def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
+    """Reads a YAML file that is one mapping.
+
+    Raises:
+        WlmError: The file cannot be read, or has other content.
+    """
     try:
         text = read_file(path, SETTINGS_BYTES, "the settings").decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -50,17 +59,20 @@ def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settin
         raise WlmError(f"{path}: expected a mapping of settings, found an empty file")
     if not isinstance(values, dict):
         raise WlmError(f"{path}: expected a mapping of settings, found {_shown(values)}")
-    return check_settings(cls, values, f"{path}: ")
+    return values
 
 
-def check_settings(cls: type[_Settings], values: Any, prefix: str = "") -> _Settings:
-    """Checks a mapping of settings. Unknown keys are errors, whatever the model's own configuration says.
+def check_settings(
+    cls: type[_Settings], values: Any, prefix: str = "", extra: Literal["forbid", "ignore"] = "forbid"
+) -> _Settings:
+    """Checks a mapping of settings, whatever the model's own configuration says about unknown keys.
 
     Args:
         cls: The pydantic model.
         values: Mapping of the model's fields to plain values.
         prefix: Text before the field's name in an error, such as `"scene.yaml: "` or `"file: profile."`; `"--"` writes
             the field as a command line option, with dashes.
+        extra: Whether unknown keys are errors ("forbid") or ignored.
 
     Returns:
         The checked settings.
@@ -69,7 +81,7 @@ def check_settings(cls: type[_Settings], values: Any, prefix: str = "") -> _Sett
         WlmError: One line with the field, the expectation and the value found, for the first of several problems.
     """
     try:
-        return cls.model_validate(values, extra="forbid")
+        return cls.model_validate(values, extra=extra)
     except ValidationError as error:
         raise WlmError(f"{prefix}{_first_problem(cls, error, as_option=prefix == '--')}") from error
 
@@ -182,6 +194,11 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
         text = f"unknown key '{field}'{_suggestion(cls, problem['loc'])}"
     elif problem["type"] == "missing":
         text = f"{field}: expected a value, found none"
+    elif problem["type"] in ("too_short", "too_long"):
+        least = "at least {min_length}" if problem["type"] == "too_short" else "at most {max_length}"
+        text = f"{field}: expected {least} entries, found {{actual_length}}".format(**problem["ctx"])
+    elif problem["type"] in ("model_type", "dict_type"):
+        text = f"{field}: expected a mapping, got {_shown(problem['input'])}"
     elif isinstance(problem["input"], dict) and "Input" not in problem["msg"]:
         # A check of several fields together: its message, or else its type, names one of them.
         name = [] if ": " in problem["msg"] else [problem["type"]]

@@ -26,7 +26,7 @@ from benchmarks.rivals.lightmap_levels import TileRanges, clear_unseen, prepare,
 from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure
 from wlm.errors import WlmError
 from wlm.formats import bc7, hdr_blocks
-from wlm.formats.block_reuse import reuse_blocks
+from wlm.formats.block_reuse import by_block, reuse_blocks
 from wlm.formats.hdr_blocks import need
 from wlm.lightmap.tiles import TILE
 from wlm.metrics import evaluate_frame, summarise
@@ -59,9 +59,14 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival
         codes = _pad(to_codes(image))
         span = _pad(TileRanges.of(to_codes(image), seen).span(*seen.shape))
         weight = _weight(mask)
-        return reuse_blocks(data, to_codes(decode(data)), codes, weight / np.square(span), weight * (loss / 255.0) ** 2)
+        return _reused(data, to_codes(decode(data)), codes, weight / np.square(span), weight * (loss / 255.0) ** 2)
 
     return _cropped(_measured(_with_loss("bc6h", loss), encode, decode), image)
+
+
+def _reused(data: bytes, *images: np.ndarray) -> bytes:
+    """Repeats blocks, see `reuse_blocks`; its arguments after the blocks are images [H, W, C] here."""
+    return reuse_blocks(np.frombuffer(data, np.uint8).reshape(-1, 16), *map(by_block, images)).tobytes()
 
 
 def ispc_bc6h(texels: np.ndarray) -> bytes:
@@ -90,7 +95,7 @@ def encode_bc7(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival:
         if loss == 0.0:
             return data
         weight = _weight(mask)
-        return reuse_blocks(data, decode(data) / np.float32(255.0), _pad(levels), weight, weight * (loss / 255.0) ** 2)
+        return _reused(data, decode(data) / np.float32(255.0), _pad(levels), weight, weight * (loss / 255.0) ** 2)
 
     rival = _cropped(_measured(_with_loss("bc7", loss), encode, decode, ranges.tobytes()), image)
     return replace(rival, decoded=ranges.radiance(rival.decoded / np.float32(255.0)))

@@ -132,7 +132,7 @@ def _refused(tmp_path, kind: str, words: str, settings=None, tensors=None, store
         ("tiles", "colour", put((0, 3, 4, 1), -1.0), "colour: expected numbers of at least 0, found -1"),
         ("tiles", "lut", put((0, 0), pack_entries(np.array([20, 0]), np.array([4, 1]))), "beyond the colour texture"),
         ("tiles", "lut", put((0, 0), pack_entries(np.array([0, 17]), np.array([1, 2]))), "beyond the colour texture"),
-        ("cascade", "lut", lambda v: v[:0], "expected textures, found one without texels"),
+        ("cascade", "lut", lambda v: v[:0], "expected at least one texel in each of these"),
         ("plain", "lut", np.zeros((2, 2, 2), np.uint16), "lut is uint16"),
         ("tiles", "mask", lambda v: v * 0, "mask: expected at least one texel of a chart"),
         ("tiles", "factor", np.zeros((1, 2, 3), np.float32), "factor is float32"),
@@ -151,8 +151,8 @@ def test_parts_that_do_not_fit_are_refused(kind, part, change, words, tmp_path):
         ({"texels": [19, 23]}, "colour is float16 .1, 18, 23, 3., expected float16 .1, 19, 23, 3."),
         ({"profile": {"name": "a", "tile": 99}}, "setting profile.tile: expected"),
         ({"profile": {"name": "a", "colours": 3}}, "setting unknown key 'profile.colours'"),
-        ({"states": ["a", "b"]}, "expected one sheet and one state for method tiles, found more"),
-        ({"separate": True}, "setting separate: expected method shared, found tiles"),
+        ({"states": ["a", "b"]}, "expected one of each for method tiles, found more"),
+        ({"separate": True}, "setting separate: only method shared has .*, found tiles"),
         ({"block_texels": [4, 4]}, "setting block_texels"),
     ],
 )
@@ -162,7 +162,7 @@ def test_settings_that_do_not_fit_are_refused(change, words, tmp_path):
 
 def test_blocks_that_are_none_of_the_format(tmp_path):
     both = {"lut": put((0, 0), np.array([15, 3]))}
-    _refused(tmp_path, MIXED, "lut: a tile is measured in blocks along one axis", tensors=both)
+    _refused(tmp_path, MIXED, "lut: a tile's entry counts blocks along one axis", tensors=both)
     beyond = {"lut": put((0, 0), pack_entries(np.array([16, 4]), np.array([8, 4]), True))}
     _refused(tmp_path, MIXED, "beyond the colour texture", tensors=beyond)
     blocks = {"colour": lambda v: np.zeros((1, 29, 16), np.uint8)}
@@ -201,17 +201,21 @@ def _shared_refused(tmp_path, words, settings=None, tensors=None, separate=False
     [
         ("lut", put((0, 0), np.array([36 << 4 | 7, 0, 0, 1])), "beyond the colour texture"),
         ("lut", put((0, 0), np.array([0, 0, 0, 5 << 12 | 1])), "beyond the colour texture"),
-        ("lut", put((0, 0), np.array([0, 0, 7, 1])), "names a factor that doesn't exist"),
-        ("lut", put((0, 0), np.array([0, 0, 0, 1 << 8 | 1])), "more coarse components than components in blocks"),
-        ("lut", lambda v: np.ascontiguousarray(v[..., :3]), "expected 2 or 4 numbers per entry"),
+        ("lut", put((0, 0), np.array([0, 0, 7, 1])), "names a factor beyond the last one"),
+        (
+            "lut",
+            put((0, 0), np.array([0, 0, 0, 1 << 8 | 1])),
+            "more coarse components, of one block each, than components",
+        ),
+        ("lut", lambda v: np.ascontiguousarray(v[..., :3]), "expected entries of 2 or 4 numbers"),
         ("lut", GONE, "lut is missing"),
         ("factor", put((0, 0, 0), np.nan), "factor: expected finite numbers"),
         ("factor", lambda v: v[:1], "factor is float32"),
-        ("sheets", put((0, 0), 999), "expected the size of its sheet"),
-        ("sheets", put((0, 4), 3), "the numbers of tiles don't fit the size"),
+        ("sheets", put((0, 0), 999), "expected the height and width in setting sizes"),
+        ("sheets", put((0, 4), 3), "expected as many tiles as"),
         ("sheets", put((1, 2), 90), "beyond the lookup texture"),
-        ("sheets", put((0, 6), 1), "its next mip level must be a later row, found 1"),
-        ("sheets", lambda v: v[:1], "expected 1 equal groups of 2 or more rows, found 1"),
+        ("sheets", put((0, 6), 1), "expected its next mip level in a later row of its state, found row 1"),
+        ("sheets", lambda v: v[:1], "expected 2 or more rows per state, for 1 states, found 1"),
     ],
 )
 def test_shared_parts_that_do_not_fit_are_refused(part, change, words, tmp_path):
@@ -219,10 +223,10 @@ def test_shared_parts_that_do_not_fit_are_refused(part, change, words, tmp_path)
 
 
 def test_shared_settings_that_do_not_fit_are_refused(tmp_path):
-    _shared_refused(tmp_path, "expected 2 equal groups of 2 or more rows", {"separate": True})
-    _shared_refused(tmp_path, "expected the size of its sheet", {"sizes": [[48, 40], [48, 64]]})
+    _shared_refused(tmp_path, "expected 2 or more rows per state, for 2 states, found 2", {"separate": True})
+    _shared_refused(tmp_path, "expected the height and width in setting sizes", {"sizes": [[48, 40], [48, 64]]})
     _shared_refused(tmp_path, "expected rgb9e5 or mixed for method shared", {"colour": "half"})
-    _shared_refused(tmp_path, "setting objects: expected at least one object for each of the 2 sheets", {"objects": []})
+    _shared_refused(tmp_path, "setting objects: expected an object or more for each of the 2 sheets", {"objects": []})
 
 
 FORMATS = {"half": "R16G16B16A16_FLOAT", "rgb9e5": "R9G9B9E5_SHAREDEXP", "bc6h": "BC6H_UF16"}
@@ -307,7 +311,7 @@ def test_a_mask_that_triangles_do_not_imply_is_stored():
 
 def test_a_texture_beyond_a_gpu():
     model = replace(random_model(sheet(), "plain"), texels=np.zeros((1, 1, 16385, 3), np.float16))
-    with pytest.raises(WlmError, match="sheet: colour: expected at most 16384 texels along a side, found 16385"):
+    with pytest.raises(WlmError, match="sheet: texture colour: expected at most 16384 texels a side, found 16385"):
         bundle(model)
 
 

@@ -161,7 +161,7 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
     document, _ = read_gltf(glb)
     del document.content["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]
     write_glb(glb, document, [], 1)
-    assert "the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1" in error_of(load, glb, light)
+    assert "expected the UV set TEXCOORD_0, found a mesh without UVs" in error_of(load, glb, light)
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")
     assert "the mesh has no UVs, or some" in error_of(load, tmp_path / "a.obj", light)
     (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}}))
@@ -189,7 +189,7 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
         ({"position": _with(POSITION, (1, 0), 1e39)}, "POSITION of vertex 1: expected finite numbers, got (inf, 0, 0)"),
         ({"uv": _with(UV, (2, 0), np.nan)}, "TEXCOORD_0 of vertex 2: expected finite numbers, got (nan, "),
         ({"uv": _with(UV, (0, 1), -np.inf)}, "TEXCOORD_0 of vertex 0: expected finite numbers, got (0.25, -inf)"),
-        ({"lightmap": _with(_lightmap(), np.s_[:3], np.nan)}, "lightmap: no texel inside the mask is finite"),
+        ({"lightmap": _with(_lightmap(), np.s_[:3], np.nan)}, "lightmap: expected a finite texel inside the mask"),
     ],
 )
 def test_what_is_refused(change, words):

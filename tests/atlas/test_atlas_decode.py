@@ -115,9 +115,9 @@ def test_the_lightmap_in_its_own_layout(device: str):
 
 def test_another_mesh_is_refused():
     model = models(sheet)["tiles"]
-    with pytest.raises(WlmError, match="sheet: expected the sheet that the model was made of"):
+    with pytest.raises(WlmError, match="sheet: expected a sheet of the size in the model, found 48x41"):
         Decoder(model).texels(sheet(height=41).sheets[0])
-    with pytest.raises(WlmError, match="sheet: expected the scene that the model was made of, source"):
+    with pytest.raises(WlmError, match="sheet: expected the mesh and lightmaps that the model was made of, hash"):
         wlm.atlas.evaluate(model, sheet(quads=5))
     with pytest.raises(ValueError, match="state: expected 0 for a model of one state, got 1"):
         Decoder(model).read(torch.zeros((1, 2)), 0, 1.0)

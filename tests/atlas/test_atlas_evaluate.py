@@ -248,13 +248,13 @@ def test_texels_in_the_mask_count(device):
 def test_what_is_refused():
     mesh = lit_cube(1)
     broken = _reader(mesh, lambda c, uv, t: torch.where((uv[:, :1] < 0.2), torch.nan, c))
-    with pytest.raises(WlmError, match="cube: it decodes to NaN or infinity at"):
+    with pytest.raises(WlmError, match="cube: decoder it gives NaN or infinity at"):
         _one(mesh, broken)
     with pytest.raises(ValueError, match=r"it: expected colours \[\d+, 3\]"):
         _one(mesh, _reader(mesh, lambda c, uv, t: c[:, :2]))
-    with pytest.raises(ValueError, match="labels: expected names of decoders, got other"):
+    with pytest.raises(ValueError, match="labels: expected names that decoders has, got other"):
         _one(mesh, _reader(mesh), labels={"other": _reader(mesh)})
-    with pytest.raises(ValueError, match="it: expected labels"):
+    with pytest.raises(ValueError, match="labels of it: expected integers"):
         _one(mesh, _reader(mesh), labels={"it": lambda points: points.uv[:, 0]})
     with pytest.raises(WlmError, match="gpu"):
         _one(mesh, _reader(mesh), device="gpu")

@@ -22,6 +22,7 @@ from wlm.atlas.model import (
     tile_counts,
     unpack_entries,
 )
+from wlm.atlas.stages import Stages
 from wlm.atlas.tiles import fit as grid
 from wlm.atlas.tiles import layout as allocation
 from wlm.atlas.tiles.layout import Size
@@ -56,11 +57,10 @@ def _places(tiles: grid.Tiles, rows: int, columns: int) -> tuple[np.ndarray, np.
     return x.reshape(len(row), -1), y.reshape(len(row), -1)
 
 
-@pytest.mark.parametrize("points", [1, 2, 7, 14])
-@pytest.mark.parametrize("samples", [1, 2, 3, 8, 16])
+@pytest.mark.parametrize(("samples", "points"), [(1, 6), (2, 6), (3, 14), (8, 14), (16, 30)])
 def test_linear(samples: int, points: int):
     """Rows are weights of a mean, and reproduce any straight line."""
-    weight = grid.linear(samples, points).numpy()
+    weight = grid._axis(samples, points, "cpu")[2].numpy()
     assert weight.shape == (points, samples) and (weight >= 0).all()
     np.testing.assert_allclose(weight.sum(1), 1.0, atol=1e-6)
     assert ((weight > 0).sum(1) <= 2).all()
@@ -161,7 +161,7 @@ def _error(tiles: grid.Tiles, samples: np.ndarray) -> np.ndarray:
     return (each * tiles.weight.double().numpy()).sum(1)
 
 
-SHAPES = [(1, 1), (2, 1), (1, 3), (3, 2), (4, 4), (5, 8), (8, 8)]
+SHAPES = [(1, 1), (1, 3), (4, 4), (5, 8)]
 
 
 @pytest.mark.parametrize(("nx", "ny"), SHAPES)
@@ -237,7 +237,7 @@ def test_curves_and_solved():
     tiles = _tiles(9, 5)
     tiles.light[:2] = (tiles.light[:2] - 2.0).clamp(min=0.0)  # a black tile with some light in it
     sizes = [Size(*sides, "half") for sides in ((1, 1), (3, 2), (6, 6))]
-    error = grid.curves(tiles, sizes)
+    error = grid.curves(tiles, sizes, Stages("cpu"))
     assert error.shape == (3, 9) and error.dtype == np.float64
     chosen = np.arange(9) % 3
     samples = {
@@ -256,7 +256,7 @@ def test_curves_and_solved():
         exact = float(grid.errors(tile, values[None])[0])
         assert exact <= error[i % 3, i] * 1.01 + 1e-12 and exact >= error[i % 3, i] * 0.9 - 1e-9
     # A curve is of what the file holds.
-    coarse = grid.curves(tiles, [Size(4, 4, "bc6h"), Size(4, 4, "rgb9e5"), Size(4, 4, "half")])
+    coarse = grid.curves(tiles, [Size(4, 4, colour) for colour in ("bc6h", "rgb9e5", "half")], Stages("cpu"))
     samples = grid.solve(tiles, 4, 4, grid._MEDIUM).clamp(min=0.0)
     weight = torch.from_numpy(np.stack([grid.sample_weights(tiles, 4, 4).numpy()])[0])
     of_blocks = grid.errors(tiles, stored(samples, weight, "bc6h")).numpy()
@@ -277,25 +277,19 @@ def test_what_is_stored_is_what_the_texture_holds():
         np.testing.assert_array_equal(decoded.reshape(40, 4, 3), texture.astype(np.float32))
 
 
-def _brute(error: np.ndarray, cost: np.ndarray, budget: float) -> float:
-    """The least error of all choices within a budget."""
-    number = np.arange(error.shape[1])
-    choices = (np.array(choice) for choice in itertools.product(range(len(cost)), repeat=error.shape[1]))
-    return min(error[choice, number].sum() for choice in choices if cost[choice].sum() <= budget)
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_allocate_is_optimal_for_what_it_spends(seed: int):
     """No choice of the same cost is better, as a Lagrange multiplier promises, and nothing on the hull is left over."""
     random = np.random.default_rng(seed)
     cost = np.array([1.0, 2, 4, 6, 9])
     error = np.sort(random.random((5, 6)), 0)[::-1] * random.random(6) ** 3
-    spent = []
+    every = np.array(list(itertools.product(range(5), repeat=6)))
+    all_errors, all_costs, spent = error[every, np.arange(6)].sum(1), cost[every].sum(1), []
     for budget in (6.0, 9.0, 14.0, 25.0, 40.0, 54.0):
         chosen = allocation.allocate(error, cost, budget, 0.0)
         spent.append(cost[chosen].sum())
         assert spent[-1] <= budget
-        assert error[chosen, np.arange(6)].sum() == pytest.approx(_brute(error, cost, spent[-1]), rel=1e-12)
+        assert error[chosen, np.arange(6)].sum() == pytest.approx(all_errors[all_costs <= spent[-1]].min(), rel=1e-12)
     assert spent == sorted(spent) and spent[0] == 6 and spent[-1] == 54
     # A hull's longest edge is one tile's step from its cheapest size to its dearest.
     assert all(budget - cost_of < 9 for budget, cost_of in zip((9.0, 14.0, 25.0, 40.0), spent[1:5], strict=True))
@@ -317,7 +311,7 @@ def test_allocate_gives_the_cheapest_where_nothing_fits():
     assert allocation.allocate(flat, np.array([1.0, 2.0]), 4.0, 0.0).tolist() == [0] * 4
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_place(seed: int):
     """Inside, apart, and on shelves that waste little."""
     random = np.random.default_rng(seed)
@@ -334,41 +328,32 @@ def test_place(seed: int):
         assert used.mean() > 0.75
 
 
-def test_entries():
-    """A table's entry holds its place and size, at the ends of their ranges too."""
-    first, size = np.array([[0, 4095], [17, 1]]), np.array([[1, 16], [16, 3]])
-    entries = pack_entries(first, size)
-    assert entries.dtype == np.uint16
-    np.testing.assert_array_equal(np.stack(unpack_entries(entries, NO_BLOCKS)[:2]), np.stack([first, size]))
-    for wrong in ((first - 1, size), (first + 1, size), (first, size - 1), (first, size + 1)):
-        with pytest.raises(ValueError, match="an entry lies beyond 4096 texels or blocks"):
-            pack_entries(*wrong)
+BLOCKS = np.array([False, True, False])
+ENTRIES = {
+    "half": ([[0, 4095], [17, 1]], [[1, 16], [16, 3]], False),
+    "bc6h": ([[0, 16380], [4, 8]], [[4, 16], [16, 4]], True),
+    "astc": ([[0, 16380], [4, 8]], [[4, 16], [16, 4]], True),
+    "mixed": ([[0, 4095], [16380, 8], [17, 1]], [[1, 12], [16, 4], [12, 3]], BLOCKS),
+}
 
 
-@pytest.mark.parametrize("colour", ["bc6h", "astc"])
-def test_entries_of_textures_of_blocks_name_blocks(colour):
-    assert first_block_code("half") == first_block_code("rgb9e5") == NO_BLOCKS
+@pytest.mark.parametrize("colour", ENTRIES)
+def test_entries(colour: str):
+    """A table's entry holds its place and size, at the ends of their ranges too; of blocks places reach four times
+    further. Numbers beyond, and what isn't of whole blocks, are refused."""
+    first, size, blocks = (np.array(each) for each in ENTRIES[colour])
     code = first_block_code(colour)
-    first, size = np.array([[0, 16380], [4, 8]]), np.array([[4, 16], [16, 4]])
-    entries = pack_entries(first, size, True, code)
-    unpacked = unpack_entries(entries, code)
-    np.testing.assert_array_equal(np.stack(unpacked[:2]), np.stack([first, size]))
-    assert unpacked[2].all()
-    for wrong in ((first + 1, size), (first, size + 4), (first + 4, size), (first, size - 1)):
-        with pytest.raises(ValueError, match="an entry"):
-            pack_entries(*wrong, True, code)
-
-
-def test_entries_of_two_textures():
-    """Of blocks places reach four times further; what isn't of whole blocks, or has a size of blocks, is refused."""
-    first, size = np.array([[0, 4095], [16380, 8], [17, 1]]), np.array([[1, 12], [16, 4], [12, 3]])
-    blocks = np.array([False, True, False])
-    entries = pack_entries(first, size, blocks)
-    for found, expected in zip(unpack_entries(entries, FIRST_BLOCK_CODE), (first, size, blocks[:, None]), strict=True):
-        np.testing.assert_array_equal(found, np.broadcast_to(expected, (3, 2)))
-    for wrong in ((first + 1, size), (first, size + 1), (first, np.where(blocks[:, None], size, 13))):
-        with pytest.raises(ValueError, match="an entry"):
-            pack_entries(*wrong, blocks)
+    assert code == {"half": NO_BLOCKS, "mixed": FIRST_BLOCK_CODE}.get(colour, 0)
+    entries = pack_entries(first, size, blocks, code)
+    assert entries.dtype == np.uint16
+    for found, expected in zip(unpack_entries(entries, code), (first, size, blocks[..., None]), strict=True):
+        np.testing.assert_array_equal(found, np.broadcast_to(expected, first.shape))
+    step = np.where(blocks[..., None], 4, 1)
+    wrong = [(first + step * (first == first.max()), size), (first, size + step * (size == 16)), (first - step, size)]
+    wrong += [(first, size - step)] if colour != "mixed" else [(first, np.where(step == 4, size, 13))]
+    for each in [*wrong, *([(first + 1, size), (first, size + 1)] if blocks.any() else [])]:
+        with pytest.raises(ValueError, match="an entry of the lookup texture"):
+            pack_entries(*each, blocks, code)
 
 
 def test_layout_of_two_textures():
@@ -446,11 +431,11 @@ def test_bc6h_is_what_another_decoder_reads():
 def test_what_is_refused():
     texels = _smooth(8, 8)
     texels[3, 2, 1] = np.nan
-    with pytest.raises(ValueError, match="1 are NaN"):
+    with pytest.raises(ValueError, match="found 1 texels with NaN"):
         encode(texels, "astc")
     blocks, _ = encode(_smooth(8, 8), "astc")
     for bad in (blocks[:3], blocks.astype(np.int32), blocks.ravel()):
-        with pytest.raises(ValueError, match=r"expected uint8 \[4, 16\]"):
+        with pytest.raises(ValueError, match=r"expected shape uint8 \[4, 16\]"):
             decode(bad, 8, 8, "astc")
     with pytest.raises(ValueError, match="uint8"):
         decode(blocks[:0], 0, 8, "astc")

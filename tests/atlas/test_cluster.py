@@ -72,7 +72,7 @@ def _sound(clusters: Clusters, count: int) -> None:
 @pytest.mark.parametrize(("threshold", "colour_threshold"), [(0.03, 0.09), (0.01, 0.09), (0.05, 2.0), (0.05, 0.0)])
 def test_against_naive(device: str, threshold: float, colour_threshold: float):
     """The same groups, representatives, edges, orders and distances."""
-    count = 90
+    count = 50
     (uv, triangle), lightmap = _mesh(count), _lightmap()
     active = np.arange(count) % 7 != 0
     reports = []
@@ -89,7 +89,7 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
     )
     patches, edges, groups = _naive(uv, triangle, lightmap, threshold, colour_threshold, 2.0, active)
     _sound(clusters, count)
-    assert edges.sum() // 2 > 20
+    assert edges.sum() // 2 > 5
     members = [np.flatnonzero(clusters.group == group).tolist() for group in range(len(clusters.representative))]
     assert list(zip(clusters.representative.tolist(), members, strict=True)) == groups
     np.testing.assert_array_equal(clusters.excluded, ~active)
@@ -103,17 +103,17 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
 
 def test_many_triangles_are_grouped_by_samples(device: str, monkeypatch: pytest.MonkeyPatch):
     """Each is like its representative, no two representatives are alike, and there are few more of them."""
-    count = 200
+    count = 100
     (uv, triangle), lightmap = _mesh(count), _lightmap()
     exact = cluster(uv, triangle, lightmap, largest=65, device=device)
-    monkeypatch.setattr(clustering, "SAMPLE", 40)
+    monkeypatch.setattr(clustering, "SAMPLE", 20)
     reports = []
     clusters = cluster(uv, triangle, lightmap, largest=65, device=device, progress=reports.append)
     _sound(clusters, count)
     assert clusters.distance.max() < 0.03
     patches, edges, _ = _naive(uv, triangle, lightmap, 0.03, 0.09, 2.0, np.ones(count, bool))
     assert not edges[np.ix_(clusters.representative, clusters.representative)].any()
-    assert len(clusters.representative) <= 1.2 * len(exact.representative) < 0.7 * count
+    assert len(clusters.representative) <= 1.2 * len(exact.representative) < 0.8 * count
     assert {report.stage for report in reports} == {"compare patches", "cluster"}
     assert reports[-1].done == reports[-1].total == count
 
@@ -147,20 +147,21 @@ def test_sizes_are_those_of_texels():
     assert [SIZES[k] for k in level] == [5, 5, 9, 9, 5, 2, 2, 33]
 
 
-@pytest.mark.parametrize("count", [0, 1])
-def test_no_triangle_and_one(device: str, count: int):
-    clusters = cluster(*_mesh(count), _lightmap(), device=device)
-    assert clusters.representative.tolist() == list(range(count)) and clusters.group.shape == (count,)
-    assert not clusters.excluded.any()
-
-
-@pytest.mark.parametrize("colour", [0.0, 0.3, 2.0])
-def test_one_colour(device: str, colour: float):
-    """All are alike: one group, of the first."""
-    count = 2000
-    clusters = cluster(*_mesh(count, longest=20), np.full((*SIDE, 3), colour), device=device)
+@pytest.mark.parametrize(("count", "active"), [(0, True), (1, True), (5, False)])
+def test_no_triangle_and_one_and_none_that_is_active(device: str, count: int, active: bool):
+    clusters = cluster(*_mesh(count), _lightmap(), active=np.full(count, active), device=device)
     _sound(clusters, count)
-    assert clusters.representative.tolist() == [0]
+    assert clusters.representative.tolist() == list(range(count)) and (clusters.excluded != active).all()
+
+
+@pytest.mark.parametrize("colour", [-5.0, 0.3, 2.0])
+def test_one_colour(device: str, colour: float):
+    """All are alike: one group, of the first; negative radiance is black."""
+    count, lightmap = 500, np.full((*SIDE, 3), colour)
+    lightmap[:, 32:] = max(colour, 0.0)
+    clusters = cluster(*_mesh(count, longest=20), lightmap, device=device)
+    _sound(clusters, count)
+    assert clusters.representative.tolist() == [0] and clusters.distance.max() == 0
 
 
 def test_degenerate_triangles(device: str):
@@ -195,20 +196,6 @@ def test_bright_triangles(device: str):
     assert clusters.group.tolist() == [0, 1, 0, 0]
     clusters = cluster(_uv([away, on]), np.arange(6).reshape(-1, 3), lightmap, max_radiance=2.1, device=device)
     assert not clusters.excluded.any()
-
-
-def test_negative_radiance_is_black(device: str):
-    lightmap = np.zeros((*SIDE, 3), np.float32)
-    lightmap[:, 32:] = -5.0
-    clusters = cluster(*_mesh(20), lightmap, device=device)
-    assert clusters.representative.tolist() == [0] and clusters.distance.max() == 0
-
-
-def test_none_active(device: str):
-    """All are excluded and alone."""
-    clusters = cluster(*_mesh(5), _lightmap(), active=np.zeros(5, bool), device=device)
-    _sound(clusters, 5)
-    assert clusters.excluded.all() and clusters.representative.tolist() == list(range(5))
 
 
 def test_ties_go_to_the_lowest_number(device: str):
@@ -251,23 +238,23 @@ def test_welded():
     assert len(np.unique(corner)) == 5
 
 
-def test_edges_join_and_corners_do_not():
-    """A strip of two, one that touches it by a corner, one apart; and one that shares an edge of that, turned over."""
-    corner = np.array([[4, 5, 6], [0, 1, 2], [2, 1, 3], [3, 7, 8], [5, 4, 9]])
-    np.testing.assert_array_equal(charts(corner), [0, 1, 1, 2, 0])
+STRIP = [[0, 1, 2], [2, 1, 3], [2, 3, 4]]
+CHARTS = {
+    "two that touch by a corner, one that shares an edge turned over": (
+        [[4, 5, 6], [0, 1, 2], [2, 1, 3], [3, 7, 8], [5, 4, 9]],
+        None,
+        [0, 1, 1, 2, 0],
+    ),
+    "strip": (STRIP, None, [0, 0, 0]),
+    "a bridge that takes no part": (STRIP, [True, False, True], [0, -1, 1]),
+    "none takes part": (STRIP, [False] * 3, [-1] * 3),
+    "three at an edge, and one twice": ([[0, 1, 2], [0, 1, 3], [1, 0, 4], [0, 1, 2]], None, [0, 0, 0, 0]),
+    "one": ([[7, 8, 9]], None, [0]),
+    "none": (np.zeros((0, 3), np.int32), None, []),
+}
 
 
-def test_a_bridge_that_takes_no_part():
-    corner = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4]])
-    np.testing.assert_array_equal(charts(corner), [0, 0, 0])
-    np.testing.assert_array_equal(charts(corner, np.array([True, False, True])), [0, -1, 1])
-    np.testing.assert_array_equal(charts(corner, np.zeros(3, bool)), [-1, -1, -1])
-
-
-def test_three_at_an_edge_and_a_triangle_twice():
-    np.testing.assert_array_equal(charts(np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4], [0, 1, 2]])), [0, 0, 0, 0])
-
-
-def test_none_and_one():
-    assert charts(np.zeros((0, 3), np.int32)).shape == (0,)
-    np.testing.assert_array_equal(charts(np.array([[7, 8, 9]])), [0])
+@pytest.mark.parametrize("case", CHARTS)
+def test_charts(case: str):
+    corner, active, expected = CHARTS[case]
+    np.testing.assert_array_equal(charts(np.array(corner), active and np.array(active)), expected)

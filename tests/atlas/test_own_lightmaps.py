@@ -428,7 +428,7 @@ def test_renderers_without_a_lightmap(tmp_path, number):
         (tmp_path / "lights.json").write_text(json.dumps(lists))
         found = load(path, tmp_path / "lights.json")
         assert [each.label for each in found.objects] == ["crate"] and len(found.blocker) == 12
-        assert "1 objects without a lightmap" in found.warnings[0]
+        assert "1 objects have no lightmap" in found.warnings[0]
 
 
 def test_a_mirrored_node_keeps_its_front(tmp_path):
@@ -470,12 +470,13 @@ def test_lightmaps_are_bounded_together(tmp_path, monkeypatch):
 
 def test_what_inspect_says_of_lightmaps_named_by_tile_or_mesh(tmp_path):
     """Beside the mesh, in a folder of their own, and without it; the commands work as printed."""
-    things = [Thing("Floor", POSITION, TRIANGLE, [UV]), Thing("Wall", POSITION, TRIANGLE, [UV])]
-    path = write_scene(tmp_path / "room.gltf", things)
     for names, words in (
         (("Floor", "Wall"), "named after the meshes of room.gltf"),
         ((1001, 1002), "of the UDIM tiles"),
     ):
+        wall = UV + np.float32([names[0] == 1001, 0])
+        things = [Thing("Floor", POSITION, TRIANGLE, [UV]), Thing("Wall", POSITION, TRIANGLE, [wall])]
+        path = write_scene(tmp_path / "room.gltf", things)
         folder = tmp_path / f"bakes {names[0]}"
         folder.mkdir()
         for name in names:

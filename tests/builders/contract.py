@@ -76,15 +76,15 @@ def _smoke(model: Any) -> dict[str, np.ndarray]:
 
 
 def _atlas(kind: str) -> Subject:
-    settings = {"method": "cascade", "steps": 40, "resolution": 32, "fallback": False} if kind == "cascade" else {}
+    cascade = {"method": "cascade", "steps": 40, "resolution": 32, "fallback": False}
 
     def decode(model: Any) -> dict[str, np.ndarray]:
         with np.load(FILES / f"atlas-{kind}.npz") as stored:
             uv = stored["uv"]
         return {"uv": uv, "light": model.decoder().read(torch.from_numpy(uv)).numpy()}
 
-    profile, scores = wlm.atlas.Profile(name="tiny", views=4, **settings), {"views": 2, "resolution": 32}
-    return Subject("atlas", f"atlas-{kind}", decode, atlas_meshes.sheet, profile, scores)
+    profile = wlm.atlas.Profile(name="tiny", views=2, **(cascade if kind == "cascade" else {"tile": 4}))
+    return Subject("atlas", f"atlas-{kind}", decode, atlas_meshes.sheet, profile, {"views": 2, "resolution": 32})
 
 
 def _room() -> Any:

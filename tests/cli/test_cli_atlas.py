@@ -147,7 +147,7 @@ def test_evaluate_refuses_other_inputs(inputs, tiles, tmp_path):
     changed = mesh.lightmap.copy()
     changed[tuple(np.argwhere(mesh.mask)[0])] += 1.0
     write_exr(tmp_path / "light.exr", changed)
-    assert re.search("expected the scene .*[0-9a-f]{16}", fails(*words, tmp_path / "light.exr"))
+    assert re.search("expected the mesh and lightmaps .*[0-9a-f]{16}", fails(*words, tmp_path / "light.exr"))
     assert "expected a name that ends in .json" in fails(*words, inputs[1], "--json", tmp_path / "a.txt")
 
 

@@ -1,26 +1,36 @@
 """`wlm inspect`: what lies in a folder is named, with the command that takes it and what is wrong with it."""
 
+import gzip
+import io
 import json
 import os
 import re
 import shutil
+import subprocess
 from pathlib import Path
 
 import imagecodecs
 import numpy as np
 import pytest
-from builders import atlas_meshes, small_sets
+from builders import small_sets
 from builders.contract import FILES
 from builders.godot_bakes import Writer, bake, probes
+from builders.running import call
+from fuzz.readers import _own_lights as own_lights
 from PIL import Image
 from typer.testing import CliRunner
 
 import wlm
 from wlm.cli.app import app
+from wlm.errors import printable
 from wlm.export import export
+from wlm.formats.artifact import encode_artifact
 from wlm.formats.exr import write_exr
-from wlm.inspection import files, inspect
+from wlm.inspection import files, input_system, inspect
+from wlm.inspection.finding import UNREADABLE
 from wlm.inspection.folders import MOST
+
+CORPUS = Path(__file__).resolve().parents[1] / "fuzz" / "corpus"
 
 
 def chart(width: int, seed: int = 0, height: int = 64, alpha: bool = False) -> np.ndarray:
@@ -29,6 +39,13 @@ def chart(width: int, seed: int = 0, height: int = 64, alpha: bool = False) -> n
     lit = np.broadcast_to((np.arange(64) % width < width - 2)[None, :], (height, 64))
     light *= lit[..., None]
     return np.concatenate([light, lit[..., None].astype(np.float32)], 2) if alpha else light
+
+
+def small_npz(**arrays: np.ndarray) -> bytes:
+    """The bytes of an archive of arrays."""
+    held = io.BytesIO()
+    np.savez(held, **arrays)
+    return held.getvalue()
 
 
 def write_set(folder) -> None:
@@ -66,9 +83,7 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
     np.savez(tmp_path / "other" / "two.npz", position=position, sh_9=sh, sh_12=sh)
     (tmp_path / "other" / "smoke.vdb").write_bytes(b" BDV\0\0\0\0")
     shutil.copy(FILES / "lightmap.wlm", tmp_path / "other" / "map.wlm")
-    mesh = atlas_meshes.sheet()
-    model = wlm.atlas.compress(mesh, wlm.atlas.Profile(name="tiny", views=2))
-    model.save(tmp_path / "other" / "atlas.wlm")
+    shutil.copy(FILES / "atlas-tiles.wlm", tmp_path / "other" / "atlas.wlm")
     text = told(tmp_path)
     for said in (
         "unity: 2 states of light from Unity, 1 map of 64x64, with light, dir, shadowmask -> "
@@ -81,7 +96,7 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
         "right-handed, y up, in metres -> wlm compress",
         "smoke.npz: a volume of smoke, 4x5x6 voxels of 1 -> wlm smoke bake",
         "two.npz: 9 light probes of 9 RGB coefficients, 9 of them lit, under the keys sh_9, sh_12; SH",
-        "wlm compress HERE/other/two.npz --key 9 -o OUT.wlm",
+        "wlm compress HERE/other/two.npz --key sh_9 -o OUT.wlm",
         "smoke.vdb: cannot be read",
         "map.wlm: compressed lightmaps over time",
         "atlas.wlm: compressed lightmaps of meshes",
@@ -91,17 +106,130 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
     lines = wlm.lightmap.load(tmp_path / "unity", times=[0, 1]).warnings
     assert len(lines) == 4 and all(line.removeprefix(f"{tmp_path}/unity: ") in text.splitlines() for line in lines)
     assert "LICENSE" not in text and text.count("set") < 20
-    export(model, tmp_path / "engine", "unity")
+    export(wlm.load(FILES / "atlas-tiles.wlm"), tmp_path / "engine", "unity")
     # No command takes it.
     assert told(tmp_path / "engine").endswith(" -> ")
+
+
+SCENE = {"name": "tiny", "grid": {"cells": [8, 8, 8], "cell": 0.025}, "frames": 1, "rate": 1000.0}
+SHEETS = {"sheets": [{"files": ["day.exr"]}], "objects": [{"node": "a", "sheet": 0}], "states": ["day"]}
+TINY = {  # options that make a command of a system quick
+    "atlas": ["--views", "1", "--resolution", "16"],
+    "lightmap": ["--steps", "10", "--samples", "128"],
+    "probe": ["--steps", "10"],
+    "bake": ["--resolution", "16"],
+}
+
+
+def kinds() -> dict[str, dict[str, bytes]]:
+    """For each kind of file the contents of small ones, by suffix, or by name after a slash."""
+    stored = {name: (CORPUS / name).read_bytes() for name in os.listdir(CORPUS)}
+    yaml_scene, sheets = json.dumps(SCENE).encode(), json.dumps(SHEETS).encode()
+    light = (
+        "light.exr",
+        "six-way.exr",
+        "plain.hdr",
+        "light.pfm",
+        "strips.tif",
+        "levels.jpg",
+        "mask-grey.png",
+        "bc6h.dds",
+    )
+    return {
+        "arrays": {".npz": small_npz(other=np.ones(3))},
+        "checkpoint": {".wlm.partial": encode_artifact("probe-checkpoint", {}, {"a": np.ones(3)}, "none")},
+        "export": {"bundle.json": b'{"format": "wlm-bundle"}'},
+        "godot bake": {".lmbake": stored["probes.lmbake"]},
+        "json": {".json": b"{}"},
+        "lights": {".json": sheets},
+        "mesh": {".glb": stored["mesh.glb"], ".gltf": next(iter(own_lights())), ".obj": stored["mesh.obj"]},
+        "model": {
+            f" {name}": (FILES / name).read_bytes()
+            for name in ("atlas-tiles.wlm", "lightmap.wlm", "probe.wlm", "smoke.wlm")
+        },
+        "output": {".html": b"<html>"},
+        "picture": {f" {name}": stored[name] for name in light},
+        "positions": {".json": stored["positions.json"], ".npz": stored["positions.npz"]},
+        "probes": {f" {name}": stored[name] for name in ("probes.npz", "probes-vci.json", "probes.csv", "volume.ktx2")}
+        | {".npz": small_npz(**{"position": probes(9)[0], "sh_-1 $'": probes(9)[1], "sh-2": probes(9)[1]})},
+        "scores": {".json": b'{"psnr": 40.0}'},
+        "set": {"set.json": stored["set.json"]},
+        "settings": {".yaml": yaml_scene, " profile.yml": b"steps: 10", " bake.yaml": b"geometry: a.glb"},
+        "unity asset": {".asset": stored["probes.asset"]},
+        "volume": {f" {name}": stored[name] for name in ("volume.npz", "volume-bricks.npz")}
+        | {".nvdb": gzip.decompress(stored["cloud.nvdb.gz"])},
+    }
+
+
+NAME = "-it's $HOME\t\n`a`"
+"""Begins with a dash, and contains what a shell reads: quotes, spaces, a variable, a tab and a line break."""
+
+
+def run(finding) -> None:
+    """Runs the command that is printed for a file or folder, as a shell reads it; nothing may be unreadable."""
+    assert UNREADABLE not in finding.what and "\n" not in finding.what, finding
+    if finding.command:
+        split = ["bash", "-c", f"printf '%s\\0' {finding.command}"]
+        words = subprocess.run(split, capture_output=True, check=True).stdout.decode().split("\0")[1:-1]
+        call(*words, *TINY.get(input_system(words[1]) if words[0] == "compress" else words[1], []))
+
+
+@pytest.mark.parametrize("kind", files._KINDS)
+def test_every_printed_command_works_as_printed(kind, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = Path(NAME)
+    folder.mkdir()
+    for name, content in kinds()[kind].items():
+        path = folder / name if name[0] not in " ." else Path(f"{folder}{name}")
+        path.write_bytes(content if isinstance(content, bytes) else b"".join(map(bytes, content)))
+        if kind == "set":
+            copy(folder, {"a.exr": "light.exr", "b.exr": "light.exr", "mask.png": "mask-grey.png"})
+        assert files.kind_of(path) == kind
+        (finding,) = inspect(path)
+        printed = CliRunner().invoke(app, ["inspect", "--", str(path)]).output.splitlines()[0]
+        assert printed.startswith(f"{printable(str(finding.path))}: ") and printed.endswith(finding.command)
+        run(finding)
+
+
+def copy(folder: Path, names: dict[str, str]) -> None:
+    """Makes a folder of files of the corpus: the name of each, and which it is."""
+    folder.mkdir(exist_ok=True)
+    for name, source in names.items():
+        shutil.copy(CORPUS / source, folder / name)
+
+
+@pytest.mark.parametrize(
+    ("names", "command"),
+    [
+        ({"a_6h.exr": "light.exr", "a_9h.exr": "light.exr", "-a.png": "mask-grey.png"}, "compress"),
+        ({"-a.hdr": "plain.hdr", "b.hdr": "plain.hdr"}, "compress"),
+        ({"-a.glb": "mesh.glb", "-b.exr": "light.exr"}, "compress"),
+        ({"-a_comp_light.exr": "light.exr", "-a_comp_dir.png": "mask-rgba.png"}, "compress"),
+        ({"frame_0001.npz": "volume.npz", "scene.json": "scene.json"}, "smoke bake"),
+        ({"-a.exr": "six-way.exr"}, "smoke flipbook"),
+        ({"-a_RLT.png": "flipbook.png", "-a_BBF.png": "flipbook.png"}, "smoke shade"),
+        # What cannot be read together gets no command.
+        ({"a_6h.exr": "light.exr", "a_9h.exr": "light.exr", "b.hdr": "mesh.obj"}, ""),
+        ({"a.obj": "mesh.obj", "b.exr": "six-way.exr", "set.json": "set.json"}, ""),
+    ],
+)
+def test_every_command_for_a_folder_works(names, command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    copy(Path(NAME), names)
+    found = inspect(Path(NAME))
+    assert [finding.command.startswith(f"wlm {command}") for finding in found if finding.command] == [True] * bool(
+        command
+    )
+    for finding in found if command else ():
+        run(finding)
 
 
 def test_all_folders_that_are_written_are_known():
     """Textures of an unknown export would be taken for lightmaps that can be compressed."""
     package = Path(wlm.__file__).parent
-    texts = (path.read_text(encoding="utf-8") for path in package.rglob("*.py"))
-    formats = {name for text in texts for name in re.findall(r'^[A-Z][A-Z_]+ = "(wlm-[^"]+)"$', text, re.MULTILINE)}
-    assert len(formats) > 3 and formats <= set(files._EXPORTS)
+    texts = [path.read_text(encoding="utf-8") for path in package.rglob("*.py") if path.parent.name != "inspection"]
+    formats = {name for text in texts for name in re.findall(r'"(wlm-[a-z-]+)"', text)}
+    assert len(formats) > 2 and formats <= set(files._EXPORTS)
 
 
 def test_pictures_of_several_atlases_are_no_times(tmp_path):
@@ -118,7 +246,7 @@ def test_pictures_of_several_atlases_are_no_times(tmp_path):
         write_exr(tmp_path / f"map_{hour}h.exr", chart(16, hour))
     write_exr(tmp_path / "map_18h.exr", chart(11, 18))
     text = told(tmp_path)
-    assert "3 lightmaps of different UV layouts" in text and "compress them with their meshes ->" in text
+    assert "3 lightmaps of different UV layouts" in text and "compress them with their mesh ->" in text
     assert "map_6h.exr and map_18h.exr have different charts" in text
     write_exr(tmp_path / "map_18h.exr", chart(16, 18, height=32))
     assert "map_18h.exr is 64x32, map_6h.exr is 64x64" in told(tmp_path)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from wlm.formats.block_reuse import reuse_blocks
+from wlm.formats.block_reuse import by_block, reuse_blocks
 
 
 def strip(*values: float) -> np.ndarray:
@@ -10,15 +10,12 @@ def strip(*values: float) -> np.ndarray:
     return np.repeat(np.float32(values), 4)[None, :, None].repeat(4, axis=0)
 
 
-def named(count: int) -> bytes:
-    """Makes blocks whose bytes are all equal to the block's number."""
-    return bytes(i for i in range(count) for _ in range(16))
-
-
 def reused(decoded, target, loss: float, weight=None) -> list[int]:
     """The numbers of the blocks that stand for each."""
     weight = np.ones_like(target) if weight is None else weight
-    return list(reuse_blocks(named(target.size // 16), decoded, target, weight, weight * np.float32(loss) ** 2)[::16])
+    images = (by_block(image) for image in (decoded, target, weight, weight * np.float32(loss) ** 2))
+    numbers = np.arange(target.size // 16, dtype=np.uint8)[:, None].repeat(16, 1)
+    return reuse_blocks(numbers, *images)[:, 0].tolist()
 
 
 def test_a_block_takes_the_nearest_before_it_within_the_loss():

@@ -112,7 +112,7 @@ def test_a_data_window_outside_the_display_window_is_refused(tmp_path):
     OpenEXR.File({**SCANLINES, "displayWindow": _box(30, 0, 9, 9)}, _planes("RGB")).write(str(path))
     assert "expected a data window that overlaps the display window, found none" in error_of(read_exr, path)
     OpenEXR.File({**SCANLINES, "displayWindow": _box(0, 0, 60000, 60000)}, _planes("RGB")).write(str(path))
-    assert "expected at most 268435456 texels" in error_of(read_exr, path)
+    assert "at most 268435456 texels" in error_of(read_exr, path)
 
 
 def _box(x: int, y: int, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
@@ -237,7 +237,7 @@ def test_integers_and_several_parts_are_refused(tmp_path, read):
     path = tmp_path / "a.exr"
     planes = _planes("RGB")
     OpenEXR.File(SCANLINES, {**planes, "G": np.ones((37, 21), np.uint32)}).write(str(path))
-    with pytest.raises(WlmError, match="channel G: expected half or float, found uint32"):
+    with pytest.raises(WlmError, match="channel G: expected half or float numbers, found uint32"):
         read(path)
     parts = [OpenEXR.Part({}, planes, name=name) for name in ("one", "two")]
     OpenEXR.File(parts).write(str(path))

@@ -24,7 +24,7 @@ from PIL import Image
 from rich.markup import escape
 
 from benchmarks.rows import read_runs
-from tests.fuzz.limits import Limits
+from tests.fuzz.worker import Limits
 from wlm import atlas, lightmap
 from wlm.atlas.stored import with_uvs
 from wlm.cli.console import note, show, show_text, table
@@ -338,7 +338,7 @@ def lightmap_set(folder: Path, entries: list | None = None, **changes: object) -
 
 def test_a_set_that_lists_one_file_without_end(tmp_path):
     entries = [{"time_hours": i / 6000, "file": "a.exr"} for i in range(100_001)]
-    assert "expected at most 100,000 entries, got 100,001" in refused(lightmap.load, lightmap_set(tmp_path, entries))
+    assert "expected at most 100000 entries, found 100001" in refused(lightmap.load, lightmap_set(tmp_path, entries))
     # 1.2 GB of frames.
     with little_memory():
         assert "expected at most 2048 times its" in refused(lightmap.load, lightmap_set(tmp_path, entries[:3000]))
@@ -368,8 +368,8 @@ def test_a_set_names_files_of_its_folder(tmp_path):
     [
         ({"mask": "x" * 5000}, "mask: expected a name of at most 1024 characters, found 5000"),
         ({"mask": "x" * 1000}, "cannot read the mask"),
-        ({"mask": "\ud800"}, "mask: expected the name of a PNG"),
-        ({"entries": [{"time_hours": 0, "file": "\ud800"}]}, "lightmaps[0].file: expected the name of a lightmap"),
+        ({"mask": "\ud800"}, "cannot read the mask"),
+        ({"entries": [{"time_hours": 0, "file": "\ud800"}]}, "cannot read the lightmap: the name has"),
         ({"entries": [{"time_hours": 0, "file": "x" * 1000}]}, "cannot read the lightmap"),
         (
             {"entries": [{"time_hours": 0, "file": "set.json"}]},
@@ -388,7 +388,7 @@ def test_a_mask_is_a_png_whatever_else_its_name_hides(tmp_path, kind):
 
 
 def test_pictures_that_claim_more_than_they_hold(tmp_path):
-    assert "expected at most 268435456 texels" in refused(read_exr, FILES / "b44-wide.exr")
+    assert "at most 268435456 texels" in refused(read_exr, FILES / "b44-wide.exr")
     write_exr(tmp_path / "a.exr", np.ones((4, 4, 3), np.float32))
     content = (tmp_path / "a.exr").read_bytes()
     at = content.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4

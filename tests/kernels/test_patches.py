@@ -50,7 +50,7 @@ def _unpacked(samples: wp.array, level: np.ndarray) -> list[np.ndarray]:
 
 def test_samples(device: str):
     """Within rounding of bilinear samples at the lattice's barycentrics; and the patch's range and dominant colour."""
-    image, (corners, level) = _image(), _triangles(60)
+    image, (corners, level) = _image(), _triangles(40)
     samples, patches, _ = _sampled(image, corners, level, device)
     patch = patches.numpy()
     for t, got in enumerate(_unpacked(samples, level)):
@@ -76,10 +76,10 @@ def test_orders_are_those_of_permuted_vertices(device: str):
 
 def test_distances(device: str):
     """Of patches of all pairs of sizes, the least Dist, exact, and the first order that has it; the same both ways."""
-    image, (corners, level) = _image(), _triangles(24)
+    image, (corners, level) = _image(), _triangles(20)
     samples, patches, _ = _sampled(image, corners, level, device)
     split = _unpacked(samples, level)
-    a, b = (x.ravel() for x in np.meshgrid(np.arange(24), np.arange(24)))
+    a, b = (x.ravel() for x in np.meshgrid(np.arange(20), np.arange(20)))
     order, distance = kernels.compare(samples, patches, _ints(a, device), _ints(b, device))
     sizes = set()
     for k in range(len(a)):
@@ -89,7 +89,7 @@ def test_distances(device: str):
         assert order[k] == int((want < want.min() + 1e-12).argmax())
         sizes.add((level[a[k]], level[b[k]]))
     assert len(sizes) == 16
-    np.testing.assert_array_equal(distance.reshape(24, 24), distance.reshape(24, 24).T)
+    np.testing.assert_array_equal(distance.reshape(20, 20), distance.reshape(20, 20).T)
     assert distance.max() > 0.1
 
 
@@ -107,11 +107,10 @@ def _graph(samples, patches, threshold: float, colour_threshold: float, device: 
     return graphs.graph(samples, patches, bounds, graphs.rule(threshold, colour_threshold, device))
 
 
-@pytest.mark.parametrize("contrast", [0.02, 0.2, 1.0])
-@pytest.mark.parametrize("threshold", [0.003, 0.03, 0.1])
+@pytest.mark.parametrize(("threshold", "contrast"), [(0.003, 0.02), (0.003, 0.2), (0.03, 0.2), (0.03, 1.0), (0.1, 1.0)])
 def test_neighbours(device: str, threshold: float, contrast: float):
     """Degrees, rows and remaining degrees of the naive matrix; some pairs need samples, for others bounds do."""
-    count = 70
+    count = 44
     image, (corners, level) = _image(contrast=contrast), _triangles(count, seed=3)
     samples, patches, _ = _sampled(image, corners, level, device)
     graph, number = _graph(samples, patches, threshold, 0.09, device)

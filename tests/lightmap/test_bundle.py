@@ -17,10 +17,10 @@ from wlm.formats.bc7 import decode_image
 from wlm.formats.exr import read_exr
 from wlm.lightmap.bundle import hour_tables, sheet_bundle
 from wlm.lightmap.decode import SheetDecoder
-from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.shader import decode_glsl, texture_names
 from wlm.lightmap.sheet import LIGHT, Sheet
+from wlm.texels import near_gaps
 
 TIMES = (7.5, 3.3, 21.7)  # stored, between, and across midnight (or past the end)
 AXES = [
@@ -287,6 +287,6 @@ def test_the_shader_fills_gaps(tmp_path):
     main = "light = vec4(vec2(wlm_source(pixel)), 0.0, 1.0);"
     found = run_glsl(text, main, mask.shape, uniforms | hour(0))[..., 1::-1]
     expected = np.moveaxis(np.indices(mask.shape), 0, 2)
-    gaps = Gaps.of(mask)
-    expected[tuple(gaps.target.T)] = gaps.source
+    target, source = near_gaps(mask)
+    expected[tuple(target.T)] = source
     np.testing.assert_array_equal(found, expected)

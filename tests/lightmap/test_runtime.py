@@ -13,8 +13,7 @@ from wlm.formats.dds import read_dds, write_dds
 from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.exact import colour_tile64
-from wlm.lightmap.runtime import ExactDecoder, MatrixDecoder, StripDecoder
-from wlm.lightmap.runtime_texture import MapDecoder
+from wlm.lightmap.runtime import ExactDecoder, MapDecoder, MatrixDecoder, StripDecoder
 from wlm.lightmap.tiles import TileKind
 from wlm.texels import near_gaps
 from wlm_kernels.shared_exponent import pack_rgb9e5 as pack_kernel

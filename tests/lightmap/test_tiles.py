@@ -12,7 +12,6 @@ from wlm.formats import zstd
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.decode import SheetDecoder
-from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import (
@@ -22,11 +21,12 @@ from wlm.lightmap.tiles import (
     TileKind,
     channel_means,
     classify,
+    cut,
     place,
     split,
     static_pattern,
 )
-from wlm.texels import REACH, fill_gaps
+from wlm.texels import REACH, fill_gaps, near_gaps
 
 HEIGHT, WIDTH, GAMMA = 200, 300, 2.2  # 2 rows and 3 columns of tiles, both cut at the end
 
@@ -63,7 +63,7 @@ def test_grid():
     for index in (-1, 6):
         with pytest.raises(WlmError, match="outside the grid"):
             grid.origin(index)
-    with pytest.raises(WlmError, match="at least 1x1"):
+    with pytest.raises(WlmError, match="at least one texel"):
         TileGrid.of(0, 5)
 
 
@@ -109,6 +109,15 @@ def test_map_end_is_edge_padded_and_not_valid(lightmaps):
     expected = np.pad(inside, ((0, 0), (0, TILE - rows), (0, TILE - columns), (0, 0)), mode="edge")
     np.testing.assert_array_equal(colour, expected)
     assert (inside > 0).all()
+
+
+def test_a_tile_of_its_own_size(lightmaps):
+    last = TileGrid.of(*lightmaps.mask.shape).count - 1
+    own = cut(lightmaps, np.array([last])).encoded(2.2, padded=False)
+    (rows, columns), padded = own.mask.shape[1:], split(lightmaps, 2.2, [last])
+    np.testing.assert_allclose(own.colour, padded.colour[:, :, :rows, :columns], rtol=1e-6)
+    np.testing.assert_array_equal(own.mask, padded.mask[:, :rows, :columns])
+    assert own.mask.size < padded.mask.size
 
 
 def test_split_refuses(lightmaps):
@@ -207,32 +216,23 @@ def _mask(seed: int = 0, shape: tuple[int, int] = (40, 50), share: float = 0.05)
 @pytest.mark.parametrize("share", [0.0, 0.005, 0.05, 0.5, 1.0])
 def test_each_takes_the_nearest_within_reach(share):
     mask = _mask(share=share)
-    gaps, valid = Gaps.of(mask), np.argwhere(mask)
+    (target, source), valid = near_gaps(mask), np.argwhere(mask)
     expected = set()
     for at in np.argwhere(~mask):
         if len(valid) and np.abs(valid - at).max(1).min() <= REACH:
             expected.add(tuple(at))
-    assert {tuple(at) for at in gaps.target} == expected
-    for at, source in zip(gaps.target, gaps.source, strict=True):
-        assert mask[tuple(source)]
-        assert np.square(source - at).sum() == np.square(valid - at).sum(1).min()
+    assert {tuple(at) for at in target} == expected and mask[tuple(source.T)].all()
+    # The first of several that are as near, in reading order.
+    first = [valid[np.square(valid - at).sum(1).argmin()] for at in target]
+    np.testing.assert_array_equal(source, np.reshape(first, source.shape))
 
 
 def test_they_are_filled_as_a_baker_dilates():
     mask = _mask(3)
     image = np.random.default_rng(1).random((40, 50, 3))
-    gaps, expected = Gaps.of(mask), fill_gaps(image, mask)
-    gaps.fill(image)
-    where = tuple(gaps.target.T)
-    assert len(gaps.target) > 100
-    np.testing.assert_array_equal(image[where], expected[where])
-
-
-def test_the_first_of_several_as_near():
-    mask = _mask(3)
-    gaps, valid = Gaps.of(mask), np.argwhere(mask)  # in reading order
-    first = [valid[np.square(valid - at).sum(1).argmin()] for at in gaps.target]
-    np.testing.assert_array_equal(gaps.source, first)
+    target, source = (tuple(at.T) for at in near_gaps(mask))
+    assert len(target[0]) > 100
+    np.testing.assert_array_equal(image[source], fill_gaps(image, mask)[target])
 
 
 @pytest.fixture(scope="module")
@@ -251,17 +251,9 @@ def test_a_map_and_its_tiles_agree(model, time):
         y, x = number // 2 * 128, number % 2 * 128
         raw[y : y + 128, x : x + 128] = light
     assert np.array_equal(frame[model.mask], raw[:236, :247][model.mask])
-    gaps = Gaps.of(model.mask)
-    assert np.array_equal(frame[tuple(gaps.target.T)], raw[tuple(gaps.source.T)])
-    crossing = (gaps.target // 128 != gaps.source // 128).any(1)
-    assert crossing.any()
-    for border in (0, 4):
-        tile = decoder.tile(0, time, border)
-        assert np.array_equal(tile[border:, border:], frame[: 128 + border, : 128 + border])
-        assert np.array_equal(tile[border, :border], tile[border, border : 2 * border][::-1])  # mirrored there
-        last = decoder.tile(3, time, border)
-        inside = frame[128 - border :, 128 - border :]
-        assert np.array_equal(last[: inside.shape[0], : inside.shape[1]], inside)
+    target, source = near_gaps(model.mask)
+    assert np.array_equal(frame[tuple(target.T)], raw[tuple(source.T)])
+    assert (target // 128 != source // 128).any(), "some gaps take light from another tile"
 
 
 def _file_of(sheet):

@@ -29,7 +29,7 @@ from wlm.smoke.data import (
     spread,
     write_six_way,
 )
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 from wlm.smoke.scene import (
     CameraSettings,
     LightSettings,
@@ -403,17 +403,21 @@ def test_files_that_are_no_lightmaps(tmp_path):
         with pytest.raises(WlmError, match=said):
             read_six_way(path)
 
-    refused({k: v for k, v in planes.items() if k != "top"}, note, "expected a channel top as bake writes")
+    refused({k: v for k, v in planes.items() if k != "top"}, note, "expected a channel top, as wlm smoke bake writes")
     refused(planes | {"top": planes["top"] * np.nan}, note, "channel top: expected finite numbers")
     write_planes(path, planes, None)
     assert read_six_way(path).camera.extent == 1.0, "another program's lightmaps get a camera of unit extent"
-    refused(planes, {"camera": {"extent": 1}}, "header attribute wlm: expected a camera as bake writes")
+    refused(planes, {"camera": {"extent": 1}}, "header attribute wlm: expected a camera, as wlm smoke bake writes")
     refused(
         planes,
         {"camera": note["camera"] | {"up": [0, 10**400, 0]}},
-        "header attribute wlm: expected a camera as bake writes",
+        "header attribute wlm: expected a camera, as wlm smoke bake writes",
     )
-    refused({k: v[:4] for k, v in planes.items()}, note, "expected its camera's .height, width. .8, 8., found")
+    refused(
+        {k: v[:4] for k, v in planes.items()},
+        note,
+        "expected images of its camera's height and width, 8 x 8 pixels, found",
+    )
     damaged = path.read_bytes()
     path.write_bytes(damaged[: len(damaged) // 2])
     with pytest.raises(WlmError, match="a.exr"):

@@ -1,4 +1,4 @@
-"""Shading: weights, lights, emission, and shadows of obstacles against traced rays."""
+"""Shading: weights, lights and emission."""
 
 import math
 from dataclasses import replace
@@ -6,9 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from builders.smoke_shadows import shadow_of
 
+<<<<<<< HEAD
 from wlm.fluid.obstacles import surface
+=======
+>>>>>>> main
 from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light, Ramp
@@ -22,14 +24,6 @@ def _six(device: str, emission: bool = False) -> SixWay:
     maps = torch.tensor(random.uniform(0, 1, (8, 8, 8)), dtype=torch.float32, device=device)
     camera = Camera.look_at(10 * np.array((0.4, 0.7, 1.0)), (0, 0, 0), extent=4.0, height=8, width=8)
     return SixWay(maps[:6], maps[6], 2 * maps[7] if emission else None, camera)
-
-
-def _box(low: tuple, high: tuple, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    corners = np.array(list(np.ndindex(2, 2, 2)))
-    vertices = np.where(corners == 1, high, low).astype(np.float32)
-    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = [(a, b, c) for q in faces for a, b, c in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))]
-    return torch.tensor(vertices, device=device), torch.tensor(triangles, device=device)
 
 
 def test_one_light_along_each_axis(device: str):
@@ -85,6 +79,7 @@ def test_background(device: str):
         np.testing.assert_allclose(result.cpu(), expected.cpu(), rtol=1e-6)
 
 
+<<<<<<< HEAD
 @pytest.mark.parametrize("perspective", [False, True])
 @pytest.mark.parametrize("toward", [(0.0, 1.0, 0.0), (0.5, 1.0, -0.3), (0.0, 0.0, 1.0), (-1.0, 0.2, 0.4)])
 def test_shadow_of_a_box(device: str, toward: tuple, perspective: bool):
@@ -145,6 +140,8 @@ def test_shadow_of_a_sphere(device: str, far: float):
     assert centre == pytest.approx(50.0, abs=0.1)
 
 
+=======
+>>>>>>> main
 def test_wrong_settings():
     six = _six("cpu")
     with pytest.raises(ValueError, match="irradiance"):
@@ -155,7 +152,7 @@ def test_wrong_settings():
         replace(six, camera=None).shade([Light((0, 0, 1))])
     with pytest.raises(ValueError, match="transparency: the lightmaps have no"):
         replace(six, transparency=None).shade([], background=(0, 0, 0))
-    with pytest.raises(ValueError, match="camera: expected .height, width. .8, 8."):
+    with pytest.raises(ValueError, match="camera: expected the height and width of the lightmaps, .8, 8."):
         replace(six, camera=six.camera.finer(2))
     with pytest.raises(ValueError, match="depth: expected"):
         replace(six, depth=torch.ones(2, 2))

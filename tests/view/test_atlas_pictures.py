@@ -95,7 +95,7 @@ def test_what_cannot_be_drawn(tmp_path):
         comparison(tmp_path / "a.png", mesh, {}, [FRONT])
     with pytest.raises(ValueError, match="one view"):
         comparison(tmp_path / "a.png", mesh, {"a": original(mesh)}, [])
-    with pytest.raises(WlmError, match="triangle: cannot draw it: no view shows it"):
+    with pytest.raises(WlmError, match="triangle: cannot draw it: no camera shows a surface"):
         comparison(tmp_path / "a.png", mesh, {"a": original(mesh)}, [View.of((1, 0, 0))])
     with pytest.raises(WlmError, match="cannot write"):
         save_png(tmp_path / "none" / "a.png", np.zeros((2, 2, 3), np.uint8))

@@ -8,7 +8,7 @@ import numpy as np
 from wlm.atlas.decode import Decoder
 from wlm.atlas.model import BLOCKS, TEXELS, AtlasModel
 from wlm.atlas.shader import EXACT, glsl
-from wlm.atlas.stored import mesh_file
+from wlm.atlas.stored import with_uvs
 from wlm.bundle import Bundle, Texture
 from wlm.errors import WlmError
 from wlm.formats.float_texels import MOST_SIDE
@@ -65,8 +65,8 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
     for name, texture in textures.items():
         side = max(texture.width, texture.height)
         if side > MOST_SIDE:
-            raise WlmError(f"{model.name}: {name}: expected at most {MOST_SIDE} texels along a side, found {side}")
-    glb, uv_set = mesh_file(model)
+            raise WlmError(f"{model.name}: texture {name}: expected at most {MOST_SIDE} texels a side, found {side}")
+    glb, uv_set = with_uvs(model.scene, model.uv) if len(model.uv) else (model.stored.glb, model.stored.uv_set)
     return Bundle(
         system=model.SYSTEM,
         name=model.name,

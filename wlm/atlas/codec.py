@@ -36,12 +36,11 @@ from wlm.atlas.model import (
 from wlm.atlas.stored import StoredScene
 from wlm.config import check_settings
 from wlm.formats.artifact import Artifact, encode_artifact
-from wlm.formats.limits import PICTURE_SIDE
+from wlm.formats.limits import PICTURE_SIDE, check_sides
 from wlm.formats.parts import Part, check_parts
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.formats.zstd import pack_parts, unpack_parts
 from wlm.system import Header, Name
-from wlm.texels import check_size
 
 _MOST_FACTOR = 1e30  # sums of 255 texels times a factor are finite
 _MOST_NUMBERS = 1 << 31  # limit on the length of an axis of a part
@@ -89,7 +88,7 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     """
     stored = model.stored
     if stored is None:
-        raise ValueError(f"{model.name}: expected a model that stores the triangles of its scene, found none")
+        raise ValueError(f"{model.name}: the model has no triangles: expected one that compress or load made")
     settings = {
         "name": model.name,
         "method": model.method,
@@ -110,7 +109,7 @@ def encode(model: AtlasModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     }
     parts = {"colour": model.texels, "lut": model.lut, "factor": model.factor}
     if not np.array_equal(snapped(model.uv), model.uv):
-        raise ValueError(f"{model.name}: expected new UVs that are rounded to 16 bits, found other values")
+        raise ValueError(f"{model.name}: expected new UVs that are multiples of 1/65535, found other values")
     parts["uv"] = np.rint(model.uv * LUT_STEPS).astype(np.uint16)
     if model.colour in colour.BLOCK_CODECS:
         parts["colour"] = model.blocks
@@ -145,7 +144,7 @@ def decode(artifact: Artifact) -> AtlasModel:
     """
     header = check_settings(_Header, artifact.settings, "setting ")
     for size in header.sizes:
-        check_size(*size)
+        check_sides("size", *size[::-1])
     parts = _checked_parts(header, artifact)
     texels, second = tuple(header.texels), tuple(header.block_texels or (0, 0))
     stored, blocks = parts["colour"], parts["blocks"]
@@ -193,16 +192,18 @@ def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]
     shared, method = header.method == "shared", header.method
     texels, second = tuple(header.texels), header.block_texels
     if len(header.sizes) != len(header.sheets):
-        raise ValueError(f"setting sizes: expected {len(header.sheets)}, one for each sheet, found {len(header.sizes)}")
+        raise ValueError(
+            f"setting sizes: expected one for each of {len(header.sheets)} sheets, found {len(header.sizes)}"
+        )
     height, width = header.sizes[0]
     if not (shared or len(header.sheets) == len(header.states) == 1):
-        raise ValueError(f"setting sheets: expected one sheet and one state for method {method}, found more")
+        raise ValueError(f"settings sheets, states: expected one of each for method {method}, found more")
     if {each.sheet for each in header.objects} != set(range(len(header.sheets))):
-        raise ValueError(f"setting objects: expected at least one object for each of the {len(header.sheets)} sheets")
+        raise ValueError(f"setting objects: expected an object or more for each of the {len(header.sheets)} sheets")
     if header.separate and not shared:
-        raise ValueError(f"setting separate: expected method shared, found {method}")
+        raise ValueError(f"setting separate: only method shared has separate tiles for each state, found {method}")
     if (second is None) == (header.colour == "mixed") or any(side % BLOCK_SIDE for side in second or ()):
-        raise ValueError("setting block_texels: expected multiples of 4 if colour is mixed, none otherwise")
+        raise ValueError("setting block_texels: expected multiples of 4 where setting colour is mixed, none elsewhere")
     if header.colour == "mixed" and method in ("cascade", "plain"):
         raise ValueError(f"setting colour: method {method} has one colour texture, found mixed, which has two")
     if shared and header.colour not in ("rgb9e5", "mixed"):
@@ -235,11 +236,11 @@ def _checked_parts(header: _Header, artifact: Artifact) -> dict[str, np.ndarray]
     }
     parts = check_parts(unpack_parts(artifact.tensors, header.parts, table), table)
     if not parts["colour"].size or (method == "cascade" and not parts["lut"].size):
-        raise ValueError("part colour, part lut: expected textures, found one without texels")
+        raise ValueError("parts colour, lut: expected at least one texel in each of these textures, found none in one")
     if shared and not all(parts[name].size for name in ("lut", "factor", "sheets")):
         raise ValueError("expected parts lut, factor and sheets for method shared, found one missing or empty")
     if shared and parts["lut"].shape[2] not in (SHORT_ENTRY, ENTRY):
-        raise ValueError(f"part lut: expected 2 or 4 numbers per entry, found {parts['lut'].shape[2]}")
+        raise ValueError(f"part lut: expected entries of 2 or 4 numbers, found {parts['lut'].shape[2]}")
     return parts
 
 
@@ -253,8 +254,8 @@ def _masks(header: _Header, bits: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
-    """Reads from `table` where the tiles of each sheet or mip level lie in the lookup texture, even if outside of
-    it."""
+    """Returns the place of each sheet and mip level in the lookup texture, from the part `sheets`, whose columns are
+    those of `AtlasModel.table`. That the places lie inside the lookup texture is not checked here."""
     if header.method != "shared":
         (size,), (name,) = header.sizes, header.sheets
         grid = tile_counts(*size, header.profile.tile) if header.method == "tiles" else (0, 0)
@@ -262,46 +263,51 @@ def _places(header: _Header, table: np.ndarray) -> list[SheetPlace]:
     count, states = len(header.sheets), len(header.states) if header.separate else 1
     stride, rest = divmod(len(table), states)
     if rest or stride < count:
-        raise ValueError(f"part sheets: expected {states} equal groups of {count} or more rows, found {len(table)}")
+        raise ValueError(
+            f"part sheets: expected {count} or more rows per state, for {states} states, found {len(table)}"
+        )
     names, places = (list(header.sheets) + [""] * (stride - count)) * states, []
     for number, row in enumerate(table.tolist()):
         smaller, first = row[6], number // stride * stride
+        where = f"part sheets: row {number}: expected"
         if smaller and not max(number, first + count - 1) < smaller < first + stride:
-            raise ValueError(f"part sheets: row {number}: its next mip level must be a later row, found {smaller}")
+            raise ValueError(f"{where} its next mip level in a later row of its state, found row {smaller}")
         if smaller:
             names[smaller] = names[number]
         place = SheetPlace(names[number], *row)
         if min(place.size) < 1 or (number - first < count and list(place.size) != header.sizes[number - first]):
-            raise ValueError(f"part sheets: row {number}: expected the size of its sheet, found {place.size}")
+            raise ValueError(f"{where} the height and width in setting sizes, found {place.size}")
         if (place.rows, place.columns) != tile_counts(*place.size, header.profile.tile):
-            raise ValueError(f"part sheets: row {number}: the numbers of tiles don't fit the size of the lightmap")
+            raise ValueError(f"{where} as many tiles as {place.size} texels have, found {place.rows, place.columns}")
         places.append(place)
     return places
 
 
 def _check_tiles(model: AtlasModel) -> None:
+    """Raises ValueError if an entry of the lookup texture names texels or factors that the model doesn't have, or if
+    the tiles of a sheet or mip level lie outside of the lookup texture."""
     pages, texels, second = len(model.texels), model.texels.shape[1:3], model.block_texels.shape[1:3]
     if model.method in ("tiles", "shared"):
         code = model.first_block_code
         most = MOST_SIZE if code else MOST_SIZE * BLOCK_SIDE
         if max(texels) > most or max(second) > MOST_SIZE * BLOCK_SIDE:
-            raise ValueError(f"part colour: expected at most {most} texels along a side, found {max(texels)}")
+            raise ValueError(f"part colour: expected at most {most} texels along a side, found {max(*texels, *second)}")
         first, size, of_blocks = unpack_entries(model.lut[..., :2], code)
         if (of_blocks[..., 0] != of_blocks[..., 1]).any():
-            raise ValueError("part lut: a tile is measured in blocks along one axis and in texels along the other")
+            raise ValueError("part lut: a tile's entry counts blocks along one axis and texels along the other")
         in_second = of_blocks[..., 0] & (model.colour == "mixed")
         count, page = np.ones(in_second.shape, np.int64), np.zeros(in_second.shape, np.int64)
         if model.method == "shared":
             _, _, component, count, page, _, coarse = unpack_tiles(model.lut, code)
             if (coarse > np.where(in_second, count, 0)).any():
-                raise ValueError("part lut: a tile has more coarse components than components in blocks")
+                raise ValueError("part lut: a tile has more coarse components, of one block each, than components")
             if (component + count >= model.factor.shape[1]).any():
-                raise ValueError("part lut: a tile names a factor that doesn't exist")
+                raise ValueError("part lut: a tile's entry names a factor beyond the last one in part factor")
             size = np.where(count[..., None] > 0, extent(size, count, coarse), size)
         beyond = ((first + size) > np.where(in_second[..., None], second[::-1], texels[::-1])).any(-1)
         beyond |= page >= np.where(in_second, len(model.block_texels), pages)
         if (beyond & (count > 0)).any():
-            raise ValueError("part lut: a tile reaches beyond the colour texture")
+            raise ValueError("part lut: the rectangle of a tile reaches beyond the colour texture")
     for place in model.rows:
         if place.row + place.rows > model.lut.shape[0] or place.column + place.columns > model.lut.shape[1]:
-            raise ValueError(f"part sheets: {place.name}: reaches beyond the lookup texture")
+            raise ValueError(f"part sheets: the tiles of {place.name} reach beyond the lookup texture, part lut")

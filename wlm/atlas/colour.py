@@ -65,11 +65,10 @@ def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Te
         return samples
     if colour == "rgb9e5":
         return _rounded(samples)
+    count, ny, nx, _ = samples.shape
     if colour == "bc6h":
-        count, ny, nx, _ = samples.shape
         _, decoded = bc6h_blocks(_by_block(samples), _by_block(weight[..., None])[..., 0])
         return _of_blocks(decoded, count, ny, nx)
-    count, ny, nx, _ = samples.shape
     _, decoded = encode(samples.reshape(count * ny, nx, 3), colour, device=str(samples.device))
     return torch.from_numpy(decoded.reshape(count, ny, nx, 3)).to(samples)
 
@@ -115,7 +114,7 @@ def encode(
     """
     light = _on(texels, device)
     if count := int(light.isnan().any(2).sum()):
-        raise ValueError(f"texels: {count} are NaN")
+        raise ValueError(f"texels: expected no NaN, found {count} texels with NaN")
     height, width = light.shape[:2]
     below, right = -height % BLOCK_SIDE, -width % BLOCK_SIDE
     light = light.clamp(0.0, HALF_MAX).float()
@@ -140,7 +139,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
     """
     rows, columns = block_grid(height, width)
     if blocks.dtype != np.uint8 or blocks.shape != (rows * columns, 16) or not blocks.size:
-        raise ValueError(f"blocks: expected uint8 [{rows * columns}, 16], got {blocks.dtype} {blocks.shape}")
+        raise ValueError(f"blocks: expected shape uint8 [{rows * columns}, 16], got {blocks.dtype} {blocks.shape}")
     size = (rows * BLOCK_SIDE, columns * BLOCK_SIDE)
     if codec == "bc6h":
         cells = bc6h.decode_bc6h(blocks).reshape(rows, columns, BLOCK_SIDE, BLOCK_SIDE, 3)
@@ -151,14 +150,12 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
     broken = ~np.isfinite(texels).all(axis=2)
     if broken.any():
         row, column = np.argwhere(broken)[0] // BLOCK_SIDE
-        raise WlmError(f"{codec}: the block in row {row}, column {column} is invalid")
+        raise WlmError(f"{codec}: the block in row {row}, column {column} is invalid: its texels are NaN or infinite")
     return texels
 
 
 def _on(values: np.ndarray | torch.Tensor, device: str) -> torch.Tensor:
-    return (
-        values.to(device) if isinstance(values, torch.Tensor) else torch.tensor(np.ascontiguousarray(values)).to(device)
-    )
+    return torch.as_tensor(values if isinstance(values, torch.Tensor) else np.array(values), device=device)
 
 
 def _astc() -> hdr_blocks.Astc:

@@ -7,7 +7,6 @@ In UVs times width and height of the lightmap, texel (row, column) is the square
 from collections.abc import Iterator
 
 import numpy as np
-import torch
 
 _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 
@@ -15,59 +14,46 @@ _SPANS_AT_ONCE = 1 << 20  # about 200 bytes each while they are worked on
 def touched_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
     """Finds the texels whose square overlaps a triangle, bool [height, width]. UVs are float64 [V, 2] in [0, 1]; each
     triangle has an area above 0. A triangle that ends exactly at a texel's side doesn't touch that texel."""
-    change = np.zeros((height, width + 1), np.int32)
-    for corner, row in _rows(uv, triangle, height, width, centres=False):
-        low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
-        for k in range(3):
-            start, end = _directed(corner[:, k], corner[:, (k + 1) % 3])
-            # This is the edge's part within the row. Both ends of a horizontal edge are also ends of the other two
-            # edges.
-            top, bottom = np.maximum(start[:, 1], row), np.minimum(end[:, 1], row + 1)
-            meets = top <= bottom
-            for y in (top, bottom):
-                x = _crossing(start, end, y)
-                np.minimum(low, x, out=low, where=meets)
-                np.maximum(high, x, out=high, where=meets)
-        # Rounding may leave a span without width; it lies in the texel of its left end.
-        first = np.clip(np.floor(low).astype(np.int64), 0, width - 1)
-        stop = np.clip(np.ceil(high).astype(np.int64), first + 1, width)
-        _add_spans(change, row, first, stop)
-    return np.cumsum(change, axis=1)[:, :width] > 0
+    return _counts(uv, triangle, height, width, centres=False) > 0
 
 
 def covered_texels(uv: np.ndarray, triangle: np.ndarray, height: int, width: int) -> np.ndarray:
     """Counts for every texel the triangles that contain its centre, int32 [height, width]. A centre on an edge that two
     triangles share counts for exactly one of them."""
-    return covered_on(uv, triangle, height, width, "cpu").numpy()
+    return _counts(uv, triangle, height, width, centres=True)
 
 
-def covered_on(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, device: str) -> torch.Tensor:
-    """Computes the same as `covered_texels` on a device: the CPU finds the ends of spans, and the device fills them."""
-    change = torch.zeros((height, width + 1), dtype=torch.int32, device=device)
-    flat = change.view(-1)
-    for row, first, stop in _centre_spans(uv, triangle, height, width):
-        for column, step in ((first, 1), (stop, -1)):
-            at = torch.from_numpy(row * (width + 1) + column).to(device)
-            flat.index_add_(0, at, flat.new_full((len(at),), step))
-    return torch.cumsum(change, 1, dtype=torch.int32)[:, :width]
-
-
-def _centre_spans(
-    uv: np.ndarray, triangle: np.ndarray, height: int, width: int
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yields rows and their spans, int64 [N] each: texels first <= column < stop have their centre in a triangle."""
-    for corner, row in _rows(uv, triangle, height, width, centres=True):
-        y = row + 0.5
+def _counts(uv: np.ndarray, triangle: np.ndarray, height: int, width: int, centres: bool) -> np.ndarray:
+    """Counts the spans of triangles at each texel, int32 [height, width]. A span has the texels whose square overlaps
+    the triangle or, if `centres`, those with their centre in it."""
+    change = np.zeros((height, width + 1), np.int32)  # the differences of counts along a row
+    for corner, row in _rows(uv, triangle, height, width, centres):
         low, high = np.full(len(row), np.inf), np.full(len(row), -np.inf)
         for k in range(3):
             start, end = _directed(corner[:, k], corner[:, (k + 1) % 3])
-            meets = (start[:, 1] <= y) & (y < end[:, 1])
-            x = _crossing(start, end, y)
-            np.minimum(low, x, out=low, where=meets)
-            np.maximum(high, x, out=high, where=meets)
-        hit = low <= high
-        first, stop = (np.ceil(x[hit] - 0.5).astype(np.int64).clip(0, width) for x in (low, high))
-        yield row[hit], first, stop
+            if centres:
+                lines = (row + 0.5,)
+                meets = (start[:, 1] <= lines[0]) & (lines[0] < end[:, 1])
+            else:
+                # This is the edge's part within the row. Both ends of a horizontal edge are also ends of the other two
+                # edges.
+                lines = np.maximum(start[:, 1], row), np.minimum(end[:, 1], row + 1)
+                meets = lines[0] <= lines[1]
+            for y in lines:
+                x = _crossing(start, end, y)
+                np.minimum(low, x, out=low, where=meets)
+                np.maximum(high, x, out=high, where=meets)
+        if centres:
+            hit = low <= high
+            row, low, high = row[hit], low[hit], high[hit]
+            first, stop = (np.ceil(x - 0.5).astype(np.int64).clip(0, width) for x in (low, high))
+        else:
+            # Rounding may leave a span without width; it lies in the texel of its left end.
+            first = np.clip(np.floor(low).astype(np.int64), 0, width - 1)
+            stop = np.clip(np.ceil(high).astype(np.int64), first + 1, width)
+        np.add.at(change, (row, first), 1)
+        np.subtract.at(change, (row, stop), 1)
+    return np.cumsum(change, axis=1, dtype=np.int32)[:, :width]
 
 
 def _rows(
@@ -104,10 +90,3 @@ def _crossing(start: np.ndarray, end: np.ndarray, y: np.ndarray) -> np.ndarray:
     drop = end[:, 1] - start[:, 1]
     share = np.divide(y - start[:, 1], drop, out=np.zeros_like(drop), where=drop > 0).clip(0.0, 1.0)
     return start[:, 0] + share * (end[:, 0] - start[:, 0])
-
-
-def _add_spans(change: np.ndarray, row: np.ndarray, first: np.ndarray, stop: np.ndarray) -> None:
-    """Adds spans first <= column < stop to `change`, the differences of counts along a row: +1 at first, -1 at stop."""
-    flat, stride = change.reshape(-1), change.shape[1]
-    np.add.at(flat, row * stride + first, 1)
-    np.subtract.at(flat, row * stride + stop, 1)

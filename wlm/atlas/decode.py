@@ -10,7 +10,8 @@ from wlm.atlas.model import LUT_STEPS, MIP_OCTAVES, AtlasModel
 from wlm.atlas.views import Points, corner_weights, texel_triangles
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
-from wlm_kernels.atlas import cascade, decode
+from wlm_kernels.atlas import decode
+from wlm_kernels.raster import texture
 
 _TEXELS_AT_ONCE = 1 << 24
 
@@ -59,7 +60,7 @@ class Decoder:
         """
         last = len(self.model.states) - 1
         if not 0 <= state <= last:
-            raise ValueError(f"state: expected 0 to {last}, got {state}")
+            raise ValueError(f"state: expected a number of 0 to {last}, got {state}")
         low = min(int(state), max(last - 1, 0))
         near, far = self.model.factor[low], self.model.factor[min(low + 1, last)]
         return (near + np.float32(state - low) * (far - near)).astype(np.float32)
@@ -86,7 +87,7 @@ class Decoder:
             ValueError: No such state, or the model has no mips.
         """
         if lod is not None and not self.model.mips:
-            raise ValueError("lod: expected a model with mips, or None")
+            raise ValueError("lod: expected None for a model without mip levels, got numbers")
         if self.model.method == "shared":
             return self._read_shared(uv, sheet, state, lod)
         if state != 0:
@@ -103,10 +104,15 @@ class Decoder:
         model = self.model
         if model.method == "tiles":
             size, tile = model.sheets[0].size, model.profile.tile
-            textures = self._lut, self._texels[0], interop.to_warp(out, wp.vec3), self._blocks[0]
+            textures = self._lut, self._texels, interop.to_warp(out, wp.vec3), self._blocks
             decode.decode(uv, *size, tile, *textures, model.first_block_code)
         else:
-            cascade.sample(self._texels, self._lut, uv, interop.to_warp(out))
+            if model.lut.size:
+                place = torch.empty((len(out), 2), device=out.device)
+                texture.sample(self._lut, uv, interop.to_warp(place))
+                # The triangle wave of eq. 8 is the identity on what 16 bits without a sign hold.
+                uv = interop.to_warp(place, wp.vec2)
+            texture.sample(self._texels, uv, interop.to_warp(out))
 
     def __call__(self, points: Points, state: float = 0.0) -> torch.Tensor:
         """Returns light at points of the scene, float32 [N, 3]."""
@@ -170,7 +176,7 @@ class Decoder:
         """
         height, width = sheet.mask.shape
         if (height, width) != self.model.sheets[number].size:
-            raise WlmError(f"{sheet.name}: expected the sheet that the model was made of, found another size")
+            raise WlmError(f"{sheet.name}: expected a sheet of the size in the model, found {width}x{height} texels")
         if len(self._corner):
             return torch.from_numpy(self._under_new_uvs(sheet)[sheet.mask]).to(self.device)
         step, parts = max(1, _TEXELS_AT_ONCE // width), []

@@ -163,7 +163,8 @@ def evaluate(
     """
     if model.source != scene.source:
         raise WlmError(
-            f"{scene.name}: expected the scene that the model was made of, source {model.source}, found {scene.source}"
+            f"{scene.name}: expected the mesh and lightmaps that the model was made of, hash {model.source}, found "
+            f"others, hash {scene.source}"
         )
     decoder = Decoder(model, device)
     labels = {"model": chart_labels(model, scene, decoder.device)} if len(model.uv) else {}
@@ -216,7 +217,7 @@ def compare(
     device, labels = check_device(device), dict(labels or {})
     unknown = sorted(labels.keys() - decoders.keys())
     if unknown:
-        raise ValueError(f"labels: expected names of decoders, got {', '.join(unknown)}")
+        raise ValueError(f"labels: expected names that decoders has, got {', '.join(unknown)}")
     several = len(scene.sheets) * len(scene.states) > 1
     views = (SHARED_VIEWS if several else VIEWS) if views is None else views
     resolution = (SHARED_RESOLUTION if several else RESOLUTION) if resolution is None else resolution
@@ -344,17 +345,17 @@ def _peaks(
 def _colours(decoder: Sampler, points: Points, state: int, scene: LightmappedScene, name: str) -> torch.Tensor:
     colour, count = decoder(points, state), len(points)
     if colour.shape != (count, 3):
-        raise ValueError(f"{name}: expected colours [{count}, 3], got {tuple(colour.shape)}")
+        raise ValueError(f"decoder {name}: expected colours [{count}, 3], got {tuple(colour.shape)}")
     broken = int((~torch.isfinite(colour).all(dim=1)).sum())
     if broken:
-        raise WlmError(f"{scene.name}: {name} decodes to NaN or infinity at {broken} of {count} points")
+        raise WlmError(f"{scene.name}: decoder {name} gives NaN or infinity at {broken} of {count} points")
     return colour.double()
 
 
 def _labels(labels: Labels, points: Points, name: str) -> torch.Tensor:
     label, count = labels(points), len(points)
     if label.shape != (count,) or label.is_floating_point():
-        raise ValueError(f"{name}: expected labels as integers [{count}], got {label.dtype} {tuple(label.shape)}")
+        raise ValueError(f"labels of {name}: expected integers [{count}], got {label.dtype} {tuple(label.shape)}")
     return label.long()
 
 

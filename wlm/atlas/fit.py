@@ -4,6 +4,7 @@ One lightmap is compressed by the method of the profile, `tiles` or `cascade`; a
 replaces the model if its error is no larger. Several lightmaps, of several sheets or states, share tiles (`shared`).
 """
 
+import functools
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,14 +38,14 @@ from wlm.atlas.weights import FineGrid, weights
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.hdr_blocks import need
+from wlm.formats.limits import check_sides
 from wlm.metrics import LostLight
 from wlm.ops.raster import texture
 from wlm.system import OnProgress
-from wlm.texels import check_size
 
 _CELLS_AT_ONCE = 1 << 24
 _FEWER_VIEWS = 4  # one view of the comparison with a plain lightmap per this number of the profile's views
-_NO_ROOM = "budget: {:g} of {}x{} texels is less than the smallest tiles and their table take; give more"
+_NO_ROOM = "budget: {:g} of the bits of {}x{} texels is less than the smallest tiles and lookup texture take; give more"
 _PACKAGES = {"cascade": "uvunwrap", "astc": "astc_encoder"}  # packages of the extra, by method and colour
 
 
@@ -83,21 +84,19 @@ def compress(
     device = interop.check_device(device)
     profile, method = Profile.load(profile).override(settings).checked(len(scene.sheets) * len(scene.states))
     for sheet in scene.sheets:
-        check_size(*sheet.mask.shape)
+        check_sides("size", *sheet.mask.shape[::-1])
     for choice in (method, profile.colour):
         if choice in _PACKAGES:  # a missing package is reported now, not after minutes
             need(_PACKAGES[choice], "atlas")
     stages = Stages(device, progress, checkpoint)
-    if method == "shared":
-        try:
-            with one_thread(device):
-                model = fit_shared(scene, profile, seed, stages)
-        except KeyboardInterrupt:
-            if checkpoint is not None:
-                checkpoint.flush()  # finished batches that are not written yet
-            raise
-    else:
-        model = _fit_one(scene, profile, method, seed, stages)
+    try:
+        with one_thread(device):
+            fit = fit_shared if method == "shared" else functools.partial(_fit_one, method)
+            model = fit(scene, profile, seed, stages)
+    except KeyboardInterrupt:
+        if checkpoint is not None:
+            checkpoint.flush()  # finished batches that are not written yet
+        raise
     for place in model.rows:
         texels = model.texels.size + model.block_texels.size
         check_area(place.size, texels // 3, model.lut[..., 0].size)
@@ -139,7 +138,7 @@ def open_checkpoint(
     return Checkpoint(os.path.realpath(output), AtlasModel.SYSTEM, fit, scene.source, resume=resume, every=every)
 
 
-def _fit_one(scene: LightmappedScene, profile: Profile, method: str, seed: int, stages: Stages) -> AtlasModel:
+def _fit_one(method: str, scene: LightmappedScene, profile: Profile, seed: int, stages: Stages) -> AtlasModel:
     """Compresses one lightmap by `tiles` or `cascade`, or by a plain smaller lightmap if that is no worse."""
     (sheet,), device = scene.sheets, stages.device
     grid = FineGrid(sheet, device)

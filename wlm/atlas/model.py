@@ -33,8 +33,8 @@ import numpy as np
 from pydantic import Field
 
 from wlm.errors import WlmError
+from wlm.formats.limits import check_sides
 from wlm.system import Model, Settings
-from wlm.texels import check_size
 
 SOURCE_BITS = 48
 """Bits per texel of a lightmap: three half floats (eq. 9)."""
@@ -106,7 +106,7 @@ class Profile(Settings):
     unseen: float = Field(0.05, gt=0.0, le=1.0)
     """For one lightmap: weight of texels that no view shows, as a fraction of the mean weight."""
     border: float = Field(16.0, gt=0.0, le=100.0)
-    """For one lightmap: factor on the weight within a texel of a chart's border, where errors show as seams."""
+    """For one lightmap: factor by which errors within a texel of a chart's border count more; they show as seams."""
     relative: float = Field(0.0, ge=0.0, le=1.0)
     """For one lightmap: 0 minimises the error in linear light, 1 the relative error, which counts more in dark places;
     values between mix both."""
@@ -115,9 +115,11 @@ class Profile(Settings):
     fallback: bool = True
     """For one lightmap: store a plain smaller lightmap of as many bits instead if the error of that is no larger."""
     threshold: float = Field(0.03, ge=0.0, le=1.0)
-    """For the cascade: lambda of eq. 4, the largest difference of triangles that share texels; 0: none share."""
+    """For the cascade: lambda of eq. 4, the largest mean difference of the light in triangles that share texels, as a
+    fraction of `max_radiance`; 0: none share."""
     colour_threshold: float = Field(0.09, ge=0.0, le=2.0)
-    """For the cascade: lambda_h of section 3.2.1, the largest difference in colour of triangles that share texels."""
+    """For the cascade: lambda_h of section 3.2.1, the largest distance of the dominant colours of triangles that share
+    texels, as a fraction of `max_radiance`."""
     max_radiance: float | None = Field(2.0, gt=0.0)
     """For the cascade: triangles with brighter texels share none, and both thresholds are fractions of this radiance
     (section 4.1.1); None: the brightest texel of the charts, which treats dark and bright lightmaps alike."""
@@ -153,8 +155,8 @@ class Profile(Settings):
         if (values.get("method") or self.method) == "cascade":
             if values.get("budget") is not None:
                 raise WlmError(
-                    f"{prefix}budget: a profile of the cascade states the sizes of its textures; choose a profile of "
-                    "tiles, or give no budget"
+                    f"{prefix}budget: expected none for method cascade, whose settings give the sizes of its textures; "
+                    "choose a profile of tiles, or give no budget"
                 )
             if (values.get("colour") or self.colour) == "mixed":
                 raise WlmError(f"{prefix}colour: expected half, rgb9e5, bc6h or astc for a cascade, found mixed")
@@ -337,15 +339,15 @@ def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
     since a file of a few bytes must not claim gigabytes.
 
     Raises:
-        WlmError: The lightmap exceeds the limits of `wlm.texels.check_size`; or it has more than 2^24 texels and also
-            more than 65,536 for each texel of T_p and T_c.
+        WlmError: The lightmap exceeds the limits of `wlm.formats.limits.check_sides`; or it has more than 2^24 texels
+            and also more than 65,536 for each texel of T_p and T_c.
     """
-    check_size(*size)
+    check_sides("size", *size[::-1])
     stored = texels + entries
     if math.prod(size) > max(_FREE_TEXELS, _MOST_SHARE * stored):
         raise WlmError(
-            f"size: expected a lightmap of at most {_MOST_SHARE} texels per stored texel, of which there are {stored}, "
-            f"found {size[1]}x{size[0]}"
+            f"size: expected at most {_MOST_SHARE} texels of a lightmap for each texel of its textures, which have "
+            f"{stored}, found {size[1]}x{size[0]}"
         )
 
 
@@ -388,11 +390,11 @@ def pack_entries(
     first, size, blocks = np.asarray(first), np.asarray(size), np.asarray(blocks)[..., None]
     most = np.where(blocks, 1 << SIDE_BITS, code)
     if (np.where(blocks, first | size, 0) % BLOCK_SIDE).any() or (blocks.any() and (size > most).any()):
-        raise ValueError("an entry of blocks isn't in multiples of 4 texels, or an entry exceeds its largest size")
+        raise ValueError("an entry of the lookup texture: expected multiples of 4 for blocks, and a size in range")
     steps = np.where(blocks, code + size // BLOCK_SIDE, size) - 1
     first = np.where(blocks, first // BLOCK_SIDE, first)
     if (first < 0).any() or (first >= MOST_SIZE).any() or (size < 1).any() or (size > 1 << SIDE_BITS).any():
-        raise ValueError(f"an entry lies beyond {MOST_SIZE} texels or blocks, or its size isn't 1 to {1 << SIDE_BITS}")
+        raise ValueError(f"an entry of the lookup texture: expected a place below {MOST_SIZE} and a size of 1 to 16")
     return ((first << SIDE_BITS) + steps).astype(np.uint16)
 
 

@@ -114,38 +114,32 @@ _WHAT = {
 
 
 def _one_lightmap(model: AtlasModel) -> str:
-    height, width = model.sheets[0].size
-    tiles, cascade, mixed = model.method == "tiles", model.method == "cascade", model.colour == "mixed"
-    kinds = ["plain", *(["mixed"] if mixed else []), model.method]
-    textures = [_TEXTURES[kind] for kind in kinds]
+    method, mixed, (height, width) = model.method, model.colour == "mixed", model.sheets[0].size
+    kinds = ["plain", *(["mixed"] if mixed else []), *([method] if method != "plain" else [])]
+    samplers = {"colour": "sampler2D"} | ({"blocks": "sampler2D"} if mixed else {})
+    if method != "plain":
+        samplers["lut"] = "usampler2D" if method == "tiles" else "sampler2D"
     text = _HEAD.format(
-        what=_WHAT[model.method],
+        what=_WHAT[method],
         coordinate="the new UVs of mesh.glb" if len(model.uv) else "the mesh's own lightmap UVs",
-        textures="\n".join(dict.fromkeys(textures)),
+        textures="\n".join(_TEXTURES[kind] for kind in kinds),
     )
-    text += sampler("wlm_atlas_colour", "sampler2D")
-    if tiles or cascade:
-        text += sampler("wlm_atlas_lut", "usampler2D" if tiles else "sampler2D")
-    if mixed:
-        text += sampler("wlm_atlas_blocks", "sampler2D")
-    text += _READ.format(type="vec3", name="colour", image="WLM_ATLAS_COLOUR", channels="rgb")
-    if mixed:
-        text += _READ.format(type="vec3", name="blocks", image="WLM_ATLAS_BLOCKS", channels="rgb")
-    body = _PLAIN
-    if tiles:
-        lines = _BLOCKS if mixed else "" if model.first_block_code else _WHOLE_BLOCKS
-        blocks = lines.format(code=FIRST_BLOCK_CODE, side=BLOCK_SIDE, last=BLOCK_SIDE - 1)
-        body = _TILES.format(
-            width=width,
-            height=height,
-            tile=model.profile.tile,
-            bits=SIDE_BITS,
-            mask=(1 << SIDE_BITS) - 1,
-            blocks=blocks,
-        )
-    elif cascade:
-        body = _READ.format(type="vec2", name="lut", image="WLM_ATLAS_LUT", channels="xy") + _CASCADE
-    return text + body
+    text += "".join(sampler(f"wlm_atlas_{name}", kind) for name, kind in samplers.items())
+    for name, kind in samplers.items():
+        if kind == "sampler2D":
+            type, channels = ("vec2", "xy") if name == "lut" else ("vec3", "rgb")
+            text += _READ.format(type=type, name=name, image=f"WLM_ATLAS_{name.upper()}", channels=channels)
+    if method != "tiles":
+        return text + (_CASCADE if method == "cascade" else _PLAIN)
+    lines = _BLOCKS if mixed else "" if model.first_block_code else _WHOLE_BLOCKS
+    return text + _TILES.format(
+        width=width,
+        height=height,
+        tile=model.profile.tile,
+        bits=SIDE_BITS,
+        mask=(1 << SIDE_BITS) - 1,
+        blocks=lines.format(code=FIRST_BLOCK_CODE, side=BLOCK_SIDE, last=BLOCK_SIDE - 1),
+    )
 
 
 _OBJECT = """

@@ -1,11 +1,13 @@
 """Stages of a compression: each is timed and reported as it begins, and long stages are saved in a checkpoint."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
+import numpy as np
 import torch
 
 from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.parts import Part
 from wlm.system import Meter, OnProgress
 
 
@@ -34,6 +36,18 @@ class Stages:
         if self.device != "cpu":
             torch.cuda.synchronize(self.device)
         self.seconds[name] = meter.seconds
+
+    def batch(
+        self, number: int, table: Mapping[str, Part], make: Callable[[], Mapping[str, np.ndarray]]
+    ) -> Mapping[str, np.ndarray]:
+        """Returns the arrays of a batch by name: from the checkpoint if it has them, checked against `table`, or else
+        from `make`, and then saves them."""
+        if self.checkpoint is None:
+            return make()
+        if (kept := self.checkpoint.finished(number, table)) is None:
+            kept = make()
+            self.checkpoint.add_finished(number, kept)
+        return kept
 
 
 @contextmanager

@@ -56,7 +56,7 @@ def restore(model: AtlasModel) -> LightmappedScene:
     """
     stored = model.stored
     if stored is None:
-        raise ValueError(f"{model.name}: expected a model that stores the triangles of its scene, found none")
+        raise ValueError(f"{model.name}: the model has no triangles: expected one that compress or load made")
     document, primitives = parse_gltf(model.name, stored.glb)
     sheets, blocker = place_objects(model.name, primitives, stored.uv_set, stored.objects, stored.masks)
     if len(model.uv) and len(model.uv) != len(sheets[0].triangle):
@@ -70,14 +70,6 @@ def restore(model: AtlasModel) -> LightmappedScene:
     return LightmappedScene(model.name, model.states, sheets, stored.objects, blocker, *settings)
 
 
-def mesh_file(model: AtlasModel) -> tuple[bytes, int]:
-    """Makes the mesh for an engine. Returns the bytes of the stored `.glb`, with an additional UV set if the model has
-    new UVs, and n of the UV set `TEXCOORD_n` for which the model is made."""
-    if not len(model.uv):
-        return model.stored.glb, model.stored.uv_set
-    return with_uvs(model.scene, model.uv)
-
-
 def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int]:
     """Encodes a scene of one sheet with an additional UV set, the corners' new UVs [F, 3, 2], numbered after the last
     existing set. Returns the bytes of a `.glb` file, and n of the new UV set `TEXCOORD_n`.
@@ -88,7 +80,9 @@ def with_uvs(scene: LightmappedScene, corner_uv: np.ndarray) -> tuple[bytes, int
     (sheet,) = scene.sheets
     corner_uv = np.asarray(corner_uv, np.float32)
     if corner_uv.shape != (len(sheet.triangle), 3, 2) or not np.isfinite(corner_uv).all():
-        raise ValueError(f"corner_uv: expected finite numbers [{len(sheet.triangle)}, 3, 2], got {corner_uv.shape}")
+        raise ValueError(
+            f"corner_uv: expected finite numbers, shape [{len(sheet.triangle)}, 3, 2], got {corner_uv.shape}"
+        )
     uv_set = 1 + max(number for part in sheet.parts for number in part.primitive.uv)
     replacements = []
     for part in sheet.parts:

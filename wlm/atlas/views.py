@@ -56,7 +56,7 @@ def visible_uv(
     Args:
         scene: The scene.
         views: The cameras.
-        resolution: Pixels along a side, 1 to 16,384.
+        resolution: Width and height of a camera's picture in pixels, 1 to 16,384.
         device: "cpu" or "cuda:N".
 
     Yields:
@@ -95,6 +95,13 @@ def corner_weights(barycentric: torch.Tensor) -> torch.Tensor:
     return torch.cat([barycentric, 1.0 - barycentric.sum(1, keepdim=True)], dim=1)
 
 
+def cells_at(uv: torch.Tensor, height: int | torch.Tensor, width: int | torch.Tensor) -> torch.Tensor:
+    """Returns the numbers of the cells, row by row, at N UVs in a grid of `height` x `width` cells over UV space, int64
+    [N]; a UV of 1 is in the last row or column. The size of the grid may differ from UV to UV, int64 [N]."""
+    column, row = ((uv[:, axis].double() * side).long() for axis, side in ((0, width), (1, height)))
+    return row.clamp(min=0).clamp(max=height - 1) * width + column.clamp(min=0).clamp(max=width - 1)
+
+
 def visibility(
     scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, height: int, width: int, device: str
 ) -> torch.Tensor:
@@ -103,28 +110,26 @@ def visibility(
     Args:
         scene: The scene.
         views: The cameras.
-        resolution: Pixels along a side of a camera's picture.
-        height, width: Size of a grid over UV space, row 0 at v = 0. It may be finer than the lightmap.
+        resolution: Width and height, in pixels, of the square picture of each camera.
+        height, width: Rows and columns of the grid's cells, row 0 at v = 0. They may be smaller than texels.
         device: "cpu" or "cuda:N".
 
     Returns:
-        float64 [height, width] on the device, pixels of all views whose UVs lie in each cell; a UV of 1 is in the last.
+        float64 [height, width] on the device: for each cell the number of pixels, in the pictures of all cameras, whose
+        UV lies in it; a UV of 1 lies in the last cell.
 
     Raises:
         WlmError: There is no such device.
         ValueError: A size is out of range.
     """
     if height < 1 or width < 1:
-        raise ValueError(f"height, width: expected at least 1, got {height} and {width}")
+        raise ValueError(f"height, width: expected at least 1 cell each, got {height} and {width}")
     count = torch.zeros(height * width, dtype=torch.int64, device=check_device(device))
     # Pixels without a triangle add 0, each to a separate cell: selecting the other pixels would wait for the GPU.
     own = torch.arange(resolution**2, device=count.device) % count.numel()
     for visible, _, uv in visible_uv(scene, views, resolution, device):
-        u, v = uv.reshape(-1, 2).double().T
-        column = (u * width).long().clamp(0, width - 1)
-        row = (v * height).long().clamp(0, height - 1)
         shown = visible.reshape(-1) >= 0
-        count.index_add_(0, torch.where(shown, row * width + column, own), shown.long())
+        count.index_add_(0, torch.where(shown, cells_at(uv.reshape(-1, 2), height, width), own), shown.long())
     return count.reshape(height, width).double()
 
 

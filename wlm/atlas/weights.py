@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch.nn.functional import max_pool2d
 
-from wlm.atlas.coverage import covered_on
+from wlm.atlas.coverage import covered_texels
 from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.model import Profile
 from wlm.atlas.views import scene_views, sheet_charts, texel_triangles, visibility
@@ -36,8 +36,7 @@ class FineGrid:
     @cached_property
     def covered(self) -> torch.Tensor:
         """Whether a triangle contains the cell's centre, computed exactly: bool [2 H, 2 W]."""
-        sheet = self.sheet
-        return covered_on(sheet.uv, sheet.triangle[sheet.active], self.height, self.width, self.device) > 0
+        return self._covered(self.height, self.width)
 
     @cached_property
     def border(self) -> torch.Tensor:
@@ -51,9 +50,8 @@ class FineGrid:
     @cached_property
     def texels(self) -> torch.Tensor:
         """Whether a cell is part of a mask texel whose centre is in a triangle: bool [2 H, 2 W]."""
-        sheet = self.sheet
-        inside = covered_on(sheet.uv, sheet.triangle[sheet.active], *sheet.mask.shape, self.device) > 0
-        return _quarters(inside & torch.from_numpy(sheet.mask).to(self.device))
+        mask = self.sheet.mask
+        return _quarters(self._covered(*mask.shape) & torch.from_numpy(mask).to(self.device))
 
     @cached_property
     def relative(self) -> torch.Tensor:
@@ -63,6 +61,10 @@ class FineGrid:
         bright = light[torch.from_numpy(sheet.mask).to(self.device)]
         dark = _DARK * float(np.percentile(bright[:: max(1, len(bright) // _SAMPLES)].cpu().numpy(), _BRIGHT))
         return _quarters(1.0 / (light + (dark or 1.0)).square())
+
+    def _covered(self, height: int, width: int) -> torch.Tensor:
+        covered = covered_texels(self.sheet.uv, self.sheet.triangle[self.sheet.active], height, width)
+        return torch.from_numpy(covered > 0).to(self.device)
 
 
 def _quarters(texels: torch.Tensor) -> torch.Tensor:

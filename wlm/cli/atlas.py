@@ -52,22 +52,34 @@ _Lights = Annotated[
     ),
 ]
 _Mask = Annotated[
-    Path | None, typer.Option(metavar="PNG", help="Valid texels: not black in this PNG; default those in triangles.")
+    Path | None,
+    typer.Option(metavar="PNG", help="PNG whose texels that aren't black count; default the texels in triangles."),
 ]
 _UvSet = Annotated[
-    int | None, typer.Option("--uv-set", min=0, help="n of the lightmap UVs TEXCOORD_n; default 1 if present, else 0.")
+    int | None,
+    typer.Option("--uv-set", min=0, help="Number of the lightmap's UVs TEXCOORD_n; default 1 if present, else 0."),
 ]
-_Node = Annotated[str | None, typer.Option(help="Node that the lightmap belongs to; default the one that fits best.")]
+_Node = Annotated[str | None, typer.Option(help="Name of the node that has the lightmap; default the best fit.")]
 _Slot = Annotated[
     str | None,
     typer.Option(help="Material slot whose textures are the lightmaps, without LIGHTMAPS: occlusion or emissive."),
 ]
 _Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is at v = 1 instead of v = 0.")]
 _Views = Annotated[
-    int | None, typer.Option(min=1, max=4096, help=f"Number of cameras outside, and as many inside; default {_VIEWS}.")
+    int | None,
+    typer.Option(
+        min=1,
+        max=4096,
+        help=f"Number of cameras around the scene, and as many in it; default {_VIEWS}, to score several lightmaps 24.",
+    ),
 ]
 _Resolution = Annotated[
-    int | None, typer.Option(min=16, max=16384, help=f"Edge of a square view in pixels; default {_RESOLUTION}.")
+    int | None,
+    typer.Option(
+        min=16,
+        max=16384,
+        help=f"Edge of a square view in pixels; default {_RESOLUTION}, to score several lightmaps 256.",
+    ),
 ]
 
 
@@ -151,7 +163,7 @@ def decode(
     file: ModelFile,
     output: Annotated[Path, output_option("OUT", "A .exr; with --view also a .png.")],
     sheet: Annotated[int, typer.Option(min=0, help="Number of the lightmap in the list of wlm info, from 0.")] = 0,
-    state: Annotated[float, typer.Option(min=0.0, help="Number of the state, from 0; a fraction mixes two.")] = 0.0,
+    state: Annotated[float, typer.Option(min=0.0, help="Number of the state, from 0; 1.5 mixes states 1 and 2.")] = 0.0,
     view: Annotated[
         int | None,
         typer.Option(min=0, help="Number, from 0, of a camera of wlm evaluate: draw its view instead."),

@@ -7,6 +7,7 @@ import typer
 
 from wlm.cli.console import quiet_warp, show_json, show_text
 from wlm.cli.options import AsJson
+from wlm.errors import printable
 
 
 def inspect(
@@ -25,6 +26,7 @@ def inspect(
         return
     lines = []
     for finding in findings:
-        lines.append(f"{finding.path}: {finding.what}" + (f" -> {finding.command}" if finding.command else ""))
+        command = f" -> {finding.command}" if finding.command else ""
+        lines.append(f"{printable(str(finding.path))}: {finding.what}{command}")
         lines += [f"  ! {problem}" for problem in finding.problems]
     show_text("\n".join(lines))

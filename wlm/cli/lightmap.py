@@ -199,7 +199,7 @@ def decode(
     import numpy as np
 
     from wlm.formats.exr import write_planes
-    from wlm.lightmap.runtime_texture import write_texture
+    from wlm.lightmap.runtime import write_texture
     from wlm.system import load
 
     model = load(file, "lightmap")

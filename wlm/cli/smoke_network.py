@@ -119,7 +119,8 @@ def evaluate(
     ] = None,
     resolution: Annotated[int, typer.Option(min=8, max=4096, help="Edge of the images in pixels.")] = 512,
     cells: Annotated[
-        int | None, typer.Option(min=16, max=512, help="Cells along an edge of the test volume; default as trained.")
+        int | None,
+        typer.Option(min=16, max=512, help="Air cells along an edge of the simulated box; default as trained."),
     ] = None,
     json_path: ReportFile = None,
     device: Device = "cpu",

@@ -9,42 +9,24 @@ no more than a given amount. The size in GPU memory and the decoder stay the sam
 import numpy as np
 
 _SIDE = 4
-_BYTES = 16
-_WINDOW = 512  # blocks
 
 
 def reuse_blocks(
-    data: bytes, decoded: np.ndarray, target: np.ndarray, weight: np.ndarray, allowed: np.ndarray
-) -> bytes:
-    """Replaces blocks of a picture by earlier ones where that adds little error.
-
-    Args:
-        data: Blocks of 16 bytes, row by row.
-        decoded: float32 [H, W, C], the decoded blocks; H and W are multiples of 4.
-        target: float32 [H, W, C], the original texels.
-        weight: float32 [H, W, C], weight of each squared error.
-        allowed: float32 [H, W, C]; its sum over a block limits the increase of the block's weighted squared error.
-
-    Returns:
-        The chosen blocks, as many as in `data`.
-    """
-    blocks = np.frombuffer(data, np.uint8).reshape(-1, _BYTES)
-    return reuse_in_order(blocks, *(by_block(image) for image in (decoded, target, weight, allowed))).tobytes()
-
-
-def reuse_in_order(
     blocks: np.ndarray,
     decoded: np.ndarray,
     target: np.ndarray,
     weight: np.ndarray,
     allowed: np.ndarray,
-    window: int = _WINDOW,
+    window: int = 512,
 ) -> np.ndarray:
-    """Does the work of `reuse_blocks` for blocks in any order; each may be replaced by one before it.
+    """Replaces blocks by earlier ones where that adds little error.
 
     Args:
         blocks: uint8 [n, 16], in the order in which the file stores them.
-        decoded, target, weight, allowed: float32 [n, V], V values per block; see `reuse_blocks`.
+        decoded: float32 [n, V], the V values that each block decodes to, see `by_block`.
+        target: float32 [n, V], the original values.
+        weight: float32 [n, V], weight of each squared error.
+        allowed: float32 [n, V]; its sum over a block limits the increase of the block's weighted squared error.
         window: Number of preceding blocks that are tried as replacements.
 
     Returns:
@@ -62,7 +44,7 @@ def reuse_in_order(
 
 
 def by_block(image: np.ndarray) -> np.ndarray:
-    """Cuts an image [H, W, C] into blocks of 4 x 4 texels, float32 [H W / 16, 16 C], row by row."""
+    """Cuts an image [H, W, C], H and W multiples of 4, into its blocks row by row, float32 [H W / 16, 16 C]."""
     height, width, channels = image.shape
     squares = image.reshape(height // _SIDE, _SIDE, width // _SIDE, _SIDE, channels).transpose(0, 2, 1, 3, 4)
     return squares.reshape(-1, _SIDE * _SIDE * channels).astype(np.float32)

@@ -71,8 +71,6 @@ def check_picture(path: str | os.PathLike[str], held: int, width: int, height: i
     Raises:
         WlmError: The picture has no texels, too many, or more than a file of this size may expand to.
     """
-    if not (width and height):
-        raise WlmError(f"{path}: expected at least one texel, found {width} x {height}")
     check_sides(str(path), width, height)
     check_growth(str(path), held, width * height * texel, PICTURE_GROWTH, PICTURE_BYTES)
 

@@ -109,11 +109,12 @@ def check_sides(where: str, width: int, height: int) -> None:
     """Checks the claimed size of a picture.
 
     Raises:
-        WlmError: The picture has more than `PICTURE_TEXELS`, or more than `PICTURE_SIDE` along a side.
+        WlmError: The picture has no texel, more than `PICTURE_TEXELS`, or more than `PICTURE_SIDE` along a side.
     """
-    if max(width, height) > PICTURE_SIDE or width * height > PICTURE_TEXELS:
+    if not 0 < min(width, height) <= max(width, height) <= PICTURE_SIDE or width * height > PICTURE_TEXELS:
         raise WlmError(
-            f"{where}: expected at most {PICTURE_TEXELS} texels, {PICTURE_SIDE} along a side, found {width} x {height}"
+            f"{where}: expected at least one texel, at most {PICTURE_TEXELS} texels and {PICTURE_SIDE} along a side, "
+            f"found {width} x {height}"
         )
 
 

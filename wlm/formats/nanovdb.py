@@ -8,14 +8,14 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats import blosc
-from wlm.formats.limits import GROWTH, SURE_BOX, SURE_BYTES, VOXELS, VOXELS_A_BYTE, check_growth
-from wlm.formats.reading import damaged
-from wlm.formats.vdb import DAMAGE, LARGEST, LEAF, LOWER, UPPER, Cursor, GridHead, Tiles, VdbGrid, leaf_array
+from wlm.formats.limits import GROWTH, SURE_BYTES, check_growth
+from wlm.formats.vdb import LEAF, LOWER, UPPER, Cursor, GridFile, GridHead, Tiles, VdbGrid, leaf_array, most_voxels
 
 _VERSION = 32  # the major version, the only one with the layout that is read here
 # Sizes in bytes of a file's segment header, of a grid's metadata in it, and of the header of a grid.
@@ -44,40 +44,17 @@ class _Entry:
     codec: int
 
 
-class NanoVdbFile:
-    """A `.nvdb` file or a buffer of raw grids, of which only the list of grids has been read.
+class NanoVdbFile(GridFile):
+    """A `.nvdb` file or a buffer of raw grids."""
 
-    Attributes:
-        heads: The grids, in the order of the file; of several with one name, only the first can be read.
-    """
+    FORMAT = "NanoVDB"
 
-    def __init__(self, data: bytes, where: str) -> None:
-        """Reads the list of grids from the content of a file, which `where` names in messages.
-
-        Raises:
-            WlmError: The content is no NanoVDB file, or is damaged.
-        """
-        self._where, self._data = where, data
-        with damaged(f"{where}: cannot read the NanoVDB file", *DAMAGE):
-            entries = list(self._list())
-        self._entries = {entry.head.name: entry for entry in reversed(entries)}
-        self.heads = tuple(entry.head for entry in entries)
-
-    def read(self, name: str, trust: bool) -> VdbGrid:
-        """Reads a grid; `trust` tells whether it may be as large as it claims.
-
-        Raises:
-            WlmError: The grid is damaged, of another type or version, or too large for its compressed size.
-        """
-        entry, where = self._entries[name], f"{self._where}: {name or 'grid 0'}"
-        with damaged(f"{where}: cannot read the NanoVDB file", *DAMAGE):
-            if entry.codec and not trust:
-                check_growth(where, entry.end - entry.at, entry.size, GROWTH, SURE_BYTES)
-            data = self._data[entry.at : entry.end]
-            data = _unpacked(data, entry.size, entry.codec) if entry.codec else data
-            most = LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * len(data)))
-            with np.errstate(over="ignore", invalid="ignore"):  # of doubles, which the reader of the grid repairs
-                return _Grid(data, where).dense(name, most)
+    def _read(self, entry: _Entry, where: str, trust: bool) -> VdbGrid:
+        if entry.codec and not trust:
+            check_growth(where, entry.end - entry.at, entry.size, GROWTH, SURE_BYTES)
+        data = self._data[entry.at : entry.end]
+        data = _unpacked(data, entry.size, entry.codec) if entry.codec else data
+        return _Grid(data, where).dense(entry.head.name, most_voxels(len(data), trust))
 
     def _list(self) -> Iterator[_Entry]:
         cursor = Cursor(self._data)
@@ -105,9 +82,8 @@ class NanoVdbFile:
             for meta, name in metas:
                 size, packed = struct.unpack_from("<2Q", meta)
                 kind, group = struct.unpack_from("<2I", meta, 32)
-                head = GridHead(name, _NAMES.get(kind, f"type {kind}"), _CLASSES.get(group, ""))
                 cursor.skip(packed)
-                yield _Entry(head, cursor.at - packed, cursor.at, size, codec)
+                yield _Entry(_head(name, kind, group), cursor.at - packed, cursor.at, size, codec)
 
     def _raw(self, cursor: Cursor, begin: int) -> _Entry:
         cursor.at = begin
@@ -116,9 +92,11 @@ class NanoVdbFile:
         group, kind = struct.unpack_from("<2I", grid, _CLASS)
         name = grid[_RAW_NAME:][:256].partition(b"\0")[0].decode("utf-8", "replace")
         cursor.skip(max(size, _GRID) - _GRID)
-        return _Entry(
-            GridHead(name, _NAMES.get(kind, f"type {kind}"), _CLASSES.get(group, "")), begin, cursor.at, size, 0
-        )
+        return _Entry(_head(name, kind, group), begin, cursor.at, size, 0)
+
+
+def _head(name: str, kind: int, group: int) -> GridHead:
+    return GridHead(name, _NAMES.get(kind, f"type {kind}"), _CLASSES.get(group, ""))
 
 
 def _unpacked(data: bytes, size: int, codec: int) -> bytes:
@@ -133,12 +111,12 @@ def _unpacked(data: bytes, size: int, codec: int) -> bytes:
             # The limit of zlib must not be 0, which it reads as none.
             pieces.append(zlib.decompressobj().decompress(piece, left + 1))
         else:
-            raise ValueError(f"expected {size} bytes after decompression, found more")
+            raise ValueError(f"expected a grid of {size} bytes after decompression, found more")
         left -= len(pieces[-1])
         if left < 0 or not length:
             break
     if left:
-        raise ValueError(f"expected {size} bytes after decompression, found another number")
+        raise ValueError(f"expected a grid of {size} bytes after decompression, found {size - left}")
     return b"".join(pieces)
 
 
@@ -171,13 +149,13 @@ class _Grid:
         values.fill(background)
         count = self._number("<I", root + 24)
         if count * 32 > data.size:
-            raise ValueError(f"its root claims {count} tiles")
+            raise ValueError(f"expected a root of at most {data.size // 32} nodes, found {count}")
         rows = self._rows(root + (96 if wide else 64) + 32 * np.arange(count), 32)
         keys, children = (
             np.ascontiguousarray(rows[:, i : i + 8]).view(f"<{kind}8")[:, 0] for i, kind in ((0, "u"), (8, "i"))
         )
         if len(np.unique(keys)) < count:
-            raise ValueError("expected nodes at different places, found two at one")
+            raise ValueError("expected root nodes at different places, found two at one")
         axes = [(keys >> np.uint64(shift) & np.uint64((1 << 21) - 1)) << np.uint64(12) for shift in (42, 21, 0)]
         corners = np.stack(axes, 1).astype(np.uint32).view(np.int32).astype(np.int64)
         begin = 24 if wide else 20
@@ -194,13 +172,7 @@ class _Grid:
         return VdbGrid(name, matrix, tuple(low.tolist()), values[inside], float(background))
 
     def _inner(
-        self,
-        nodes: np.ndarray,
-        corners: np.ndarray,
-        side: int,
-        values: np.ndarray,
-        first: np.ndarray,
-        background: np.float32,
+        self, nodes: np.ndarray, corners: np.ndarray, side: int, values: np.ndarray, first: np.ndarray, background: Any
     ) -> tuple[np.ndarray, np.ndarray]:
         """Reads inner nodes with `side` children along each edge and writes their tiles; returns their children that
         are in the box, with offsets and corners."""
@@ -228,34 +200,34 @@ class _Grid:
         """Writes the values of leaves at offsets, with places in leaves of the box."""
         x, y, z = (n // LEAF for n in values.shape)
         cut = values.reshape(x, LEAF, y, LEAF, z, LEAF).transpose(0, 2, 4, 1, 3, 5)
-        sizes = {0: (96 if self._type == "float" else 128, "<f4" if self._type == "float" else "<f8")}
-        if self._type in ("float", "double"):
-            groups = [(np.arange(len(nodes)), 0)]
-        elif self._type in _BITS:
-            groups = [(np.arange(len(nodes)), _BITS[self._type])]
-        else:
+        form = {"float": "<f4", "double": "<f8"}.get(self._type, "")
+        head = 96 if self._type == "float" else 128 if form else _CODES
+        groups = [(np.arange(len(nodes)), 8 * np.dtype(form).itemsize if form else _BITS.get(self._type, 0))]
+        if self._type == "fpn":  # each leaf states its number of bits
             self._count(len(nodes), _CODES + LEAF**3 // 8)
             width = self._rows(nodes, 16)[:, 15] >> 5
             if (width > 4).any():
-                raise ValueError("expected codes of at most 16 bits")
+                raise ValueError("expected codes of at most 16 bits in its leaves, found longer ones")
             groups = [(np.flatnonzero(width == b), 1 << b) for b in range(5)]
         for chosen, bits in groups:
-            head, form = sizes[0] if not bits else (_CODES, "")
-            size = head + LEAF**3 * (np.dtype(form).itemsize if form else bits) // (1 if form else 8)
+            size = head + LEAF**3 * bits // 8
             self._count(len(chosen), size)
             for at in range(0, len(chosen), _CHUNK):
                 part = chosen[at : at + _CHUNK]
                 rows = self._rows(nodes[part], size)
+                stored = np.ascontiguousarray(rows[:, head:])
                 if form:
-                    numbers = np.ascontiguousarray(rows[:, head:]).view(form).astype(np.float32)
+                    numbers = stored.view(form).astype(np.float32)
                 else:
                     low, quantum = (np.ascontiguousarray(rows[:, i : i + 4]).view("<f4") for i in (80, 84))
-                    numbers = _codes(np.ascontiguousarray(rows[:, head:]), bits) * quantum + low
+                    numbers = _codes(stored, bits) * quantum + low
                 cut[tuple(places[part].T)] = numbers.reshape(-1, LEAF, LEAF, LEAF)
 
     def _count(self, count: int, size: int) -> None:
         if count * size > self._data.size:
-            raise ValueError(f"its nodes claim {count} of {size} bytes")
+            raise ValueError(
+                f"expected nodes within its {self._data.size} bytes, found {count} nodes of {size} bytes each"
+            )
 
     def _number(self, form: str, at: int) -> int:
         return struct.unpack_from(form, self._data, at)[0]
@@ -263,7 +235,7 @@ class _Grid:
     def _rows(self, offsets: np.ndarray, size: int, form: str = "u1") -> np.ndarray:
         """Returns the `size` bytes at each offset as numbers [N, size / their bytes]."""
         if len(offsets) and not 0 <= offsets.min() <= offsets.max() <= self._data.size - size:
-            raise ValueError("a node is outside the grid")
+            raise ValueError(f"expected nodes within its {self._data.size} bytes, found one outside")
         if not len(offsets):
             return np.zeros((0, size // np.dtype(form).itemsize), form)
         return np.lib.stride_tricks.sliding_window_view(self._data, size)[offsets].view(form)

@@ -9,9 +9,10 @@ of the format is OpenVDB's source code: `io/Archive.cc`, `io/Compression.h`, `tr
 import math
 import struct
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -87,47 +88,70 @@ class _Entry:
     at: int
 
 
-class VdbFile:
-    """A `.vdb` file in memory, of which only the list of grids has been read.
+class GridFile(ABC):
+    """A file of grids in memory, of which only the list of grids has been read.
 
     Attributes:
+        FORMAT: Name of the format.
         heads: The grids, in the order of the file; of several with one name, only the first can be read.
     """
+
+    FORMAT: ClassVar[str]
 
     def __init__(self, data: bytes, where: str) -> None:
         """Reads the list of grids from the content of a file, which `where` names in messages.
 
         Raises:
-            WlmError: The content is no OpenVDB file, is too old or too new, or is damaged.
+            WlmError: The content is not of the format, is of a version that is not read, or is damaged.
         """
         self._where, self._data = where, data
-        with damaged(f"{where}: cannot read the OpenVDB file", *DAMAGE):
+        with damaged(f"{where}: cannot read the {self.FORMAT} file", *DAMAGE):
             entries = list(self._list())
         self._entries = {entry.head.name: entry for entry in reversed(entries)}
         self.heads = tuple(entry.head for entry in entries)
 
     def read(self, name: str, trust: bool) -> VdbGrid:
-        """Reads a grid; `trust` tells whether its bounding box may be as large as it claims.
+        """Reads a grid; `trust` tells whether it may be as large as it claims.
 
         Raises:
-            WlmError: The grid is damaged, has no numbers, is a frustum, or has a bounding box that is too large.
+            WlmError: The grid is damaged, has no numbers, is a frustum, or is too large for the bytes that it takes.
         """
-        entry, where = self._entries[name], f"{self._where}: {name or 'grid 0'}"
-        if not entry.head.is_number:
-            raise WlmError(f"{where}: expected a grid of floats, found {entry.head.type}")
-        most = LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * len(self._data)))
-        with damaged(f"{where}: cannot read the OpenVDB file", *DAMAGE):
-            matrix, cursor, flags = self._head(entry, where)
-            if entry.parent:
-                if entry.parent not in self._entries or self._entries[entry.parent].parent:
-                    raise WlmError(f"{where}: the grid {entry.parent}, whose tree it shares, is missing")
-                entry = self._entries[entry.parent]
-                if not entry.head.is_number:
-                    raise WlmError(f"{where}: expected a grid of floats, found {entry.head.type}")
-                _, cursor, flags = self._head(entry, where)
-            with np.errstate(over="ignore", invalid="ignore"):  # of doubles, which the reader of the grid repairs
-                tree = _Tree(cursor, flags, entry, where)
-                low, values = tree.dense(most)
+        where = f"{self._where}: {name or 'grid 0'}"
+        with (
+            damaged(f"{where}: cannot read the {self.FORMAT} file", *DAMAGE),
+            np.errstate(over="ignore", invalid="ignore"),  # of doubles, which the caller repairs
+        ):
+            return self._read(self._entries[name], where, trust)
+
+    @abstractmethod
+    def _list(self) -> Iterator[Any]:
+        """Yields an entry with a `head` for each grid."""
+
+    @abstractmethod
+    def _read(self, entry: Any, where: str, trust: bool) -> VdbGrid:
+        """Reads the grid of an entry."""
+
+
+def most_voxels(size: int, trust: bool) -> int:
+    """Returns the most voxels of the box of a grid of `size` bytes; `trust` lifts the limit."""
+    return LARGEST if trust else min(VOXELS, max(SURE_BOX, VOXELS_A_BYTE * size))
+
+
+class VdbFile(GridFile):
+    """A `.vdb` file."""
+
+    FORMAT = "OpenVDB"
+
+    def _read(self, entry: _Entry, where: str, trust: bool) -> VdbGrid:
+        matrix, cursor, flags = self._head(entry, where)
+        name = entry.head.name
+        if entry.parent:
+            if entry.parent not in self._entries or self._entries[entry.parent].parent:
+                raise WlmError(f"{where}: the grid {entry.parent}, whose tree it shares, is missing")
+            entry = self._entries[entry.parent]
+            _, cursor, flags = self._head(entry, where)
+        tree = _Tree(cursor, flags, entry, where)
+        low, values = tree.dense(most_voxels(len(self._data), trust))
         return VdbGrid(name, matrix, low, values, float(tree.background))
 
     def _list(self) -> Iterator[_Entry]:
@@ -142,7 +166,9 @@ class VdbFile:
         cursor.unpack("<II")  # the version of the library
         (offsets,) = cursor.unpack("<?")
         if not offsets:
-            raise WlmError(f"{self._where}: expected a file with grid offsets, found a stream")
+            raise WlmError(
+                f"{self._where}: expected a file with the offsets of its grids, found a stream: save it anew"
+            )
         cursor.take(36)  # the UUID of the file
         cursor.metadata()
         (count,) = cursor.unpack("<I")
@@ -160,6 +186,8 @@ class VdbFile:
 
     def _head(self, entry: _Entry, where: str) -> tuple[np.ndarray, "Cursor", int]:
         """Returns a grid's transform, a cursor at the start of its tree, and its compression flags."""
+        if not entry.head.is_number:
+            raise WlmError(f"{where}: expected a grid of floats, found {entry.head.type}")
         cursor = Cursor(self._data, entry.at)
         (flags,) = cursor.unpack("<I")
         if flags & ~(_ZIP | _ACTIVE_MASK | _BLOSC):
@@ -239,7 +267,9 @@ class _Tree:
         # Nodes that overlap would multiply the work for a byte of the file.
         places = np.concatenate(corners)
         if (places % _UPPER_EDGE).any() or len(np.unique(places, axis=0)) < len(places):
-            raise ValueError(f"expected nodes at different multiples of {_UPPER_EDGE}, found others")
+            raise ValueError(
+                f"expected root nodes at different multiples of {_UPPER_EDGE} voxels, found two at one or one elsewhere"
+            )
 
     def _node(self, corner: np.ndarray, side: int, edge: int) -> None:
         """Reads an inner node with `side` children along each edge, each of `edge` voxels."""
@@ -340,7 +370,9 @@ class _Tree:
             elif packed > 0:
                 piece = zlib.decompressobj().decompress(piece, size + 1)
             if len(piece) != size:
-                raise ValueError(f"expected {size} bytes after decompression, found at least {len(piece)}")
+                raise ValueError(
+                    f"expected a node's values of {size} bytes after decompression, found {len(piece)} or more"
+                )
         else:
             piece = cursor.take(size)
         return np.frombuffer(piece, self._many).astype(np.float32)

@@ -7,26 +7,33 @@ that compresses its input.
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from wlm.atlas.materials import filled_slots, own_extension, own_lightmaps
+from wlm.atlas.listing import read_listing
+from wlm.atlas.materials import filled_slots, own_extension
+from wlm.config import check_settings, read_yaml
 from wlm.errors import WlmError
-from wlm.formats.geometry import read_geometry
-from wlm.formats.gltf import GltfDocument, GltfPrimitive, read_gltf
+from wlm.formats.artifact import read_artifact
+from wlm.formats.checkpoint import SUFFIX as CHECKPOINT
+from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_users
 from wlm.formats.ktx2 import VOLUME_HEAD, is_volume
 from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
-from wlm.formats.light import SUFFIXES, read_light
+from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import JSON_BYTES
+from wlm.formats.meshes import SUFFIXES as MESHES
+from wlm.formats.meshes import read_mesh
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import open_file, read_json_file
 from wlm.formats.unity_asset import read_lighting_data
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import inspect_picture, picture_of, said
 from wlm.inspection.sets import inspect_set
+from wlm.lightmap.listing import count_of
 from wlm.system import load, system_of
 
 if TYPE_CHECKING:
@@ -54,6 +61,7 @@ _MODELS = {
     "probe": "compressed light probes",
     "smoke": "a network that predicts six-way lightmaps",
 }
+_OUTPUTS = {".gif": "an animation", ".html": "a web page", ".mp4": "a film", ".onnx": "a network in ONNX"}
 _MOST_NAMES = 8  # names that one line lists
 
 
@@ -76,23 +84,19 @@ def kind_of(path: Path) -> str:
     kind = kind or _BY_SUFFIX.get(path.suffix.lower(), "")
     if kind == "arrays":
         names = _names(path)
-        return "volume" if "density" in names else "probes" if _value_names(names) else "arrays"
+        if "position" in names:
+            return "probes" if _value_names(names) else "positions"
+        return "volume" if {"density", "density_bricks"} & set(names) else "arrays"
     return _kind_of_json(path) if kind == "json" else kind
 
 
 def inspect_file(path: Path) -> Finding:
     """Describes a file. An unreadable file gives a `Finding` with a problem, not an error."""
     try:
-        if kind := kind_of(path):
-            return _KINDS[kind].inspect(path)
+        kind = kind_of(path)
+        return _KINDS[kind].inspect(path) if kind else Finding(path, "unknown kind of file")
     except WlmError as error:
         return Finding(path, UNREADABLE, problems=(said(error, path),))
-    if path.suffix.lower() in (*SUFFIXES, *LEVEL_SUFFIXES, *_OTHER_LIGHT):
-        try:
-            read_light(path)
-        except WlmError as error:
-            return Finding(path, UNREADABLE, problems=(said(error, path),))
-    return Finding(path, "unknown kind of file")
 
 
 def file_system(path: Path) -> str:
@@ -126,8 +130,8 @@ def _names(path: Path) -> list[str]:
 
 
 def _value_names(names: Sequence[str]) -> list[str]:
-    """Returns the names of the arrays of an .npz that hold probe values; none if it has no positions."""
-    return [name for name in names if name.startswith("sh")] if "position" in names else []
+    """Returns the names of the arrays of an .npz of probes that hold values."""
+    return [name for name in names if name.startswith("sh")]
 
 
 def _arrays(path: Path) -> Finding:
@@ -147,7 +151,7 @@ def _probes(path: Path) -> Finding:
     if len(keys) > 1:
         what += f", under the keys {', '.join(keys[:_MOST_NAMES])}"
     what += f"; {probes.reading}"
-    options = () if key is None else ("--key", key.removeprefix("sh_"))
+    options = () if key is None else ("--key", key)
     return Finding(path, what, compress_command(path, *options), probes.warnings)
 
 
@@ -194,18 +198,40 @@ def describe_volume(path: Path, volume: "DensityVolume", file: Path, output: str
     return Finding(path, what, command("smoke", "bake", path, *options, "-o", output), tuple(problems))
 
 
+def scene_command(mesh: Path, *light: Path) -> tuple[str, tuple[str, ...]]:
+    """Reads a mesh with its lightmaps.
+
+    Args:
+        mesh: The file of the mesh.
+        light: A lightmap, a folder or a list of lightmaps; none for those that a glTF file names itself.
+
+    Returns:
+        The command that compresses them, "" if they cannot be read together, and problems and assumptions, a line each.
+    """
+    # This imports torch.
+    from wlm.atlas.data import load as load_scene
+
+    try:
+        scene = load_scene(mesh, *light)
+    except WlmError as error:
+        return "", (said(error, mesh),)
+    return compress_command(mesh, *light), tuple(line.removeprefix(f"{mesh}: ") for line in scene.warnings)
+
+
 def _mesh(path: Path) -> Finding:
-    own: tuple[str, str, tuple[str, ...]] = ("compress it together with its lightmap", "", ())
-    if path.suffix.lower() not in (".glb", ".gltf"):
-        mesh = read_geometry(path, with_uv=False)
-        parts, sets, uvs = 1, "", []
-        count = len(mesh.triangle)
-        with suppress(WlmError):
-            whole = read_geometry(path)
-            sets, uvs = "UVs", [whole.uv[whole.triangle]]
+    use, words, notes = "compress it together with its lightmap", "", ()
+    if path.suffix.lower() in MESHES:
+        mesh = read_mesh(path)
+        parts, count = 1, len(mesh.triangle)
+        sets, uvs = ("", []) if mesh.uv is None else ("UVs", [mesh.uv[mesh.triangle]])
     else:
         document, primitives = read_gltf(path)
-        own = _own_lightmaps(path, document, primitives)
+        if name := own_extension(document):
+            words, notes = scene_command(path)
+            use = f"with {notes[0]}" if words else f"its lightmaps are named by {name}"
+            notes = notes[1:] if words else notes
+        elif slots := filled_slots(document):
+            use += f", or with that of a material slot (--slot {' or '.join(slots)})"
         count, parts = sum(len(each.triangle) for each in primitives), len({each.mesh for each in primitives})
         numbers = sorted({number for each in primitives for number in each.uv})
         sets = ", ".join(f"TEXCOORD_{number}" for number in numbers)
@@ -217,36 +243,20 @@ def _mesh(path: Path) -> Finding:
         corners = np.concatenate(uvs).astype(np.float64)
         a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         area = float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2.0)
-        if corners.min() < -1e-3 or corners.max() > 1.001:
-            problems.append("its UVs exceed 0 to 1: are they those of a repeated texture, not of a lightmap?")
+        if len(corners) and (corners.min() < -1e-3 or corners.max() > 1.001):
+            problems.append("its UVs exceed 0 to 1: they are those of a repeated texture or of UDIM tiles")
         elif area > 1.0:
             cause = "each mesh may have its own lightmap" if parts > 1 else "are they those of a lightmap?"
             problems.append(f"the triangles cover {area:.1f} times the UV square and overlap; {cause}")
-        what += f"; {own[0]}"
-    return Finding(path, what, own[1], (*problems, *own[2]))
-
-
-def _own_lightmaps(
-    path: Path, document: GltfDocument, primitives: Sequence[GltfPrimitive]
-) -> tuple[str, str, tuple[str, ...]]:
-    """Describes the lightmaps that a glTF file names: what they are, the command that compresses them, problems."""
-    name, slots = own_extension(document), filled_slots(document)
-    if name is None:
-        other = f", or with that of a material slot (--slot {' or '.join(slots)})" if slots else ""
-        return f"compress it together with its lightmap{other}", "", ()
-    try:
-        listing, _ = own_lightmaps(document, primitives)
-    except WlmError as error:
-        return f"its lightmaps are named by {name}", "", (said(error, path),)
-    notes = tuple(note.removeprefix(f"{path}: ") for note in listing.notes)
-    return f"with {notes[0]}", compress_command(path), notes[1:]
+        what += f"; {use}"
+    return Finding(path, what, words, (*problems, *notes))
 
 
 def _model(path: Path) -> Finding:
     model, system = load(path), system_of(path)
-    what = f"{_MODELS[system]}: {model.name}"
     if system == "smoke":
         return Finding(path, _MODELS[system], command("info", path))
+    what = f"{_MODELS[system]}: {model.name}"
     if system == "probe" and not model.has_positions:
         return Finding(path, f"{what}, without positions", command("info", path))
     return Finding(path, what, command("web", path, "-o", "PAGE.html"))
@@ -257,12 +267,69 @@ def _kind_of_json(path: Path) -> str:
     if isinstance(content, dict):
         if str(content.get("format")) in _EXPORTS:
             return "export"
-        if "lightmaps" in content:
-            return "set"
+        for key, kind in (("sheets", "lights"), ("lightmaps", "set"), ("psnr", "scores")):
+            if key in content:
+                return kind
     # This imports scipy.
+    from wlm.probe.data import load_positions
     from wlm.probe.fields import holds_probes
 
-    return "probes" if holds_probes(content) else "json"
+    if holds_probes(content):
+        return "probes"
+    points = content.get("position") if isinstance(content, dict) else content
+    with suppress(WlmError):
+        if isinstance(points, list) and points and isinstance(points[0], list):
+            load_positions(path)
+            return "positions"
+    return "json"
+
+
+def _lights(path: Path) -> Finding:
+    """Describes a list of the lightmaps of a scene."""
+    listing = read_listing(path)
+    lists = f"{count_of(listing.sheets, 'lightmap')} at {count_of(listing.states, 'state')}"
+    return Finding(path, f"a list of lightmaps of a scene: {lists}; compress it together with its mesh")
+
+
+def _positions(path: Path) -> Finding:
+    from wlm.probe.data import load_positions
+
+    use = "for --positions of wlm decode and --walk of wlm view"
+    return Finding(path, f"{count_of(load_positions(path), 'position')} without light, {use}")
+
+
+def _settings(path: Path) -> Finding:
+    """Describes a YAML file: a scene or a profile."""
+    values = read_yaml(path)
+    if "grid" in values:
+        # This imports torch.
+        from wlm.smoke.scene import Scene
+
+        scene = check_settings(Scene, values, f"{path}: ")
+        what = f"a scene of smoke: {count_of(range(scene.frames), 'frame')} at {scene.rate:g} a second"
+        return Finding(path, what, command("smoke", "simulate", path, "-o", "DIR"))
+    if "geometry" in values:
+        return Finding(path, "a scene for wlm bake lightmaps and wlm bake probes")
+    if isinstance(values.get("smoke"), str):
+        return Finding(path, "a scene for wlm bake sixway")
+    fitting, faults = [], {}
+    for system in _MODELS:
+        profile = import_module(f"wlm.{system}").Profile
+        try:
+            check_settings(profile, values, f"{path}: ")
+            fitting.append(system)
+        except WlmError as error:
+            faults[system] = said(error, path)
+    if fitting:
+        use = "wlm smoke train" if fitting == ["smoke"] else "--profile of wlm compress"
+        return Finding(path, f"settings of {' or '.join(fitting)}, for {use}")
+    return Finding(path, "YAML, neither a scene nor settings", problems=tuple(f"{s}: {f}" for s, f in faults.items()))
+
+
+def _checkpoint(path: Path) -> Finding:
+    name = path.name.removesuffix(CHECKPOINT)
+    work = read_artifact(path).system.removesuffix("-checkpoint")
+    return Finding(path, f"an interrupted run ({work}): repeat the command that writes {name} with --resume")
 
 
 def _unity_asset(path: Path) -> Finding:
@@ -284,14 +351,20 @@ class _Kind(NamedTuple):
 
 _KINDS = {
     "arrays": _Kind(_arrays),
+    "checkpoint": _Kind(_checkpoint),
     "export": _Kind(lambda path: Finding(path, str(document_of(path)))),
     "godot bake": _Kind(_lmbake, "probe"),
     "json": _Kind(lambda path: Finding(path, "unknown JSON")),
+    "lights": _Kind(_lights),
     "mesh": _Kind(_mesh, "atlas"),
     "model": _Kind(_model),
+    "output": _Kind(lambda path: Finding(path, f"{_OUTPUTS[path.suffix.lower()]}, which no command of wlm reads")),
     "picture": _Kind(inspect_picture),
+    "positions": _Kind(_positions),
     "probes": _Kind(_probes, "probe"),
+    "scores": _Kind(lambda path: Finding(path, "scores, such as wlm evaluate --json writes")),
     "set": _Kind(inspect_set, "lightmap"),
+    "settings": _Kind(_settings),
     "unity asset": _Kind(_unity_asset, "probe"),
     "volume": _Kind(_volume, "smoke"),
 }
@@ -303,16 +376,16 @@ _BY_MAGIC = {
     b" BDV\0\0\0\0": "volume",
 }
 _BY_SUFFIX = {
-    ".npz": "arrays",
-    ".lmbake": "godot bake",
-    ".glb": "mesh",
-    ".gltf": "mesh",
-    ".obj": "mesh",
-    ".nvdb": "volume",
-    ".vdb": "volume",
-    ".wlm": "model",
-    ".json": "json",
+    **dict.fromkeys((*SUFFIXES, *LEVEL_SUFFIXES, *_OTHER_LIGHT), "picture"),
+    **dict.fromkeys((".glb", ".gltf", *MESHES), "mesh"),
+    **dict.fromkeys((".csv", ".tsv"), "probes"),
+    **dict.fromkeys((".nvdb", ".vdb"), "volume"),
+    **dict.fromkeys((".yaml", ".yml"), "settings"),
+    **dict.fromkeys(_OUTPUTS, "output"),
+    CHECKPOINT: "checkpoint",
     ".asset": "unity asset",
-    ".csv": "probes",
-    ".tsv": "probes",
+    ".json": "json",
+    ".lmbake": "godot bake",
+    ".npz": "arrays",
+    ".wlm": "model",
 }

@@ -1,9 +1,12 @@
 """A description of a file or a folder, and the commands that it may name."""
 
+import os
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from wlm.errors import printable
 
 UNREADABLE = "cannot be read"
 """Description of unreadable files and folders."""
@@ -25,16 +28,30 @@ class Finding:
     command: str = ""
     problems: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        # Names in them may contain line breaks.
+        object.__setattr__(self, "what", printable(self.what))
+        object.__setattr__(self, "problems", tuple(map(printable, self.problems)))
+
     def to_json(self) -> dict[str, Any]:
         """Returns the finding as JSON values."""
         return {"path": str(self.path), "what": self.what, "command": self.command, "problems": list(self.problems)}
 
 
 def command(*words: str | Path) -> str:
-    """Returns a `wlm` command line of the words, quoted for a shell."""
-    return shlex.join(["wlm", *map(str, words)])
+    """Returns a `wlm` command line of the words, quoted for a shell: sh, or bash for names with control characters."""
+    return " ".join(["wlm", *map(_quoted, words)])
 
 
 def compress_command(*words: str | Path) -> str:
     """Returns the command line that compresses the given inputs, with options among the words."""
     return command("compress", *words, "-o", "OUT.wlm")
+
+
+def _quoted(word: str | Path) -> str:
+    # A path that begins with a dash would be read as an option.
+    text = f"./{word}" if isinstance(word, Path) and str(word)[0] == "-" else str(word)
+    if printable(text) == text:
+        return shlex.quote(text)
+    plain = (chr(byte) if 32 <= byte < 127 and byte not in b"'\\" else f"\\x{byte:02x}" for byte in os.fsencode(text))
+    return f"$'{''.join(plain)}'"

@@ -12,6 +12,7 @@ from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
+from wlm.formats.meshes import SUFFIXES as MESHES
 from wlm.inspection.files import (
     BAKED,
     FRAMES,
@@ -20,6 +21,7 @@ from wlm.inspection.files import (
     file_system,
     inspect_file,
     kind_of,
+    scene_command,
 )
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import Picture, picture_of, said, size_of
@@ -34,6 +36,8 @@ _DEEPEST = 4
 _BESIDE = 16  # folders beside a mesh that are examined for its lightmaps
 _ENTRIES = 20_000  # most entries that are read of a folder
 _DOCUMENTS = 64  # most JSON files that are read of a folder
+_MESHES = (".glb", ".gltf", *MESHES)
+_BOOKS = (".png", ".tga", ".exr")
 _IGNORED = {".md", ".txt", ".meta", ".import", ".uid", ".html", ".pdf", ".py", ".js", ".cs", ".glsl", ".hlsl", ".bin"}
 _IGNORED_NAMES = ("license", "licence", "readme", "copying")
 
@@ -51,7 +55,7 @@ def inspect(path: str | os.PathLike[str]) -> list[Finding]:
     if not path.exists():
         raise WlmError(f"{path}: no such file or folder")
     if not path.is_dir():
-        return [inspect_file(path)]
+        return [_inside(path) or inspect_file(path)]
     _entries(path)
     found: list[Finding] = []
     waiting = [(path, 0)]
@@ -129,8 +133,34 @@ def _entries(folder: Path) -> list[Path]:
     try:
         found = [Path(entry.path) for entry in islice(os.scandir(folder), _ENTRIES) if entry.name[0] != "."]
     except OSError as error:
-        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
+        raise WlmError(f"{folder}: cannot read the folder: {error.strerror or error}") from error
     return sorted(found, key=lambda path: (natural(path.name), path.name))
+
+
+def _inside(path: Path) -> Finding | None:
+    """Describes a file together with those beside it, if it is part of an export or of a flip book."""
+    try:
+        files = [entry for entry in _entries(path.parent) if entry.is_file()]
+    except WlmError:
+        return None
+    documents = [file for file in files if file.suffix.lower() == ".json"][:_DOCUMENTS]
+    if path not in documents:
+        stated = next(filter(None, map(document_of, documents)), None)
+        if stated not in (None, BAKED, FRAMES):
+            return Finding(path, f"a file of the folder {path.parent}: {stated}")
+    names = {name for back in (False, True) for name, _ in _book_names(path, back)}
+    beside = [file for file in files if file == path or file.name.lower() in names]
+    return next((finding for finding, its in _flip_books(path.parent, beside) if path in its), None)
+
+
+def _book_names(file: Path, back: bool = False) -> list[tuple[str, str]]:
+    """Returns the names, in lower case, that the other texture of a flip book may have, each with a layout."""
+    if file.suffix.lower() not in _BOOKS:
+        return []
+    # This imports torch, which takes seconds.
+    from wlm.smoke.flipbook.naming import second_names
+
+    return [(f"{name}{file.suffix}".lower(), layout) for name, layout in second_names(file.stem, back)]
 
 
 def _is_ignored(file: Path) -> bool:
@@ -152,9 +182,21 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
         stated = document_of(file)
         if stated is not None:
             # All files of the folder belong to that output.
-            bake = command("smoke", "bake", folder, "-o", "DIR") if stated == FRAMES else ""
-            return [(Finding(folder, stated, bake), set(files) | set(_entries(folder)))]
+            its = set(files) | set(_entries(folder))
+            return [(_simulated(folder) if stated == FRAMES else Finding(folder, stated), its)]
     return []
+
+
+def _simulated(folder: Path) -> Finding:
+    """Describes frames of smoke that wlm wrote."""
+    from wlm.smoke.data import load_frames
+
+    try:
+        frames = load_frames(folder)
+        frames.load(frames.numbers[-1])
+    except WlmError as error:
+        return Finding(folder, FRAMES, problems=(said(error, folder),))
+    return Finding(folder, FRAMES, command("smoke", "bake", folder, "-o", "DIR"), frames.warnings)
 
 
 def _unity(folder: Path, files: Sequence[Path]) -> _Found:
@@ -169,18 +211,22 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
         times, options = range(len(states)), ["--times", f"0:{len(states)}:1"]
         problems.append(f"the hours of {', '.join(state.name for state in states[:8])} are unknown: change --times")
     listing = list_set(folder, times)
-    sizes = []
+    sizes, words = [], compress_command(folder, *options)
     for atlas in listing.atlases:
         paths = [one[key].path for one in listing.states for key in [(atlas.name, "light")] if key in one]
-        heads = [picture_of(path) for path in paths]
-        sizes += sorted({size_of(path) for path in paths})
-        problems += [f"{atlas.name}: {text}" for text in together(paths, heads)[0]]
+        try:
+            heads = [picture_of(path) for path in paths]
+            sizes += sorted({size_of(path) for path in paths})
+            problems += [f"{atlas.name}: {text}" for text in together(paths, heads)[0]]
+        except WlmError as error:
+            words = ""
+            problems.append(said(error, folder))
     problems += assumed(listing)
     names = ", ".join(layer.name for layer in listing.layers)
     size = " and ".join(dict.fromkeys(sizes))
     maps = f"{count_of(listing.atlases, 'map')} of {size}, with {names}"
     what = f"{count_of(states, 'state')} of light from Unity, {maps}"
-    finding = Finding(folder, what, compress_command(folder, *options), tuple(problems))
+    finding = Finding(folder, what, words, tuple(problems))
     its = {path for paths in held.values() for path in paths}
     if states == [folder]:
         return [(finding, its)]
@@ -210,38 +256,36 @@ def _godot(folder: Path, files: Sequence[Path]) -> _Found:
 
 def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
     """Describes pairs of textures that are named as six-way lightmaps are, or as pairs whose light is that of them."""
-    pictures = [file for file in files if file.suffix.lower() in (".png", ".tga", ".exr")]
+    pictures = {file.name.lower(): file for file in files if file.suffix.lower() in _BOOKS}
     found: _Found = []
     taken: set[Path] = set()
-    for file in pictures[:_DOCUMENTS]:
-        # This imports torch, which takes seconds.
-        from wlm.smoke.flipbook.naming import second_names
-        from wlm.smoke.flipbook.reading import guess_book, read_flipbook
-
-        for name, layout in second_names(file.stem):
-            other = next((each for each in pictures if each.name.lower() == f"{name}{file.suffix}".lower()), None)
-            if other is None or other == file or taken & {file, other}:
+    for file in list(pictures.values())[:_DOCUMENTS]:
+        for name, layout in _book_names(file):
+            other = pictures.get(name, file)
+            if other == file or taken & {file, other}:
                 continue
-            with suppress(WlmError):
+            # This imports torch, which takes seconds.
+            from wlm.smoke.flipbook.reading import guess_book, read_flipbook
+
+            what, notes = f"a flip book of six-way lightmaps of smoke, with {other.name}", list[str]()
+            words = ""
+            try:
                 if not layout and guess_book(file, other) is None:
                     continue
-                notes: list[str] = []
-                what = f"a flip book of six-way lightmaps of smoke, with {other.name}"
-                book = [file, "--with", other, *(("--from", layout) if layout else ())]
-                try:
-                    frames = read_flipbook((file, other), layout or None, notes=notes)
-                except WlmError as error:
-                    found.append((Finding(file, what, problems=(said(error, file),)), {file, other}))
-                    taken |= {file, other}
-                    continue
+                frames = read_flipbook((file, other), layout or None, notes=notes)
                 use = "shade"
                 if frames[0].transparency is None:
                     notes.append("no opacity: wlm smoke shade needs the texture that has it as a second --with")
                     use = "flipbook"
                 output = "OUT.png" if use == "flipbook" or len(frames) == 1 else "DIR"
-                finding = Finding(file, what, command("smoke", use, *book, "-o", output), tuple(notes))
-                found.append((finding, {file, other}))
-                taken |= {file, other}
+                chosen = ("--from", layout) if layout else ()
+                words = command("smoke", use, file, "--with", other, *chosen, "-o", output)
+            except WlmError as error:
+                if not layout:
+                    continue
+                notes = [said(error, file)]
+            found.append((Finding(file, what, words, tuple(notes)), {file, other}))
+            taken |= {file, other}
     return found
 
 
@@ -273,40 +317,55 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
             return []  # each is described by itself
         what = f"six-way lightmaps of smoke, {count_of(smoke, 'frame')} of {heads[smoke[0]].size}"
         return [(Finding(folder, what, command("smoke", "flipbook", folder, "-o", "OUT.png")), set(smoke))]
+    if (folder / SET_FILE).is_file():
+        return []  # it lists the lightmaps of the folder; others are described by themselves
     pictures = [file for file in heads if "_comp_" not in file.name.lower()]
-    meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
-    if len(pictures) == len(meshes) == 1:
-        mesh, light = inspect_file(meshes[0]), inspect_file(pictures[0])
-        if mesh.command:  # the mesh names its lightmaps itself
-            return [(mesh, {mesh.path, light.path})]
-        if UNREADABLE not in (mesh.what, light.what):
-            what, problems = f"a mesh with the lightmap {light.path.name}", (*mesh.problems, *light.problems)
-            return [
-                (Finding(mesh.path, what, compress_command(mesh.path, light.path), problems), {mesh.path, light.path})
-            ]
-    if what := _lightmaps_of(meshes[0] if len(meshes) == 1 else None, pictures):
-        words = compress_command(meshes[0], folder) if len(meshes) == 1 else ""
-        what = what if words else f"{what}; compress them with their mesh: wlm compress MESH FOLDER"
-        return [(Finding(folder, what, words), {*pictures, *(meshes if words else ())})]
+    meshes = [file for file in files if file.suffix.lower() in _MESHES]
+    mesh = meshes[0] if len(meshes) == 1 else None
+    if mesh is not None and len(pictures) == 1:
+        alone = inspect_file(mesh)
+        if alone.command:  # the mesh names its lightmaps itself
+            return [(alone, {mesh, *pictures})]
+        light = inspect_file(pictures[0])
+        if UNREADABLE in (alone.what, light.what):
+            return []
+        words, notes = scene_command(mesh, pictures[0])
+        problems = dict.fromkeys((*alone.problems, *light.problems, *notes))
+        return [(Finding(mesh, f"a mesh with the lightmap {pictures[0].name}", words, (*problems,)), {mesh, *pictures})]
+    if what := _lightmaps_of(mesh, pictures):
+        return [_of_mesh(folder, what, mesh, pictures)]
     if len(pictures) < 2:
         return []
-    problems, alike = together(pictures, [heads[file] for file in pictures])
-    if not alike:
-        what = f"{count_of(pictures, 'lightmap')} of different UV layouts, not times of one"
-        if len(meshes) == 1:
+    what, words, problems = count_of(pictures, "lightmap"), "", list[str]()
+    try:
+        problems, size = together(pictures, [heads[file] for file in pictures])
+        if not size:
             # The charts show which lightmap belongs to which mesh of the scene.
-            words = compress_command(meshes[0], folder)
-            return [(Finding(folder, f"{what}, with {meshes[0].name}", words, tuple(problems)), {*pictures, *meshes})]
-        return [(Finding(folder, f"{what}; compress them with their meshes", problems=tuple(problems)), set(pictures))]
-    times, options = None, list[str]()
-    if None in hours_of_names([file.stem for file in pictures])[0]:
-        times, options = range(len(pictures)), ["--times", f"0:{len(pictures)}:1"]
-        problems.append("the names state no hours: are they one lightmap at several times? Then change --times")
-    with suppress(WlmError):  # other files in the folder, which are described by themselves
+            return [_of_mesh(folder, f"{what} of different UV layouts, not times of one", mesh, pictures, problems)]
+        times, options, what = None, list[str](), f"{what} of {size}"
+        if None in hours_of_names([file.stem for file in pictures])[0]:
+            times, options = range(len(pictures)), ["--times", f"0:{len(pictures)}:1"]
+            problems.append("the names state no hours: are they one lightmap at several times? Then change --times")
+        if others := [file for file in _entries(folder) if file.suffix.lower() in SUFFIXES and file not in pictures]:
+            raise WlmError(
+                f"{others[0].name} is no lightmap that can be read: move it away, or list the lightmaps in a {SET_FILE}"
+            )
         problems += assumed(list_set(folder, times))
-    what = f"{count_of(pictures, 'lightmap')} of {size_of(pictures[0])}"
+        words = compress_command(folder, *options)
+    except WlmError as error:
+        problems.append(said(error, folder))
     taken = {*pictures, folder / "mask.png"} & set(files)
-    return [(Finding(folder, what, compress_command(folder, *options), tuple(problems)), taken)]
+    return [(Finding(folder, what, words, tuple(problems)), taken)]
+
+
+def _of_mesh(
+    folder: Path, what: str, mesh: Path | None, pictures: Sequence[Path], problems: Sequence[str] = ()
+) -> tuple[Finding, set[Path]]:
+    """Describes the lightmaps of a folder that belong to the meshes of a file, if it is known."""
+    if mesh is None:
+        return Finding(folder, f"{what}; compress them with their mesh", problems=tuple(problems)), set(pictures)
+    words, notes = scene_command(mesh, folder)
+    return Finding(folder, f"{what}, with {mesh.name}", words, (*problems, *notes)), {*pictures, mesh}
 
 
 def _lightmaps_of(mesh: Path | None, pictures: Sequence[Path]) -> str:
@@ -333,7 +392,7 @@ def _mesh_folders(folder: Path, files: Sequence[Path]) -> _Found:
     for inside in [entry for entry in _entries(folder) if entry.is_dir() and not entry.is_symlink()][:_BESIDE]:
         pictures = list(_light([entry for entry in _entries(inside) if entry.is_file()]))
         if what := _lightmaps_of(meshes[0], pictures):
-            found.append((Finding(inside, what, compress_command(meshes[0], inside)), {inside}))
+            found.append((Finding(inside, what, *scene_command(meshes[0], inside)), {inside}))
     return found
 
 

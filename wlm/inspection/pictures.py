@@ -1,12 +1,13 @@
 """Describes pictures: radiance or other data, and whether the values are plausible radiance."""
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from wlm.errors import WlmError
+from wlm.errors import WlmError, one_line
 from wlm.formats import dds, ktx2, pfm, radiance
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import HALF_MAX, read_header
@@ -116,7 +117,8 @@ def inspect_picture(path: Path) -> Finding:
     """
     picture, name = picture_of(path), path.name.lower()
     if picture is None:
-        raise WlmError(f"{path}: expected an EXR, Radiance, KTX2, DDS or PNG picture")
+        read_light(path)  # raises an error that names what it is
+        return Finding(path, "unknown kind of file")
     if picture.is_six_way:
         what, assumed = f"six-way lightmaps of smoke, {picture.size}", list[str]()
         # This imports torch, too.
@@ -140,8 +142,22 @@ def inspect_picture(path: Path) -> Finding:
         return Finding(path, what, problems=tuple(notes))
     pixels, names = read_light(path, notes)
     height, width = pixels.shape[:2]
-    what = f"a lightmap, {picture.kind}, {width}x{height}, {''.join(names)}; compress it together with its mesh"
+    use = "; compress it together with its mesh"
+    if others := _halves(picture.channels):
+        use = f", or half of six-way lightmaps of smoke without their layer {' or '.join(others)}"
+    what = f"a lightmap, {picture.kind}, {width}x{height}, {''.join(names)}{use}"
     return Finding(path, what, problems=(*notes, *problems_of(pixels)))
+
+
+def _halves(channels: Sequence[str]) -> list[str]:
+    """Returns the layers that six-way lightmaps would have beside those of the channels."""
+    layers = {name.rpartition(".")[0] for name in channels} - {""}
+    if not layers:
+        return []
+    # This imports torch, too.
+    from wlm.smoke.flipbook.naming import second_names
+
+    return [name for layer in layers for back in (False, True) for name, _ in second_names(layer, back)]
 
 
 def problems_of(pixels: np.ndarray) -> tuple[str, ...]:
@@ -179,4 +195,4 @@ def read_lit(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
 
 def said(error: WlmError, path: Path) -> str:
     """Returns an error message without the path at its beginning."""
-    return str(error).removeprefix(f"{path}: ")
+    return str(error).removeprefix(f"{one_line(path)}: ")

@@ -17,19 +17,25 @@ UNREADABLE_SET = "a lightmap set that cannot be read"
 
 def inspect_set(path: Path) -> Finding:
     """Describes the lightmap set that a `set.json` lists, and names its missing files."""
+    folder = path.parent
     try:
         listing = list_set(path)
+        files = list(dict.fromkeys(source.path for state in listing.states for source in state.values()))
+        masks = [mask for atlas in listing.atlases if (mask := Path(str(atlas.mask))).suffix]  # the others are words
+        if missing := [file.name for file in (*files, *masks) if not file.is_file()]:
+            lost = f"{missing[0]} is missing" + f", and {len(missing) - 1} more" * (len(missing) > 1)
+            return Finding(folder, f"a set of {count_of(files, 'lightmap')}", problems=(lost,))
+        what, problems = f"a set of lightmaps at {count_of(listing.states, 'time')}", list[str]()
         if any(key != (LIGHT.atlas, LIGHT.layer) for key in listing.states[0]):
-            sheets = f"{count_of(listing.atlases, 'atlas')} with {', '.join(layer.name for layer in listing.layers)}"
-            problems = sorted(
-                {f"{s.path.name} is missing" for one in listing.states for s in one.values() if not s.path.is_file()}
-            )
-            what = f"a set of lightmaps with layers at {count_of(listing.states, 'time')}: {sheets}"
-            problems = [*problems[:4], *assumed(listing)]
-            return Finding(path.parent, what, compress_command(path.parent), tuple(problems))
-        return _checked(path.parent, listing)
+            names = ", ".join(layer.name for layer in listing.layers)
+            what = f"{what}: {count_of(listing.atlases, 'atlas')} with {names}"
+        else:
+            stored = listing.layers[0].stored
+            what = f"{what}, {size_of(files[0])}" + (f", stored as {stored}" if stored else "")
+            problems = [] if stored else together(files, [picture_of(file) for file in files])[0]
+        return Finding(folder, what, compress_command(folder), (*problems, *assumed(listing)))
     except WlmError as error:
-        return Finding(path.parent, UNREADABLE_SET, problems=(said(error, path),))
+        return Finding(folder, UNREADABLE_SET, problems=(said(error, path),))
 
 
 def named(path: Path, files: Sequence[Path]) -> set[Path]:
@@ -39,20 +45,6 @@ def named(path: Path, files: Sequence[Path]) -> set[Path]:
     except WlmError:
         return set()
     return {*listing.files, *(Path(str(atlas.mask)) for atlas in listing.atlases)} & set(files)
-
-
-def _checked(folder: Path, listing: Listing) -> Finding:
-    missing = [file.name for file in listing.files if not file.is_file()]
-    problems = [f"{missing[0]} is missing" + f", and {len(missing) - 1} more" * (len(missing) > 1)] if missing else []
-    files = list(dict.fromkeys(file for file in listing.files if file.is_file()))
-    heads = [picture_of(file) for file in files]
-    size = size_of(files[0]) if files else ""
-    what = f"a set of lightmaps at {count_of(listing.files, 'time')}, {size or 'an unknown size'}"
-    problems += assumed(listing)
-    if (stored := listing.layers[0].stored) is not None:
-        return Finding(folder, f"{what}, stored as {stored}", compress_command(folder), tuple(problems))
-    problems += together(files, heads)[0]
-    return Finding(folder, what, compress_command(folder), tuple(problems))
 
 
 def assumed(listing: Listing) -> list[str]:
@@ -71,34 +63,36 @@ def assumed(listing: Listing) -> list[str]:
     return lines
 
 
-def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[list[str], bool]:
+def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[list[str], str]:
     """Checks whether pictures are one lightmap at several times, from all headers and the texels of at most eight.
 
     Returns:
-        The problems, one line each, and whether the pictures may be one lightmap.
+        The problems, one line each, and the common size, such as "512x256"; "" if the pictures are not one lightmap.
+
+    Raises:
+        WlmError: One of the pictures cannot be read, or is no light.
     """
-    problems = []
     for file, head in zip(files, heads, strict=True):
         if head is None or not head.is_light:
-            return [f"{file.name} has no radiance"], True
+            raise WlmError(f"{file.name}: expected a picture of light, found a file of another kind")
     sized = [(file, head) for file, head in zip(files, heads, strict=True) if head is not None and head.width]
     for file, head in sized[1:]:
         if head.size != sized[0][1].size:
-            return [f"{file.name} is {head.size}, {sized[0][0].name} is {sized[0][1].size}"], False
+            return [f"{file.name} is {head.size}, {sized[0][0].name} is {sized[0][1].size}"], ""
     chosen = [files[i] for i in spread(len(files), PICTURES)]
     lit, notes = [], []
     for file in chosen:
         try:
             one, found = read_lit(file)
         except WlmError as error:
-            return [*problems, f"{file.name}: {said(error, file)}"], True
+            raise WlmError(f"{file.name}: {said(error, file)}") from error
         lit.append(one)
         notes.append(found)
-    problems += noted([file.name for file in chosen], notes)
+    problems = noted([file.name for file in chosen], notes)
     if len({one.shape for one in lit}) > 1:
-        return [*problems, "their sizes differ"], False
+        return [*problems, "their sizes differ"], ""
     odd = odd_layout(len(lit), lit.__getitem__)
     if odd is None:
-        return problems, True
+        return problems, "{1}x{0}".format(*lit[0].shape)
     first, second = (chosen[i].name for i in odd)
-    return [*problems, f"{first} and {second} have different charts"], False
+    return [*problems, f"{first} and {second} have different charts"], ""

@@ -8,10 +8,10 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.encodings import ENCODINGS
 from wlm.lightmap.encodings.base import DeviceTiles
-from wlm.lightmap.gaps import Gaps
 from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.sheet import Sheet, first_light
 from wlm.lightmap.tiles import TILE, place
+from wlm.texels import near_gaps
 from wlm_kernels.mlp import GELUS
 
 _PIECE = 1024  # tiles that are decoded at once: 192 MiB
@@ -51,50 +51,12 @@ class SheetDecoder:
         self._tiles: list[DeviceTiles] = [
             tiles for encoding in ENCODINGS for tiles in encoding.upload(model, self.device, gelu)
         ]
-        self._gaps = Gaps.of(model.mask)
+        self._gaps = [tuple(at.T) for at in near_gaps(model.mask)]
 
     @property
     def device_bytes(self) -> int:
         """Memory that the maps, networks and frames take on the device, in bytes."""
         return sum(tiles.device_bytes for tiles in self._tiles)
-
-    def tile(self, number: int, time: float, border: int = 0) -> np.ndarray:
-        """Decodes one tile and fills the gaps between charts.
-
-        Args:
-            number: Number of the tile in the grid, row-major.
-            time: In the unit of the set's times.
-            border: Texels added on each side from the neighbouring tiles, so that a texture of tiles can be filtered;
-                past the edges of the map, its outer texels are mirrored (neural-dynamic-gi, section 9).
-
-        Returns:
-            Linear radiance, float32 [128 + 2 border, 128 + 2 border, 3].
-
-        Raises:
-            WlmError: There is no such tile, the time is not finite, or the border is not in 0..128.
-        """
-        y, x = self._grid.origin(number)
-        if not 0 <= border <= TILE:
-            raise WlmError(f"border: expected 0 to {TILE} texels, got {border}")
-        window = tuple(slice(max(at - border, 0), at + TILE + border) for at in (y, x))
-        gaps = self._gaps.within(window)
-        # The rows and columns of the border and of the sources of gaps are needed.
-        needed = np.concatenate([[[part.start for part in window], [part.stop - 1 for part in window]], gaps.source])
-        rows, columns = (
-            range(max(low // TILE, 0), min(high // TILE, last - 1) + 1)
-            for low, high, last in zip(needed.min(0), needed.max(0), (self._grid.rows, self._grid.cols), strict=True)
-        )
-        numbers = [row * self._grid.cols + column for row in rows for column in columns]
-        light = self.tiles(numbers, time).reshape(len(rows), len(columns), TILE, TILE, 3).swapaxes(1, 2)
-        light = light.reshape(len(rows) * TILE, len(columns) * TILE, 3)
-        first = np.array([rows[0], columns[0]]) * TILE
-        Gaps(gaps.target - first, gaps.source - first).fill(light)
-        corner = np.array([y, x]) - border - first
-        before = np.maximum(-corner, 0)
-        after = np.maximum(corner + TILE + 2 * border - light.shape[:2], 0)
-        light = np.pad(light, (*zip(before, after, strict=True), (0, 0)), mode="symmetric")
-        top, left = corner + before
-        return np.ascontiguousarray(light[top : top + TILE + 2 * border, left : left + TILE + 2 * border])
 
     def tiles(self, numbers: Sequence[int], time: float) -> np.ndarray:
         """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; gaps are not filled, empty tiles are 0."""
@@ -126,7 +88,9 @@ class SheetDecoder:
         image = np.zeros((self._grid.height, self._grid.width, 3), np.float32)
         for numbers in self._stored():
             place(image, self.tiles(numbers.tolist(), time), numbers, self._grid)
-        self._gaps.fill(image)
+        # As a baker dilates charts: a bilinear read at the edge of a chart includes texels outside it.
+        target, source = self._gaps
+        image[target] = image[source]
         return image
 
     def _stored(self) -> list[np.ndarray]:

@@ -275,7 +275,7 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
             if not 0 < np.count_nonzero(2.0 * light >= light.max()) <= _FEW_TEXELS < np.count_nonzero(valid):
                 continue
             decoder = decoder or SheetDecoder(model, device)
-            decoded = decoder.tile(tile, stamp)[: valid.shape[0], : valid.shape[1]]
+            decoded = decoder.tiles([tile], stamp)[0, : valid.shape[0], : valid.shape[1]]
             lost.add(texels[valid], decoded[valid], _place(tile, stamp))
     return lost.warnings(model.name, *_LOST)
 

@@ -26,7 +26,7 @@ def decode_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
     """
     _check(model, number, time)
     if model.kind[number] == TileKind.CONSTANT:
-        return _filled(_constant(model, number, time))
+        return np.broadcast_to(_constant(model, number, time), (TILE, TILE, 3)).copy()
     if model.kind[number] == TileKind.FRAMES:
         before, after, share = model.axis.neighbours(time)
         early, late = (_frame(model, number, at) ** model.profile.gamma for at in (before, after))
@@ -36,17 +36,6 @@ def decode_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
 
 def colour_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
     """Decodes one tile to gamma space, radiance ** (1 / gamma), float64 [128, 128, 3]; see `decode_tile64`."""
-    _check(model, number, time)
-    kind = model.kind[number]
-    if kind == TileKind.EMPTY:
-        return np.zeros((TILE, TILE, 3))
-    if kind == TileKind.CONSTANT:
-        return _filled(_constant(model, number, time) ** (1.0 / model.profile.gamma))
-    reads = model.axis.reads(time)
-    if kind == TileKind.FRAMES and model.axis.neighbours(time)[2] == 0:
-        return _frame(model, number, model.axis.neighbours(time)[0])
-    if kind != TileKind.FRAMES and len(reads) == 1:
-        return _colour(model, number, reads[0][0])
     return decode_tile64(model, number, time) ** (1.0 / model.profile.gamma)
 
 
@@ -104,10 +93,6 @@ def _constant(model: SheetModel, number: int, time: float) -> np.ndarray:
     return (1.0 - share) * rows[before] + share * rows[after]
 
 
-def _filled(colour: np.ndarray) -> np.ndarray:
-    return np.broadcast_to(colour, (TILE, TILE, 3)).copy()
-
-
 def _network_output(model: SheetModel, number: int, place: int, time: float) -> np.ndarray:
     """Returns the output of a tile's network at one time, normalised colour [128, 128, 3]."""
     profile = model.profile
@@ -135,9 +120,8 @@ def _network_output(model: SheetModel, number: int, place: int, time: float) -> 
     net = (model.net if dynamic else model.net_static)[row].astype(np.float64)
     split = (inputs + width + 2) * width
     hidden, output = net[:split].reshape(-1, width), net[split:].reshape(-1, 3)
-    act = _gelu_exact if profile.gelu == "exact" else _gelu_tanh
-    x = act(features @ hidden[:inputs] + hidden[inputs])
-    x = act(x @ hidden[inputs + 1 : -1] + hidden[-1])
+    x = _gelu(features @ hidden[:inputs] + hidden[inputs], profile.gelu)
+    x = _gelu(x @ hidden[inputs + 1 : -1] + hidden[-1], profile.gelu)
     return x @ output[:-1] + output[-1]
 
 
@@ -152,9 +136,7 @@ def _along(values: np.ndarray, at: np.ndarray, periodic: bool = False) -> np.nda
     return (1.0 - share) * values[pair[0]] + share * values[pair[1]]
 
 
-def _gelu_exact(x: np.ndarray) -> np.ndarray:
-    return 0.5 * x * (1.0 + erf(x / math.sqrt(2.0)))
-
-
-def _gelu_tanh(x: np.ndarray) -> np.ndarray:
+def _gelu(x: np.ndarray, kind: str) -> np.ndarray:
+    if kind == "exact":
+        return 0.5 * x * (1.0 + erf(x / math.sqrt(2.0)))
     return 0.5 * x * (1.0 + np.tanh(math.sqrt(2.0 / math.pi) * (x + 0.044715 * x**3)))

@@ -4,20 +4,24 @@ No pixels are read here. The layout follows the scene configuration of neural-dy
 of atlases and layers; the plain set of one lightmap for each time has one atlas "0" with one layer "light".
 """
 
-import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from wlm.config import check_settings
 from wlm.errors import WlmError
 from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
 from wlm.formats.reading import named_file, read_json_file
 from wlm.lightmap.hours import DAY, hours_of_names
-from wlm.lightmap.sheet import LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS, VALUE_RANGES
+from wlm.lightmap.sheet import LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS
 
 SET_FILE = "set.json"
 
@@ -171,7 +175,7 @@ def count_of(items: Sequence[object], noun: str) -> str:
 
 def is_name(value: object) -> bool:
     """Returns whether a value can name a layer, an atlas or a channel."""
-    return is_text(value) and len(value) <= MOST_NAME and value.isprintable()
+    return isinstance(value, str) and bool(value.strip()) and len(value) <= MOST_NAME and value.isprintable()
 
 
 def state_folders(folder: Path) -> list[Path]:
@@ -284,203 +288,154 @@ def _labelled(path: Path, *place: int) -> Source:
 def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
     """Reads a `set.json`."""
     content = read_json_file(path, "the set")
-    if not isinstance(content, dict):
-        raise WlmError(f"{path}: expected a JSON object, got {_kind(content)}")
-    plain = "layers" not in content
-    if plain:
-        layers = (LayerInfo(LIGHT.layer, LIGHT.encoding, stored=_stored(path, content, "")),)
-        expected = "a whole number of texels above 0"
-        size = tuple(_field(path, content, key, "", _is_size, expected) for key in ("height", "width"))
-        atlases = (AtlasInfo(LIGHT.atlas, _mask(path, content, "", trust), size, _mesh(path, content, "", trust)),)
+    kind = _Layered if isinstance(content, dict) and "layers" in content else _Plain
+    checked = check_settings(kind, content, f"{path}: ", extra="ignore")
+    found: dict[str, Path] = {}
+
+    def file(name: str, place: str) -> Path:
+        if name not in found:
+            found[name] = named_file(path, name, f"{path}: {place}", trust)
+        return found[name]
+
+    def atlas(name: str, entry: _Atlas, place: str) -> AtlasInfo:
+        mask = entry.mask or "all"
+        mask = mask if mask in _MASK_WORDS else str(file(mask, f"{place}mask"))
+        size = None if entry.height is None or entry.width is None else (entry.height, entry.width)
+        return AtlasInfo(name, mask, size, None if entry.mesh is None else file(entry.mesh, f"{place}mesh"))
+
+    states: list[dict[tuple[str, str], Source]] = []
+    if isinstance(checked, _Plain):
+        layers: tuple[LayerInfo, ...] = (LayerInfo(LIGHT.layer, LIGHT.encoding, stored=checked.stored),)
+        atlases: tuple[AtlasInfo, ...] = (atlas(LIGHT.atlas, checked, ""),)
+        for i, one in enumerate(checked.lightmaps):
+            picture = file(one.file, f"lightmaps.{i}.file")
+            states.append({(LIGHT.atlas, LIGHT.layer): Source(picture, picture.name)})
+        labels = [source.label for state in states for source in state.values()]
     else:
-        named = _named(path, content, "layers", "an object of layers")
-        layers = tuple(_layer(path, name, value) for name, value in named.items())
-        named = _named(path, content, "atlases", "an object of atlases")
-        atlases = tuple(_atlas(path, name, value, trust) for name, value in named.items())
-    if len(layers) > MOST_CHANNELS or len(layers) * len(atlases) > MOST_SHEETS:
-        raise WlmError(f"{path}: expected at most {MOST_CHANNELS} layers, {MOST_SHEETS} in all atlases together")
-    entries = _field(path, content, "lightmaps", "", _is_list, "a list of lightmaps")
-    name, period = path.resolve().parent.name, None
-    if content.get("name") is not None:
-        name = _field(path, content, "name", "", is_text, "a name")
-    if content.get("period_hours") is not None:
-        period = float(
-            _field(path, content, "period_hours", "", lambda value: _is_number(value) and value > 0, "a number above 0")
-        )
-    if len(entries) > TIMES:
-        raise WlmError(f"{path}: lightmaps: expected at most {TIMES:,} entries, got {len(entries):,}")
-    states, stamps, found = [], [], {}
-    for i, entry in enumerate(entries):
-        place = f"lightmaps[{i}]"
-        if not isinstance(entry, dict):
-            keys = "time_hours, file" if plain else "time_hours, files"
-            raise WlmError(f"{path}: {place}: expected an object ({keys}), got {_kind(entry)}")
-        if plain:
-            _field(path, entry, "file", f"{place}.", is_text, "the name of a lightmap")
-            source = _source(path, entry["file"], f"{place}.file", found, trust)
-            states.append({(LIGHT.atlas, LIGHT.layer): replace(source, label=source.path.name)})
-        else:
-            files = _field(path, entry, "files", f"{place}.", _is_object, "an object of atlases")
+        layers = tuple(LayerInfo(name, **dict(entry)) for name, entry in checked.layers.items())
+        atlases = tuple(atlas(name, entry, f"atlases.{name}.") for name, entry in checked.atlases.items())
+        labels = [f"lightmaps.{i}" for i in range(len(checked.lightmaps))]
+        for label, state in zip(labels, checked.lightmaps, strict=True):
             states.append({})
-            for atlas in atlases:
-                if atlas.name not in files:
-                    continue
-                of_atlas = _field(path, files, atlas.name, f"{place}.files.", _is_object, "an object of layers")
-                for layer in layers:
-                    if layer.name not in of_atlas:
-                        continue
-                    at, expected = f"{place}.files.{atlas.name}.", "a file, or an object (file, slice, slices)"
-                    value = _field(path, of_atlas, layer.name, at, _is_source, expected)
-                    states[-1][atlas.name, layer.name] = _source(path, value, at + layer.name, found, trust)
+            for own, layer in product(checked.atlases, checked.layers):
+                if (entry := state.files.get(own, {}).get(layer)) is not None:
+                    place = f"{label}.files.{own}.{layer}"
+                    states[-1][own, layer] = _labelled(file(entry.file, place), entry.slice, entry.slices)
             if not states[-1]:
-                raise WlmError(f"{path}: {place}.files: expected a picture, found none of the atlases and layers")
-        if times is None:
-            stamps.append(float(_field(path, entry, "time_hours", f"{place}.", _is_number, "a finite number")))
-    held = [key for state in states for key in state]
-    for i, noun, infos in ((0, "atlas", atlases), (1, "layer", layers)):
-        if lone := sorted({info.name for info in infos} - {key[i] for key in held}):
-            raise WlmError(f"{path}: {noun} {lone[0]}: expected a picture of it in an entry of lightmaps, found none")
-    if times is not None:
-        _check_count(path, states, times, "lightmap" if plain else "state")
-    labels = [source.label for state in states for source in state.values()] if plain else None
+                raise WlmError(f"{path}: {label}.files: expected a picture, found none of the atlases and layers")
+        for i, noun, names in ((0, "atlas", checked.atlases), (1, "layer", checked.layers)):
+            if lone := sorted(set(names) - {key[i] for state in states for key in state}):
+                raise WlmError(
+                    f"{path}: {noun} {lone[0]}: expected a picture of it in an entry of lightmaps, found none"
+                )
+    stamps = [one.time_hours for one in checked.lightmaps] if times is None else times
+    _check_count(path, states, stamps, "lightmap")
+    if None in stamps:
+        raise WlmError(f"{path}: lightmaps.{stamps.index(None)}.time_hours: expected a finite number, found none")
     return Listing(
-        name=name,
+        name=checked.name or path.resolve().parent.name,
         where=path,
-        times=stamps if times is None else times,
-        period=period,
+        times=stamps,
+        period=checked.period_hours,
         layers=layers,
         atlases=atlases,
         states=states,
-        labels=labels or [f"lightmaps[{i}]" for i in range(len(states))],
+        labels=labels,
         origin="" if times is None else _GIVEN,
     )
 
 
-def _named(path: Path, content: Mapping[str, Any], key: str, expected: str) -> dict[str, Any]:
-    """Returns a JSON object of named entries from a field; an empty one is an error."""
-    values = _field(path, content, key, "", lambda value: _is_object(value) and bool(value), expected)
-    for name in values:
-        if not is_name(name):
-            raise WlmError(f"{path}: {key}: expected names of 1 to {MOST_NAME} printable characters")
-    return values
+def _text(value: str) -> str:
+    if not value.strip() or "\0" in value:
+        raise PydanticCustomError("text", "expected a name that is not blank and has no NUL")
+    return value
 
 
-def _layer(path: Path, name: str, value: Any) -> LayerInfo:
-    """Reads the description of a layer: an encoding, or an object with `encoding` and optional `channels`."""
-    place, options = f"layers.{name}", {"encoding": value} if isinstance(value, str) else value
-    if not isinstance(options, dict):
-        raise WlmError(f"{path}: {place}: expected an encoding or an object (encoding, channels), got {_kind(value)}")
-    names = ", ".join(VALUE_RANGES)
-    encoding = _field(
-        path, options, "encoding", f"{place}.", lambda text: text in list(VALUE_RANGES), f"one of {names}"
-    )
-    stored = _stored(path, options, f"{place}.") if encoding == LIGHT.encoding else None
-    if options.get("channels") is None:
-        return LayerInfo(name, encoding, stored=stored)
-    channels = _field(path, options, "channels", f"{place}.", _is_list, f"a list of 1 to {MOST_CHANNELS} channels")
-    named = len(channels) <= MOST_CHANNELS and all(is_name(channel) for channel in channels)
-    if not named or len(set(channels)) < len(channels):
-        raise WlmError(f"{path}: {place}.channels: expected 1 to {MOST_CHANNELS} different names of channels")
-    return LayerInfo(name, encoding, tuple(channels), stored)
+def _word(value: str) -> str:
+    if not is_name(value):
+        raise PydanticCustomError("name", f"expected a name of 1 to {MOST_NAME} printable characters")
+    return value
 
 
-def _stored(path: Path, holder: dict[str, Any], place: str) -> str | None:
-    """Reads how files store the light of a layer, such as "rgbm:8:2"; None if the field is absent."""
-    if holder.get("stored") is None:
-        return None
-    return _field(path, holder, "stored", place, is_text, "an encoding, such as srgb or rgbm:8:2")
+_Text = Annotated[str, AfterValidator(_text)]
+_Word = Annotated[str, AfterValidator(_word)]
+_Texels = Annotated[int, Field(gt=0)] | None
 
 
-def _atlas(path: Path, name: str, value: Any, trust: bool) -> AtlasInfo:
-    """Reads the description of an atlas: an object with optional `width`, `height`, `mask` and `mesh`."""
-    place = f"atlases.{name}"
-    if not isinstance(value, dict):
-        raise WlmError(f"{path}: {place}: expected an object (width, height, mask, mesh), got {_kind(value)}")
-    size = None
-    if value.get("width") is not None or value.get("height") is not None:
-        expected = "a whole number of texels above 0"
-        size = tuple(_field(path, value, key, f"{place}.", _is_size, expected) for key in ("height", "width"))
-    place += "."
-    return AtlasInfo(name, _mask(path, value, place, trust), size, _mesh(path, value, place, trust))
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, strict=True, allow_inf_nan=False)
 
 
-def _mask(path: Path, holder: dict[str, Any], place: str, trust: bool) -> str:
-    """Reads the mask of an atlas: "all", "alpha" or the path of a PNG; "all" if none is named."""
-    if holder.get("mask") is None:
-        return "all"
-    mask = _field(path, holder, "mask", place, is_text, 'the name of a PNG, "alpha" or "all"')
-    return mask if mask in _MASK_WORDS else str(named_file(path, mask, f"{path}: {place}mask", trust))
+class _Picture(_Part):
+    file: _Text
+    slice: int = Field(0, ge=0)
+    slices: int = Field(1, gt=0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_name(cls, value: Any) -> Any:
+        return {"file": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.slice >= self.slices:
+            raise PydanticCustomError("slice", f"slice: expected a whole number from 0 to {self.slices - 1}")
+        return self
 
 
-def _mesh(path: Path, holder: dict[str, Any], place: str, trust: bool) -> Path | None:
-    if holder.get("mesh") is None:
-        return None
-    file = _field(path, holder, "mesh", place, is_text, "the name of a mesh")
-    return named_file(path, file, f"{path}: {place}mesh", trust)
+class _Layer(_Part):
+    encoding: Literal["radiance", "unit", "signed"]
+    channels: tuple[_Word, ...] | None = Field(None, min_length=1, max_length=MOST_CHANNELS, strict=False)
+    stored: _Text | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_encoding(cls, value: Any) -> Any:
+        return {"encoding": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(set(self.channels or ())) < len(self.channels or ()):
+            raise PydanticCustomError("channels", "channels: expected different names, found one twice")
+        return self
 
 
-def _source(path: Path, value: Any, place: str, found: dict[str, Path], trust: bool) -> Source:
-    """Reads the entry of a picture: a file, or a slice of one. `found` caches resolved paths of files named before."""
-    options = {"file": value} if isinstance(value, str) else value
-    file = _field(path, options, "file", f"{place}.", is_text, "the name of a picture")
-    if file not in found:
-        found[file] = named_file(path, file, f"{path}: {place}", trust)
-    if "slice" not in options and "slices" not in options:
-        return _labelled(found[file])
-    slices = _field(path, options, "slices", f"{place}.", _is_size, "a whole number above 0")
-    expected = f"a whole number from 0 to {slices - 1}"
-    index = _field(path, options, "slice", f"{place}.", lambda at: at == 0 or (_is_size(at) and at < slices), expected)
-    return _labelled(found[file], int(index), slices)
+class _Atlas(_Part):
+    width: _Texels = None
+    height: _Texels = None
+    mask: _Text | None = None
+    mesh: _Text | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.width is None) != (self.height is None):
+            raise PydanticCustomError("size", "width and height: expected both or neither, found one")
+        return self
 
 
-def _is_object(value: object) -> bool:
-    return isinstance(value, dict)
+class _Time(_Part):
+    time_hours: float | None = None
 
 
-def _is_source(value: object) -> bool:
-    return is_text(value) or isinstance(value, dict)
+class _PlainTime(_Time):
+    file: _Text
 
 
-def _field(path: Path, holder: dict[str, Any], key: str, place: str, ok: Callable[[Any], bool], expected: str) -> Any:
-    """Returns `holder[key]` if `ok` accepts it. For messages: `place` of the object, such as `lightmaps[0].`."""
-    if key not in holder:
-        raise WlmError(f"{path}: {place}{key} is missing; expected {expected}")
-    if not ok(holder[key]):
-        raise WlmError(f"{path}: {place}{key}: expected {expected}, got {_kind(holder[key])}")
-    return holder[key]
+class _LayeredTime(_Time):
+    files: dict[str, dict[str, _Picture]]
 
 
-def is_text(value: object) -> bool:
-    """Returns whether a value is text that can name a file or a set: not blank, and valid in file names."""
-    # File names cannot have a NUL or half of a surrogate pair.
-    if not isinstance(value, str) or not value.strip() or "\0" in value:
-        return False
-    return not any("\ud800" <= character <= "\udfff" for character in value)
+class _Set(_Part):
+    name: _Text | None = None
+    period_hours: float | None = Field(None, gt=0)
 
 
-def _is_number(value: object) -> bool:
-    """Returns whether a JSON value is a finite number that is not too large for a float."""
-    # Python's True is an int, and its JSON reader accepts NaN, Infinity and integers of any length.
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return abs(value) <= 1e300
+class _Plain(_Set, _Atlas):
+    lightmaps: list[_PlainTime] = Field(min_length=1, max_length=TIMES)
+    stored: _Text | None = None
 
 
-def _is_list(value: object) -> bool:
-    """Returns whether a value is a list that is not empty."""
-    return isinstance(value, list) and bool(value)
-
-
-def _is_size(value: object) -> bool:
-    """Returns whether a value is a whole number above 0."""
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-
-def _kind(value: object) -> str:
-    """Describes a JSON value in a message: the value itself, or its kind if it is long."""
-    if isinstance(value, dict):
-        return "an object"
-    if isinstance(value, list):
-        return f"a list of {len(value)}" if value else "an empty list"
-    text = json.dumps(value) if not isinstance(value, int) or abs(value) < 1e300 else "a very large number"
-    return text if len(text) <= 60 else text[:57] + "..."
+class _Layered(_Set):
+    layers: dict[_Word, _Layer] = Field(min_length=1, max_length=MOST_CHANNELS)
+    atlases: dict[_Word, _Atlas] = Field(min_length=1, max_length=MOST_SHEETS)
+    lightmaps: list[_LayeredTime] = Field(min_length=1, max_length=TIMES)

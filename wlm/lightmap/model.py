@@ -100,7 +100,7 @@ class SheetModel:
     Attributes:
         name, width, height, times, period: Properties of the input, see `wlm.lightmap.data.SheetFrames`.
         profile: The settings of the fit of this sheet.
-        mask: bool [H, W], true where a texel is valid; gaps are filled after decoding (`wlm.lightmap.gaps`).
+        mask: bool [H, W], true where a texel is valid; gaps are filled after decoding (`wlm.texels.near_gaps`).
         kind: uint8 [tiles], `TileKind` of each tile of the grid, row-major; EMPTY also for tiles that were not fitted.
         uv: BC7 blocks of F_uv.
         uvt: BC7 blocks of F_uvt, slice by slice.

@@ -13,8 +13,9 @@ from enum import IntEnum
 import numpy as np
 
 from wlm.errors import WlmError
+from wlm.formats.limits import check_sides
 from wlm.lightmap.data import SheetFrames
-from wlm.texels import check_size, fill_gaps
+from wlm.texels import fill_gaps
 from wlm.workers import each
 
 TILE = 128
@@ -48,7 +49,7 @@ class TileGrid:
     @classmethod
     def of(cls, height: int, width: int) -> TileGrid:
         """Makes the grid of a map of `height` x `width` texels; raises WlmError if the size is out of range."""
-        check_size(height, width)
+        check_sides("size", width, height)
         return cls(height, width, -(-height // TILE), -(-width // TILE))
 
     @property
@@ -110,9 +111,11 @@ class TileCut:
     light: list[np.ndarray]
     mask: list[np.ndarray]
 
-    def encoded(self, gamma: float) -> TileData:
-        """Converts the tiles to padded gamma-space colours, which take N * T * 192 KiB."""
-        colour = np.zeros((len(self.index), len(self.light[0]), TILE, TILE, 3), np.float32)
+    def encoded(self, gamma: float, padded: bool = True) -> TileData:
+        """Converts the tiles to gamma-space colours, padded to 128 x 128 texels, which take N * T * 192 KiB; a single
+        tile that isn't `padded` keeps its height and width."""
+        size = (TILE, TILE) if padded else self.mask[0].shape
+        colour = np.zeros((len(self.index), len(self.light[0]), *size, 3), np.float32)
 
         def encode(i: int) -> None:
             valid, out = self.mask[i], colour[i]
@@ -126,7 +129,7 @@ class TileCut:
                 np.power(out, np.float32(1.0 / gamma), out=out)
 
         list(each(encode, range(len(self.index))))
-        return TileData(self.index, colour, np.stack([_whole(valid) for valid in self.mask]))
+        return TileData(self.index, colour, np.stack([_whole(valid) if padded else valid for valid in self.mask]))
 
 
 class TileKind(IntEnum):

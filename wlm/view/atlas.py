@@ -29,7 +29,7 @@ def draw(
         scene: The scene.
         samplers: Decoders by name.
         view: The camera.
-        resolution: Pixels along a side.
+        resolution: Width and height of the picture in pixels.
         device: "cpu" or "cuda:N", the device of the decoders.
         state: The index of the lighting state.
 
@@ -75,7 +75,7 @@ def comparison(
         WlmError: The mesh is visible in no view, or the file cannot be written.
     """
     if not samplers or not views:
-        raise ValueError("expected at least one decoder and one view")
+        raise ValueError("samplers, views: expected at least one decoder and one view, found none")
     drawn = {}
     for number, view in enumerate(views, 1):
         pictures, hit = draw(scene, {"original": original(scene, device), **samplers}, view, resolution, device)
@@ -84,7 +84,7 @@ def comparison(
             window = tuple(slice(int(line.argmax()), len(line) - int(line[::-1].argmax())) for line in lines)
             drawn[f"view {number}"] = {name: picture[window] for name, picture in pictures.items()}, hit[window]
     if not drawn:
-        raise WlmError(f"{scene.name}: cannot draw it: no view shows it")
+        raise WlmError(f"{scene.name}: cannot draw it: no camera shows a surface that has a lightmap")
     white = white_of(np.concatenate([pictures["original"][hit] for pictures, hit in drawn.values()]))
     rows = {}
     for label, (pictures, hit) in drawn.items():

@@ -56,16 +56,17 @@ def contact_sheet(
     *,
     columns: int = MOST_COLUMNS,
 ) -> tuple[int, ...]:
-    """Writes a PNG of pictures in labelled rows; if there are too many for a row, evenly spread ones are chosen.
+    """Writes a PNG of rows of pictures, with a label on the left of each row. If the rows have more than `columns`
+    pictures, that many are chosen, evenly spread and at the same places in each row.
 
     Args:
         path: The PNG to write; its folder must exist.
         rows: Pictures uint8 [H, W, 3] by label, the same number in each row, those of a row of one size.
         titles: Titles of the columns, one for each picture of a row; or none.
-        columns: Most pictures in a row.
+        columns: The largest number of pictures in a row.
 
     Returns:
-        Indices of the chosen pictures.
+        The places in a row of the chosen pictures, from 0.
 
     Raises:
         ValueError: There is no picture, or they differ in size or number.
@@ -74,10 +75,10 @@ def contact_sheet(
     counts = {len(row) for row in rows.values()}
     uneven = any(len({cell.shape for cell in row}) > 1 for row in rows.values())
     if len(counts) != 1 or 0 in counts or columns < 1 or uneven:
-        raise ValueError(f"expected rows of as many pictures of one size, got {sorted(counts)}")
+        raise ValueError(f"rows: expected equally many pictures in each row, of one size, got rows of {sorted(counts)}")
     (count,) = counts
     if titles and len(titles) != count:
-        raise ValueError(f"titles: expected {count}, got {len(titles)}")
+        raise ValueError(f"titles: expected one for each of {count} columns, got {len(titles)}")
     chosen = [int(i) for i in np.unique(np.linspace(0, count - 1, min(columns, count)).round())]
     width, heights = max(row[0].shape[1] for row in rows.values()), [row[0].shape[0] for row in rows.values()]
     font = ImageFont.load_default(_FONT)

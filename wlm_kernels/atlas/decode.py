@@ -63,9 +63,12 @@ def axis_at(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
 
 
 @wp.func
-def _bilinear(texels: wp.array2d[wp.vec3h], x: Axis, y: Axis) -> wp.vec3:
-    top = wp.lerp(wp.vec3(texels[y.low, x.low]), wp.vec3(texels[y.low, x.high]), x.share)
-    bottom = wp.lerp(wp.vec3(texels[y.high, x.low]), wp.vec3(texels[y.high, x.high]), x.share)
+def _bilinear(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y: Axis) -> wp.vec3:
+    """Reads texture `page` bilinearly at x and y, after moving both texels of x to the right by `right` texels."""
+    left = right + x.low
+    next = right + x.high
+    top = wp.lerp(wp.vec3(pages[page, y.low, left]), wp.vec3(pages[page, y.low, next]), x.share)
+    bottom = wp.lerp(wp.vec3(pages[page, y.high, left]), wp.vec3(pages[page, y.high, next]), x.share)
     return wp.lerp(top, bottom, y.share)
 
 
@@ -77,8 +80,8 @@ def _decode(
     width: int,
     size: int,
     lut: wp.array3d[wp.uint16],
-    texels: wp.array2d[wp.vec3h],
-    blocks: wp.array2d[wp.vec3h],
+    texels: wp.array3d[wp.vec3h],
+    blocks: wp.array3d[wp.vec3h],
     first_block_code: int,
     # out:
     out: wp.array1d[wp.vec3],
@@ -92,9 +95,9 @@ def _decode(
     x = axis_at(entry, across[1], first_block_code)
     y = axis_at(lut[row, column, 1], down[1], first_block_code)
     if (int(entry) & _SIDE_MASK) < first_block_code:
-        out[i] = _bilinear(texels, x, y)
+        out[i] = _bilinear(texels, 0, 0, x, y)
     else:
-        out[i] = _bilinear(blocks, x, y)
+        out[i] = _bilinear(blocks, 0, 0, x, y)
 
 
 def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None, first_block_code=16) -> None:
@@ -106,24 +109,14 @@ def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None
         size: B, number of texels along a tile.
         lut: uint16 [ty, tx, 2], for each tile an entry for x and one for y: (first texel of the rectangle) << 4 |
             (number of its texels - 1).
-        texels: vec3h [Hp, Wp], the colour texture.
+        texels: vec3h [1, Hp, Wp], the colour texture.
         out: vec3 [N], written.
-        blocks: vec3h [Hb, Wb], the second colour texture, with sides that are multiples of 4; None if there is none.
+        blocks: vec3h [1, Hb, Wb], the second colour texture, with sides that are multiples of 4; None if there is none.
         first_block_code: An entry whose low 4 bits are at least this number refers to the second texture and counts
             blocks of 4 texels: (first block) << 4 | (`first_block_code` + number of blocks - 1). With 16 no entry does.
     """
     inputs = [uv, height, width, size, lut, texels, texels if blocks is None else blocks, first_block_code]
     wp.launch(_decode, uv.shape, inputs=inputs, outputs=[out], device=uv.device)
-
-
-@wp.func
-def _bilinear_at(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y: Axis) -> wp.vec3:
-    """Reads texture `page` bilinearly at x and y, after moving both texels of x to the right by `right` texels."""
-    left = right + x.low
-    next = right + x.high
-    top = wp.lerp(wp.vec3(pages[page, y.low, left]), wp.vec3(pages[page, y.low, next]), x.share)
-    bottom = wp.lerp(wp.vec3(pages[page, y.high, left]), wp.vec3(pages[page, y.high, next]), x.share)
-    return wp.lerp(top, bottom, y.share)
 
 
 @wp.func
@@ -187,9 +180,9 @@ def _decode_shared(
             y.high += below
         light = wp.vec3(0.0, 0.0, 0.0)
         if of_blocks:
-            light = _bilinear_at(blocks, page, right, x, y)
+            light = _bilinear(blocks, page, right, x, y)
         else:
-            light = _bilinear_at(texels, page, right, x, y)
+            light = _bilinear(texels, page, right, x, y)
         total += wp.cw_mul(factor[first + 1 + k], light)
     # Factors may be negative, and so may the sum.
     for c in range(3):

@@ -116,23 +116,13 @@ def _bounds(
 
 
 @wp.func
-def _row_difference(a: wp.mat33, v: int, b: wp.mat33, u: int) -> float:
-    return wp.abs(a[v, 0] - b[u, 0]) + wp.abs(a[v, 1] - b[u, 1]) + wp.abs(a[v, 2] - b[u, 2])
-
-
-@wp.func
 def _row_differences(a: wp.mat33, b: wp.mat33) -> wp.mat33:
-    return wp.mat33(
-        _row_difference(a, 0, b, 0),
-        _row_difference(a, 0, b, 1),
-        _row_difference(a, 0, b, 2),
-        _row_difference(a, 1, b, 0),
-        _row_difference(a, 1, b, 1),
-        _row_difference(a, 1, b, 2),
-        _row_difference(a, 2, b, 0),
-        _row_difference(a, 2, b, 1),
-        _row_difference(a, 2, b, 2),
-    )
+    """Returns the matrix of the differences |a_v - b_u| of rows v of a and rows u of b, summed over the channels."""
+    out = wp.mat33()
+    for v in range(3):
+        for u in range(3):
+            out[v, u] = wp.abs(a[v, 0] - b[u, 0]) + wp.abs(a[v, 1] - b[u, 1]) + wp.abs(a[v, 2] - b[u, 2])
+    return out
 
 
 @wp.func
@@ -229,22 +219,6 @@ def _spans(
         most = wp.max(most, mean)
     low[i] = least
     high[i] = most
-
-
-@wp.kernel(enable_backward=False)
-def _take(
-    # in:
-    patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
-    index: wp.array1d[int],
-    # out:
-    taken: wp.array1d[Patch],
-    taken_bounds: wp.array2d[Bounds],
-):
-    i = wp.tid()
-    taken[i] = patches[index[i]]
-    for level in range(bounds.shape[1]):
-        taken_bounds[i, level] = bounds[index[i], level]
 
 
 @wp.kernel(enable_backward=False)
@@ -373,12 +347,8 @@ def part(whole: Graph, nodes: np.ndarray) -> Graph:
 
 
 def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
-    device = patches.device
-    out = wp.empty(len(nodes), dtype=Patch, device=device)
-    out_bounds = wp.empty((len(nodes), bounds.shape[1]), dtype=Bounds, device=device)
-    index = wp.array(nodes.astype(np.int32), dtype=int, device=device)
-    wp.launch(_take, len(nodes), inputs=[patches, bounds, index], outputs=[out, out_bounds], device=device)
-    return out, out_bounds
+    pairs = (patches, Patch), (bounds, Bounds)
+    return tuple(wp.array(each.numpy()[nodes], dtype=kind, device=each.device) for each, kind in pairs)
 
 
 def find_edges(graph: Graph, begin: int, end: int, edge) -> None:

@@ -164,7 +164,8 @@ def _dominant(
     # out:
     patches: wp.array1d[Patch],
 ):
-    """Finds the dominant colour of one patch per thread: counts the samples in each histogram bin, in rising order."""
+    """Finds the dominant colour of one patch per thread: goes through the histogram bins that have samples, from the
+    lowest to the highest, counts the samples in each, and takes the colour of the fullest bin."""
     t = wp.tid()
     p = patches[t]
     size = size_of(p.level)
@@ -342,7 +343,7 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
     """
     start = np.concatenate([[0], np.cumsum(samples_of(np.array(SIZES, np.int64))[level])])
     if start[-1] > np.iinfo(np.int32).max:
-        raise ValueError(f"level: expected patches of at most {np.iinfo(np.int32).max} samples in all, got {start[-1]}")
+        raise ValueError(f"level: expected at most {np.iinfo(np.int32).max} samples in all patches, got {start[-1]}")
     samples = wp.empty(int(start[-1]), dtype=int, device=device)
     patches = wp.empty(len(level), dtype=Patch, device=device)
     bright = wp.empty(len(level), dtype=wp.uint8, device=device)

@@ -1,4 +1,4 @@
-"""Assembles decoded tiles into one RGB9E5 texture with mips, for `wlm.lightmap.runtime_texture.MapDecoder`."""
+"""Assembles decoded tiles into one RGB9E5 texture with mips, for `wlm.lightmap.runtime.MapDecoder`."""
 
 import warp as wp
 

@@ -1,8 +1,9 @@
 """The paper's method: group triangles, pack them, and tune two small textures (lightmap-uv-clustering-cascade,
 sections 3.1 to 3.3).
 
-T_p, the colour texture, starts as the repacked lightmap downscaled by epsilon_p. T_c, the lookup texture, starts as the
-coordinates of its own texels' centres; `wlm_kernels.atlas.cascade` describes how they are read. Adam then tunes both:
+C(u) = T_p(F(T_c(u))) (eq. 7): the lookup texture T_c gives a coordinate, the triangle wave F folds it into [0, 1], and
+the colour texture T_p gives the colour; both are read bilinearly, by `wlm.ops.texture`. T_p starts as the repacked
+lightmap downscaled by epsilon_p, T_c as the coordinates of its own texels' centres. Adam then tunes both:
 
     space "views"   A step draws the mesh from one random camera of `views`, once with the old UVs and the lightmap,
                     its gaps filled, and once with the new UVs and the cascade. The loss is the L1 of the colours plus
@@ -12,11 +13,11 @@ coordinates of its own texels' centres; `wlm_kernels.atlas.cascade` describes ho
                     difference within a pair in place of an image's gradient. Places that no camera sees count too;
                     seams don't, since a pair doesn't cross one. This is our alternative.
 
-The paper leaves some points open. Here the loss is a sum and not a mean, which hardly changes Adam's steps. Radiance,
-and so T_p's rate, is in units of the lightmap's mean, since a dark lightmap would otherwise be tuned more coarsely than
-a bright one. After each step T_p is clamped to the range of half floats and T_c to [0, 1], the range of its 16 bits,
-where the folding of coordinates by eq. 8 changes nothing. `Profile.final_rate` lets rates, which are constant in the
-paper, decay.
+Eq. 8 has a floor in place of an absolute value, and would be -2 or 0 everywhere; here F(x) is 2 |x/2 - floor(x/2 +
+1/2)|. The paper leaves some points open. Here the loss is a sum and not a mean, which hardly changes Adam's steps.
+Radiance, and so T_p's rate, is in units of the lightmap's mean, since a dark lightmap would otherwise be tuned more
+coarsely than a bright one. After each step T_p is clamped to the range of half floats and T_c to [0, 1], the range of
+its 16 bits, where F changes nothing. `Profile.final_rate` lets rates, which are constant in the paper, decay.
 
 On CUDA gradients are added in any order: two fits with one seed differ in the last bits of each step.
 """
@@ -35,17 +36,18 @@ from wlm.atlas.colour import quantise
 from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace, snapped
 from wlm.atlas.resize import resized
-from wlm.atlas.stages import Stages
+from wlm.atlas.stages import Stages, one_thread
+from wlm.atlas.views import corner_weights
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part, check_parts
+from wlm.ops.raster import texture
 from wlm.ops.views import DISTANCE, ZOOM, normalised, sphere_views
 from wlm.system import Meter, OnProgress
 from wlm.texels import fill_gaps
-from wlm_kernels.atlas import cascade as kernels
 from wlm_kernels.atlas.patches import ORDERS
-from wlm_kernels.raster import texture as texture_kernels
+from wlm_kernels.atlas.surface import surface_points
 from wlm_kernels.raster.rasterize import Rasterizer
 
 _CHUNK = {"cpu": 5, "cuda": 100}  # steps between two progress reports
@@ -69,26 +71,26 @@ def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters 
         return None
     # A black lightmap may use any number, since its triangles are all alike.
     brightest = float(sheet.lightmap[sheet.mask].max()) or 1.0
+    triangle = Part(np.int32, (count := len(sheet.triangle),), least=0, most=count - 1)
+    table = {
+        "group": triangle,
+        "representative": Part(np.int32, (None,), least=0, most=count - 1),
+        "order": Part(np.int8, (count,), least=0, most=len(ORDERS) - 1),
+        "distance": Part(np.float64, (count,), least=0.0),
+        "excluded": Part(np.bool_, (count,)),
+    }
+
+    def make() -> dict[str, np.ndarray]:
+        limits = {"threshold": profile.threshold, "colour_threshold": profile.colour_threshold}
+        limits["max_radiance"] = brightest if profile.max_radiance is None else profile.max_radiance
+        options = {"active": sheet.active, "device": stages.device, "progress": stages.progress}
+        return vars(cluster(sheet.uv, sheet.triangle, sheet.lightmap, **limits, **options))
+
     with stages("cluster"):
-        if (
-            stages.checkpoint is not None
-            and (kept := _kept_clusters(stages.checkpoint, len(sheet.triangle))) is not None
-        ):
-            return kept
-        clusters = cluster(
-            sheet.uv,
-            sheet.triangle,
-            sheet.lightmap,
-            threshold=profile.threshold,
-            colour_threshold=profile.colour_threshold,
-            max_radiance=brightest if profile.max_radiance is None else profile.max_radiance,
-            active=sheet.active,
-            device=stages.device,
-            progress=stages.progress,
-        )
-        if stages.checkpoint is not None:
-            stages.checkpoint.add_finished(0, vars(clusters))
-        return clusters
+        clusters = Clusters(**stages.batch(0, table, make))
+    if clusters.group.max() >= len(clusters.representative):
+        raise WlmError(f"{stages.checkpoint.path}: the checkpoint is damaged: a group has no representative triangle")
+    return clusters
 
 
 def fit_cascade(
@@ -128,7 +130,7 @@ def fit_cascade(
         facts = {
             "groups": int(np.count_nonzero(shares)),
             "shared": int(shares[shares > 1].sum()),
-            "charts": len(packed.to_lightmap),
+            "charts": len(packed.rotation),
             "packed": [packed.height, packed.width],
         }
     else:
@@ -187,7 +189,7 @@ def tune(
         WlmError: There is no such device, or the textures became NaN or infinite (the fit diverged).
     """
     device = interop.check_device(device)
-    with interop.stream(device):
+    with interop.stream(device), one_thread(device):
         step = _Step(sheet, uv, textures, profile, seed, device)
         graph = interop.StepGraph(step, device)
         meter, done = Meter(progress, "fit", profile.steps), 0
@@ -211,24 +213,10 @@ def tune(
                 checkpoint.save({1: step.state()})
         tuned = step.textures()
     if not (np.isfinite(tuned.colour).all() and np.isfinite(tuned.lut).all()):
-        raise WlmError(f"{sheet.name}: the fit diverged; use smaller learning rates than profile {profile.name}")
+        raise WlmError(
+            f"{sheet.name}: the fit diverged; use smaller learning rates than those of profile {profile.name}"
+        )
     return tuned
-
-
-def _kept_clusters(checkpoint: Checkpoint, count: int) -> Clusters | None:
-    triangle = Part(np.int32, (count,), least=0, most=count - 1)
-    table = {
-        "group": triangle,
-        "representative": Part(np.int32, (None,), least=0, most=count - 1),
-        "order": Part(np.int8, (count,), least=0, most=len(ORDERS) - 1),
-        "distance": Part(np.float64, (count,), least=0.0),
-        "excluded": Part(np.bool_, (count,)),
-    }
-    if (kept := checkpoint.finished(0, table)) is None:
-        return None
-    if kept["group"].max() >= len(kept["representative"]):
-        raise WlmError(f"{checkpoint.path}: the groups of triangles are damaged: a group has no representative")
-    return Clusters(**kept)
 
 
 def _sides(height: int, width: int, scale: float) -> tuple[int, int]:
@@ -258,48 +246,40 @@ class _Step:
         rates = np.outer(final + (1.0 - final) * cosine, [profile.colour_rate, profile.lut_rate])
         self._rates = torch.tensor(rates, dtype=torch.float32, device=device)
         self._rate = [torch.zeros((), device=device) for _ in range(2)]
-        groups = [{"params": [self._colour], "lr": self._rate[0]}]
-        if textures.lut.size:
-            groups.append({"params": [self._lut], "lr": self._rate[1]})
-        self._grads = [torch.zeros_like(self._colour), torch.zeros_like(self._lut)]
-        self._colour.grad, self._lut.grad = self._grads
-        on_cuda = device != "cpu"
-        self._adam = torch.optim.Adam(groups, capturable=on_cuda, fused=True)
-        self._textures = [_wrap(each, device) for each in (self._colour, self._lut)]
-        self._texture_grads = [_wrap(each, device) for each in self._grads]
-        self._image = _wrap(torch.tensor(sheet.lightmap / np.float32(self._unit), device=device), device)
-
+        self._tuned = {"colour": self._colour} | ({"lut": self._lut} if textures.lut.size else {})
+        groups = [{"params": [each], "lr": rate} for each, rate in zip(self._tuned.values(), self._rate, strict=False)]
+        for each in self._tuned.values():
+            each.grad = torch.zeros_like(each)  # of a fixed address
+        self._adam = torch.optim.Adam(groups, capturable=device != "cpu", fused=True)
+        self._image = torch.tensor(sheet.lightmap / np.float32(self._unit), device=device)
         self._step = torch.zeros(1, dtype=torch.int32, device=device)
         # An inactive triangle hides what is behind it; NaN excludes it from the loss.
         active = sheet.active[:, None, None]
-        self._corner, self._new_corner = (
-            wp.array(np.where(active, each, np.nan).astype(np.float32), dtype=wp.vec2, device=device)
+        self._corners = [
+            torch.tensor(np.where(active, each, np.nan), dtype=torch.float32, device=device)
             for each in (sheet.uv[sheet.triangle], uv)
-        )
-        if profile.space == "views":
-            self._points = _Views(sheet, profile, self._step, seed, device)
-        else:
-            self._points = _Surface(sheet, profile, self._step, seed, device)
-        count, shape = self._points.count, self._points.shape
-        self._uv, self._new_uv = (wp.empty(count, dtype=wp.vec2, device=device) for _ in range(2))
-        self._value, self._target, grad = (torch.zeros(count, 3, device=device) for _ in range(3))
-        self._value_array, self._target_array, self._value_grad = (
-            _wrap(each, device) for each in (self._value, self._target, grad)
-        )
-        self._difference, self._difference_grad = (_wrap(each.view(shape), device) for each in (self._value, grad))
+        ]
+        kind = _Views if profile.space == "views" else _Surface
+        self.points = kind(sheet, profile, self._step, seed, device)
 
     def __call__(self) -> None:
-        points = self._points
-        points.draw()
-        kernels.corner_points(points.triangle, points.barycentric, self._new_corner, self._new_uv)
-        kernels.corner_points(points.triangle, points.barycentric, self._corner, self._uv)
-        kernels.sample(*self._textures, self._new_uv, self._value_array)
-        texture_kernels.sample(self._image, self._uv, self._target_array)
-        self._value.sub_(self._target)
-        points.loss(self._difference, self._gradient, self._difference_grad)
-        for grad in self._grads:
-            grad.zero_()
-        kernels.sample_backward(*self._textures, self._new_uv, self._value_grad, *self._texture_grads)
+        self.points.draw()
+        shown = (self.points.triangle >= 0)[:, None]
+        triangle, weight = self.points.triangle.clamp(min=0).long(), corner_weights(self.points.barycentric)
+        # Points without a triangle are NaN.
+        old, new = (
+            torch.where(shown, (corner[triangle] * weight[..., None]).sum(1), torch.nan) for corner in self._corners
+        )
+        if "lut" in self._tuned:
+            colour = texture(self._colour, texture(self._lut, new), boundary="mirror")
+        else:
+            colour = texture(self._colour, new)
+        difference = (colour - texture(self._image, old)).nan_to_num()
+        self._adam.zero_grad(set_to_none=False)
+        loss = difference.abs().sum()
+        for pairs in self.points.pairs(difference):
+            loss = loss + self._gradient * pairs.abs().sum()
+        loss.backward()
         for rate, now in zip(self._rate, self._rates.index_select(0, self._step)[0], strict=True):
             rate.copy_(now)
         self._adam.step()
@@ -311,11 +291,9 @@ class _Step:
     def state(self) -> dict[str, np.ndarray]:
         """Returns the arrays that later steps depend on, by name: the textures and Adam's state."""
         tensors = {"step": self._step}
-        for group in self._adam.param_groups:
-            for parameter in group["params"]:
-                name = "colour" if parameter is self._colour else "lut"
-                moments = self._adam.state[parameter]
-                tensors |= {name: parameter} | {f"{name}.{key}": moments[key] for key in _MOMENTS}
+        for name, parameter in self._tuned.items():
+            moments = self._adam.state[parameter]
+            tensors |= {name: parameter} | {f"{name}.{key}": moments[key] for key in _MOMENTS}
         return {name: np.array(value.detach().cpu().numpy()) for name, value in tensors.items()}
 
     @torch.no_grad()
@@ -326,23 +304,20 @@ class _Step:
             ValueError: The state belongs to another fit; nothing has changed.
         """
         table = {"step": Part(np.int32, (1,), least=0, most=len(self._rates))}
-        for group in self._adam.param_groups:
-            for parameter in group["params"]:
-                name, shape = "colour" if parameter is self._colour else "lut", tuple(parameter.shape)
-                table |= {name: Part(np.float32, shape), f"{name}.step": Part(np.float32, (), least=0.0)}
-                table |= {f"{name}.{key}": Part(np.float32, shape) for key in _MOMENTS[1:]}
+        for name, parameter in self._tuned.items():
+            shapes = {name: parameter.shape} | {f"{name}.{key}": parameter.shape for key in _MOMENTS[1:]}
+            table |= {each: Part(np.float32, tuple(shape)) for each, shape in shapes.items()}
+            table[f"{name}.step"] = Part(np.float32, (), least=0.0)
         check_parts(state, table)
         values = {name: torch.from_numpy(np.array(value)) for name, value in state.items()}
         self._step.copy_(values["step"])
-        for group in self._adam.param_groups:
-            for parameter in group["params"]:
-                name = "colour" if parameter is self._colour else "lut"
-                parameter.copy_(values[name])
-                moments = self._adam.state[parameter]
-                moments["step"] = values[f"{name}.step"].to(parameter.device)
-                for key in _MOMENTS[1:]:
-                    # Both use the parameter's memory layout, which the fused step expects.
-                    moments[key] = torch.zeros_like(parameter).copy_(values[f"{name}.{key}"])
+        for name, parameter in self._tuned.items():
+            parameter.copy_(values[name])
+            moments = self._adam.state[parameter]
+            moments["step"] = values[f"{name}.step"].to(parameter.device)
+            for key in _MOMENTS[1:]:
+                # Both use the parameter's memory layout, which the fused step expects.
+                moments[key] = torch.zeros_like(parameter).copy_(values[f"{name}.{key}"])
 
     @property
     def done(self) -> int:
@@ -354,21 +329,25 @@ class _Step:
 
 
 class _Views:
-    """Supplies the points of each step for the space "views": the pixels of one random view."""
+    """Supplies the points of each step for the space "views": the pixels of one random view.
+
+    Attributes:
+        triangle, barycentric: int32 [N], the triangle at each point, -1 for none; float32 [N, 2], the weights of its
+            corners 0 and 1.
+    """
 
     def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
-        side = profile.resolution
-        self.count, self.shape = side * side, (side, side, 3)
+        self._side = profile.resolution
         axes = np.array([view.axes for view in sphere_views(profile.steps, seed)], np.float32).reshape(-1, 3, 3)
         self._axes = torch.tensor(axes, device=device)
         self._step = step
         self._position = torch.tensor(normalised(sheet.position, sheet.triangle), dtype=torch.float32, device=device)
         self._clip = torch.zeros(len(sheet.position), 4, device=device)
-        triangle = wp.array(sheet.triangle, dtype=int, device=device)
-        self._rasterizer = Rasterizer(triangle, side, side)
-        self._clip_array = _wrap(self._clip, device)
+        self._clip_array = interop.to_warp(self._clip)
+        self._rasterizer = Rasterizer(wp.array(sheet.triangle, dtype=int, device=device), self._side, self._side)
         raster = self._rasterizer.raster
-        self.triangle, self.barycentric = raster.triangle.flatten(), raster.barycentric.flatten()
+        self.triangle = wp.to_torch(raster.triangle).flatten()
+        self.barycentric = wp.to_torch(raster.barycentric).reshape(-1, 2)
 
     def draw(self) -> None:
         axes = self._axes.index_select(0, self._step)[0]
@@ -379,38 +358,39 @@ class _Views:
         self._clip.copy_(torch.stack([ZOOM * x, ZOOM * y, w - 1.0, w], 1))
         self._rasterizer.run(self._clip_array)
 
-    @staticmethod
-    def loss(difference: wp.array, weight: float, grad: wp.array) -> None:
-        kernels.image_loss(difference, weight, grad)
+    def pairs(self, values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Returns the differences between neighbours, of values [N, 3]: the image's gradient (section 3.3.3)."""
+        image = values.unflatten(0, (self._side, self._side))
+        return image.diff(dim=0), image.diff(dim=1)
 
 
 class _Surface:
-    """Supplies the points of each step for the space "uv": new pairs of random points on the mesh."""
+    """Supplies the points of each step for the space "uv": new pairs of random points on the mesh, with the attributes
+    of `_Views`; point i and point i + N / 2 are a pair."""
 
     def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
         pairs = max(1, profile.resolution**2 // (2 * _PIXELS_PER_POINT))
-        self.count, self.shape = 2 * pairs, (2 * pairs, 3)
-        self._seed = int(seed) % (1 << 30)
         position = normalised(sheet.position, sheet.triangle)[sheet.triangle]
         normal = np.cross(position[:, 1] - position[:, 0], position[:, 2] - position[:, 0])
         area = np.where(sheet.active, np.linalg.norm(normal, axis=1), 0.0)
-        self._area = wp.array(np.cumsum(area), dtype=wp.float64, device=device)
         texels = (sheet.uv * sheet.mask.shape[::-1])[sheet.triangle]
-        self._texels = wp.array(texels.astype(np.float32), dtype=wp.vec2, device=device)
-        self._step = _wrap(step, device)
-        self.triangle = wp.empty(self.count, dtype=int, device=device)
-        self.barycentric = wp.empty(self.count, dtype=wp.vec2, device=device)
+        self.triangle = torch.empty(2 * pairs, dtype=torch.int32, device=device)
+        self.barycentric = torch.empty((2 * pairs, 2), device=device)
+        self._inputs = (
+            wp.array(np.cumsum(area), dtype=wp.float64, device=device),
+            wp.array(texels.astype(np.float32), dtype=wp.vec2, device=device),
+            1.0,
+            int(seed) % (1 << 30),
+            interop.to_warp(step),
+            interop.to_warp(self.triangle),
+            interop.to_warp(self.barycentric, wp.vec2),
+        )
 
     def draw(self) -> None:
-        kernels.surface_points(self._area, self._texels, 1.0, self._seed, self._step, self.triangle, self.barycentric)
+        surface_points(*self._inputs)
 
     @staticmethod
-    def loss(difference: wp.array, weight: float, grad: wp.array) -> None:
-        kernels.pair_loss(difference, weight, grad)
-
-
-def _wrap(tensor: torch.Tensor, device: str) -> wp.array:
-    """Wraps a tensor's memory; an empty tensor, which Warp can't wrap, becomes an empty array."""
-    if tensor.numel():
-        return interop.to_warp(tensor)
-    return wp.empty(tuple(tensor.shape), dtype=float, device=device)
+    def pairs(values: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Returns the differences within the pairs, of values [N, 3]."""
+        first, second = values.chunk(2)
+        return (first - second,)

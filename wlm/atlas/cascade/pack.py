@@ -48,8 +48,8 @@ class Packed:
         source: int32 [F], the number of the triangle whose texels each triangle reads: its own or its representative's;
             -1 for a triangle that isn't active.
         chart: int32 [F], the new chart that each triangle reads; -1 for a triangle that isn't active.
-        to_lightmap: float64 [C, 2, 3], for each chart the affine map from (x, y, 1) in texels of the atlas to x and y
-            in texels of the lightmap.
+        rotation, shift: complex128 [C], the rigid motion of each chart: z = x + iy in texels of the lightmap goes
+            to rotation * z + shift in texels of the atlas; |rotation| is the scale.
     """
 
     height: int
@@ -58,7 +58,8 @@ class Packed:
     uv: np.ndarray
     source: np.ndarray
     chart: np.ndarray
-    to_lightmap: np.ndarray
+    rotation: np.ndarray
+    shift: np.ndarray
 
 
 def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
@@ -70,12 +71,12 @@ def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
         ValueError: `scale` isn't above 0, or the groups belong to another mesh.
     """
     if not 0.0 < scale < math.inf:
-        raise ValueError(f"scale: expected above 0, got {scale}")
+        raise ValueError(f"scale: expected a number above 0, got {scale}")
     count = len(sheet.triangle)
     source, order = np.arange(count, dtype=np.int32), np.zeros((count, 3), np.int64) + np.arange(3)
     if clusters is not None:
         if len(clusters.group) != count:
-            raise ValueError(f"clusters: expected {count} triangles, got {len(clusters.group)}")
+            raise ValueError(f"clusters: expected groups of {count} triangles, got those of {len(clusters.group)}")
         source = clusters.representative[clusters.group].astype(np.int32)
         order = np.array(ORDERS)[clusters.order]
     source = np.where(sheet.active, source, -1).astype(np.int32)
@@ -89,29 +90,20 @@ def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
     chart = np.full(count, -1, np.int32)
     chart[heads] = head_chart
     corner = np.zeros((count, 3, 2))
-    corner[heads] = _pairs(rotation[head_chart, None] * _complex(old[heads]) + shift[head_chart, None])
+    corner[heads] = _real(rotation[head_chart, None] * _complex(old[heads]) + shift[head_chart, None])
     active = source >= 0
     corner[active] = np.take_along_axis(corner[source[active]], order[active, :, None], 1)
     chart[active] = chart[source[active]]
     _place_inactive(corner, numbers, active)
 
-    inverse = 1.0 / rotation
-    origin = -inverse * shift
-    to_lightmap = np.stack(
-        [
-            np.stack([inverse.real, -inverse.imag, origin.real], -1),
-            np.stack([inverse.imag, inverse.real, origin.imag], -1),
-        ],
-        axis=1,
-    )
     uv = (corner / size).astype(np.float32).clip(0.0, 1.0)
-    return Packed(int(size[1]), int(size[0]), corner, uv, source, chart, to_lightmap)
+    return Packed(int(size[1]), int(size[0]), corner, uv, source, chart, rotation, shift)
 
 
 def regenerate(sheet: Sheet, packed: Packed, device: str = "cpu") -> tuple[np.ndarray, np.ndarray]:
     """Renders the new lightmap: each texel that a bilinear read of a chart can reach takes the lightmap's colour at
     that place. A point in a triangle takes the colour at the same barycentric coordinates in the old UVs, as in the
-    paper. Since a chart moves rigidly, one affine map converts all its points, also those just beyond its border.
+    paper. Since a chart moves rigidly, one map converts all its points, also those just beyond its border.
     Returns float32 [H_r, W_r, 3], linear, 0 outside of charts; and bool [H_r, W_r], true in charts."""
     height, width = packed.height, packed.width
     heads = np.flatnonzero(packed.source == np.arange(len(packed.source)))
@@ -122,9 +114,9 @@ def regenerate(sheet: Sheet, packed: Packed, device: str = "cpu") -> tuple[np.nd
     fans = rasterize_uv(points, torch.tensor(triangle, device=device), height, width).triangle.cpu().numpy()
     mask = fans >= 0
     row, column = np.nonzero(mask)
-    to_lightmap = packed.to_lightmap[packed.chart[heads[fans[mask] // len(fan)]]]
-    place = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], -1)
-    uv = (to_lightmap @ place[:, :, None])[:, :, 0] / sheet.mask.shape[::-1]
+    chart = packed.chart[heads[fans[mask] // len(fan)]]
+    old = (column + 0.5 + 1j * (row + 0.5) - packed.shift[chart]) / packed.rotation[chart]
+    uv = _real(old) / sheet.mask.shape[::-1]
     image = torch.tensor(sheet.lightmap, device=device)
     out = np.zeros((height, width, 3), np.float32)
     out[mask] = texture(image, torch.tensor(uv, dtype=torch.float32, device=device)).cpu().numpy()
@@ -152,7 +144,7 @@ def _pack_charts(
         label[thin] = label.max() + 1 + extra
         place, chart, placed, size = _uvunwrap(name, points, numbers, label, scale)
     if (chart < 0).any():
-        raise WlmError(f"{name}: uvunwrap left out {np.count_nonzero(chart < 0)} triangles: expected a place for each")
+        raise WlmError(f"{name}: the UV packer uvunwrap left out {np.count_nonzero(chart < 0)} triangles")
     rotation, shift = _motions(name, points[placed], place[placed], chart[placed], scale)
     return chart, rotation, shift, size
 
@@ -178,7 +170,7 @@ def _uvunwrap(
             max_area_distortion=1e9,
         )
     except uvunwrap.UnwrapError as error:
-        raise WlmError(f"{name}: uvunwrap: {error}") from error
+        raise WlmError(f"{name}: the UV packer uvunwrap failed: {error}") from error
     place, corner_chart = np.empty((len(points), 3, 2)), np.empty((len(points), 3), np.int64)
     place[order] = np.concatenate([np.asarray(each.corner_uvs, np.float64) for each in atlas.meshes]).reshape(-1, 3, 2)
     place *= [atlas.width, atlas.height]
@@ -194,7 +186,7 @@ def _uvunwrap(
     size = np.ceil(place[placed].reshape(-1, 2).max(0, initial=0.0) + _PADDING - 1e-3)
     if size.max() > _MOST:
         shape = f"{size[0]:.0f}x{size[1]:.0f}"
-        raise WlmError(f"{name}: the packed lightmap: expected at most {_MOST} texels along a side, got {shape}")
+        raise WlmError(f"{name}: scale: too large: {shape} texels under the new UVs, expected at most {_MOST} a side")
     return place, chart, placed, size
 
 
@@ -240,7 +232,9 @@ def _motions(
     shift = new_centre - rotation * centre
     deviation = np.abs(rotation[chart] * before + shift[chart] - after).max(initial=0.0)
     if deviation > _STRETCH:
-        raise WlmError(f"{name}: uvunwrap stretched a chart by {deviation:.3g} texels: expected at most {_STRETCH}")
+        raise WlmError(
+            f"{name}: the UV packer uvunwrap stretched a chart by {deviation:.3g} texels, at most {_STRETCH} fit"
+        )
     return rotation, shift
 
 
@@ -295,5 +289,5 @@ def _complex(points: np.ndarray) -> np.ndarray:
     return points[..., 0] + 1j * points[..., 1]
 
 
-def _pairs(values: np.ndarray) -> np.ndarray:
+def _real(values: np.ndarray) -> np.ndarray:
     return np.stack([values.real, values.imag], -1)

@@ -7,17 +7,14 @@ import numpy as np
 
 from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, FACTOR_BITS, MOST_PAGES, MOST_SIZE, TEXELS, Profile
 from wlm.atlas.shared.curves import MOST_MIXTURES, Candidate, costs
-from wlm.atlas.tiles.layout import allocate, place
+from wlm.atlas.tiles.layout import allocate, packed
 from wlm.errors import WlmError
-
-WIDTHS = np.linspace(0.7, 1.5, 9)
-"""Candidate widths of a page or a lookup texture, as multiples of the square root of its area."""
 
 _TRIES, _FULL = 12, 0.995  # attempts to place all tiles, and the used fraction of the bits that ends them
 _LEAST_GAIN = 2.0**-24
 _LESS = 0.95  # fraction of the bits at which the error is measured again, for the value of a bit
 _DROPPED = 8  # one in eight of the mixtures that aren't worth their factors is removed per round
-NO_ROOM = "budget: {:g} is less than the smallest tiles and their table take; give more"
+NO_ROOM = "budget: {:g} of the lightmaps' bits is less than the smallest tiles and lookup texture take; give more"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +76,7 @@ def allocated(tried: list[Candidate], bits: float, profile: Profile) -> Allocate
             at = np.flatnonzero(second == texture)
             step, shape = (BLOCK_SIDE if texture else 1), (0, 0, 0)
             if len(at):
-                first[at], page[at], side = packed(extents[chosen[at]] // step)
+                first[at], page[at], side = _on_pages(extents[chosen[at]] // step)
                 first[at] *= step
                 shape = (int(page[at].max()) + 1, *(step * each for each in side))
             elif not texture:
@@ -140,35 +137,19 @@ def _worth(
     return np.where(np.isinf(least)[of], never, error)
 
 
-def packed(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+def _on_pages(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Packs rectangles, int [T, 2] texels along x and y, on as few pages of equal size as possible. Returns the first
     texel of each, int64 [T, 2]; its page, int64 [T]; and rows and columns of a page.
 
     Raises:
         WlmError: All pages together are too small.
     """
-    order, pages = np.lexsort((size[:, 0], size[:, 1])), max(1, -(-int(size.prod(1).sum()) // MOST_SIZE**2))
-    while pages <= MOST_PAGES:
-        page = np.empty(len(size), np.int64)
+    order, page = np.lexsort((size[:, 0], size[:, 1])), np.empty(len(size), np.int64)
+    for pages in range(max(1, -(-int(size.prod(1).sum()) // MOST_SIZE**2)), MOST_PAGES + 1):
         page[order] = np.arange(len(size)) % pages  # the sizes are spread evenly over the pages
-        first, shape = _on_pages(size, page, pages)
+        first, shape = packed(size, [np.flatnonzero(page == number) for number in range(pages)])
         if max(shape) <= MOST_SIZE:
             return first, page, shape
-        pages += 1
-    raise WlmError(f"budget: too large for {MOST_PAGES} pages of {MOST_SIZE} texels along a side; give less")
-
-
-def _on_pages(size: np.ndarray, page: np.ndarray, pages: int) -> tuple[np.ndarray, tuple[int, int]]:
-    groups = [np.flatnonzero(page == number) for number in range(pages)]
-    most = max(float(size[group].prod(1).sum()) for group in groups)
-    best = None
-    for share in WIDTHS:
-        width = max(int(size[:, 0].max()), round(share * math.sqrt(most)))
-        first, height, widest = np.zeros((len(size), 2), np.int64), 0, 0
-        for group in groups:
-            first[group], tall = place(size[group], width)
-            height = max(height, tall)
-            widest = max(widest, int((first[group, 0] + size[group, 0]).max(initial=0)))
-        if best is None or widest * height < best[0]:
-            best = widest * height, first, (height, widest)
-    return best[1:]
+    raise WlmError(
+        f"budget: too large: tiles fill more than {MOST_PAGES} pages of {MOST_SIZE} x {MOST_SIZE} texels; give less"
+    )

@@ -9,8 +9,10 @@ with r_k the error of component k after it is stored: clipped at 0 and rounded, 
 component has a separate curve, and the last ones, which have the least energy, may be coarse, with one block each.
 """
 
+import functools
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -62,6 +64,11 @@ class SceneTiles:
     index: np.ndarray
     size: int
     device: str
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """The weight of each tile, float64 [T]."""
+        return self.weight.double().sum(1).cpu().numpy()
 
     def light(self, at: np.ndarray | slice) -> tuple[torch.Tensor, torch.Tensor]:
         """Returns the texels of the tiles `at` and the weights of their points, copied to the device."""
@@ -160,12 +167,8 @@ def candidates(
         error = np.repeat(tried[0].error.max(0)[None], len(choices), 0) if tried else np.zeros((len(choices), count))
         parts = {"number": Part(np.int64, (len(eager),), least=0, most=len(mixtures.factor) - 1)}
         parts["error"] = Part(np.float64, (len(choices), len(eager)), least=0.0)
-        kept = None if stages.checkpoint is None else stages.checkpoint.finished(batch + done, parts)
-        if kept is None:
-            found = _curves(tiles, eager, mixtures, sizes, choices, meter, done * count)
-            kept = dict(zip(("number", "error"), found, strict=True))
-            if stages.checkpoint is not None:
-                stages.checkpoint.add_finished(batch + done, kept)
+        make = functools.partial(_curves, tiles, eager, mixtures, sizes, choices, meter, done * count)
+        kept = stages.batch(batch + done, parts, make)
         number[eager], error[:, eager] = kept["number"], kept["error"]
         tried.append(Candidate(mixtures, number, choices, error, 0.0))
         left, chosen = _left(tried, bits)
@@ -186,7 +189,7 @@ def _curves(
     choices: list[Choice],
     meter: Meter,
     done: int,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> dict[str, np.ndarray]:
     """Returns each tile's mixture and errors, as `number` and `error` of `Candidate`, for the tiles `members`."""
     device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
     mixtures = mixtures.to(device)
@@ -208,9 +211,7 @@ def _curves(
         whole, shares = chosen.repeat_interleave(rank), weight.repeat_interleave(rank, 0)
         piece = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
         # The error of each component alone.
-        alone = torch.empty(
-            (len(sizes), len(chosen), rank), dtype=torch.float64, device=device
-        )  # error of each component
+        alone = torch.empty((len(sizes), len(chosen), rank), dtype=torch.float64, device=device)
         for i, size in enumerate(sizes):
             samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
             held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
@@ -220,7 +221,7 @@ def _curves(
             left = alone[place[choice.size], :, :whole].sum(1) + alone[block, :, whole:].sum(1)
             error[i, part] = (left + lost).cpu().numpy()
         number[part] = chosen.cpu().numpy()
-    return number, error
+    return {"number": number, "error": error}
 
 
 def costs(tried: list[Candidate]) -> np.ndarray:

@@ -28,7 +28,7 @@ from wlm.atlas.model import (
 )
 from wlm.atlas.shared.allocation import Allocated
 from wlm.atlas.shared.curves import Candidate, SceneTiles
-from wlm.atlas.shared.sharing import Layout, fitted, planes_of
+from wlm.atlas.shared.sharing import Cut, fitted, planes_of
 from wlm.atlas.shared.weights import peaks_of, scales, scene_weights, variation
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import Tiles, solved
@@ -56,12 +56,11 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
         unit = peak * scales(varies, [_of_texels(weight) for weight in weights])
         planes = planes_of(scene, weights, profile.mips, device)
     kept = fitted(scene, planes, unit, varies, profile, seed, stages)
-    planes, layout, tiles, tried, given = kept.planes, kept.layout, kept.tiles, kept.tried, kept.given
-    stride = len(planes) // kept.states
+    tiles, tried, given, rows = kept.cut.tiles, kept.tried, kept.given, kept.cut.places
+    stride = len(rows) // kept.states
     with stages("solve"):
         textures, scale = _textures(tiles, tried, given)
-    lut = np.ascontiguousarray(_lookup(tiles, layout, given)[..., : kept.numbers])
-    rows = layout.places
+    lut = np.ascontiguousarray(_lookup(kept.cut, given)[..., : kept.numbers])
     sheets = len(scene.sheets)
     counts, samples, many = (
         np.bincount(tiles.plane % stride, each, stride)[:sheets]
@@ -145,12 +144,12 @@ def _textures(tiles: SceneTiles, tried: list[Candidate], given: Allocated) -> tu
     return textures, scale.astype(np.float64)
 
 
-def _lookup(tiles: SceneTiles, layout: Layout, given: Allocated) -> np.ndarray:
+def _lookup(cut: Cut, given: Allocated) -> np.ndarray:
     """Makes the lookup texture T_c, uint16 [Hc, Wc, 4]. Tiles without a weight are black."""
-    places = np.array([(each.row, each.column, each.columns) for each in layout.places])
+    tiles, places = cut.tiles, np.array([(each.row, each.column, each.columns) for each in cut.places])
     first, left, columns = places[tiles.plane].T
     row, column = first + tiles.index // columns, left + tiles.index % columns
-    table = np.zeros((*layout.shape, 4), np.uint16)
+    table = np.zeros((*cut.shape, 4), np.uint16)
     table[row, column] = pack_tiles(
         given.first, given.size, given.component, given.count, given.page, given.second, given.coarse
     )

@@ -31,12 +31,12 @@ from wlm.atlas.model import (
     tile_counts,
 )
 from wlm.atlas.resize import box
-from wlm.atlas.shared.allocation import NO_ROOM, WIDTHS, Allocated, allocated
+from wlm.atlas.shared.allocation import NO_ROOM, Allocated, allocated
 from wlm.atlas.shared.balance import ViewShares, balance, tile_shares
 from wlm.atlas.shared.curves import Candidate, SceneTiles, candidates, costs
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import patches, weighted
-from wlm.atlas.tiles.layout import allocate, place, sizes_of
+from wlm.atlas.tiles.layout import allocate, packed, sizes_of
 from wlm.errors import WlmError
 from wlm.texels import fill_gaps
 
@@ -94,16 +94,26 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
-    """The places of sheets and mip levels in the lookup texture T_c, and the rows and columns of T_c."""
+class Cut:
+    """Sheets and mip levels, cut into tiles.
 
+    Attributes:
+        planes, places: Sheets and mip levels, from `planes_of`, and the place of each in the lookup texture T_c.
+        shape: Rows and columns of T_c.
+        tiles: The tiles of all planes.
+        bits: The budget of bits of the whole model.
+    """
+
+    planes: list[Plane]
     places: list[SheetPlace]
     shape: tuple[int, int]
+    tiles: SceneTiles
+    bits: float
 
-    @property
-    def grids(self) -> list[tuple[int, int]]:
-        """The rows and columns of tiles of each sheet and level."""
-        return [(place.rows, place.columns) for place in self.places]
+    def room(self, numbers: int) -> float:
+        """Returns the bits that remain for tiles and factors beside the table of sheets and T_c, which has this many
+        integers per entry."""
+        return self.bits - len(self.planes) * SHEET_BITS - math.prod(self.shape) * numbers // 2 * LUT_BITS
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +121,7 @@ class Fitted:
     """The components, sizes and places chosen for all tiles.
 
     Attributes:
-        planes, layout, tiles: Sheets and levels, their places and tiles; separate tiles are listed state by state.
+        cut: Sheets and levels with their tiles; separate tiles are listed state by state.
         tried: The errors of all tiles for each number of components, weighted by `balance`.
         given: Components, sizes and places of the tiles.
         numbers: Number of integers per entry of T_c.
@@ -119,9 +129,7 @@ class Fitted:
         gain: Estimated advantage of separate tiles in views, in dB; None if it wasn't computed to the end.
     """
 
-    planes: list[Plane]
-    layout: Layout
-    tiles: SceneTiles
+    cut: Cut
     tried: list[Candidate]
     given: Allocated
     numbers: int
@@ -152,28 +160,27 @@ def fitted(
     Raises:
         WlmError: The budget is less than the smallest tiles take.
     """
-    device, states, sheets = stages.device, len(scene.states), len(scene.sheets)
-    bits = profile.budget * scene.texels * SOURCE_BITS
-    layout = _laid_out(planes, profile.tile)
+    states = len(scene.states)
     # One state has one component.
     numbers = ENTRY if states > 1 else SHORT_ENTRY
     with stages("tiles"):
-        tiles = _tiles(planes, [unit] * len(planes), profile.tile, device)
-    room = _room(bits, layout, len(planes), numbers)
-    if room < len(tiles.index) * COLOUR_BITS[TEXELS]:
+        bits = profile.budget * scene.texels * SOURCE_BITS
+        cut = _cut(planes, [unit] * len(planes), bits, profile.tile, stages.device)
+    room = cut.room(numbers)
+    if room < len(cut.tiles.index) * COLOUR_BITS[TEXELS]:
         raise WlmError(NO_ROOM.format(profile.budget))
     with stages("curves"):
-        tried = candidates(tiles, sizes_of(profile), room, seed, stages, 0)
+        tried = candidates(cut.tiles, sizes_of(profile), room, seed, stages, 0)
     with stages("balance"):
-        shown = tile_shares(scene, varies, tiles, layout.grids[:sheets], profile, seed, device)
-        weight = tiles.weight.double().sum(1).cpu().numpy()
-        factor = balance(tried, weight, shown, room)
+        grids = [(place.rows, place.columns) for place in cut.places[: len(scene.sheets)]]
+        shown = tile_shares(scene, varies, cut.tiles, grids, profile, seed, stages.device)
+        factor = balance(tried, cut.tiles.weights, shown, room)
     with stages("allocate"):
-        together = _allocated(planes, layout, tiles, _times(tried, factor), bits, room, numbers, profile)
+        together = _allocated(cut, tried, factor, numbers, profile)
     if states == 1:
         return together
     with stages("separate"):
-        return _choose_sharing(together, unit, factor, shown, bits, profile, seed, stages)
+        return _choose_sharing(together, unit, factor, shown, profile, seed, stages)
 
 
 def _choose_sharing(
@@ -181,37 +188,36 @@ def _choose_sharing(
     unit: np.ndarray,
     factor: np.ndarray,
     shown: ViewShares,
-    bits: float,
     profile: Profile,
     seed: int,
     stages: Stages,
 ) -> Fitted:
     """Returns shared tiles, or separate tiles for each state if the views' mean PSNR is higher with separate tiles."""
-    states, count = len(unit), len(together.planes)
+    states, whole = len(unit), together.cut
+    count = len(whole.planes)
     planes = [
         replace(plane, frames=plane.frames[m : m + 1], smaller=plane.smaller and plane.smaller + m * count)
         for m in range(states)
-        for plane in together.planes
+        for plane in whole.planes
     ]
-    layout = _laid_out(planes, profile.tile)
     # Each of the other states needs a constant and a factor.
-    bits -= 2 * FACTOR_BITS * (states - 1)
-    room = _room(bits, layout, len(planes), SHORT_ENTRY)
-    if room < states * len(together.tiles.index) * COLOUR_BITS[TEXELS]:
+    bits = whole.bits - 2 * FACTOR_BITS * (states - 1)
+    units = [unit[m : m + 1] for m in range(states) for _ in range(count)]
+    cut = _cut(planes, units, bits, profile.tile, stages.device)
+    room, tiles = cut.room(SHORT_ENTRY), cut.tiles
+    if room < len(tiles.index) * COLOUR_BITS[TEXELS]:
         return together
-    tiles = _tiles(planes, [unit[m : m + 1] for m in range(states) for _ in range(count)], profile.tile, stages.device)
-    if len(together.tiles.index) > _SAMPLES and _hopeless(together, tiles, states, factor, room, profile, seed, stages):
+    if len(whole.tiles.index) > _SAMPLES and _hopeless(together, tiles, states, factor, room, profile, seed, stages):
         return together
     tried = candidates(tiles, sizes_of(profile), room, seed, stages, _SEPARATE)
-    weight = tiles.weight.double().sum(1).cpu().numpy()
     of_states = shown.by_state(states)
-    of_tiles = balance(tried, weight, of_states, room)
+    of_tiles = balance(tried, tiles.weights, of_states, room)
     try:
-        separate = _allocated(planes, layout, tiles, _times(tried, of_tiles), bits, room, SHORT_ENTRY, profile)
+        separate = _allocated(cut, tried, of_tiles, SHORT_ENTRY, profile)
     except WlmError:  # shared tiles fit where separate ones do not
         return together
-    before = shown.psnr(together.given.error / (factor * weight[: len(factor)] * states))
-    gain = of_states.psnr(separate.given.error / (of_tiles * weight)) - before
+    before = shown.psnr(together.given.error / (factor * whole.tiles.weights))
+    gain = of_states.psnr(separate.given.error / (of_tiles * tiles.weights)) - before
     return replace(separate, states=states, gain=gain) if gain > 0.0 else replace(together, gain=gain)
 
 
@@ -229,84 +235,46 @@ def _hopeless(
     given, count = together.given, len(factor)
     few = np.sort(np.random.default_rng(seed).choice(count, max(count // _SAMPLE, _SAMPLES), replace=False))
     cost = costs(together.tried)
-    shared = np.concatenate([each.error for each in together.tried])
-    chosen = allocate(shared, cost, room, 0.0)
-    taken = cost[chosen]
+    taken = cost[allocate(np.concatenate([each.error for each in together.tried]), cost, room, 0.0)]
     own = float(taken[few].sum()) / float(taken.sum()) * room
     # The sample has the same tiles in each state.
     members = (np.arange(states)[:, None] * count + few).ravel()
-    piece = SceneTiles(
-        tiles.texels[members],
-        tiles.weight[members],
-        tiles.plane[members],
-        tiles.index[members],
-        tiles.size,
-        tiles.device,
-    )
-    tried = candidates(piece, sizes_of(profile), own, seed, stages, _SAMPLED)
+    arrays = (each[members] for each in (tiles.texels, tiles.weight, tiles.plane, tiles.index))
+    tried = candidates(SceneTiles(*arrays, tiles.size, tiles.device), sizes_of(profile), own, seed, stages, _SAMPLED)
     error = np.concatenate([each.error for each in tried]) * np.tile(factor[few], states)
     separate = allocate(error, costs(tried), own, 0.0)
     return float(error[separate, np.arange(len(members))].sum()) > _HOPELESS * float(given.error[few].sum())
 
 
-def _room(bits: float, layout: Layout, planes: int, numbers: int) -> float:
-    """Returns the bits that remain for tiles and factors after the lookup texture and the table of sheets."""
-    return bits - planes * SHEET_BITS - math.prod(layout.shape) * numbers // 2 * LUT_BITS
-
-
-def _times(tried: list[Candidate], factor: np.ndarray) -> list[Candidate]:
-    return [replace(each, error=each.error * factor) for each in tried]
-
-
-def _allocated(
-    planes: list[Plane],
-    layout: Layout,
-    tiles: SceneTiles,
-    tried: list[Candidate],
-    bits: float,
-    room: float,
-    numbers: int,
-    profile: Profile,
-) -> Fitted:
-    given = allocated(tried, room, profile)
+def _allocated(cut: Cut, tried: list[Candidate], factor: np.ndarray, numbers: int, profile: Profile) -> Fitted:
+    """Allocates the tiles, whose errors are multiplied by `factor` [T]; with long entries of T_c if there are pages."""
+    tried = [replace(each, error=each.error * factor) for each in tried]
+    given = allocated(tried, cut.room(numbers), profile)
     if numbers == SHORT_ENTRY and given.page.any():
         numbers = ENTRY
-        given = allocated(tried, _room(bits, layout, len(planes), numbers), profile)
-    return Fitted(planes, layout, tiles, tried, given, numbers)
+        given = allocated(tried, cut.room(numbers), profile)
+    return Fitted(cut, tried, given, numbers)
 
 
-def _laid_out(planes: list[Plane], tile: int) -> Layout:
-    grid = [tile_counts(*plane.frames.shape[1:3], tile) for plane in planes]
-    across = np.array([(columns, rows) for rows, columns in grid])
-    best = None
-    for share in WIDTHS:
-        width = max(int(across[:, 0].max()), round(share * math.sqrt(across.prod(1).sum())))
-        first, height = place(across, width)
-        width = int((first[:, 0] + across[:, 0]).max())
-        if best is None or width * height < best[0]:
-            best = width * height, first, (height, width)
-    places = [
-        SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *counts, plane.smaller)
-        for plane, (column, row), counts in zip(planes, best[1].tolist(), grid, strict=True)
-    ]
-    return Layout(places, best[2])
-
-
-def _tiles(planes: list[Plane], units: list[np.ndarray], tile: int, device: str) -> SceneTiles:
-    """Cuts the light of all planes into tiles, after division by the unit of each state."""
-    total = sum(float(plane.weight.sum()) for plane in planes)
+def _cut(planes: list[Plane], units: list[np.ndarray], bits: float, tile: int, device: str) -> Cut:
+    """Places all planes in T_c, and cuts their light into tiles, after division by the unit of each state."""
+    total, grid = sum(float(plane.weight.sum()) for plane in planes), []
     texels, weights, numbers, owner = [], [], [], []
     for number, (plane, unit) in enumerate(zip(planes, units, strict=True)):
+        grid.append(tile_counts(*plane.frames.shape[1:3], tile))
         if not plane.weight.any():
             continue
         index, share = weighted(torch.from_numpy(plane.weight), tile)
-        columns = tile_counts(*plane.frames.shape[1:3], tile)[1]
         # The texel axes come first, then the states.
         frames = torch.from_numpy(plane.frames).permute(1, 2, 0, 3)
-        texels.append(patches(frames, index, columns, tile) / torch.from_numpy(unit).float()[:, None])
+        texels.append(patches(frames, index, grid[-1][1], tile) / torch.from_numpy(unit).float()[:, None])
         weights.append(share * (float(plane.weight.sum()) / total))
         numbers.append(index.numpy())
         owner.append(np.full(len(index), number))
-    return SceneTiles(
-        torch.cat(texels), torch.cat(weights), np.concatenate(owner), np.concatenate(numbers), tile, device
-    )
+    arrays = torch.cat(texels), torch.cat(weights), np.concatenate(owner), np.concatenate(numbers)
+    first, shape = packed(np.array([(columns, rows) for rows, columns in grid]))
+    places = [
+        SheetPlace(plane.name, *plane.frames.shape[1:3], row, column, *counts, plane.smaller)
+        for plane, (column, row), counts in zip(planes, first.tolist(), grid, strict=True)
+    ]
+    return Cut(planes, places, shape, SceneTiles(*arrays, tile, device), bits)

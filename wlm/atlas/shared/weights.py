@@ -13,9 +13,8 @@ import torch
 
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.model import Profile
-from wlm.atlas.views import Points, points_at, scene_views, visible_uv
+from wlm.atlas.views import Points, cells_at, points_at, scene_views, visible_uv
 from wlm.atlas.weights import RESOLUTION, FineGrid, spread
-from wlm.ops.views import View, Viewpoint
 
 UNSEEN, BORDER = 0.05, 4.0
 """Weight of texels that no view shows, as a fraction of the mean weight of the scene; and the factor on the weight
@@ -70,38 +69,21 @@ def scene_weights(
     the scene show each, 0 where there is no triangle. An object that is large in the views thus gets more weight than
     one that is small, far away or hidden. The weight of a view is the inverse of the variation of the light that it
     shows; it does not grow with its number of pixels."""
-    grids = [FineGrid(sheet, device) for sheet in scene.sheets]
-    visible = _counts(scene, grids, Detail(scene, varies, device), scene_views(scene, profile.views, seed), device)
+    grids, detail = [FineGrid(sheet, device) for sheet in scene.sheets], Detail(scene, varies, device)
+    sizes = [grid.height * grid.width for grid in grids]
+    counts = torch.zeros(sum(sizes), dtype=torch.float64, device=device)
+    for drawn in visible_uv(scene, scene_views(scene, profile.views, seed), RESOLUTION, device):
+        points = points_at(scene, *drawn)[1]
+        if len(points):
+            cell, pixels = torch.unique(detail.cells(points, 2), return_counts=True)
+            counts[cell] += pixels / (detail.lost(points) * len(points))
+    visible = [each.reshape(grid.height, grid.width) for each, grid in zip(counts.split(sizes), grids, strict=True)]
     # The cells that `spread` uses.
     used = [grid.covered | grid.texels | (count > 0) for grid, count in zip(grids, visible, strict=True)]
     cells = sum(int(each.sum()) for each in used)
     mean = sum(float(count[each].sum()) for count, each in zip(visible, used, strict=True)) / max(cells, 1)
     pairs = zip(grids, visible, strict=True)
     return [spread(grid, count, UNSEEN, BORDER, mean=mean or 1.0).cpu().numpy() for grid, count in pairs]
-
-
-def _counts(
-    scene: LightmappedScene,
-    grids: Sequence[FineGrid],
-    detail: "Detail",
-    views: Sequence[View | Viewpoint],
-    device: str,
-) -> list[torch.Tensor]:
-    """Sums the fractions of views' pixels that show each cell (quarter of a texel), divided by the views' variation."""
-    sizes = [(grid.height, grid.width) for grid in grids]
-    first = np.cumsum([0, *(height * width for height, width in sizes)])
-    place = torch.tensor(np.array([(*size, start) for size, start in zip(sizes, first, strict=False)]), device=device)
-    count = torch.zeros(int(first[-1]), dtype=torch.float64, device=device)
-    for drawn in visible_uv(scene, views, RESOLUTION, device):
-        points = points_at(scene, *drawn)[1]
-        if not len(points):
-            continue
-        height, width, start = place[points.sheet.long()].T
-        column = torch.minimum((points.uv[:, 0].double() * width).long().clamp(min=0), width - 1)
-        row = torch.minimum((points.uv[:, 1].double() * height).long().clamp(min=0), height - 1)
-        cell, pixels = torch.unique(start + row * width + column, return_counts=True)
-        count[cell] += pixels / (detail.lost(points) * len(points))
-    return [count[a:b].reshape(size) for a, b, size in zip(first, first[1:], sizes, strict=False)]
 
 
 class Detail:
@@ -119,12 +101,13 @@ class Detail:
         """Returns the rows and columns of texels of the sheet at each point, int64 [N] each."""
         return tuple(self._place[points.sheet.long()].T[:2])
 
+    def cells(self, points: Points, fine: int = 1) -> torch.Tensor:
+        """Returns the numbers of the cells at N points, int64 [N], sheet by sheet; a texel has `fine` cells per
+        axis."""
+        start = self._place[points.sheet.long(), 2]
+        return fine**2 * start + cells_at(points.uv, *(fine * side for side in self.sizes(points)))
+
     def lost(self, points: Points) -> float:
         """Estimates the error of a view that shows the points, above 0: the mean variation of light over the states,
         which are scaled to vary equally."""
-        height, width, start = self._place[points.sheet.long()].T
-        column, row = (
-            (points.uv[:, axis].double() * side).long().clamp(min=0).minimum(side - 1)
-            for axis, side in ((0, width), (1, height))
-        )
-        return float(self._even[start + row * width + column].mean()) + FLOOR
+        return float(self._even[self.cells(points)].mean()) + FLOOR

@@ -21,6 +21,7 @@ from wlm import interop
 from wlm.atlas import colour
 from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.model import (
+    BLOCK_SIDE,
     BLOCKS,
     LUT_BITS,
     SOURCE_BITS,
@@ -28,15 +29,17 @@ from wlm.atlas.model import (
     AtlasModel,
     Profile,
     SheetPlace,
+    first_block_code,
+    pack_entries,
     tile_counts,
 )
 from wlm.atlas.stages import Stages
-from wlm.atlas.tiles.layout import Layout, Size, composed, layout, sizes_of
+from wlm.atlas.tiles.layout import Layout, Size, layout, sizes_of, texels_of
 from wlm.atlas.weights import FineGrid, weights
-from wlm.formats.checkpoint import Checkpoint
-from wlm.formats.parts import Part, check_parts
+from wlm.formats.exr import HALF_MAX
+from wlm.formats.parts import Part
 from wlm.ops.tensors import on_stream
-from wlm.system import Meter, OnProgress
+from wlm.system import Meter
 from wlm_kernels.atlas import solve as kernels
 
 SUPERSAMPLING = 2
@@ -89,7 +92,7 @@ def fit_tiles(
     if room < len(tiles.index) * min(size.bits for size in sizes):
         return None
     with stages("curves"):
-        error = curves(tiles, sizes, stages.progress, stages.checkpoint)
+        error = curves(tiles, sizes, stages)
     with stages("allocate"):
         packed = layout(torch.from_numpy(error).to(grid.device), sizes, room, least_gain(sheet))
         if packed is None:
@@ -110,16 +113,30 @@ def composed_model(
     device: str,
 ) -> AtlasModel:
     """Makes the model from the tiles' solved samples, sizes and places, and numbers in the grid, int64 [T]."""
-    size = scene.sheets[0].mask.shape
-    counts = tile_counts(*size, profile.tile)
-    (first, *second), lut = composed(samples, sizes, packed, index, counts, device)
-    mixed = profile.colour == "mixed"
-    textures = colour.quantise(first[0], TEXELS if mixed else profile.colour, first[1], device)
-    if mixed:
-        blocks = colour.quantise(second[0][0], BLOCKS, second[0][1], device)
-        textures |= {"blocks": blocks["blocks"], "block_texels": blocks["texels"]}
-    textures = {name: texture[None] for name, texture in textures.items()}
-    chosen = [sizes[number] for number in packed.chosen]
+    size, mixed, code = scene.sheets[0].mask.shape, profile.colour == "mixed", first_block_code(profile.colour)
+    counts, chosen = tile_counts(*size, profile.tile), [sizes[number] for number in packed.chosen]
+    images = [(torch.zeros((*shape, 3), device=device), torch.zeros(shape, device=device)) for shape in packed.shapes]
+    for members, values, weight in samples:
+        each = chosen[members[0]]
+        # Copying a large texture through the host would take seconds.
+        at = tuple(torch.from_numpy(part).to(device) for part in texels_of(packed.first[members], each.nx, each.ny))
+        images[each.second][0][at], images[each.second][1][at] = values, weight
+    formats = (TEXELS, BLOCKS) if mixed else (profile.colour,)
+    first, *second = (
+        {
+            name: part[None]
+            for name, part in colour.quantise(texels.clamp_(max=HALF_MAX), format, weight, device).items()
+        }
+        for (texels, weight), format in zip(images, formats, strict=True)
+    )
+    textures = first | ({"blocks": second[0]["blocks"], "block_texels": second[0]["texels"]} if mixed else {})
+    # All other tiles of the grid show the first texel or block.
+    total = counts[0] * counts[1]
+    place, side = np.zeros((total, 2), int), np.full((total, 2), 1 if code else BLOCK_SIDE)
+    blocks = np.full(total, not code)
+    place[index], side[index] = packed.first, [(each.nx, each.ny) for each in chosen]
+    blocks[index] = [each.step > 1 for each in chosen]
+    lut = pack_entries(place, side, blocks, code).reshape(*counts, 2)
     report = {
         "tiles": len(index),
         "of tiles": counts[0] * counts[1],
@@ -128,8 +145,8 @@ def composed_model(
     }
     if mixed:
         report["tiles of blocks"] = sum(size.second for size in chosen)
-    place = SheetPlace(scene.sheets[0].name, *size, 0, 0, *counts)
-    settings = (scene.name, scene.source, profile, "tiles", profile.colour, scene.states, (place,))
+    sheets = (SheetPlace(scene.sheets[0].name, *size, 0, 0, *counts),)
+    settings = (scene.name, scene.source, profile, "tiles", profile.colour, scene.states, sheets)
     return AtlasModel(*settings, **textures, lut=lut, report=report)
 
 
@@ -187,18 +204,6 @@ def _folded(weight: torch.Tensor, points: int) -> torch.Tensor:
     return padded
 
 
-def linear(samples: int, points: int, device: str = "cpu") -> torch.Tensor:
-    """Returns the weights of linear interpolation from samples to points along an axis, float [points, samples]."""
-    place = (torch.arange(points, device=device) + 0.5) / points * (samples - 1)
-    first = place.floor().clamp(max=max(samples - 2, 0)).long()
-    result = torch.zeros((points, samples), device=device)
-    row = torch.arange(points, device=device)
-    result[row, first] = 1.0 - (place - first)
-    if samples > 1:
-        result[row, first + 1] = place - first
-    return result
-
-
 def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
     """Returns the samples of least weighted squared error, float [T, ny, nx, 3], for tiles that all have nx x ny
     samples, by at most `rounds` iterations of conjugate gradients on the normal equations of each tile and channel,
@@ -215,7 +220,7 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
         start = space(3, nx * ny)
         kernels.gather(light, grid, interop.to_warp(start))
         # With equal weights the equations separate by axis.
-        across, down = (_axis(samples, grid.points, str(start.device))[2] for samples in (nx, ny))
+        across, down = (_axis(samples, grid.points, str(start.device))[3] for samples in (nx, ny))
         start = _laid_out((down @ start.unflatten(2, (ny, nx)) @ across).flatten(2))
         *work, out = (space(3, nx * ny) for _ in range(4))
         ridge = _RIDGE * grid.points**2 / (nx * ny)
@@ -252,15 +257,19 @@ def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
 
 
 @functools.cache
-def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Returns the linear interpolation along an axis: the sample before each point, the weight of the next sample, and
-    the inverse Gram matrix of the interpolation, which is cached, since it is slow to compute on a GPU."""
-    matrix = linear(samples, points)
-    place = (torch.arange(points) + 0.5) / points * (samples - 1)
+def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, ...]:
+    """Returns the linear interpolation from samples to points along an axis: the sample before each point and the
+    weight of the next one, [points] each; the matrix, float [points, samples]; and the inverse of its Gram matrix,
+    which is slow to compute on a GPU."""
+    place, row = (torch.arange(points) + 0.5) / points * (samples - 1), torch.arange(points)
     first = place.floor().clamp(max=max(samples - 2, 0))
-    share = place - first
+    share, before = place - first, first.long()
+    matrix = torch.zeros((points, samples))
+    matrix[row, before] = 1.0 - share
+    if samples > 1:
+        matrix[row, before + 1] = share
     inverse = torch.linalg.inv(matrix.double().T @ matrix.double())
-    return first.int().to(device), share.float().to(device), inverse.float().to(device)
+    return tuple(each.to(device) for each in (before.int(), share, matrix, inverse.float()))
 
 
 def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
@@ -278,46 +287,29 @@ def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:
 def sample_weights(tiles: Tiles, nx: int, ny: int) -> torch.Tensor:
     """Returns the weight of each sample's squared error, float [T, ny, nx]."""
     points, device = SUPERSAMPLING * tiles.size, str(tiles.weight.device)
-    down, across = (linear(count, points, device).square() for count in (ny, nx))
+    down, across = (_axis(count, points, device)[2].square() for count in (ny, nx))
     return down.T @ tiles.weight.unflatten(1, (points, points)) @ across
 
 
-def curves(
-    tiles: Tiles,
-    sizes: list[Size],
-    progress: OnProgress | None = None,
-    checkpoint: Checkpoint | None = None,
-) -> np.ndarray:
+def curves(tiles: Tiles, sizes: list[Size], stages: Stages) -> np.ndarray:
     """Returns the error of every tile at every size, float64 [sizes, T], with samples rounded as the size's format
-    stores them. The checkpoint saves the errors of finished sizes."""
-    result, meter = np.empty((len(sizes), len(tiles.index))), Meter(progress, "curves", len(sizes))
-    begin = 0
+    stores them. The checkpoint of `stages` saves the errors at each size as one batch."""
+    meter, pieces = Meter(stages.progress, "curves", len(sizes)), [piece for _, piece in _pieces(tiles)]
+    table = {"error": Part(np.float64, (len(tiles.index),), least=0.0)}
 
-    def load(state: dict[str, np.ndarray]) -> None:
-        nonlocal begin
-        done = check_parts(state, {"error": Part(np.float64, (None, len(tiles.index)), least=0.0)})["error"]
-        begin = min(len(done), len(sizes))
-        result[:begin] = done[:begin]
-
-    if checkpoint is not None:
-        checkpoint.restore(0, load)
-    pieces = list(_pieces(tiles))
-    for i, size in enumerate(sizes[begin:], begin):
+    def at_size(i: int, size: Size) -> dict[str, np.ndarray]:
         if meter.due(i):
-            try:
-                meter.report(i)
-            except KeyboardInterrupt:
-                if checkpoint is not None:
-                    checkpoint.save({0: {"error": result[:i]}})
-                raise
-        rounds = _ROUGH if size.step == 1 else _MEDIUM
-        for part, piece in pieces:
+            meter.report(i)
+        result, rounds = [], _ROUGH if size.step == 1 else _MEDIUM
+        for piece in pieces:
             samples = solve(piece, size.nx, size.ny, rounds).clamp(min=0.0)
             weight = sample_weights(piece, size.nx, size.ny)
-            result[i, part] = errors(piece, colour.stored(samples, weight, size.format)).cpu().numpy()
-        if checkpoint is not None and checkpoint.due():
-            checkpoint.save({0: {"error": result[: i + 1]}})
-    return result
+            result.append(errors(piece, colour.stored(samples, weight, size.format)).cpu().numpy())
+        return {"error": np.concatenate(result)}
+
+    return np.stack(
+        [stages.batch(i, table, functools.partial(at_size, i, size))["error"] for i, size in enumerate(sizes)]
+    )
 
 
 def solved(tiles: Tiles, sizes: list[Size], chosen: np.ndarray) -> list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]:

@@ -1,11 +1,13 @@
 """Chooses the sizes of tiles within a budget of bits, and their places in the texture.
 
-Each tile has a curve of error against bits. At the optimum one more bit reduces the error by the same amount in every
-tile. That gain, a Lagrange multiplier, is found by bisection. With colour "mixed" a tile's sizes have two formats, each
-with its own texture: blocks where the block format is accurate, RGB9E5 for other light and for small tiles.
+A tile has an error at each size that it may have, and a size takes a number of bits. In the best choice of sizes one
+more bit would reduce the error by about the same amount in every tile. That amount, a Lagrange multiplier, is found by
+bisection. With colour "mixed" there are two textures, one of BC6H blocks and one of RGB9E5 texels, and the chosen size
+of a tile says which one it is in.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +23,12 @@ from wlm.atlas.model import (
     TEXELS,
     Profile,
     first_block_code,
-    pack_entries,
 )
 from wlm.errors import WlmError
-from wlm.formats.exr import HALF_MAX
 
 _BISECTIONS, _CLOSE = 60, 1e-6
 _TILES_AT_ONCE = 1 << 16
-_WIDTHS = np.linspace(0.7, 1.5, 17)  # candidate widths of T_p over the square root of its number of samples
+_WIDTHS = np.linspace(0.7, 1.5, 17)  # candidate widths of a page over the square root of its area
 _SIDES = (1, 2, 3, 4, 5, 6, 8, 10, 12, 14)  # texels, beside the largest side: above 6 every second one is enough
 
 
@@ -76,9 +76,9 @@ def sizes_of(profile: Profile) -> list[Size]:
 
 
 def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, least: float) -> Layout | None:
-    """Chooses sizes whose rectangles fit in textures of `room` bits, and places the rectangles; returns None if not
-    even the smallest sizes fit. `error` is float64 [sizes, T] on any device; `least` is the smallest error that a bit
-    must save.
+    """Chooses a size for each of T tiles, and places the tiles' rectangles in textures that take at most `room` bits;
+    returns None if not even the smallest sizes fit. `error`, float64 [sizes, T] on any device, is the error of each
+    tile at each size; a bit is only spent where it reduces the error by at least `least`.
 
     Raises:
         WlmError: A texture has more texels along a side than an entry of T_c can name.
@@ -90,87 +90,25 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
     budget, fewest = room, error.shape[1] * cost.min()
     while True:
         chosen = allocate(error, cost, budget, least)
-        counts, widths, shapes, bits = np.bincount(chosen, minlength=len(sizes)), [], [], 0
+        first, shapes, bits = np.zeros((len(chosen), 2), np.int64), [], 0
         for texture in textures:
-            members = (second == texture.second) & (counts > 0)
-            width, shape = _narrowest(_Kinds.of(sides[members], counts[members]), texture.step)
-            widths.append(width)
+            members = np.flatnonzero(second[chosen] == texture.second)
+            first[members], shape = packed(sides[chosen[members]], step=texture.step)
             shapes.append(shape)
             most = MOST_SIZE * texture.step
             if max(shape) > most:
                 raise WlmError(
-                    f"budget: too large, T_p would have {max(shape)} texels along a side; expected at most {most}"
+                    f"budget: too large: a colour texture would have {max(shape)} texels along a side, expected at "
+                    f"most {most}; give less"
                 )
             bits += math.prod(shape) * COLOUR_BITS[texture.format]
         if bits <= room:
-            first = np.zeros((len(chosen), 2), np.int64)
-            for texture, width in zip(textures, widths, strict=True):
-                members = np.flatnonzero(second[chosen] == texture.second)
-                first[members] = place(sides[chosen[members]], width)[0]
             return Layout(chosen, first, tuple(shapes))
         total = cost[chosen].sum()
         if total <= fewest:
             return None
         # The area lost between shelves is about the same next time.
         budget = min(budget, total) * min(0.999 * room / bits, 0.99)
-
-
-def _narrowest(kinds: "_Kinds", step: int) -> tuple[int, tuple[int, int]]:
-    """Finds the width of shelves (rows of rectangles) for the smallest texture; returns it and the texture's size."""
-    if not len(kinds.size):
-        return step, (step, step)
-    total = float(kinds.size.prod(1) @ kinds.count)
-    best = None
-    for share in _WIDTHS:
-        width = max(int(kinds.size[:, 0].max()), -(-round(share * math.sqrt(total)) // step) * step)
-        runs, height = kinds.shelves(width)
-        # No shelf may reach as far as the width allows.
-        widest = max(run.widest for run in runs)
-        if best is None or widest * height < best[0]:
-            best = widest * height, width, (height, widest)
-    return best[1:]
-
-
-def composed(
-    samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]],
-    sizes: list[Size],
-    layout: Layout,
-    index: np.ndarray,
-    counts: tuple[int, int],
-    device: str,
-) -> tuple[list[tuple[torch.Tensor, torch.Tensor]], np.ndarray]:
-    """Makes the colour textures T_p and the lookup texture T_c.
-
-    Args:
-        samples: Groups of tiles of one size, from `solved`.
-        sizes: The sizes that tiles may have.
-        layout: Sizes and places of the tiles.
-        index: int64 [T], the tiles' numbers in the grid; all other tiles of the grid show the texture's first texel.
-        counts: Rows and columns of the grid.
-        device: "cpu" or "cuda:N": copying a large texture through the host takes seconds.
-
-    Returns:
-        For each colour texture its texels, float32 [H, W, 3], and their weights [H, W], on the device; and the lookup
-        texture T_c.
-    """
-    textures = [(torch.zeros((*shape, 3), device=device), torch.zeros(shape, device=device)) for shape in layout.shapes]
-    for members, values, weight in samples:
-        size = sizes[layout.chosen[members[0]]]
-        at = tuple(torch.from_numpy(each).to(device) for each in texels_of(layout.first[members], size.nx, size.ny))
-        texels, weights = textures[size.second]
-        texels[at], weights[at] = values, weight
-    total = counts[0] * counts[1]
-    mixed = any(size.second for size in sizes)
-    code = first_block_code("mixed" if mixed else sizes[0].format)
-    first, side, blocks = np.zeros((total, 2), int), np.ones((total, 2), int), np.zeros(total, bool)
-    if not code:
-        side[:], blocks[:] = BLOCK_SIDE, True
-    first[index] = layout.first
-    side[index] = np.array([(size.nx, size.ny) for size in sizes])[layout.chosen]
-    if mixed:
-        blocks[index] = np.array([size.second for size in sizes])[layout.chosen]
-    lut = pack_entries(first, side, blocks, code).reshape(*counts, 2)
-    return [(texels.clamp_(max=HALF_MAX), weights) for texels, weights in textures], lut
 
 
 def texels_of(first: np.ndarray, nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
@@ -205,65 +143,63 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
     return best(high).cpu().numpy()
 
 
-@dataclass(frozen=True)
-class _Run:
-    """The places of all rectangles of one size. The first `beside` rectangles start at (x, y), on a shelf (row) shared
-    with another size. All others fill their own shelves, of `each` rectangles, from y = `below` on. `widest` is the
-    right end of all rectangles."""
+def packed(
+    size: np.ndarray, pages: Sequence[np.ndarray] | None = None, step: int = 1
+) -> tuple[np.ndarray, tuple[int, int]]:
+    """Packs rectangles, int [R, 2] texels along x and y, on pages of equal size, with the width of least area.
 
-    beside: int
-    x: int
-    y: int
-    each: int
-    below: int
-    widest: int
+    Args:
+        size: Width and height of each rectangle; multiples of `step`.
+        pages: For each page the numbers of its rectangles; None: all are on one page.
+        step: The width that the shelves (rows) may take is a multiple of this.
 
-
-@dataclass(frozen=True)
-class _Kinds:
-    """The different sizes of rectangles, by falling height and then width, and the number of rectangles of each."""
-
-    size: np.ndarray
-    count: np.ndarray
-
-    @classmethod
-    def of(cls, size: np.ndarray, count: np.ndarray) -> "_Kinds":
-        order = np.lexsort((-size[:, 0], -size[:, 1]))
-        return cls(size[order], count[order])
-
-    def shelves(self, width: int) -> tuple[list[_Run], int]:
-        """Places the rectangles of each size on shelves `width` wide; returns the places and the total height."""
-        runs, x, y, height = [], 0, 0, 0
-        for (w, h), count in zip(self.size.tolist(), self.count.tolist(), strict=True):
-            each = width // w
-            beside = min((width - x) // w, count) if height else 0
-            run = _Run(
-                beside, x, y, each, y + height, max(x + w * beside if beside else 0, w * min(each, count - beside))
-            )
-            runs.append(run)
-            x += w * beside
-            if rest := count - beside:
-                y, height = run.below + h * ((rest - 1) // each), h
-                x = w * ((rest - 1) % each + 1)
-        return runs, y + height
+    Returns:
+        The first texel (x, y) of each rectangle on its page, int64 [R, 2]; and the rows and columns of a page.
+    """
+    first = np.zeros((len(size), 2), np.int64)
+    if not len(size):
+        return first, (step, step)
+    pages = [np.arange(len(size))] if pages is None else pages
+    most, shelves = max(float(size[page].prod(1).sum()) for page in pages), [_Shelves(size[page]) for page in pages]
+    best = None
+    for share in _WIDTHS:
+        width = max(int(size[:, 0].max()), -(-round(share * math.sqrt(most)) // step) * step)
+        placed, heights = zip(*(each.place(width) for each in shelves), strict=True)
+        # No shelf may reach as far as the width allows.
+        widest = max(int((at + size[page])[:, 0].max(initial=0)) for at, page in zip(placed, pages, strict=True))
+        if best is None or widest * max(heights) < best[0]:
+            best = widest * max(heights), placed, (max(heights), widest)
+    for at, page in zip(best[1], pages, strict=True):
+        first[page] = at
+    return first, best[2]
 
 
 def place(sizes: np.ndarray, width: int) -> tuple[np.ndarray, int]:
     """Packs rectangles, int [R, 2] widths and heights, on shelves (rows) `width` wide, in order of height; each shelf
     is as high as its first rectangle. Returns x and y of each rectangle, int64 [R, 2], and the total height."""
-    first = np.zeros((len(sizes), 2), np.int64)
-    if not len(sizes):
-        return first, 0
-    order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
-    ordered = sizes[order]
-    starts = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(1)))
-    kinds = _Kinds(ordered[starts], np.diff(np.append(starts, len(sizes))))
-    runs, height = kinds.shelves(width)
-    for run, (w, h), members in zip(runs, kinds.size.tolist(), np.split(order, starts[1:]), strict=True):
-        beside, below = members[: run.beside], members[run.beside :]
-        first[beside, 0] = run.x + w * np.arange(len(beside))
-        first[beside, 1] = run.y
-        shelf, column = np.divmod(np.arange(len(below)), run.each)
-        first[below, 0] = w * column
-        first[below, 1] = run.below + h * shelf
-    return first, height
+    return _Shelves(sizes).place(width)
+
+
+class _Shelves:
+    """Rectangles, int [R, 2], sorted for `place` by falling height and then width."""
+
+    def __init__(self, sizes: np.ndarray) -> None:
+        self._order = np.lexsort((-sizes[:, 0], -sizes[:, 1]))
+        ordered = sizes[self._order]
+        starts = np.flatnonzero(np.append(True, (ordered[1:] != ordered[:-1]).any(1))[: len(sizes)])
+        self._sizes, self._counts = ordered[starts], np.diff(np.append(starts, len(sizes)))
+
+    def place(self, width: int) -> tuple[np.ndarray, int]:
+        parts, x, y, height = [np.zeros((0, 2), np.int64)], 0, 0, 0
+        for (w, h), count in zip(self._sizes.tolist(), self._counts.tolist(), strict=True):
+            # The first ones share the last shelf with the size before; the others fill shelves of their own.
+            beside = min((width - x) // w, count) if height else 0
+            parts.append(np.stack([x + w * np.arange(beside), np.full(beside, y)], 1))
+            x += w * beside
+            if beside < count:
+                shelf, column = np.divmod(np.arange(count - beside), width // w)
+                parts.append(np.stack([w * column, y + height + h * shelf], 1))
+                x, y, height = w * (int(column[-1]) + 1), int(parts[-1][-1, 1]), h
+        first = np.empty((len(self._order), 2), np.int64)
+        first[self._order] = np.concatenate(parts)
+        return first, y + height

@@ -1,7 +1,7 @@
 """Writes WGSL: functions, and declarations of textures and buffers in bind group 0."""
 
 from wlm.export.shading.tree import SAMPLERS, VECTORS, Function, Node, Statement, Variable
-from wlm.export.shading.writer import Writer
+from wlm.export.shading.writer import Writer, nodes_of
 
 _TEXTURES = {"sampler2D": "texture_2d<f32>", "usampler2D": "texture_2d<u32>", "sampler2DArray": "texture_2d_array<f32>"}
 _SCALARS = {"float": "f32", "int": "i32", "uint": "u32", "bool": "bool"}
@@ -51,7 +51,7 @@ class WgslWriter(Writer):
     def function(self, function: Function) -> list[str]:
         # WGSL parameters are immutable.
         names = {each.name for each in function.parameters if each.way == "in"}
-        self._changed = sorted(names & set(_assigned(function.body)))
+        self._changed = sorted(names & _assigned(function.body))
         self.scope = {each.name: each for each in function.parameters}
         copies = [f"    var {name} = {name}_given;" for name in self._changed]
         return [self.signature(function), "{", *copies, *self.block(function.body, "    "), "}"]
@@ -113,22 +113,12 @@ class WgslWriter(Writer):
         return f"vec2i(textureDimensions({texture.name}, 0))"
 
 
-def _assigned(body: tuple[Statement, ...]) -> list[str]:
+def _assigned(body: tuple[Statement, ...]) -> set[str]:
     """Returns the names of the variables that the statements assign to."""
-    found = []
-
-    def look(node: Node) -> None:
+    found = set()
+    for node in nodes_of(body):
         if node.kind in ("assign", "step"):
-            target = node.parts[0]
-            while target.parts:
-                target = target.parts[0]
-            found.append(target.text)
-        for part in node.parts:
-            look(part)
-
-    for statement in body:
-        for part in statement.parts:
-            look(part)
-        for inner in statement.bodies:
-            found += _assigned(inner)
+            while node.parts:
+                node = node.parts[0]
+            found.add(node.text)
     return found

@@ -21,7 +21,7 @@ from wlm.bundle import Texture
 from wlm.errors import WlmError
 from wlm.formats import bc7
 from wlm.formats.bc7 import BLOCK_BYTES
-from wlm.formats.block_reuse import by_block, reuse_in_order
+from wlm.formats.block_reuse import by_block, reuse_blocks
 from wlm.formats.folder import rounded
 from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, rgba, side_by_side
 from wlm.lightmap.encodings.maps import tile_bytes
@@ -126,7 +126,7 @@ def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> 
     kept = np.tile(needed, (len(colour), 1))
     images = decoded, levels, weight, weight * np.float32(_LOSS)
     values = (by_block(image)[kept.ravel()] for image in images)
-    blocks[kept] = reuse_in_order(blocks[kept], *values, _WINDOW)
+    blocks[kept] = reuse_blocks(blocks[kept], *values, _WINDOW)
     return clear_unneeded(blocks.reshape(len(colour), BLOCKS, BLOCKS, -1), needed), ranges
 
 

@@ -56,10 +56,13 @@ def layout_name(layout: Layout) -> str:
     return named or ":".join(",".join(page) for page in layout)
 
 
-def second_names(first: str) -> list[tuple[str, str]]:
-    """Returns the names that the second texture may have beside a first one, each with a layout, "" for any."""
+def second_names(first: str, back: bool = False) -> list[tuple[str, str]]:
+    """Returns the names that the second texture may have beside a first one, each with a layout, "" for any; `back`:
+    the names that the first may have beside a second one."""
     found = []
     for one, other, layout in PAIRS:
+        if back:
+            one, other = other, one
         # A part begins after a separator or, in upper case, after a lower-case letter: smoke_RLT, lightmapA.
         for match in re.finditer(rf"(?:^|(?<=[_. -])|(?<=[a-z])(?=[A-Z]))(?i:{one})(?=[_. -]|$)", first):
             name = first[: match.start()] + _like(match[0], other) + first[match.end() :]
