@@ -208,8 +208,7 @@ def test_unsupported_nvdb(tmp_path: Path):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-<<<<<<< HEAD
-        ({"smoke": np.ones((2, 2, 2))}, "density is missing; found smoke"),
+        ({"smoke": np.ones((2, 2, 2))}, "the array density is missing; found smoke"),
         (
             {"density": np.ones((2, 2))},
             r"density: expected \[X, Y, Z\], 1 to 2147483647 voxels, found \(2, 2\)",
@@ -217,13 +216,6 @@ def test_unsupported_nvdb(tmp_path: Path):
         ({"density": np.ones((0, 2, 2))}, r"density: expected \[X, Y, Z\], 1 to"),
         ({"density": np.full((1, 1, 1), "x")}, "density: expected an array of real numbers"),
         ({"density": np.ones((1, 1, 1), complex)}, "density: expected an array of real numbers"),
-=======
-        ({"smoke": np.ones((2, 2, 2))}, "the array density is missing; found smoke"),
-        ({"density": np.ones((2, 2))}, r"density: expected \[X, Y, Z\] voxels, found \(2, 2\)"),
-        ({"density": np.ones((0, 2, 2))}, r"density: expected \[X, Y, Z\] voxels"),
-        ({"density": np.full((1, 1, 1), "x")}, "density: expected numbers"),
-        ({"density": np.ones((1, 1, 1), complex)}, "density: expected numbers"),
->>>>>>> main
         ({"density": np.ones((2, 2, 2)), "temperature": np.ones((2, 2, 1))}, "temperature: expected"),
         ({"density": np.ones((1, 1, 1)), "voxel": 0.0}, "voxel: expected a length above 0"),
         ({"density": np.ones((1, 1, 1)), "voxel": "big"}, "voxel: expected 1 finite numbers"),
