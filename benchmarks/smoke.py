@@ -37,18 +37,16 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.volume import DensityVolume
-from wlm.interop import stream, to_warp, torch_memory
+from wlm.interop import stream, to_warp
 from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import RULES, Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import Guide, guide
-from wlm.smoke.march.fine import bake
-from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera, obstacle_mesh
-from wlm.smoke.shading import Light, light_axes
+from wlm.smoke.march.six_way import Guide, bake, guide
+from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera
+from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.simulation import make_solver, volume_of
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
 from wlm.view.smoke import Drawing
@@ -57,7 +55,6 @@ from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.smoke.settings import March
-from wlm_kernels.smoke.shadow import visibility
 
 PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("guide", "six ways")))
 """The panels of a plot: PSNR and error of guiding maps and of the fine march against their time."""
@@ -589,17 +586,11 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
     surface = guide(volume, camera)
     six = bake(volume, camera, estimate=False)
     lights = [settings.light() for settings in scene.lights]
-    corners, triangles, _ = obstacle_mesh(scene.obstacles, scene.time(sizes.frames))
-    corners, triangles = (torch.from_numpy(part).to(device) for part in (corners, triangles))
-
-    seen = torch.ones_like(surface.depth)
+    drawing = Drawing(camera, lights, obstacles=scene.obstacles, device=device)
 
     def shadows() -> None:
-        with stream(device):
-            mesh, view = (to_warp(corners, wp.vec3), to_warp(triangles)), camera.in_world()
-            for light in lights:
-                maps = to_warp(surface.depth), to_warp(seen)
-                visibility(*mesh, light_axes(light.toward), view, *maps, empty=torch_memory(seen.device))
+        drawing.move(scene.time(sizes.frames))
+        drawing.draw_shadows(surface.depth)
 
     def shading() -> torch.Tensor:
         return six.shade(lights, background=scene.background)

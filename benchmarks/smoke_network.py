@@ -42,20 +42,19 @@ from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.evaluation import coarse, of_decoder
 from wlm.smoke.evaluation import score as score_pool
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse
-from wlm.smoke.march.fine import bake
 from wlm.smoke.march.motion import motion
+from wlm.smoke.march.six_way import bake, bake_coarse
 from wlm.smoke.model import SmokeModel, parameter_count
 from wlm.smoke.network.planes import (
     EMISSION_PLANE,
     GUIDES,
     OPACITY_PLANE,
+    Pool,
     decode_lightmaps,
     encode_lightmaps,
     render_guide,
     to_srgb,
 )
-from wlm.smoke.network.pool import Pool
 from wlm.smoke.network.scenes import draw_scene
 from wlm.smoke.network.settings import DatasetSettings, Profile
 from wlm.smoke.network.unet import SixWayNetwork

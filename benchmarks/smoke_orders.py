@@ -48,6 +48,7 @@ from benchmarks.rivals.smoke_orders import FITTED, diffused, filter_planes, octa
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from benchmarks.smoke import make_cloud
+from benchmarks.smoke_learning import FAINT, at, draw_view, psnr
 from benchmarks.timing import Timing
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
@@ -57,12 +58,10 @@ from wlm.smoke.march.motion import motion
 from wlm.smoke.network.losses import warp
 from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.scene import load_scene
-from wlm.smoke.shading import Light
+from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.synthetic import make_plume
-from wlm.smoke.transport.learning import FAINT, draw_view, psnr
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
-from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import OrdersModel, load_orders, make_inputs, orders_march, scatter
 from wlm.smoke.transport.tracing import Transport, trace
 
@@ -436,7 +435,7 @@ def _scores(device: str, sizes: GridSizes, cells: int, model: OrdersModel) -> It
             _, inputs = make_inputs(volume, camera, lights, ALBEDOS, orders_march(volume))
             for albedo in ALBEDOS:
                 diffused = inputs.by_diffusion(albedo)
-                mixed = model.light(inputs.at(albedo), (albedo,) * 3)[..., 0]
+                mixed = model.light(at(inputs, albedo), (albedo,) * 3)[..., 0]
                 truth = _at_albedo(traced, albedo).sum(1)[..., 0]
                 for one, other, wanted in zip(diffused, mixed, truth, strict=True):
                     yield psnr(one, wanted), psnr(other, wanted)

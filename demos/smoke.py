@@ -29,8 +29,7 @@ from wlm.smoke.data import load_frames, open_frames, write_six_way
 from wlm.smoke.flipbook.book import Shot, pack_book, write_book
 from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import guide, with_surface
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, guide, with_surface
 from wlm.smoke.scene import CameraSettings, Grid, Scene, load_scene
 from wlm.smoke.shading import Light
 from wlm.smoke.simulation import simulate

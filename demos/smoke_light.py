@@ -19,11 +19,12 @@ from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.interop import check_device
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import Camera
+from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.shading import Light
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport import load_orders, scatter, trace
-from wlm.smoke.transport.learning import psnr
 from wlm.view.pictures import contact_sheet, to_bytes
 
 HERE = Path(__file__).resolve().parent
@@ -55,7 +56,8 @@ def run(out: Path, device: str) -> dict[str, float]:
         for name, image in (("scattered once", once), ("all orders", lit.shade()), ("path-traced", truth)):
             drawn[name].append(to_bytes(image))
             if name in scores:
-                scores[name].append(psnr(image, truth))
+                error = (to_srgb(image) - to_srgb(truth)).double().square().mean()
+                scores[name].append(psnr_from_mse(float(error), 1.0))
     contact_sheet(out / "smoke_light.png", drawn, [f"{degrees:g}°" for degrees in SIDES])
     single, every = (float(np.mean(scores[name])) for name in scores)
     if not (every >= LEAST_ALL and every - single >= LEAST_GAIN):

@@ -33,8 +33,7 @@ from wlm.smoke.codec import open_network
 from wlm.smoke.data import load_frames, open_frames
 from wlm.smoke.fit import train
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse, guide
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, bake_coarse, guide
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.planes import EMISSION_PLANE, encode_lightmaps
 from wlm.smoke.network.prediction import SmokePredictor

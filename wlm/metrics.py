@@ -576,7 +576,7 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
         raise WlmError("summarise: expected at least one lightmap's metrics")
     first = frames[0]
     if any(f.valid.shape != first.valid.shape or set(f.metrics) != set(first.metrics) for f in frames):
-        raise WlmError("summarise: lightmaps differ in size or metrics; summarise each kind on its own")
+        raise WlmError("summarise: expected lightmaps of one size with scores of the same metrics, found others")
 
     psnr, ssim, flip, errors = (
         np.stack([getattr(f, field) for f in frames]) for field in ("psnr", "ssim", "flip", "max_abs_error")

@@ -25,7 +25,7 @@ _FILMIC_WHITE = 4.0
 # Share of values at 1, median and brightest radiance, and mean distance from 8-bit levels that suggest other data than
 # radiance; the numbers of a lightmap that are compared, and the fewest texels for the test of levels.
 _AT_ONE, _BRIGHT, _DARK, _LEVELS, _NEAR_LEVEL = 0.02, 1000.0, 1e-4, 255.0, 0.08
-_SAMPLES, _MANY = 6144, 1000
+_SAMPLES, _MANY = 3072, 500
 
 
 def exposure(light: np.ndarray) -> float:
@@ -154,11 +154,13 @@ def doubts(light: np.ndarray) -> list[str]:
     """
     step = max(1, round((light.size / _SAMPLES) ** 0.5))
     used = light[::step, ::step].reshape(-1, 3)
+    largest = used.max(1)  # NaN where one of the three is
     with np.errstate(invalid="ignore"):
-        used = used[(used > 0).any(-1) & np.isfinite(used).all(-1)]
-    if not len(used) or used.min() == used.max():
+        chosen = (largest > 0) & (largest < np.inf)
+    used, largest = used[chosen], np.sort(largest[chosen])
+    if not len(used) or used.min() == largest[-1]:
         return []
-    brightest, middle = float(used.max()), float(np.median(used.max(-1)))
+    brightest, middle = float(largest[-1]), float(largest[len(largest) // 2])
     found = []
     if middle > _BRIGHT:
         found.append(f"half of the texels exceed {_BRIGHT:,.0f}: are they in lux, or scaled for an encoding?")
@@ -192,7 +194,7 @@ def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
     all_finite = bool(finite.all())
     good = mask if all_finite else mask & finite
     if not good.any():
-        raise WlmError(f"{where}: no texel inside the mask is finite")
+        raise WlmError(f"{where}: expected a finite texel inside the mask, found only NaN and infinity")
     if not all_finite:
         broken = np.count_nonzero(mask & ~finite)
         if broken:

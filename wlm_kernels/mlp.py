@@ -153,7 +153,7 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact", outputs: int = 3) -> 
         ValueError: A size is below 1, or the activation is unknown.
     """
     if min(inputs, hidden, outputs) < 1 or gelu not in GELUS:
-        raise ValueError(f"MLP: expected sizes above 0, GELU exact, tanh or fast; got {inputs, hidden, outputs, gelu}")
+        raise ValueError(f"MLP: expected sizes above 0 and GELU {GELUS}, got {inputs, hidden, outputs, gelu}")
     vec_in = wp.types.vector(inputs, float)
     vec_hidden = wp.types.vector(hidden, float)
     vec_out = wp.vec3 if outputs == 3 else wp.types.vector(outputs, float)

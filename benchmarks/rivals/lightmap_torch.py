@@ -17,8 +17,8 @@ from torch.nn import functional
 from benchmarks.rivals.rival import EXTRA
 from wlm.formats.hdr_blocks import need
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
-from wlm.lightmap.targets import Targets
 from wlm.lightmap.tiles import TILE
+from wlm.lightmap.trainer import Targets
 from wlm.ops import plain
 
 _BLOCK = 4  # texels along a BC7 block's side

@@ -330,7 +330,7 @@ def test_what_a_list_of_lightmaps_says_wrong(tmp_path):
     assert "objects[0].sheet: expected 0 to 0, found 3" in told(objects=[{"node": "left", "sheet": 3}])
     assert "node: expected one of left, right, found 'top'" in told(objects=[{"node": "top", "sheet": 0}])
     twice = [{"node": "left", "sheet": 0}, {"node": "left", "sheet": 0, "scale_offset": [1, 1, 0.5, 0]}]
-    assert "left is given two lightmaps" in told(objects=twice)
+    assert "left is listed twice, with different sheets or rectangles" in told(objects=twice)
     assert "sheets[0]: no triangle of the mesh is lit by it" in told(objects=[])
     godot = {"convention": "godot", "objects": [{"path": "a", "uv_scale": [1, 2]}]}
     assert "objects[0].uv_scale: expected 4 numbers, found [1, 2]" in told(**godot)

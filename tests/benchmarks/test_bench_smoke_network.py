@@ -27,7 +27,7 @@ from benchmarks.smoke_network import (
 )
 from wlm.errors import WlmError
 from wlm.smoke.codec import shipped
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
 from wlm.smoke.network.unet import SixWayNetwork

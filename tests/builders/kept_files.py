@@ -28,7 +28,7 @@ from wlm.lightmap.fit import SheetFit
 from wlm.probe.gaussian import trainer as probe_trainer
 from wlm.probe.model import box_of
 from wlm.smoke.fit import train
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import Pool
 from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 
 

@@ -41,12 +41,12 @@ class Counts:
     lost: float = 0.0
 
 
-def drive(command: Command, folder: Path, *, kills: int, seed: int, numbers: tuple[int, ...] = ()) -> Counts:
+def drive(command: Command, folder: Path, *, kills: int, seed: int) -> Counts:
     """Runs a command, kills it, runs it again until it ends, and all that until it was killed often enough."""
     chance, counts = random.Random(seed), Counts()
     (folder / "whole").mkdir()
     whole = folder / "whole" / command.output
-    run = _Run(command, whole, False)
+    run = Run(command, whole, False)
     begin = run.wait_for_work()
     assert run.wait() == 0, run.errors()
     span = time.monotonic() - run.start - begin
@@ -58,11 +58,11 @@ def drive(command: Command, folder: Path, *, kills: int, seed: int, numbers: tup
         command.earlier(output)
         earlier, resume = command.content(output), False
         while True:
-            run = _Run(command, output, resume)
+            run = Run(command, output, resume)
             count = sum(counts.kills.values())
             if count < kills:
-                number = numbers[count % len(numbers)] if numbers else chance.choice([signal.SIGKILL, signal.SIGTERM])
-                if chance.random() < EARLY and not numbers:
+                number = chance.choice([signal.SIGKILL, signal.SIGTERM])
+                if chance.random() < EARLY:
                     run.sleep(chance.uniform(0.0, begin))
                 else:
                     run.wait_for_work()
@@ -86,7 +86,7 @@ def drive(command: Command, folder: Path, *, kills: int, seed: int, numbers: tup
     return counts
 
 
-class _Run:
+class Run:
     """A process that runs a command."""
 
     def __init__(self, command: Command, output: Path, resume: bool) -> None:

@@ -48,6 +48,18 @@ def facing(volume: DensityVolume, way: tuple = (0.0, 0.0, 1.0), size: int = 24, 
     return Camera.look_at(position, volume.centre, **({"extent": 1.1 * edge, "height": size, "width": size} | options))
 
 
+def rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Returns origins and unit directions of the rays through all pixels, in the world, both [H, W, 3]."""
+    right, up, toward = camera.axes
+    u = (np.arange(camera.width) + 0.5 - 0.5 * camera.width) * camera.pitch
+    v = (0.5 * camera.height - np.arange(camera.height) - 0.5) * camera.pitch
+    across = u[None, :, None] * right + v[:, None, None] * up
+    if camera.perspective:
+        way = across - toward
+        return np.broadcast_to(camera.position, across.shape), way / np.linalg.norm(way, axis=-1, keepdims=True)
+    return across + camera.position, np.broadcast_to(-toward, across.shape)
+
+
 def write_frames(folder: Path, **changed: object) -> Frames:
     """Writes a folder like that of a simulation."""
     frames = open_frames(folder, Scene.model_validate(SCENE | changed))

@@ -12,10 +12,9 @@ from builders.smoke_plumes import plume
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact
 from wlm.smoke.camera import Camera
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 from wlm.smoke.model import SmokeModel
-from wlm.smoke.network.planes import encode_lightmaps, render_guide
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import Pool, encode_lightmaps, render_guide
 from wlm.smoke.network.settings import NetworkSettings
 from wlm.smoke.network.unet import SixWayNetwork
 from wlm.smoke.scene import CameraSettings, make_camera

@@ -139,7 +139,7 @@ def test_wrong_flip_books(straight, tmp_path):
         (["--cells", "2x2"], "no opacity"),
         (["--cells", "2x2", "--straight"], "for straight alpha, found none"),
         (["--cells", "0x2"], "--cells: expected rows and columns"),
-        (["--cells", "3x3"], "expected sides that divide into 3 rows and 3 columns"),
+        (["--cells", "3x3"], "expected textures that divide into 3 rows and 3 columns"),
         (["--with", opacity, "--with", opacity, "--cells", "2x2"], "got 4"),
     ):
         assert call(*words, *extra, *out, code=2) == "" and line in call.stderr.splitlines()[-1]

@@ -8,6 +8,7 @@ from builders.probe_sets import synthetic
 from builders.running import call, check_a_stop_is_resumed, fails
 
 import wlm.cli.console
+import wlm.probe.volume.walk
 from wlm.probe import data, evaluate, save_probes
 
 PROBES, DEAD = 160, 5
@@ -234,15 +235,6 @@ def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path)
     assert "viewpoint: expected" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", 1, 2, "nan")
 
 
-def test_shaders_in_other_languages(fitted, tmp_path):
-    for language, name in (("hlsl", "probe.hlsl"), ("wgsl", "probe.wgsl"), ("glsl", "probe.glsl")):
-        assert name in call("export", fitted, "-o", tmp_path / "out", "--shader", language)
-        assert "wlm_probe_sh(" in (tmp_path / "out" / name).read_text()
-    words = ["export", fitted, "-o", tmp_path / "no", "--engine"]
-    assert "--shader: has no meaning" in fails(*words, "three", "--shader", "hlsl")
-    assert "'--engine': 'any' is not one of 'three'" in fails(*words, "any")
-
-
 @pytest.mark.parametrize(("engine", "index", "file"), [("three", "grid", "grid.ktx2"), ("unreal", "light", "sh5.dds")])
 def test_lattices_of_engines(engine, index, file, fitted, tmp_path):
     text = call("export", fitted, "--engine", engine, "-o", tmp_path / "out", "--cells", 5)
@@ -260,7 +252,8 @@ def test_a_volume_takes_the_normals_of_probes(carrying, room, tmp_path):
     assert len(pools[0]) == len(pools[1]) and pools[0] != pools[1]
 
 
-def test_evaluate_scores_walks_and_pictures(fitted, room, tmp_path):
+def test_evaluate_scores_walks_and_pictures(fitted, room, tmp_path, monkeypatch):
+    monkeypatch.setattr(wlm.probe.volume.walk, "_STEP", 2.0)  # sides of a block per frame
     text = call("evaluate", fitted, room, "--views", 2, "--volume", "--json", tmp_path / "r.json")
     report = json.loads((tmp_path / "r.json").read_text())
     views, walked = report["views"], report["volume"]

@@ -16,8 +16,7 @@ from wlm.fluid.volume import load_volume, save_volume
 from wlm.formats.exr import read_planes
 from wlm.smoke.data import load_frames, read_shaded, read_six_way
 from wlm.smoke.lightmaps import axis_faults
-from wlm.smoke.march.coarse import with_surface
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, with_surface
 from wlm.smoke.scene import CameraSettings, LightSettings, make_camera
 from wlm.view.pictures import to_bytes
 from wlm.view.smoke import picture
@@ -47,8 +46,8 @@ def camera_of(volume, **settings):
 @pytest.mark.parametrize(
     ("words", "place", "other"),
     [
-        (["bake", "--step", 1], "wlm.smoke.march.fine.bake", ["--step", 2]),
-        (["predict", "--coarse"], "wlm.smoke.march.coarse.bake_coarse", ["--seed", 7]),
+        (["bake", "--step", 1], "wlm.smoke.march.six_way.bake", ["--step", 2]),
+        (["predict", "--coarse"], "wlm.smoke.march.six_way.bake_coarse", ["--seed", 7]),
     ],
 )
 def test_frames_that_were_made_are_not_made_again(words, place, other, frames, tmp_path, monkeypatch):
@@ -172,7 +171,7 @@ def test_every_route_keeps_the_scene(tmp_path):
     assert kept == load_frames(folder).scene.looks(2) and bool((six.depth > 0).any())
     assert kept.albedo == (0.9, 0.5, 0.7)
     # What has light of all orders has its albedo.
-    words = ("--fit", "sphere", "--albedo", 0.8, "--step", 2, "--resolution", 20)
+    words = ("--fit", "sphere", "--albedo", 0.8, "--step", 4, "--resolution", 8)
     call("smoke", "bake", folder, "-o", tmp_path / "sphere", *words)
     assert read_shaded(tmp_path / "sphere" / "six_0002.exr")[1] == kept.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
 

@@ -9,8 +9,7 @@ from wlm.fluid.volume import load_volume
 from wlm.formats.exr import read_exr
 from wlm.smoke.camera import Camera
 from wlm.smoke.scene import CameraSettings, make_camera
-from wlm.smoke.shading import Light
-from wlm.smoke.transport.lights import PointLight
+from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.transport.tracing import trace
 
 SMALL = ("--resolution", 16)

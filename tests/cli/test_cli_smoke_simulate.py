@@ -73,7 +73,7 @@ def test_simulate_as_told(jet, tmp_path):
     for change, words in (
         ({"grid": {"cells": [4096, 4096, 4096], "cell": 0.1, "faces": {}}}, "4096 x 4096 x 4096 cells"),
         ({"air": {"speed": 0.1}}, "cells per step: expected at most 0.3"),
-        ({"inlets": [SCENE["inlets"][0] | {"radius": 0.01}]}, "inlets.0: too small to cover a cell's centre"),
+        ({"inlets": [SCENE["inlets"][0] | {"radius": 0.01}]}, "inlets.0: its circle covers no cell's centre"),
         ({"smoke": {"storage": "float16", "dissipation": 1e-3}}, "with float16"),
     ):
         (tmp_path / "wrong.yaml").write_text(yaml.safe_dump(JET | change))

@@ -4,13 +4,17 @@ Moments are drawn from a seed, but where they fall depends on the machine; what 
 """
 
 import json
+import os
 import signal
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 from builders import atlas_meshes, probe_sets, small_sets
-from builders.killing import Command, drive, file_bytes
+from builders.killing import Command, Run, drive, file_bytes
+from builders.running import call
 from builders.smoke_plumes import SCENE, write_frames
 from builders.smoke_samples import file_content
 
@@ -163,8 +167,21 @@ def command(request, tmp_path_factory):
 
 @pytest.mark.parametrize("command", ["probe compress"], indirect=True)
 def test_a_killed_command_goes_on_to_the_same_bytes(command, tmp_path):
-    counts = drive(command, tmp_path, kills=1, seed=1, numbers=(signal.SIGKILL,))
-    assert sum(counts.kills.values()) == 1 and counts.runs >= 1
+    """Only the run that is killed has a process of its own; the whole run and the resumed one are in this process."""
+    whole, output = tmp_path / command.output, tmp_path / "killed" / command.output
+    output.parent.mkdir()
+    words = (*command.words, "--checkpoint-every", 0, "--steps", 100)
+    call(*words, "-o", whole)
+    command.earlier(output)
+    earlier, expected = command.content(output), command.content(whole)
+    run = Run(replace(command, words=words), output, False)
+    while run.process.poll() is None and not command.partial(output).exists():
+        time.sleep(0.002)
+    run.process.send_signal(signal.SIGKILL)
+    assert run.wait() == -signal.SIGKILL, run.errors()
+    command.state(output, earlier, expected)
+    call(*words, "-o", output, "--resume")
+    assert command.content(output) == expected and os.listdir(output.parent) == [command.output]
 
 
 @pytest.mark.slow

@@ -207,7 +207,7 @@ def test_unsupported_nvdb(tmp_path: Path):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"smoke": np.ones((2, 2, 2))}, "density is missing; found smoke"),
+        ({"smoke": np.ones((2, 2, 2))}, "the array density is missing; found smoke"),
         ({"density": np.ones((2, 2))}, r"density: expected \[X, Y, Z\] voxels, found \(2, 2\)"),
         ({"density": np.ones((0, 2, 2))}, r"density: expected \[X, Y, Z\] voxels"),
         ({"density": np.full((1, 1, 1), "x")}, "density: expected numbers"),

@@ -95,17 +95,17 @@ def test_wrong_arguments_are_value_errors():
     endpoints, indices = _parameters(3)
     with pytest.raises(ValueError, match="uint8"):
         pack_mode6(endpoints.astype(np.int32), indices)
-    with pytest.raises(ValueError, match="expected endpoints"):
+    with pytest.raises(ValueError, match="endpoints, indices: expected"):
         pack_mode6(endpoints, indices[:2])
-    with pytest.raises(ValueError, match="0..15, got 16"):
+    with pytest.raises(ValueError, match="indices: expected 0 to 15, got 16"):
         pack_mode6(endpoints, np.full_like(indices, 16))
     endpoints[1, 0, 2] ^= 1
-    with pytest.raises(ValueError, match="share their lowest bit"):
+    with pytest.raises(ValueError, match="have the same lowest bit"):
         pack_mode6(endpoints, indices)
     for wrong in (np.zeros((3, 15), np.uint8), np.zeros((3, 16), np.int8)):
-        with pytest.raises(ValueError, match="expected blocks uint8"):
+        with pytest.raises(ValueError, match="blocks: expected uint8"):
             unpack_mode6(wrong)
-        with pytest.raises(ValueError, match="expected blocks uint8"):
+        with pytest.raises(ValueError, match="blocks: expected uint8"):
             decode_image(wrong[None])
     with pytest.raises(ValueError, match="H/4"):
         decode_image(np.zeros((3, 16), np.uint8))

@@ -48,7 +48,9 @@ def test_what_no_encoding_says(tmp_path):
     path = tmp_path / "a.png"
     Image.fromarray(BYTES[..., :3]).save(path)
     assert read_encoded(path, "srgb").shape == (1, 2, 3)
-    assert "encoding rgbm: expected a picture with alpha, found RGB" in error_of(read_encoded, path, "rgbm")
+    assert "encoding rgbm: expected a picture with alpha, found the channels RGB" in error_of(
+        read_encoded, path, "rgbm"
+    )
     for wrong in ("logluv", "rgbm:0", "rgbm:x", "rgbm:8:2:1", "srgb:2", "rgbm:nan", "layer:", ""):
         assert "encoding: expected linear, srgb, rgbm, rgbm:RANGE:GAMMA" in error_of(read_encoded, path, wrong)
     assert "found a PNG: state what light its numbers stand for with --encoding" in error_of(read_light, path)
@@ -86,7 +88,7 @@ def test_grey_and_palettes(tmp_path):
     np.testing.assert_allclose(light[0] * 255, [[0, 255, 7], [51, 204, 7], [255, 0, 7]], rtol=1e-6)
     assert not notes
     np.testing.assert_array_equal(_read(_picture(path, image, transparency=1))[0], light)
-    assert "found RGB" in error_of(read_encoded, _picture(path, image), "rgbm")
+    assert "found the channels RGB" in error_of(read_encoded, _picture(path, image), "rgbm")
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".webp", ".tga", ".png", ".exr"])
@@ -141,7 +143,7 @@ def test_levels_that_are_no_light_are_refused(tmp_path):
     path = _picture(tmp_path / "a.webp", frames[0], save_all=True, append_images=frames[1:])
     assert "expected one picture, found an animation of 2" in error_of(read_encoded, path, "srgb")
     path = _picture(tmp_path / "a.jpg", Image.new("CMYK", (4, 4)))
-    assert "expected a JPEG of grey, RGB or a palette, with alpha or without, found CMYK" in error_of(
+    assert "expected a JPEG of grey, RGB or a palette, with alpha or without, found mode CMYK" in error_of(
         read_encoded, path, "srgb"
     )
     for suffix, form in ((".png", "PNG"), (".jpg", "JPEG"), (".webp", "WEBP"), (".tga", "TGA")):

@@ -237,7 +237,7 @@ def test_integers_and_several_parts_are_refused(tmp_path, read):
     path = tmp_path / "a.exr"
     planes = _planes("RGB")
     OpenEXR.File(SCANLINES, {**planes, "G": np.ones((37, 21), np.uint32)}).write(str(path))
-    with pytest.raises(WlmError, match="channel G: expected half or float, found uint32"):
+    with pytest.raises(WlmError, match="channel G: expected half or float numbers, found uint32"):
         read(path)
     parts = [OpenEXR.Part({}, planes, name=name) for name in ("one", "two")]
     OpenEXR.File(parts).write(str(path))

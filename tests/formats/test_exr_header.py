@@ -22,12 +22,15 @@ HEADERS = {
         "expected a flat EXR picture, found deep data",
     ),
     "many channels": (exr_header(names=[f"c{i}" for i in range(9000)]), "at most 8192 attributes and channels"),
-    "many attributes": (exr_header(*((f"a{i}", "int", bytes(4)) for i in range(9000))), "at most 8192 different"),
+    "many attributes": (
+        exr_header(*((f"a{i}", "int", bytes(4)) for i in range(9000))),
+        "at most 8192 attributes of different names",
+    ),
     "many parts": (
         exr_header(flags=0x1000) + exr_header(names=["c"] * 100)[8:] * 100 + b"\0",
         "at most 8192 attributes and channels",
     ),
-    "one attribute twice": (exr_header(*[("a", "int", bytes(4))] * 2), "different attributes, found a beyond them"),
+    "one attribute twice": (exr_header(*[("a", "int", bytes(4))] * 2), "different names, found twice the attribute a"),
     "a long attribute": (exr_header(("a", "string", b"")).replace(bytes(5), b"\xff\xff\xff\x7f\0"), "expected at most"),
     "a large window": (exr_header(window=(0, 0, 1 << 20, 1)), "65536 along a side, found 1048577 x 2"),
     "more pixels than bytes": (exr_header(window=(0, 0, 16383, 16383)), "2048 times its"),

@@ -207,7 +207,7 @@ def test_kinds_are_told_by_content(tmp_path):
         (LEVEL, 500, "level 0: the file is cut short: expected 590 bytes"),
         (DESCRIPTOR_AT, 2**31, "the data format descriptor: the file is cut short"),
         (PAIRS_BYTES, 2**31, "the key/value data: the file is cut short"),
-        (104 + 14, 2, "expected linear light (transfer 1), found 2"),
+        (104 + 14, 2, "expected linear light (transfer function 1), found 2"),
     ],
 )
 def test_a_wrong_field_of_ktx2_is_named(tmp_path, at, value, words):
@@ -371,7 +371,7 @@ def test_tiffs_that_are_refused(tmp_path):
     for tag, value, words in (
         (256, 60000, "cut short or damaged"),
         (256, 70000, "65536 along a side"),
-        (262, 5, "expected a TIFF of grey or RGB, found photometric interpretation 5 with 3 samples"),
+        (262, 5, "expected a TIFF of grey or RGB, found the photometric interpretation 5 with 3 samples"),
         (277, 2, "with 2 samples"),
         (257, 17, "a.tif: "),
     ):
@@ -429,7 +429,7 @@ def test_primaries_of_a_ktx2(tmp_path, number, name):
     np.testing.assert_allclose(read_light(path)[0], 0.5, atol=1e-3)
     content[descriptor + 13] = 200
     path.write_bytes(content)
-    assert "expected primaries 0, 1, 4, 5, 6, 7, 10, 11, found 200" in error_of(read_light, path)
+    assert "expected colour primaries 0, 1, 4, 5, 6, 7, 10, 11, found 200" in error_of(read_light, path)
 
 
 def test_a_colour_profile_of_a_tiff_is_mentioned(tmp_path):

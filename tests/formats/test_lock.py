@@ -47,7 +47,10 @@ def test_one_process_writes_an_output(folder, tmp_path):
     (tmp_path / "link").symlink_to(output)
     with another_process(f"with locked({str(output)!r}):"):
         for name in (output, tmp_path / "link"):
-            with pytest.raises(WlmError, match=f"{name.name}: another process is writing it$"), locked(name):
+            with (
+                pytest.raises(WlmError, match=f"{name.name}: another process is writing it: wait until it ends$"),
+                locked(name),
+            ):
                 pytest.fail("two have the lock")
         with locked(tmp_path / "other"), locked(tmp_path):
             assert len([name for name in os.listdir(tmp_path) if name.endswith(".lock")]) == 2

@@ -5,8 +5,8 @@
     readers.py     the table of readers: what a case is made of, how it is read, what an accepted one must be
     models.py      those of artifacts and checkpoints
     corpus.py      the small good files in `corpus/`, and how they are made
-    worker.py      a process that runs cases; limits.py, its limits
-    campaign.py    workers for many cases, and the table of counts
+    worker.py      reads cases within limits of time and memory
+    campaign.py    processes for many cases, and the table of counts
     __main__.py    `python -m tests.fuzz`
 
 A case depends on its reader's name and its index alone. It must be accepted, or be refused with one `WlmError` of one

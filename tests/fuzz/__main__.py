@@ -18,8 +18,7 @@ from typing import Any
 from wlm.errors import WlmError
 
 from .campaign import Tally, campaign
-from .limits import Limits
-from .worker import FAILURES, ROOT
+from .worker import FAILURES, ROOT, Bench, Limits
 
 _ROW = "{:26} {:>9} {:>9} {:>9} {:>9}"
 
@@ -45,8 +44,7 @@ def main() -> int:
         parser.error(f"expected a reader and an index, or --cases; readers are {', '.join(readers)}")
     if words.cases is None:
         return _one(readers[words.reader], words.index, words.write)
-    counts = {name: max(words.cases // readers[name].cost, 1) for name in readers}
-    return _many(counts, words)
+    return _many({name: range(max(words.cases // reader.cost, 1)) for name, reader in readers.items()}, words)
 
 
 def _one(reader: Any, index: int, target: Path | None) -> int:
@@ -56,10 +54,7 @@ def _one(reader: Any, index: int, target: Path | None) -> int:
         target.write_bytes(data)
         return 0
     with tempfile.TemporaryDirectory(prefix="wlm-fuzz-") as folder:
-        for name, content in reader.beside().items():
-            (Path(folder) / name).write_bytes(content)
-        path = Path(folder) / reader.file
-        path.write_bytes(data)
+        path = Bench(folder, Limits()).write(reader.name, data)
         try:
             with Limits().held():
                 reader.read(path)
@@ -70,7 +65,7 @@ def _one(reader: Any, index: int, target: Path | None) -> int:
     return 0
 
 
-def _many(counts: dict[str, int], words: argparse.Namespace) -> int:
+def _many(cases: dict[str, range], words: argparse.Namespace) -> int:
     print(_ROW.format("reader", "cases", "refused", "accepted", "failed"), flush=True)
 
     def show(name: str, tally: Tally) -> None:
@@ -81,7 +76,7 @@ def _many(counts: dict[str, int], words: argparse.Namespace) -> int:
             print(f"    {each['count']} x {each['kind']}, first {each['index']}: {line}", flush=True)
 
     begin = time.perf_counter()
-    tallies = campaign(counts, words.workers, done=show)
+    tallies = campaign(cases, words.workers, done=show)
     seconds = time.perf_counter() - begin
     rows = {name: tally.to_json() for name, tally in tallies.items()}
     sums = {key: sum(row[key] for row in rows.values()) for key in ("cases", "refused", "accepted", "failed")}

@@ -22,8 +22,8 @@ from wlm.formats.exr import write_exr
 from wlm.probe.ambient_cube import write_irradiance_volume
 from wlm.probe.data import save_probes
 from wlm.smoke.data import open_frames, write_six_way
-from wlm.smoke.march.coarse import with_surface
-from wlm.smoke.march.fine import bake as bake_smoke
+from wlm.smoke.march.six_way import bake as bake_smoke
+from wlm.smoke.march.six_way import with_surface
 from wlm.smoke.scene import Scene
 
 _HEIGHT, _WIDTH = 12, 10  # of every picture
@@ -58,6 +58,15 @@ def _exrs(folder: Path) -> None:
             header["tiles"] = OpenEXR.TileDescription()
         content = {channel: np.ascontiguousarray(plane, dtype) for channel, plane in planes.items()}
         OpenEXR.File(header, content).write(str(folder / f"{name}.exr"))
+    halves = {channel: np.ascontiguousarray(planes[channel], np.float16) for channel in "RGB"}
+    layers = {
+        f"{layer}.{channel}": plane for layer in ("View.Combined", "View.Bake") for channel, plane in halves.items()
+    }
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, layers).write(str(folder / "layers.exr"))
+    header = {"compression": OpenEXR.RLE_COMPRESSION, "dataWindow": ((1, 2), (_WIDTH, _HEIGHT + 1))}
+    header["displayWindow"] = (0, 0), (_WIDTH - 1, _HEIGHT - 1)
+    parts = [OpenEXR.Part(dict(header), dict(halves), name=name) for name in ("beauty", "second")]
+    OpenEXR.File(parts).write(str(folder / "parts.exr"))
 
 
 def _pictures(folder: Path) -> None:

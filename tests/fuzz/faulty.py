@@ -61,7 +61,8 @@ def _reader(name: str, fault: Callable[[Path], None]) -> Reader:
     return Reader(name, "a", lambda: (_GOOD,), lambda draw, data: b"bad", read, blind=0.0)
 
 
-READERS = {
+_PICKY = Reader("picky", "a", lambda: (_GOOD,), lambda draw, data: b"bad", _refuse, blind=0.0)
+READERS = {"picky": _PICKY} | {
     name: _reader(name, fault)
     for name, fault in {
         "accepted": Path.exists,

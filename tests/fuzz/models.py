@@ -21,7 +21,7 @@ from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
 from wlm.smoke.fit import train
 from wlm.smoke.march.motion import read_velocity, write_velocity
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import Pool
 from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 from wlm.smoke.scene import Scene
 from wlm.smoke.simulation import make_solver

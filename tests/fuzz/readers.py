@@ -25,7 +25,7 @@ from wlm.bake.settings import LightmapSettings
 from wlm.config import load_settings
 from wlm.errors import WlmError
 from wlm.fluid.volume import load_volume
-from wlm.formats.channels import read_encoded
+from wlm.formats.channels import read_channels, read_encoded
 from wlm.formats.exr import read_exr
 from wlm.formats.gltf import read_gltf
 from wlm.formats.gltf_writer import write_glb
@@ -60,6 +60,11 @@ def _json(draw: Random, data: bytes) -> bytes:
 
 def _exr(path: Path) -> None:
     pixels, names = read_exr(path)
+    assert pixels.dtype == np.float32 and pixels.shape[2] == len(names), f"accepted as {pixels.dtype} {pixels.shape}"
+
+
+def _layered(path: Path) -> None:
+    pixels, names, _ = read_channels(path, light=True)
     assert pixels.dtype == np.float32 and pixels.shape[2] == len(names), f"accepted as {pixels.dtype} {pixels.shape}"
 
 
@@ -406,6 +411,7 @@ _FRAME = {"frame_0001.npz": "volume.npz"}
 _ALL = (
     *models.READERS,
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
+    Reader("exr-layers", "a.exr", corpus("layers.exr", "parts.exr"), corrupt, _layered),
     Reader("radiance", "a.hdr", corpus("runs.hdr", "plain.hdr"), vary_radiance, _light_file),
     Reader("pfm", "a.pfm", corpus("light.pfm"), corrupt, _light_file),
     Reader("tiff", "a.tif", corpus("strips.tif", "tiles.tif"), _tags, _light_file),

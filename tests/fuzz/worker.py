@@ -1,26 +1,20 @@
-"""A process that runs cases: it imports once, answers with a line a case, and may be killed by any of them.
-
-    python -m tests.fuzz.worker MODULE SECONDS WAIT MEMORY
-
-It takes jobs as lines of JSON: `{"reader": NAME, "first": INDEX, "count": N}`. It answers `"ready"` once the reader has
-accepted its good files, so that kernels are compiled and packages imported before anything is timed, and then
-`[index, outcome, detail]` for each case.
-"""
+"""Reads cases within limits of time and memory, in this process or in one of its own."""
 
 import importlib
-import json
 import os
+import resource
 import shutil
+import signal
 import sys
 import tempfile
 import traceback
 import unicodedata
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
-from .limits import Limits, out_of_memory
 from .reader import Reader
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -30,6 +24,28 @@ FAILURES = ("traceback", "wrong", "message", "left", "memory", "time", "crash")
 plain line; files left behind; memory or time beyond the limit; death by a signal."""
 
 _MOST_MESSAGE = 2000  # characters
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The limits of a case, held by the system: nothing that the case does in C or Python gets round them."""
+
+    seconds: float = 5.0
+    wait: float = 60.0
+    memory: int = 2 << 30
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Holds this process to the time and the memory."""
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + self.memory, hard))
+        signal.setitimer(signal.ITIMER_PROF, self.seconds)
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
+            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY if hard < 0 else hard, hard))
 
 
 @dataclass(frozen=True)
@@ -45,31 +61,90 @@ class Outcome:
         return self.kind in FAILURES
 
 
-def judge(reader: Reader, path: Path, limits: Limits) -> tuple[str, str]:
-    """Reads a file that lies alone, or beside what belongs to it, in a folder; gives an outcome and its detail."""
-    from wlm.errors import WlmError
+class Bench:
+    """A table of readers, and the folders in which their cases are read."""
 
-    folder = path.parent
-    before = sorted(folder.rglob("*"))
-    try:
-        with limits.held():
-            reader.read(path)
-    except WlmError as error:
-        kind, detail = "refused", str(error)
-        if out_of_memory(error):
-            kind = "memory"
-        elif fault := _fault(detail, folder):
-            kind, detail = "message", f"{fault}: {detail!r}"
-    except AssertionError as error:
-        kind, detail = "wrong", str(error)
-    except Exception as error:
-        kind = "memory" if out_of_memory(error) else "traceback"
-        detail = f"{_place(error)}: {type(error).__name__}: {error}"
-    else:
-        kind, detail = "accepted", ""
-    if left := sorted(set(folder.rglob("*")) - set(before)):
-        kind, detail = "left", ", ".join(str(each.relative_to(folder)) for each in left)
-    return kind, detail[:600]
+    def __init__(self, root: str, limits: Limits, module: str = "tests.fuzz.readers") -> None:
+        """Takes the folder, the limits of a case, and the module with the table `READERS`."""
+        self._root, self._limits = Path(root), limits
+        self._readers: dict[str, Reader] = importlib.import_module(module).READERS
+
+    def prepare(self, name: str) -> None:
+        """Checks that a reader accepts its good files; imports and compiles what it needs, without limits."""
+        reader = self._readers[name]
+        for number, seed in enumerate(reader.seeds()):
+            try:
+                reader.read(self.write(name, seed))
+            except Exception as error:
+                raise AssertionError(f"{name}: expected seed {number} to be accepted: {error}") from error
+
+    def write(self, name: str, data: bytes) -> Path:
+        """Lays a case's file into the reader's folder, beside what belongs to it."""
+        folder, reader = self._root / name, self._readers[name]
+        if not folder.exists():
+            folder.mkdir(parents=True)
+            for beside, content in reader.beside().items():
+                (folder / beside).write_bytes(content)
+        path = folder / reader.file
+        path.write_bytes(data)
+        return path
+
+    def run(self, name: str, index: int) -> Outcome:
+        """Makes and reads one case."""
+        path = self.write(name, self._readers[name].case(index))
+        kind, detail = self._judge(self._readers[name], path)
+        if kind in FAILURES:
+            # Whatever it left must not be there for the next.
+            shutil.rmtree(path.parent)
+        return Outcome(index, kind, detail[:600])
+
+    def _judge(self, reader: Reader, path: Path) -> tuple[str, str]:
+        from wlm.errors import WlmError
+
+        before = set(path.parent.rglob("*"))
+        try:
+            with self._limits.held():
+                reader.read(path)
+        except WlmError as error:
+            kind, detail = "refused", str(error)
+            if _out_of_memory(error):
+                kind = "memory"
+            elif fault := _fault(detail, path.parent):
+                kind, detail = "message", f"{fault}: {detail!r}"
+        except AssertionError as error:
+            kind, detail = "wrong", str(error)
+        except Exception as error:
+            kind = "memory" if _out_of_memory(error) else "traceback"
+            detail = f"{_place(error)}: {type(error).__name__}: {error}"
+        else:
+            kind, detail = "accepted", ""
+        if left := sorted(set(path.parent.rglob("*")) - before):
+            kind, detail = "left", ", ".join(str(each.relative_to(path.parent)) for each in left)
+        return kind, detail
+
+
+class Alone(Bench):
+    """The same in a process of its own."""
+
+    def __init__(self, root: str, number: int, *arguments: object) -> None:
+        """Takes a folder, the number among the processes, and what `Bench` takes besides."""
+        own = tempfile.mkdtemp(dir=root)
+        tempfile.tempdir = own
+        cache = os.environ.get("WARP_CACHE_PATH", str(ROOT / ".cache" / "warp"))
+        # Two that compile one kernel at once would race for its files.
+        os.environ["WARP_CACHE_PATH"] = f"{cache}-{number}" if number else cache
+        sys.path.append(str(ROOT / "tests"))
+        warnings.simplefilter("ignore")
+        super().__init__(own, *arguments)
+
+
+def _out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error, or one that it was made of, says that memory could not be had."""
+    while error is not None:
+        if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and "alloc" in str(error).lower()):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _fault(message: str, folder: Path) -> str:
@@ -88,83 +163,3 @@ def _place(error: BaseException) -> str:
     frames = frames or traceback.extract_tb(error.__traceback__)
     file = Path(frames[-1].filename)
     return f"{file.relative_to(ROOT) if file.is_relative_to(ROOT) else file.name}:{frames[-1].lineno}"
-
-
-class _Bench:
-    """The folders in which cases are read."""
-
-    def __init__(self, readers: dict[str, Reader], root: Path, limits: Limits) -> None:
-        self.readers, self.root, self.limits = readers, root, limits
-        self.ready: set[str] = set()
-
-    def _folder(self, name: str) -> Path:
-        return self.root / name
-
-    def prepare(self, name: str) -> None:
-        """Checks that a reader accepts its good files; imports and compiles what it needs."""
-        if name in self.ready:
-            return
-        reader = self.readers[name]
-        for number, seed in enumerate(reader.seeds()):
-            # Without limits: the first call of a kernel compiles it.
-            path = self._write(name, seed)
-            try:
-                reader.read(path)
-            except Exception as error:
-                raise AssertionError(f"{name}: expected seed {number} to be accepted: {error}") from error
-        self.ready.add(name)
-
-    def _write(self, name: str, data: bytes) -> Path:
-        """Lays a case's file into the reader's folder, beside what belongs to it."""
-        folder = self._folder(name)
-        if not folder.exists():
-            folder.mkdir()
-            for beside, content in self.readers[name].beside().items():
-                (folder / beside).write_bytes(content)
-        path = folder / self.readers[name].file
-        path.write_bytes(data)
-        return path
-
-    def run(self, name: str, index: int) -> tuple[str, str]:
-        """Makes and reads one case."""
-        reader = self.readers[name]
-        result = judge(reader, self._write(name, reader.case(index)), self.limits)
-        if result[0] in FAILURES:
-            # Whatever it left must not be there for the next.
-            shutil.rmtree(self._folder(name))
-        return result
-
-
-def main(module: str, limits: Limits) -> None:
-    """Runs the jobs that come on stdin until there are no more."""
-    answers = os.fdopen(os.dup(1), "w")
-    silence = os.open(os.devnull, os.O_WRONLY)
-    # What libraries print is of no interest, and must not be taken for an answer.
-    os.dup2(silence, 1)
-    sys.path.append(str(ROOT / "tests"))
-    warnings.simplefilter("ignore")
-    readers = importlib.import_module(module).READERS
-    os.dup2(silence, 2)
-    with tempfile.TemporaryDirectory(prefix="wlm-fuzz-") as root:
-        bench = _Bench(readers, Path(root), limits)
-        for line in sys.stdin:
-            _serve(bench, json.loads(line), answers)
-
-
-def _serve(bench: _Bench, job: dict, answers: TextIO) -> None:
-    def answer(value: object) -> None:
-        answers.write(json.dumps(value) + "\n")
-        answers.flush()
-
-    try:
-        bench.prepare(job["reader"])
-        answer("ready")
-        for index in range(job["first"], job["first"] + job["count"]):
-            answer([index, *bench.run(job["reader"], index)])
-    except Exception:
-        # Of the harness: what a reader raises is an outcome.
-        answer({"error": traceback.format_exc()})
-
-
-if __name__ == "__main__":
-    main(sys.argv[1], Limits(float(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])))

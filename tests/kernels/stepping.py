@@ -9,8 +9,7 @@ from reference import temporal as reference
 
 from wlm import interop
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
-from wlm.lightmap.targets import Targets
-from wlm.lightmap.trainer import Trainer
+from wlm.lightmap.trainer import Targets, Trainer
 from wlm.ops import plain
 from wlm_kernels.lightmap.matrix_step import fits_matrix_units
 

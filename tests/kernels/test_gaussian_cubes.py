@@ -169,9 +169,9 @@ def test_everything_is_one_list(device: str):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([0, 0, 0], [1, -1, 1]), "expected a lowest and a highest corner"),
-        (([0, 0, 0], [1, np.nan, 1]), "expected a lowest and a highest corner"),
-        (([0, 0], [1, 1]), "expected a lowest and a highest corner"),
+        (([0, 0, 0], [1, -1, 1]), "expected the lowest and the highest corner"),
+        (([0, 0, 0], [1, np.nan, 1]), "expected the lowest and the highest corner"),
+        (([0, 0], [1, 1]), "expected the lowest and the highest corner"),
         (([0, 0, 0], [1, 1, 1], 0.0), "size: expected a positive number, got 0.0"),
         (([0, 0, 0], [1, 1, 1], np.inf), "size: expected a positive number, got inf"),
         (([0, 0, 0], [1, 1, 1], 1e-4), r"makes 10+ cubes, expected at most 1073741823"),

@@ -119,6 +119,7 @@ def test_cutoff(device: str):
 def test_six_way_against_reference(device: str, turned: bool, inside: bool, kind: str, monkeypatch):
     """The same samples, processed in slabs of a few planes, also from inside the smoke and for hot smoke."""
     scene = _scene(turned, inside=inside)
+    scene.width, scene.height, scene.pitch = 7, 6, 2.0
     hot = np.random.default_rng(1).uniform(0, 1, scene.density.shape).astype(np.float16).astype(np.float32)
     monkeypatch.setattr(march_six, "_SLAB_BYTES", 16 * scene.height * scene.width * 5)
     result = _six(scene, device, TYPES[kind], (hot, 0.2), step=0.8, g=0.4)

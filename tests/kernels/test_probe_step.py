@@ -241,8 +241,8 @@ class Training:
     def run(self, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray]:
         """Rows and network after some steps."""
         s = self.step
-        for partial in self.net_grads[:steps]:
-            probe_step.count_step(self.control)
+        for step, partial in enumerate(self.net_grads[:steps]):
+            self.control.fill_(step + 1)
             s.prepare()
             s.collect(self.grad_f)
             rows = s.values, s.used, s.shapes, s.sums, self._moments

@@ -15,6 +15,7 @@ from wlm.lightmap.data import from_arrays, load
 from wlm.lightmap.evaluation import bits_per_texel, evaluate, lost_light
 from wlm.lightmap.fit import compress
 from wlm.lightmap.sheet import LIGHT
+from wlm.lightmap.tiles import TILE
 from wlm.metrics import evaluate_frame, summarise
 
 SUFFIXED = [f"{name}_by_{what}" for name in ("psnr", "ssim", "flip") for what in ("tile", "time")]
@@ -84,7 +85,7 @@ def test_what_is_scored_and_left_out_is_counted(fitted, report):
 def test_only_the_tiles_of_the_file_are_scored(fitted):
     lightmaps, whole, _ = fitted
     model = compress(lightmaps, tiny_profile(steps=60), tiles=[1, 2])
-    report = evaluate(model, lightmaps, file_bytes=50_000)
+    report = evaluate(model, lightmaps, metrics=("psnr",), file_bytes=50_000)
     light = report.light
     assert light.not_scored == {"empty": 5, "not_held": 5, "few_texels": 0, "zero_range": 5}
     assert light.tiles == 2 and "1 tiles with valid texels" in report.warnings[0]
@@ -169,17 +170,21 @@ def test_each_hour_is_scored_on_its_own_texels():
 DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "city"
 
 
-@pytest.fixture(scope="module")
-def demo_report():
-    day = load(DEMO)
-    return evaluate(compress(day, "M", steps=800, samples=1024), day, metrics=("psnr", "seen"), views=0)
-
-
-@pytest.mark.parametrize(("name", "least"), [("psnr", 41.0), ("seen", 42.0), ("ring", 37.0), ("between", 42.5)])
-def test_light_is_as_right_as_it_was(demo_report, name, least):
+@pytest.mark.parametrize(
+    ("whole", "least"),
+    [
+        (False, {"psnr": 32.2, "seen": 33.0, "ring": 28.7, "between": 33.3}),
+        pytest.param(True, {"psnr": 41.0, "seen": 42.0, "ring": 37.0, "between": 42.5}, marks=pytest.mark.slow),
+    ],
+    ids=["a tile", "all"],
+)
+def test_light_is_as_right_and_small_as_it_was(whole, least):
     """At texels, filtered, beside charts, and half-way between hours, dB; seeds differ by 0.2."""
-    assert getattr(demo_report, name) >= least
-
-
-def test_the_file_is_as_small_as_it_was(demo_report):
-    assert demo_report.bpp <= 0.62
+    day, steps = load(DEMO), 800
+    if not whole:
+        light, steps = day.light, 200
+        day = from_arrays(light.frames[::3, :TILE], light.times[::3], light.mask[:TILE], 24.0)
+    report = evaluate(compress(day, "M", steps=steps, samples=1024), day, metrics=("psnr", "seen"), views=0)
+    found = {name: getattr(report, name) for name in least}
+    assert all(found[name] >= least[name] for name in least), found
+    assert report.bpp <= (0.62 if whole else 1.7)

@@ -36,11 +36,11 @@ TIMES = (0.0, 7.5, 10.0, 13.0, 21.7, 23.99)
 @pytest.mark.parametrize(
     "settings",
     [
-        {},
-        {"period": None},
-        {"time_axis": "paper"},
-        {"gelu": "tanh", "hidden": 16, "uvt_slices": 1},
         {"times": (3.0,)},
+        {"period": None},
+        {"time_axis": "paper", "period": None, "interpolation": "network"},
+        {"gelu": "tanh", "hidden": 16, "uvt_slices": 1},
+        {"hidden": 17, "time_axis": "paper"},
     ],
     ids=str,
 )

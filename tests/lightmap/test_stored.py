@@ -80,7 +80,7 @@ def test_integers_with_an_encoding(tmp_path, suffix):
     (tmp_path / "set.json").write_text(json.dumps({key: value for key, value in plain.items() if key != "stored"}))
     assert "state what light its numbers stand for with --encoding" in error_of(wlm.lightmap.load, tmp_path)
     (tmp_path / "set.json").write_text(json.dumps(plain | {"stored": 5}))
-    assert "stored: expected an encoding, such as srgb" in error_of(wlm.lightmap.load, tmp_path)
+    assert "stored: expected a valid string, got 5" in error_of(wlm.lightmap.load, tmp_path)
 
 
 def test_a_layer_is_chosen_by_name_in_a_set_and_for_a_mesh(tmp_path):

@@ -288,6 +288,11 @@ f 4/4 3/3 2/2 1/1
 """A floor, seen from above alone."""
 
 
+@pytest.fixture(autouse=True)
+def small_views(monkeypatch):
+    monkeypatch.setattr("wlm.lightmap.view_scores.RESOLUTION", 128)
+
+
 def floor() -> Geometry:
     position = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]], np.float32)
     uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
@@ -377,4 +382,4 @@ def test_the_mesh_of_a_set_lies_in_its_folder(tmp_path):
     assert load(stored(mesh="scene.glb")).light.mesh == tmp_path / "scene.glb"
     assert "mesh: expected a file within" in error_of(load, stored(mesh="../scene.glb"))
     assert load(stored(mesh="../scene.glb"), trust=True).light.mesh == tmp_path / "../scene.glb"
-    assert "mesh: expected the name of a mesh, got 3" in error_of(load, stored(mesh=3))
+    assert "mesh: expected a valid string, got 3" in error_of(load, stored(mesh=3))

@@ -51,17 +51,6 @@ def test_texture_as_three_lays_it_out(grid):
     np.testing.assert_array_equal(texels[:, -1], texels[:, -2])
 
 
-def test_export_refuses(tmp_path):
-    for model, settings, message in [
-        (random_model(outputs=12), {}, "expected 27 numbers per probe"),
-        (random_model(), {"cells": 0}, "cells: expected"),
-        (random_model(), {"cells": 257}, "cells: expected"),
-    ]:
-        with pytest.raises(WlmError, match=message):
-            export(model, tmp_path / "out", "three", **settings)
-    assert not (tmp_path / "out").exists()
-
-
 def shade(sh: np.ndarray, n: np.ndarray) -> np.ndarray:
     """What Unity shows: SphericalHarmonicsL2.Evaluate of sh[channel, coefficient] at normals [M, 3]."""
     x, y, z = n.T
@@ -87,20 +76,6 @@ def test_unity_shows_the_same_light(mirror, outputs, tmp_path):
     assert (sh[model.dead] == 0).all()
     script = (tmp_path / "out" / "WlmLightProbes.cs").read_text()
     assert f'"{content["format"]}"' in script and f"version != {content['version']}" in script
-
-
-def test_what_unity_refuses(tmp_path):
-    np.savez(tmp_path / "other.npz", position=np.zeros((3, 3)))
-    for model, settings, message in [
-        (random_model(outputs=48, positions=True), {}, "expected 3, 12 or 27 numbers per probe"),
-        (random_model(outputs=5, positions=True), {}, "expected 3, 12 or 27 numbers per probe"),
-        (random_model(positions=True), {"mirror": "w"}, "mirror: expected x, y or z"),
-        (random_model(), {}, "stores no positions"),
-        (random_model(), {"original": tmp_path / "other.npz"}, "expected the 200 probes"),
-    ]:
-        with pytest.raises(WlmError, match=message):
-            export(model, tmp_path / "out", "unity", **settings)
-    assert not (tmp_path / "out").exists()
 
 
 FILES = ("ambient.dds", *SH_FILES)
@@ -252,18 +227,6 @@ def test_the_shader_compiles(model, tmp_path):
     assert done.returncode == 0, done.stdout
 
 
-def test_what_unreal_refuses(model, tmp_path):
-    bright = wlm.probe.compress(wlm.probe.from_arrays(np.eye(3), np.full((3, 27), 1e6)), positions=True)
-    for made, settings, message in [
-        (random_model(outputs=12, positions=True), {}, "expected 27 numbers per probe"),
-        (model, {"cells": 129}, "cells: expected 1 to 128"),
-        (bright, {}, "expected light within 64512"),
-    ]:
-        with pytest.raises(WlmError, match=message):
-            export(made, tmp_path / "out", "unreal", **settings)
-    assert not (tmp_path / "out").exists()
-
-
 def packed(data: bytes, key: str, kind: int, form: str, each: int) -> np.ndarray:
     """A packed array of the dictionary, found by its key."""
     mark = struct.pack("<I", len(key) + 1) + key.encode() + b"\0" + struct.pack("<I", kind)
@@ -339,19 +302,51 @@ def test_a_bake_keeps_all_but_its_light(order, double, tmp_path):
     np.testing.assert_array_equal(relit(made, read_lmbake(path)[1]), old)
 
 
-def test_what_is_refused(tmp_path):
-    writer, random = Writer(), np.random.default_rng(0)
-    points, path = random.random((9, 3)), tmp_path / "a.lmbake"
-    path.write_bytes(writer.file(bake(writer, points, np.ones((9, 9, 3)))))
-    model = wlm.probe.compress(from_arrays(points[::-1] + 1.0, np.ones((9, 27))))
-    for refused, settings, message in [
-        (random_model(outputs=12), {}, "expected 27 numbers per probe"),
-        (random_model(outputs=12), {"original": path}, "expected 27 numbers per probe"),
-        (random_model(), {"cells": 65}, "cells: expected 1 to 64"),
-        (random_model(), {"cells": 4, "original": path}, "cells: expected none"),
-        (model, {"original": path}, "a.lmbake: expected the 9 probes"),
-        (model, {}, "stores no positions"),
-    ]:
+def _bake_file(folder):
+    path = folder / "a.lmbake"
+    points = np.random.default_rng(0).random((9, 3))
+    path.write_bytes(Writer().file(bake(Writer(), points, np.ones((9, 9, 3)))))
+    return path
+
+
+REFUSED = {
+    "three": [
+        ({"outputs": 12}, {}, "expected 27 numbers per probe"),
+        ({}, {"cells": 0}, "cells: expected"),
+        ({}, {"cells": 257}, "cells: expected"),
+    ],
+    "unity": [
+        ({"outputs": 48, "positions": True}, {}, "expected 3, 12 or 27 numbers per probe"),
+        ({"outputs": 5, "positions": True}, {}, "expected 3, 12 or 27 numbers per probe"),
+        ({"positions": True}, {"mirror": "w"}, "mirror: expected x, y or z"),
+        ({}, {}, "stores no positions"),
+        ({}, {"original": _bake_file}, "expected the 200 probes"),
+    ],
+    "unreal": [
+        ({"outputs": 12}, {}, "expected 27 numbers per probe"),
+        ({}, {"cells": 129}, "cells: expected 1 to 128"),
+        (np.full((3, 27), 1e6), {}, "expected light within 64512"),
+    ],
+    "godot": [
+        ({"outputs": 12}, {}, "expected 27 numbers per probe"),
+        ({"outputs": 12}, {"original": _bake_file}, "expected 27 numbers per probe"),
+        ({}, {"cells": 65}, "cells: expected 1 to 64"),
+        ({}, {"cells": 4, "original": _bake_file}, "cells: expected none"),
+        ({}, {"original": _bake_file}, "a.lmbake: expected the 200 probes"),
+        (np.ones((9, 27)), {}, "stores no positions"),
+    ],
+}
+
+
+@pytest.mark.parametrize("engine", REFUSED)
+def test_what_an_engine_refuses(engine, tmp_path):
+    for made, settings, message in REFUSED[engine]:
+        if isinstance(made, dict):
+            model = random_model(**made)
+        else:
+            places = np.random.default_rng(0).random((len(made), 3))
+            model = wlm.probe.compress(from_arrays(places, made), positions=engine == "unreal")
+        settings = {name: value(tmp_path) if callable(value) else value for name, value in settings.items()}
         with pytest.raises(WlmError, match=message):
-            export(refused, tmp_path / "out", "godot", **settings)
+            export(model, tmp_path / "out", engine, **settings)
     assert not (tmp_path / "out").exists()

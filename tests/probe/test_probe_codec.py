@@ -191,23 +191,6 @@ def test_a_name_does_not_reach_the_terminal_as_orders(tmp_path):
     assert load(path).name == "a [2J b"
 
 
-@pytest.mark.parametrize("at", range(0, 60, 2))
-def test_damage_is_one_line_or_another_model(at, tmp_path):
-    whole_model(positions=True).save(tmp_path / "a.wlm")
-    artifact = read_artifact(tmp_path / "a.wlm")
-    body = artifact.tensors[BODY].copy()
-    body[at] ^= 0xFF
-    for damaged in (body, body[: len(body) - 20], body[:at]):
-        artifact.tensors[BODY] = damaged
-        try:
-            model = codec.decode(artifact)
-        except (WlmError, ValueError) as error:
-            assert "\n" not in str(error)
-        else:
-            codec.encode(model)
-            assert np.isfinite(model.content.rows()).all()
-
-
 def test_steps_beyond_floats_are_refused(tmp_path):
     model = whole_model()
     whole = model.content.whole

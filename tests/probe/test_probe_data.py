@@ -1,8 +1,6 @@
 """What comes in: every stated behaviour of `wlm.probe.data`."""
 
-import io
 import json
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -278,7 +276,7 @@ def test_numbers_as_large_and_as_small_as_float32_allows():
         wide[3, 8], wide[5, 1] = bad, np.inf
         for convention in ("threejs", "godot"):
             message = error_of(from_arrays, _position(), wide, convention=convention)
-            assert "sh[3]: expected numbers within 1.8e+19, got " in message
+            assert "sh[3]: expected numbers of at most 1.8e+19, got " in message
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float64, np.int16, np.uint8, ">f4", np.longdouble])
@@ -294,10 +292,10 @@ def test_number_types_are_converted(tmp_path, dtype):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"position": np.zeros((N, 2))}, "position: expected (N, 3), got (6, 2)"),
+        ({"position": np.zeros((N, 2))}, "position: expected the shape (N, 3), got (6, 2)"),
         ({"position": np.float64(3)}, "position: expected at least one probe, found none"),
         ({"position": np.full((N, 3), "a")}, "position: expected numbers, got <U1"),
-        ({"sh": _values(N - 1, 9, 3)}, "sh: expected (6, C, 3) with RGB last or (6, D), a row for each position, got"),
+        ({"sh": _values(N - 1, 9, 3)}, "sh: expected the shape (6, C, 3) with RGB last or (6, D), a row for each"),
         ({"sh": _values(N, 3, 5)}, "got (6, 3, 5)"),
         ({"sh": _values(N, 9, 1)}, "got (6, 9, 1)"),
         ({"sh": np.zeros((N, 0))}, "got (6, 0)"),
@@ -311,16 +309,6 @@ def test_wrong_shapes_and_types(tmp_path, changes, expected):
     path = _write(tmp_path / "a.npz", **changes)
     message = error_of(load, path)
     assert message.startswith(f"{path}: ") and expected in message
-
-
-def test_an_array_that_claims_to_be_huge(tmp_path):
-    header = io.BytesIO()
-    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**14, 3)})
-    path = tmp_path / "a.npz"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("position.npy", header.getvalue())
-        archive.writestr("sh.npy", header.getvalue())
-    assert "a.npz: position: expected at most" in error_of(load, path)
 
 
 @pytest.mark.parametrize(
@@ -375,7 +363,7 @@ def test_positions_of_any_file(tmp_path):
         ("{}", "position: expected a list, got null"),
         ('{"probes": [{"sh": 3}]}', "probes[0].position is missing"),
         ("[]", "position: expected at least one probe, found none"),
-        ("[[1, 2]]", "position: expected (N, 3), got (1, 2)"),
+        ("[[1, 2]]", "position: expected the shape (N, 3), got (1, 2)"),
         ('[[0, 0, 0], [0, 1, "2"]]', "position[1]: expected numbers, as many as position[0] has, got [0, 1, "),
         ("[[0, 1, 1e999]]", "position[0]: expected finite numbers"),
         ({"path": np.zeros((2, 3))}, "position is missing; found path"),

@@ -68,7 +68,7 @@ HARD = {
 @pytest.mark.parametrize("kind", HARD)
 def test_hard_sets(kind, tmp_path):
     probes = from_arrays(*HARD[kind])
-    compress(probes, SMALL, steps=240, ratio=0.5, positions=True).save(tmp_path / "a.wlm")
+    compress(probes, SMALL, steps=150, ratio=0.5, positions=True).save(tmp_path / "a.wlm")
     back = wlm.load(tmp_path / "a.wlm")
     decoded = back.decoder(position=probes.position).decode_probes()
     assert decoded.shape == probes.values.shape and np.isfinite(decoded).all()
@@ -92,7 +92,7 @@ def test_more_gaussians_than_places_are_not_made():
 def test_useless_gaussians_are_dropped_within_the_bound(monkeypatch):
     probes = synthetic(200)
     monkeypatch.setattr(training, "_PRUNE", 0.03)
-    profile = SMALL.override({"steps": 300, "ratio": 0.3})
+    profile = SMALL.override({"steps": 200, "ratio": 0.3})
     x, values = _input(probes)
     trainer = Trainer(x, values, profile, 0, "cpu")
     try:
@@ -227,7 +227,7 @@ def test_hard_sets_of_components(kind, tmp_path):
 
 
 def test_light_between_probes_is_read_from_a_volume(tmp_path):
-    probes = synthetic(400)
+    probes = synthetic(300)
     model = wlm.probe.compress(probes)
     assert model.method == "pca"
     with pytest.raises(WlmError, match="stores no positions"):
@@ -239,16 +239,16 @@ def test_light_between_probes_is_read_from_a_volume(tmp_path):
     # Points outside of the box are moved to it, and no point is black.
     far = decoder.decode(np.array([[1e6, 0.0, 0.0], [4.0, 1.5, 3.0]]))
     assert np.isfinite(far).all() and (np.abs(far) > 0).any(1).all()
-    with pytest.raises(WlmError, match="expected the positions of its own 400 probes"):
+    with pytest.raises(WlmError, match="expected the positions of its own 300 probes"):
         model.decoder(position=probes.position[:7])
-    with pytest.raises(WlmError, match="expected the positions of its own 400 probes"):
+    with pytest.raises(WlmError, match="expected the positions of its own 300 probes"):
         decoder.light(probes.position + 1.0)
 
 
 def test_the_choice_is_by_error_at_equal_gpu_bytes():
     # Light that is smooth over thousands of probes suits Gaussians; white noise suits neither, and stays PCA's.
-    smooth = synthetic(900)
-    model = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.02, latent=3, hidden=8, steps=1500))
+    smooth = synthetic(600)
+    model = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.02, latent=3, hidden=8, steps=900))
     assert model.method == "gaussians" and model.choice.startswith("Gaussians: ")
     assert model.profile.method == "gaussians"
     unfinished = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.3, latent=3, hidden=8, steps=10))

@@ -184,7 +184,7 @@ def test_a_scene_that_is_refused(tmp_path):
         ({"sh": None}, "sh[0]: expected numbers"),
         ({"intensity": "high"}, "intensity[0]: expected numbers"),
         ({"children": 3}, "children: expected a list of objects"),
-        ({"sh": [1.0] * 12}, "expected as many numbers in each LightProbe"),
+        ({"sh": [1.0] * 12}, "expected as many SH coefficients in each LightProbe"),
         ({"matrix": [1e308, 1e999] * 8}, "expected finite numbers"),
     ):
         scene = probe_layouts.three_scene()

@@ -1,6 +1,5 @@
 """Exported models: shaders compile for Vulkan, and buffers decode like Python, by shaders and by NumPy alone."""
 
-import itertools
 import shutil
 import subprocess
 from dataclasses import replace
@@ -67,6 +66,7 @@ def test_gaussians_and_lists_of_them(settings):
     main = "vec3 position = texelFetch(u_points, ivec2(pixel.x, 0), 0).xyz;" + (_VALUES, _SH)[model.outputs != 5]
     size = model.outputs, len(position)
     got = _run(made.shader, main, size, dict(made.buffers), head, u_points=points_of(position))
+    assert np.ptp(got[..., 0], axis=1).min() > 0, "the light varies"
     for kind, chosen in enumerate((slice(None), slice(1, None, 2), slice(0, None, 2))):
         code = model.content.code[chosen]
         if len(code):
@@ -97,7 +97,7 @@ def _gaussians(**settings) -> tuple[str, str]:
     return head + probe_glsl(model.content), f"float o[{model.outputs}]; {call}"
 
 
-CALLERS = {str(shape): lambda shape=shape: _gaussians(**shape) for shape in SHAPES} | {
+CALLERS = {str(shape): lambda shape=shape: _gaussians(**shape) for shape in SHAPES if "turn" not in shape} | {
     "components": lambda: (
         wlm.probe.compress(synthetic(100)).bundle().shader,
         "vec3 sh[9]; wlm_probe_sh(2, sh); float o[1]; o[0] = sh[0].x;",
@@ -113,8 +113,10 @@ CALLERS = {str(shape): lambda shape=shape: _gaussians(**shape) for shape in SHAP
 
 
 @pytest.mark.skipif(shutil.which("glslangValidator") is None, reason="glslangValidator is not installed")
-@pytest.mark.parametrize("kind", CALLERS)
-@pytest.mark.parametrize(("version", "options"), [(430, []), (450, ["-V", "-o", "shader.spv"])])
+@pytest.mark.parametrize(
+    ("version", "options", "kind"),
+    [*((450, ["-V", "-o", "shader.spv"], kind) for kind in CALLERS), *((430, [], kind) for kind in list(CALLERS)[:2])],
+)
 def test_it_compiles(kind, version, options, tmp_path):
     shader, body = CALLERS[kind]()
     text = f"#version {version}\nlayout(local_size_x = 64) in;\n{shader}\n"
@@ -127,89 +129,6 @@ def test_it_compiles(kind, version, options, tmp_path):
 def test_the_shader_depends_on_the_shape_alone():
     assert probe_glsl(random_model(seed=0).content) == probe_glsl(random_model(seed=1, count=9, bits=7).content)
     assert probe_glsl(random_model().content) != probe_glsl(random_model(support="sphere").content)
-
-
-def sigmoid(x):
-    return 1.0 / (1.0 + np.exp(-x))
-
-
-class Files:
-    """A raw folder, read as "about" and the head of probe.glsl say, in float64."""
-
-    def __init__(self, folder):
-        self.info, arrays = read_export(folder)
-        info, words = self.info, arrays["gaussians"]
-        halves = arrays["network"].view("<f2").astype(np.float64)
-        self.words = words
-        latent, hidden, count = info["latent"], info["hidden"], info["gaussians"]
-        per, first = info["words_per_gaussian"], info["first_gaussian_word"]
-        assert words[9] == count and len(words) == first + count * per
-        codes = words[first:].view("<u2").reshape(count, 2 * per)[:, : 10 + latent]
-        numbers = np.array(info["low"]) + codes * np.array(info["step"])
-        self.centre, self.scale = numbers[:, :3], np.exp(numbers[:, 3:6])
-        q = numbers[:, 6:10]
-        norm = np.linalg.norm(q, axis=1, keepdims=True)
-        w, x, y, z = np.where(norm < 1e-12, [1.0, 0.0, 0.0, 0.0], q / np.where(norm < 1e-12, 1.0, norm)).T
-        self.rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        ).transpose(2, 0, 1)
-        self.latent = numbers[:, 10:]
-        self.layers, at = [], 0
-        sizes = [latent + 3, hidden, hidden, info["outputs"]]
-        for inputs, outputs in itertools.pairwise(sizes):
-            rows, fours = 1 + -(-inputs // 4) * 4, -(-outputs // 4)
-            layer = halves[at : at + 4 * rows * fours].reshape(fours, rows, 4).transpose(1, 0, 2).reshape(rows, -1)
-            at += layer.size
-            assert not layer[1 + inputs :].any() and not layer[:, outputs:].any()
-            self.layers.append((layer[1 : 1 + inputs, :outputs], layer[0, :outputs]))
-        assert at == len(halves)
-
-    def place(self, position):
-        x = (np.asarray(position) - self.info["origin"]) / self.info["extent"]
-        return np.clip(x, 0.0, self.info["size"])
-
-    def weights(self, x):
-        """[M, K], 0 where a Gaussian doesn't reach."""
-        d = x[:, None] - self.centre
-        u = np.einsum("kij,mki->mkj", self.rotation, d) / self.scale
-        square, cut = (u**2).sum(2), self.info["cut"]
-        if self.info["support"] == "sphere":
-            reached = (d**2).sum(2) < (cut * self.scale.max(1)) ** 2
-        else:
-            reached = square < cut**2
-        return np.where(reached, np.exp(-0.5 * square), 0.0)
-
-    def values(self, position):
-        x = self.place(position)
-        h = np.concatenate([self.weights(x) @ self.latent, x], 1)
-        (w1, b1), (w2, b2), (w3, b3) = self.layers
-        return self.info["gain"] * (sigmoid(sigmoid(h @ w1 + b1) @ w2 + b2) @ w3 + b3)
-
-
-def places(count=200, seed=1):
-    """Positions in the box and a little beyond."""
-    return ORIGIN + EXTENT * SIZE * np.random.default_rng(seed).uniform(-0.1, 1.1, (count, 3))
-
-
-@pytest.mark.parametrize("settings", SHAPES, ids=str)
-def test_the_files_alone_give_the_decoders_light(settings, tmp_path):
-    model = random_model(**settings)
-    export(model, tmp_path)
-    files = Files(tmp_path)
-    expected = model.decoder().decode(places())
-    assert np.ptp(expected, axis=0).min() > 0, "the light varies"
-    # float32 in the decoder.
-    np.testing.assert_allclose(files.values(places()), expected, rtol=0, atol=2e-5 * np.abs(expected).max())
-    # The reference, whose last point is outside the box.
-    _, arrays = read_export(tmp_path)
-    position, values = arrays["position"], arrays["values"]
-    assert values.shape == (min(model.content.count, 64) + 1, model.outputs)
-    assert (position[-1] > ORIGIN + EXTENT * SIZE).all()
-    np.testing.assert_allclose(files.values(position), values, rtol=0, atol=2e-5 * np.abs(values).max())
 
 
 def test_what_is_written(tmp_path):
@@ -232,6 +151,9 @@ def test_what_is_written(tmp_path):
     codes = arrays["positions"].reshape(-1, 3)
     position = np.array(info["origin"]) + info["extent"] * np.array(info["size"]) * codes / 65535
     np.testing.assert_allclose(position, model.stored_positions(), rtol=1e-12)
+    # The last point of the reference is outside the box.
+    assert arrays["values"].shape == (41, 27) and (arrays["position"][-1] > ORIGIN + EXTENT * SIZE).all()
+    np.testing.assert_allclose(arrays["values"], decode64(model, arrays["position"]), rtol=0, atol=1e-4)
     # As many bytes as half floats would take, but for the head (section 5.3.2).
     assert arrays["gaussians"].nbytes == 40 * 40 + 4 * (10 + 2 * 19)
 

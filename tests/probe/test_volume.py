@@ -72,10 +72,10 @@ def _settle(volume: Volume, viewpoint: object) -> list[FrameStats]:
     return frames
 
 
-@pytest.mark.parametrize("budget", [7, 64, 1024])
+@pytest.mark.parametrize("budget", [7, 64])
 def test_teleport_converges_in_the_frames_of_the_budget(device: str, budget: int):
     """ceil(blocks near a probe / budget) frames, each full but the last; empty blocks cost nothing."""
-    position = _surface(300)
+    position = _surface(150)
     volume = _volume(position, device, budget=budget)
     decoded = set()
     for viewpoint in ([0.0, 2.0, 0.0], [700.0, 0.0, 0.0], [-40.0, 3.0, 41.0]):
@@ -109,9 +109,9 @@ def test_nearest_blocks_first(device: str):
     assert {level for _, level in ranks[:90]} == {0, 1, 2, 3}
 
 
-def test_blocks_have_the_stated_light(device: str):
+def test_blocks_have_the_stated_field(device: str):
     """Those that few probes decide, against a dense system; of the others the probes are spread over their reach."""
-    position = _surface(500)
+    position = _surface(250)
     values = _field(position)
     volume = _volume(position, device, budget=1024)
     stats = _settle(volume, [1.0, 2.0, 3.0])
@@ -135,7 +135,7 @@ def test_blocks_have_the_stated_light(device: str):
     )
 
 
-def test_read_at_a_probe_is_that_probes_light(device: str):
+def test_read_at_a_probe_is_that_probes_field(device: str):
     """Most of a light without likeness from probe to probe comes back, where a mean leaves little; a constant all."""
     random = np.random.default_rng(3)
     grid = np.stack(np.meshgrid(np.arange(30.0), 0.0, np.arange(30.0)), -1).reshape(-1, 3)
@@ -166,6 +166,9 @@ def test_normals_keep_light_from_leaking(device: str):
         reading = volume.read(position[inner], known if known is None else normal[inner])
         leaks.append(float(np.sqrt((reading.values**2).mean())))
     assert leaks[0] > 0.3 and leaks[1] < 0.4 * leaks[0]
+    sets = [from_arrays(position, bright[:, None] + 0.1, normal=known) for known in (None, normal)]
+    psnr = [score_volume(each, StoredLight(each.values, device), frames=2)["psnr"] for each in sets]
+    assert psnr[1] > psnr[0] + 1.5
     with pytest.raises(ValueError, match="normal"):
         Volume(position, light, normal=normal[1:])
 
@@ -190,15 +193,17 @@ def test_any_way_leads_to_the_same_volume(device: str):
 
 def test_no_read_of_a_block_that_is_not_there(device: str):
     """In every frame of a hurried walk what is there lies in the windows and is right, and a read takes that alone."""
-    position = _surface(600)
-    volume = _volume(position, device, budget=5, rows=900)
-    whole = _volume(position, side=32, budget=1024)
+    position = _surface(250)
+    volume = _volume(position, device, budget=3, rows=400)
+    whole = _volume(position, side=16, budget=1024)
     settle(whole, np.zeros(3))
     truth = _there(whole)
     random = np.random.default_rng(6)
-    viewpoint, dropped, cached = np.array([0.0, 1.0, 0.0]), 0, 0
-    for step in range(12):
-        viewpoint = random.uniform(-50, 50, 3) if step % 4 == 3 else viewpoint + random.normal(size=3) * [4, 1, 4]
+    home, dropped, cached = np.array([0.0, 1.0, 0.0]), 0, 0
+    for step in range(9):
+        if step % 3 == 0:
+            viewpoint = np.array([40.0, 3.0, -30.0]) if step == 3 else home
+        viewpoint = viewpoint + random.normal(size=3) * [4, 1, 4]
         stats = volume.update(viewpoint)
         dropped, cached = dropped + stats.dropped, cached + stats.cached
         there = _there(volume)
@@ -232,7 +237,7 @@ def test_the_pool_gives_away_the_least_recently_used(device: str):
 
 def test_a_pool_too_small_keeps_what_it_has(device: str):
     """The nearest blocks fill it; the others wait, and nothing that is seen is taken away."""
-    position = _surface()
+    position = _surface(200)
     volume = _volume(position, device, budget=8, rows=40)
     stats = [volume.update([0.0, 1.0, 0.0]) for _ in range(30)]
     there = _there(volume)
@@ -416,14 +421,6 @@ def _ground(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     return 5.0 + 2.0 * np.sin(x / 20.0) + z / 15.0
 
 
-def _light(position: np.ndarray) -> np.ndarray:
-    return np.stack([np.sin(position[:, 0] / 3), np.cos(position[:, 2] / 4)], 1).astype(np.float32)
-
-
-def _walked_volume(position: np.ndarray, device: str = "cpu", **settings: object) -> Volume:
-    return Volume(position, StoredLight(_light(position), device), **({"block": 2.0, "side": 16} | settings))
-
-
 def _line(frames: int, step: float) -> np.ndarray:
     path = np.zeros((frames, 3))
     path[:, 0], path[:, 1] = np.arange(frames) * step, 7.0
@@ -474,8 +471,8 @@ def test_figures_are_those_of_the_readings(device: str):
     """The figures of one frame follow from the volume, its light and the original, dead probes left out."""
     position = _hills()
     live = np.arange(len(position)) % 9 > 0
-    original = _light(position) + np.random.default_rng(1).normal(size=(len(position), 2)).astype(np.float32) / 10
-    volume = _walked_volume(position, device, live=live, budget=40)
+    original = _field(position) + np.random.default_rng(1).normal(size=(len(position), 5)).astype(np.float32) / 10
+    volume = _volume(position, device, side=16, live=live, budget=40)
     reports = []
     path = _line(12, 1.0)
     figures = walk(volume, path, original, samples=60, progress=reports.append)
@@ -487,7 +484,7 @@ def test_figures_are_those_of_the_readings(device: str):
     last = walk(volume, path[-1:], original, samples=10**6)
     inside = (np.abs(position - path[-1]) < 16.0).all(1)
     near, far = np.flatnonzero(live & inside), np.flatnonzero(live & ~inside)
-    reading, light, peak = volume.read(position[near]), _light(position[near]), np.ptp(original)
+    reading, light, peak = volume.read(position[near]), _field(position[near]), np.ptp(original)
 
     def rms(values: np.ndarray) -> float:
         return float(np.sqrt((values.astype(np.float64) ** 2).mean()))
@@ -501,27 +498,17 @@ def test_figures_are_those_of_the_readings(device: str):
         assert last[name] == pytest.approx(20.0 * np.log10(peak / rms(error)))
 
 
-def test_points_that_nothing_covers_count_as_black():
-    position = _hills()
-    light = np.full((len(position), 1), 2.0, np.float32)
-    volume = Volume(position, StoredLight(light), block=2.0, ratios=(1,), side=16, budget=1)
-    figures = walk(volume, _line(1, 0.0), light, samples=10**6)
-    covered = figures["coverage"]["mean"]
-    assert 0.0 < covered < 0.2
-    assert figures["rmse"]["mean"] == pytest.approx(2.0 * math.sqrt(1.0 - covered), rel=1e-5)
-
-
 def test_a_second_lap_decodes_nothing():
     position = _hills()
-    path, volume = camera_path(position, 30), _walked_volume(position, budget=1024)
-    first, second = (walk(volume, path, _light(position)) for _ in range(2))
+    path, volume = camera_path(position, 30), _volume(position, side=16, budget=1024)
+    first, second = (walk(volume, path, _field(position)) for _ in range(2))
     assert first["updated"]["max"] > 0 and second["updated"]["max"] == second["probes"]["max"] == 0
     assert second["left"]["max"] == 0 and second["light_psnr"] == first["light_psnr"] == 120.0
 
 
 def test_a_walk_outside_of_the_scene():
     """Frames without a near sample have no coverage and no error."""
-    volume, light = _walked_volume(_hills(), budget=1024), _light(_hills())
+    volume, light = _volume(_hills(), side=16, budget=1024), _field(_hills())
     figures = walk(volume, _line(2, 1.0) + 1e6, light)
     assert json.loads(json.dumps(figures, allow_nan=False)) == figures
     assert all(figures[key] is None for key in ("coverage", "rmse", "rms", "psnr", "light_psnr"))
@@ -531,7 +518,7 @@ def test_a_walk_outside_of_the_scene():
 
 
 def test_walk_refuses():
-    volume, light = _walked_volume(_hills(50)), _light(_hills(50))
+    volume, light = _volume(_hills(50), side=16), _field(_hills(50))
     for path, options in [(np.zeros(3), {}), (np.zeros((0, 3)), {}), (_line(1, 0.0), {"samples": 0})]:
         with pytest.raises(ValueError, match="walk: expected"):
             walk(volume, path, light, **options)
@@ -539,19 +526,6 @@ def test_walk_refuses():
         walk(volume, _line(1, 0.0), light[1:])
     with pytest.raises(WlmError, match="viewpoint"):
         walk(volume, np.array([[0.0, np.nan, 0.0]]), light)
-
-
-def test_normals_of_a_set_keep_rooms_apart():
-    """A bright room and a dark one, with a wall between that is thinner than a block."""
-    along = np.stack(np.meshgrid(np.arange(-3.0, 3.1, 0.3), np.arange(0.0, 3.1, 0.3)), -1).reshape(-1, 2)
-    side = np.repeat([-1.0, 1.0], len(along))
-    position, normal = np.column_stack([0.05 * side, np.tile(along, (2, 1))]), side[:, None] * [7.0, 0.0, 0.0]
-    values = np.where(side < 0, 1.0, 0.1)[:, None]
-    psnr = []
-    for known in (None, normal):
-        probes = from_arrays(position, values, normal=known)
-        psnr.append(score_volume(probes, StoredLight(probes.values), frames=3)["psnr"])
-    assert psnr[1] > psnr[0] + 1.5
 
 
 def _cells(key: np.ndarray) -> np.ndarray:
@@ -598,10 +572,9 @@ def test_no_probe_and_coincident_ones():
 
 
 def test_index_refuses():
-    good = np.zeros((2, 3))
-    for position, side in [(np.zeros(3), 1), (np.array([[0, np.nan, 0]]), 1), (np.full((1, 3), 1e101), 1), (good, 0)]:
-        with pytest.raises(ValueError, match="position|side"):
-            BlockIndex(position, side, (1,))
+    for position in (np.array([[0, np.nan, 0]]), np.full((1, 3), 1e101)):
+        with pytest.raises(ValueError, match="position: expected numbers"):
+            BlockIndex(position, 1.0, (1,))
 
 
 def test_side_follows_the_spacing():

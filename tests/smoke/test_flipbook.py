@@ -19,7 +19,7 @@ from wlm.smoke.flipbook.book import Book, Shot, pack_book, write_book
 from wlm.smoke.flipbook.naming import parse_layout, second_names
 from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.lightmaps import SixWay, axis_faults
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 
 KINDS = {".exr": 6e-4, ".png": 0.51 / 255, ".tga": 0.51 / 255}
 
@@ -199,7 +199,7 @@ def test_straight_alpha_in_a_third_texture(tmp_path: Path):
     expected = frames[1].lightmaps * (1.0 - frames[1].transparency)
     np.testing.assert_allclose(read[1].lightmaps, expected, atol=0.01)
     np.testing.assert_allclose(read[1].transparency, frames[1].transparency, atol=0.003)
-    with pytest.raises(WlmError, match="expected an alpha channel or a third texture for straight alpha"):
+    with pytest.raises(WlmError, match="expected an alpha channel or a texture of opacity for straight alpha"):
         read_flipbook([*paths], "unity", rows=1, columns=2, straight=True)
     Image.new("L", (8, 8)).save(book[2])
     with pytest.raises(WlmError, match="expected textures of one size"):
@@ -213,17 +213,23 @@ def test_wrong_files(tmp_path: Path):
         with pytest.raises(WlmError, match=message):
             read_flipbook(paths, layout, rows=cells, columns=cells)
 
-    refused("a_1.png: cannot read the picture")
+    refused("a_1.png: cannot read the PNG")
     write_book(_book(_frames(1)), tmp_path / "a.png")
-    refused("expected sides that divide into 4 rows and 4 columns, found 6 x 9", cells=4)
-    refused("expected sides that divide into 12 rows and 12 columns, found 6 x 9", cells=12)
+    refused(
+        "expected textures that divide into 4 rows and 4 columns of cells, found a height of 6 and a width of 9",
+        cells=4,
+    )
+    refused(
+        "expected textures that divide into 12 rows and 12 columns of cells, found a height of 6 and a width of 9",
+        cells=12,
+    )
     Image.new("RGB", (9, 5)).save(paths[1])
     refused("textures of one size")
     Image.new("L", (9, 6)).save(paths[1])
-    refused("a_2.png: expected RGB or RGBA with 8 bits per channel, found L")
+    refused("a_2.png: expected a texture of RGB or RGBA, found one of L")
     whole = paths[0].read_bytes()
     paths[0].write_bytes(whole[: len(whole) // 2])
-    refused("a_1.png: cannot read the picture")
+    refused("a_1.png: cannot read the PNG")
     # The header alone states the size; the rest of the file is as before.
     header = b"IHDR" + struct.pack(">2I", 9400, 9400) + whole[24:29]
     paths[0].write_bytes(whole[:12] + header + struct.pack(">I", zlib.crc32(header)) + whole[33:])

@@ -7,6 +7,7 @@ from PIL import Image
 from reference.flipbook import between
 from typer.testing import CliRunner
 
+from benchmarks.smoke_learning import psnr
 from wlm import smoke
 from wlm.cli.smoke import app
 from wlm.errors import WlmError
@@ -24,7 +25,6 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.motion import read_velocity, velocity_file
 from wlm.smoke.scene import load_scene
 from wlm.smoke.simulation import simulate
-from wlm.smoke.transport.learning import psnr
 
 FRAMES = 26
 
@@ -134,7 +134,7 @@ def test_velocities_that_are_missing_or_damaged(folder, tmp_path):
         WlmError, match="nowhere: expected a folder of frames from simulate --velocity, found no folder"
     ):
         open_motion(tmp_path / "nowhere")
-    with pytest.raises(WlmError, match=r"frame_0099.npz, frame 1 of the flip book, is missing"):
+    with pytest.raises(WlmError, match="frame 1 of the flip book needs frame_0099.npz, which is missing"):
         frames_motion(open_motion(folder), (99,), book)
     path = tmp_path / "velocity.npz"
     for values, words in (

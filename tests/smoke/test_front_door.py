@@ -46,7 +46,7 @@ def test_three_ways_to_the_same_lightmaps(smoke):
 def test_a_predictor_for_many_frames(smoke):
     """One predictor serves several sizes; the seed is that of the guiding map."""
     predictor = wlm.smoke.SmokePredictor()
-    cameras = [wlm.smoke.Camera.around(smoke, pixels=pixels) for pixels in (16, 24, 32, 40, 48)]
+    cameras = [wlm.smoke.Camera.around(smoke, pixels=pixels) for pixels in (16, 8, 10, 12, 14)]
     first = [wlm.smoke.predict(smoke, camera, predictor, seed=1) for camera in cameras]
     again = [predictor(smoke, camera, 1) for camera in cameras]
     assert all(torch.equal(a.lightmaps, b.lightmaps) for a, b in zip(first, again, strict=True))

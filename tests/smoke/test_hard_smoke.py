@@ -6,8 +6,7 @@ import torch
 
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
-from wlm.smoke.march.coarse import bake_coarse, guide
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, bake_coarse, guide
 from wlm_kernels.smoke.settings import March
 
 STEPS = March(2.0, jitter=0.0, threshold=1e-6)

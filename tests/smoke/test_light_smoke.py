@@ -10,11 +10,10 @@ from reference.single_light import lit
 
 from wlm.fluid.volume import from_array
 from wlm.smoke.camera import Camera
-from wlm.smoke.march.fine import bake
-from wlm.smoke.shading import Light
+from wlm.smoke.march.six_way import bake
+from wlm.smoke.shading import Light, PointLight, sky_lights
 from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import fine_march, light_smoke
-from wlm.smoke.transport.lights import PointLight, sky_lights
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.settings import March
 
@@ -26,12 +25,11 @@ def rms(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(((a - b).double().square().mean() / b.double().square().mean()).sqrt())
 
 
-@pytest.mark.parametrize("g", [0.0, 0.6])
-@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize(("g", "perspective"), [(0.0, True), (0.6, False)])
 def test_each_light_has_its_own_march(device: str, g: float, perspective: bool):
     """Lights from any direction and their opposites are within 0.5% of a march from every sample."""
     volume = make_plume(28, hot=False, extinction=10.0, device=device)
-    camera = Camera.around(volume, toward=(0.4, 0.2, 1.0), pixels=16, perspective=perspective)
+    camera = Camera.around(volume, toward=(0.4, 0.2, 1.0), pixels=12, perspective=perspective)
     made = light_smoke(volume, camera, [Light(way) for way in WAYS], fine_march(volume, g))
     for n, way in enumerate(WAYS):
         for plane, sign in ((made.planes[n], 1.0), (made.opposite[n], -1.0)):
@@ -76,19 +74,6 @@ def test_the_whole_picture_is_the_tracers(device: str):
     assert rms(made, wanted) < 0.02
 
 
-def test_six_ways_are_far_off_and_this_is_not(device: str):
-    """Weighted lightmaps have a large error for an oblique light, the march to the light has not."""
-    volume = make_plume(40, hot=False, extinction=25.0, device=device)
-    camera = facing(volume, size=20)
-    light = Light((1.0, 0.7, 0.8))
-    expected = lit(volume, camera, light.toward, step=0.25)[..., None].expand(-1, -1, 3)
-    maps = bake(volume, camera, step=0.5, estimate=False)
-    six = maps.shade([light])
-    assert torch.allclose(maps.shade([light], albedo=(0.5, 0.0, 1.0)), six * torch.tensor([0.5, 0.0, 1.0]).to(six))
-    coarse = light_smoke(volume, camera, [light], March(step=1.0, seed=1)).shade()
-    assert rms(six, expected) > 0.15 > 0.08 > rms(coarse, expected)
-
-
 def test_hard_smoke(device: str):
     volume = make_plume(16, extinction=10.0, device=device)
     none = light_smoke(volume, facing(volume, size=6), [])
@@ -113,8 +98,8 @@ def test_a_sky_is_twelve_lights(device: str):
     total = sum(np.array(light.irradiance) for light in lights)
     assert len(lights) == 12 and total == pytest.approx(4 * math.pi * np.array(sky))
     assert np.abs(sum(np.array(light.toward) for light in lights)).max() < 1e-6
-    volume = make_plume(28, seed=6, hot=False, extinction=12.0, device=device)
-    camera = Camera.around(volume, toward=(0.3, 0.2, 1.0), pixels=12)
+    volume = make_plume(20, seed=6, hot=False, extinction=12.0, device=device)
+    camera = Camera.around(volume, toward=(0.3, 0.2, 1.0), pixels=10)
     wanted = trace(volume, camera, [], sky=sky, samples=192, orders=0, highest=1).planes[0, 1:].sum(0)
     made = light_smoke(volume, camera, lights).shade()
     assert float(made.mean() / wanted.mean()) == pytest.approx(1.0, abs=0.03) and rms(made, wanted) < 0.13

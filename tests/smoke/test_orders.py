@@ -9,22 +9,23 @@ import torch
 from builders.smoke_plumes import plume
 
 from benchmarks.smoke import make_cloud
-from wlm.errors import WlmError
-from wlm.fluid.volume import DensityVolume, from_array
-from wlm.smoke.camera import Camera
-from wlm.smoke.shading import Light
-from wlm.smoke.synthetic import make_plume
-from wlm.smoke.transport.learning import (
-    ALBEDOS,
+from benchmarks.smoke_learning import (
     Lesson,
+    at,
     draw_view,
+    features,
     fit_orders,
     learn,
     make_lessons,
     psnr,
+    save_orders,
 )
-from wlm.smoke.transport.lights import PointLight
-from wlm.smoke.transport.orders import Inputs, OrdersModel, load_orders, make_inputs, orders_march, scatter
+from wlm.errors import WlmError
+from wlm.fluid.volume import DensityVolume, from_array
+from wlm.smoke.camera import Camera
+from wlm.smoke.shading import Light, PointLight
+from wlm.smoke.synthetic import make_plume
+from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, load_orders, make_inputs, orders_march, scatter
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.orders import FEATURES, MIXES
 from wlm_kernels.smoke.settings import March
@@ -38,7 +39,7 @@ def lessons() -> list[Lesson]:
 
 
 def diffused(inputs: Inputs, albedo: float) -> torch.Tensor:
-    """Returns the input of the prediction, [H, W]: single scattering and diffusion."""
+    """Returns single scattering and diffusion, the input of the prediction, [H, W]."""
     return inputs.by_diffusion(albedo)[0]
 
 
@@ -52,7 +53,7 @@ def input_alone() -> OrdersModel:
 
 def mixed(model: OrdersModel, inputs: Inputs, albedo: float) -> torch.Tensor:
     """Returns all light of one light, [H, W]."""
-    return model.light(inputs.at(albedo), (albedo,) * 3)[0, ..., 0]
+    return model.light(at(inputs, albedo), (albedo,) * 3)[0, ..., 0]
 
 
 def test_the_mix_is_worth_its_name_and_never_worse(lessons):
@@ -99,7 +100,7 @@ def test_on_no_grid_is_the_mix_worse_than_its_input(cells: int):
 def test_smoke_thinner_and_thicker_than_any_that_was_learned(extinction: float):
     """Outside the fitted range the result is no worse than its input."""
     volume = make_plume(32, seed=3, hot=False, extinction=extinction)
-    camera = Camera.around(volume, toward=(0.3, 0.1, 1.0), pixels=20)
+    camera = Camera.around(volume, toward=(0.3, 0.1, 1.0), pixels=20 if extinction < 1.0 else 12)
     lights = [Light((1.0, 0.6, 0.2)), Light((-0.4, 0.5, -0.8))]
     traced = trace(volume, camera, lights, samples=4096 if extinction < 1.0 else 256).planes.sum(1)[..., 0]
     _, inputs = make_inputs(volume, camera, lights, [1.0], orders_march(volume))
@@ -148,8 +149,8 @@ def test_a_mix_finds_the_weights_that_light_is_made_with(lessons):
     random = torch.Generator().manual_seed(4)
     made = []
     for lesson in lessons:
-        features = lesson.inputs.features(0)
-        multiple = features[:, 18] + 0.3 * features[:, 7] + 0.2 * lesson.inputs.cosines[0] * features[:, 1]
+        x = features(lesson.inputs, 0)
+        multiple = x[:, 18] + 0.3 * x[:, 7] + 0.2 * lesson.inputs.cosines[0] * x[:, 1]
         albedo = torch.tensor(ALBEDOS)[:, None, None]
         light = albedo * lesson.inputs.single + albedo**2 * multiple
         noise = 1.0 + 0.01 * torch.randn(light.shape, generator=random)
@@ -157,13 +158,6 @@ def test_a_mix_finds_the_weights_that_light_is_made_with(lessons):
     model = fit_orders(made)
     for lesson in made:
         assert psnr(mixed(model, lesson.inputs, 0.95), lesson.light[ALBEDOS.index(0.95)]) > 45.0
-
-
-def test_views_are_of_their_numbers():
-    (a, b, c), (d, e, f) = draw_view(3, 5), draw_view(3, 5)
-    assert torch.equal(a.density, d.density) and b == e
-    assert [light.toward for light in c] == [light.toward for light in f]
-    assert not torch.equal(a.density, draw_view(3, 6)[0].density[: a.shape[0], : a.shape[1], : a.shape[2]])
 
 
 def test_light_is_the_mix_of_its_features(device: str):
@@ -195,8 +189,8 @@ def test_light_is_the_mix_of_its_features(device: str):
             multiple = np.tensordot(mix @ part.numpy(), np.stack(x), 1).clip(0)
             wanted = np.minimum(albedo * s[n] + albedo**2 * multiple, 6.0 * a)
             assert np.allclose(found[n, ..., channel], np.maximum(wanted, albedo * s[n]), atol=2e-5)
-    features = inputs.features(1)
-    assert features.shape == (3, FEATURES, 6, 7) and torch.allclose(features[2, 18].cpu(), diffused[0, 1, 2])
+    planes = features(inputs, 1)
+    assert planes.shape == (3, FEATURES, 6, 7) and torch.allclose(planes[2, 18].cpu(), diffused[0, 1, 2])
 
 
 def test_hard_smoke(device: str):
@@ -234,20 +228,18 @@ def test_a_light_and_a_camera_in_the_smoke(device: str, within: str):
 def test_files_of_models(tmp_path):
     """A saved model is read back; each wrong file is an error that names the part."""
     model = load_orders()
-    model.save(tmp_path / "a.npz")
+    save_orders(model, tmp_path / "a.npz")
     again = load_orders(tmp_path / "a.npz")
     assert torch.equal(model.weights, again.weights) and torch.equal(model.known, again.known)
-    with pytest.raises(WlmError, match="npz"):
-        model.save(tmp_path / "a.bin")
     wrong = {
         "weights": (torch.zeros(3, 3), model.known),
         "range": (model.weights, torch.tensor([2.0, 1.0])),
     }
     for name, arrays in wrong.items():
-        OrdersModel(*arrays).save(tmp_path / "b.npz")
+        save_orders(OrdersModel(*arrays), tmp_path / "b.npz")
         with pytest.raises(WlmError, match=rf"b.npz: {name}: expected"):
             load_orders(tmp_path / "b.npz")
-    OrdersModel(model.weights * math.inf, model.known).save(tmp_path / "b.npz")
+    save_orders(OrdersModel(model.weights * math.inf, model.known), tmp_path / "b.npz")
     with pytest.raises(WlmError, match="weights: expected finite"):
         load_orders(tmp_path / "b.npz")
     np.savez(tmp_path / "b.npz", weights=model.weights.numpy())
@@ -261,9 +253,9 @@ def test_inputs_hold_for_any_image(device: str):
     """The light does not depend on the number of pixels."""
     volume, model = plume(device=device), load_orders().to(device)
     made = []
-    for pixels in (24, 48, 96):
+    for pixels in (24, 48):
         camera = Camera.around(volume, pixels=pixels)
         _, inputs = make_inputs(volume, camera, [Light((1.0, 0.5, 0.6))], [1.0], orders_march(volume))
         made.append(torch.nn.functional.avg_pool2d(model.light(inputs, (1.0,) * 3)[..., 0], pixels // 24))
-    for finer in made[1:]:
-        assert float((made[0] - finer).square().mean().sqrt() / finer.square().mean().sqrt()) < 0.12
+    rough, finer = made
+    assert float((rough - finer).square().mean().sqrt() / finer.square().mean().sqrt()) < 0.12

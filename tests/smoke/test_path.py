@@ -15,11 +15,10 @@ from wlm.errors import WlmError
 from wlm.fluid.obstacles import box
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
-from wlm.smoke.march.fine import bake
 from wlm.smoke.march.launch import medium_of
-from wlm.smoke.shading import Light
+from wlm.smoke.march.six_way import bake
+from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.synthetic import make_plume
-from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.tracing import Transport, trace
 from wlm_kernels.smoke import path
 from wlm_kernels.smoke.march import BRICK

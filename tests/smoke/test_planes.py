@@ -11,8 +11,7 @@ from builders.smoke_samples import view_of
 
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse, guide
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake, bake_coarse, guide
 from wlm.smoke.network.planes import (
     GUIDES,
     OPACITY_PLANE,
@@ -116,7 +115,7 @@ def test_a_camera_so_far_away_that_all_depths_are_one_is_refused(kind):
     volume = plume()
     camera = view_of(volume)
     camera = replace(camera, position=tuple(1e20 * np.asarray(camera.position)))
-    with pytest.raises(ValueError, match="expected near < far"):
+    with pytest.raises(ValueError, match="expected a near distance below the far one"):
         render_guide(volume, camera, kind, MARCH)
 
 
@@ -148,8 +147,6 @@ def test_decoding_clamps_what_no_plane_can_be():
 def test_wrong_shapes_are_refused():
     with pytest.raises(ValueError, match="maps"):
         encode_guide(torch.zeros(2, 4, 4), 0, 1)
-    with pytest.raises(ValueError, match="near"):
-        encode_guide(torch.zeros(3, 4, 4), 1, 1)
     with pytest.raises(ValueError, match="planes"):
         decode_lightmaps(torch.zeros(7, 4, 4))
     with pytest.raises(ValueError, match="transparency"):

@@ -1,4 +1,4 @@
-"""Shading: weights, lights, emission, and shadows of obstacles against traced rays."""
+"""Shading: weights, lights and emission."""
 
 import math
 from dataclasses import replace
@@ -6,9 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from builders.smoke_shadows import shadow_of
 
-from wlm.fluid.obstacles import sphere
 from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light, Ramp
@@ -22,14 +20,6 @@ def _six(device: str, emission: bool = False) -> SixWay:
     maps = torch.tensor(random.uniform(0, 1, (8, 8, 8)), dtype=torch.float32, device=device)
     camera = Camera.look_at(10 * np.array((0.4, 0.7, 1.0)), (0, 0, 0), extent=4.0, height=8, width=8)
     return SixWay(maps[:6], maps[6], 2 * maps[7] if emission else None, camera)
-
-
-def _box(low: tuple, high: tuple, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    corners = np.array(list(np.ndindex(2, 2, 2)))
-    vertices = np.where(corners == 1, high, low).astype(np.float32)
-    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = [(a, b, c) for q in faces for a, b, c in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))]
-    return torch.tensor(vertices, device=device), torch.tensor(triangles, device=device)
 
 
 def test_one_light_along_each_axis(device: str):
@@ -59,6 +49,8 @@ def test_lights_add_up(device: str):
     both = sum(six.shade([light]) for light in lights)
     np.testing.assert_allclose(six.shade(lights).cpu(), both.cpu(), rtol=1e-5)
     assert not six.shade([]).any()
+    tinted = six.shade(lights, albedo=(0.5, 0.0, 1.0))
+    assert torch.allclose(tinted, both * torch.tensor([0.5, 0.0, 1.0], device=device), rtol=1e-5)
 
 
 def test_glow(device: str):
@@ -85,66 +77,6 @@ def test_background(device: str):
         np.testing.assert_allclose(result.cpu(), expected.cpu(), rtol=1e-6)
 
 
-@pytest.mark.parametrize("perspective", [False, True])
-@pytest.mark.parametrize("toward", [(0.0, 1.0, 0.0), (0.5, 1.0, -0.3), (0.0, 0.0, 1.0), (-1.0, 0.2, 0.4)])
-def test_shadow_of_a_box(device: str, toward: tuple, perspective: bool):
-    """Rays from a plane of smoke to the light give the same shadow, except within a few texels of its edge."""
-    way = (0.1, 1.0, 1.0)
-    extent = 0.6 if perspective else 6.0
-    camera = Camera.look_at(
-        10 * np.array(way) / np.linalg.norm(way), (0, 0, 0), extent=extent, height=40, width=40, perspective=perspective
-    )
-    low, high = (-0.8, 0.2, -0.5), (0.6, 1.0, 0.7)
-    origin, ray = (part.numpy() for part in camera.rays())
-    # Smoke's surface: the plane x + 2 y + 2 z = 0.3, which cuts the box.
-    normal = np.array([1.0, 2.0, 2.0])
-    depth = (0.3 - origin @ normal) / (ray @ normal)
-    depth[:, :3] = 0.0
-    depths = torch.tensor(depth, dtype=torch.float32, device=device)
-    result = shadow_of(depths, camera, toward, *_box(low, high, device), resolution=512)
-    at = origin + depth[..., None] * ray
-    light = np.array(toward) / np.linalg.norm(toward)
-
-    def hidden(shrink: float) -> np.ndarray:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = ((np.array(c) - at) / light for c in (np.array(low) + shrink, np.array(high) - shrink))
-        near, far = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
-        return (near < far) & (far > shrink)
-
-    rim = 0.03
-    result = result.cpu().numpy()
-    sure = depth > 0
-    assert (hidden(rim) & sure).sum() > 20
-    assert (result[sure & hidden(rim)] < 1e-6).all()
-    assert (result[sure & ~hidden(-rim)] == 1).all()
-    assert (result[~sure] == 1).all()
-
-
-def test_shadow_falls_behind_only(device: str):
-    """Smoke between light and obstacle is lit; a larger bias lights smoke close behind the obstacle."""
-    camera = Camera.look_at((0, 0, 10), (0, 0, 0), extent=4.0, height=9, width=9)
-    box = _box((-1, -1, -0.1), (1, 1, 0.1), device)
-    for depth, bias, expected in ((8.0, -1.0, 1.0), (12.0, -1.0, 0.0), (12.0, 3.0, 1.0)):
-        depths = torch.full((9, 9), depth, device=device)
-        result = shadow_of(depths, camera, (0, 0, 1), *box, bias=bias)
-        assert float(result[4, 4]) == expected and float(result[0, 0]) == 1.0
-
-
-@pytest.mark.parametrize("far", [0.0, 1000.0])
-def test_shadow_of_a_sphere(device: str, far: float):
-    """The shadow has the area of a circle, also a thousand radii from the origin."""
-    points, triangles = sphere()
-    corners = torch.from_numpy((points + [far, 0, far]).astype(np.float32)).to(device)
-    camera = Camera.look_at((far, 8, far), (far, 0, far), extent=4.0, height=100, width=100, world_up=(0, 0, 1))
-    depths = torch.full((100, 100), 12.0, device=device)
-    light = shadow_of(depths, camera, (0, 1, 0), corners, torch.from_numpy(triangles).to(device))
-    area = float((1 - light).sum()) * (4.0 / 100) ** 2
-    # The sphere has 48 sides.
-    assert area == pytest.approx(24 * np.sin(np.pi / 24), rel=5e-3)
-    centre = (1 - light.cpu().numpy()).sum(0) @ (np.arange(100) + 0.5) / float((1 - light).sum())
-    assert centre == pytest.approx(50.0, abs=0.1)
-
-
 def test_wrong_settings():
     six = _six("cpu")
     with pytest.raises(ValueError, match="irradiance"):
@@ -155,7 +87,7 @@ def test_wrong_settings():
         replace(six, camera=None).shade([Light((0, 0, 1))])
     with pytest.raises(ValueError, match="transparency: the lightmaps have no"):
         replace(six, transparency=None).shade([], background=(0, 0, 0))
-    with pytest.raises(ValueError, match="camera: expected .height, width. .8, 8."):
+    with pytest.raises(ValueError, match="camera: expected the height and width of the lightmaps, .8, 8."):
         replace(six, camera=six.camera.finer(2))
     with pytest.raises(ValueError, match="depth: expected"):
         replace(six, depth=torch.ones(2, 2))

@@ -101,5 +101,5 @@ def test_planes_repeat_and_the_network_is_left_alone():
 def test_wrong_sizes_are_refused():
     with pytest.raises(ValueError, match="pixel"):
         random_model().decoder(height=0, width=4)
-    with pytest.raises(ValueError, match=r"expected \[3, 8, 8\]"):
+    with pytest.raises(ValueError, match=r"expected a guiding map \[3, 8, 8\]"):
         random_model().decoder(height=8, width=8)(torch.zeros(3, 8, 9))

@@ -17,12 +17,11 @@ from wlm.metrics import psnr_from_mse
 from wlm.smoke.evaluation import COARSE, HALF, NETWORK, coarse, compare, evaluate, of_decoder, of_network, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.dataset import make_validation
-from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
 from wlm.smoke.network.settings import DatasetSettings
 
 FEW = DatasetSettings(
-    cells=16, refine=2, resolution=24, frames=1, views=3, warmup=0.8, hot=0.0, validation_sequences=1, moving=0.0
+    cells=16, refine=2, resolution=16, frames=1, views=2, warmup=0.6, hot=0.0, validation_sequences=1, moving=0.0
 )
 
 
@@ -109,7 +108,7 @@ def test_all_methods_on_all_sets(tmp_path, device):
         results[kind] = compare(model, volumes=[tmp_path / "a.npz"], **options)
         smoke, volume = results[kind]
         assert (smoke.name, volume.name) == ("density x 1", str(tmp_path / "a.npz"))
-        assert smoke.samples == volume.samples == 3
+        assert smoke.samples == volume.samples == 2
         names = [NETWORK, *([HALF] if device != "cpu" else []), *([COARSE] if kind == "six" else [])]
         assert list(smoke.methods) == list(volume.methods) == names
         assert (smoke.half_loss is None) == (device == "cpu")

@@ -6,15 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from builders.smoke_plumes import plume
-from builders.smoke_shadows import shadow_of
+from builders.smoke_plumes import plume, rays
 from PIL import Image
 
+from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera, obstacle_mesh
-from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.scene import CameraSettings, LightSettings, ObstacleSettings, make_camera
+from wlm.smoke.shading import Light, PointLight, Ramp
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.lights import PointLight
 from wlm.smoke.transport.orders import scatter
 from wlm.view.pictures import contact_sheet, to_bytes
 from wlm.view.smoke import Drawing, picture
@@ -38,6 +37,13 @@ def draw_obstacles(obstacles, camera, lights, device):
     return drawing.solid_light, drawing.solid_depth
 
 
+def shadow_of(depth, camera, toward, obstacle):
+    """Returns the share of a directional light that an obstacle lets through to a surface of smoke."""
+    drawing = Drawing(camera, [Light(toward)], obstacles=[obstacle], device=str(depth.device))
+    drawing.draw_shadows(depth)
+    return drawing.visibility[0]
+
+
 def _flat(camera, transparency, light=0.0, device="cpu"):
     """Makes uniform smoke."""
     size = (camera.height, camera.width)
@@ -59,7 +65,7 @@ def test_an_obstacle_is_drawn_where_it_is(device, toward, perspective):
     camera = _camera(48, toward=toward, perspective=perspective)
     ball = _ball(0.1, -0.05, 0.2)
     _, depth = draw_obstacles([ball], camera, [], device)
-    origin, way = (part.numpy() for part in camera.rays())
+    origin, way = rays(camera)
     middle = ball.centre(0.0) - origin
     along = (middle * way).sum(-1)
     gap = 0.2**2 - ((middle**2).sum(-1) - along**2)
@@ -117,6 +123,59 @@ def test_an_obstacle_before_and_behind_smoke(device):
     level = torch.full_like(six.transparency, surface)
     shadow = picture(replace(six, depth=level), [side], obstacles=[_ball(0.3, 0, 0, 0.1)])
     assert float(shadow[16, 5, 0]) < 0.05 and float(shadow[5, 5, 0]) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("perspective", [False, True])
+@pytest.mark.parametrize("toward", [(0.5, 1.0, -0.3), (0.0, 0.0, 1.0)])
+def test_shadow_of_a_box(device, toward, perspective):
+    """Slabs that the ray from a plane of smoke to the light passes give the same shadow, except at its very edge."""
+    way, middle, half = (0.1, 1.0, 1.0), np.array([-0.1, 0.6, 0.1]), np.array([0.7, 0.4, 0.6])
+    extent = 0.6 if perspective else 6.0
+    camera = Camera.look_at(
+        10 * np.array(way) / np.linalg.norm(way), (0, 0, 0), extent=extent, height=40, width=40, perspective=perspective
+    )
+    origin, ray = rays(camera)
+    # The surface of the smoke is the plane x + 2 y + 2 z = 0.3, which cuts the box.
+    normal = np.array([1.0, 2.0, 2.0])
+    depth = (0.3 - origin @ normal) / (ray @ normal)
+    depth[:, :3] = 0.0
+    box = ObstacleSettings(shape="box", radius=tuple(half), path=((0.0, *middle),))
+    result = shadow_of(torch.tensor(depth, dtype=torch.float32, device=device), camera, toward, box)
+    at = origin + depth[..., None] * ray
+
+    def hidden(shrink: float) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = ((middle + side * (half - shrink) - at) / np.array(toward) for side in (-1.0, 1.0))
+        near, far = np.minimum(a, b).max(-1), np.maximum(a, b).min(-1)
+        return (near < far) & (far > shrink)
+
+    rim, result = 1e-3, result.cpu().numpy()
+    sure = depth > 0
+    assert (hidden(rim) & sure).sum() > 20
+    assert (result[sure & hidden(rim)] == 0).all() and (result[sure & ~hidden(-rim)] == 1).all()
+    assert (result[~sure] == 1).all()
+
+
+def test_shadow_falls_behind_only(device):
+    """Smoke between light and obstacle is lit."""
+    camera = Camera.look_at((0, 0, 10), (0, 0, 0), extent=4.0, height=9, width=9)
+    box = ObstacleSettings(shape="box", radius=(1, 1, 0.1), path=((0.0, 0, 0, 0),))
+    for depth, expected in ((8.0, 1.0), (12.0, 0.0)):
+        result = shadow_of(torch.full((9, 9), depth, device=device), camera, (0, 0, 1), box)
+        assert float(result[4, 4]) == expected and float(result[0, 0]) == 1.0
+
+
+@pytest.mark.parametrize("far", [0.0, 1000.0])
+def test_shadow_of_a_sphere(device, far):
+    """The shadow has the area of a circle, also a thousand radii from the origin."""
+    camera = Camera.look_at((far, 8, far), (far, 0, far), extent=4.0, height=100, width=100, world_up=(0, 0, 1))
+    ball = ObstacleSettings(radius=1.0, path=((0.0, far, 0, far),))
+    light = shadow_of(torch.full((100, 100), 12.0, device=device), camera, (0, 1, 0), ball)
+    area = float((1 - light).sum()) * (4.0 / 100) ** 2
+    # The sphere has 48 sides.
+    assert area == pytest.approx(24 * np.sin(np.pi / 24), rel=1e-2)
+    centre = (1 - light.cpu().numpy()).sum(0) @ (np.arange(100) + 0.5) / float((1 - light).sum())
+    assert centre == pytest.approx(50.0, abs=0.1)
 
 
 def test_without_obstacles_it_is_smoke_over_a_colour(device):
@@ -191,10 +250,9 @@ def test_smoke_under_its_own_lights_is_drawn_as_it_shades(device, orders):
         assert smoke.lit.thrown.any()
     torch.testing.assert_close(drawn, shaded(smoke, looks["background"]))
     ball = [_ball(0.1, 0.6, 0.25)]
-    points, triangles, _ = (torch.from_numpy(part).to(device) for part in obstacle_mesh(ball, 0.0))
     solid, away = draw_obstacles(ball, camera, lights[:1], device)
     behind = torch.where(torch.isfinite(away)[..., None], solid, torch.tensor(looks["background"], device=device))
-    seen = shadow_of(depth.contiguous(), camera, (1.0, 1.0, 1.0), points, triangles)
+    seen = shadow_of(depth, camera, (1.0, 1.0, 1.0), ball[0])
     by_hand = torch.where((away < depth)[..., None], solid, shaded(smoke, behind, seen))
     extra = {"albedo": (0.9, 0.5, 0.0)} if orders == "single" else {}
     torch.testing.assert_close(picture(smoke, obstacles=ball, **looks, **extra), by_hand)

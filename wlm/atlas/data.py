@@ -22,12 +22,13 @@ import numpy as np
 
 from wlm.atlas.charts import charts, welded
 from wlm.atlas.coverage import covered_texels, touched_texels
-from wlm.atlas.listing import Listing, SheetFiles, is_listing, lone_lightmap, read_listing
+from wlm.atlas.listing import Listing, SheetFiles, is_listing, read_listing
 from wlm.atlas.matching import all_by_name, chart_map, choose_mesh, fits_flipped, misfits, named, replace_strays
 from wlm.atlas.materials import Readings, Rectangle, own_lightmaps, settle, slot_readings
 from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
 from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf
+from wlm.formats.gltf_slots import usual_set
 from wlm.formats.light import noted, read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, check_growth
 from wlm.formats.mask import read_mask
@@ -219,7 +220,9 @@ def load(
             if value is not None:
                 raise WlmError(f"{name}: can't be given with a list of lightmaps; state it in the list")
     if slot is not None and lights_path is not None:
-        raise WlmError("slot: only allowed without lightmaps beside the mesh: it reads those of its materials")
+        raise WlmError(
+            "slot: only allowed without lightmaps from other files: it reads those in this slot of the mesh's materials"
+        )
     sets = {number for each in primitives for number in each.uv}
     known = uv_set if uv_set in sets else None
     readings: Readings = {}
@@ -227,12 +230,15 @@ def load(
         listing, readings = own_lightmaps(document, primitives, slot, encoding, known)
         notes = listing.notes
     else:
-        listing = lone_lightmap(lights_path, path.stem, mask_path, encoding, flip) if alone else None
-        listing = read_listing(lights_path) if listing is None else listing
+        if alone:
+            files = {"files": [os.fspath(lights_path)], "name": path.stem, "encoding": encoding, "flip": flip}
+            sheet = SheetFiles(**files, mask=None if mask_path is None else os.fspath(mask_path))
+            listing = Listing(os.fspath(lights_path), ("light",), (sheet,), direct=True)
+        else:
+            listing = read_listing(lights_path)
         known = listing.uv_set if known is None else known
-        default = 1 if 1 in sets else 0
-        stem = Path(listing.sheets[0].files[0]).stem
-        readings, notes = slot_readings(document, primitives, default if known is None else known, stem)
+        number = usual_set(primitives) if known is None else known
+        readings, notes = slot_readings(document, primitives, number, Path(listing.sheets[0].files[0]).stem)
         notes = listing.notes + notes
     places: dict[int, tuple[int, Rectangle]] = {}
     if readings:
@@ -244,7 +250,7 @@ def load(
     placed: list[tuple[GltfPrimitive, Placed]] | None = None
     if lights_path is None:
         placed = [(each, Placed(each.node, each.label, *places[each.node])) for each in readers if each.node in places]
-    elif listing.tiles and _leave_square(readers, uv_set):
+    elif listing.tiles and any((np.abs(each.uv[uv_set] - 0.5) > 0.5 + _EDGE).any() for each in readers):
         document, primitives, placed = _tiled(str(path), readers, uv_set, listing)
         notes = (
             *notes,
@@ -270,15 +276,15 @@ def load(
         if placed is not None:
             pairs = [(each, place) for each, place in placed if place.sheet == number]
         else:
-            moved = {(each.node, each.primitive): _moved(each, uv_set, _base(places, each, number)) for each in readers}
-            candidates = by_name.get(number) or readers
-            chosen, warnings = choose_mesh(
-                str(path), label, [moved[each.node, each.primitive] for each in candidates], uv_set, lightmaps[0], alone
-            )
+            candidates = [(each, _base(places, each, number)) for each in by_name.get(number) or readers]
+            moved = [_moved(each, uv_set, place) for each, place in candidates]
+            chosen, warnings = choose_mesh(str(path), label, moved, uv_set, lightmaps[0], alone)
             keys = {(each.node, each.primitive) for each in chosen}
-            pairs = [(each, _base(places, each, number)) for each in readers if (each.node, each.primitive) in keys]
+            pairs = [(each, place) for each, place in candidates if (each.node, each.primitive) in keys]
         if not pairs:
-            raise WlmError(f"{listing.path}: sheets[{number}]: no triangle of the mesh is lit by it")
+            raise WlmError(
+                f"{listing.path}: sheets[{number}]: no triangle of the mesh is lit by it: no object has this sheet"
+            )
         objects += [place for _, place in pairs]
         for each, _ in pairs:
             other = owner.setdefault((each.node, each.primitive), number)
@@ -293,11 +299,8 @@ def load(
         sheets.append(_checked(str(path), label, chosen, uv_set, lightmaps, mask, names, warnings, others))
     rest = [] if alone else [each for each in primitives if (each.node, each.primitive) not in owner]
     blocker = np.concatenate([np.empty((0, 3, 3)), *(each.position[each.triangle] for each in rest)])
-    objects = tuple(dict.fromkeys(objects))
-    source = _hash(sheets)
-    return LightmappedScene(
-        path.stem, listing.states, tuple(sheets), objects, blocker, uv_set, metres, source, document
-    )
+    settings = blocker, uv_set, metres, _hash(sheets), document
+    return LightmappedScene(path.stem, listing.states, tuple(sheets), tuple(dict.fromkeys(objects)), *settings)
 
 
 def from_arrays(
@@ -350,14 +353,16 @@ def join(scenes: Sequence[LightmappedScene], name: str = "scene") -> Lightmapped
     """Joins several scenes into one that has all their sheets.
 
     Args:
-        scenes: At least one, in the same space and with equally many states, whose names are taken from the first.
+        scenes: At least one, in the same space. All have the same number of states (lightmaps of a sheet, such as one
+            for each hour); the new scene has the states' names of the first.
         name: The name of the new scene.
 
     Raises:
         WlmError: The numbers of states differ.
     """
-    if len({len(scene.states) for scene in scenes}) != 1:
-        raise WlmError(f"{name}: expected scenes with the same number of states, got different numbers")
+    counts = [len(scene.states) for scene in scenes]
+    if len(set(counts)) != 1:
+        raise WlmError(f"{name}: expected scenes with the same number of states, got {', '.join(map(str, counts))}")
     sheets = [sheet for scene in scenes for sheet in scene.sheets]
     meshes = [(sheet.name, sheet.position, sheet.triangle, sheet.uv) for sheet in sheets]
     document, primitives = document_from_meshes(meshes, name)
@@ -437,7 +442,8 @@ def _compact(where: str, name: str, position: np.ndarray, triangle: np.ndarray, 
         raise WlmError(f"{where}: has no triangles")
     if triangle.min() < 0 or triangle.max() >= len(position):
         raise WlmError(
-            f"{where}: triangle: expected vertices 0 to {len(position) - 1}, found {triangle.min()} to {triangle.max()}"
+            f"{where}: triangle: expected vertex numbers 0 to {len(position) - 1}, found {triangle.min()} to "
+            f"{triangle.max()}"
         )
     used, corner = np.unique(triangle, return_inverse=True)
     with np.errstate(over="ignore"):  # `_check_finite` reports it as infinite
@@ -448,14 +454,11 @@ def _select(
     where: str, primitives: list[GltfPrimitive], uv_set: int | None
 ) -> tuple[list[GltfPrimitive], int, list[str]]:
     """Selects the UV set and the primitives that have it. Also returns a warning if some primitives lack it."""
-    sets = sorted({number for each in primitives for number in each.uv})
-    if not sets:
-        raise WlmError(f"{where}: the mesh has no UVs: expected TEXCOORD_0 or TEXCOORD_1")
-    if uv_set is None:
-        uv_set = 1 if 1 in sets else 0
+    uv_set = usual_set(primitives) if uv_set is None else uv_set
     selected = [each for each in primitives if uv_set in each.uv]
     if not selected:
-        names = ", ".join(f"TEXCOORD_{number}" for number in sets)
+        sets = sorted({number for each in primitives for number in each.uv})
+        names = ", ".join(f"TEXCOORD_{number}" for number in sets) or "a mesh without UVs"
         raise WlmError(f"{where}: expected the UV set TEXCOORD_{uv_set}, found {names}")
     skipped = [each for each in primitives if uv_set not in each.uv]
     if not skipped:
@@ -470,8 +473,8 @@ def _select(
 def _placed(
     where: str, readers: list[GltfPrimitive], listing: Listing, places: dict[int, tuple[int, Rectangle]]
 ) -> list[tuple[GltfPrimitive, Placed]]:
-    """Finds the primitives that the objects of a list name, and their rectangles in the sheets. `places` has the
-    rectangles of texture transforms, which apply first."""
+    """Returns the primitives that the objects of a list name, each with its place: its sheet, and its rectangle there,
+    which the object gives. A rectangle of a texture transform, by node in `places`, applies to the UVs before."""
     pairs = []
     for each in listing.objects or ():
         for primitive in named(where, readers, each.node):
@@ -479,21 +482,19 @@ def _placed(
             width, height, left, top = each.scale_offset
             rectangle = (width * sx, height * sy, width * x + left, height * y + top)
             pairs.append((primitive, Placed(primitive.node, primitive.label, each.sheet, rectangle)))
-    found: dict[tuple[int, int], Placed] = {}
+    found: dict[tuple[int, int], tuple[GltfPrimitive, Placed]] = {}
     for primitive, place in pairs:
-        if found.setdefault((primitive.node, primitive.primitive), place) != place:
-            raise WlmError(f"{listing.path}: objects: {primitive.label} is given two lightmaps")
-    return list({(each.node, each.primitive): (each, place) for each, place in pairs}.values())
+        if found.setdefault((primitive.node, primitive.primitive), (primitive, place))[1] != place:
+            raise WlmError(
+                f"{listing.path}: objects: {primitive.label} is listed twice, with different sheets or rectangles"
+            )
+    return list(found.values())
 
 
 def _base(places: dict[int, tuple[int, Rectangle]], primitive: GltfPrimitive, sheet: int) -> Placed:
     """Returns the place of a primitive in a sheet by its texture transform alone."""
     rectangle = places[primitive.node][1] if primitive.node in places else _WHOLE
     return Placed(primitive.node, primitive.label, sheet, rectangle)
-
-
-def _leave_square(readers: Sequence[GltfPrimitive], uv_set: int) -> bool:
-    return any(((each.uv[uv_set] < -_EDGE) | (each.uv[uv_set] > 1.0 + _EDGE)).any() for each in readers)
 
 
 def _tiled(
@@ -513,7 +514,7 @@ def _tiled(
                 at = ", ".join(f"{x:.3g}" for x in middle[tile == number][0])
                 raise WlmError(
                     f"{where}: {each.name}: {_count(int((tile == number).sum()), 'triangle')} at UV ({at}) of "
-                    f"TEXCOORD_{uv_set}: expected UDIM tiles {', '.join(map(str, listing.tiles))}"
+                    f"TEXCOORD_{uv_set}: expected UDIM tiles {', '.join(map(str, listing.tiles))}, which have lightmaps"
                 )
             here = tile == number
             local = uv + [-float((number - 1001) % 10), float((number - 1001) // 10)]

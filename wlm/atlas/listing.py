@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from wlm.config import check_settings
 from wlm.errors import WlmError
-from wlm.formats.godot import GodotUser, read_users
+from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
 from wlm.formats.limits import INDEX_BYTES
 from wlm.formats.reading import named_file, read_json_file
@@ -40,7 +40,8 @@ _SET_FILE = "set.json"
 
 
 class SheetFiles(BaseModel):
-    """The files of a sheet (a UV layout): a lightmap for each state and a mask; other fields as in `wlm.atlas.load`."""
+    """A sheet (a UV layout): the files of its lightmaps, one for each state; its mask, a PNG above 0 where a texel
+    belongs to a chart; and arguments of `wlm.atlas.load`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -132,19 +133,6 @@ def is_listing(path: str | os.PathLike[str] | None) -> bool:
     return path is None or os.path.isdir(path) or os.fspath(path).lower().endswith((".json", ".lmbake"))
 
 
-def lone_lightmap(
-    path: str | os.PathLike[str],
-    name: str,
-    mask: str | os.PathLike[str] | None = None,
-    encoding: str | None = None,
-    flip: bool = False,
-) -> Listing:
-    """Makes the list of one lightmap that the caller names; the arguments are as for `wlm.atlas.load`."""
-    mask = None if mask is None else os.fspath(mask)
-    files = SheetFiles(files=[os.fspath(path)], name=name, encoding=encoding, flip=flip, mask=mask)
-    return Listing(os.fspath(path), ("light",), (files,), direct=True)
-
-
 def read_listing(path: str | os.PathLike[str]) -> Listing:
     """Reads a list of lightmaps from a JSON file, a `.lmbake` file or a folder.
 
@@ -178,9 +166,9 @@ def read_listing(path: str | os.PathLike[str]) -> Listing:
         if each.sheet >= len(checked.sheets):
             raise WlmError(f"{path}: objects[{i}].sheet: expected 0 to {len(checked.sheets) - 1}, found {each.sheet}")
     objects = None if checked.objects is None else tuple(checked.objects)
-    line = f"{path}: {unlit} objects without a lightmap (their number is -1, 65534 or 65535): they only hide others"
-    sheets, notes = tuple(checked.sheets), (line,) * (unlit > 0)
-    return Listing(str(path), tuple(states), sheets, objects, checked.uv_set, notes=notes)
+    line = f"{path}: {unlit} objects have no lightmap (their lightmap's number is -1, 65534 or 65535)"
+    notes = (f"{line}: in rendered views they hide what is behind them",) * (unlit > 0)
+    return Listing(str(path), tuple(states), tuple(checked.sheets), objects, checked.uv_set, notes=notes)
 
 
 def _object(entry: Any, convention: str, where: str) -> Any:
@@ -237,13 +225,12 @@ def _from_bake(path: str) -> Listing:
             "save each slice as a file, and list the files in JSON"
         )
     sheet = SheetFiles(files=[bake.textures[0].replace("\\", "/").rsplit("/", 1)[-1]])
-    objects = tuple(_godot_place(user) for user in bake.users)
-    return Listing(path, ("light",), (sheet,), objects, None)
-
-
-def _godot_place(user: GodotUser) -> ObjectPlace:
-    x, y, width, height = user.rectangle
-    return ObjectPlace(node=user.node.rsplit("/", 1)[-1], sheet=0, scale_offset=[width, height, x, y])
+    objects = []
+    for user in bake.users:
+        x, y, width, height = user.rectangle
+        node = user.node.rsplit("/", 1)[-1]
+        objects.append(ObjectPlace(node=node, sheet=0, scale_offset=[width, height, x, y]))
+    return Listing(path, ("light",), (sheet,), tuple(objects))
 
 
 def _from_folder(where: str, folder: Path) -> Listing:
@@ -271,14 +258,9 @@ def tiles_of(names: Sequence[str]) -> tuple[int, ...]:
 
 def _from_set(path: str, content: dict[str, Any]) -> Listing:
     """Reads the list of lightmaps in a `set.json`: one sheet (lightmap), with a state of light for each time of day."""
-    entries = content["lightmaps"]
-    fields = ("time_hours", "file")
-    entries = entries if isinstance(entries, list) else [None]
-    if not all(isinstance(each, dict) and set(fields) <= set(each) for each in entries):
-        raise WlmError(f"{path}: lightmaps: expected a list of objects, each with time_hours and file")
-    states = [f"{float(each['time_hours']):g} h" for each in entries if isinstance(each["time_hours"], int | float)]
-    mask, files = content.get("mask"), [each["file"] for each in entries]
-    sheet = check_settings(SheetFiles, {"files": files, "mask": mask}, f"{path}: lightmaps: ")
-    if len(states) != len(files):
-        raise WlmError(f"{path}: lightmaps: expected a number for each time_hours, found other values")
-    return Listing(path, tuple(states), (sheet,), None, None)
+    entries = content["lightmaps"] if isinstance(content["lightmaps"], list) else [None]
+    if not all(isinstance(each, dict) and isinstance(each.get("time_hours"), int | float) for each in entries):
+        raise WlmError(f"{path}: lightmaps: expected a list of objects, each with a number as time_hours and a file")
+    files = {"files": [each.get("file") for each in entries], "mask": content.get("mask")}
+    sheet = check_settings(SheetFiles, files, f"{path}: lightmaps: ")
+    return Listing(path, tuple(f"{float(each['time_hours']):g} h" for each in entries), (sheet,))

@@ -23,7 +23,7 @@ from wlm.formats.gltf import (
     texture_transform,
     vertex_normals,
 )
-from wlm.formats.gltf_slots import lightmap_uv
+from wlm.formats.gltf_slots import lightmap_uv, usual_set
 from wlm.formats.gltf_writer import Replacement
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import MESH_BYTES
@@ -125,11 +125,10 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
         replacements = unwrap(document, primitives, settings)
         number = _UNWRAPPED
     elif settings is not None:
-        sets = {each for one in primitives for each in one.uv}
-        own = 1 if 1 in sets else 0
+        own = usual_set(primitives)
         number = own if settings.uv_set is None else settings.uv_set
         usual = number == own
-        if number not in sets:
+        if not any(number in each.uv for each in primitives):
             raise WlmError(f"{path}: expected lightmap UVs in TEXCOORD_{number}; lightmap.unwrap: true creates UVs")
     cache: dict[int | None, Material] = {}
     surfaces = []

@@ -20,7 +20,7 @@ from wlm.formats.reading import named_file
 from wlm.smoke.camera import VECTORS, Camera
 from wlm.smoke.data import Frames, load_frames
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 from wlm.smoke.scene import CameraSettings
 from wlm.smoke.shading import Light
 from wlm.smoke.transport import trace

@@ -13,7 +13,10 @@ app = typer.Typer(
 )
 
 _Scene = Annotated[
-    Path, typer.Argument(metavar="SCENE.yaml", help="YAML settings: a glTF file, its lights by hour, the resolution.")
+    Path,
+    typer.Argument(
+        metavar="SCENE.yaml", help="YAML file of the scene: its glTF file, its lights by hour, and the resolution."
+    ),
 ]
 
 
@@ -93,7 +96,10 @@ def probes(
 @exclusive
 def sixway(
     scene: Annotated[
-        Path, typer.Argument(metavar="SCENE.yaml", help="YAML settings: smoke, camera, number of samples.")
+        Path,
+        typer.Argument(
+            metavar="SCENE.yaml", help="YAML file of the scene: its smoke, its camera, and the paths per pixel."
+        ),
     ],
     output: Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")],
     device: Device = "cpu",

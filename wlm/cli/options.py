@@ -14,12 +14,17 @@ CheckpointEvery = Annotated[
         "--checkpoint-every",
         min=0.0,
         metavar="SECONDS",
-        help="Time between two checkpoints, from which --resume continues after a crash.",
+        help="Seconds between two checkpoints (saved states), from which --resume continues after a crash.",
     ),
 ]
-ReportFile = Annotated[Path | None, typer.Option("--json", metavar="REPORT.json", help="Write the report as JSON.")]
+ReportFile = Annotated[
+    Path | None, typer.Option("--json", metavar="REPORT.json", help="Also write the scores to this file, as JSON.")
+]
 SceneFile = Annotated[
-    Path | None, typer.Option("--mesh", metavar="SCENE.glb", help="Mesh of the scene: .glb, .gltf or .obj.")
+    Path | None,
+    typer.Option(
+        "--mesh", metavar="SCENE.glb", help="File with the mesh of the scene: .glb, .gltf, .obj, .ply, .stl or .off."
+    ),
 ]
 Original = Annotated[
     Path | None,
@@ -52,10 +57,16 @@ ShaderLanguage = Annotated[
     typer.Option(help="Language of the shader without --engine; default glsl."),
 ]
 ExactShader = Annotated[
-    bool, typer.Option("--exact", help="Without --engine: a shader that filters texels in 32-bit floats itself.")
+    bool,
+    typer.Option(
+        "--exact", help="Write a shader that interpolates texels itself, in 32-bit floats; not with --engine."
+    ),
 ]
 ModelFile = Annotated[Path, typer.Argument(metavar="FILE.wlm", help="Compressed file that wlm compress wrote.")]
-Key = Annotated[str | None, typer.Option(help="Name of the array to read, if a probe file has several, such as hours.")]
+Key = Annotated[
+    str | None,
+    typer.Option(help="Name of the array of light to read from a probe file with several, such as one an hour."),
+]
 
 
 def output_option(metavar: str, help_text: str) -> Any:

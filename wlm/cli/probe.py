@@ -110,10 +110,10 @@ def evaluate(
     probes_path: _Probes,
     json_path: ReportFile = None,
     volume: Annotated[
-        bool, typer.Option("--volume", help="Also score the volume that wlm probe volume writes, along a path.")
+        bool, typer.Option("--volume", help="Also score light read from the cascaded volume along a path.")
     ] = False,
     views: Annotated[
-        int, typer.Option(help="Number of rendered pictures of lit balls (or --mesh) to score; 0 for none.")
+        int, typer.Option(help="Number of pictures to render and score, of balls at probes and of --mesh; 0: none.")
     ] = 0,
     mesh: SceneFile = None,
     key: Key = None,
@@ -201,7 +201,8 @@ def export(
         typer.Option(help="With --engine three, godot, unreal or bevy: grid cells along the longest side; default 24."),
     ] = None,
     mirror: Annotated[
-        Literal["x", "y", "z"] | None, typer.Option(help="With --engine unity: axis to flip, as Unity is left-handed.")
+        Literal["x", "y", "z"] | None,
+        typer.Option(help="With --engine unity: axis to mirror, as Unity is left-handed."),
     ] = None,
     device: Device = "cpu",
 ) -> None:

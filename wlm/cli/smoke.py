@@ -1,6 +1,5 @@
 """`wlm smoke`: simulates and lights smoke, and makes six-way lightmaps by ray marching or with a network."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -28,13 +27,14 @@ from wlm.cli.smoke_options import (
     SHEET,
     Background,
     Input,
+    Lights,
     SmokeOptions,
     White,
     check_white,
     note_thickness,
     outputs,
+    parse_lights,
     vector,
-    vectors,
     with_smoke,
     write_lightmaps,
 )
@@ -45,9 +45,7 @@ if TYPE_CHECKING:
     from wlm.fluid.volume import DensityVolume
     from wlm.smoke.camera import Camera
     from wlm.smoke.lightmaps import SixWay
-    from wlm.smoke.model import SmokeModel
-    from wlm.smoke.shading import Light
-    from wlm.smoke.transport.lights import AnyLight
+    from wlm.smoke.scene import Scene
 
 __all__ = ["INSTEAD", "app", "evaluate", "info"]
 
@@ -72,7 +70,7 @@ _Albedo = Annotated[
     typer.Option(metavar="R,G,B", help="Single scattering albedo, one number or three; default the scene's."),
 ]
 _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")]
-_Lightmaps = Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")]
+_Lightmaps = Annotated[Path, output_option("OUT", "The .exr to write; for a folder of frames, a folder.")]
 
 
 @app.command()
@@ -83,7 +81,7 @@ def simulate(
     frames: _SceneFrames = None,
     scale: _SceneScale = 1.0,
     velocity: Annotated[
-        bool, typer.Option("--velocity", help="Also keep the velocity of the air, for flipbook --motion.")
+        bool, typer.Option("--velocity", help="Also write the air's velocity of each frame, for flipbook --motion.")
     ] = False,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
@@ -97,16 +95,11 @@ def simulate(
     quiet_warp()
     from wlm.interop import check_device
     from wlm.smoke.data import CHECKPOINT, open_frames
-    from wlm.smoke.scene import load_scene
     from wlm.smoke.simulation import make_solver, simulate, warnings_of
     from wlm.system import Progress
 
     device = check_device(device)
-    scene = load_scene(scene_name)
-    if scale != 1.0:
-        scene = scene.scaled(scale)
-    if frames is not None:
-        scene = scene.model_copy(update={"frames": frames})
+    scene = _scene(scene_name, scale, frames)
     # The solver comes first, so that a simulation that cannot start removes no earlier frames.
     solver = make_solver(scene, device=device)
     note_warnings(warnings := warnings_of(scene))
@@ -134,8 +127,22 @@ def simulate(
     if figures:
         facts |= {"smoke in the last frame": figures["smoke"], "seconds per frame": figures["frame s"]}
         if not most and not warnings:
-            note_warnings([f"{scene.name}: no frame has smoke: is each source inside an obstacle?"])
+            _note_no_smoke(scene)
     show_facts(f"{output}: {scene.name}", facts)
+
+
+def _scene(name: str, scale: float, frames: int | None) -> "Scene":
+    """Loads a scene with a factor on its cells and, unless None, another number of frames."""
+    from wlm.smoke.scene import load_scene
+
+    scene = load_scene(name)
+    if scale != 1.0:
+        scene = scene.scaled(scale)
+    return scene if frames is None else scene.model_copy(update={"frames": frames})
+
+
+def _note_no_smoke(scene: "Scene") -> None:
+    note_warnings([f"{scene.name}: no frame has smoke: is each source inside an obstacle?"])
 
 
 @app.command()
@@ -146,15 +153,17 @@ def bake(
     output: _Lightmaps,
     options: SmokeOptions,
     step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Longest step of the ray march in voxels.")] = 0.5,
-    supersample: Annotated[int, typer.Option(min=1, max=16, help="Supersampling: rays along the edge of a pixel.")] = 1,
+    supersample: Annotated[int, typer.Option(min=1, max=16, help="N: a pixel is the mean of N x N rays.")] = 1,
     g: _G = 0.0,
     fit: Annotated[
         Literal["axes", "sphere"],
-        typer.Option(help="axes: exact for lights along the six axes; sphere: least error over all light directions."),
+        typer.Option(
+            help="Best lightmaps for: axes, lights along the camera's axes (exact); sphere, lights from all sides."
+        ),
     ] = "axes",
     albedo: Annotated[
         float | None,
-        typer.Option(min=0.0, max=1.0, help="With --fit sphere: include multiple scattering of this albedo."),
+        typer.Option(min=0.0, max=1.0, help="With --fit sphere: add multiple scattering of this albedo; default none."),
     ] = None,
     resume: Resume = False,
 ) -> None:
@@ -168,7 +177,7 @@ def bake(
     if albedo is not None and fit == "axes":
         raise WlmError("--albedo needs --fit sphere: with --fit axes lightmaps have single scattering only")
     quiet_warp()
-    from wlm.smoke.march.fine import bake
+    from wlm.smoke.march.six_way import bake
 
     frames = options.open(smoke)
     settings = {"step": step, "g": g, "supersample": supersample}
@@ -204,36 +213,24 @@ def predict(
         raise WlmError("--coarse: expected no --network, since --coarse uses no network")
     quiet_warp()
     from wlm.smoke.codec import open_network
-    from wlm.smoke.march.coarse import bake_coarse, coarse_march
+    from wlm.smoke.march.six_way import bake_coarse, coarse_march
+    from wlm.smoke.network.prediction import SmokePredictor
 
     frames = options.open(smoke)
-    made: dict[str, Any] = {"made": "coarse", "seed": seed}
+    predictor = None
     if coarse:
+        made: dict[str, Any] = {"made": "coarse", "seed": seed}
 
         def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
             return bake_coarse(volume, camera, coarse_march(volume, seed))
     else:
         model = open_network(network)
-        made |= {"made": "network", "of": dict(model.summary)}
-        make = _predicted(model, seed, frames.device)
+        made = {"made": "network", "seed": seed, "of": dict(model.summary)}
+        predictor = SmokePredictor(model, frames.device)
+        make = partial(predictor, seed=seed)
     write_lightmaps(frames, options.view(frames), output, make, made, resume=resume)
-
-
-def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[DensityVolume, Camera], SixWay]":
-    """Returns a function that predicts lightmaps with a network; the first call may print the predictor's note."""
-    from wlm.smoke.network.prediction import SmokePredictor
-
-    predictor, first = SmokePredictor(model, device), True
-
-    def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-        nonlocal first
-        six = predictor(volume, camera, seed)
-        if first and (line := predictor.note()):
-            note(line)
-        first = False
-        return six
-
-    return make
+    if predictor is not None and (line := predictor.note()):
+        note(line)
 
 
 @app.command()
@@ -241,18 +238,15 @@ def _predicted(model: "SmokeModel", seed: int, device: str) -> "Callable[[Densit
 @exclusive
 def light(
     smoke: Input,
-    output: Annotated[Path, output_option("OUT", "A .png or .exr, or for frames a folder of PNGs.")],
+    output: Annotated[Path, output_option("OUT", "The .png or .exr to write; for a folder of frames, a folder.")],
     options: SmokeOptions,
-    lights: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--light", metavar="X,Y,Z[:R,G,B]", help="Direction to a light and its irradiance; repeat for more."
-        ),
-    ] = None,
+    lights: Lights = None,
     points: Annotated[
         list[str] | None,
         typer.Option(
-            "--point", metavar="X,Y,Z[:R,G,B]", help="Position of a point light and its intensity; repeat for more."
+            "--point",
+            metavar="X,Y,Z[:R,G,B]",
+            help="Point light, repeatable: position in the world, and intensity, one number or three; default 1.",
         ),
     ] = None,
     sky: Annotated[
@@ -280,7 +274,7 @@ def light(
     colour, around = _given_albedo(albedo), None if sky is None else vector("--sky", sky)
     behind = around if background is None else vector("--background", background)
     check_white(white)
-    own, twelve = _lights(lights, points), () if around is None else _sky_lights(around)
+    own, twelve = parse_lights(lights, points, around)
     quiet_warp()
     from wlm.formats.exr import write_exr
     from wlm.smoke.scene import obstacle_mesh
@@ -351,13 +345,16 @@ def run(
     orders: Annotated[
         Literal["all", "single"] | None,
         typer.Option(
-            help="Scattering: all orders, or single by six-way lightmaps; default all, with --network single."
+            help="Scattering: all orders, or single, by six-way lightmaps; default all, but single with --network."
         ),
     ] = None,
     albedo: _Albedo = None,
     network: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Make the six-way lightmaps with this network from wlm smoke train."),
+        typer.Option(
+            metavar="FILE",
+            help="Network that wlm smoke train wrote, to make the six-way lightmaps; default a coarse march.",
+        ),
     ] = None,
     white: White = 1.0,
     device: Device = "cpu",
@@ -379,24 +376,21 @@ def run(
     from wlm.interop import check_device
     from wlm.smoke.data import NumberedFiles
     from wlm.smoke.network.prediction import SmokePredictor
-    from wlm.smoke.scene import load_scene
     from wlm.smoke.simulation import warnings_of
     from wlm.view.pictures import save_png
     from wlm.view.smoke_run import Lighting, write_all
     from wlm.view.smoke_run import run as frames_of
 
     device = check_device(device)
-    scene = load_scene(scene_name)
-    if scale != 1.0:
-        scene = scene.scaled(scale)
+    scene = _scene(scene_name, scale, frames)
     single = orders == "single" or network is not None
     camera = scene.camera if resolution is None else scene.camera.model_copy(update={"resolution": resolution})
     if camera.perspective and single:
         raise WlmError(f"{scene_name}: camera.perspective: expected false for six-way lightmaps, found true")
-    scene = scene.model_copy(update={"camera": camera, "frames": frames or scene.frames})
+    scene = scene.model_copy(update={"camera": camera})
     if colour is not None:
         scene = scene.model_copy(update={"smoke": scene.smoke.model_copy(update={"albedo": colour})})
-    note_warnings(warnings_of(scene))
+    note_warnings(warnings := warnings_of(scene))
     predictor = None if network is None else SmokePredictor(network, device)
     lighting = Lighting(None if single else scene.smoke.albedo, predictor)
     with running("run", unit="frame") as progress:
@@ -404,10 +398,12 @@ def run(
         if film_file:
             width = max(round(camera.resolution * camera.aspect), 1)
             with film(output, camera.resolution, width, scene.rate) as add:
-                seconds = write_all(made, lambda number, pixels: add(pixels))
+                seconds, smoke = write_all(made, lambda number, pixels: add(pixels))
         else:
             files = NumberedFiles(output, "run", ".png")
-            seconds = write_all(made, lambda number, pixels: save_png(files.file(number), pixels))
+            seconds, smoke = write_all(made, lambda number, pixels: save_png(files.file(number), pixels))
+    if not smoke and not warnings:
+        _note_no_smoke(scene)
     rows = table(f"{output}: {scene.name}, {scene.frames} frames", ["stage", "ms per frame", "frames"])
     for stage, taken in seconds.items():
         counted = taken[_WARM:] or taken
@@ -423,37 +419,6 @@ def _given_albedo(text: str | None) -> tuple[float, float, float] | None:
     if not all(0 <= value <= 1 for value in values):
         raise WlmError(f"--albedo: expected numbers of 0 to 1, got {text!r}")
     return values
-
-
-def _checked(option: str, make: Callable[..., Any], *values: Any) -> Any:
-    """Calls `make` with an option's values; a ValueError becomes a WlmError that names the option."""
-    try:
-        return make(*values)
-    except ValueError as error:
-        raise WlmError(f"{option}: {error}") from error
-
-
-def _sky_lights(radiance: tuple[float, float, float]) -> "tuple[Light, ...]":
-    from wlm.smoke.transport.lights import sky_lights
-
-    return _checked("--sky", sky_lights, radiance)
-
-
-def _lights(directions: list[str] | None, places: list[str] | None) -> "list[AnyLight]":
-    from wlm.smoke.camera import unit
-    from wlm.smoke.shading import Light
-    from wlm.smoke.transport.lights import PointLight, checked_colour
-
-    made: list[AnyLight] = []
-    for option, texts in (("--light", directions), ("--point", places)):
-        for text in texts or ():
-            values = vectors(option, text)
-            if len(values) == 2:
-                _checked(option, checked_colour, "colour", values[1])
-            if option == "--light":
-                _checked(option, unit, values[0], "direction")
-            made.append(_checked(option, Light if option == "--light" else PointLight, *values))
-    return made
 
 
 for _module in (smoke_book, smoke_network):

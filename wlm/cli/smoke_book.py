@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.markup import escape
 
-from wlm.cli.console import check_output, note, quiet_warp, running, show, table
+from wlm.cli.console import check_output, note, note_warnings, quiet_warp, running, show, table
 from wlm.cli.options import Device, Engine, ShaderLanguage, output_option
-from wlm.cli.smoke_options import SHEET, Background, White, check_white, outputs, vector, vectors
+from wlm.cli.smoke_options import SHEET, Background, Lights, White, check_white, outputs, parse_lights, vector
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.smoke.flipbook.book import Book, Shot
-    from wlm.smoke.shading import Light
     from wlm.system import OnProgress
 
     _Source = tuple[bool, Callable[[int | None, OnProgress], Iterable[Shot]]]
@@ -31,10 +30,17 @@ _Lightmaps = Annotated[
 ]
 _With = Annotated[
     list[Path] | None,
-    typer.Option("--with", metavar="TEXTURE", help="A flip book's second texture; a second --with is its opacity."),
+    typer.Option(
+        "--with",
+        metavar="TEXTURE",
+        help="The second texture of a given flip book; repeated, the texture of its opacity.",
+    ),
 ]
 _Cells = Annotated[
-    str | None, typer.Option(metavar="ROWSxCOLUMNS", help="Cells of the flip book (see --with), such as 8x8.")
+    str | None,
+    typer.Option(
+        metavar="ROWSxCOLUMNS", help="Rows and columns of frames of a given flip book; default by name or content."
+    ),
 ]
 _Layout = Literal["unity", "o3de", "o3de-tlrb", "embergen"]
 _From = Annotated[
@@ -48,11 +54,17 @@ _From = Annotated[
 ]
 _Straight = Annotated[
     bool | None,
-    typer.Option("--straight/--premultiplied", help="Alpha of a given flip book; default by content."),
+    typer.Option(
+        "--straight/--premultiplied",
+        help="Whether alpha still has to multiply the light of a given flip book; default by content.",
+    ),
 ]
 _FromGain = Annotated[
     float | None,
-    typer.Option("--from-gain", help="Factor on the light of a given flip book; default as wlm wrote it, or 1."),
+    typer.Option(
+        "--from-gain",
+        help="Factor by which the light of a given flip book was multiplied; default as wlm wrote it, or 1.",
+    ),
 ]
 
 
@@ -64,16 +76,15 @@ def register(app: typer.Typer) -> None:
 
 def shade(
     lightmaps: _Lightmaps,
-    output: Annotated[Path, output_option("OUT", "A .png, or for frames a folder.")],
-    light: Annotated[
-        list[str] | None,
-        typer.Option(metavar="X,Y,Z[:R,G,B]", help="Direction to a light and its irradiance; repeat for more."),
-    ] = None,
+    output: Annotated[Path, output_option("OUT", "The .png to write; for several frames, a folder.")],
+    light: Lights = None,
     background: Background = None,
     white: White = 1.0,
     rule: Annotated[
         Literal["squared", "absolute", "normalised"],
-        typer.Option(help="The rule by which a light's direction weights the maps."),
+        typer.Option(
+            help="Weight of a map by the cosine c of its axis and the light: c^2, c, or c over the sum of all c."
+        ),
     ] = "squared",
     textures: _With = None,
     cells: _Cells = None,
@@ -88,7 +99,7 @@ def shade(
     light along an axis shows the lightmap of this axis unchanged.
     """
     check_white(white)
-    lights = [_light(text) for text in light or ()]
+    lights, _ = parse_lights(light)
     behind = None if background is None else vector("--background", background)
     quiet_warp()
     from wlm.smoke.scene import LightSettings, Looks
@@ -99,7 +110,7 @@ def shade(
     plain = Looks(lights=[LightSettings(toward=(1, 1, 1))])
     file = outputs(lightmaps, single, output, "shade", ".png")
     rows = table(str(lightmaps), ["file", "covered pixels", "mean", "largest", "clipped pixels"])
-    pictures = []
+    pictures, most = [], 0.0
     with running("shade") as progress:
         for shot in shots(None, progress):
             if shot.six.transparency is None:
@@ -113,12 +124,15 @@ def shade(
             path = file(shot.number)
             save_png(path, pictures[-1])
             covered = float((shot.six.transparency < 0.99).float().mean())
+            most = max(most, covered)
             clipped = float((shaded > white).any(-1).float().mean())
             figures = (f"{covered:.1%}", f"{shaded.mean():.4g}", f"{shaded.max():.4g}", f"{clipped:.1%}")
             rows.add_row(escape(path.name), *figures)
     if not single:
         contact_sheet(output / SHEET, {"": pictures})
     show(rows)
+    if not most:
+        note_warnings([f"{lightmaps}: no picture shows smoke: bake it with a larger --volume extinction=PER_LENGTH"])
 
 
 def flipbook(
@@ -126,11 +140,15 @@ def flipbook(
     output: Annotated[Path, output_option("OUT", "A folder, or a .png, .tga or .exr: written as OUT_1 and OUT_2.")],
     engine: Engine = None,
     shader: ShaderLanguage = None,
-    layout: Annotated[_Layout, typer.Option(help="Order of the channels in the two textures.")] = "unity",
-    count: Annotated[int | None, typer.Option(min=1, max=4096, help="Number of frames to pack; default all.")] = None,
+    layout: Annotated[
+        _Layout, typer.Option(help="Order of the lightmaps in the channels of the written textures.")
+    ] = "unity",
+    count: Annotated[
+        int | None, typer.Option(min=1, max=4096, help="Largest number of frames, evenly spread; default all.")
+    ] = None,
     gain: Annotated[
         float | None,
-        typer.Option(help="Factor on the light; default 1 in an .exr, else the largest that does not clip."),
+        typer.Option(help="Factor on the stored light; default 1 in an .exr, else the largest that does not clip."),
     ] = None,
     rate: Annotated[float | None, typer.Option(help="Frames per second; default the scene's, or 25.")] = None,
     textures: _With = None,
@@ -141,11 +159,12 @@ def flipbook(
     mips: Annotated[
         int | None,
         typer.Option(
-            min=1, max=6, help="Mip levels without bleeding between frames; default: 1 pixel of padding, 0 in files."
+            min=1, max=6, help="Number of mip levels for which frames are padded so that they do not mix; default none."
         ),
     ] = None,
     motion: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder of simulate --velocity, to add a motion texture.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Add a texture of motion, from the folder of wlm smoke simulate --velocity."),
     ] = None,
     device: Device = "cpu",
 ) -> None:
@@ -192,14 +211,6 @@ def flipbook(
         paths = export(bundle, output, engine, shader=shader or "glsl")
         contents, clipped = {path: packed.channels.get(path.stem, ()) for path in paths}, bundle.document["clipped"]
     _show(str(output), packed, contents, clipped)
-
-
-def _light(text: str) -> "Light":
-    from wlm.config import check_settings
-    from wlm.smoke.scene import LightSettings
-
-    values = dict(zip(("toward", "irradiance"), vectors("--light", text), strict=False))
-    return check_settings(LightSettings, values, "--light: ").light()
 
 
 def _source(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from wlm.smoke.data import Frames
     from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.scene import CameraSettings
+    from wlm.smoke.shading import AnyLight, Light
 
 SHEET = "sheet.png"
 _CAMERA = ("toward", "turn", "extent", "distance", "perspective")
@@ -28,6 +29,14 @@ _VOLUME = ("up", "extinction", "emission", "density", "temperature")
 White = Annotated[float, typer.Option(help="Radiance that becomes white in a PNG.")]
 Background = Annotated[
     str | None, typer.Option(metavar="R,G,B", help="Linear colour behind the smoke; default the scene's, or black.")
+]
+Lights = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--light",
+        metavar="X,Y,Z[:R,G,B]",
+        help="Light, repeatable: direction from the smoke to it, and irradiance, one number or three; default 4 pi.",
+    ),
 ]
 Input = Annotated[
     Path, typer.Argument(metavar="SMOKE", help="A volume (.npz, .nvdb, .vdb) or a folder of numbered volumes.")
@@ -151,6 +160,29 @@ def vectors(option: str, text: str) -> list[tuple[float, float, float]]:
     return values
 
 
+def parse_lights(
+    directions: Sequence[str] | None,
+    places: Sequence[str] | None = None,
+    sky: tuple[float, float, float] | None = None,
+) -> "tuple[list[AnyLight], tuple[Light, ...]]":
+    """Parses the texts of `--light` and `--point`; returns these lights, and those that stand for a sky."""
+    from wlm.config import check_settings
+    from wlm.smoke.scene import LightSettings
+    from wlm.smoke.shading import PointLight, sky_lights
+
+    made: list[AnyLight] = []
+    for text in directions or ():
+        values = dict(zip(("toward", "irradiance"), vectors("--light", text), strict=False))
+        made.append(check_settings(LightSettings, values, "--light: ").light())
+    option = "--point"
+    try:
+        made += [PointLight(*vectors(option, text)) for text in places or ()]
+        option = "--sky"
+        return made, () if sky is None else sky_lights(sky)
+    except ValueError as error:
+        raise WlmError(f"{option}: {error}") from error
+
+
 def check_white(white: float) -> None:
     """Checks the value of `--white`, which must be above 0."""
     if not 0 < white < float("inf"):
@@ -200,7 +232,7 @@ def write_lightmaps(
     """
     from wlm.smoke.data import NumberedFiles, write_six_way
     from wlm.smoke.lightmaps import axis_faults
-    from wlm.smoke.march.coarse import with_surface
+    from wlm.smoke.march.six_way import with_surface
 
     files = None
     if frames.single:

@@ -62,7 +62,10 @@ def register(
     def general(
         file: Annotated[Path, typer.Argument(metavar=metavar, help=argument_help)],
         system: Annotated[
-            str | None, typer.Option(metavar="|".join(SYSTEMS), help="Choose the system instead of detecting it.")
+            str | None,
+            typer.Option(
+                metavar="|".join(SYSTEMS), help="System that reads the file; default: the one that the file belongs to."
+            ),
         ] = None,
     ) -> None:
         """Placeholder that describes the verb in `--help`; a call with a file runs the function for that file."""

@@ -27,9 +27,15 @@ def view(
     original: Original = None,
     key: Key = None,
     view: Annotated[
-        str | None, typer.Option(help="The picture: light or tiles; of probes: balls, gaussians or volume.")
+        str | None,
+        typer.Option(help="Picture to show: light or tiles of lightmaps; balls, gaussians or volume of probes."),
     ] = None,
-    outside: Annotated[bool, typer.Option("--outside", help="Also draw walls seen from outside the room.")] = False,
+    outside: Annotated[
+        bool,
+        typer.Option(
+            "--outside", help="Also draw the walls of a room that are seen from outside, which are hidden else."
+        ),
+    ] = False,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,
     sliders: Annotated[
         list[str] | None,
@@ -42,22 +48,32 @@ def view(
             "block=SIDE of the finest blocks of the volume of probes.",
         ),
     ] = None,
-    tone: Annotated[Literal["clamped", "filmic"], typer.Option(help="Tone mapping of light above white.")] = "clamped",
+    tone: Annotated[
+        Literal["clamped", "filmic"],
+        typer.Option(help="Light above white: cut off (clamped), or up to 4 times white compressed (filmic)."),
+    ] = "clamped",
     walk: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Viewpoints in --view volume: a JSON list of x, y, z, or a .npz's `position`."
+            metavar="FILE",
+            help="Viewpoints for --view volume: a JSON list of [x, y, z], or a .npz with the array position.",
         ),
     ] = None,
     up: Up = "y",
     rate: Annotated[float, typer.Option(help="Frames per second of an animation or of smoke.")] = 24.0,
-    frames: Annotated[int | None, typer.Option(help="Number of pictures; default 48, or all frames of smoke.")] = None,
+    frames: Annotated[
+        int | None, typer.Option(help="Number of pictures of --movie; default 48, or all frames of smoke.")
+    ] = None,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the window in pixels.")] = "1280x720",
     screenshot: Annotated[
-        Path | None, typer.Option(metavar="OUT.png", help="Write a picture; needs no display.")
+        Path | None,
+        typer.Option(metavar="OUT.png", help="Write a picture instead of opening a window; needs no display."),
     ] = None,
     movie: Annotated[
-        Path | None, typer.Option(metavar="OUT.gif", help="Write an animation, .gif or .webp; needs no display.")
+        Path | None,
+        typer.Option(
+            metavar="OUT.gif", help="Write an animation, .gif or .webp, instead of opening a window; needs no display."
+        ),
     ] = None,
 ) -> None:
     """Show lightmaps, probes or smoke in a window; with --original, beside the original and the error."""

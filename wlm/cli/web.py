@@ -22,8 +22,10 @@ def web(
     mesh: SceneFile = None,
     original: Original = None,
     key: Key = None,
-    hours: Annotated[int, typer.Option(min=1, help="Largest number of original lightmaps in the page.")] = 6,
-    rate: Annotated[float, typer.Option(help="Frames per second of smoke.")] = 30.0,
+    hours: Annotated[
+        int, typer.Option(min=1, help="Most original lightmaps in the page, evenly spread over the times.")
+    ] = 6,
+    rate: Annotated[float, typer.Option(help="Frames per second at which smoke is played.")] = 30.0,
     up: Up = "y",
 ) -> None:
     """Write one HTML file that decodes and shows the light on the GPU of a browser. It works without a network."""

@@ -112,7 +112,9 @@ def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: 
     if not bundle.parts:
         module = _KITS.get(bundle.system, "")
         if not module or (engine not in ENGINES and "{engine}" not in module):
-            raise WlmError(f"{bundle.name}: there is no kit for {engine}; export a raw folder")
+            raise WlmError(
+                f"{bundle.name}: there is no kit for {engine}; export without an engine: textures, buffers and a shader"
+            )
         write_kit = import_module(module.format(engine=engine)).write_kit
         known = tuple(signature(write_kit).parameters)[3:]
         _check_options(options, known, f"a {bundle.system} kit for {engine}")
@@ -125,7 +127,7 @@ def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: 
         return
     parts = {name: part for name, part in bundle.parts.items() if "values" not in part.document}
     if not parts:
-        raise WlmError(f"{bundle.name}: cannot export for {engine}: expected a layer of light, found other values only")
+        raise WlmError(f"{bundle.name}: cannot export for {engine}: expected a layer of light, found only others")
     for name, part in parts.items():
         (folder / name).mkdir()
         _write_kit(part, folder / name, engine, device, options)
@@ -143,7 +145,9 @@ def _check_options(options: Iterable[str], known: Sequence[str], where: str) -> 
 
 def _write_index(bundle: Bundle, folder: Path, entries: dict[str, Any], document: Mapping[str, Any]) -> None:
     if wrong := RESERVED & set(document):
-        raise ValueError(f"document: expected none of the reserved keys, got {', '.join(sorted(wrong))}")
+        raise ValueError(
+            f"document: expected none of the keys that the export writes itself, got {', '.join(sorted(wrong))}"
+        )
     head = {"format": FORMAT, "version": _VERSION, "system": bundle.system, "name": bundle.name}
     try:
         text = compact_json(head | entries | dict(document))

@@ -345,9 +345,8 @@ def _found(bad: torch.Tensor) -> tuple[int, tuple[int, ...]]:
 def _dimmed(name: str, heat: torch.Tensor, emission: float, voxel: float, warnings: list[str]) -> torch.Tensor:
     """Returns temperatures clamped so that the light of a voxel stays within the range of half floats."""
     most = HALF_MAX / max(emission * voxel, _TINY)
-    bad = heat > most
-    if bad.any():
-        count, first = _found(bad)
+    if float(heat.max()) > most:
+        count, first = _found(heat > most)
         warnings.append(
             f"{name}: {_TEMPERATURE}: {count} voxels that each emit more light than {HALF_MAX:,.0f}, the largest half "
             f"float, are lowered to it, the first is {first}"

@@ -26,7 +26,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     with _as_wlm_error(path):
         # Renaming over a device such as /dev/null would destroy it.
         if os.path.lexists(target) and not stat.S_ISREG(os.stat(target).st_mode):
-            raise WlmError(f"{path}: cannot write: it exists and is not a regular file")
+            raise WlmError(f"{path}: cannot write: expected a file or none, found a folder, a device or a pipe")
         if not target.parent.is_dir():
             raise WlmError(f"{path}: cannot write: the folder {target.parent} does not exist")
         with temporary(target) as part:

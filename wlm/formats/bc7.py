@@ -115,16 +115,16 @@ def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
         ValueError: Wrong shapes or types, an index above 15, or an endpoint without a shared lowest bit.
     """
     if endpoints.dtype != np.uint8 or indices.dtype != np.uint8:
-        raise ValueError(f"expected uint8 endpoints and indices, got {endpoints.dtype} and {indices.dtype}")
+        raise ValueError(f"endpoints, indices: expected uint8, got {endpoints.dtype} and {indices.dtype}")
     if endpoints.shape[-2:] != (2, 4) or indices.shape != (*endpoints.shape[:-2], 16):
         raise ValueError(
-            f"expected endpoints [..., 2, 4] and indices [..., 16], got {endpoints.shape}, {indices.shape}"
+            f"endpoints, indices: expected [..., 2, 4] and [..., 16], got {endpoints.shape}, {indices.shape}"
         )
     if indices.size and indices.max() > 15:
-        raise ValueError(f"expected indices in 0..15, got {indices.max()}")
+        raise ValueError(f"indices: expected 0 to 15, got {indices.max()}")
     parity = endpoints & 1
     if np.any(parity != parity[..., :1]):
-        raise ValueError("expected the four bytes of every endpoint to share their lowest bit")
+        raise ValueError("endpoints: expected the four bytes of each endpoint to have the same lowest bit")
     swapped = indices[..., :1] >= 8
     endpoints = np.where(swapped[..., None], endpoints[..., ::-1, :], endpoints)
     indices = np.where(swapped, 15 - indices, indices)
@@ -141,7 +141,7 @@ def unpack_mode6(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         WlmError: A block is of another mode.
     """
     if blocks.dtype != np.uint8 or blocks.shape[-1:] != (BLOCK_BYTES,):
-        raise ValueError(f"expected blocks uint8 [..., 16], got {blocks.dtype} {blocks.shape}")
+        raise ValueError(f"blocks: expected uint8 [..., 16], got {blocks.dtype} {blocks.shape}")
     words = np.ascontiguousarray(blocks).view("<u8").astype(np.uint64)
     low, high = words[..., 0], words[..., 1]
     foreign = (low & np.uint64((1 << _MODE_BITS) - 1)) != _MODE_6
@@ -165,7 +165,7 @@ def decode_image(blocks: np.ndarray) -> np.ndarray:
         ValueError: Wrong shape or type.
     """
     if blocks.dtype != np.uint8 or blocks.ndim < 3 or blocks.shape[-1] != BLOCK_BYTES:
-        raise ValueError(f"expected blocks uint8 [..., H/4, W/4, 16], got {blocks.dtype} {blocks.shape}")
+        raise ValueError(f"blocks: expected uint8 [..., H/4, W/4, 16], got {blocks.dtype} {blocks.shape}")
     *rest, rows, columns, _ = blocks.shape
     size = 4 * columns, 4 * rows * math.prod(rest)
     pixels = Image.frombytes("RGBA", size, blocks.tobytes(), "bcn", 7)

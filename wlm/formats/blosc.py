@@ -34,8 +34,9 @@ def unpack(packed: bytes, size: int) -> bytes:
     stated = unpacked_size(packed)
     if stated != size and not size < stated <= _PADDED:
         raise ValueError(f"expected a decompressed size of {size} bytes, found {stated}")
-    if struct.unpack_from("<I", packed, 12)[0] != len(packed):
-        raise ValueError(f"the Blosc header states another size than the {len(packed)} bytes of the data")
+    (length,) = struct.unpack_from("<I", packed, 12)
+    if length != len(packed):
+        raise ValueError(f"expected {length} bytes of Blosc data, as its header states, found {len(packed)}")
     codecs = need("imagecodecs", EXTRA)
     out = np.empty(stated, np.uint8)
     try:

@@ -74,11 +74,11 @@ def read_encoded(path: str | os.PathLike[str], encoding: str, notes: list[str] |
         kind = level_kind(path, file.read(HEAD))
     if kind is None:
         raise WlmError(
-            f"{path}: encoding: expected a {KINDS} of integers; other formats define their encoding themselves"
+            f"{path}: encoding: expected a {KINDS} of integers, found a format that states its encoding itself"
         )
     pixels, names = read_levels(path, kind, notes)
     if name in _ALPHA and "A" not in names:
-        raise WlmError(f"{path}: encoding {name}: expected a picture with alpha, found {''.join(names)}")
+        raise WlmError(f"{path}: encoding {name}: expected a picture with alpha, found the channels {''.join(names)}")
     colour, alpha = (pixels[..., :-1], pixels[..., -1:]) if "A" in names else (pixels, None)
     if colour.shape[2] == 1:
         notes.append("its grey is taken as grey light")

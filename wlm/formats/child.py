@@ -4,7 +4,7 @@ Some C libraries end their process on damaged data, or allocate what the data cl
 which imports nothing of this package. It imports the library, sets the limits, and calls the file's `main`.
 
 The file has the name of the library, `PACKAGE`; its limits beyond the import, `MEMORY` in bytes and `SECONDS` of CPU
-time, which hold on systems that can set them; and `main`, which gets the data and returns arrays by name.
+time; and `main`, which gets the data and returns arrays by name.
 """
 
 import contextlib
@@ -42,15 +42,14 @@ def run_child(reader: ModuleType, data: bytes, *arguments: str) -> dict[str, np.
 
 
 def _limit(memory: int, seconds: int) -> None:
-    with contextlib.suppress(ImportError, OSError):
-        import resource
+    import resource  # which Windows lacks: it can import this file, not run a child
 
-        with open("/proc/self/statm") as file:
-            memory += int(file.read().split()[0]) * resource.getpagesize()
-        used = resource.getrusage(resource.RUSAGE_SELF)
-        seconds += int(used.ru_utime + used.ru_stime)
-        for kind, most in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds), (resource.RLIMIT_CORE, 0)):
-            resource.setrlimit(kind, (most, most))
+    with open("/proc/self/statm") as file:
+        memory += int(file.read().split()[0]) * resource.getpagesize()
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    seconds += int(used.ru_utime + used.ru_stime)
+    for kind, most in ((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, seconds), (resource.RLIMIT_CORE, 0)):
+        resource.setrlimit(kind, (most, most))
 
 
 if __name__ == "__main__":

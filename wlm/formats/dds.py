@@ -98,7 +98,7 @@ def write_dds(
         raise ValueError(f"fmt: expected one of {', '.join(DXGI_FORMATS)}, got {fmt}")
     for name, count, alone in (("depth", depth, not layers), ("layers", layers, not mips)):
         if not 0 <= count <= MOST_SLICES or (count and not alone):
-            raise ValueError(f"{name}: expected 0 to {MOST_SLICES}, and one of depth, mips and layers, got {count}")
+            raise ValueError(f"{name}: expected 0 to {MOST_SLICES}, and no layers with depth or mips, got {count}")
     sizes = texels.mip_bytes(fmt, width, height, mips, 0 if depth else None)
     size = (depth or layers or 1) * sizes[0] + sum(sizes[1:])
     if len(data) != size:

@@ -176,7 +176,9 @@ def _pixels(path: str | os.PathLike[str], channels: _Channels, names: Sequence[s
         (part, channel), where = channels[name], f"{path}: channel {name}"
         plane = channel.pixels
         if plane is None or plane.dtype not in (np.float16, np.float32):
-            raise WlmError(f"{where}: expected half or float, found {'no pixels' if plane is None else plane.dtype}")
+            raise WlmError(
+                f"{where}: expected half or float numbers, found {'no pixels' if plane is None else plane.dtype}"
+            )
         plane = _framed(where, part, plane.astype(np.float32, copy=False), notes)
         if not index:
             pixels = np.empty((*plane.shape, len(names)), np.float32)
@@ -194,7 +196,9 @@ def _framed(where: str, part: OpenEXR.Part, plane: np.ndarray, notes: list[str])
     left, top, width, height = display
     x, y = data[0] - left, data[1] - top
     if plane.shape != (data[3], data[2]):
-        raise WlmError(f"{where}: expected {data[2]}x{data[3]} pixels, found {plane.shape[1]}x{plane.shape[0]}")
+        raise WlmError(
+            f"{where}: expected {data[2]}x{data[3]} pixels in the data window, found {plane.shape[1]}x{plane.shape[0]}"
+        )
     rows, columns = (slice(max(at, 0), max(at + size, 0)) for at, size in ((y, data[3]), (x, data[2])))
     framed = np.zeros((height, width), np.float32)
     inside = plane[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]

@@ -51,7 +51,8 @@ def check_header(path: str | os.PathLike[str]) -> list[ExrHeader]:
             attributes and channels, or claims more pixels than the limits or the size of the file allow.
     """
     with open_file(path, "the EXR file") as file:
-        data, size = file.read(_HEADER_BYTES), os.fstat(file.fileno()).st_size
+        size = os.fstat(file.fileno()).st_size
+        data = file.read(min(size, _HEADER_BYTES))
     if not data.startswith(MAGIC):
         raise WlmError(f"{path}: expected an EXR file, found other content")
     with damaged(f"{path}: the EXR file is cut short or damaged", ValueError, LookupError, struct.error):
@@ -85,7 +86,8 @@ def _attributes(data: bytes, at: int, most: int) -> tuple[dict[str, tuple[str, b
         if not 0 <= length <= len(data) - at:
             raise ValueError(f"attribute {name[:60]}: expected at most {len(data) - at} bytes, found {length}")
         if name in attributes or len(attributes) >= most:
-            raise ValueError(f"expected at most {_FIELDS} different attributes, found {name[:60]} beyond them")
+            fault = "twice the attribute" if name in attributes else "also"
+            raise ValueError(f"expected at most {_FIELDS} attributes of different names, found {fault} {name[:60]}")
         attributes[name] = kind, data[at : at + length]
         at += length
     return attributes, at + 1

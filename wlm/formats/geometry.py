@@ -8,7 +8,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf
-from wlm.formats.gltf_slots import lightmap_uv
+from wlm.formats.gltf_slots import lightmap_uv, usual_set
 from wlm.formats.meshes import SUFFIXES, read_mesh
 
 _ROOM = 0.25  # smallest fraction of the bounding box that an interior encloses
@@ -66,8 +66,7 @@ def read_geometry(path: str | os.PathLike[str], uv_set: int | None = None, *, wi
         parts = [(mesh.position, mesh.triangle, mesh.uv)] if mesh.uv is not None or not with_uv else []
     else:
         document, primitives = read_gltf(path)
-        sets = {number for each in primitives for number in each.uv}
-        number = (1 if 1 in sets else 0) if uv_set is None else uv_set
+        number = usual_set(primitives) if uv_set is None else uv_set
         parts = [
             (each.position, each.triangle, lightmap_uv(document, each, number) if with_uv else None)
             for each in primitives

@@ -5,7 +5,7 @@ them; others store tiling and offset there. Integer UVs take the transform of an
 of a slot for light if it keeps them in [0, 1]. A slot whose image has the name of the lightmap comes first.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,12 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 _FLOAT = 5126
 _MOST_SLOTS = 64  # texture slots of a material that are examined
 _NEAR = 0.01  # a transform for lightmaps leaves UVs this near to [0, 1]
+
+
+def usual_set(primitives: Sequence[GltfPrimitive]) -> int:
+    """Returns n of the `TEXCOORD_n` that is read without a stated set: 1, where engines look for lightmap UVs, if any
+    primitive has it; else 0."""
+    return int(any(1 in each.uv for each in primitives))
 
 
 def lightmap_transform(

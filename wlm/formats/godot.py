@@ -43,46 +43,15 @@ _LARGEST_BLOCK = 1 << 20
 _BOOL, _INT, _FLOAT, _RECTANGLE, _AABB, _LONG = 2, 3, 4, 11, 15, 40
 _STRING, _STRING_NAME, _NODE_PATH, _OBJECT, _DICTIONARY, _ARRAY = 5, 44, 22, 24, 26, 30
 _BYTES, _INTS, _STRINGS, _VECTOR3S, _COLOURS = 31, 32, 34, 35, 36
-# Types of a fixed size: number of reals and number of further bytes.
-_FIXED = {
-    1: (0, 0),  # nil
-    2: (0, 4),  # bool
-    3: (0, 4),  # int
-    4: (1, 0),  # float
-    10: (2, 0),  # Vector2
-    11: (4, 0),  # Rect2
-    12: (3, 0),  # Vector3
-    13: (4, 0),  # Plane
-    14: (4, 0),  # Quaternion
-    15: (6, 0),  # AABB
-    16: (9, 0),  # Basis
-    17: (12, 0),  # Transform3D
-    18: (6, 0),  # Transform2D
-    20: (0, 16),  # Color, always single
-    23: (0, 4),  # RID
-    40: (0, 8),  # 64-bit int
-    41: (0, 8),  # double
-    42: (0, 0),  # Callable, not stored
-    43: (0, 0),  # Signal, not stored
-    45: (0, 8),  # Vector2i
-    46: (0, 16),  # Rect2i
-    47: (0, 12),  # Vector3i
-    50: (4, 0),  # Vector4
-    51: (0, 16),  # Vector4i
-    52: (16, 0),  # Projection
-}
-# Packed arrays: reals and further bytes of one element.
-_PACKED = {
-    _BYTES: (0, 1),
-    _INTS: (0, 4),  # of 32 bits
-    33: (0, 4),  # floats
-    _VECTOR3S: (3, 0),
-    _COLOURS: (0, 16),
-    37: (2, 0),  # Vector2
-    48: (0, 8),  # 64-bit ints
-    49: (0, 8),  # doubles
-    53: (4, 0),  # Vector4
-}
+# Reals of the types of a fixed size: float, Vector2, Rect2, Vector3, Plane, Quaternion, AABB, Basis, Transform3D,
+# Transform2D, Vector4, Projection; and bytes of nil, bool, int, Color, RID, 64-bit int, double, Callable, Signal (these
+# two are not stored), Vector2i, Rect2i, Vector3i, Vector4i.
+_REALS = {4: 1, 10: 2, 11: 4, 12: 3, 13: 4, 14: 4, 15: 6, 16: 9, 17: 12, 18: 6, 50: 4, 52: 16}
+_SIZES = {1: 0, 2: 4, 3: 4, 20: 16, 23: 4, 40: 8, 41: 8, 42: 0, 43: 0, 45: 8, 46: 16, 47: 12, 51: 16}
+# The same for an element of a packed array: of Vector3, Vector2, Vector4; and of bytes, ints and floats of 32 bits,
+# colours, ints and floats of 64 bits.
+_PACKED_REALS = {_VECTOR3S: 3, 37: 2, 53: 4}
+_PACKED_SIZES = {_BYTES: 1, _INTS: 4, 33: 4, _COLOURS: 16, 48: 8, 49: 8}
 # Kinds of references to a resource: no content, two strings (in old files), an index, an index.
 _EMPTY, _EXTERNAL_PATH, _INTERNAL, _EXTERNAL = range(4)
 
@@ -147,10 +116,10 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
             reader.expect(name, _ARRAY, "an array")
             count = reader.u32() & 0x7FFFFFFF
             if count % 4:
-                raise WlmError(f"{path}: {name}: expected four values for each user, found {count}")
+                raise WlmError(f"{path}: {name}: expected four values for each mesh, found {count} in all")
             users += [reader.user(names) for _ in range(count // 4)]
         elif name == _DIRECTIONAL:
-            reader.expect(name, _BOOL, "a yes or no")
+            reader.expect(name, _BOOL, "a boolean")
             directional = reader.u32() != 0
         else:
             reader.skip()
@@ -211,7 +180,9 @@ def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, _Reader
             else:
                 reader.skip()
     if points is None or colours is None or len(points) == 0:
-        raise WlmError(f"{path}: {_PROPERTY} has no probes: bake with LightmapProbe nodes or with generated probes")
+        raise WlmError(
+            f"{path}: {_PROPERTY} has no probes: bake with LightmapProbe nodes, or let Godot generate probes"
+        )
     if len(colours) != COEFFICIENTS * len(points):
         raise WlmError(
             f"{path}: {_PROPERTY}.sh: expected {COEFFICIENTS} colours for each of {len(points)} points, "
@@ -376,13 +347,11 @@ class _Reader:
         if depth > _DEEPEST:
             raise WlmError(f"{self.path}: damaged: values are nested more than {_DEEPEST} deep")
         kind = self.u32()
-        if kind in _FIXED:
-            reals, size = _FIXED[kind]
-            self.take(reals * self.real + size)
-        elif kind in _PACKED:
-            reals, size = _PACKED[kind]
-            count = self.u32() * (reals * self.real + size)
-            self.take(count + (-count % 4 if kind == _BYTES else 0))
+        if kind in _REALS or kind in _SIZES:
+            self.take(_REALS.get(kind, 0) * self.real + _SIZES.get(kind, 0))
+        elif kind in _PACKED_REALS or kind in _PACKED_SIZES:
+            size = self.u32() * (_PACKED_REALS.get(kind, 0) * self.real + _PACKED_SIZES.get(kind, 0))
+            self.take(size + -size % 4)  # only bytes need the padding
         elif kind in (_STRING, _STRING_NAME):
             self.string()
         elif kind == _STRINGS:
@@ -466,7 +435,7 @@ def lmbake_bytes(
         "points": _u32(_VECTOR3S, len(points)) + points.astype("<f4").tobytes(),
         "tetrahedra": _u32(_INTS, tetrahedra.size) + tetrahedra.astype("<i4").tobytes(),
         "bsp": _u32(_INTS, node.size) + node.tobytes(),
-        "sh": _u32(_COLOURS, COEFFICIENTS * len(points)) + _colours(sh),
+        "sh": _u32(_COLOURS, COEFFICIENTS * len(points)) + np.pad(sh, ((0, 0), (0, 0), (0, 1))).astype("<f4").tobytes(),
         "interior": _u32(_BOOL, 0),
         "baked_exposure": _u32(_FLOAT) + struct.pack("<f", 1.0),
     }
@@ -478,12 +447,6 @@ def lmbake_bytes(
     head += _u32(1) + _text("local://1")
     body = _text(_TYPE) + _u32(1) + _u32(0) + content
     return head + struct.pack("<Q", len(head) + 8) + body + b"RSRC"
-
-
-def _colours(sh: np.ndarray) -> bytes:
-    colours = np.zeros((len(sh), COEFFICIENTS, 4), "<f4")
-    colours[..., :3] = sh
-    return colours.tobytes()
 
 
 def _u32(*values: int) -> bytes:

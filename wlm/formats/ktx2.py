@@ -261,13 +261,17 @@ def _primaries(path: str | os.PathLike[str], data: bytes) -> tuple[float, ...]:
     """Returns the chromaticities that the data format descriptor states, and checks that its transfer function is
     linear."""
     if len(data) < _DESCRIPTOR_BYTES:
-        raise WlmError(f"{path}: the data format descriptor: expected {_DESCRIPTOR_BYTES} bytes, found {len(data)}")
+        raise WlmError(
+            f"{path}: the data format descriptor: expected at least {_DESCRIPTOR_BYTES} bytes, found {len(data)}"
+        )
     transfer = data[14]
     if transfer not in _TRANSFERS:
-        raise WlmError(f"{path}: the data format descriptor: expected linear light (transfer 1), found {transfer}")
+        raise WlmError(
+            f"{path}: the data format descriptor: expected linear light (transfer function 1), found {transfer}"
+        )
     if data[13] not in _PRIMARIES:
         known = ", ".join(map(str, _PRIMARIES))
-        raise WlmError(f"{path}: the data format descriptor: expected primaries {known}, found {data[13]}")
+        raise WlmError(f"{path}: the data format descriptor: expected colour primaries {known}, found {data[13]}")
     return _PRIMARIES[data[13]]
 
 

@@ -5,6 +5,7 @@ The files do not say what light the levels stand for. Profiles of colour and gam
 
 import io
 import os
+from typing import Any
 
 import numpy as np
 from PIL.Image import Image
@@ -52,13 +53,21 @@ def level_kind(path: str | os.PathLike[str], head: bytes) -> str | None:
     return "TGA" if os.fspath(path).lower().endswith(".tga") else None
 
 
-def read_levels(path: str | os.PathLike[str], kind: str, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+def read_levels(
+    path: str | os.PathLike[str],
+    kind: str,
+    notes: list[str],
+    entries: dict[Any, Any] | None = None,
+    sure: int = PICTURE_BYTES,
+) -> tuple[np.ndarray, tuple[str, ...]]:
     """Reads a picture of integers.
 
     Args:
         path: The file.
         kind: Its kind, of `level_kind`.
         notes: A line is added if the file states an orientation, which is ignored.
+        entries: Receives what Pillow finds in the file besides the pixels, such as the texts of a PNG by name.
+        sure: Decoded bytes that are allowed for any size of file.
 
     Returns:
         The levels, float32 [H, W, C] in [0, 1], the top row first, and the names of the channels: L, or R, G and B,
@@ -75,12 +84,14 @@ def read_levels(path: str | os.PathLike[str], kind: str, notes: list[str]) -> tu
         with damaged(f"{path}: cannot read the {kind}", *DAMAGED_PICTURE), _READERS[kind](io.BytesIO(data)) as image:
             check_sides(str(path), image.width, image.height)
             size = image.width * image.height * len(image.getbands())
-            check_growth(str(path), len(data), size, PICTURE_GROWTH, PICTURE_BYTES)
+            check_growth(str(path), len(data), size, PICTURE_GROWTH, sure)
             pixels, names = _pixels(path, kind, data, image)
+            if entries is not None:
+                entries |= image.info
             if kind == "JPEG" and (turned := image.getexif().get(_ORIENTATION, 1)) != 1:
                 notes.append(f"its EXIF orientation, {turned}, is ignored: rows are read as they are stored")
     if pixels.dtype.kind == "f":
-        raise WlmError(f"{path}: encoding: expected a picture of integers, found floats, which are linear light")
+        raise WlmError(f"{path}: encoding: expected a picture of integers, found floats, which need no encoding")
     levels = pixels.astype(np.float32) / np.iinfo(pixels.dtype).max
     return levels.reshape(*pixels.shape[:2], -1), names
 
@@ -97,6 +108,6 @@ def _pixels(path: str | os.PathLike[str], kind: str, data: bytes, image: Image) 
         image = image.convert("RGBA" if image.mode == "PA" or "transparency" in image.info else "RGB")
     if image.mode not in _DIRECT:
         raise WlmError(
-            f"{path}: expected a {kind} of grey, RGB or a palette, with alpha or without, found {image.mode}"
+            f"{path}: expected a {kind} of grey, RGB or a palette, with alpha or without, found mode {image.mode}"
         )
     return np.asarray(image), ("L",) if image.mode == "I;16" else tuple(image.getbands())

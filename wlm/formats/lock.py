@@ -116,7 +116,7 @@ def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
                 return handle
         except BlockingIOError:
             os.close(handle)
-            raise WlmError(f"{output}: another process is writing it") from None
+            raise WlmError(f"{output}: another process is writing it: wait until it ends") from None
         except FileNotFoundError:
             # Its owner removed it after it was opened here.
             os.close(handle)

@@ -111,12 +111,12 @@ def _unpacked(data: bytes, size: int, codec: int) -> bytes:
             # The limit of zlib must not be 0, which it reads as none.
             pieces.append(zlib.decompressobj().decompress(piece, left + 1))
         else:
-            raise ValueError(f"expected {size} bytes after decompression, found more")
+            raise ValueError(f"expected a grid of {size} bytes after decompression, found more")
         left -= len(pieces[-1])
         if left < 0 or not length:
             break
     if left:
-        raise ValueError(f"expected {size} bytes after decompression, found another number")
+        raise ValueError(f"expected a grid of {size} bytes after decompression, found {size - left}")
     return b"".join(pieces)
 
 
@@ -149,13 +149,13 @@ class _Grid:
         values.fill(background)
         count = self._number("<I", root + 24)
         if count * 32 > data.size:
-            raise ValueError(f"its root claims {count} tiles")
+            raise ValueError(f"expected a root of at most {data.size // 32} nodes, found {count}")
         rows = self._rows(root + (96 if wide else 64) + 32 * np.arange(count), 32)
         keys, children = (
             np.ascontiguousarray(rows[:, i : i + 8]).view(f"<{kind}8")[:, 0] for i, kind in ((0, "u"), (8, "i"))
         )
         if len(np.unique(keys)) < count:
-            raise ValueError("expected nodes at different places, found two at one")
+            raise ValueError("expected root nodes at different places, found two at one")
         axes = [(keys >> np.uint64(shift) & np.uint64((1 << 21) - 1)) << np.uint64(12) for shift in (42, 21, 0)]
         corners = np.stack(axes, 1).astype(np.uint32).view(np.int32).astype(np.int64)
         begin = 24 if wide else 20
@@ -207,7 +207,7 @@ class _Grid:
             self._count(len(nodes), _CODES + LEAF**3 // 8)
             width = self._rows(nodes, 16)[:, 15] >> 5
             if (width > 4).any():
-                raise ValueError("expected codes of at most 16 bits")
+                raise ValueError("expected codes of at most 16 bits in its leaves, found longer ones")
             groups = [(np.flatnonzero(width == b), 1 << b) for b in range(5)]
         for chosen, bits in groups:
             size = head + LEAF**3 * bits // 8
@@ -225,7 +225,9 @@ class _Grid:
 
     def _count(self, count: int, size: int) -> None:
         if count * size > self._data.size:
-            raise ValueError(f"its nodes claim {count} of {size} bytes")
+            raise ValueError(
+                f"expected nodes within its {self._data.size} bytes, found {count} nodes of {size} bytes each"
+            )
 
     def _number(self, form: str, at: int) -> int:
         return struct.unpack_from(form, self._data, at)[0]
@@ -233,7 +235,7 @@ class _Grid:
     def _rows(self, offsets: np.ndarray, size: int, form: str = "u1") -> np.ndarray:
         """Returns the `size` bytes at each offset as numbers [N, size / their bytes]."""
         if len(offsets) and not 0 <= offsets.min() <= offsets.max() <= self._data.size - size:
-            raise ValueError("a node is outside the grid")
+            raise ValueError(f"expected nodes within its {self._data.size} bytes, found one outside")
         if not len(offsets):
             return np.zeros((0, size // np.dtype(form).itemsize), form)
         return np.lib.stride_tricks.sliding_window_view(self._data, size)[offsets].view(form)

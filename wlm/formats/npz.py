@@ -49,7 +49,7 @@ def read_npz(
     with damaged(f"{path}: cannot read the arrays", Exception), open_file(path, "the arrays") as file:
         size = os.fstat(file.fileno()).st_size
         if size > VOLUME_BYTES:
-            raise WlmError(f"{path}: cannot read the arrays: expected a file of at most {VOLUME_BYTES} bytes")
+            raise WlmError(f"{path}: expected a file of at most {VOLUME_BYTES} bytes, found {size}")
         if file.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX:
             raise WlmError(f"{path}: expected a .npz file, which names its arrays, found a .npy file of one array")
         budget = Budget(str(path), max(sure, GROWTH * size), "bytes of arrays")
@@ -58,7 +58,7 @@ def read_npz(
             arrays = {}
             for name in choose(list(members)):
                 if name not in members:
-                    raise WlmError(f"{path}: {name} is missing; found {', '.join(members) or 'nothing'}")
+                    raise WlmError(f"{path}: the array {name} is missing; found {', '.join(members) or 'nothing'}")
                 arrays[name] = _read(f"{path}: {name}", archive, members[name], numbers, budget)
             return arrays
 
@@ -85,10 +85,10 @@ def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: 
         shape, by_columns, dtype = _header(where, begin)
         count = math.prod(shape)
         if count > numbers:
-            raise WlmError(f"{where}: expected at most {numbers} numbers, found the shape {shape}")
+            raise WlmError(f"{where}: expected an array of at most {numbers} numbers, found the shape {shape}")
         size, stated = count * dtype.itemsize, info.file_size - begin.tell()
         if stated != size:
-            raise WlmError(f"{where}: expected {size} bytes of numbers, found {stated}")
+            raise WlmError(f"{where}: expected {size} bytes of numbers for the shape {shape}, found {stated}")
         budget.spend(count * max(dtype.itemsize, _VALUE_BYTES))
         flat = room((count,), dtype, where)
         unfilled = memoryview(flat.view(np.uint8)) if size else memoryview(b"")
@@ -99,7 +99,7 @@ def _read(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, numbers: 
             # At the end of the member, zipfile compares the checksum.
             piece = member.read(_PIECE)
         if piece or unfilled:
-            raise WlmError(f"{where}: the array is {'longer' if piece else 'shorter'} than its file states")
+            raise WlmError(f"{where}: the array's data is {'longer' if piece else 'shorter'} than its header states")
         if dtype.kind == "U":
             flat.tolist()  # invalid characters fail here rather than at their first use
     return flat.reshape(shape, order="F" if by_columns else "C")
@@ -110,7 +110,7 @@ def _header(where: str, file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
-        raise WlmError(f"{where}: expected version 1.0 or 2.0 of the array's format, found {version}")
+        raise WlmError(f"{where}: expected version 1.0 or 2.0 of NumPy's .npy format, found {version}")
     shape, by_columns, dtype = readers[version](file)
     if dtype.hasobject or dtype.itemsize == 0 or any(size < 0 for size in shape):
         raise WlmError(f"{where}: expected an array of plain values, found {dtype} {shape}")

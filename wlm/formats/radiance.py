@@ -50,9 +50,10 @@ def read_radiance(path: str | os.PathLike[str], notes: list[str] | None = None) 
         if not head.startswith(MAGIC):
             raise WlmError(f"{path}: expected a Radiance picture, found other content")
         lines, start = _header(path, head)
-        axes = _SIZE.fullmatch(lines.pop())
+        line = lines.pop()
+        axes = _SIZE.fullmatch(line)
         if axes is None or axes[2] == axes[5]:
-            raise WlmError(f"{path}: expected a size like -Y 512 +X 512 after the header, found another line")
+            raise WlmError(f"{path}: expected a size such as -Y 512 +X 512 after the header, found {line[:40]!r}")
         factor, primaries = _header_fields(path, lines)
         rows, columns = int(axes[3]), int(axes[6])  # of the file: a row may be a column of the picture
         upright = axes[2] == b"Y"

@@ -77,7 +77,7 @@ def read_tiff(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarra
     samples, colours = tags["samples"], 3 if tags["photometric"] == _RGB else 1
     if tags["photometric"] not in (_GREY, _RGB) or not colours <= samples <= _MOST_SAMPLES:
         raise WlmError(
-            f"{path}: expected a TIFF of grey or RGB, found photometric interpretation {tags['photometric']} with "
+            f"{path}: expected a TIFF of grey or RGB, found the photometric interpretation {tags['photometric']} with "
             f"{samples} samples"
         )
     texel = max(samples * tags["bits"] // 8, 1)
@@ -92,7 +92,9 @@ def read_tiff(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarra
         pixels = np.moveaxis(pixels, 0, -1)
     expected = tags["height"], tags["width"], samples
     if pixels.size != np.prod(expected) or pixels.dtype.str[1:] not in ("u1", "u2", "f2", "f4", "f8"):
-        raise WlmError(f"{path}: expected integers of 8 or 16 bits or floats, found {pixels.dtype} {pixels.shape}")
+        raise WlmError(
+            f"{path}: expected a TIFF of floats or of integers of 8 or 16 bits, found {pixels.dtype} {pixels.shape}"
+        )
     pixels = pixels.reshape(expected)[..., : colours + 1]
     if tags["orientation"] > 4:
         pixels = pixels.swapaxes(0, 1)

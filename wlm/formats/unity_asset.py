@@ -18,7 +18,7 @@ from wlm.formats.child import run_child
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import PROBES
 from wlm.formats.reading import damaged, read_file
-from wlm.formats.unity_child import KINDS, LIGHT, POSITIONS, RENDERERS, WANTED
+from wlm.formats.unity_child import KINDS, LIGHT, LIGHTING, POSITIONS, RENDERERS
 
 _EXTRA = "unity"
 _BYTES = 1 << 28
@@ -83,7 +83,7 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
     with damaged(f"{path}: the asset is damaged, or UnityPy cannot read its version", ValueError):
         tables = run_child(unity_child, data)
     position, light = tables[POSITIONS], tables[LIGHT]
-    if not WANTED.keys() & set(tables[KINDS].tolist()):
+    if not {unity_child.PROBES, LIGHTING} & set(tables[KINDS].tolist()):
         raise WlmError(f"{path}: expected Unity's lighting data or light probes, found neither")
     if len(position) != len(light):
         raise WlmError(f"{path}: expected light for each of {len(position)} probes, found light for {len(light)}")

@@ -166,7 +166,9 @@ class VdbFile(GridFile):
         cursor.unpack("<II")  # the version of the library
         (offsets,) = cursor.unpack("<?")
         if not offsets:
-            raise WlmError(f"{self._where}: expected a file with grid offsets, found a stream")
+            raise WlmError(
+                f"{self._where}: expected a file with the offsets of its grids, found a stream: save it anew"
+            )
         cursor.take(36)  # the UUID of the file
         cursor.metadata()
         (count,) = cursor.unpack("<I")
@@ -265,7 +267,9 @@ class _Tree:
         # Nodes that overlap would multiply the work for a byte of the file.
         places = np.concatenate(corners)
         if (places % _UPPER_EDGE).any() or len(np.unique(places, axis=0)) < len(places):
-            raise ValueError(f"expected nodes at different multiples of {_UPPER_EDGE}, found others")
+            raise ValueError(
+                f"expected root nodes at different multiples of {_UPPER_EDGE} voxels, found two at one or one elsewhere"
+            )
 
     def _node(self, corner: np.ndarray, side: int, edge: int) -> None:
         """Reads an inner node with `side` children along each edge, each of `edge` voxels."""
@@ -366,7 +370,9 @@ class _Tree:
             elif packed > 0:
                 piece = zlib.decompressobj().decompress(piece, size + 1)
             if len(piece) != size:
-                raise ValueError(f"expected {size} bytes after decompression, found at least {len(piece)}")
+                raise ValueError(
+                    f"expected a node's values of {size} bytes after decompression, found {len(piece)} or more"
+                )
         else:
             piece = cursor.take(size)
         return np.frombuffer(piece, self._many).astype(np.float32)

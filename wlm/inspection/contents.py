@@ -56,4 +56,4 @@ def check_options(path: Path, given: Sequence[str], known: Sequence[str]) -> Non
     """
     for name in given:
         if name not in known:
-            raise WlmError(f"{path}: --{name} has no meaning for this file")
+            raise WlmError(f"{path}: --{name} has no meaning for this file; leave the option out")

@@ -133,7 +133,7 @@ def _entries(folder: Path) -> list[Path]:
     try:
         found = [Path(entry.path) for entry in islice(os.scandir(folder), _ENTRIES) if entry.name[0] != "."]
     except OSError as error:
-        raise WlmError(f"{folder}: cannot read: {error.strerror or error}") from error
+        raise WlmError(f"{folder}: cannot read the folder: {error.strerror or error}") from error
     return sorted(found, key=lambda path: (natural(path.name), path.name))
 
 
@@ -348,7 +348,7 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
             problems.append("the names state no hours: are they one lightmap at several times? Then change --times")
         if others := [file for file in _entries(folder) if file.suffix.lower() in SUFFIXES and file not in pictures]:
             raise WlmError(
-                f"{others[0].name} is no lightmap that can be read: move it, or list the others in a {SET_FILE}"
+                f"{others[0].name} is no lightmap that can be read: move it away, or list the lightmaps in a {SET_FILE}"
             )
         problems += assumed(list_set(folder, times))
         words = compress_command(folder, *options)

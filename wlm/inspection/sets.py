@@ -74,7 +74,7 @@ def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[li
     """
     for file, head in zip(files, heads, strict=True):
         if head is None or not head.is_light:
-            raise WlmError(f"{file.name}: expected a picture of light, found another")
+            raise WlmError(f"{file.name}: expected a picture of light, found a file of another kind")
     sized = [(file, head) for file, head in zip(files, heads, strict=True) if head is not None and head.width]
     for file, head in sized[1:]:
         if head.size != sized[0][1].size:

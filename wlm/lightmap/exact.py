@@ -120,9 +120,8 @@ def _network_output(model: SheetModel, number: int, place: int, time: float) -> 
     net = (model.net if dynamic else model.net_static)[row].astype(np.float64)
     split = (inputs + width + 2) * width
     hidden, output = net[:split].reshape(-1, width), net[split:].reshape(-1, 3)
-    act = _gelu_exact if profile.gelu == "exact" else _gelu_tanh
-    x = act(features @ hidden[:inputs] + hidden[inputs])
-    x = act(x @ hidden[inputs + 1 : -1] + hidden[-1])
+    x = _gelu(features @ hidden[:inputs] + hidden[inputs], profile.gelu)
+    x = _gelu(x @ hidden[inputs + 1 : -1] + hidden[-1], profile.gelu)
     return x @ output[:-1] + output[-1]
 
 
@@ -137,9 +136,7 @@ def _along(values: np.ndarray, at: np.ndarray, periodic: bool = False) -> np.nda
     return (1.0 - share) * values[pair[0]] + share * values[pair[1]]
 
 
-def _gelu_exact(x: np.ndarray) -> np.ndarray:
-    return 0.5 * x * (1.0 + erf(x / math.sqrt(2.0)))
-
-
-def _gelu_tanh(x: np.ndarray) -> np.ndarray:
+def _gelu(x: np.ndarray, kind: str) -> np.ndarray:
+    if kind == "exact":
+        return 0.5 * x * (1.0 + erf(x / math.sqrt(2.0)))
     return 0.5 * x * (1.0 + np.tanh(math.sqrt(2.0 / math.pi) * (x + 0.044715 * x**3)))

@@ -17,8 +17,8 @@ from wlm.lightmap.encodings.frames import choose_frames, encode_frames, missing_
 from wlm.lightmap.encodings.maps import Reads, check_packable, clear_unread
 from wlm.lightmap.model import LightmapModel, SheetModel, decode_scale, encode_scale, part_table
 from wlm.lightmap.profile import Profile
-from wlm.lightmap.targets import Targets, TileJob
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, check_index, classify, cut, split, valid_texels
+from wlm.lightmap.trainer import Targets, TileJob
 from wlm.system import Meter, OnProgress
 from wlm.workers import each
 

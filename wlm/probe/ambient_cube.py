@@ -79,7 +79,9 @@ def write_irradiance_volume(path: str | os.PathLike[str], values: np.ndarray, co
     nx, ny, nz = (int(n) for n in count)
     seen = (_SEEN @ np.asarray(values, np.float64)).reshape(nz, ny, nx, _STACKS, _SIDES, 3)
     if not np.abs(seen).max() <= LARGEST:
-        raise WlmError(f"{path}: expected light within the range of RGB9E5, {LARGEST:g}, got {np.abs(seen).max():.3g}")
+        raise WlmError(
+            f"{path}: expected irradiance of at most {LARGEST:g}, as RGB9E5 holds, got {np.abs(seen).max():.3g}"
+        )
     words = pack_rgb9e5(seen.transpose(3, 0, 4, 1, 2, 5).reshape(_STACKS * nz, _SIDES * ny, nx, 3))
     write_ktx2(path, words.astype("<u4").tobytes(), nx, _SIDES * ny, "E5B9G9R9_UFLOAT_PACK32", _STACKS * nz)
     return float(max(-seen.min(), 0.0) / max(seen.max(), np.finfo(np.float64).tiny))

@@ -117,7 +117,7 @@ def decode(artifact: Artifact) -> ProbeModel:
     if "dead" in table:
         dead = np.unpackbits(stored["dead"], count=header.probes).astype(bool)
         if int((~dead).sum()) != header.live:
-            raise ValueError(f"part dead: expected {header.live} live probes, found {int((~dead).sum())}")
+            raise ValueError(f"part dead: expected to leave {header.live} live probes, found {int((~dead).sum())}")
     positions = np.zeros((0, 3), np.uint16)
     if "positions" in table:
         positions = np.cumsum(stored["positions"].T, axis=0, dtype=np.uint16)

@@ -70,7 +70,7 @@ def from_canonical(values: np.ndarray, name: str) -> np.ndarray:
 
 def _checked(values: np.ndarray) -> np.ndarray:
     if values.ndim != 3 or values.shape[2] != 3:
-        raise ValueError(f"expected coefficients [N, C, 3], got {values.shape}")
+        raise ValueError(f"values: expected the shape [N, C, 3] (probes, coefficients, RGB), got {values.shape}")
     return values.astype(np.float64)
 
 

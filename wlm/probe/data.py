@@ -304,7 +304,7 @@ _READERS = {
 def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
     """Returns the name of the array of values: `key`, with or without "sh_", or else the only one that begins "sh"."""
     if _POSITION not in names:
-        raise WlmError(f"{path}: {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
+        raise WlmError(f"{path}: the field {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
     fields = [name for name in names if name not in (_POSITION, _CONVENTION, *_BESIDE)]
     listed = ", ".join(fields) or "nothing"
     if key is not None:
@@ -314,7 +314,9 @@ def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
         raise WlmError(f"{path}: expected values named {key} or {_SH}_{key}; found {listed}")
     candidates = [name for name in fields if name.startswith(_SH)]
     if not candidates:
-        raise WlmError(f"{path}: expected an array whose name begins with {_SH}, or the key of one; found {listed}")
+        raise WlmError(
+            f"{path}: expected an array of light, whose name begins with {_SH} or is given as --key; found {listed}"
+        )
     if len(candidates) > 1:
         raise WlmError(f"{path}: found several arrays of values; choose one by its key: {', '.join(candidates)}")
     return candidates[0]
@@ -355,8 +357,8 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
     fits = values.ndim == 2 or (values.ndim == 3 and (values.shape[2] == 3 or by_channel))
     if not fits or len(values) != count or values.size == 0:
         raise WlmError(
-            f"{where}: {key}: expected ({count}, C, 3) with RGB last or ({count}, D), a row for each position, "
-            f"got {values.shape}"
+            f"{where}: {key}: expected the shape ({count}, C, 3) with RGB last or ({count}, D), a row for each "
+            f"position, got {values.shape}"
         )
     if values.size > NUMBERS * count:
         raise WlmError(f"{where}: {key}: expected at most {NUMBERS} numbers a probe, got {values.size // count}")
@@ -366,7 +368,7 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
             f"{values.size // count}"
         )
     if raw.reading and (convention or order):
-        raise WlmError(f"{where}: convention and order have no meaning for this kind of file: {raw.reading}")
+        raise WlmError(f"{where}: --convention and --order have no meaning for this kind of file: {raw.reading}")
     origin = "as given" if convention else "as the file states" if raw.convention else ""
     convention = convention or raw.convention or CANONICAL
     doubts: tuple[str, ...] = ()
@@ -394,16 +396,21 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
         if len(beyond):
             worst = np.abs(wide[beyond[0]]).max()
             raise WlmError(
-                f"{where}: {key}[{start + beyond[0]}]: expected numbers within {LARGEST:.2g}, got {worst:.3g}"
+                f"{where}: {key}[{start + beyond[0]}]: expected numbers of at most {LARGEST:.2g}, got {worst:.3g}"
             )
         wide[~finite[rows]] = 0.0
         checked[rows] = wide
     if _VALID in beside:
-        checked[~_check_valid(where, beside[_VALID], count)] = 0.0
+        valid = _check_beside(where, _VALID, beside[_VALID], "biuf", (count,))
+        for bad in np.flatnonzero((valid < 0) | (valid > 1))[:1]:
+            raise WlmError(f"{where}: {_VALID}[{bad}]: expected true or false, or 0 to 1, got {valid[bad]:g}")
+        checked[valid < 0.5] = 0.0
     live = (checked != 0.0).any(axis=1)
     if not live.any():
         raise WlmError(f"{where}: {key}: every probe is zero, not finite or not valid: there is nothing to fit")
-    normal = _check_normal(where, beside[_NORMAL], count) if _NORMAL in beside else None
+    normal = None
+    if _NORMAL in beside:
+        normal = unit_or_zero(_check_beside(where, _NORMAL, beside[_NORMAL], "iuf", (count, 3)))
 
     warnings = [f"{name}: {key}: {doubt}" for doubt in doubts]
     broken = np.flatnonzero(~finite)
@@ -427,7 +434,7 @@ def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
     if count == 0:
         raise WlmError(f"{where}: {_POSITION}: expected at least one probe, found none")
     if position.shape != (count, 3):
-        raise WlmError(f"{where}: {_POSITION}: expected (N, 3), got {position.shape}")
+        raise WlmError(f"{where}: {_POSITION}: expected the shape (N, 3), got {position.shape}")
     if count > PROBES:
         raise WlmError(f"{where}: {_POSITION}: expected at most {PROBES} probes, got {count}")
     position = position.astype(np.float64)
@@ -456,26 +463,14 @@ def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
     return digest.hexdigest()
 
 
-def _check_valid(where: str, valid: np.ndarray, count: int) -> np.ndarray:
-    """Returns which of `count` probes are valid, bool [N]. `valid`, [N], has booleans or numbers from 0 to 1."""
-    _check_field(where, _VALID, valid, "biuf", (count,))
-    bad = np.flatnonzero(~((valid >= 0) & (valid <= 1)))
-    if len(bad):
-        raise WlmError(f"{where}: {_VALID}[{bad[0]}]: expected true or false, or 0 to 1, got {float(valid[bad[0]]):g}")
-    return valid >= 0.5
-
-
-def _check_normal(where: str, normal: np.ndarray, count: int) -> np.ndarray:
-    """Returns the unit normals of `count` probes, float64 [N, 3]; normals of length 0 stay 0."""
-    _check_field(where, _NORMAL, normal, "iuf", (count, 3))
-    normal = normal.astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(normal).all(1))
-    if len(bad):
-        raise WlmError(f"{where}: {_NORMAL}[{bad[0]}]: expected finite numbers, got {normal[bad[0]].tolist()}")
-    return unit_or_zero(normal)
-
-
-def _check_field(where: str, field: str, array: np.ndarray, kinds: str, shape: tuple[int, ...]) -> None:
+def _check_beside(where: str, field: str, array: np.ndarray, kinds: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns a field beside the values as float64, after checking its type, its shape and that it is finite."""
     if array.dtype.kind not in kinds or array.shape != shape:
         expected = "numbers" if kinds == "iuf" else "numbers, or true and false,"
         raise WlmError(f"{where}: {field}: expected {expected} {list(shape)}, got {array.dtype} {list(array.shape)}")
+    array = array.astype(np.float64)
+    finite = np.isfinite(array)
+    bad = np.flatnonzero(~(finite.all(1) if array.ndim > 1 else finite))
+    if len(bad):
+        raise WlmError(f"{where}: {field}[{bad[0]}]: expected finite numbers, got {array[bad[0]].tolist()}")
+    return array

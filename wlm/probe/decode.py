@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 
 import numpy as np
+import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
@@ -29,15 +30,21 @@ class Decoder(ABC):
             WlmError: The device does not exist, or the positions are not those of the model's probes.
         """
         self.model, self.device = model, interop.check_device(device)
+        self._arrays: list[wp.array] = []
         self._position = None
         if position is not None:
             self.check_own(position)
             self._position = np.array(position, np.float64)
 
+    def _put(self, array: np.ndarray, dtype: type) -> wp.array:
+        """Copies a part of the model to the device."""
+        self._arrays.append(wp.array(array, dtype=dtype, device=self.device))
+        return self._arrays[-1]
+
     @property
-    @abstractmethod
     def device_bytes(self) -> int:
         """The bytes of memory that the model takes on the device."""
+        return sum(array.capacity for array in self._arrays)
 
     @abstractmethod
     def decode(self, position: np.ndarray) -> np.ndarray:
@@ -68,7 +75,8 @@ class Decoder(ABC):
         """Returns a source that decodes the light of probes at positions [N, 3] whenever a volume asks for it.
 
         Raises:
-            WlmError: A position is not finite; or principal components are read at other positions than their probes'.
+            WlmError: A position is not finite; or the model stores principal components, which are only known at its
+                own probes, and `position` has other points.
         """
 
     def own_positions(self) -> np.ndarray:
@@ -79,4 +87,4 @@ class Decoder(ABC):
         """Raises a WlmError if the positions differ from those of the model's own probes in number or bounding box."""
         if not self.model.has_probes_at(np.asarray(position, np.float64)):
             expected = f"expected the positions of its own {self.model.probes} probes, in their order"
-            raise WlmError(f"{self.model.name}: {expected}")
+            raise WlmError(f"{self.model.name}: {expected}, got {len(position)} in another number or bounding box")

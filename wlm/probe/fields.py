@@ -231,7 +231,7 @@ def _scene(path: Path, root: dict[str, Any]) -> Fields:
             raise WlmError(f"{path}: {name}.children: expected a list of objects")
         waiting += [(child, world) for child in reversed(children)]
     if len({each.shape for each in light}) > 1:
-        raise WlmError(f"{path}: expected as many numbers in each LightProbe, found different numbers")
+        raise WlmError(f"{path}: expected as many SH coefficients in each LightProbe as in the first")
     arrays = {_POSITION: np.array(position).reshape(-1, 3), _SH: np.array(light)}
     return Fields(list(arrays), arrays.__getitem__, "threejs", "positions in the world of the scene, y up")
 

@@ -188,11 +188,9 @@ def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, chec
     meter = Meter(progress, "fit", steps)
     peak = float(np.ptp(probes.values))
     live = probes.live.mean()  # dead probes decode exactly, and count
-    step = trainer.step
-    while step < steps:
-        count = min(chunk, steps - step)
-        trainer.run(count)
-        step += count
+    for start in range(trainer.step, steps, chunk):
+        step = min(start + chunk, steps)
+        trainer.run(step - start)
         if meter.due(step):
             try:
                 meter.report(step, PSNR_dB=psnr_from_mse(trainer.mse() * live, peak))

@@ -23,7 +23,7 @@ _SLACK = 1.1  # bakers filter and clamp, which exceeds the bound slightly
 _FEW = 0.01  # share of probes beyond the bound that needs no warning
 _APART = 0.1  # difference of shares that decides between orders, and largest share of an order that fits
 _TINTED = 0.1  # share of the squares in the differences of channels: natural light has some hundredths
-_SAMPLE = 4096  # probes that are checked
+_SAMPLE = 512  # probes that are checked
 
 
 def coefficients_first(values: np.ndarray, order: str) -> np.ndarray:

@@ -36,7 +36,7 @@ class Profile(Settings):
     hidden: int = Field(64, ge=8, le=128, multiple_of=8)
     """Width of both hidden layers of the network."""
     support: Literal["ellipsoid", "sphere"] = "ellipsoid"
-    """Support of a Gaussian: its ellipsoid at three standard deviations, or the sphere of its longest axis (eq. 6)."""
+    """Support of a Gaussian: ellipsoid, at three standard deviations, or sphere, of its longest half axis (eq. 6)."""
     optimiser: Literal["adam", "adan"] = "adam"
     """Optimiser of the Gaussians; the network is always trained by Adam."""
     steps: int = Field(12000, ge=10)
@@ -52,11 +52,11 @@ class Profile(Settings):
     net_rate: float = Field(2e-2, gt=0.0, lt=1.0)
     """Initial learning rate of the network."""
     detail: float = Field(1.0, ge=0.0, le=4.0)
-    """Initial centres are denser where light varies, by this power of its local variance; 0: uniformly distributed."""
+    """Initial centres are denser where light varies, by this power of its local standard deviation; 0: uniform."""
     first_scale: float = Field(0.7, gt=0.0, le=4.0)
     """Initial scale of a Gaussian as a share of the distance to the nearest other centre."""
     gain: float = Field(3.0, gt=0.0, le=10.0)
-    """Magnitude of the network's initial weights, relative to uniform random numbers of variance 1 / (3 * inputs)."""
+    """Magnitude of the hidden layers' initial weights; 1: uniform random numbers of variance 1 / (3 * inputs)."""
 
 
 class Content(ABC):
@@ -190,7 +190,7 @@ class ProbeModel(Model):
         """
         if not self.has_positions:
             raise WlmError(
-                f"{self.name}: the file stores no positions: give the probes' positions, or store them in the fit"
+                f"{self.name}: the file stores no positions: pass those of its probes, or store them in the fit"
             )
         return self.origin + self.extent * self.size * (self.positions / CODES)
 
@@ -212,12 +212,11 @@ def box_of(position: np.ndarray) -> dict[str, Any]:
     return {"origin": low, "extent": extent, "size": np.minimum((high - low) / extent, 1.0)}
 
 
-def check_points(position: np.ndarray, letter: str = "M") -> np.ndarray:
+def check_points(position: np.ndarray) -> np.ndarray:
     """Checks points in space and returns them as float64.
 
     Args:
         position: [M, 3].
-        letter: Name of the first axis in error messages.
 
     Returns:
         float64 [M, 3].
@@ -228,7 +227,7 @@ def check_points(position: np.ndarray, letter: str = "M") -> np.ndarray:
     """
     position = np.asarray(position, np.float64)
     if position.ndim != 2 or position.shape[1] != 3:
-        raise ValueError(f"position: expected [{letter}, 3], got {position.shape}")
+        raise ValueError(f"position: expected [M, 3], got {position.shape}")
     bad = np.flatnonzero(~np.isfinite(position).all(1))
     if len(bad):
         raise WlmError(f"position {bad[0]}: expected finite numbers, got {position[bad[0]].tolist()}")

@@ -60,7 +60,7 @@ def basis(directions: np.ndarray, coefficients: int) -> np.ndarray:
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ValueError(f"directions: expected [M, 3], got {directions.shape}")
     if not (np.abs(np.linalg.norm(directions, axis=1) - 1.0) <= _UNIT_TOLERANCE).all():
-        raise ValueError("directions: expected unit length")
+        raise ValueError("directions: expected vectors of unit length, got others")
     order = int(coefficient_bands(coefficients)[-1]) + 1
     z = directions[:, 2]
     turned = np.ones(len(z), np.complex128)  # (x + iy)^m: sin^m theta with the cosine and the sine of m phi

@@ -11,9 +11,9 @@ from wlm.smoke.evaluation import Report as Report
 from wlm.smoke.evaluation import evaluate as evaluate
 from wlm.smoke.fit import train as train
 from wlm.smoke.lightmaps import SixWay as SixWay
-from wlm.smoke.march.coarse import bake_coarse as bake_coarse
-from wlm.smoke.march.coarse import guide as guide
-from wlm.smoke.march.fine import bake as bake
+from wlm.smoke.march.six_way import bake as bake
+from wlm.smoke.march.six_way import bake_coarse as bake_coarse
+from wlm.smoke.march.six_way import guide as guide
 from wlm.smoke.model import SmokeModel as SmokeModel
 from wlm.smoke.network.onnx_file import export_onnx as export_onnx
 from wlm.smoke.network.prediction import SmokePredictor as SmokePredictor

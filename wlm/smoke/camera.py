@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from wlm.fluid.volume import DensityVolume
 from wlm_kernels.smoke.march import View, make_view
@@ -216,23 +215,10 @@ class Camera:
         """Returns the same view with each pixel divided into factor x factor pixels."""
         return replace(self, height=self.height * factor, width=self.width * factor)
 
-    def rays(self, device: torch.device | str = "cpu") -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns origins and unit directions of the rays through all pixels, in the world, both float64 [H, W, 3]."""
-        right, up, toward, position = (
-            torch.tensor(np.asarray(vector, np.float64), device=device) for vector in (*self.axes, self.position)
-        )
-        columns, rows = (torch.arange(n, dtype=torch.float64, device=device) for n in (self.width, self.height))
-        u = (columns + 0.5 - 0.5 * self.width) * self.pitch
-        v = (0.5 * self.height - rows - 0.5) * self.pitch
-        across = u[None, :, None] * right + v[:, None, None] * up
-        if self.perspective:
-            return position.expand_as(across), torch.nn.functional.normalize(across - toward, dim=-1)
-        return across + position, (-toward).expand_as(across)
-
     def in_world(self) -> View:
-        """Returns the camera in world coordinates, as the structure that ray march kernels take."""
+        """Returns the camera in the world's unit and axes, with its position as the origin, for kernels."""
         right, up, toward = self.axes
-        return make_view(self.position, right, up, -toward, self.pitch, self.width, self.height, self.perspective)
+        return make_view(np.zeros(3), right, up, -toward, self.pitch, self.width, self.height, self.perspective)
 
     def view(self, volume: DensityVolume) -> View:
         """Returns the camera in the voxel coordinates of a volume, as the structure that ray march kernels take.

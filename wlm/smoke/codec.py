@@ -43,7 +43,9 @@ def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         with np.errstate(over="ignore"):
             parts[name] = weight.detach().float().cpu().numpy().astype(np.float16)
         if not np.isfinite(parts[name]).all():
-            raise WlmError(f"weight {name}: cannot write: expected numbers that half floats can store, up to 65504")
+            raise WlmError(
+                f"weight {name}: cannot write: expected finite weights of at most 65504, the largest half float"
+            )
         digest.update(parts[name].tobytes())
     settings = {"network": model.settings.model_dump(mode="json"), "summary": dict(model.summary)}
     return settings, parts, digest.hexdigest()

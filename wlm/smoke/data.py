@@ -193,7 +193,9 @@ def load_frames(
     if not (path / SCENE_FILE).is_file():
         return _frames_of_others(path, *given)
     if (name := next((name for name in options if name != "trust"), None)) is not None:
-        raise WlmError(f"{path}: option {name}: applies only to files of other programs, found frames of simulate")
+        raise WlmError(
+            f"{path}: option {name}: applies only to files of other programs, not to frames of wlm smoke simulate"
+        )
     frames = Frames(path, _read_scene(path), numbered(path, "frame", ".npz"), *given)
     if not frames.files:
         raise WlmError(f"{path}: expected files of frames, such as {frames.file(1).name}, found none")
@@ -270,7 +272,9 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
     if resume and (folder / SCENE_FILE).is_file():
         earlier, later = _simulated(_read_scene(folder)), _simulated(scene)
         if (field := next((key for key in later if earlier.get(key) != later[key]), None)) is not None:
-            raise WlmError(f"{folder}: cannot resume: its frames have another {field}; start anew without --resume")
+            raise WlmError(
+                f"{folder}: cannot resume: its frames have another {field} than the scene; start anew without --resume"
+            )
     with _writing(folder):
         folder.mkdir(exist_ok=True)
         if not resume:
@@ -346,7 +350,9 @@ class NumberedFiles:
         if resume and self.partial.is_file():
             earlier = read_index(self.partial)
             if (field := next((key for key in self._run if earlier.get(key) != self._run[key]), None)) is not None:
-                raise WlmError(f"{self.partial}: cannot resume a run with another {field}; start anew without --resume")
+                raise WlmError(
+                    f"{self.partial}: cannot resume a run with another {field} than before; start anew without --resume"
+                )
             self._cleared = True
             self.done = frozenset(numbered(self.folder, stem, suffix))
 
@@ -457,7 +463,9 @@ def read_shaded(
     planes, note = read_planes(path)
     for name in (*DIRECTIONS, _TRANSPARENCY):
         if name not in planes:
-            raise WlmError(f"{path}: expected a channel {name} as bake writes, found only {', '.join(planes)}")
+            raise WlmError(
+                f"{path}: expected a channel {name}, as wlm smoke bake writes, found only {', '.join(planes)}"
+            )
     for name, plane in planes.items():
         if not np.isfinite(plane).all():
             raise WlmError(f"{path}: channel {name}: expected finite numbers, found NaN or infinity")
@@ -466,10 +474,13 @@ def read_shaded(
         fields = {key: tuple(value) if isinstance(value, list) else value for key, value in note["camera"].items()}
         camera = Camera(**fields)
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise WlmError(f"{path}: header attribute wlm: expected a camera as bake writes: {error}") from error
+        raise WlmError(f"{path}: header attribute wlm: expected a camera, as wlm smoke bake writes: {error}") from error
     size = next(iter(planes.values())).shape
     if size != (camera.height, camera.width):
-        raise WlmError(f"{path}: expected its camera's (height, width) {camera.height, camera.width}, found {size}")
+        raise WlmError(
+            f"{path}: expected images of its camera's height and width, {camera.height} x {camera.width} pixels, found "
+            f"{size[0]} x {size[1]}"
+        )
     tensors = {name: torch.from_numpy(plane).to(device) for name, plane in planes.items()}
     lightmaps = torch.stack([tensors[name] for name in DIRECTIONS])
     six = SixWay(lightmaps, tensors[_TRANSPARENCY], tensors.get(EMISSION), camera, tensors.get(_DEPTH))

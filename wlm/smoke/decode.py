@@ -76,7 +76,9 @@ class Decoder:
         """
         if encoded.shape != self._guide.shape[1:] or encoded.device != self._guide.device:
             expected = f"{list(self._guide.shape[1:])} on {self.device}"
-            raise ValueError(f"encoded: expected {expected}, got {list(encoded.shape)} on {encoded.device}")
+            raise ValueError(
+                f"encoded: expected a guiding map {expected}, got {list(encoded.shape)} on {encoded.device}"
+            )
         self._guide[0].copy_(encoded)
         self._run()
         return self._planes
@@ -94,7 +96,7 @@ class _Adapters:
 
     def __init__(self, blocks: list[NafBlock], height: int, width: int, device: str, dtype: torch.dtype) -> None:
         channels, groups, rows, cuda = blocks[0].attend.in_features, len(blocks), height * width, device != "cpu"
-        self.height, self.width, self.channels, self.groups, self.device = height, width, channels, groups, device
+        self.height, self.width, self.channels, self.groups = height, width, channels, groups
         self.kernels = naf_block.kernels(channels, dtype == torch.float16, cuda)
         self.lanes = naf_block.lanes(channels, cuda)
         expand, expand_bias = zip(*(_after_norm(b.norm1, b.expand) for b in blocks), strict=True)
@@ -129,27 +131,23 @@ class _Adapters:
         """Applies the blocks to an image [1, c, H, W]; returns [G, H * W, c], which the next call overwrites."""
         rows, channels, groups = len(self._x), self.channels, self.groups
         self._x.copy_(image[0].permute(1, 2, 0).reshape_as(self._x))
-        self._launch("norm", self.lanes * rows, [to_warp(self._x), self._zero, rows], self._normed)
+        _launch(self.kernels.norm, self.lanes * rows, [to_warp(self._x), self._zero, rows], self._normed)
         torch.addmm(self.expand_bias, self._normed[:rows], self.expand, out=self._wide)
         size = (-(-self.height // naf_block.STRIP), self.width, groups * channels)
         planes = (self.height, self.width, -1)
         inputs = [to_warp(self._wide.view(planes)), self._depthwise, self._depthwise_bias]
-        self._launch("gate", size, inputs, self._gated.view(planes))
+        _launch(self.kernels.gate, size, inputs, self._gated.view(planes))
         # In float32, as in training.
         torch.mean(self._gated, 0, dtype=torch.float32, out=self._mean)
         weights = [to_warp(self._mean), *self._attention]
-        self._launch("attend", self.lanes * groups * channels, weights, self._project)
+        _launch(self.kernels.attend, self.lanes * groups * channels, weights, self._project)
         gated = self._gated.view(rows, groups, channels).transpose(0, 1)
         torch.baddbmm(self._x.expand(groups, -1, -1), gated, self._project, out=self._between)
         inputs = [to_warp(self._between.view(-1, channels)), self._middle, rows]
-        self._launch("norm", self.lanes * groups * rows, inputs, self._normed)
+        _launch(self.kernels.norm, self.lanes * groups * rows, inputs, self._normed)
         wide = torch.baddbmm(self.widen_bias, self._normed.view(groups, rows, channels), self.widen)
         left, right = wide.chunk(2, -1)
         return self._between.baddbmm_(left * right, self.narrow)
-
-    def _launch(self, name: str, dim: int | tuple[int, ...], inputs: list, output: torch.Tensor) -> None:
-        kernel = getattr(self.kernels, name)
-        wp.launch(kernel, dim, inputs=inputs, outputs=[to_warp(output)], device=self.device)
 
 
 class _Body:
@@ -205,7 +203,7 @@ class _Tail:
 
     def __init__(self, network: SixWayNetwork, height: int, width: int, device: str, dtype: torch.dtype) -> None:
         settings = network.settings
-        self.device, self.stem, area = device, settings.stem, settings.stem**2
+        self.stem, area = settings.stem, settings.stem**2
         order = [PLANES.index(name) for name in network.names]
         adapters = [i for i, group in enumerate(network.groups) for _ in group]
         # The adapter of each plane, and its first channel.
@@ -220,19 +218,20 @@ class _Tail:
         self._taps = to_warp(taps.view(-1, len(PLANES)).to(device), smoke_planes.Taps)
         self._kernels = smoke_planes.kernels(edge, REACH, dtype == torch.float16, device != "cpu")
         blocks = (-(-height // REACH), -(-width // REACH))
-        self._smoke = to_warp(torch.empty(blocks, dtype=torch.int32, device=device))
+        self._smoke = torch.empty(blocks, dtype=torch.int32, device=device)
 
     def __call__(self, heads: torch.Tensor, guide: torch.Tensor, planes: torch.Tensor) -> None:
         """Writes planes [8, H, W] from the outputs of `_Body` and the guide [C, H, W]."""
         kernels, source = self._kernels, to_warp(guide)
-        self._launch(kernels.near, kernels.lanes * self._smoke.size, [source], self._smoke)
+        _launch(kernels.near, kernels.lanes * self._smoke.numel(), [source], self._smoke)
         pixels = to_warp(heads.permute(0, 2, 3, 1))
-        inputs = [pixels, source, self._taps, self._places, self.stem, self._smoke]
+        inputs = [pixels, source, self._taps, self._places, self.stem, to_warp(self._smoke)]
         size = (-(-guide.shape[1] // smoke_planes.STRIP), guide.shape[2])
-        self._launch(kernels.compose, size, inputs, to_warp(planes))
+        _launch(kernels.compose, size, inputs, planes)
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, output: wp.array) -> None:
-        wp.launch(kernel, dim, inputs=inputs, outputs=[output], device=self.device)
+
+def _launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, output: torch.Tensor) -> None:
+    wp.launch(kernel, dim, inputs=inputs, outputs=[to_warp(output)], device=wp.device_from_torch(output.device))
 
 
 def _weights(layer: nn.Conv2d, device: str, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:

@@ -6,9 +6,8 @@ All errors are measured in sRGB, as encoded for the network, like the paper's PS
 import copy
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -22,8 +21,7 @@ from wlm.smoke.decode import Decoder
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.dataset import make_validation, pool_of_volume
 from wlm.smoke.network.losses import residual
-from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.system import Meter, OnProgress
 
@@ -244,26 +242,25 @@ def compare(
     settings = _with_guide(settings or model.dataset, guide)
     network = copy.deepcopy(model.network).to(device)
 
-    methods: dict[str, Callable[[Pool], Method]] = {NETWORK: lambda pool: of_network(network)}
-    if device != "cpu":
-        methods[HALF] = partial(_at_run_time, model, device)
-    if guide == "six":
-        methods[COARSE] = lambda pool: coarse
-    # Almost empty frames of the test set are not scored.
-    sets: dict[str, Callable[[], Pool]] = {
-        f"density x {scale:g}": partial(
-            make_validation, settings.model_copy(update={"kept_empty": 0.0}), device, test=True, scale=scale
-        )
-        for scale in densities
-    }
-    sets |= {os.fspath(path): partial(pool_of_volume, path, settings, device=device) for path in volumes}
-    meter = Meter(progress, "evaluate", len(sets))
+    def pools() -> Iterator[tuple[str, Pool]]:
+        # Almost empty frames of the test set are not scored.
+        filled = settings.model_copy(update={"kept_empty": 0.0})
+        for scale in densities:
+            yield f"density x {scale:g}", make_validation(filled, device, test=True, scale=scale)
+        for path in volumes:
+            yield os.fspath(path), pool_of_volume(path, settings, device=device)
+
+    meter = Meter(progress, "evaluate", len(densities) + len(volumes))
     comparisons = []
-    for name, make in sets.items():
-        pool = make()
+    for name, pool in pools():
         if not len(pool):
             raise WlmError(f"{name}: expected frames with smoke, found only frames without")
-        scores = {method: score(of_pool(pool), pool) for method, of_pool in methods.items()}
+        methods = {NETWORK: of_network(network)}
+        if device != "cpu":
+            methods[HALF] = _at_run_time(model, device, pool)
+        if guide == "six":
+            methods[COARSE] = coarse
+        scores = {method: score(function, pool) for method, function in methods.items()}
         comparisons.append(Comparison(name, len(pool), scores))
         meter.report(len(comparisons), PSNR_dB=scores[NETWORK].psnr)
     return comparisons

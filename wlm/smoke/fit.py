@@ -28,8 +28,7 @@ from wlm.interop import check_device
 from wlm.smoke.evaluation import Score, of_network, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network import dataset
-from wlm.smoke.network.planes import PLANES
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import PLANES, Pool
 from wlm.smoke.network.settings import Profile
 from wlm.smoke.network.trainer import Trainer, plan_round
 from wlm.system import Meter, OnProgress, Progress, load

@@ -13,8 +13,7 @@ import numpy as np
 import torch
 
 from wlm.smoke.camera import DIRECTIONS, Camera, weights
-from wlm.smoke.shading import Light, Ramp
-from wlm.smoke.transport.lights import checked_albedo, checked_colour
+from wlm.smoke.shading import Light, Ramp, checked_albedo, checked_colour, glow_of
 
 _DARKEST = 1e-20
 _LEAST_SHIFT = 1e-3  # of the image, between the centres of light of opposite lightmaps
@@ -60,14 +59,15 @@ class SixWay:
 
     def __post_init__(self) -> None:
         if self.lightmaps.ndim != 3 or self.lightmaps.shape[0] != 6:
-            raise ValueError(f"lightmaps: expected [6, H, W], got {tuple(self.lightmaps.shape)}")
+            raise ValueError(f"lightmaps: expected shape [6, H, W], got {tuple(self.lightmaps.shape)}")
         size = tuple(self.lightmaps.shape[1:])
         for name in ("transparency", "emission", "depth"):
             plane = getattr(self, name)
             if plane is not None and tuple(plane.shape) != size:
                 raise ValueError(f"{name}: expected shape {size}, as the lightmaps have, got {tuple(plane.shape)}")
         if self.camera is not None and (self.camera.height, self.camera.width) != size:
-            raise ValueError(f"camera: expected (height, width) {size}, got {(self.camera.height, self.camera.width)}")
+            seen = (self.camera.height, self.camera.width)
+            raise ValueError(f"camera: expected the height and width of the lightmaps, {size}, got {seen}")
 
     def __getitem__(self, direction: str) -> torch.Tensor:
         """Returns the lightmap of a direction, such as "front", [H, W]."""
@@ -110,7 +110,7 @@ class SixWay:
             grey = torch.einsum("c,chw->hw", torch.tensor(share).to(self.lightmaps), self.lightmaps)
             image += grey[..., None] * torch.tensor(irradiance * scattered).to(image)
         if self.emission is not None:
-            image += self.emission[..., None] if ramp is None else ramp(self.emission)
+            image += glow_of(self.emission, ramp)
         if background is None:
             return image
         if self.transparency is None:

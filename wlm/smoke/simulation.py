@@ -254,7 +254,7 @@ def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlet
         if inlet.radius is not None:
             here = np.hypot(first - inlet.centre[across[0]], second - inlet.centre[across[1]]) <= inlet.radius
         if not here.any():
-            raise WlmError(f"{scene.name}: inlets.{number}: too small to cover a cell's centre: use a larger radius")
+            raise WlmError(f"{scene.name}: inlets.{number}: its circle covers no cell's centre: use a larger radius")
         velocity[here] = [domain.speed(v) for v in inlet.velocity]
         opened |= here
     lattice.set_inlet(name, velocity, opened)

@@ -1,9 +1,9 @@
 """Light probes in a window: balls, Gaussians, and the cascaded volume around a moving viewer."""
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 import torch
@@ -16,10 +16,10 @@ from wlm.ops.plain import rotations
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
 from wlm.probe.model import ProbeModel
-from wlm.probe.places import ball_exposure, ball_radius
+from wlm.probe.places import ball_exposure, ball_radius, probes_of
 from wlm.probe.sphere import irradiance, irradiance_weights, sh_count, unit_or_zero
 from wlm.probe.volume.cascade import Volume
-from wlm.probe.volume.light import Light, StoredLight
+from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.walk import camera_path, settle
 from wlm.view.canvas import Canvas, Hit
 from wlm.view.scene import Scene, Slider, State, frame_slider
@@ -42,65 +42,54 @@ class Probes:
     Attributes:
         position: float64 [N, 3].
         number: int [N], index of each probe in the file.
-        coefficients: Number C of coefficients.
         values: float32 [N, C, 3] by name, "decoded" or "original" or both.
         decode: Function that returns light float32 [M, 3 C] at points [M, 3].
-        light: Light of the probes in the form that the cascaded volume takes.
         model: The model, if it has Gaussians; otherwise None.
         note: Text for the caption of the window.
     """
 
     position: np.ndarray
     number: np.ndarray
-    coefficients: int
     values: dict[str, np.ndarray]
     decode: Callable[[np.ndarray], np.ndarray]
-    light: Light
     model: ProbeModel | None
     note: str
 
-    @classmethod
-    def of_model(
-        cls,
-        model: ProbeModel,
-        position: np.ndarray,
-        original: np.ndarray | None,
-        live: np.ndarray,
-        title: str,
-    ) -> Self:
-        """Takes the probes of a model, as `wlm.probe.places.probes_of` returns them.
 
-        Raises:
-            WlmError: The numbers of a probe are not spherical harmonics.
-        """
-        count = _coefficients(model.outputs, title)
-        decoder, places = model.decoder(position=position), position[live]
-        values = {"decoded": decoder.decode_probes()[live].reshape(-1, count, 3)}
-        if original is not None:
-            values["original"] = original[live].reshape(-1, count, 3)
-        shapes = model if isinstance(model.content, Gaussians) else None
-        gaussians = "" if shapes is None else f"{shapes.content.count:,} Gaussians, "
-        note = f"{model.name}, {len(places):,} probes, {gaussians}profile {model.profile.name}"
-        light = StoredLight(values["decoded"])
-        return cls(places, np.flatnonzero(live), count, values, decoder.decode, light, shapes, note)
+def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None, title: str) -> Probes:
+    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`.
 
-    @classmethod
-    def of_set(cls, probes: ProbeSet, title: str) -> Self:
-        """Takes the probes of an input file; the light between probes is that of the nearest one.
+    Raises:
+        WlmError: The numbers of a probe are not spherical harmonics, or the positions are unknown.
+    """
+    position, given, live, _ = probes_of(model, original, key)
+    count = _coefficients(model.outputs, title)
+    decoder, places = model.decoder(position=position), position[live]
+    values = {"decoded": decoder.decode_probes()[live].reshape(-1, count, 3)}
+    if given is not None:
+        values["original"] = given[live].reshape(-1, count, 3)
+    shapes = model if isinstance(model.content, Gaussians) else None
+    gaussians = "" if shapes is None else f"{shapes.content.count:,} Gaussians, "
+    note = f"{model.name}, {len(places):,} probes, {gaussians}profile {model.profile.name}"
+    return Probes(places, np.flatnonzero(live), values, decoder.decode, shapes, note)
 
-        Raises:
-            WlmError: The numbers of a probe are not spherical harmonics.
-        """
-        count = _coefficients(probes.outputs, title)
-        places, values = probes.position[probes.live], probes.values[probes.live]
-        tree = cKDTree(places)
 
-        def nearest(points: np.ndarray) -> np.ndarray:
-            return values[tree.query(points)[1]]
+def set_probes(probes: ProbeSet, title: str) -> Probes:
+    """Takes the probes of an input file; the light between probes is that of the nearest one.
 
-        shown = {"original": values.reshape(-1, count, 3)}
-        note = f"{probes.name}, {len(places):,} live probes, {probes.key}"
-        return cls(places, np.flatnonzero(probes.live), count, shown, nearest, StoredLight(values), None, note)
+    Raises:
+        WlmError: The numbers of a probe are not spherical harmonics.
+    """
+    count = _coefficients(probes.outputs, title)
+    places, values = probes.position[probes.live], probes.values[probes.live]
+    tree = cKDTree(places)
+
+    def nearest(points: np.ndarray) -> np.ndarray:
+        return values[tree.query(points)[1]]
+
+    shown = {"original": values.reshape(-1, count, 3)}
+    note = f"{probes.name}, {len(places):,} live probes, {probes.key}"
+    return Probes(places, np.flatnonzero(probes.live), shown, nearest, None, note)
 
 
 def probe_scene(
@@ -125,7 +114,8 @@ def probe_scene(
     Raises:
         WlmError: The side is not above 0.
     """
-    volume = Volume(probes.position, probes.light, block=block)
+    light = StoredLight(next(iter(probes.values.values())))  # the decoded light, or else the original
+    volume = Volume(probes.position, light, block=block)
     path = walk if walk is not None else camera_path(volume.position, _LOOP, up=up)
     views = ("balls", "gaussians", "volume") if probes.model is not None else ("balls", "volume")
     sliders = frame_slider(len(path), ("volume",)) + (_SIGMAS,) * (probes.model is not None)
@@ -165,8 +155,9 @@ class _ProbeScene(Scene):
         self._surface: np.ndarray | None = None
         if self.geometry is not None:
             at_vertices = probes.decode(self.geometry.position.astype(np.float64))
-            weights = irradiance_weights(_normals(self.geometry), probes.coefficients)
-            self._surface = np.einsum("vc,vcd->vd", weights, at_vertices.reshape(*weights.shape, 3)) / math.pi
+            at_vertices = at_vertices.reshape(len(at_vertices), -1, 3)
+            weights = irradiance_weights(_normals(self.geometry), at_vertices.shape[1])
+            self._surface = np.einsum("vc,vcd->vd", weights, at_vertices) / math.pi
 
     def draw(self, canvas: Canvas, state: State) -> None:
         display = state.display(self._brightness)
@@ -274,7 +265,7 @@ class _ProbeScene(Scene):
 def _coefficients(outputs: int, title: str) -> int:
     count = sh_count(outputs)
     if count is None:
-        raise WlmError(f"{title}: expected spherical harmonics, found {outputs} numbers a probe")
+        raise WlmError(f"{title}: expected probes of RGB spherical harmonics, found {outputs} numbers a probe")
     return count
 
 

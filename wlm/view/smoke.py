@@ -7,17 +7,14 @@ import numpy as np
 import torch
 import warp as wp
 
-from wlm.interop import device_name, stream, to_warp, torch_memory
-from wlm.ops.raster import rasterize
+from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import DIRECTIONS, Camera, unit, weights
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import ObstacleSettings, obstacle_mesh
-from wlm.smoke.shading import Light, Ramp, light_axes
+from wlm.smoke.shading import AnyLight, Light, Ramp, checked_albedo, checked_colour, glow_of
 from wlm.smoke.transport.lighting import LitSmoke
-from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour
 from wlm.smoke.transport.orders import ScatteredSmoke
 from wlm_kernels.smoke import picture as kernels
-from wlm_kernels.smoke import shadow
 
 # Share of an obstacle's colour that is always lit, so that its dark side differs from a black background.
 _AMBIENT = 0.2
@@ -36,6 +33,7 @@ class Drawing:
         image: float32 [H, W, 3], linear, the last picture.
         solid_light, solid_depth: Light [H, W, 3] of the obstacles and distance [H, W] along the ray, infinite where
             there is no obstacle.
+        visibility: Share of each of the L lights that obstacles let through to the smoke, [L, H, W]: 0 or 1.
     """
 
     def __init__(
@@ -68,6 +66,7 @@ class Drawing:
         """
         self._camera, self._obstacles, self._device = camera, tuple(obstacles), device
         self._albedo, self._background = tuple(map(float, checked_albedo(albedo))), tuple(map(float, background))
+        self._ramp = ramp
         height, width = camera.height, camera.width
         colours, toward, shares = [], [], []
         for light in lights:
@@ -87,37 +86,47 @@ class Drawing:
             self.image = torch.zeros((height, width, 3), device=device)
             self.solid_light = torch.zeros_like(self.image)
             self.solid_depth = torch.full((height, width), math.inf, device=device)
-            self._axes = [light_axes(way) if way.any() else None for way in toward]
-            self._visibility = torch.ones((len(lights), height, width), device=device)
+            self._directional = all(way.any() for way in toward)
+            self.visibility = torch.ones((len(lights), height, width), device=device)
             # At least one row: an empty array has no memory.
             rows = max(len(lights), 1)
             zeros = np.zeros((rows - len(lights), 3))
             self._lamps = tuple(put([*values, *zeros], (rows, 3)) for values in (toward, colours))
             self._shares = put(shares, (len(lights), len(DIRECTIONS)))
-            self._ramp = None if ramp is None else (put(ramp.stops, (-1,)), put(ramp.colours, (-1, 3)))
             if self._obstacles:
-                points, triangles, owner = (torch.from_numpy(part).to(device) for part in obstacle_mesh(obstacles, 0.0))
-                tints = put([obstacle.colour for obstacle in obstacles], (-1, 3))
-                self._solids = (points, triangles, owner, tints)
-                self._clip = torch.empty((len(points), 4), device=device)
+                points, triangles, owner = self._mesh_at(0.0)
+                indices = wp.array(triangles.ravel(), dtype=wp.int32, device=device)
+                mesh = wp.Mesh(wp.array(points, dtype=wp.vec3, device=device), indices)
+                colours = np.array([obstacle.colour for obstacle in obstacles], np.float32)
+                tints = wp.array(colours, dtype=wp.vec3, device=device)
+                self._solids = kernels.Solids(mesh, wp.array(owner, dtype=wp.int32, device=device), tints)
 
     def move(self, time: float) -> None:
         """Moves the obstacles to their positions at a time in seconds."""
         if self._obstacles:
             with stream(self._device):
-                self._solids[0].copy_(torch.from_numpy(obstacle_mesh(self._obstacles, time)[0]))
+                self._solids.mesh.points.assign(self._mesh_at(time)[0])
+                self._solids.mesh.refit()
+
+    def _mesh_at(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Returns the obstacles as `obstacle_mesh` does, relative to the camera, so that float32 is exact enough."""
+        points, triangles, owner = obstacle_mesh(self._obstacles, time)
+        return (points - np.asarray(self._camera.position)).astype(np.float32), triangles, owner
 
     def draw_obstacles(self) -> None:
         """Fills `solid_light` and `solid_depth`."""
         if not self._obstacles:
             return
         with stream(self._device):
-            solids, view = self._as_solids(), self._camera.in_world()
-            kernels.clip_points(solids, view, to_warp(self._clip, wp.vec4))
-            drawn = rasterize(self._clip, self._solids[1], self._camera.height, self._camera.width)
-            seen = to_warp(drawn.triangle), to_warp(drawn.barycentric.contiguous(), wp.vec2)
             out = to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
-            kernels.light_solids(solids, self._as_lamps(), _AMBIENT, view, *seen, *out)
+            kernels.light_solids(self._solids, self._as_lamps(), _AMBIENT, self._camera.in_world(), *out)
+
+    def draw_shadows(self, surface: torch.Tensor) -> None:
+        """Fills `visibility` for a surface of smoke at distances [H, W] along the rays; 0: no surface, which is lit."""
+        if self._obstacles:
+            with stream(self._device):
+                view = self._camera.in_world()
+                kernels.shadow(self._solids, self._as_lamps(), view, to_warp(surface.contiguous()))
 
     def __call__(self, smoke: SixWay | LitSmoke | ScatteredSmoke) -> torch.Tensor:
         """Draws a frame.
@@ -134,7 +143,7 @@ class Drawing:
         """
         six = smoke if isinstance(smoke, SixWay) else None
         seen = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
-        if six is not None and None in self._axes:
+        if six is not None and not self._directional:
             raise ValueError("lights: expected only directional lights for six-way lightmaps, got a point light")
         if seen.transparency is None:
             raise ValueError("smoke: expected lightmaps or lit smoke with transparency, found none")
@@ -144,13 +153,12 @@ class Drawing:
             solids = None
             if self._obstacles:
                 self.draw_obstacles()
-                surface, mesh = to_warp(seen.depth.contiguous()), self._as_solids()
-                for axes, own in zip(self._axes, self._visibility, strict=True):
-                    if axes is not None:
-                        mesh_and_light = mesh.points, mesh.triangles, axes, self._camera.in_world()
-                        shadow.visibility(*mesh_and_light, surface, to_warp(own), empty=torch_memory(own.device))
-                solids = surface, to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
-            glow = self._glow_of(seen.emission, None if six is not None else seen.thrown)
+                self.draw_shadows(seen.depth)
+                solids = to_warp(seen.depth.contiguous()), to_warp(self.solid_light, wp.vec3), to_warp(self.solid_depth)
+            glow = None
+            if seen.emission is not None:
+                fire = glow_of(seen.emission.float(), self._ramp, None if six is not None else seen.thrown)
+                glow = to_warp(fire.expand_as(self.image).contiguous(), wp.vec3)
             transparency = to_warp(seen.transparency.float().contiguous())
             image, common = to_warp(self.image, wp.vec3), (self._as_lamps(), self._background, solids)
             if six is not None:
@@ -164,26 +172,11 @@ class Drawing:
         """Multiplies light scattered once, [L, H, W], by the albedo: [L, H, W, 3]."""
         return torch.stack([value * planes for value in self._albedo], -1)
 
-    def _glow_of(self, emission: torch.Tensor | None, thrown: torch.Tensor | None) -> wp.array | None:
-        """Returns the light of fire, vec3 [H, W]: emitted, plus scattered by smoke in the fire's mean colour."""
-        if emission is None:
-            return None
-        ramp = None if self._ramp is None else (to_warp(self._ramp[0]), to_warp(self._ramp[1], wp.vec3))
-        glow = torch.empty_like(self.image)
-        kernels.glow_of(to_warp(emission.float().contiguous()), ramp, to_warp(glow, wp.vec3))
-        if thrown is not None:
-            glow += thrown * (1.0 if ramp is None else glow.sum((0, 1)) / emission.sum().clamp(min=1e-12))
-        return to_warp(glow, wp.vec3)
-
-    def _as_solids(self) -> kernels.Solids:
-        points, triangles, owner, tints = self._solids
-        return kernels.Solids(to_warp(points, wp.vec3), to_warp(triangles), to_warp(owner), to_warp(tints, wp.vec3))
-
     def _as_lamps(self) -> kernels.Lamps:
         toward, irradiance = self._lamps
-        visibility = self._visibility if len(self._axes) else self.solid_depth[None]
-        arrays = to_warp(toward, wp.vec3), to_warp(irradiance, wp.vec3), to_warp(visibility)
-        return kernels.Lamps(len(self._axes), *arrays)
+        count = len(self.visibility)
+        visibility = self.visibility if count else self.solid_depth[None]
+        return kernels.Lamps(count, to_warp(toward, wp.vec3), to_warp(irradiance, wp.vec3), to_warp(visibility))
 
 
 def picture(

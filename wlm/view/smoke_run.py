@@ -14,12 +14,12 @@ import warp as wp
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import bake_coarse, coarse_march, guide
 from wlm.smoke.march.launch import VolumeGraph
+from wlm.smoke.march.six_way import bake_coarse, coarse_march, guide
 from wlm.smoke.network.prediction import SmokePredictor
 from wlm.smoke.scene import Scene, make_camera
+from wlm.smoke.shading import AnyLight
 from wlm.smoke.simulation import advance, make_solver, volume_of
-from wlm.smoke.transport.lights import AnyLight
 from wlm.smoke.transport.orders import ScatteredSmoke, scatter
 from wlm.system import Meter, OnProgress
 from wlm.view.pictures import to_bytes
@@ -68,11 +68,13 @@ class Frame:
     Attributes:
         number: Frame number, from 1.
         pixels: uint8 [H, W, 3] in sRGB.
+        smoke: Whether this frame or an earlier one has smoke.
         seconds: Duration of each stage by name.
     """
 
     number: int
     pixels: np.ndarray
+    smoke: bool
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -111,6 +113,7 @@ def run(
     if lighting.network is None and device != "cpu":
         # The frames before have loaded the kernels.
         graph = VolumeGraph(lambda volume: drawing(lighting(volume, camera, lights)), device, warmup=1)
+    smoke = False
     meter = Meter(progress, "run", scene.frames)
     for number in range(1, scene.frames + 1):
         clock = _Clock(device)
@@ -129,7 +132,8 @@ def run(
             clock.stop(DRAWING)
         pixels = to_bytes(drawing.image, white)
         clock.stop(BYTES)
-        yield Frame(number, pixels, clock.seconds)
+        smoke = smoke or bool(volume.density.any())
+        yield Frame(number, pixels, smoke, clock.seconds)
         meter.report(number)
 
 
@@ -150,7 +154,7 @@ class _Clock:
         return time.perf_counter()
 
 
-def write_all(frames: Iterator[Frame], write: Callable[[int, np.ndarray], None]) -> dict[str, list[float]]:
+def write_all(frames: Iterator[Frame], write: Callable[[int, np.ndarray], None]) -> tuple[dict[str, list[float]], bool]:
     """Writes frames as they are made.
 
     Args:
@@ -158,12 +162,15 @@ def write_all(frames: Iterator[Frame], write: Callable[[int, np.ndarray], None])
         write: Function of a frame's number and its pixels.
 
     Returns:
-        The durations of each stage, "writing" among them, one for each frame that had the stage.
+        The durations of each stage, "writing" among them, one for each frame that had the stage; and whether any frame
+        has smoke.
     """
+    smoke = False
     seconds: dict[str, list[float]] = {}
     for frame in frames:
         begin = time.perf_counter()
         write(frame.number, frame.pixels)
         for stage, taken in (frame.seconds | {"writing": time.perf_counter() - begin}).items():
             seconds.setdefault(stage, []).append(taken)
-    return seconds
+        smoke = frame.smoke
+    return seconds, smoke

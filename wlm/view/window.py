@@ -95,7 +95,7 @@ class Window:
             WlmError: The scene has no such slider, or the value is not finite.
         """
         if name not in self.sliders:
-            raise WlmError(f"{self.scene.title}: {name} has no meaning for this file")
+            raise WlmError(f"{self.scene.title}: {name} has no meaning for this file; it has {', '.join(self.sliders)}")
         if not np.isfinite(value):
             raise WlmError(f"{name}: expected a finite number, got {value}")
         self.state.values[name] = self.sliders[name].fit(value)
@@ -141,7 +141,7 @@ class Window:
             WlmError: The angle is not finite.
         """
         if not np.isfinite(degrees):
-            raise WlmError(f"turn: expected a finite number, got {degrees}")
+            raise WlmError(f"turn: expected a finite number of degrees, got {degrees}")
         camera, axis = self.canvas.renderers[0].camera, np.eye(3)[self.scene.up]
         focus = np.array(camera.focal_point)
         camera.position = focus + _turned(np.array(camera.position) - focus, axis, np.radians(degrees))

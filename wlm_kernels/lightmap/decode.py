@@ -1,6 +1,6 @@
 """Decodes tiles of a lightmap over time from their stored bytes: BC7 blocks, 8-bit planes and a small MLP.
 
-`exact_kernels` evaluates one texel per thread, in the same order of operations as training. `StripKernels` is faster,
+`exact_kernels` evaluates one texel per thread, in the same order of operations as training. `strip_kernels` is faster,
 for use at run time: it computes once what all texels of a frame share (F_uvt interpolated between two slices, and for
 each column the contribution of F_ut and the encoded time to the first layer), and a thread decodes four texels, so that
 each weight is loaded once for four texels.
@@ -241,14 +241,14 @@ def frame_volume(
 
 
 @dataclass(frozen=True)
-class StripKernels:
-    """Kernels of the fast decoder for networks with H = `hidden` units in each hidden layer; see `decode`. `vec_hidden`
-    is Warp's type of a vector of H floats."""
+class FastKernels:
+    """Kernels of a fast decoder for networks with H = `hidden` units in each hidden layer; see `decode`."""
 
     hidden: int
-    vec_hidden: Any
-    _frame_lines: Any
+    _lines: Any  # writes `columns` and `rows`
     _decode: Any
+    _texels: int  # of a column that a thread decodes
+    _network: bool  # whether `_lines` reads the networks and the encoded time, too
 
     def decode(
         self,
@@ -271,7 +271,8 @@ class StripKernels:
             output: vec3 [N, H + 1], output layers.
             time: The time, and the numbers that convert the networks' outputs to colour.
             volume: vec4 [N, R, R], scratch memory: F_uvt of all N tiles.
-            columns: float [N, H, 128], scratch memory: each column's part of the first layer.
+            columns: Scratch memory, each column's part of the first layer, float [N, H, 128]; on matrix units F_ut of
+                each column, vec2 [N, 128].
             rows: vec2 [N, 128], scratch memory: F_vt of each row.
             places: int [N], index of each tile in `time`.
             tiles: int [n], the tiles to decode.
@@ -279,16 +280,11 @@ class StripKernels:
         """
         device = out.device
         wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
-        wp.launch(
-            self._frame_lines,
-            rows.shape,
-            inputs=[stored, hidden, time],
-            outputs=[columns, rows],
-            device=device,
-        )
+        inputs = [stored, hidden, time] if self._network else [stored, time.tau]
+        wp.launch(self._lines, rows.shape, inputs=inputs, outputs=[columns, rows], device=device)
         wp.launch(
             self._decode,
-            (out.shape[0], 32, 128),
+            (out.shape[0], 128 // self._texels, 128),
             inputs=[stored, hidden, output, time, volume, columns, rows, places, tiles],
             outputs=[out],
             device=device,
@@ -330,7 +326,7 @@ STRIP_BOUNDS = (128, 3)  # threads of a block, blocks of a multiprocessor: 168 r
 
 
 @functools.cache
-def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
+def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> FastKernels:
     """Builds (once) the fast decoder of tiles with temporal maps, for networks of one hidden width.
 
     Args:
@@ -464,4 +460,4 @@ def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> StripKernels:
         out[i, y + 2, x] = finish(time, place, y2)
         out[i, y + 3, x] = finish(time, place, y3)
 
-    return StripKernels(hidden, vec_hidden, frame_lines, decode)
+    return FastKernels(hidden, frame_lines, decode, 4, True)

@@ -8,18 +8,16 @@ Read first: `exact_kernels` in `wlm_kernels/lightmap/decode.py`.
 """
 
 import functools
-from dataclasses import dataclass
-from typing import Any
 
 import warp as wp
 
 from wlm_kernels.lightmap.blocks import bits7
 from wlm_kernels.lightmap.decode import (
+    FastKernels,
     Stored,
     TimeState,
     centred_texel,
     finish_words,
-    frame_volume,
     frame_volume_at,
     stored_plane_at,
 )
@@ -49,49 +47,9 @@ def _frame_planes(
     vt[n, i] = (stored_plane_at(stored.vt, n, p, tau, stored.periodic) - half) * CENTRE
 
 
-@dataclass(frozen=True)
-class MatrixKernels:
-    """Kernels of the decoder for networks of one hidden width; see `decode`."""
-
-    hidden: int
-    _decode: Any
-
-    def decode(
-        self,
-        stored: Stored,
-        hidden: wp.array,
-        output: wp.array,
-        time: TimeState,
-        volume: wp.array,
-        ut: wp.array,
-        vt: wp.array,
-        places: wp.array,
-        tiles: wp.array,
-        out: wp.array,
-    ) -> None:
-        """Decodes n of N tiles at one time to 32 bits per texel, on CUDA.
-
-        Args:
-            hidden, output: Hidden and output layers as for `StripKernels.decode`, but of half floats.
-            ut, vt: vec2 [N, 128], scratch memory: F_ut and F_vt of all N tiles.
-            stored, time, volume, places, tiles, out: As for `StripKernels.decode`.
-        """
-        device = out.device
-        wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
-        wp.launch(_frame_planes, ut.shape, inputs=[stored, time.tau], outputs=[ut, vt], device=device)
-        wp.launch(
-            self._decode,
-            (out.shape[0], 128 // ROWS, 128),
-            inputs=[stored, hidden, output, time, volume, ut, vt, places, tiles],
-            outputs=[out],
-            device=device,
-            block_dim=128,
-        )
-
-
 @functools.cache
-def matrix_kernels(hidden: int, shared: bool = False) -> MatrixKernels:
-    """Builds (once) the decoder for networks of one hidden width.
+def matrix_kernels(hidden: int, shared: bool = False) -> FastKernels:
+    """Builds (once) the decoder, whose networks are of half floats, for one hidden width.
 
     Args:
         hidden: H, width of the hidden layers, a multiple of 16.
@@ -154,4 +112,4 @@ def matrix_kernels(hidden: int, shared: bool = False) -> MatrixKernels:
                 f[10 + c] = down[c]
             out[i, y, x] = finish(time, place, forward(hidden, output, n, wp.where(r == 0, 1, 0), f))
 
-    return MatrixKernels(hidden, decode)
+    return FastKernels(hidden, _frame_planes, decode, ROWS, False)

@@ -291,7 +291,7 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
     """
     corners = np.array([low, high], np.float64)
     if corners.shape != (2, 3) or not np.isfinite(corners).all() or (corners[0] > corners[1]).any():
-        raise ValueError(f"low, high: expected a lowest and a highest corner, got {low} and {high}")
+        raise ValueError(f"low, high: expected the lowest and the highest corner of a box, got {low} and {high}")
     if size is None:
         cubes = _chosen_grid(shapes, corners)
     elif math.isfinite(size) and size > 0:
@@ -300,7 +300,9 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
         raise ValueError(f"size: expected a positive number, got {size}")
     total = math.prod(cubes.counts)
     if total > MOST_PAIRS:
-        raise ValueError(f"size: {cubes.size:g} makes {total} cubes, expected at most {MOST_PAIRS}: use larger cubes")
+        raise ValueError(
+            f"size: an edge of {cubes.size:g} makes {total} cubes, expected at most {MOST_PAIRS}: use a larger edge"
+        )
     tested = _tested(shapes, cubes)
     if tested > MOST_PAIRS:
         raise ValueError(f"size: {cubes.size:g} makes {tested} pairs (cube, Gaussian), expected at most {MOST_PAIRS}")

@@ -21,16 +21,6 @@ wp.set_module_options({"enable_backward": False})
 SUPPORTS = ("ellipsoid", "sphere")
 
 
-@wp.func
-def _log_scale(rows: wp.array2d[float], k: int) -> wp.vec3:
-    return wp.vec3(rows[k, 3], rows[k, 4], rows[k, 5])
-
-
-@wp.func
-def _quaternion(rows: wp.array2d[float], k: int) -> wp.vec4:
-    return wp.vec4(rows[k, 6], rows[k, 7], rows[k, 8], rows[k, 9])
-
-
 @wp.kernel
 def _shapes(
     # in:
@@ -41,8 +31,7 @@ def _shapes(
     out: wp.array1d[Shape],
 ):
     k = wp.tid()
-    centre = wp.vec3(rows[k, 0], rows[k, 1], rows[k, 2])
-    out[k] = shape_of(centre, _log_scale(rows, k), _quaternion(rows, k), cut, sphere)
+    out[k] = shape_of(rows, k, cut, sphere)
 
 
 @wp.kernel
@@ -124,7 +113,7 @@ def sum_kernels(latent: int) -> _Kernels:
                         for c in range(wp.static(latent)):
                             g[c] = grad_f[c, i]
                         sums = accumulate(sums, shape, rows, k, x[i], g, cut)
-        head = chain(sums, shape, _log_scale(rows, k), _quaternion(rows, k))
+        head = chain(sums, shape, rows, k)
         for c in range(wp.static(LATENT)):
             grad[k, c] = head[c]
         for c in range(wp.static(latent)):

@@ -67,17 +67,30 @@ def _rotation(q: wp.vec4d) -> wp.mat33d:
 
 
 @wp.func
-def shape_of(centre: wp.vec3, log_scale: wp.vec3, q: wp.vec4, cut: float, sphere: int) -> Shape:
+def _log_scale(rows: wp.array2d[float], k: int) -> wp.vec3:
+    return wp.vec3(rows[k, 3], rows[k, 4], rows[k, 5])
+
+
+@wp.func
+def _quaternion(rows: wp.array2d[float], k: int) -> wp.vec4:
+    return wp.vec4(rows[k, 6], rows[k, 7], rows[k, 8], rows[k, 9])
+
+
+@wp.func
+def shape_of(rows: wp.array2d[float], k: int, cut: float, sphere: int) -> Shape:
     """Returns the `Shape` of one Gaussian.
 
     Args:
-        centre, log_scale, q: The first ten numbers of the Gaussian's row.
+        rows: [K, 10 + L], parameters of the Gaussians.
+        k: Index of the Gaussian.
         cut: Radius of the support in standard deviations.
         sphere: 1: the support is the sphere whose radius is the longest half axis (eq. 6); 0: the ellipsoid.
     """
+    log_scale = _log_scale(rows, k)
+    q = _quaternion(rows, k)
     s = wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
     shape = Shape()
-    shape.centre = centre
+    shape.centre = wp.vec3(rows[k, 0], rows[k, 1], rows[k, 2])
     r = wp.mat33()
     if wp.max(log_scale) - wp.min(log_scale) > wp.log(_SLENDER):
         one = wp.float64(1.0)
@@ -143,8 +156,8 @@ class GaussianFunctions:
         add: (f, shape, rows, k, x, cut) -> f plus F_k w_k(x).
         accumulate: (sums, shape, rows, k, x, grad_f, cut) -> `sums` plus the terms of point x.
         slope: (shape, rows, k, x, grad_f, cut) -> contribution of Gaussian k to the gradient of x.
-        chain: (sums, shape, log_scale, q) -> gradient of the first ten numbers of a row; the last L sums are the
-            gradient of the latent.
+        chain: (sums, shape, rows, k) -> gradient of the first ten numbers of a row; the last L sums are the gradient of
+            the latent.
     """
 
     vec_latent: Any
@@ -207,7 +220,9 @@ def functions(latent: int) -> GaussianFunctions:
         return -a * wp.exp(-0.5 * d2) * (wp.transpose(shape.whiten) * u)
 
     @wp.func
-    def chain(sums: vec_sums, shape: Shape, log_scale: wp.vec3, q: wp.vec4) -> _vec10:
+    def chain(sums: vec_sums, shape: Shape, rows: wp.array2d[float], k: int) -> _vec10:
+        log_scale = _log_scale(rows, k)
+        q = _quaternion(rows, k)
         centre = wp.transpose(shape.whiten) * wp.vec3(sums[0], sums[1], sums[2])
         # A rotation by omega in the Gaussian's own axes changes u by -S^-1 [omega] S u.
         xy = wp.exp(log_scale[0] - log_scale[1])

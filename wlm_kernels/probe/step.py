@@ -96,11 +96,6 @@ def next_bit(bits: wp.uint32) -> int:
 def _ballot(bit: int) -> wp.uint32: ...
 
 
-@wp.kernel(enable_backward=False)
-def _count_step(control: wp.array1d[int]):
-    control[0] = control[0] + 1
-
-
 @wp.func
 def _meet(groups: Groups, shapes: wp.array1d[Shape], transposed: int, row: int, column: int) -> int:
     g = wp.where(transposed != 0, column, row)
@@ -112,41 +107,26 @@ def _meet(groups: Groups, shapes: wp.array1d[Shape], transposed: int, row: int, 
 
 
 @wp.kernel(enable_backward=False)
-def _touch_cpu(
+def _touch(
     # in:
     groups: Groups,
     shapes: wp.array1d[Shape],
     transposed: int,
+    lanes: int,
     # out:
     bits: wp.array2d[wp.uint32],
 ):
-    row, word = wp.tid()
+    row, word, lane = wp.tid()
     word_bits = wp.uint32(0)
-    for b in range(32):
-        met = _meet(groups, shapes, transposed, row, word * 32 + b)
-        word_bits = word_bits | (wp.uint32(met) << wp.uint32(b))
-    bits[row, word] = word_bits
-
-
-@wp.kernel(enable_backward=False)
-def _touch_cuda(
-    # in:
-    groups: Groups,
-    shapes: wp.array1d[Shape],
-    transposed: int,
-    # out:
-    bits: wp.array2d[wp.uint32],
-):
-    row, word, b = wp.tid()
-    # The last dimension has 32 threads, which are one warp in every launch.
-    word_bits = _ballot(_meet(groups, shapes, transposed, row, word * 32 + b))
-    if b == 0:
+    if lanes == 32:
+        # The last dimension has 32 threads, which are one warp in every launch on CUDA.
+        word_bits = _ballot(_meet(groups, shapes, transposed, row, word * 32 + lane))
+    else:
+        for b in range(32):
+            met = _meet(groups, shapes, transposed, row, word * 32 + b)
+            word_bits = word_bits | (wp.uint32(met) << wp.uint32(b))
+    if lane == 0:
         bits[row, word] = word_bits
-
-
-def count_step(control) -> None:
-    """Adds one to `control`, int [1], the index of the step."""
-    wp.launch(_count_step, 1, outputs=[control], device=control.device)
 
 
 def touch(groups, shapes, by_group, by_gaussian) -> None:
@@ -160,12 +140,10 @@ def touch(groups, shapes, by_group, by_gaussian) -> None:
         by_gaussian: uint32 [K, ceil(G / 32)], written: for each Gaussian the bits of the groups that it may reach.
     """
     device = shapes.device
+    lanes = 32 if device.is_cuda else 1
     for transposed, bits in enumerate((by_group, by_gaussian)):
-        inputs = [groups, shapes, transposed]
-        if device.is_cuda:
-            wp.launch(_touch_cuda, (*bits.shape, 32), inputs=inputs, outputs=[bits], device=device)
-        else:
-            wp.launch(_touch_cpu, bits.shape, inputs=inputs, outputs=[bits], device=device)
+        inputs = [groups, shapes, transposed, lanes]
+        wp.launch(_touch, (*bits.shape, lanes), inputs=inputs, outputs=[bits], device=device)
 
 
 @dataclass(frozen=True)
@@ -180,7 +158,7 @@ class StepKernels:
 
     def load(self, device) -> None:
         """Compiles the kernels for a device now."""
-        for kernel in (self._shapes, self._features, self._collect, self._update, _count_step):
+        for kernel in (self._shapes, self._features, self._collect, self._update, _touch):
             kernel.module.load(wp.get_device(device))
 
     def shapes(self, rows, bounds, quantised, levels, cut, sphere, used, shapes) -> None:
@@ -286,13 +264,7 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
                 else:
                     value = low
             used[k, c] = value
-        shapes[k] = shape_of(
-            wp.vec3(used[k, 0], used[k, 1], used[k, 2]),
-            wp.vec3(used[k, 3], used[k, 4], used[k, 5]),
-            wp.vec4(used[k, 6], used[k, 7], used[k, 8], used[k, 9]),
-            cut,
-            sphere,
-        )
+        shapes[k] = shape_of(used, k, cut, sphere)
 
     @wp.func
     def sum_at(
@@ -465,12 +437,7 @@ def update_kernel(latent: int):
                 s = vec_sums()
                 for a in range(SHAPE_NUMBERS):
                     s[a] = sums[k, a]
-                gradient = chain(
-                    s,
-                    shapes[k],
-                    wp.vec3(used[k, 3], used[k, 4], used[k, 5]),
-                    wp.vec4(used[k, 6], used[k, 7], used[k, 8], used[k, 9]),
-                )
+                gradient = chain(s, shapes[k], used, k)
                 g = gradient[c]
             else:
                 g = sums[k, SHAPE_NUMBERS + c - LATENT]

@@ -50,19 +50,6 @@ class _Slab:
     planes: int
 
 
-@wp.struct
-class _Depths:
-    """Optical depths: from each sample of a slab to the lights at the four sides, [planes, H, W]; and along each
-    pixel's ray behind and in front of the camera's plane, [H, W]."""
-
-    right: wp.array3d[float]
-    left: wp.array3d[float]
-    top: wp.array3d[float]
-    bottom: wp.array3d[float]
-    behind: wp.array2d[float]
-    ahead: wp.array2d[float]
-
-
 @wp.func
 def _thickness(smoke: Any, span: wp.vec2, p: wp.vec3, direction: wp.vec3, s: float, h: float) -> float:
     """Computes the optical depth of a step of length h, sampled at distance s; 0 if s is outside the range `span`."""
@@ -162,7 +149,9 @@ def _gather(smoke_type: Any) -> wp.Kernel:
         view: View,
         slab: _Slab,
         march: MarchParameters,
-        depths: _Depths,
+        sides: wp.array4d[float],
+        behind: wp.array2d[float],
+        ahead: wp.array2d[float],
         # in and out:
         passed: wp.array2d[float],
         out: wp.array3d[float],
@@ -171,8 +160,8 @@ def _gather(smoke_type: Any) -> wp.Kernel:
         r = ray(view, row, col)
         span = clip(size_of(smoke.density), r.origin, r.direction)
         side = phase(march.g, 0.0)
-        front = phase(march.g, -1.0) * wp.exp(-depths.behind[row, col])
-        back = phase(march.g, 1.0) * wp.exp(-depths.ahead[row, col])
+        front = phase(march.g, -1.0) * wp.exp(-behind[row, col])
+        back = phase(march.g, 1.0) * wp.exp(-ahead[row, col])
         tau = passed[row, col]
         a = wp.vec4()
         b = wp.vec3()
@@ -184,10 +173,10 @@ def _gather(smoke_type: Any) -> wp.Kernel:
                 t = wp.exp(-tau)
                 if x > 0.0:
                     left = wp.vec4(
-                        wp.exp(-depths.right[n, row, col]),
-                        wp.exp(-depths.left[n, row, col]),
-                        wp.exp(-depths.top[n, row, col]),
-                        wp.exp(-depths.bottom[n, row, col]),
+                        wp.exp(-sides[0, n, row, col]),
+                        wp.exp(-sides[1, n, row, col]),
+                        wp.exp(-sides[2, n, row, col]),
+                        wp.exp(-sides[3, n, row, col]),
                     )
                     a += t * absorbed(x) * side * left
                     # The integral of sigma exp(-2 sigma s) over the step; for the back that of sigma alone, since the
@@ -238,10 +227,8 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
     out.zero_()
     near, far = _extent(medium.density.shape, view.origin, view.forward)
     start = max(near, 0.0)
-    depths = _Depths()
-    passed, depths.behind, depths.ahead = (medium.buffer((height, width), float) for _ in range(3))
-    for plane in (passed, depths.behind, depths.ahead):
-        plane.zero_()
+    passed, behind, ahead = (medium.buffer((height, width), float) for _ in range(3))
+    passed.zero_()
 
     def column(first: float, last: float, tau: wp.array) -> tuple[float, int]:
         planes = max(math.ceil((last - first) / march.step), 0)
@@ -249,20 +236,19 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
         _column(medium, (height, width), [view, _slab(first, gap, planes)], [tau])
         return gap, planes
 
-    column(near, min(far, 0.0), depths.behind)
-    gap, planes = column(start, far, depths.ahead)
+    column(near, min(far, 0.0), behind)
+    gap, planes = column(start, far, ahead)
     parts = max(1, math.ceil(view.pitch / march.step))
     capacity = max(1, min(planes, _SLAB_BYTES // (16 * height * width)))
-    sides = [medium.buffer((capacity, height, width), float) for _ in range(4)]
-    depths.right, depths.left, depths.top, depths.bottom = sides
+    sides = medium.buffer((4, capacity, height, width), float)
     # The loop runs once even if there is no plane, to write the transparency.
     for first in range(0, max(planes, 1), capacity):
         count = min(capacity, planes - first)
         slab = _slab(start + first * gap, gap, count)
-        for along, tau in enumerate(sides):
-            lines = height if along < 2 else width
-            _sweep(medium, (count, lines), [view, slab, along, parts], [tau])
-        _gather(medium, (height, width), [view, slab, parameters(march), depths], [passed, out])
+        for along, lines in enumerate((height, height, width, width)):
+            _sweep(medium, (count, lines), [view, slab, along, parts], [sides[along]])
+        inputs = [view, slab, parameters(march), sides, behind, ahead]
+        _gather(medium, (height, width), inputs, [passed, out])
 
 
 def _slab(start: float, gap: float, planes: int) -> _Slab:

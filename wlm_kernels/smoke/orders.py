@@ -28,9 +28,10 @@ _Mixes = wp.types.vector(length=MIXES, dtype=float)
 
 
 @wp.func
-def _features(
+def features(
     single: float, opposite: float, diffused: float, from_thin: float, transparency: float, thin: float
 ) -> _Features:
+    """Computes the features of a pixel, from which R is predicted; `thin` is the opacity of thin smoke."""
     opacity = 1.0 - transparency
     root = wp.sqrt(single)
     spread = wp.sqrt(diffused)
@@ -73,27 +74,6 @@ def _mixes(cosine: float, depth: float) -> _Mixes:
     m[8] = cosine * cosine * depth
     m[9] = cosine * depth * depth
     return m
-
-
-@wp.kernel
-def _write_features(
-    # in:
-    single: wp.array2d[float],
-    opposite: wp.array2d[float],
-    diffused: wp.array3d[float],
-    from_thin: wp.array3d[float],
-    transparency: wp.array2d[float],
-    thin: wp.array2d[float],
-    # out:
-    out: wp.array4d[float],
-):
-    a, row, column = wp.tid()
-    s = single[row, column]
-    o = opposite[row, column]
-    d = diffused[a, row, column]
-    x = _features(s, o, d, from_thin[a, row, column], transparency[row, column], thin[row, column])
-    for n in range(FEATURES):
-        out[a, n, row, column] = x[n]
 
 
 @wp.kernel
@@ -151,7 +131,7 @@ def _light(
     found = wp.vec3()
     o = opposite[n, row, column]
     for a in range(diffused.shape[1]):
-        x = _features(s, o, diffused[n, a, row, column], from_thin[n, a, row, column], t, thin[row, column])
+        x = features(s, o, diffused[n, a, row, column], from_thin[n, a, row, column], t, thin[row, column])
         more = float(0.0)
         for m in range(FEATURES):
             more += weights[n, a, m] * x[m]
@@ -161,28 +141,6 @@ def _light(
         found[a] = wp.max(wp.min(total, _BRIGHTEST * (1.0 - t)), once)
     for channel in range(3):
         out[n, row, column, channel] = found[places[channel]]
-
-
-def features(
-    single: wp.array,
-    opposite: wp.array,
-    diffused: wp.array,
-    from_thin: wp.array,
-    transparency: wp.array,
-    thin: wp.array,
-    out: wp.array,
-) -> None:
-    """Computes the features of each pixel under one light, at A albedos, from which R is predicted.
-
-    Args:
-        single, opposite: float [H, W], light scattered once under the light, and under the opposite light.
-        diffused, from_thin: float [A, H, W], R by diffusion at A albedos, and the part of this from thin smoke.
-        transparency: float [H, W], transparency of the smoke.
-        thin: float [H, W], opacity of thin smoke.
-        out: float [A, FEATURES, H, W], written.
-    """
-    inputs = [single, opposite, diffused, from_thin, transparency, thin]
-    wp.launch(_write_features, diffused.shape, inputs, [out], device=out.device)
 
 
 def mixes(depth: wp.array, known: wp.array, cosine: float, out: wp.array) -> None:

@@ -338,18 +338,6 @@ def _majorants(smoke_type: Any) -> wp.Kernel:
 
 
 @wp.kernel(module="unique", module_options=OPTIONS)
-def _window(
-    # in:
-    bounds: wp.array3d[float],
-    begin: wp.vec3i,
-    # out:
-    out: wp.array3d[float],
-):
-    a, b, c = wp.tid()
-    out[a, b, c] = bounds[begin[0] + a, begin[1] + b, begin[2] + c]
-
-
-@wp.kernel(module="unique", module_options=OPTIONS)
 def _coarser(
     # in:
     bounds: wp.array3d[float],
@@ -553,8 +541,7 @@ def bounds(medium: Medium, densest: float) -> Majorants:
     begin, end = _filled(most.numpy() > 0.0)
     low = tuple(edge * n for n in begin)
     size = tuple(min(edge * n, most) - least for n, most, least in zip(end, density.shape, low, strict=True))
-    inner = medium.buffer(tuple(b - a for a, b in zip(begin, end, strict=True)), float)
-    wp.launch(_window, inner.shape, [most, wp.vec3i(*begin)], [inner], device=device)
+    inner = most[begin[0] : end[0], begin[1] : end[1], begin[2] : end[2]].contiguous()
     while 2 * edge * densest <= _DEEP and max(inner.shape) > 1:
         edge *= 2
         wider = medium.buffer(tuple(-(-n // 2) for n in inner.shape), float)

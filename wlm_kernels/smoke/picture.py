@@ -12,20 +12,20 @@ from wlm_kernels.smoke.march import View, ray
 
 wp.set_module_options({"enable_backward": False})
 
+_FAR = wp.constant(1.0e30)
+
 
 @dataclass(frozen=True)
 class Solids:
     """Obstacles on a device.
 
     Attributes:
-        points: vec3 [V], corners in the world.
-        triangles: int32 [F, 3], indices of each triangle's corners.
+        mesh: Their surfaces, in the coordinates of the camera `view` of the functions below.
         owner: int32 [F], index of each triangle's obstacle.
         colours: vec3 [obstacles], albedo of each obstacle.
     """
 
-    points: wp.array
-    triangles: wp.array
+    mesh: wp.Mesh
     owner: wp.array
     colours: wp.array
 
@@ -49,33 +49,9 @@ class Lamps:
 
 
 @wp.kernel
-def _clip(
-    # in:
-    points: wp.array(dtype=wp.vec3),
-    view: View,
-    # out:
-    clip: wp.array(dtype=wp.vec4),
-):
-    n = wp.tid()
-    p = points[n] - view.origin
-    away = wp.dot(p, view.forward)
-    half = 0.5 * view.pitch * float(view.height)
-    x = wp.dot(p, view.right) / (half * float(view.width) / float(view.height))
-    y = wp.dot(p, view.up) / half
-    if view.perspective != 0:
-        clip[n] = wp.vec4(x, y, away - 1.0, away)
-    elif away > 0.0:
-        clip[n] = wp.vec4(x, y, away, 1.0)
-    else:
-        # With parallel rays the rasteriser does not clip geometry behind the camera, but it skips NaN.
-        clip[n] = wp.vec4(wp.nan, wp.nan, wp.nan, wp.nan)
-
-
-@wp.kernel
 def _light_solids(
     # in:
-    points: wp.array(dtype=wp.vec3),
-    triangles: wp.array2d(dtype=wp.int32),
+    mesh: wp.uint64,
     owner: wp.array(dtype=wp.int32),
     colours: wp.array(dtype=wp.vec3),
     lights: int,
@@ -83,76 +59,44 @@ def _light_solids(
     irradiance: wp.array(dtype=wp.vec3),
     ambient: float,
     view: View,
-    drawn: wp.array2d(dtype=wp.int32),
-    barycentric: wp.array2d(dtype=wp.vec2),
     # out:
     light: wp.array2d(dtype=wp.vec3),
     depth: wp.array2d(dtype=float),
 ):
     i, j = wp.tid()
-    n = drawn[i, j]
-    if n < 0:
+    r = ray(view, i, j)
+    hit = wp.mesh_query_ray(mesh, r.origin, r.direction, _FAR)
+    if not hit.result:
         light[i, j] = wp.vec3(0.0, 0.0, 0.0)
         depth[i, j] = wp.inf
         return
-    a = points[triangles[n, 0]]
-    b = points[triangles[n, 1]]
-    c = points[triangles[n, 2]]
-    share = barycentric[i, j]
-    r = ray(view, i, j)
-    at = share[0] * (a - r.origin) + share[1] * (b - r.origin) + (1.0 - share[0] - share[1]) * (c - r.origin)
-    depth[i, j] = wp.dot(at, r.direction)
-    normal = wp.normalize(wp.cross(b - a, c - a))
+    depth[i, j] = hit.t
+    normal = hit.normal
     if wp.dot(normal, r.direction) > 0.0:
         normal = -normal
     total = wp.vec3(ambient, ambient, ambient)
     for lamp in range(lights):
         total += wp.max(wp.dot(normal, toward[lamp]), 0.0) / wp.pi * irradiance[lamp]
-    light[i, j] = wp.cw_mul(colours[owner[n]], total)
-
-
-@wp.func
-def _glow(stops: wp.array(dtype=float), colours: wp.array(dtype=wp.vec3), count: int, emission: float) -> wp.vec3:
-    """Computes the colour of an emission by a ramp: linear between stops, constant beyond them; grey without stops."""
-    if count == 0:
-        return wp.vec3(emission, emission, emission)
-    colour = colours[0]
-    for n in range(1, count):
-        share = wp.clamp((emission - stops[n - 1]) / (stops[n] - stops[n - 1]), 0.0, 1.0)
-        if emission > stops[n - 1]:
-            colour = (1.0 - share) * colours[n - 1] + share * colours[n]
-    return colour
+    light[i, j] = wp.cw_mul(colours[owner[hit.face]], total)
 
 
 @wp.kernel
-def _glow_of(
+def _shadow(
     # in:
-    emission: wp.array2d(dtype=float),
-    stops: wp.array(dtype=float),
-    colours: wp.array(dtype=wp.vec3),
-    count: int,
-    # out:
-    glow: wp.array2d(dtype=wp.vec3),
-):
-    i, j = wp.tid()
-    glow[i, j] = _glow(stops, colours, count, emission[i, j])
-
-
-@wp.func
-def _behind(
-    i: int,
-    j: int,
-    background: wp.vec3,
-    solids: int,
+    mesh: wp.uint64,
+    toward: wp.array(dtype=wp.vec3),
+    view: View,
     surface: wp.array2d(dtype=float),
-    solid_light: wp.array2d(dtype=wp.vec3),
-    solid_depth: wp.array2d(dtype=float),
-) -> wp.vec4:
-    """Returns the light of the obstacle or background at a pixel, and 1 if it is an obstacle in front of the smoke."""
-    if solids != 0 and solid_depth[i, j] < wp.inf:
-        light = solid_light[i, j]
-        return wp.vec4(light[0], light[1], light[2], wp.where(solid_depth[i, j] < surface[i, j], 1.0, 0.0))
-    return wp.vec4(background[0], background[1], background[2], 0.0)
+    # out:
+    visibility: wp.array3d(dtype=float),
+):
+    lamp, i, j = wp.tid()
+    share = float(1.0)
+    if surface[i, j] > 0.0 and wp.length_sq(toward[lamp]) > 0.0:
+        r = ray(view, i, j)
+        if wp.mesh_query_ray_anyhit(mesh, r.origin + surface[i, j] * r.direction, toward[lamp], _FAR):
+            share = 0.0
+    visibility[lamp, i, j] = share
 
 
 @wp.kernel
@@ -174,11 +118,13 @@ def _compose(
     image: wp.array2d(dtype=wp.vec3),
 ):
     i, j = wp.tid()
-    behind = _behind(i, j, background, solids, surface, solid_light, solid_depth)
-    if behind[3] > 0.0:
-        image[i, j] = wp.vec3(behind[0], behind[1], behind[2])
-        return
-    total = transparency[i, j] * wp.vec3(behind[0], behind[1], behind[2])
+    behind = background
+    if solids != 0 and solid_depth[i, j] < wp.inf:
+        behind = solid_light[i, j]
+        if solid_depth[i, j] < surface[i, j]:
+            image[i, j] = behind
+            return
+    total = transparency[i, j] * behind
     for lamp in range(lights):
         total += wp.cw_mul((visibility[lamp, i, j] / (4.0 * wp.pi)) * planes[lamp, i, j], irradiance[lamp])
     if hot != 0:
@@ -186,48 +132,33 @@ def _compose(
     image[i, j] = total
 
 
-def clip_points(solids: Solids, view: View, clip: wp.array) -> None:
-    """Writes the obstacles' corners in clip space, vec4 [V]; a corner that must not be drawn becomes NaN."""
-    wp.launch(_clip, solids.points.shape, [solids.points, view], [clip], device=clip.device)
-
-
-def light_solids(
-    solids: Solids,
-    lamps: Lamps,
-    ambient: float,
-    view: View,
-    drawn: wp.array,
-    barycentric: wp.array,
-    light: wp.array,
-    depth: wp.array,
-) -> None:
+def light_solids(solids: Solids, lamps: Lamps, ambient: float, view: View, light: wp.array, depth: wp.array) -> None:
     """Computes the light that obstacles reflect to each pixel; obstacles cast no shadows on each other.
 
     Args:
         solids: The obstacles.
         lamps: The lights.
         ambient: Ambient light, added to each colour channel before the albedo is applied.
-        view: The camera in the world.
-        drawn, barycentric: int32 [H, W] and vec2 [H, W], results of the rasteriser.
+        view: The camera; its `voxel` and `moved` are not used.
         light: vec3 [H, W], written; 0 where there is no obstacle.
         depth: float [H, W], written: distance along the rays, infinite where there is no obstacle.
     """
-    inputs = [*vars(solids).values(), lamps.count, lamps.toward, lamps.irradiance, ambient, view, drawn, barycentric]
+    inputs = [solids.mesh.id, solids.owner, solids.colours, lamps.count, lamps.toward, lamps.irradiance, ambient, view]
     wp.launch(_light_solids, depth.shape, inputs, [light, depth], device=depth.device)
 
 
-def glow_of(emission: wp.array, ramp: tuple[wp.array, wp.array] | None, glow: wp.array) -> None:
-    """Converts the emission of each pixel to a colour by a colour ramp.
+def shadow(solids: Solids, lamps: Lamps, view: View, surface: wp.array) -> None:
+    """Computes which lights reach the surface of the smoke, by a ray from each pixel's surface to each light.
 
     Args:
-        emission: float [H, W].
-        ramp: Emission at each of S stops, float [S], and the colours there, vec3 [S]; None: grey.
-        glow: vec3 [H, W], the emitted light in R, G, B, written.
+        solids: The obstacles.
+        lamps: The lights; their `visibility` is written, 0 where an obstacle is on the way to a directional light.
+        view: The camera; its `voxel` and `moved` are not used.
+        surface: float [H, W], distance along the rays to the surface; 0: no surface, which counts as lit.
     """
-    # Without a ramp, the kernel gets arrays that it does not read.
-    stops, colours = ramp or (emission.flatten(), glow.flatten())
-    inputs = [emission, stops, colours, 0 if ramp is None else stops.shape[0]]
-    wp.launch(_glow_of, emission.shape, inputs, [glow], device=glow.device)
+    size = (lamps.count, *surface.shape)
+    inputs = [solids.mesh.id, lamps.toward, view, surface]
+    wp.launch(_shadow, size, inputs, [lamps.visibility], device=surface.device)
 
 
 def compose(

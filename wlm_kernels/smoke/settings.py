@@ -38,11 +38,11 @@ class March:
         for name in ("step", "spacing", "light_step"):
             value = getattr(self, name)
             if value is not None and not LEAST_STEP <= value < float("inf"):
-                raise ValueError(f"{name}: expected at least {LEAST_STEP} voxels, got {value}")
+                raise ValueError(f"{name}: expected a finite length of at least {LEAST_STEP} voxels, got {value}")
         if not 0 <= self.jitter <= 1:
-            raise ValueError(f"jitter: expected 0 to 1, got {self.jitter}")
+            raise ValueError(f"jitter: expected a share of a step, 0 to 1, got {self.jitter}")
         if not -1 < self.g < 1:
-            raise ValueError(f"g: expected a number within -1 and 1, got {self.g}")
+            raise ValueError(f"g: expected a mean cosine above -1 and below 1, got {self.g}")
         for name in ("threshold", "cutoff"):
             if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
+                raise ValueError(f"{name}: expected a number of at least 0, got {getattr(self, name)}")

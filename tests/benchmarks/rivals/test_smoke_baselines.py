@@ -8,7 +8,7 @@ from benchmarks.rivals.smoke import billboard
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.fine import bake
+from wlm.smoke.march.six_way import bake
 from wlm.smoke.scene import CameraSettings, make_camera
 
 

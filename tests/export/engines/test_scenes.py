@@ -1,5 +1,6 @@
 """Kits of scenes: each object reads its part of a sheet, as far as the compilers and players here can tell."""
 
+import dataclasses
 import json
 import os
 import re
@@ -10,7 +11,7 @@ from builders.checks import error_of
 from builders.engine_scripts import Script, assert_csharp_parses, assert_gdscript_parses, node_gives, pixels_of
 from builders.scene_folders import expected_picture, scene_folder
 from builders.shader_runs import run_glsl
-from test_folders import TEXTS, UNITY, as_glsl, compiled
+from test_folders import TEXTS, as_glsl, surface_compiles
 
 from wlm.atlas.model import SHORT_ENTRY
 from wlm.export import ENGINES, export
@@ -25,7 +26,7 @@ def made(tmp_path_factory):
     return scene_folder(tmp_path_factory.mktemp("scene") / "scene")
 
 
-@pytest.fixture(scope="module", params=["mixed", "rgb9e5", "short", "apart"])
+@pytest.fixture(scope="module", params=["mixed", pytest.param("rgb9e5", marks=pytest.mark.slow), "short", "apart"])
 def each_form(request, tmp_path_factory):
     """The same of each way of storing colours; of one state, which has short entries, with mips; of states apart."""
     if request.param == "mixed":
@@ -84,14 +85,14 @@ def test_inspect_names_a_scenes_files(made, tmp_path):
 
 
 def test_scenes_that_cannot_be_exported(made, tmp_path):
-
-    other = scene_folder(tmp_path / "other", 2)
+    bundle = made.bundle()
+    other = dataclasses.replace(bundle, document={**bundle.document, "uv_set": 2})
     line = error_of(export, other, tmp_path / "deep" / "a", "godot")
     assert line.startswith(f"{other.name}: cannot export for godot: its shaders read TEXCOORD_0 and 1")
-    assert os.listdir(tmp_path) == ["other"]
+    assert not os.listdir(tmp_path)
 
 
-@pytest.mark.parametrize("state", [-0.5, 1.5])
+@pytest.mark.parametrize("state", [pytest.param(-0.5, marks=pytest.mark.slow), 1.5])
 def test_the_shader_alone_reads_each_objects_part(state, each_form, tmp_path):
     """With the textures as they lie in their files; of the blocks the bytes are compared, and their texels bound."""
     model = each_form
@@ -124,7 +125,9 @@ def test_the_shader_alone_reads_each_objects_part(state, each_form, tmp_path):
     check(picture, model, state)
 
 
-@pytest.mark.parametrize("state", [0.0, 1.5, 2.0])
+@pytest.mark.parametrize(
+    "state", [pytest.param(0.0, marks=pytest.mark.slow), 1.5, pytest.param(2.0, marks=pytest.mark.slow)]
+)
 def test_unreals_node_reads_each_objects_part(state, each_form, tmp_path, monkeypatch):
     model = each_form
     export(model, tmp_path, "unreal")
@@ -170,10 +173,5 @@ def test_unitys_surface_compiles_and_its_component_parses(each_form, tmp_path):
     model = each_form
     export(model, tmp_path, "unity")
     assert (tmp_path / "factors.bytes").stat().st_size == 148 + 16 * len(model.states) * model.factor.shape[1]
-    text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "WlmScene.shader").read_text(), re.DOTALL)[1]
-    text = re.sub(r"^ *#pragma.*$", "", text, flags=re.MULTILINE).replace("sampler2D _MainTex;", "")
-    text = text.replace('#include "WlmScene.hlsl"', (tmp_path / "WlmScene.hlsl").read_text())
-    for stage in ("frag", "vert"):
-        own = UNITY + text.replace('#include "UnityCG.cginc"', "")
-        compiled(own, tmp_path, "-D", "-S", stage, "-e", stage, "--auto-map-bindings")
+    surface_compiles(tmp_path, "WlmScene")
     assert_csharp_parses(tmp_path / "WlmScene.cs")

@@ -73,7 +73,7 @@ class Page:
             # Without "<" no name can end the script element.
             text = json.dumps(manifest, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
         except ValueError as error:
-            raise WlmError(f"{self.title}: cannot be shown: a number is NaN or infinite") from error
+            raise WlmError(f"{self.title}: cannot make the page: a number for its script is NaN or infinite") from error
         scripts = [*map(_asset, _COMMON), *self.scripts, *map(_asset, (f"{self.kind}.js", "main.js"))]
         script = "\n".join(["'use strict';", *scripts])
         pieces = {

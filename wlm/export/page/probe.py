@@ -77,7 +77,9 @@ def probe_page(
     model, file_bytes = load_model(paths[0], "probe"), paths[0].stat().st_size
     coefficients = sh_count(model.outputs)
     if coefficients is None:
-        raise WlmError(f"{model.name}: expected spherical harmonics, found {model.outputs} numbers a probe")
+        raise WlmError(
+            f"{model.name}: expected probes of RGB spherical harmonics, found {model.outputs} numbers a probe"
+        )
     position, values, live, _ = probes_of(model, original, key)
     places = position[live].astype(np.float32)
     decoded = model.decoder(position=position).decode_probes()[live]

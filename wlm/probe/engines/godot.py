@@ -73,7 +73,9 @@ def write_kit(
         info = {"probes": len(points), "low": lattice.low.tolist(), "size": lattice.size, "cells": count.tolist()}
     else:
         if cells is not None:
-            raise WlmError(f"cells: expected none with {bake}: the light goes to the probes of this bake")
+            raise WlmError(
+                f"cells: expected none with {bake}: the light replaces that of this bake's probes, without a grid"
+            )
         check_numbers(model)
         places = positions_of(model, bake)
         content = relit(bake, _godot(model.name, model.decoder(device, position=places).decode_probes()))

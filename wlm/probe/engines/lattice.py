@@ -76,7 +76,7 @@ def lattice_of(model: ProbeModel, cells: int, most: int, position: np.ndarray | 
     """
     check_numbers(model)
     if not 1 <= cells <= most:
-        raise WlmError(f"cells: expected 1 to {most} along the longest side, got {cells}")
+        raise WlmError(f"cells: expected 1 to {most} grid cells along the longest side of the probes' box, got {cells}")
     span = model.extent * model.size
     size = float(span.max()) / cells or 1.0  # one cell if all probes coincide
     count = np.clip(np.ceil(span / size - 1e-6), 1, cells).astype(int)

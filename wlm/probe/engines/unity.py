@@ -192,7 +192,7 @@ def write_kit(
     if model.probes > _MOST_PROBES:
         raise WlmError(f"{model.name}: expected at most {_MOST_PROBES} probes, got {model.probes}")
     if mirror is not None and mirror not in tuple(_AXES):
-        raise WlmError(f"mirror: expected x, y or z, got {mirror}")
+        raise WlmError(f"mirror: expected x, y or z, the axis to mirror, got {mirror}")
     place = model.stored_positions() if position is None else np.array(position, np.float64)
     values = model.decoder(device, position=place).decode_probes()
     light = np.zeros((len(values), _L2, 3))

@@ -108,7 +108,9 @@ def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]
     sh = from_canonical(values.reshape(-1, 9, 3).astype(np.float64), "unreal")
     if not np.abs(sh[:, 0]).max() <= _PACKED_MAX.min():
         found = np.abs(sh[:, 0]).max()
-        raise WlmError(f"{lattice.name}: expected light within {_PACKED_MAX.min():g}, got {found:.3g}")
+        raise WlmError(
+            f"{lattice.name}: expected light within {_PACKED_MAX.min():g}, as R11G11B10F holds, got {found:.3g}"
+        )
     width, height, depth = (int(count) for count in lattice.count)
     ambient, level = packed(sh)
     ratios = level.reshape(-1, 6, 4)  # of each colour coefficients 1 to 4, then 5 to 8

@@ -50,21 +50,17 @@ class GaussianDecoder(Decoder):
         assert isinstance(content, Gaussians)
         check_outputs(model.name, content.latent, content.hidden, model.outputs, self.device)
         self._gain = content.gain
-        self._rows = wp.array(content.rows(), dtype=float, device=self.device)
+        self._rows = self._put(content.rows(), float)
         self._shapes = gaussian_sum.shapes(self._rows, CUT, content.support)
         self._cubes = probe_cubes.build(self._shapes, np.zeros(3, np.float32), model.size.astype(np.float32))
         self.pairs = self._cubes.item.shape[0]
         first, second, third = (layer.astype(np.float32) for layer in content.layers())
         third = np.pad(third, ((0, 0), (0, probe_network.padded(model.outputs) - model.outputs)))
         net = np.concatenate([first.ravel(), second.ravel(), third.ravel()])
-        self._net = wp.array(net, dtype=float, device=self.device)
+        self._net = self._put(net, float)
+        self._arrays += [self._shapes, self._cubes.start, self._cubes.item]
         kind = "cpu" if self.device == "cpu" else "cuda"
         self._kernels = decode_kernels(content.latent, content.hidden, model.outputs, kind)
-
-    @property
-    def device_bytes(self) -> int:
-        arrays = (self._rows, self._shapes, self._net, self._cubes.start, self._cubes.item)
-        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
 
     def points(self, position: np.ndarray) -> Points:
         """Uploads points that will be decoded often; arguments and errors are those of `decode`."""
@@ -90,7 +86,7 @@ class GaussianDecoder(Decoder):
         return values
 
     def light(self, position: np.ndarray) -> "GaussianLight":
-        return GaussianLight(self, check_points(position, "N"))
+        return GaussianLight(self, check_points(position))
 
 
 class GaussianLight:

@@ -85,7 +85,9 @@ class WholeNumbers:
         turn = self.gaussians[:, STORED_ROTATION] * self.step[STORED_ROTATION]
         square = np.square(turn).sum(1, keepdims=True)
         if (high - low).max() > CODES or not (square <= 1.0).all():
-            raise ValueError("part gaussians: expected channels within 16 bits, and rotations of at most half a turn")
+            raise ValueError(
+                "part gaussians: expected numbers of a channel within 16 bits, and rotations of at most half a turn"
+            )
         code = self.gaussians - low
         quaternion = np.concatenate([1.0 - square, 2.0 * turn], 1) / (1.0 + square)
         turned = np.rint((quaternion + 1.0) * (0.5 * CODES))

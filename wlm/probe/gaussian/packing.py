@@ -105,18 +105,6 @@ class _Steps(NamedTuple):
     third: float
 
 
-class _Sums(NamedTuple):
-    """K Gaussians, `rows` [K, 9], and their weights at the N probes, float64 [N, K]. To save memory, they are None if
-    there are more than `_TOGETHER` Gaussians."""
-
-    rows: np.ndarray
-    weight: torch.Tensor | None = None
-    square: np.ndarray | None = None
-    """weight^T weight, float64 [K, K]."""
-    feed: np.ndarray | None = None
-    """Result of `_feed` for `square`."""
-
-
 class _Search:
     """Finds the integers of a model for given steps, and the error that they cause."""
 
@@ -129,7 +117,7 @@ class _Search:
         order = np.argsort(morton_keys(np.rint((centre - centre.min(0)) * CODES / 4).astype(np.int64)))
         self._rows = rows = rows[order]
         self._layers = [layer.astype(np.float64) for layer in content.layers()]
-        self._latent = self._latents(self._sums(rows[:, : STORED_LATENT.start]), rows[:, STORED_LATENT])
+        self._latent = self._latents(rows[:, : STORED_LATENT.start], rows[:, STORED_LATENT])
         self._inside = []  # inputs of the second and of the third layer, before the sigmoid
         inputs = self._inputs(self._latent)
         for layer in self._layers[:2]:
@@ -185,15 +173,17 @@ class _Search:
         turn = whole[:, STORED_ROTATION] * step[STORED_ROTATION]
         # A file holds at most half a turn, which only steps that are far too coarse exceed.
         whole[np.square(turn).sum(1) > 1.0, STORED_ROTATION] = 0.0
-        sums = self._sums(whole * step[:start])
-        latent = rows[:, STORED_LATENT]
-        if sums.square is not None:
-            latent = _fitted(sums.square, (sums.weight.T @ self._latent).cpu().numpy(), latent, _OF_LATENTS)
-        latent = _fed(latent, np.tile(step[STORED_LATENT], (len(rows), 1)), sums.feed, CODES // 2)
+        moved, latent, weight, feed = whole * step[:start], rows[:, STORED_LATENT], None, None
+        if len(rows) <= _TOGETHER:
+            weight = torch.cat(list(self._weights(moved)))
+            square = (weight.T @ weight).cpu().numpy()
+            latent = _fitted(square, (weight.T @ self._latent).cpu().numpy(), latent, _OF_LATENTS)
+            feed = _feed(square, _OF_LATENTS)
+        latent = _fed(latent, np.tile(step[STORED_LATENT], (len(rows), 1)), feed, CODES // 2)
         net_step = [steps.first * each for each in self._of_first]
         net_step += [steps.position] * 4 + [steps.second, steps.third]
         net_step = np.array([stored_step(each) for each in net_step])
-        inputs = self._inputs(self._latents(sums, latent * step[STORED_LATENT]))
+        inputs = self._inputs(self._latents(moved, latent * step[STORED_LATENT], weight))
         net = []
         wanted = [*self._inside, self._wanted]
         for number, layer in enumerate(self._layers):
@@ -212,13 +202,6 @@ class _Search:
     def _error(self, result: torch.Tensor) -> float:
         return float((result - self._wanted).square().mean()) + self._faint
 
-    def _sums(self, rows: np.ndarray) -> _Sums:
-        if len(rows) > _TOGETHER:
-            return _Sums(rows)
-        weight = torch.cat(list(self._weights(rows)))
-        square = (weight.T @ weight).cpu().numpy()
-        return _Sums(rows, weight, square, _feed(square, _OF_LATENTS))
-
     def _weights(self, rows: np.ndarray) -> Iterator[torch.Tensor]:
         """Yields the weights of Gaussians [K, 9] at the probes, float64 [n, K], for n probes at a time."""
         scale = np.exp(rows[:, STORED_SCALE])
@@ -233,10 +216,11 @@ class _Search:
             reached = (x[:, None] - centre).square_().sum(2) < reach if self._sphere else square < CUT**2
             yield square.mul_(-0.5).exp_().mul_(reached)
 
-    def _latents(self, sums: _Sums, latent: np.ndarray) -> torch.Tensor:
-        """Returns the weighted sum of latents at each probe, float64 [N, L] on the device."""
+    def _latents(self, rows: np.ndarray, latent: np.ndarray, weight: torch.Tensor | None = None) -> torch.Tensor:
+        """Returns the weighted sum of latents at each probe, float64 [N, L] on the device; `weight`, if known, is that
+        of the Gaussians `rows` [K, 9] at the probes, [N, K]."""
         latents = self._put(latent)
-        pieces = self._weights(sums.rows) if sums.weight is None else [sums.weight]
+        pieces = self._weights(rows) if weight is None else [weight]
         return torch.cat([weight @ latents for weight in pieces])
 
     def _put(self, numbers: np.ndarray) -> torch.Tensor:

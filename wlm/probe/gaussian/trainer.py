@@ -206,7 +206,7 @@ class Trainer:
     def _step(self, stage: int) -> None:
         a, t = self._arrays, self._tensors
         move = stage < 2
-        probe_step.count_step(a["control"])
+        t["control"].add_(1)
         if move:
             self._make_shapes(quantised=stage > 0)
             self._features()
@@ -346,7 +346,9 @@ class Trainer:
         done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         state = check_parts(state, self.table(int(done[0])))
         if not state["kept"].any() or (state["bounds"][0] > state["bounds"][1]).any():
-            raise ValueError("parts kept, bounds: expected a kept Gaussian, and lowest values at most the highest")
+            raise ValueError(
+                "parts kept, bounds: expected at least one Gaussian to be kept, and lower bounds up to the upper ones"
+            )
         for key in _STATE:
             self._tensors[key].copy_(torch.from_numpy(np.array(state[key])))
         self.needed, self._entered = np.array(state["kept"]), int(state["entered"])

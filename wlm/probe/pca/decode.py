@@ -24,32 +24,18 @@ class ComponentDecoder(Decoder):
     """
 
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
-        """Loads a model.
-
-        Args:
-            model: The model, whose content is principal components.
-            device: "cpu" or "cuda:N".
-            position: Positions of the probes, see `wlm.probe.decode.Decoder`.
-
-        Raises:
-            WlmError: The device does not exist, or the positions are not those of the model's probes.
-        """
+        """Loads a model of principal components; arguments and errors are those of `wlm.probe.decode.Decoder`."""
         super().__init__(model, device, position=position)
         content = model.content
         assert isinstance(content, Components)
-        self._code = wp.array(content.code, dtype=wp.uint8, device=self.device)
-        self._bounds = wp.array(content.bounds, dtype=float, device=self.device)
-        self._basis = wp.array(content.basis, dtype=wp.float16, device=self.device)
+        self._code = self._put(content.code, wp.uint8)
+        self._bounds = self._put(content.bounds, float)
+        self._basis = self._put(content.basis, wp.float16)
         live = model.live
         row = np.where(live, np.cumsum(live) - 1, -1)
-        self._row = wp.array(row.astype(np.int32), dtype=int, device=self.device)
+        self._row = self._put(row.astype(np.int32), int)
         self.count, self.channels = model.probes, model.outputs
         self._volume: Volume | None = None
-
-    @property
-    def device_bytes(self) -> int:
-        arrays = (self._code, self._bounds, self._basis, self._row)
-        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays)
 
     def decode(self, position: np.ndarray) -> np.ndarray:
         """Returns the light at any points as a renderer reads it: from the cascaded volume around a nearby viewer.

@@ -34,7 +34,7 @@ def volume_bundle(volume: Volume) -> Bundle:
     state = volume.state()
     rows, pages = np.unique(state.pages[state.pages >= 0]), state.pages
     if not len(rows):
-        raise WlmError("volume: cannot export: there is no block around the viewer")
+        raise WlmError("volume: cannot export: no block of light is near the viewpoint; choose one near the probes")
     head = [np.array([len(volume.sizes), volume.side, volume.channels, len(rows)], "<u4")]
     for view, base in zip(state.views, state.bases, strict=True):
         head += [view.astype("<f4").view("<u4"), np.append(base, 0).astype("<i4").view("<u4")]

@@ -160,7 +160,7 @@ class Volume:
         self.sizes = self.index.sizes
         if not _SMALLEST <= self.sizes[0] <= self.sizes[-1] <= 1.0 / _SMALLEST:
             limits = f"{_SMALLEST:g} to {1.0 / _SMALLEST:g}"
-            raise WlmError(f"volume block: expected sides from {limits}, got {list(self.sizes)}")
+            raise WlmError(f"volume block: expected sides of all levels from {limits}, got {list(self.sizes)}")
         self.position, self.light = position, light
         self.side, self.budget, self.channels = side, budget, light.channels
         self.device = light.device
@@ -343,8 +343,10 @@ def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     if normal is None:
         return np.zeros(shape, np.float32)
     normal = np.asarray(normal, np.float64)
-    if normal.shape != shape or not np.isfinite(normal).all():
-        raise ValueError(f"normal: expected finite numbers {list(shape)}, got {list(normal.shape)}")
+    if normal.shape != shape:
+        raise ValueError(f"normal: expected the shape {list(shape)}, got {list(normal.shape)}")
+    if not np.isfinite(normal).all():
+        raise ValueError("normal: expected finite numbers, got NaN or infinity")
     return unit_or_zero(normal).astype(np.float32)
 
 
@@ -354,10 +356,12 @@ def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, r
         raise WlmError(f"volume block: expected a side from {_SMALLEST:g} to {1.0 / _SMALLEST:g}, got {block:g}")
     rising = list(ratios[:1]) == [1] and all(a < b for a, b in itertools.pairwise(ratios))
     if not rising or len(ratios) > frame_kernels.LEVELS or any(r & (r - 1) or r > 1024 for r in ratios):
-        raise WlmError(f"volume ratios: expected up to 8 rising powers of two from 1 to 1024, got {list(ratios)}")
+        raise WlmError(
+            f"volume ratios: expected up to 8 rising powers of two, from 1 to 1024 at most, got {list(ratios)}"
+        )
     if not 2 <= side <= _LONGEST or side % 2:
         raise WlmError(f"volume side: expected an even number of blocks from 2 to {_LONGEST}, got {side}")
     if not 1 <= budget <= 1024:
         raise WlmError(f"volume budget: expected 1 to 1024 blocks a frame, got {budget}")
     if rows < budget:
-        raise WlmError(f"volume rows: expected at least the budget of {budget} blocks, got {rows}")
+        raise WlmError(f"volume rows: expected at least as many blocks as the budget of {budget}, got {rows}")

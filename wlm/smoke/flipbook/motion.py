@@ -73,7 +73,8 @@ def frames_motion(
     meter = Meter(progress, "motion", len(numbers))
     for i, (number, six) in enumerate(zip(numbers, book, strict=True)):
         if number not in frames.files:
-            raise WlmError(f"{frames.path}: {frames.file(number).name}, frame {i + 1} of the flip book, is missing")
+            name = frames.file(number).name
+            raise WlmError(f"{frames.path}: frame {i + 1} of the flip book needs {name}, which is missing: simulate it")
         later = numbers[i + 1] if i + 1 < len(numbers) else number
         between = range(number + 1, later + 1) if later > number else [number]
         apart = len(between) if later > number else (number - numbers[i - 1] if i else 1)
@@ -165,7 +166,7 @@ def mip_padding(height: int, width: int, levels: int) -> int:
             return padding
     raise WlmError(
         f"mips: {levels} levels need cells with sides of a multiple of {part} pixels, which no padding gives for frames"
-        f" of {width} x {height} pixels"
+        f" of {width} x {height} pixels: use fewer levels"
     )
 
 

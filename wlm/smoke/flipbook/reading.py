@@ -4,25 +4,23 @@ Such files do not state what their numbers mean. Each reader takes it from its o
 or beside it, or from the content, and notes in one line what it assumed.
 """
 
-import io
 import json
 import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from PIL import Image
+from pydantic import BaseModel, Field
 
 from wlm.errors import WlmError
 from wlm.formats.exr import read_every_channel, read_exr
 from wlm.formats.exr_header import check_header
 from wlm.formats.folder import read_index
-from wlm.formats.limits import IMAGE_BYTES, PICTURE_GROWTH, check_growth
-from wlm.formats.mask import DAMAGED_PICTURE
-from wlm.formats.reading import read_file
+from wlm.formats.levels import read_levels
+from wlm.formats.limits import SURE_BYTES
 from wlm.smoke.camera import ALPHA, DIRECTIONS, EMISSION, LAYOUTS, Camera
 from wlm.smoke.flipbook.naming import TRANSPARENCY, Layout, layout_name, parse_layout, second_names, six_way_channels
 from wlm.smoke.lightmaps import SixWay, axis_faults, axis_shifts, light_centres
@@ -32,7 +30,6 @@ NOTE = "wlm"
 
 SUFFIXES = (".exr", ".png", ".tga")
 
-_MODES, _GREY = ("RGB", "RGBA", "P", "PA"), ("L", "LA", "I;16")
 _LEAST_SHIFT, _CLEARLY = 1e-3, 1.1  # of the centres of light; share by which another layout must fit better
 _BARE, _LIT = 0.001, 0.05  # largest opacity without smoke; largest mean light there if alpha is premultiplied
 _THIN, _THICK, _FEWEST = (0.02, 0.1), 0.5, 16  # opacities whose light tells straight from premultiplied, and pixels
@@ -40,6 +37,17 @@ _STRAIGHT, _PREMULTIPLIED = 4.0, 2.5  # light over opacity of thin smoke, as a m
 _SAMPLES = 1 << 20
 _MOST_CELLS, _SMALLEST = 64, 8  # cells along a side, and pixels of a cell, of a guess
 _DARK = 0.02  # of the mean light: at the borders of cells, and in a cell without smoke
+
+
+class _Stated(BaseModel, strict=True, allow_inf_nan=False):
+    """What `write_book` states about a texture."""
+
+    layout: Literal[tuple(LAYOUTS)]  # type: ignore[valid-type]
+    rows: int = Field(ge=1, le=4096)
+    columns: int = Field(ge=1, le=4096)
+    frames: int = Field(ge=0, le=4096)
+    padding: int = Field(ge=0, le=4096)
+    gain: float = Field(gt=0.0)
 
 
 def read_flipbook(
@@ -59,8 +67,8 @@ def read_flipbook(
     then from their content.
 
     Args:
-        paths: The files, .exr, .png or .tga (8 bits per channel, linear): the two of the layout, and optionally a third
-            with the opacity in its alpha or first channel; or one EXR file with a layer or a part per light.
+        paths: The files, .exr, .png or .tga (linear): the two of the layout, and optionally a third with the opacity in
+            its alpha or first channel; or one EXR file with a layer or a part per light.
         layout: A layout for `parse_layout`; else the one that the light fits best, or "unity".
         rows, columns: Number of rows and of columns of cells; all cells are read.
         straight: Whether the files have straight (unpremultiplied) alpha; the result is premultiplied.
@@ -77,8 +85,8 @@ def read_flipbook(
     """
     where, lines, said = ", ".join(map(str, paths)), [] if notes is None else notes, []
     if not (len(paths) in (2, 3) or (len(paths) == 1 and Path(paths[0]).suffix.lower() == ".exr")):
-        raise WlmError(f"{where}: expected two textures, or three with one of opacity, got {len(paths)}")
-    stated = _stated(Path(paths[0]))
+        raise WlmError(f"{where}: expected two textures, or three with one of opacity, got {len(paths)} file(s)")
+    stated: dict[str, Any] = {}
     if len(paths) == 1:
         planes = read_layers(paths[0], lines)
         if layout is not None:
@@ -88,7 +96,8 @@ def read_flipbook(
         pages = [np.stack([*planes.values()], -1)]
         names: list[Sequence[str]] = [[*planes]]
     else:
-        pages = [_read(path, grey=number == 2) for number, path in enumerate(paths)]
+        read = [_read(Path(path), grey=number == 2) for number, path in enumerate(paths)]
+        pages, stated = [page for page, _ in read], _stated(read[0][1], Path(paths[0]))
         if any(page.shape[:2] != pages[0].shape[:2] for page in pages):
             raise WlmError(f"{where}: expected textures of one size, found {[page.shape[:2] for page in pages]}")
         if len(pages) == 3:
@@ -112,7 +121,7 @@ def read_flipbook(
     if len(paths) == 1:
         lines += [f"{where}: {fault}" for fault in axis_faults(maps)]
     if straight and alpha is None:
-        raise WlmError(f"{where}: expected an alpha channel or a third texture for straight alpha, found none")
+        raise WlmError(f"{where}: expected an alpha channel or a texture of opacity for straight alpha, found none")
     if alpha is not None:
         source = "as given"
         if straight is None and (stated or len(paths) == 1):
@@ -173,7 +182,7 @@ def guess_book(first: Path, second: Path) -> str | None:
     Raises:
         WlmError: A texture cannot be read.
     """
-    pages = [_read(path, grey=False) for path in (first, second)]
+    pages = [_read(path)[0] for path in (first, second)]
     if pages[0].shape[:2] != pages[1].shape[:2]:
         return None
     rows, columns = guess_cells(pages) or (1, 1)
@@ -226,7 +235,8 @@ def _cells(
     cell = height // rows, width // columns
     if (height, width) != (rows * cell[0], columns * cell[1]) or min(cell) <= 2 * padding:
         raise WlmError(
-            f"{where}: expected sides that divide into {rows} rows and {columns} columns, found {height} x {width}"
+            f"{where}: expected textures that divide into {rows} rows and {columns} columns of cells, found a height "
+            f"of {height} and a width of {width} pixels"
         )
     said.append(f"{rows} x {columns} cells, {source}")
     return rows, columns, padding
@@ -337,58 +347,32 @@ def _is_straight(maps: torch.Tensor, alpha: torch.Tensor) -> bool | None:
     return True if share > _STRAIGHT else False if share < _PREMULTIPLIED else None
 
 
-def _stated(path: Path) -> dict[str, Any]:
-    """Returns what `write_book` wrote into a texture, or `wlm.export` beside it; empty for files of other programs."""
-    found: Any = {}
+def _stated(entry: bytes | str, path: Path) -> dict[str, Any]:
+    """Returns what `write_book` wrote as a texture's entry, or `wlm.export` beside it; empty for other files."""
     try:
-        if path.suffix.lower() == ".exr":
-            found = json.loads(check_header(path)[0].attributes.get(NOTE, ("", b"{}"))[1])
-        else:
-            with Image.open(io.BytesIO(read_file(path, IMAGE_BYTES, "the picture")), formats=["PNG", "TGA"]) as image:
-                found = json.loads(image.info.get(NOTE) or image.info.get("id_section") or b"{}")
+        found = json.loads(entry or b"{}")
         index = path.with_name("bundle.json")
         if not found and index.is_file():
             document = read_index(index)
             found = document if path.stem in document.get("channels", ()) and document.get("system") == "smoke" else {}
-    except (*DAMAGED_PICTURE, WlmError, RecursionError):
+        return _Stated.model_validate(found).model_dump()
+    except (ValueError, TypeError, AttributeError, WlmError, RecursionError):
         return {}
-    if not isinstance(found, dict) or found.get("layout") not in LAYOUTS:
-        return {}
-    whole = {name: found.get(name) for name in ("rows", "columns", "frames", "padding")}
-    if (
-        not all(type(value) is int and 0 <= value <= 4096 for value in whole.values())
-        or not whole["rows"]
-        or not whole["columns"]
-    ):
-        return {}
-    gain = found.get("gain")
-    if not isinstance(gain, int | float) or not 0 < gain < float("inf"):
-        return {}
-    return {**whole, "layout": found["layout"], "gain": float(gain)}
 
 
-def _read(path: str | os.PathLike[str], *, grey: bool) -> np.ndarray:
-    if suffix_of(path) == ".exr":
+def _read(path: Path, *, grey: bool = False) -> tuple[np.ndarray, bytes | str]:
+    """Reads a texture, float32 [H, W, C], and the entry that `write_book` wrote into it; empty for other files."""
+    suffix = suffix_of(path)
+    if suffix == ".exr":
         page = read_exr(path)[0]
         if not np.isfinite(page).all():
             raise WlmError(f"{path}: expected finite light, found NaN or infinity")
-        return page
-    data = read_file(path, IMAGE_BYTES, "the picture")
-    try:
-        # From memory: for a file on disk Pillow would allocate as many bytes as a chunk claims.
-        with Image.open(io.BytesIO(data), formats=[suffix_of(path)[1:].upper()]) as image:
-            modes = (*_MODES, *_GREY) if grey else _MODES
-            if image.mode not in modes:
-                raise WlmError(f"{path}: expected RGB or RGBA with 8 bits per channel, found {image.mode}")
-            floats = 4 * image.width * image.height * max(len(image.getbands()), 4 if image.mode[0] == "P" else 1)
-            check_growth(str(path), len(data), floats, PICTURE_GROWTH)
-            opaque = image.mode == "P" and "transparency" not in image.info
-            shown = image.convert("RGB" if opaque else "RGBA") if image.mode[0] == "P" else image
-            most = np.float32(65535.0 if image.mode == "I;16" else 255.0)
-            pixels = np.asarray(shown).astype(np.float32) / most
-            return pixels.reshape(*pixels.shape[:2], -1)
-    except DAMAGED_PICTURE as error:
-        raise WlmError(f"{path}: cannot read the picture: {str(error) or type(error).__name__}") from error
+        return page, check_header(path)[0].attributes.get(NOTE, ("", b""))[1]
+    entries: dict[Any, Any] = {}
+    page, names = read_levels(path, suffix[1:].upper(), [], entries, SURE_BYTES)
+    if len(names) < 3 and not grey:
+        raise WlmError(f"{path}: expected a texture of RGB or RGBA, found one of {', '.join(names)}")
+    return page, entries.get(NOTE) or entries.get("id_section") or b""
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str:

@@ -68,7 +68,10 @@ class VolumeGraph(Generic[_Made]):
                 heat = None if volume.temperature is None else torch.empty_like(volume.temperature)
                 self._volume = replace(volume, density=torch.empty_like(volume.density), temperature=heat)
             if _kind(volume) != _kind(self._volume):
-                raise ValueError(f"volume: expected {_kind(self._volume)}, as in the first call, got {_kind(volume)}")
+                raise ValueError(
+                    "volume: expected shape, type, temperature, voxel, origin, extinction and emission of the first "
+                    f"call, {_kind(self._volume)}, got {_kind(volume)}"
+                )
             self._volume.density.copy_(volume.density)
             if volume.temperature is not None:
                 self._volume.temperature.copy_(volume.temperature)

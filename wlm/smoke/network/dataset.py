@@ -23,10 +23,9 @@ from wlm.fluid.solver import Solver
 from wlm.fluid.volume import load_volume
 from wlm.interop import check_device, no_collection, stream
 from wlm.smoke.camera import Camera
-from wlm.smoke.march.fine import bake
 from wlm.smoke.march.motion import motion
-from wlm.smoke.network.planes import GUIDES, PLANES, encode_lightmaps, render_guide
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.march.six_way import bake
+from wlm.smoke.network.planes import GUIDES, PLANES, Pool, encode_lightmaps, render_guide
 from wlm.smoke.network.scenes import draw_scene, generator
 from wlm.smoke.network.settings import EDGE, PERIOD, DatasetSettings
 from wlm.smoke.scene import CameraSettings, Scene, make_camera

@@ -1,4 +1,8 @@
-"""Encoding of guiding maps and lightmaps for the network: light in sRGB, and all planes with values of about 0 to 1."""
+"""Encoding of guiding maps and lightmaps for the network, with values of about 0 to 1, and the container of samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
 
 import torch
 
@@ -6,7 +10,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.coarse import guide, march_planes
+from wlm.smoke.march.six_way import guide, march_planes
 from wlm_kernels.smoke import planes as smoke_planes
 from wlm_kernels.smoke.planes import FOOT
 from wlm_kernels.smoke.settings import March
@@ -63,19 +67,13 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
         [..., 3, H, W]: light in sRGB; opacity; depth, from 1 at `near` to 0 at `far`, and 0 without a surface.
 
     Raises:
-        ValueError: The number of planes is wrong, or `near` is not less than `far`.
+        ValueError: The number of planes is wrong.
     """
     if maps.ndim < 3 or maps.shape[-3] != 3:
-        raise ValueError(f"maps: expected [..., 3, H, W], got {tuple(maps.shape)}")
-    _check_span(near, far)
+        raise ValueError(f"maps: expected shape [..., 3, H, W], got {tuple(maps.shape)}")
     light, transparency, depth = maps.unbind(-3)
     share = ((far - depth) / (far - near)).clamp(0.0, 1.0)
     return torch.stack([to_srgb(light), 1.0 - transparency, share * (depth > 0)], -3)
-
-
-def _check_span(near: float, far: float) -> None:
-    if not near < far:
-        raise ValueError(f"near, far: expected near < far, got {near} and {far}")
 
 
 def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March) -> torch.Tensor:
@@ -92,15 +90,16 @@ def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March)
         smoke.
 
     Raises:
-        ValueError: The kind is unknown, or the camera is in perspective.
+        ValueError: The kind is unknown, or the camera is in perspective or too far away for float64.
     """
     near, far = span(volume, camera)
+    if not near < far:
+        raise ValueError(f"camera: expected a near distance below the far one, got {near} and {far}")
     if kind == "paper":
         return encode_guide(guide(volume, camera, march).maps, near, far)
     if kind not in GUIDES:
         raise ValueError(f"kind: expected one of {', '.join(GUIDES)}, got {kind!r}")
     planes = march_planes(volume, camera, march)
-    _check_span(near, far)
     with stream(device_name(volume.device)):
         encoded = torch.empty_like(planes)
         smoke_planes.encode_six(to_warp(planes), near, far, volume.temperature is not None, to_warp(encoded))
@@ -136,10 +135,65 @@ def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera |
         ValueError: The number of planes is wrong.
     """
     if planes.ndim != 3 or planes.shape[0] != len(PLANES):
-        raise ValueError(f"planes: expected [{len(PLANES)}, H, W], got {tuple(planes.shape)}")
+        raise ValueError(f"planes: expected shape [{len(PLANES)}, H, W], got {tuple(planes.shape)}")
     with stream(device_name(planes.device)):
         planes = planes.detach().float().contiguous()
         light = torch.empty_like(planes)
         smoke_planes.decode(to_warp(planes), to_warp(light))
     glow = light[EMISSION_PLANE] if hot else None
     return SixWay(light[: len(DIRECTIONS)], light[OPACITY_PLANE], glow, camera)
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """N samples on one device, each with two successive frames, the earlier first; all floats are half floats.
+
+    Attributes:
+        guides: [N, 2, C, H, W], encoded guiding maps with the C planes of their kind in `GUIDES`.
+        targets: [N, 2, 8, H, W], encoded reference lightmaps, in the order of `PLANES`.
+        motion: [N, 2, H, W], pixels to the right and down by which the smoke in the later frame has moved since the
+            earlier frame.
+        sequence: int [N], number of the simulated sequence that each sample is from; sets share no sequence.
+    """
+
+    guides: torch.Tensor
+    targets: torch.Tensor
+    motion: torch.Tensor
+    sequence: torch.Tensor
+
+    def __post_init__(self) -> None:
+        count, size = len(self.guides), tuple(self.guides.shape[-2:])
+        channels = self.guides.shape[2] if self.guides.ndim == 5 else 0
+        if channels not in map(len, GUIDES.values()):
+            raise ValueError(
+                f"guides: expected shape [N, 2, C, H, W] with C planes of a kind in GUIDES, got {[*self.guides.shape]}"
+            )
+        shapes = {
+            "guides": (count, 2, channels, *size),
+            "targets": (count, 2, len(PLANES), *size),
+            "motion": (count, 2, *size),
+            "sequence": (count,),
+        }
+        for name, shape in shapes.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise ValueError(f"{name}: expected shape {list(shape)}, got {list(getattr(self, name).shape)}")
+
+    def __len__(self) -> int:
+        return len(self.guides)
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the samples."""
+        return self.guides.device
+
+    def covered(self) -> torch.Tensor:
+        """Returns the share of pixels that show smoke, 0 to 1, [N]: of a sample's two frames the smaller share."""
+        return (self.targets[:, :, OPACITY_PLANE] > VISIBLE).float().mean((-2, -1)).amin(1)
+
+    def take(self, which: torch.Tensor) -> Pool:
+        """Returns the samples that an index tensor or a mask [N] selects."""
+        return Pool(*(getattr(self, field.name)[which] for field in fields(self)))
+
+    def to(self, device: str | torch.device) -> Pool:
+        """Returns the same samples on another device."""
+        return Pool(*(getattr(self, field.name).to(device) for field in fields(self)))

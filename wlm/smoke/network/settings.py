@@ -32,7 +32,7 @@ class NetworkSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     width: int = Field(16, ge=8, le=64, multiple_of=8)
-    """Channels of the first level. Each further level has twice the channels at half the resolution."""
+    """Channels of the U-Net's first level. Each further level has twice the channels at half the resolution."""
     levels: int = Field(5, ge=2, le=6)
     """Levels of the U-Net, the lowest included."""
     adapters: bool = True
@@ -81,11 +81,11 @@ class DatasetSettings(BaseModel):
     elevation: float = Field(20.0, ge=0.0, le=89.0)
     """Largest angle of a random view above or below the horizontal, degrees."""
     zoom: _Range = (0.65, 1.2)
-    """Smallest and largest edge of the region that a random view shows."""
+    """Smallest and largest edge of the region that a random view shows, in edges of the box."""
     guide: GuideKind = "paper"
     """Kind of the guiding maps: `paper` or `six`, see `planes.GUIDES`."""
     guide_step: _Positive = 1.0 / 40.0
-    """Step along the rays of a guiding map; the paper's is 10 of 400 voxels."""
+    """Step along the rays of a guiding map, in edges of the box; the paper's is 10 of 400 voxels."""
     guide_spacing: _Positive | None = None
     """Distance between nodes of the lattice that stores optical depths to the lights, for guide `six`; None:
     `guide_step`."""

@@ -12,8 +12,7 @@ import torch.nn.functional as F
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.interop import StepGraph
 from wlm.smoke.network.losses import losses
-from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE
-from wlm.smoke.network.pool import Pool
+from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, VISIBLE, Pool
 from wlm.smoke.network.settings import NetworkSettings, TrainSettings
 from wlm.smoke.network.unet import SixWayNetwork
 

@@ -5,7 +5,7 @@ from wlm._facade import facade
 _PLACES = {
     "LitSmoke": "wlm.smoke.transport.lighting",
     "OrdersModel": "wlm.smoke.transport.orders",
-    "PointLight": "wlm.smoke.transport.lights",
+    "PointLight": "wlm.smoke.shading",
     "ScatteredSmoke": "wlm.smoke.transport.orders",
     "Transport": "wlm.smoke.transport.tracing",
     "bake_sphere": "wlm.smoke.transport.sphere",
@@ -13,7 +13,7 @@ _PLACES = {
     "light_smoke": "wlm.smoke.transport.lighting",
     "load_orders": "wlm.smoke.transport.orders",
     "scatter": "wlm.smoke.transport.orders",
-    "sky_lights": "wlm.smoke.transport.lights",
+    "sky_lights": "wlm.smoke.shading",
     "trace": "wlm.smoke.transport.tracing",
 }
 

@@ -1,9 +1,9 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
+from wlm.smoke.shading import PointLight as PointLight
+from wlm.smoke.shading import sky_lights as sky_lights
 from wlm.smoke.transport.lighting import LitSmoke as LitSmoke
 from wlm.smoke.transport.lighting import fine_march as fine_march
 from wlm.smoke.transport.lighting import light_smoke as light_smoke
-from wlm.smoke.transport.lights import PointLight as PointLight
-from wlm.smoke.transport.lights import sky_lights as sky_lights
 from wlm.smoke.transport.orders import OrdersModel as OrdersModel
 from wlm.smoke.transport.orders import ScatteredSmoke as ScatteredSmoke
 from wlm.smoke.transport.orders import load_orders as load_orders

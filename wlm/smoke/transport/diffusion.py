@@ -15,8 +15,8 @@ import warp as wp
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import to_warp
 from wlm.smoke.march.launch import medium_of
+from wlm.smoke.shading import AnyLight, PointLight, in_voxels
 from wlm.smoke.transport.lighting import Depths, Marching
-from wlm.smoke.transport.lights import AnyLight, PointLight, in_voxels
 from wlm_kernels.smoke import diffusion
 
 CELLS = 32

@@ -17,8 +17,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
-from wlm.smoke.shading import Light, Ramp
-from wlm.smoke.transport.lights import AnyLight, checked_albedo, in_voxels
+from wlm.smoke.shading import AnyLight, Light, Ramp, checked_albedo, glow_of, in_voxels
 from wlm_kernels.smoke import depth_lattice, marches
 from wlm_kernels.smoke.march import Medium, View
 from wlm_kernels.smoke.settings import March
@@ -90,12 +89,7 @@ class LitSmoke:
             colour = light.irradiance if isinstance(light, Light) else light.intensity
             _add(image, plane, np.asarray(colour) / (4 * math.pi))
         if self.emission is not None:
-            glow = self.emission[..., None] if ramp is None else ramp(self.emission)
-            image += glow
-            if self.thrown is not None:
-                # In the mean colour of the visible fire.
-                whole = self.emission.sum().clamp(min=1e-12)
-                image += self.thrown * (1.0 if ramp is None else glow.sum((0, 1)) / whole)
+            image += glow_of(self.emission, ramp, self.thrown)
         if background is None:
             return image
         if isinstance(background, torch.Tensor) or np.ndim(background) > 1:

@@ -7,7 +7,7 @@ Light scattered many times diffuses, except at the smoke's edges, where it leave
 predicted per pixel as a weighted sum of features: light from diffusion, light scattered once from the light and from
 the opposite direction, opacity, and the shares of light and opacity from thin smoke. The weights depend on the angle
 between light and camera and on the smoke's mean optical depth. They were fitted to path-traced light by least squares
-(`learning`) at `ALBEDOS`, and are interpolated linearly in between."""
+(`benchmarks/smoke_learning.py`) at `ALBEDOS`, and are interpolated linearly in between."""
 
 import functools
 import os
@@ -20,14 +20,12 @@ import torch
 
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
-from wlm.formats.atomic import atomic_path
 from wlm.formats.npz import read_npz
 from wlm.interop import device_name, stream, to_warp
 from wlm.smoke.camera import Camera, unit
-from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.shading import AnyLight, Light, PointLight, Ramp, checked_albedo
 from wlm.smoke.transport.diffusion import Spreading, share_of, thrown_by_fire
 from wlm.smoke.transport.lighting import LitSmoke, light_in, light_smoke, marching
-from wlm.smoke.transport.lights import AnyLight, PointLight, checked_albedo
 from wlm_kernels.smoke import orders
 from wlm_kernels.smoke.orders import FEATURES, MIXES, THINNEST
 from wlm_kernels.smoke.settings import March
@@ -67,15 +65,6 @@ class Inputs:
     cosines: tuple[float, ...]
     depth: torch.Tensor
 
-    def features(self, light: int) -> torch.Tensor:
-        """Returns the features of one light for the weighted sum, float32 [A, FEATURES, H, W]."""
-        size = (len(self.albedos), FEATURES, *self.transparency.shape)
-        out = torch.empty(size, device=self.transparency.device)
-        of_light = (part[light] for part in (self.single, self.opposite, self.diffused, self.from_thin))
-        planes = (*of_light, self.transparency, self.thin)
-        orders.features(*map(to_warp, planes), to_warp(out))
-        return out
-
     def by_diffusion(self, albedo: float) -> torch.Tensor:
         """Returns all light, [L, H, W], by diffusion without fitted weights, at an albedo that is one of `albedos`."""
         return albedo * self.single + albedo**2 * self.diffused[:, self.albedos.index(albedo)]
@@ -85,12 +74,6 @@ class Inputs:
         names = ("single", "opposite", "diffused", "from_thin")
         planes = {name: getattr(self, name)[light : light + 1] for name in names}
         return replace(self, **planes, cosines=self.cosines[light : light + 1])
-
-    def at(self, albedo: float) -> "Inputs":
-        """Returns the inputs at `albedo` alone, which must be one of `albedos`."""
-        n = self.albedos.index(albedo)
-        planes = {name: getattr(self, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
-        return replace(self, **planes, albedos=(albedo,))
 
 
 def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
@@ -213,17 +196,6 @@ class OrdersModel:
             orders.light(*map(to_warp, (*planes, *learned)), *settings)
         return out
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the model as `.npz`, atomically.
-
-        Raises:
-            WlmError: The suffix is wrong, or the file cannot be written.
-        """
-        if Path(path).suffix.lower() != ".npz":
-            raise WlmError(f"{path}: expected a file name that ends in .npz")
-        with atomic_path(path) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, weights=self.weights.cpu().numpy(), range=self.known.cpu().numpy())
-
 
 def _between(albedo: float) -> tuple[int, float]:
     """Returns the index of the last of `ALBEDOS` below an albedo, and the share of the way to the next, 0 to 1."""
@@ -233,7 +205,7 @@ def _between(albedo: float) -> tuple[int, float]:
 
 
 def load_orders(path: str | os.PathLike[str] | None = None) -> OrdersModel:
-    """Reads the weights that `OrdersModel.save` wrote.
+    """Reads the fitted weights.
 
     Args:
         path: The file; None: the weights that ship with wlm.

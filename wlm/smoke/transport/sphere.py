@@ -11,9 +11,8 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, stream
 from wlm.smoke.camera import Camera, weights
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.shading import Light
+from wlm.smoke.shading import Light, half_sphere
 from wlm.smoke.transport.lighting import light_smoke
-from wlm.smoke.transport.lights import half_sphere
 from wlm.smoke.transport.orders import orders_march, scatter
 from wlm_kernels.smoke.settings import March
 

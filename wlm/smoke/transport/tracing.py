@@ -16,7 +16,7 @@ from wlm.fluid.volume import DensityVolume
 from wlm.interop import device_name, free_memory, stream, to_warp
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
-from wlm.smoke.transport.lights import AnyLight, checked_albedo, checked_colour, in_voxels
+from wlm.smoke.shading import AnyLight, checked_albedo, checked_colour, in_voxels
 from wlm.system import Meter, OnProgress
 from wlm_kernels.smoke import path
 from wlm_kernels.smoke.march import View
@@ -110,7 +110,7 @@ def trace(
         WlmError: The smoke is too dense, or the planes do not fit into the memory.
     """
     if not -1 < g < 1:
-        raise ValueError(f"g: expected a number between -1 and 1, got {g}")
+        raise ValueError(f"g: expected a mean cosine above -1 and below 1, got {g}")
     for name, value, least in (
         ("samples", samples, 1),
         ("orders", orders, 0),
@@ -192,7 +192,10 @@ def _mesh(obstacles: tuple[np.ndarray, np.ndarray], volume: DensityVolume, devic
     if corners.ndim != 2 or corners.shape[1] != 3 or not np.isfinite(corners).all():
         raise ValueError(f"obstacles: expected corners [V, 3] of finite numbers, got shape {corners.shape}")
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.min() < 0 or triangles.max() >= len(corners):
-        raise ValueError(f"obstacles: expected triangles [F, 3], indices below {len(corners)}, got {triangles.shape}")
+        raise ValueError(
+            f"obstacles: expected triangles [F, 3] of indices from 0 to {len(corners) - 1}, got {triangles.shape} "
+            f"with {triangles.min()} to {triangles.max()}"
+        )
     points = (corners - np.asarray(volume.origin)) / volume.voxel
     return wp.Mesh(
         wp.array(points.astype(np.float32), dtype=wp.vec3, device=device),

@@ -1,23 +1,28 @@
-"""Fits the weights of `transport.orders` to path-traced light of random smoke, cameras and lights, by least squares.
+"""Fits the weights of `wlm.smoke.transport.orders` to path-traced light of random smoke, cameras and lights.
 
-The traced light may be noisy as long as it has no bias: least squares fits its mean."""
+The traced light may be noisy as long as it has no bias: least squares fits its mean.
+"""
 
-import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+import warp as wp
 
-from wlm.fluid.volume import DensityVolume
-from wlm.interop import device_name, stream
+from wlm.fluid.volume import DensityVolume, from_array
+from wlm.formats.atomic import atomic_path
+from wlm.interop import device_name, stream, to_warp
+from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import Camera
 from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.shading import Light
-from wlm.smoke.synthetic import make_billows, make_plume
+from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, make_inputs, orders_march
 from wlm.smoke.transport.tracing import trace
+from wlm_kernels.smoke import orders
 from wlm_kernels.smoke.orders import FEATURES, MIXES
 
 _ORDERS = 40
@@ -30,10 +35,46 @@ _SMALL, _HAZY = 0.4, 0.4  # probabilities of smoke that fills a part of its box,
 _RIDGE = 1e-5
 _RARE, _NARROWEST = 0.02, 0.1  # share of depths at either end outside the range, and the least range
 _CLEAR = 1e-3  # opacity below which pixels are ignored
+_OCTAVES = range(1, 6)
+_SHAPES = ("ball", "column", "shell", "fog")
 _CURVE = 1.16  # exponent of the light in the weight, from the slope of sRGB's curve
 
 FAINT = 0.03
 """Light below which errors have the same weight."""
+
+
+def make_billows(n: int = 48, *, seed: int = 1, extinction: float = 1.0, device: str = "cpu") -> DensityVolume:
+    """Makes smoke in the shape of a ball, column, shell or fog, rotated and stretched, with edges perturbed by noise.
+
+    Args:
+        n, extinction, device: As for `make_plume`.
+        seed: Seed of the shape, its softness, and the noise.
+
+    Raises:
+        WlmError: The device does not exist.
+    """
+    random = np.random.default_rng(seed)
+    shape = _SHAPES[int(random.integers(len(_SHAPES)))]
+    roughness, wisps = random.uniform(0.35, 0.75), random.uniform(0.0, 0.6)
+    sharpness = float(np.exp(random.uniform(np.log(0.7), np.log(8.0))))
+    noise = torch.zeros(1, 1, n, n, n)
+    for octave in _OCTAVES:
+        k = min(2**octave + 1, n)
+        coarse = torch.from_numpy(random.standard_normal((1, 1, k, k, k), np.float32))
+        noise += roughness**octave * F.interpolate(coarse, (n, n, n), mode="trilinear", align_corners=k > 1)
+    noise /= noise.std(correction=0).clamp(min=1e-6)
+    turn, _ = np.linalg.qr(random.standard_normal((3, 3)))
+    radii = random.uniform(0.2, 0.5, 3)
+    axis = (np.arange(n) + 0.5) / n
+    place = np.stack(np.meshgrid(axis, axis, axis, indexing="ij")) - random.uniform(0.4, 0.6, (3, 1, 1, 1))
+    along = np.einsum("ij,jxyz->ixyz", turn, place) / radii[:, None, None, None]
+    across = np.sqrt((along[:2] ** 2).sum(0))
+    away = np.sqrt(across**2 + along[2] ** 2)
+    distance = {"ball": away, "column": across, "shell": 2.5 * np.abs(away - 0.7), "fog": np.full_like(away, 0.5)}[
+        shape
+    ]
+    density = np.clip(sharpness * (1.0 - distance + wisps * noise[0, 0].numpy()), 0.0, 1.0).astype(np.float32)
+    return from_array(density, extinction=extinction, voxel=1.0 / n, device=device)
 
 
 def draw_view(
@@ -148,14 +189,14 @@ def fit_orders(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) 
     right = torch.zeros(len(ALBEDOS), MIXES, FEATURES, dtype=torch.float64, device=device)
     random = torch.Generator().manual_seed(seed)
     for lesson in lessons:
-        features = lesson.inputs.features(0).flatten(2).double()
-        chosen = torch.randperm(features.shape[2], generator=random)[:pixels].to(device)
-        features = features[..., chosen]
+        x = features(lesson.inputs, 0).flatten(2).double()
+        chosen = torch.randperm(x.shape[2], generator=random)[:pixels].to(device)
+        x = x[..., chosen]
         target, weights = (part.flatten(1)[:, chosen].double() for part in (lesson.multiple(), lesson.weights()))
         # All pixels of a lesson have the same polynomial terms, so that the normal matrix is a product.
         mix = model.mixes(lesson.inputs)[0].double()
-        weighed = features * weights[:, None]
-        squares = weighed @ features.transpose(1, 2)
+        weighed = x * weights[:, None]
+        squares = weighed @ x.transpose(1, 2)
         left += (mix[:, None] * mix)[None, :, None, :, None] * squares[:, None, :, None, :]
         right += mix[None, :, None] * (weighed @ target[..., None])[:, None, :, 0]
     left, right = left.reshape(len(ALBEDOS), size, size), right.reshape(len(ALBEDOS), size)
@@ -190,7 +231,51 @@ def learn(
     return fit_orders(lessons)
 
 
+@wp.kernel(enable_backward=False)
+def _features(
+    # in:
+    single: wp.array2d[float],
+    opposite: wp.array2d[float],
+    diffused: wp.array3d[float],
+    from_thin: wp.array3d[float],
+    transparency: wp.array2d[float],
+    thin: wp.array2d[float],
+    # out:
+    out: wp.array4d[float],
+):
+    a, i, j = wp.tid()
+    d, e = diffused[a, i, j], from_thin[a, i, j]
+    x = orders.features(single[i, j], opposite[i, j], d, e, transparency[i, j], thin[i, j])
+    for n in range(FEATURES):
+        out[a, n, i, j] = x[n]
+
+
+def features(inputs: Inputs, light: int) -> torch.Tensor:
+    """Returns the features of one light for the weighted sum, float32 [A, FEATURES, H, W]."""
+    out = torch.empty((len(inputs.albedos), FEATURES, *inputs.thin.shape), device=inputs.thin.device)
+    of_light = (part[light] for part in (inputs.single, inputs.opposite, inputs.diffused, inputs.from_thin))
+    planes = [to_warp(plane) for plane in (*of_light, inputs.transparency, inputs.thin)]
+    wp.launch(_features, (len(out), *inputs.thin.shape), planes, [to_warp(out)], device=planes[0].device)
+    return out
+
+
+def at(inputs: Inputs, albedo: float) -> Inputs:
+    """Returns the inputs at one of their albedos alone."""
+    n = inputs.albedos.index(albedo)
+    planes = {name: getattr(inputs, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
+    return replace(inputs, **planes, albedos=(albedo,))
+
+
+def save_orders(model: OrdersModel, path: str | os.PathLike[str]) -> None:
+    """Writes weights as `.npz` for `load_orders`, atomically.
+
+    Raises:
+        WlmError: The file cannot be written.
+    """
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, weights=model.weights.cpu().numpy(), range=model.known.cpu().numpy())
+
+
 def psnr(light: torch.Tensor, reference: torch.Tensor) -> float:
     """Returns the PSNR in dB of two linear images, computed in sRGB with a peak of 1."""
-    error = (to_srgb(light) - to_srgb(reference)).double().square().mean()
-    return -10.0 * math.log10(max(float(error), 1e-12))
+    return psnr_from_mse(float((to_srgb(light) - to_srgb(reference)).double().square().mean()), 1.0)
