@@ -28,14 +28,12 @@ _TRIED = wp.constant(2)  # number of partitions tried that are encoded
 _LEAST_WEIGHT = wp.constant(1.0e-4)  # fraction of the largest texel weight
 _HUGE = wp.constant(3.4e38)
 
+_Colours = wp.types.matrix(shape=(16, 3), dtype=float)
+_Indices = wp.types.vector(length=16, dtype=int)
+_Codes = wp.types.matrix(shape=(4, 3), dtype=int)
 _Numbers = wp.types.vector(length=16, dtype=float)
 _Ends = wp.types.matrix(shape=(4, 3), dtype=float)
 _Moments = wp.types.vector(length=10, dtype=float)
-
-
-Colours = wp.types.matrix(shape=(16, 3), dtype=float)
-_Indices = wp.types.vector(length=16, dtype=int)
-_Codes = wp.types.matrix(shape=(4, 3), dtype=int)
 
 
 @wp.struct
@@ -58,7 +56,7 @@ class Tables:
 
 
 @wp.struct
-class Block:
+class _Block:
     """A block that is encoded in one mode.
 
     Attributes:
@@ -74,7 +72,7 @@ class Block:
     partition: int
     code: _Codes
     index: _Indices
-    light: Colours
+    light: _Colours
 
 
 @wp.struct
@@ -90,10 +88,10 @@ class _Texels:
         metric: Scale of each channel's distance from the mean: the square root of the mean of `pull`.
     """
 
-    light: Colours
+    light: _Colours
     weight: _Numbers
-    place: Colours
-    pull: Colours
+    place: _Colours
+    pull: _Colours
     middle: wp.vec3
     metric: wp.vec3
 
@@ -326,9 +324,9 @@ def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> i
 
 
 @wp.func
-def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> Block:
+def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> _Block:
     """Encodes a block in a mode: rounds the ends and chooses the index with the least error for each texel."""
-    block = Block()
+    block = _Block()
     block.mode = mode
     block.partition = partition
     bits = tables.modes[mode, 3]
@@ -341,7 +339,7 @@ def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition:
         mask = tables.masks[partition]
         anchor = tables.anchors[partition]
         steps = 7
-    palette = Colours()
+    palette = _Colours()
     for line in range(lines):
         for c in range(3):
             block.code[2 * line, c] = _coded(ends[2 * line][c], bits)
@@ -388,7 +386,7 @@ def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
 
 
 @wp.func
-def _refitted(texels: _Texels, block: Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
+def _refitted(texels: _Texels, block: _Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
     """Refits the ends of a line by least squares to the indices of its texels."""
     sums = _Sums()
     for i in range(_TEXELS):
@@ -453,7 +451,7 @@ def _split(texels: _Texels, tables: Tables, whole: _Moments, tried: int) -> wp.v
 
 
 @wp.func
-def _write(number: int, block: Block, tables: Tables, blocks: wp.array2d[wp.uint32]):
+def _write_block(number: int, block: _Block, tables: Tables, blocks: wp.array2d[wp.uint32]):
     """Packs a block into 128 bits and writes them to row `number` of `blocks`."""
     mode = block.mode
     word = wp.vec4ui()
@@ -511,7 +509,7 @@ def _encode(
     whole = _moments(texels, _ALL)
     # An index of four bits leaves 1/225 of the scatter along a line.
     alone = _spread(whole) - _axis_of(whole, _AXIS_ROUNDS)[3] * (224.0 / 225.0)
-    best = Block()
+    best = _Block()
     best.error = _HUGE
     tried = int(0)  # one bit per partition
     for attempt in range(1 + _TRIED):  # one line, then two
@@ -537,7 +535,7 @@ def _encode(
         if promising:
             second = _moments(texels, mask)
             ends = _Ends()
-            block = Block()
+            block = _Block()
             for round in range(1 + _REFITTED):
                 for line in range(lines):
                     own = _ALL ^ mask
@@ -560,7 +558,7 @@ def _encode(
                     block = best
     for i in range(_TEXELS):
         decoded[number, i] = best.light[i]
-    _write(number, best, tables, blocks)
+    _write_block(number, best, tables, blocks)
 
 
 def encode(light, weight, tables: Tables, blocks, decoded) -> None:
