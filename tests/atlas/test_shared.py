@@ -137,6 +137,7 @@ def test_mips(scene, model, device):
 def test_mips_of_one_lightmap_are_shared_tiles():
     model = compress(sheet(), views=1, budget=0.4, mips=True, tile=5)
     assert model.method == "shared" and len(model.levels) == 4 and model.compression_ratio >= 0.6
+    assert model.profile.budget == 0.4 and Profile.load("standard").checked(2)[0].budget == 0.05
     for settings, words in (
         ({"method": "cascade", "colour": "rgb9e5"}, "method: expected tiles"),
         ({"colour": "astc"}, "colour: expected"),

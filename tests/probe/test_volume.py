@@ -572,10 +572,9 @@ def test_no_probe_and_coincident_ones():
 
 
 def test_index_refuses():
-    good = np.zeros((2, 3))
-    for position, side in [(np.zeros(3), 1), (np.array([[0, np.nan, 0]]), 1), (np.full((1, 3), 1e101), 1), (good, 0)]:
-        with pytest.raises(ValueError, match="position|side"):
-            BlockIndex(position, side, (1,))
+    for position in (np.array([[0, np.nan, 0]]), np.full((1, 3), 1e101)):
+        with pytest.raises(ValueError, match="position: expected numbers"):
+            BlockIndex(position, 1.0, (1,))
 
 
 def test_side_follows_the_spacing():

@@ -134,7 +134,9 @@ def _unpack_primitives(
         start = view.get("byteOffset", 0)
         pieces.append(buffers[view["buffer"]][start : start + view["byteLength"]])
         if sum(map(len, pieces)) > held:
-            raise WlmError(f"{path}: {where}: expected meshes in bytes of their own, found the same ones again")
+            raise WlmError(
+                f"{path}: {where}: expected compressed data of its own, found data that other primitives name too"
+            )
     sizes = json.dumps([len(each) for each in pieces]).encode()
     with damaged(f"{path}: {DRACO}: damaged", ValueError):
         arrays = run_child(draco_child, b"\n".join((sizes, b"".join(pieces))), str(max(SURE_BYTES, GROWTH * held)))

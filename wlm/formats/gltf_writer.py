@@ -234,16 +234,20 @@ class _Tree:
 def _check(new: Replacement, uv_set: int) -> None:
     where = new.primitive.name
     if uv_set < 0 or uv_set in new.primitive.uv:
-        raise ValueError(f"uv_set: expected a UV set that {where} does not have, got {uv_set}")
+        raise ValueError(f"uv_set: expected 0 or more, a UV set that {where} does not have, got {uv_set}")
     count = len(new.gather)
     if new.uv.shape != (count, 2) or new.triangle.ndim != 2 or new.triangle.shape[1] != 3 or not len(new.triangle):
-        raise ValueError(f"{where}: expected uv [{count}, 2] and triangles, got {new.uv.shape}, {new.triangle.shape}")
+        raise ValueError(
+            f"{where}: expected uv [{count}, 2] and triangle [F, 3], F >= 1, got {new.uv.shape}, {new.triangle.shape}"
+        )
     for field, numbers, limit in (
         ("gather", new.gather, len(new.primitive.row)),
         ("triangle", new.triangle, count),
     ):
         if numbers.min() < 0 or numbers.max() >= limit:
-            raise ValueError(f"{where}: {field}: expected 0 to {limit - 1}, got {numbers.min()} to {numbers.max()}")
+            raise ValueError(
+                f"{where}: {field}: expected vertex numbers 0 to {limit - 1}, got {numbers.min()} to {numbers.max()}"
+            )
 
 
 def _accessor_slots(content: dict) -> Iterator[tuple[dict, str]]:

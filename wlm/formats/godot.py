@@ -116,10 +116,10 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
             reader.expect(name, _ARRAY, "an array")
             count = reader.u32() & 0x7FFFFFFF
             if count % 4:
-                raise WlmError(f"{path}: {name}: expected four values for each user, found {count}")
+                raise WlmError(f"{path}: {name}: expected four values for each mesh, found {count} in all")
             users += [reader.user(names) for _ in range(count // 4)]
         elif name == _DIRECTIONAL:
-            reader.expect(name, _BOOL, "a yes or no")
+            reader.expect(name, _BOOL, "a boolean")
             directional = reader.u32() != 0
         else:
             reader.skip()
@@ -180,7 +180,9 @@ def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray, _Reader
             else:
                 reader.skip()
     if points is None or colours is None or len(points) == 0:
-        raise WlmError(f"{path}: {_PROPERTY} has no probes: bake with LightmapProbe nodes or with generated probes")
+        raise WlmError(
+            f"{path}: {_PROPERTY} has no probes: bake with LightmapProbe nodes, or let Godot generate probes"
+        )
     if len(colours) != COEFFICIENTS * len(points):
         raise WlmError(
             f"{path}: {_PROPERTY}.sh: expected {COEFFICIENTS} colours for each of {len(points)} points, "

@@ -170,6 +170,8 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
     if coefficients is not None:
         band = np.repeat(coefficient_bands(coefficients), 3)
         by_band = [psnr_from_mse(by_coefficient[band == i].mean(), peak) for i in range(band[-1] + 1)]
+    worst = int(np.argmax(by_probe))
+    found = {"probe": worst, "psnr": psnr_from_mse(by_probe[worst], peak), "position": probes.position[worst].tolist()}
     return Report(
         name=probes.name,
         probes=count,
@@ -183,17 +185,10 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         psnr_live=psnr_from_mse(by_probe[live].mean(), peak) if live.any() else math.nan,
         mse=mse,
         max_abs_error=largest,
-        worst_probe=_worst(by_probe, probes.position, peak),
+        worst_probe=found if by_probe[worst] else None,
         psnr_by_band=by_band,
         irradiance_psnr=None if coefficients is None else _irradiance_psnr(decoded[live], values[live], coefficients),
     )
-
-
-def _worst(by_probe: np.ndarray, position: np.ndarray, peak: float) -> dict[str, Any] | None:
-    worst = int(np.argmax(by_probe))
-    if by_probe[worst] == 0.0:
-        return None
-    return {"probe": worst, "psnr": psnr_from_mse(by_probe[worst], peak), "position": position[worst].tolist()}
 
 
 def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int) -> float:

@@ -12,6 +12,16 @@ layout(std430, binding = WLM_{PART}_{NAME}_BINDING) readonly buffer Wlm{Part}{Na
 #define WLM_{PART}_{NAME}(i) wlm_{part}_{name}[i]
 #endif
 """
+_SH = """
+// Spherical harmonics of the light: {coefficients} coefficients, RGB.
+void {name}({arguments}, out vec3 sh[{coefficients}])
+{{
+    float values[WLM_PROBE_OUTPUTS];
+    {call};
+    for (int c = 0; c < {coefficients}; ++c)
+        sh[c] = vec3(values[3 * c], values[3 * c + 1], values[3 * c + 2]);
+}}
+"""
 
 
 def buffer_glsl(part: str, name: str, number: int, kind: str = "uint") -> str:
@@ -25,3 +35,15 @@ def buffer_glsl(part: str, name: str, number: int, kind: str = "uint") -> str:
     part, name = part.lower(), name.lower()
     words = {"part": part, "name": name, "Part": part.title(), "Name": name.title()}
     return _BUFFER.format(number=number, kind=kind, PART=part.upper(), NAME=name.upper(), **words)
+
+
+def sh_glsl(name: str, arguments: str, call: str, coefficients: int) -> str:
+    """Returns a GLSL function that gives the numbers of a probe as spherical harmonics in RGB.
+
+    Args:
+        name: Name of the function.
+        arguments: Its parameters before the output `sh`, an array of vec3.
+        call: Function call that writes the array of numbers, `values`.
+        coefficients: Number of coefficients.
+    """
+    return _SH.format(name=name, arguments=arguments, call=call, coefficients=coefficients)

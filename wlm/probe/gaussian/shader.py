@@ -1,7 +1,7 @@
 """Generates the GLSL that decodes Gaussians from the buffers of `wlm.probe.gaussian.bundle`."""
 
 from wlm.probe.gaussian.model import LATENT, Gaussians
-from wlm.probe.glsl import buffer_glsl
+from wlm.probe.glsl import buffer_glsl, sh_glsl
 from wlm.probe.sphere import sh_count
 
 HEAD_WORDS = 10  # words of the buffer `gaussians` before the bounds: see _TEMPLATE
@@ -185,28 +185,6 @@ void wlm_probe_values_listed(vec3 x, int first, int count, out float values[WLM_
 #endif
 """
 
-_SH = """
-// Spherical harmonics of the light at a position of the scene: {coefficients} coefficients, RGB.
-void wlm_probe_sh(vec3 position, out vec3 sh[{coefficients}])
-{{
-    float values[WLM_PROBE_OUTPUTS];
-    wlm_probe_values(wlm_probe_place(position), values);
-    for (int c = 0; c < {coefficients}; ++c)
-        sh[c] = vec3(values[3 * c], values[3 * c + 1], values[3 * c + 2]);
-}}
-"""
-_SH_LISTED = """
-#ifdef WLM_PROBE_LIST
-void wlm_probe_sh_listed(vec3 position, int first, int count, out vec3 sh[{coefficients}])
-{{
-    float values[WLM_PROBE_OUTPUTS];
-    wlm_probe_values_listed(wlm_probe_place(position), first, count, values);
-    for (int c = 0; c < {coefficients}; ++c)
-        sh[c] = vec3(values[3 * c], values[3 * c + 1], values[3 * c + 2]);
-}}
-#endif
-"""
-
 _LONGEST = """
     float longest = max(s.x, max(s.y, s.z));"""
 
@@ -242,4 +220,9 @@ def probe_glsl(content: Gaussians) -> str:
         reached=_REACHED[content.support],
     )
     coefficients = sh_count(content.outputs)
-    return text if coefficients is None else text + (_SH + _SH_LISTED).format(coefficients=coefficients)
+    if coefficients is None:
+        return text
+    x = "wlm_probe_place(position)"
+    text += sh_glsl("wlm_probe_sh", "vec3 position", f"wlm_probe_values({x}, values)", coefficients)
+    call, arguments = f"wlm_probe_values_listed({x}, first, count, values)", "vec3 position, int first, int count"
+    return text + f"\n#ifdef WLM_PROBE_LIST{sh_glsl('wlm_probe_sh_listed', arguments, call, coefficients)}#endif\n"

@@ -4,7 +4,7 @@ import numpy as np
 
 from wlm.bundle import Bundle
 from wlm.probe.decode import Decoder
-from wlm.probe.glsl import buffer_glsl
+from wlm.probe.glsl import buffer_glsl, sh_glsl
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import sh_count
 
@@ -75,17 +75,6 @@ _UNIT = """\
         values[d] = magnitude * wlm_probe_number(probe, 1 + d);
 """
 
-_SH = """
-// Spherical harmonics of a live probe: {coefficients} coefficients, RGB.
-void wlm_probe_sh(int probe, out vec3 sh[{coefficients}])
-{{
-    float values[WLM_PROBE_OUTPUTS];
-    wlm_probe_values(probe, values);
-    for (int c = 0; c < {coefficients}; ++c)
-        sh[c] = vec3(values[3 * c], values[3 * c + 1], values[3 * c + 2]);
-}}
-"""
-
 
 def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     """Returns the shader, buffers and examples for a model of principal components; `decoder` decodes the examples."""
@@ -135,4 +124,6 @@ def component_glsl(count: int, outputs: int, basis: bool) -> str:
         **layout,
     )
     coefficients = sh_count(outputs)
-    return text if coefficients is None else text + _SH.format(coefficients=coefficients)
+    if coefficients is None:
+        return text
+    return text + sh_glsl("wlm_probe_sh", "int probe", "wlm_probe_values(probe, values)", coefficients)

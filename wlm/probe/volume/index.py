@@ -50,21 +50,16 @@ class BlockIndex:
 
         Args:
             position: [N, 3], in any unit; N may be 0.
-            side: Side of a block of the finest level. It is doubled until the keys hold all cells and float64
+            side: Side of a block of the finest level, positive. It is doubled until the keys hold all cells and float64
                 separates neighbouring cells.
             ratios: Side of each level divided by the finest side: rising powers of two from 1.
 
         Raises:
-            ValueError: The shape is different, a position is NaN or above 1e100, or the side is not a positive
-                finite number.
+            ValueError: A position is NaN or above 1e100.
         """
         position = np.asarray(position, np.float64)
-        if position.ndim != 2 or position.shape[1] != 3:
-            raise ValueError(f"position: expected [N, 3], got {position.shape}")
         if not (np.abs(position) <= _FARTHEST).all():
             raise ValueError(f"position: expected numbers of at most {_FARTHEST:g}, got NaN or a larger number")
-        if not 0.0 < side < np.inf:
-            raise ValueError(f"side: expected a positive number, got {side}")
         self.count = len(position)
         self.ratios = tuple(ratios)
         widest = 2 * self.ratios[-1]  # cells along a side of the coarsest block
