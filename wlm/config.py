@@ -132,45 +132,35 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         event = self.peek_event()
         if self._depth > _DEEPEST:
-            raise yaml.composer.ComposerError(
-                None, None, f"expected values at most {_DEEPEST} deep in others", event.start_mark
-            )
+            raise _refused(f"expected values at most {_DEEPEST} deep in others", event.start_mark)
         if getattr(event, "anchor", None) is not None:
-            raise yaml.composer.ComposerError(
-                None, None, f"expected a value, found the anchor or alias '{event.anchor}'", event.start_mark
-            )
+            raise _refused(f"expected a value, found the anchor or alias '{event.anchor}'", event.start_mark)
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
 
-    def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        for key, _ in node.value:
-            if key.tag == _MERGE:
-                raise yaml.constructor.ConstructorError(
-                    None, None, "expected keys of settings, found '<<'", key.start_mark
-                )
-        super().flatten_mapping(node)
-
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
         # The length is checked first, because the value of a million digits takes long to compute.
         value = super().construct_yaml_int(node) if len(node.value) <= _INTEGER_LENGTH else INTEGER
         if not -INTEGER < value < INTEGER:
-            raise yaml.constructor.ConstructorError(
-                None, None, "expected an integer within 64 bits, found a larger one", node.start_mark
-            )
+            raise _refused("expected an integer within 64 bits, found a larger one", node.start_mark)
         return value
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = set()
-        for key_node, _ in node.value:
-            if isinstance(key_node, yaml.ScalarNode):
-                if key_node.value in keys:
-                    raise yaml.constructor.ConstructorError(
-                        None, None, f"the key '{key_node.value}' is given twice", key_node.start_mark
-                    )
-                keys.add(key_node.value)
+        for key, _ in node.value:
+            if key.tag == _MERGE:
+                raise _refused("expected keys of settings, found '<<'", key.start_mark)
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in keys:
+                    raise _refused(f"the key '{key.value}' is given twice", key.start_mark)
+                keys.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+def _refused(problem: str, mark: yaml.Mark) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
 
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)

@@ -602,7 +602,7 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
         flip_by_time=nanmean(flip, axis=(1, 2)),
         worst_psnr=math.nan if worst_tile is None else float(psnr[worst_tile]),
         worst_tile=worst_tile,
-        max_abs_error=_nanmax(errors),
+        max_abs_error=math.nan if np.isnan(errors).all() else float(np.nanmax(errors)),
         tiles=scored.size,
         scored=int(scored.sum()),
         few_texels=int((~enough).sum()),
@@ -617,8 +617,3 @@ def nanmean(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np
     count = valid.sum(axis=axis)
     total = np.where(valid, values, 0.0).sum(axis=axis)
     return np.where(count > 0, total / np.maximum(count, 1), math.nan)
-
-
-def _nanmax(values: np.ndarray) -> float:
-    valid = values[~np.isnan(values)]
-    return float(valid.max()) if valid.size else math.nan

@@ -12,8 +12,6 @@ The tables are those of `wlm.formats.bc6h`, whose decoder is the reference.
 
 import warp as wp
 
-from wlm_kernels.bc6h_block import Block, Colours, Tables, write_block
-
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 _TEXELS = wp.constant(16)
@@ -30,9 +28,51 @@ _TRIED = wp.constant(2)  # number of partitions tried that are encoded
 _LEAST_WEIGHT = wp.constant(1.0e-4)  # fraction of the largest texel weight
 _HUGE = wp.constant(3.4e38)
 
+_Colours = wp.types.matrix(shape=(16, 3), dtype=float)
+_Indices = wp.types.vector(length=16, dtype=int)
+_Codes = wp.types.matrix(shape=(4, 3), dtype=int)
 _Numbers = wp.types.vector(length=16, dtype=float)
 _Ends = wp.types.matrix(shape=(4, 3), dtype=float)
 _Moments = wp.types.vector(length=10, dtype=float)
+
+
+@wp.struct
+class Tables:
+    """The tables of the format, described in `wlm.formats.bc6h`.
+
+    Attributes:
+        modes: int [14, 7], bit counts of each mode: `MODES`.
+        layout: int [14, 82], meaning of each bit in each mode: `LAYOUT`.
+        masks: int [32], texels on the second line of each partition: `MASKS`.
+        anchors: int [32], anchor texel of the second line of each partition: `SECOND_ANCHORS`.
+        halves: float [31,744], the value of each half float by its bit pattern.
+    """
+
+    modes: wp.array2d[int]
+    layout: wp.array2d[int]
+    masks: wp.array1d[int]
+    anchors: wp.array1d[int]
+    halves: wp.array1d[float]
+
+
+@wp.struct
+class _Block:
+    """A block that is encoded in one mode.
+
+    Attributes:
+        error: Weighted squared error of its texels.
+        mode, partition: Rows of the mode and of the partition in `Tables.modes` and `Tables.masks`.
+        code: The endpoints w, x, y and z in the mode's number of bits, before differences to w are taken.
+        index: Index of each texel.
+        light: Decoded light of each texel.
+    """
+
+    error: float
+    mode: int
+    partition: int
+    code: _Codes
+    index: _Indices
+    light: _Colours
 
 
 @wp.struct
@@ -48,10 +88,10 @@ class _Texels:
         metric: Scale of each channel's distance from the mean: the square root of the mean of `pull`.
     """
 
-    light: Colours
+    light: _Colours
     weight: _Numbers
-    place: Colours
-    pull: Colours
+    place: _Colours
+    pull: _Colours
     middle: wp.vec3
     metric: wp.vec3
 
@@ -284,9 +324,9 @@ def _finest(tables: Tables, ends: _Ends, first: int, last: int, count: int) -> i
 
 
 @wp.func
-def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> Block:
+def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition: int) -> _Block:
     """Encodes a block in a mode: rounds the ends and chooses the index with the least error for each texel."""
-    block = Block()
+    block = _Block()
     block.mode = mode
     block.partition = partition
     bits = tables.modes[mode, 3]
@@ -299,7 +339,7 @@ def _encoded(texels: _Texels, tables: Tables, ends: _Ends, mode: int, partition:
         mask = tables.masks[partition]
         anchor = tables.anchors[partition]
         steps = 7
-    palette = Colours()
+    palette = _Colours()
     for line in range(lines):
         for c in range(3):
             block.code[2 * line, c] = _coded(ends[2 * line][c], bits)
@@ -346,7 +386,7 @@ def _turned(texels: _Texels, ends: _Ends, line: int, anchor: int) -> _Ends:
 
 
 @wp.func
-def _refitted(texels: _Texels, block: Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
+def _refitted(texels: _Texels, block: _Block, mask: int, ends: _Ends, line: int, steps: int) -> _Ends:
     """Refits the ends of a line by least squares to the indices of its texels."""
     sums = _Sums()
     for i in range(_TEXELS):
@@ -410,6 +450,45 @@ def _split(texels: _Texels, tables: Tables, whole: _Moments, tried: int) -> wp.v
     return wp.vec2(float(partition), least)
 
 
+@wp.func
+def _write_block(number: int, block: _Block, tables: Tables, blocks: wp.array2d[wp.uint32]):
+    """Packs a block into 128 bits and writes them to row `number` of `blocks`."""
+    mode = block.mode
+    word = wp.vec4ui()
+    word[0] = wp.uint32(tables.modes[mode, 0])
+    begin = tables.modes[mode, 1]
+    for place in range(begin, 82):
+        code = tables.layout[mode, place]
+        if code >= 0:
+            field = code >> 4
+            value = block.partition
+            if field < 12:
+                channel, end = field >> 2, field & 3
+                value = block.code[end, channel]
+                if end > 0 and tables.modes[mode, 2] == 1:
+                    value = value - block.code[0, channel]
+            bit = wp.uint32((value >> (code & 15)) & 1)
+            word[place >> 5] = word[place >> 5] | (bit << wp.uint32(place & 31))
+    anchor = int(0)
+    width = int(4)
+    if mode < 10:
+        anchor = tables.anchors[block.partition]
+        width = 3
+    place = int(65)
+    if mode < 10:
+        place = 82
+    for i in range(_TEXELS):
+        own = width
+        if i == 0 or i == anchor:
+            own = width - 1
+        for b in range(own):
+            bit = wp.uint32((block.index[i] >> b) & 1)
+            word[place >> 5] = word[place >> 5] | (bit << wp.uint32(place & 31))
+            place += 1
+    for k in range(4):
+        blocks[number, k] = word[k]
+
+
 @wp.kernel
 def _encode(
     # in:
@@ -430,7 +509,7 @@ def _encode(
     whole = _moments(texels, _ALL)
     # An index of four bits leaves 1/225 of the scatter along a line.
     alone = _spread(whole) - _axis_of(whole, _AXIS_ROUNDS)[3] * (224.0 / 225.0)
-    best = Block()
+    best = _Block()
     best.error = _HUGE
     tried = int(0)  # one bit per partition
     for attempt in range(1 + _TRIED):  # one line, then two
@@ -456,7 +535,7 @@ def _encode(
         if promising:
             second = _moments(texels, mask)
             ends = _Ends()
-            block = Block()
+            block = _Block()
             for round in range(1 + _REFITTED):
                 for line in range(lines):
                     own = _ALL ^ mask
@@ -479,7 +558,7 @@ def _encode(
                     block = best
     for i in range(_TEXELS):
         decoded[number, i] = best.light[i]
-    write_block(number, best, tables, blocks)
+    _write_block(number, best, tables, blocks)
 
 
 def encode(light, weight, tables: Tables, blocks, decoded) -> None:

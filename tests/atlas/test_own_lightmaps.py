@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+from contextlib import contextmanager
 
 import imagecodecs
 import numpy as np
@@ -43,6 +44,21 @@ def scene(folder, slot, sets=(OTHER, UV), images=({"uri": EXR},), textures=({"so
     write_exr(folder / EXR, light())
     things = [Thing("crate", POSITION, TRIANGLE, list(sets), material=slot)]
     return write_scene(folder / "a.gltf", things, {"images": list(images), "textures": list(textures)} | more)
+
+
+@contextmanager
+def changed(path):
+    """The JSON content of a file, which is written at the end of the block."""
+    content = json.loads(path.read_text())
+    yield content
+    path.write_text(json.dumps(content))
+
+
+def listed(folder, file, *objects, **more):
+    """Writes a list of one lightmap."""
+    content = {"sheets": [{"files": [file]}], "objects": objects} | more
+    (folder / "lights.json").write_text(json.dumps(content))
+    return folder / "lights.json"
 
 
 def moz(**more):
@@ -87,7 +103,9 @@ def test_pictures_inside_the_file(tmp_path):
         assert_lit(inside, atol=atol)
         assert any(PNG_8 in line for line in inside.warnings) == (data[:4] == b"\x89PNG")
         maker = GltfMaker()
-        maker.content |= {key: value for key, value in content.items() if key not in ("accessors", "bufferViews")}
+        maker.content |= {
+            key: value for key, value in content.items() if key not in ("accessors", "bufferViews", "buffers")
+        }
         attributes = {"POSITION": maker.add(np.float32(POSITION)), "TEXCOORD_1": maker.add(np.float32(UV))}
         corners = maker.add(np.uint32(TRIANGLE).reshape(-1))
         maker.content["meshes"] = [{"primitives": [{"attributes": attributes, "indices": corners, "material": 0}]}]
@@ -116,18 +134,11 @@ def test_images_by_percent_encoding_and_extension(tmp_path):
 
 NODE = {"MX_lightmap": {"lightMapTexture": {"index": 0}, "scale": [0.5, 0.5], "offset": [0.5, 0.0], "intensity": 2}}
 NEEDLE = {"name": "MeshRenderer", "lightmapIndex": 0, "lightmapScaleOffset": {"x": 0.5, "y": 0.5, "z": 0.5, "w": 0.5}}
+SECOND = {"index": 0, "texCoord": 1}
 WRITERS = {
     "XR3": ({"XR3_lightmap": {"index": 0, "texCoord": 1, "intensity": 2.0}}, {}, {}),
-    "FB": (
-        {"FB_materials_lightmap": {"lightmapTexture": {"index": 0, "texCoord": 1}, "lightmapFactor": [2, 2, 2]}},
-        {},
-        {},
-    ),
-    "WEBGI": (
-        {"WEBGI_materials_lightmap": {"lightMapTexture": {"index": 0, "texCoord": 1}, "lightMapIntensity": 2}},
-        {},
-        {},
-    ),
+    "FB": ({"FB_materials_lightmap": {"lightmapTexture": SECOND, "lightmapFactor": [2, 2, 2]}}, {}, {}),
+    "WEBGI": ({"WEBGI_materials_lightmap": {"lightMapTexture": SECOND, "lightMapIntensity": 2}}, {}, {}),
     "MX": ({}, NODE, {}),
     "NEEDLE": (
         {},
@@ -137,20 +148,15 @@ WRITERS = {
     "EPIC": (
         {},
         {"EPIC_lightmap_textures": {"lightmap": 0}},
-        {
-            "EPIC_lightmap_textures": {
-                "lightmaps": [{"texture": {"index": 0, "texCoord": 1}, "coordinateScaleBias": [0.5, 0.5, 0.5, 0]}]
-            }
-        },
+        {"EPIC_lightmap_textures": {"lightmaps": [{"texture": SECOND, "coordinateScaleBias": [0.5, 0.5, 0.5, 0]}]}},
     ),
 }
 
 
 def writers_scene(folder, writer):
     material, node, root = WRITERS[writer]
-    content = json.loads(scene(folder, {"extensions": material}, extensions=root).read_text())
-    content["nodes"][0]["extensions"] = node
-    (folder / "a.gltf").write_text(json.dumps(content))
+    with changed(scene(folder, {"extensions": material}, extensions=root)) as content:
+        content["nodes"][0]["extensions"] = node
     return folder / "a.gltf"
 
 
@@ -170,39 +176,34 @@ def test_lightmaps_of_other_extensions(tmp_path, writer):
 
 
 def test_the_renderer_of_several_materials_is_above_its_meshes(tmp_path):
-    content = json.loads(writers_scene(tmp_path, "NEEDLE").read_text())
-    above = content["nodes"][0].pop("extensions")
-    content["nodes"].append({"children": [0], "extensions": above})
-    content["scenes"][0]["nodes"] = [1]
-    (tmp_path / "a.gltf").write_text(json.dumps(content))
+    with changed(writers_scene(tmp_path, "NEEDLE")) as content:
+        above = content["nodes"][0].pop("extensions")
+        content["nodes"].append({"children": [0], "extensions": above})
+        content["scenes"][0]["nodes"] = [1]
     (place,) = load(tmp_path / "a.gltf").objects
     assert (place.node, place.scale_offset) == (0, (0.5, 0.5, 0.5, 0.0))
 
 
 def test_a_factor_for_each_channel(tmp_path):
-    factor = {"lightmapTexture": {"index": 0, "texCoord": 1}, "lightmapFactor": [2.0, 1.0, 0.5]}
+    factor = {"lightmapTexture": SECOND, "lightmapFactor": [2.0, 1.0, 0.5]}
     assert_lit(load(scene(tmp_path, {"extensions": {"FB_materials_lightmap": factor}})), light() * [2.0, 1.0, 0.5])
     factor["lightmapFactor"] = [2.0, -1.0, 0.5]
     text = error_of(load, scene(tmp_path, {"extensions": {"FB_materials_lightmap": factor}}))
-    assert "expected a factor of one number or three, of 0 or more" in text
+    assert "expected a factor of the light, one number or three, of 0 or more" in text
 
 
 def test_lightmaps_that_are_named_and_cannot_be_read(tmp_path):
     path = writers_scene(tmp_path, "EPIC")
-    content = json.loads(path.read_text())
-    (entry,) = content["extensions"]["EPIC_lightmap_textures"]["lightmaps"]
-    entry["lightmapAdd"] = [0, 0, 0, -4]
-    path.write_text(json.dumps(content))
+    with changed(path) as content:
+        content["extensions"]["EPIC_lightmap_textures"]["lightmaps"][0]["lightmapAdd"] = [0, 0, 0, -4]
     assert "EPIC_lightmap_textures holds Unreal's encoded lightmap" in error_of(load, path)
-    path = writers_scene(tmp_path, "NEEDLE")
-    content = json.loads(path.read_text())
     (tmp_path / "a.png").write_bytes(png(light()))
-    content["images"][0]["uri"] = "a.png"
-    path.write_text(json.dumps(content))
+    with changed(writers_scene(tmp_path, "NEEDLE")) as content:
+        content["images"][0]["uri"] = "a.png"
     assert "NEEDLE_lightmaps: an image of 8 bits in Needle's RGBM" in error_of(load, path)
-    content["nodes"][0]["extensions"]["NEEDLE_components"]["builtin_components"][0]["lightmapIndex"] = 65535
-    path.write_text(json.dumps(content))
-    assert "NEEDLE_lightmaps: no lit mesh is drawn" in error_of(load, path)
+    with changed(path) as content:
+        content["nodes"][0]["extensions"]["NEEDLE_components"]["builtin_components"][0]["lightmapIndex"] = 65535
+    assert "NEEDLE_lightmaps: no mesh of the scene has such" in error_of(load, path)
     assert "its extension ABC_lightmap is not known" in error_of(
         load, scene(tmp_path, {}, extensionsUsed=["ABC_lightmap"])
     )
@@ -217,7 +218,7 @@ def test_a_material_slot_as_a_choice(tmp_path):
     path = scene(tmp_path, slots, images=[{"uri": "a.png"}])
     assert "or read that of a material slot: --slot emissive" in error_of(load, path)
     assert_lit(load(path, slot="emissive"), 0.5 * light(), atol=0.02)
-    assert "occlusion: no lit mesh is drawn" in error_of(load, path, slot="occlusion")
+    assert "occlusion: no mesh of the scene has such" in error_of(load, path, slot="occlusion")
     assert "slot: expected one of occlusion, emissive, got 'base'" in error_of(load, path, slot="base")
     assert "slot: only allowed without lightmaps" in error_of(load, path, tmp_path / EXR, slot="emissive")
     linear = load(path, slot="emissive", encoding="linear")
@@ -227,18 +228,14 @@ def test_a_material_slot_as_a_choice(tmp_path):
 def two_materials(folder, first, second, uvs=(OTHER, UV)):
     """A box whose halves have a material each, in one mesh."""
     path = scene(folder, first, sets=uvs, textures=[{"source": 0}, {"source": 0, "sampler": 0}], samplers=[{}])
-    content = json.loads(path.read_text())
-    (whole,) = content["meshes"][0]["primitives"]
-    index = content["accessors"][whole["indices"]]
-    half = {**index, "count": index["count"] // 2}
-    content["accessors"] += [half, {**half, "byteOffset": 2 * index["count"]}]
-    size = len(content["accessors"])
-    content["materials"].append(second)
-    content["meshes"][0]["primitives"] = [
-        {**whole, "indices": size - 2, "material": 0},
-        {**whole, "indices": size - 1, "material": 1},
-    ]
-    path.write_text(json.dumps(content))
+    with changed(path) as content:
+        (whole,) = content["meshes"][0]["primitives"]
+        index = content["accessors"][whole["indices"]]
+        half = {**index, "count": index["count"] // 2}
+        size = len(content["accessors"])
+        content["accessors"] += [half, {**half, "byteOffset": 2 * index["count"]}]
+        content["materials"].append(second)
+        content["meshes"][0]["primitives"] = [{**whole, "indices": size + i, "material": i} for i in range(2)]
     return path
 
 
@@ -301,12 +298,8 @@ def test_a_transform_of_the_slot_that_reads_the_uvs(tmp_path, kind):
     assert_lit(found)
     assert any("TEXCOORD_1 is moved by KHR_texture_transform" in line for line in found.warnings) == (kind != "tiling")
     np.testing.assert_allclose(np.sort(read_geometry(tmp_path / "a.glb").uv, axis=0), np.sort(UV, axis=0), atol=1e-4)
-    lists = {
-        "sheets": [{"files": ["bake.exr"]}],
-        "objects": [{"node": "0", "sheet": 0, "scale_offset": [0.5, 1, 0.5, 0]}],
-    }
-    (tmp_path / "lights.json").write_text(json.dumps(lists))
-    (sheet,) = load(tmp_path / "a.glb", tmp_path / "lights.json").sheets
+    lists = listed(tmp_path, "bake.exr", {"node": "0", "sheet": 0, "scale_offset": [0.5, 1, 0.5, 0]})
+    (sheet,) = load(tmp_path / "a.glb", lists).sheets
     np.testing.assert_allclose(np.sort(sheet.uv, axis=0), np.sort(UV * [0.5, 1] + [0.5, 0], axis=0), atol=1e-4)
 
 
@@ -344,15 +337,8 @@ def test_uvs_that_the_light_does_not_fit(tmp_path, dilated):
 def test_rectangles_counted_from_the_other_side(tmp_path):
     path = scene(tmp_path, {}, sets=[UV])
     write_exr(tmp_path / "b.exr", np.concatenate([light(), 0 * light()]))
-    lists = {
-        "sheets": [{"files": ["b.exr"]}],
-        "objects": [{"node": "crate", "sheet": 0, "scale_offset": [1, 0.5, 0, 0.5]}],
-    }
-    (tmp_path / "lights.json").write_text(json.dumps(lists))
-    assert (
-        "rectangles that are counted from the bottom (convention unity)"
-        in load(path, tmp_path / "lights.json").warnings[0]
-    )
+    lists = listed(tmp_path, "b.exr", {"node": "crate", "sheet": 0, "scale_offset": [1, 0.5, 0, 0.5]})
+    assert "rectangles that are counted from the bottom (convention unity)" in load(path, lists).warnings[0]
 
 
 def test_charts_outside_the_square_are_refused(tmp_path):
@@ -423,10 +409,8 @@ def test_renderers_without_a_lightmap(tmp_path, number):
     path = write_scene(tmp_path / "a.gltf", things)
     write_exr(tmp_path / EXR, light())
     for convention, key in (("unity", "lightmapIndex"), ("godot", "slice_index")):
-        objects = [{"node": "crate", key: 0}, {"node": "lamp", key: number}]
-        lists = {"convention": convention, "sheets": [{"files": [EXR]}], "objects": objects}
-        (tmp_path / "lights.json").write_text(json.dumps(lists))
-        found = load(path, tmp_path / "lights.json")
+        objects = {"node": "crate", key: 0}, {"node": "lamp", key: number}
+        found = load(path, listed(tmp_path, EXR, *objects, convention=convention))
         assert [each.label for each in found.objects] == ["crate"] and len(found.blocker) == 12
         assert "1 objects have no lightmap" in found.warnings[0]
 
@@ -437,9 +421,8 @@ def test_a_mirrored_node_keeps_its_front(tmp_path):
     path = write_scene(tmp_path / "a.gltf", [Thing("room", *inward[:2], [UV])])
     write_exr(tmp_path / EXR, light())
     plain = load(path, tmp_path / EXR)
-    content = json.loads(path.read_text())
-    content["nodes"][0]["scale"] = [-1, 1, 1]
-    path.write_text(json.dumps(content))
+    with changed(path) as content:
+        content["nodes"][0]["scale"] = [-1, 1, 1]
     mirrored = load(path, tmp_path / EXR)
     assert volume(mirrored) == pytest.approx(volume(plain)) and volume(plain) < 0
     sheet = mirrored.sheets[0]

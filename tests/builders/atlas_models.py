@@ -65,6 +65,14 @@ def random_model(scene: LightmappedScene, kind: str, colour: str = "half", seed:
     return AtlasModel(*settings, **textures, lut=lut, uv=uv, stored=store(scene), report=report)
 
 
+def off_borders(model: AtlasModel, uv: np.ndarray) -> np.ndarray:
+    """Returns those of UVs [N, 2] that are on no border of tiles, where either tile may be read."""
+    if model.method != "tiles":
+        return uv
+    place = (uv * model.sheets[0].size[::-1] - 0.5) / model.profile.tile
+    return uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
+
+
 def shared_model(scene: LightmappedScene, seed: int = 0, separate: bool = False) -> AtlasModel:
     """Makes a model of shared or separate tiles in RGB9E5, for a scene of any sheets and states."""
     random, tile = np.random.default_rng(seed), 7

@@ -11,7 +11,7 @@ COMPONENTS = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123, "uint3
 
 
 class GltfMaker:
-    """The JSON content and the buffer of a glTF file without nodes and meshes."""
+    """The JSON content and the buffer of a glTF file without nodes and meshes; `content` may state other buffers."""
 
     def __init__(self) -> None:
         self.blob = bytearray()
@@ -45,7 +45,7 @@ class GltfMaker:
         return len(self.content["accessors"]) - 1
 
     def glb(self) -> bytes:
-        content = {**self.content, "buffers": [{"byteLength": len(self.blob)}]}
+        content = {"buffers": [{"byteLength": len(self.blob)}]} | self.content
         text = json.dumps(content).encode()
         text += b" " * (-len(text) % 4)
         blob = bytes(self.blob) + bytes(-len(self.blob) % 4)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from builders.gltf_maker import GltfMaker
 
 
 @dataclass
@@ -45,21 +46,13 @@ def box(
 
 def write_scene(path: Path, things: Sequence[Thing], extra: dict | None = None) -> Path:
     """Writes a `.gltf` with its data inside."""
-    data, views, accessors, meshes, nodes, materials = b"", [], [], [], [], []
-
-    def accessor(array: np.ndarray, kind: str, component: int) -> int:
-        nonlocal data
-        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": array.nbytes})
-        accessors.append({"bufferView": len(views) - 1, "componentType": component, "count": len(array), "type": kind})
-        data += array.tobytes()
-        return len(accessors) - 1
-
+    maker, meshes, nodes, materials = GltfMaker(), [], [], []
     for thing in things:
         if thing.like is None:
-            attributes = {"POSITION": accessor(np.asarray(thing.position, "<f4"), "VEC3", 5126)}
+            attributes = {"POSITION": maker.add(np.asarray(thing.position, np.float32))}
             for number, uv in enumerate(thing.uv):
-                attributes[f"TEXCOORD_{number}"] = accessor(np.asarray(uv, "<f4"), "VEC2", 5126)
-            corners = accessor(np.asarray(thing.triangle, "<u4").reshape(-1), "SCALAR", 5125)
+                attributes[f"TEXCOORD_{number}"] = maker.add(np.asarray(uv, np.float32))
+            corners = maker.add(np.asarray(thing.triangle, np.uint32).reshape(-1))
             primitive = {"attributes": attributes, "indices": corners}
             if thing.material is not None:
                 materials.append(thing.material)
@@ -67,16 +60,13 @@ def write_scene(path: Path, things: Sequence[Thing], extra: dict | None = None) 
             meshes.append({"primitives": [primitive], "name": f"{thing.name}-mesh"})
         mesh = len(meshes) - 1 if thing.like is None else nodes[thing.like]["mesh"]
         nodes.append({"name": thing.name, "mesh": mesh, "translation": list(thing.translation)})
-    uri = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(maker.blob).decode()
     content = {
-        "asset": {"version": "2.0"},
         "scene": 0,
         "scenes": [{"nodes": list(range(len(nodes)))}],
         "nodes": nodes,
         "meshes": meshes,
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(data), "uri": uri}],
+        "buffers": [{"byteLength": len(maker.blob), "uri": uri}],
     } | ({"materials": materials} if materials else {})
-    path.write_text(json.dumps(content | (extra or {})))
+    path.write_text(json.dumps(maker.content | content | (extra or {})))
     return path

@@ -37,6 +37,17 @@ def static_light(height=128, width=128, hours=HOURS, period=24.0) -> LightmapSet
     return from_arrays(frames, hours, period=period, name="static")
 
 
+def four_tiles(holes: np.ndarray | None = None) -> LightmapSet:
+    """Makes a dynamic, a static, a constant and an empty tile; `holes`, bool [256, 256], are outside the mask too."""
+    frames = np.zeros((5, 256, 256, 3), np.float32)
+    frames[:, :128, :128] = moving_light().light.frames
+    frames[:, :128, 128:] = static_light().light.frames / 24.0
+    frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
+    mask = np.ones((256, 256), bool)
+    mask[128:, 128:] = False
+    return from_arrays(frames, HOURS, mask if holes is None else mask & ~holes, 24.0, name="four tiles")
+
+
 def write_set(folder: Path, lightmaps: LightmapSet) -> None:
     """Writes the frames of a set into a new folder, and its mask if not all is valid; their names tell their hours."""
     folder.mkdir()

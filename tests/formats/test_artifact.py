@@ -203,7 +203,7 @@ def test_a_newer_version_and_another_system_are_named(artifact):
     header["__metadata__"] = {"wlm": "12"}
     assert "artifact version 12: expected at most 2" in _refusal(artifact, _join(header, payload))
     older = whole.replace(b'"2 lightmap', b'"1 lightmap')
-    assert _refusal(artifact, older) == "artifact version 1: expected 2"
+    assert _refusal(artifact, older) == "artifact version 1: expected 2; compress the input again"
     line = _refusal(artifact, whole, system="probe")
     assert line == "expected an artifact of probe, found one of lightmap"
 

@@ -254,9 +254,9 @@ def test_nothing_replaced_is_a_copy(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"gather": GATHER + 3}, "gather: expected 0 to 3, got 3 to 6"),
-        ({"gather": GATHER - 1}, "gather: expected 0 to 3, got -1 to 2"),
-        ({"triangle": CORNERS + 1}, "triangle: expected 0 to 5, got 1 to 6"),
+        ({"gather": GATHER + 3}, "gather: expected vertex numbers 0 to 3, got 3 to 6"),
+        ({"gather": GATHER - 1}, "gather: expected vertex numbers 0 to 3, got -1 to 2"),
+        ({"triangle": CORNERS + 1}, "triangle: expected vertex numbers 0 to 5, got 1 to 6"),
         ({"triangle": CORNERS[:0]}, "expected uv"),
         ({"uv": NEW_UV[:4]}, "expected uv"),
     ],
@@ -273,7 +273,9 @@ def test_what_does_not_fit_is_a_value_error(tmp_path, change, words):
 def test_a_set_that_is_there_and_a_primitive_twice_are_value_errors(tmp_path):
     document = _document(tmp_path)
     replacements = _replacements(tmp_path)
-    with pytest.raises(ValueError, match="expected a UV set that node 0, mesh 0, primitive 1 does not have, got 0"):
+    with pytest.raises(
+        ValueError, match="expected 0 or more, a UV set that node 0, mesh 0, primitive 1 does not have, got 0"
+    ):
         write_glb(tmp_path / "out.glb", document, replacements, 0)
     with pytest.raises(ValueError, match="at most one for each primitive"):
         write_glb(tmp_path / "out.glb", document, [*replacements, replacements[0]], 1)

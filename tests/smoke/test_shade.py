@@ -49,6 +49,8 @@ def test_lights_add_up(device: str):
     both = sum(six.shade([light]) for light in lights)
     np.testing.assert_allclose(six.shade(lights).cpu(), both.cpu(), rtol=1e-5)
     assert not six.shade([]).any()
+    tinted = six.shade(lights, albedo=(0.5, 0.0, 1.0))
+    assert torch.allclose(tinted, both * torch.tensor([0.5, 0.0, 1.0], device=device), rtol=1e-5)
 
 
 def test_glow(device: str):

@@ -103,32 +103,6 @@ def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, te
     assert path.read_bytes() == content and not (tmp_path / "parts.partial").exists()
 
 
-def test_a_killed_training_goes_on_from_its_last_save(tmp_path, monkeypatch):
-    """A killed training saves nothing at its end."""
-    monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
-    profile, path, steps = _profile(steps=4), tmp_path / "parts", []
-    _train(tmp_path / "whole", profile, seed=1)
-
-    def kill(progress) -> None:
-        steps.append(progress.done)
-        if len(steps) == 2:
-            raise ZeroDivisionError
-
-    starts = []
-    while True:
-        steps.clear()
-        try:
-            assert _train(path, profile, seed=1, resume=True, checkpoint_every=0.0, progress=kill).finished
-            break
-        except ZeroDivisionError:
-            starts.append(steps[0])
-    # The end of a round is saved before it is reported.
-    assert starts == [2, 6] and not steps, "the end of a round is saved before it is reported"
-    assert file_content(path) == file_content(tmp_path / "whole")
-    for row, expected in zip(_curves(path), _curves(tmp_path / "whole"), strict=True):
-        assert {**row, "seconds": 0} == {**expected, "seconds": 0}
-
-
 def test_a_training_stopped_in_its_first_pool_is_resumed(tmp_path):
     profile = _profile()
     _train(tmp_path / "whole", profile)

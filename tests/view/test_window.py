@@ -19,7 +19,6 @@ from wlm.fluid.volume import save_volume
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
-from wlm.lightmap.data import from_arrays
 from wlm.lightmap.tiles import TileKind
 from wlm.probe.data import save_probes
 from wlm.probe.sphere import basis
@@ -85,13 +84,7 @@ def drag(window, name: str, value: float) -> None:
 def lightmaps(tmp_path_factory):
     """A model of a dynamic, a static, a constant and an empty tile as `four.wlm`; its set; a quad with lightmap UVs."""
     folder = tmp_path_factory.mktemp("lightmaps")
-    frames = np.zeros((5, 256, 256, 3), np.float32)
-    frames[:, :128, :128] = small_sets.moving_light().light.frames
-    frames[:, :128, 128:] = small_sets.static_light().light.frames / 24.0
-    frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
-    mask = np.ones((256, 256), bool)
-    mask[128:, 128:] = False
-    given = from_arrays(frames, small_sets.HOURS, mask, 24.0, name="four")
+    given = small_sets.four_tiles()
     wlm.lightmap.compress(given, small_sets.tiny_profile(static_budget_db=20.0, steps=20)).save(folder / "four.wlm")
     small_sets.write_set(folder / "set", given)
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -222,10 +215,10 @@ def test_the_input_of_an_atlas(tmp_path, show):
 
 
 def test_probes_as_balls_gaussians_and_a_volume(tmp_path, show):
-    model = probe_models.whole_model(probes=200, positions=True)
+    model = probe_models.whole_model(probes=60, positions=True)
     model.save(tmp_path / "room.wlm")
     places = model.stored_positions()
-    save_probes(tmp_path / "room.npz", places, probe_sets.synthetic(200).values)
+    save_probes(tmp_path / "room.npz", places, probe_sets.synthetic(60).values)
     low, high = places.min(0), places.max(0)
     floor = np.array([low, [high[0], low[1], low[2]], [low[0], low[1], high[2]]])
     document, _ = document_from_arrays(floor, np.array([[0, 2, 1]]), np.zeros((3, 2)), "floor")
@@ -438,7 +431,7 @@ def test_a_ball_in_a_room_is_under_the_cursor_before_the_wall_behind_it(tmp_path
     assert window.scene.room
 
     def seen() -> set[str]:
-        pixels = [(x, y) for x in range(0, SIZE[0], 12) for y in range(STRIP + 4, SIZE[1], 12)]
+        pixels = [(x, y) for x in range(0, SIZE[0], 24) for y in range(STRIP + 4, SIZE[1], 24)]
         return {hit.name for pixel in pixels if (hit := window.canvas.hit(*pixel)) is not None}
 
     assert seen() == {"balls", "mesh"}

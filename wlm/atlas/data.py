@@ -220,7 +220,9 @@ def load(
             if value is not None:
                 raise WlmError(f"{name}: can't be given with a list of lightmaps; state it in the list")
     if slot is not None and lights_path is not None:
-        raise WlmError("slot: only allowed without lightmaps beside the mesh: it reads those of its materials")
+        raise WlmError(
+            "slot: only allowed without lightmaps from other files: it reads those in this slot of the mesh's materials"
+        )
     sets = {number for each in primitives for number in each.uv}
     known = uv_set if uv_set in sets else None
     readings: Readings = {}
@@ -280,7 +282,9 @@ def load(
             keys = {(each.node, each.primitive) for each in chosen}
             pairs = [(each, place) for each, place in candidates if (each.node, each.primitive) in keys]
         if not pairs:
-            raise WlmError(f"{listing.path}: sheets[{number}]: no triangle of the mesh is lit by it")
+            raise WlmError(
+                f"{listing.path}: sheets[{number}]: no triangle of the mesh is lit by it: no object has this sheet"
+            )
         objects += [place for _, place in pairs]
         for each, _ in pairs:
             other = owner.setdefault((each.node, each.primitive), number)
@@ -438,7 +442,8 @@ def _compact(where: str, name: str, position: np.ndarray, triangle: np.ndarray, 
         raise WlmError(f"{where}: has no triangles")
     if triangle.min() < 0 or triangle.max() >= len(position):
         raise WlmError(
-            f"{where}: triangle: expected vertices 0 to {len(position) - 1}, found {triangle.min()} to {triangle.max()}"
+            f"{where}: triangle: expected vertex numbers 0 to {len(position) - 1}, found {triangle.min()} to "
+            f"{triangle.max()}"
         )
     used, corner = np.unique(triangle, return_inverse=True)
     with np.errstate(over="ignore"):  # `_check_finite` reports it as infinite
@@ -509,7 +514,7 @@ def _tiled(
                 at = ", ".join(f"{x:.3g}" for x in middle[tile == number][0])
                 raise WlmError(
                     f"{where}: {each.name}: {_count(int((tile == number).sum()), 'triangle')} at UV ({at}) of "
-                    f"TEXCOORD_{uv_set}: expected UDIM tiles {', '.join(map(str, listing.tiles))}"
+                    f"TEXCOORD_{uv_set}: expected UDIM tiles {', '.join(map(str, listing.tiles))}, which have lightmaps"
                 )
             here = tile == number
             local = uv + [-float((number - 1001) % 10), float((number - 1001) // 10)]

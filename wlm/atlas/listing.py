@@ -40,7 +40,8 @@ _SET_FILE = "set.json"
 
 
 class SheetFiles(BaseModel):
-    """The files of a sheet (a UV layout): a lightmap for each state and a mask; other fields as in `wlm.atlas.load`."""
+    """A sheet (a UV layout): the files of its lightmaps, one for each state; its mask, a PNG above 0 where a texel
+    belongs to a chart; and arguments of `wlm.atlas.load`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 

@@ -185,7 +185,11 @@ def _own(
         moved = np.array([[sx], [sy]]) * inner + [[0.0, 0.0, x], [0.0, 0.0, y]]
         readings[each.node, each.primitive] = Reading(sheets[key][0], number, tuple(map(float, moved.ravel())))
     if not readings:
-        reason = f"the UVs that it names are missing in {lacking} primitives" if lacking else "no lit mesh is drawn"
+        reason = (
+            f"the UVs that it names are missing in {lacking} primitives"
+            if lacking
+            else "no mesh of the scene has such a lightmap"
+        )
         raise WlmError(f"{document.path}: {name}: {reason}")
     files = tuple(files for _, files in sheets.values())
     many = f"{len(files)} lightmap{'s' if len(files) > 1 else ''}"
@@ -239,7 +243,9 @@ def _needle(document: GltfDocument, node: dict[str, Any]) -> _Slot | None:
             continue
         found = [each for each in textures if each.get("type") == 0 and each.get("index", 0) == number]
         if not found:
-            raise WlmError(f"{document.path}: {_NEEDLE}: expected a lightmap of index {number}, found none")
+            raise WlmError(
+                f"{document.path}: {_NEEDLE}: expected an entry of textures with type 0 and index {number}, found none"
+            )
         pointer = re.fullmatch(r"(?:#?/)?textures/(\d+)", str(found[0].get("pointer")))
         if pointer is None:
             where = one_line(found[0].get("pointer"), 60)
@@ -261,7 +267,9 @@ def _factor(value: Any, where: str) -> float | list[float]:
     """Checks a factor, of all channels or of each."""
     factor = np.array(value, np.float64)
     if factor.shape not in ((), (3,)) or not (np.isfinite(factor) & (factor >= 0)).all():
-        raise WlmError(f"{where}: expected a factor of one number or three, of 0 or more, found {one_line(value, 60)}")
+        raise WlmError(
+            f"{where}: expected a factor of the light, one number or three, of 0 or more, found {one_line(value, 60)}"
+        )
     return float(factor.ravel()[0]) if (factor == factor.ravel()[0]).all() else factor.tolist()
 
 

@@ -107,30 +107,17 @@ verbs.register(
     argument_help="A lightmap set or a folder of lightmaps; a mesh, followed by its lightmaps; or a probe file.",
     detect=_input_system,
 )
-verbs.register(
-    app,
-    "evaluate",
-    "Compare a compressed file with its original and report the error.\n\n"
-    "wlm evaluate FILE.wlm --help lists the options of the file's system.",
-)
-verbs.register(
-    app,
-    "decode",
-    "Decode a compressed file: a lightmap at a time, the lightmap of a mesh, or probes.\n\n"
-    "wlm decode FILE.wlm --help lists the options of the file's system.",
-)
-verbs.register(
-    app,
-    "export",
-    "Write a compressed file as a folder for an engine: textures, buffers, a shader, and a kit for engines by name.\n\n"
-    "wlm export FILE.wlm --help lists the options of the file's system.",
-)
-verbs.register(
-    app,
-    "info",
-    "Show what a compressed file contains: settings, sizes on disk and on a device.\n\n"
-    "wlm info FILE.wlm --help lists the options of the file's system.",
-)
+for _name, _about in (
+    ("evaluate", "Compare a compressed file with its original and report the error."),
+    ("decode", "Decode a compressed file: a lightmap at a time, the lightmap of a mesh, or probes."),
+    (
+        "export",
+        "Write a compressed file as a folder for an engine: textures, buffers, and a shader or an engine's kit.",
+    ),
+    ("info", "Show what a compressed file contains: settings, sizes on disk and on a device."),
+):
+    _more = f"wlm {_name} FILE.wlm --help lists the options of the file's system."
+    verbs.register(app, _name, f"{_about}\n\n{_more}")
 app.command()(inspect.inspect)
 app.command()(view.view)
 app.command()(web.web)

@@ -157,11 +157,13 @@ def bake(
     g: _G = 0.0,
     fit: Annotated[
         Literal["axes", "sphere"],
-        typer.Option(help="axes: exact for lights along the six axes; sphere: least error over all light directions."),
+        typer.Option(
+            help="Best lightmaps for: axes, lights along the camera's axes (exact); sphere, lights from all sides."
+        ),
     ] = "axes",
     albedo: Annotated[
         float | None,
-        typer.Option(min=0.0, max=1.0, help="With --fit sphere: include multiple scattering of this albedo."),
+        typer.Option(min=0.0, max=1.0, help="With --fit sphere: add multiple scattering of this albedo; default none."),
     ] = None,
     resume: Resume = False,
 ) -> None:
@@ -349,7 +351,10 @@ def run(
     albedo: _Albedo = None,
     network: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Make the six-way lightmaps with this network from wlm smoke train."),
+        typer.Option(
+            metavar="FILE",
+            help="Network that wlm smoke train wrote, to make the six-way lightmaps; default a coarse march.",
+        ),
     ] = None,
     white: White = 1.0,
     device: Device = "cpu",

@@ -94,7 +94,8 @@ def train(
 def export_onnx(
     output: Annotated[Path, output_option("NETWORK.onnx", "The file to write.")],
     network: Annotated[
-        Path | None, typer.Argument(metavar="NETWORK", help="Network that train wrote; default the shipped one.")
+        Path | None,
+        typer.Argument(metavar="NETWORK", help="Network that wlm smoke train wrote; default the shipped one."),
     ] = None,
     resolution: Annotated[int, typer.Option(min=1, max=16384, help="Edge of the square image in pixels.")] = 512,
 ) -> None:
@@ -117,7 +118,7 @@ def evaluate(
     smoke: Annotated[
         list[Path] | None, typer.Argument(metavar="SMOKE...", help="Volumes (.npz, .nvdb, .vdb) to score as well.")
     ] = None,
-    resolution: Annotated[int, typer.Option(min=8, max=4096, help="Edge of the images in pixels.")] = 512,
+    resolution: Annotated[int, typer.Option(min=8, max=4096, help="Edge of the test images in pixels.")] = 512,
     cells: Annotated[
         int | None,
         typer.Option(min=16, max=512, help="Air cells along an edge of the simulated box; default as trained."),

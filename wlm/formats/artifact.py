@@ -187,7 +187,7 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
     if version > FORMAT_VERSION:
         raise WlmError(f"{path}: artifact version {version}: expected at most {FORMAT_VERSION}; update wlm")
     if version < FORMAT_VERSION:
-        raise WlmError(f"{path}: artifact version {version}: expected {FORMAT_VERSION}")
+        raise WlmError(f"{path}: artifact version {version}: expected {FORMAT_VERSION}; compress the input again")
     entries = {name: _entry(path, name, entry) for name, entry in header.items() if name != "__metadata__"}
     _check_extents(path, entries, size - start)
     _check_digest(path, content, encoded, digest)
@@ -274,7 +274,7 @@ def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tu
     except (KeyError, TypeError, ValueError):
         valid = False
     if not valid:
-        raise WlmError(f"{path}: part {one_line(name, 60)}: expected a type, a shape and two offsets")
+        raise WlmError(f"{path}: part {one_line(name, 60)}: expected a type, a shape and two offsets in the header")
     # A part of size 0 along one axis may state any other sizes, and NumPy limits them.
     if len(shape) > _MOST_AXES or math.prod(max(size, 1) for size in shape) > _MOST_NUMBERS:
         raise WlmError(

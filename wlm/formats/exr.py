@@ -112,8 +112,8 @@ def _channels(path: str | os.PathLike[str]) -> _Channels:
         except (RuntimeError, ValueError, MemoryError) as error:
             reason = one_line(error)
     # A part that cannot be read is missing from the list; only the printed message reports it.
-    if not parts or chatter.text:
-        raise WlmError(f"{path}: the EXR file is cut short or damaged: {chatter.text or reason}")
+    if not parts or chatter:
+        raise WlmError(f"{path}: the EXR file is cut short or damaged: {(chatter or [reason])[0]}")
     found = {}
     for part in parts:
         prefix = f"{part.name()}." if len(parts) > 1 else ""
@@ -296,8 +296,8 @@ def write_planes(
             except (RuntimeError, ValueError) as error:
                 reason = one_line(error).replace(str(temporary), str(path))
                 raise WlmError(f"{path}: cannot write: {reason}") from error
-        if chatter.text:
-            raise WlmError(f"{path}: cannot write: {chatter.text}")
+        if chatter:
+            raise WlmError(f"{path}: cannot write: {chatter[0]}")
         # The library reports no error if the disk is full when it flushes its buffer at the end.
         try:
             read_every_channel(temporary)
@@ -341,16 +341,11 @@ def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]
     return *parts[0].size, tuple(name for part in parts for name in part.full_names(len(parts) > 1))
 
 
-class _Chatter:
-    """Collects the messages that OpenEXR prints in a block, joined to one line in `text`."""
-
-    text = ""
-
-
 @contextlib.contextmanager
-def _captured_chatter() -> Iterator[_Chatter]:
-    """Captures what OpenEXR prints in the block: its C library to the stderr, its Python module to sys.stdout."""
-    chatter, printed = _Chatter(), io.StringIO()
+def _captured_chatter() -> Iterator[list[str]]:
+    """Captures what OpenEXR prints in the block: its C library to the stderr, its Python module to sys.stdout. Yields a
+    list, to which the messages are added as one line at the end, if there are any."""
+    chatter, printed = list[str](), io.StringIO()
     lines: list[bytes] = []
     try:
         with captured_stderr(lambda line: b"(EXR_ERR_" in line) as lines, contextlib.redirect_stdout(printed):
@@ -359,4 +354,4 @@ def _captured_chatter() -> Iterator[_Chatter]:
         # The reason follows the error code; our own message names the file.
         reasons = [line.decode(errors="replace").partition(") ")[2] for line in lines]
         messages = "; ".join(dict.fromkeys(map(str.strip, reasons))) or printed.getvalue()
-        chatter.text = one_line(messages, 200)
+        chatter += [text] if (text := one_line(messages, 200)) else []

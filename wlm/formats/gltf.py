@@ -409,7 +409,9 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                 if len(values) != len(local):
                     raise WlmError(f"{where}: {name}: expected {len(local)} UVs, like POSITION, found {len(values)}")
                 uv[number] = values[row]
-            triangle = triangle.reshape(-1, 3).astype(np.int32)
+            triangle, material = triangle.reshape(-1, 3).astype(np.int32), primitive.get("material")
+            if material is not None:
+                document.item("materials", material)
             mirrored = bool(np.linalg.det(transform[:3, :3]) < 0)
             primitives.append(
                 GltfPrimitive(
@@ -423,7 +425,7 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
                     row=row,
                     label=_label(document.content["nodes"][node], f"node {node}"),
                     mesh_label=_label(mesh, f"mesh {mesh_number}"),
-                    material=_material(where, primitive),
+                    material=material,
                     mirrored=mirrored,
                 )
             )
@@ -433,13 +435,6 @@ def _read_primitives(document: GltfDocument) -> list[GltfPrimitive]:
 def _label(item: dict, other: str) -> str:
     name = item.get("name")
     return one_line(name, _LABEL) if isinstance(name, str) and name else other
-
-
-def _material(where: str, primitive: dict) -> int | None:
-    number = primitive.get("material")
-    if number is not None and (not isinstance(number, int) or isinstance(number, bool)):
-        raise WlmError(f"{where}.material: expected a whole number, found {one_line(number, _LABEL)}")
-    return number
 
 
 def _count(document: GltfDocument, number: int) -> int:

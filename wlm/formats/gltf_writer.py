@@ -112,7 +112,10 @@ def encode_glb(
             meshes[node] = meshes[node] if node in meshes else tree.own_mesh(node)
             tree.replace(meshes[node]["primitives"][each.primitive.primitive], each, uv_set)
         tree.embed_images()
-        tree.drop_unused()
+        # An extension may refer to data in an unknown way.
+        if all(name.startswith(_HARMLESS) for name in tree.content.get("extensionsUsed", [])):
+            tree.keep("accessors", _accessor_slots)
+            tree.payloads = [tree.payloads[number] for number in tree.keep("bufferViews", _view_slots)]
     return _pack(document.path if path is None else path, tree.content, tree.payloads)
 
 
@@ -174,15 +177,7 @@ class _Tree:
             del image["uri"]
             image |= {"bufferView": self._view(data, {}), "mimeType": kind}
 
-    def drop_unused(self) -> None:
-        """Drops unused accessors and buffer views, unless an extension may refer to them."""
-        used = self.content.get("extensionsUsed", [])
-        if all(name.startswith(_HARMLESS) for name in used):
-            self._keep("accessors", _accessor_slots)
-            numbers = self._keep("bufferViews", _view_slots)
-            self.payloads = [self.payloads[number] for number in numbers]
-
-    def _keep(self, kind: str, slots: Callable[[dict], Iterable[tuple[dict, str]]]) -> list[int]:
+    def keep(self, kind: str, slots: Callable[[dict], Iterable[tuple[dict, str]]]) -> list[int]:
         """Drops the entries of list `kind` that no reference in `slots` uses; returns the old indices of those kept."""
         places = list(slots(self.content))
         numbers = sorted({holder[key] for holder, key in places})
@@ -234,16 +229,20 @@ class _Tree:
 def _check(new: Replacement, uv_set: int) -> None:
     where = new.primitive.name
     if uv_set < 0 or uv_set in new.primitive.uv:
-        raise ValueError(f"uv_set: expected a UV set that {where} does not have, got {uv_set}")
+        raise ValueError(f"uv_set: expected 0 or more, a UV set that {where} does not have, got {uv_set}")
     count = len(new.gather)
     if new.uv.shape != (count, 2) or new.triangle.ndim != 2 or new.triangle.shape[1] != 3 or not len(new.triangle):
-        raise ValueError(f"{where}: expected uv [{count}, 2] and triangles, got {new.uv.shape}, {new.triangle.shape}")
+        raise ValueError(
+            f"{where}: expected uv [{count}, 2] and triangle [F, 3], F >= 1, got {new.uv.shape}, {new.triangle.shape}"
+        )
     for field, numbers, limit in (
         ("gather", new.gather, len(new.primitive.row)),
         ("triangle", new.triangle, count),
     ):
         if numbers.min() < 0 or numbers.max() >= limit:
-            raise ValueError(f"{where}: {field}: expected 0 to {limit - 1}, got {numbers.min()} to {numbers.max()}")
+            raise ValueError(
+                f"{where}: {field}: expected vertex numbers 0 to {limit - 1}, got {numbers.min()} to {numbers.max()}"
+            )
 
 
 def _accessor_slots(content: dict) -> Iterator[tuple[dict, str]]:

@@ -60,10 +60,6 @@ def _stops(glow: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[f
 _Glow = Annotated[tuple[tuple[_Number, _NotNegative, _NotNegative, _NotNegative], ...], AfterValidator(_stops)]
 
 
-def _ramp(glow: tuple[tuple[float, float, float, float], ...]) -> Ramp | None:
-    return Ramp(tuple(stop[0] for stop in glow), tuple(stop[1:] for stop in glow)) if glow else None
-
-
 class _Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -324,7 +320,7 @@ class Looks(_Settings):
     @property
     def ramp(self) -> Ramp | None:
         """Colour ramp of the emission; None: grey."""
-        return _ramp(self.glow)
+        return Ramp(tuple(s[0] for s in self.glow), tuple(s[1:] for s in self.glow)) if self.glow else None
 
 
 class Scene(_Settings):

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from inspect import signature
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry, read_geometry
@@ -88,7 +88,7 @@ def _atlas_model(paths: list[Path], title: str, up: int, original: _Path | None 
     return atlas_scene(model.scene, model, light, title=title, flat=flat, up=up)
 
 
-def _probe_model(
+def _probes(
     paths: list[Path],
     title: str,
     up: int,
@@ -98,35 +98,15 @@ def _probe_model(
     walk: _Path | None = None,
     block: float | None = None,
 ) -> Scene:
-    from wlm.probe.places import probes_of
-    from wlm.view.probe_scene import Probes
-
-    model = load(paths[0], "probe")
-    position, values, live, _ = probes_of(model, original, key)
-    return _probe_scene(Probes.of_model(model, position, values, live, title), title, up, mesh, walk, block)
-
-
-def _probe_set(
-    paths: list[Path],
-    title: str,
-    up: int,
-    mesh: _Path | None = None,
-    key: str | None = None,
-    walk: _Path | None = None,
-    block: float | None = None,
-) -> Scene:
     from wlm.probe.data import load as load_probes
-    from wlm.view.probe_scene import Probes
-
-    return _probe_scene(Probes.of_set(load_probes(paths[0], key=key), title), title, up, mesh, walk, block)
-
-
-def _probe_scene(
-    probes: Any, title: str, up: int, mesh: _Path | None, walk: _Path | None, block: float | None
-) -> Scene:
     from wlm.probe.data import load_positions
-    from wlm.view.probe_scene import probe_scene
+    from wlm.view.probe_scene import model_probes, probe_scene, set_probes
 
+    if content_of(paths)[0] == "probe":
+        probes = model_probes(load(paths[0], "probe"), original, key, title)
+    else:
+        check_options(paths[0], ("original",) if original else (), ())
+        probes = set_probes(load_probes(paths[0], key=key), title)
     geometry = None if mesh is None else read_geometry(mesh, with_uv=False)
     path = None if walk is None else load_positions(walk)
     return probe_scene(probes, title=title, geometry=geometry, walk=path, block=block, up=up)
@@ -167,8 +147,8 @@ _OPENERS: dict[str, Callable[..., Scene]] = {
     "atlas": _atlas_model,
     "lightmap": _lightmap_model,
     "picture": _picture,
-    "probe": _probe_model,
-    "probes": _probe_set,
+    "probe": _probes,
+    "probes": _probes,
     "set": _lightmap_set,
     "six-way": _six_way,
     "volume": _volume,

@@ -1,9 +1,9 @@
 """Light probes in a window: balls, Gaussians, and the cascaded volume around a moving viewer."""
 
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from wlm.ops.plain import rotations
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
 from wlm.probe.model import ProbeModel
-from wlm.probe.places import ball_exposure, ball_radius
+from wlm.probe.places import ball_exposure, ball_radius, probes_of
 from wlm.probe.sphere import irradiance, irradiance_weights, sh_count, unit_or_zero
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
@@ -55,47 +55,41 @@ class Probes:
     model: ProbeModel | None
     note: str
 
-    @classmethod
-    def of_model(
-        cls,
-        model: ProbeModel,
-        position: np.ndarray,
-        original: np.ndarray | None,
-        live: np.ndarray,
-        title: str,
-    ) -> Self:
-        """Takes the probes of a model, as `wlm.probe.places.probes_of` returns them.
 
-        Raises:
-            WlmError: The numbers of a probe are not spherical harmonics.
-        """
-        count = _coefficients(model.outputs, title)
-        decoder, places = model.decoder(position=position), position[live]
-        values = {"decoded": decoder.decode_probes()[live].reshape(-1, count, 3)}
-        if original is not None:
-            values["original"] = original[live].reshape(-1, count, 3)
-        shapes = model if isinstance(model.content, Gaussians) else None
-        gaussians = "" if shapes is None else f"{shapes.content.count:,} Gaussians, "
-        note = f"{model.name}, {len(places):,} probes, {gaussians}profile {model.profile.name}"
-        return cls(places, np.flatnonzero(live), values, decoder.decode, shapes, note)
+def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None, title: str) -> Probes:
+    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`.
 
-    @classmethod
-    def of_set(cls, probes: ProbeSet, title: str) -> Self:
-        """Takes the probes of an input file; the light between probes is that of the nearest one.
+    Raises:
+        WlmError: The numbers of a probe are not spherical harmonics, or the positions are unknown.
+    """
+    position, given, live, _ = probes_of(model, original, key)
+    count = _coefficients(model.outputs, title)
+    decoder, places = model.decoder(position=position), position[live]
+    values = {"decoded": decoder.decode_probes()[live].reshape(-1, count, 3)}
+    if given is not None:
+        values["original"] = given[live].reshape(-1, count, 3)
+    shapes = model if isinstance(model.content, Gaussians) else None
+    gaussians = "" if shapes is None else f"{shapes.content.count:,} Gaussians, "
+    note = f"{model.name}, {len(places):,} probes, {gaussians}profile {model.profile.name}"
+    return Probes(places, np.flatnonzero(live), values, decoder.decode, shapes, note)
 
-        Raises:
-            WlmError: The numbers of a probe are not spherical harmonics.
-        """
-        count = _coefficients(probes.outputs, title)
-        places, values = probes.position[probes.live], probes.values[probes.live]
-        tree = cKDTree(places)
 
-        def nearest(points: np.ndarray) -> np.ndarray:
-            return values[tree.query(points)[1]]
+def set_probes(probes: ProbeSet, title: str) -> Probes:
+    """Takes the probes of an input file; the light between probes is that of the nearest one.
 
-        shown = {"original": values.reshape(-1, count, 3)}
-        note = f"{probes.name}, {len(places):,} live probes, {probes.key}"
-        return cls(places, np.flatnonzero(probes.live), shown, nearest, None, note)
+    Raises:
+        WlmError: The numbers of a probe are not spherical harmonics.
+    """
+    count = _coefficients(probes.outputs, title)
+    places, values = probes.position[probes.live], probes.values[probes.live]
+    tree = cKDTree(places)
+
+    def nearest(points: np.ndarray) -> np.ndarray:
+        return values[tree.query(points)[1]]
+
+    shown = {"original": values.reshape(-1, count, 3)}
+    note = f"{probes.name}, {len(places):,} live probes, {probes.key}"
+    return Probes(places, np.flatnonzero(probes.live), shown, nearest, None, note)
 
 
 def probe_scene(

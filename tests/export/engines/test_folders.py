@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.atlas_meshes import charts, sheet
-from builders.atlas_models import KINDS, MIXED, random_model
+from builders.atlas_models import KINDS, MIXED, off_borders
 from builders.atlas_models import random_model as random_atlas
 from builders.checks import error_of
 from builders.engine_scripts import Script, assert_csharp_parses, assert_gdscript_parses, node_gives, pixels_of
@@ -206,10 +206,7 @@ def test_godots_atlas_shows_its_light(kind, tmp_path):
     model = atlas_model(kind, mesh=charts())
     export(model, tmp_path / "out", "godot")
     text = as_glsl((tmp_path / "out" / "atlas.gdshader").read_text())
-    uv = np.random.default_rng(0).random((1000, 2)).astype(np.float32)
-    if model.method == "tiles":
-        place = (uv * model.sheets[0].size[::-1] - 0.5) / model.profile.tile
-        uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
+    uv = off_borders(model, np.random.default_rng(0).random((1000, 2)).astype(np.float32))
     bound = {path.stem: read_light(path)[0] for path in (tmp_path / "out").glob("*.exr")}
     bound = {f"wlm_atlas_{name}": np.float32(np.pad(v[..., :3], ((0, 0), (0, 0), (0, 1)))) for name, v in bound.items()}
     bound |= {"u_points": np.pad(uv, ((0, 0), (0, 2)))[None], "albedo": np.full((1, 1, 4), 255, np.uint8)}
@@ -242,6 +239,7 @@ def test_unitys_passes_compile(kinds, tmp_path):
     for each in passes:
         compiled(shared + each, tmp_path, "-D", "-S", "frag", "-e", "frag", "--auto-map-bindings")
     compiled(shared + passes[0], tmp_path, "-D", "-S", "vert", "-e", "vert", "--auto-map-bindings")
+    assert_csharp_parses(tmp_path / "unity" / "WlmLightmap.cs")
 
 
 # Constants and functions of Unity, to run a pass as a function.
@@ -296,25 +294,22 @@ Texture2D _MainTexture; SamplerState sampler_MainTexture;
 """
 
 
-@pytest.mark.parametrize("kind", [*KINDS, MIXED])
-def test_unitys_surface_compiles(kind, tmp_path):
-    export(atlas_model(kind), tmp_path / "out", "unity")
-    shader = (tmp_path / "out" / "WlmAtlas.shader").read_text()
-    text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", shader, re.DOTALL)[1]
+def surface_compiles(folder, name, defines=("",)):
+    """Compiles the stages of the surface shader of a kit for Unity, after each of the `defines`."""
+    text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", (folder / f"{name}.shader").read_text(), re.DOTALL)[1]
     text = re.sub(r"^ *#pragma.*$", "", text, flags=re.MULTILINE).replace("sampler2D _MainTex;", "")
-    text = text.replace('#include "WlmAtlas.hlsl"', (tmp_path / "out" / "WlmAtlas.hlsl").read_text())
-    text = UNITY + text.replace('#include "UnityCG.cginc"', "")
-    for first in ("", "#define WLM_FIRST_UV\n"):
-        for stage, entry in (("frag", "frag"), ("vert", "vert")):
-            compiled(first + text, tmp_path, "-D", "-S", stage, "-e", entry, "--auto-map-bindings")
+    text = text.replace(f'#include "{name}.hlsl"', (folder / f"{name}.hlsl").read_text())
+    for first in defines:
+        for stage in ("frag", "vert"):
+            own = first + UNITY + text.replace('#include "UnityCG.cginc"', "")
+            compiled(own, folder, "-D", "-S", stage, "-e", stage, "--auto-map-bindings")
 
 
-def test_unitys_components_parse(tmp_path):
-
-    export(random_lightmap(), tmp_path / "lightmap", "unity")
-    export(atlas_model("tiles"), tmp_path / "atlas", "unity")
-    assert_csharp_parses(tmp_path / "lightmap" / "WlmLightmap.cs")
-    assert_csharp_parses(tmp_path / "atlas" / "WlmAtlas.cs")
+@pytest.mark.parametrize("kind", ["cascade", "plain with uv", MIXED])
+def test_unitys_surface_compiles(kind, tmp_path):
+    export(atlas_model(kind), tmp_path, "unity")
+    surface_compiles(tmp_path, "WlmAtlas", ("", "#define WLM_FIRST_UV\n"))
+    assert_csharp_parses(tmp_path / "WlmAtlas.cs")
 
 
 _SCRIPT = """
@@ -347,7 +342,7 @@ def test_others_read_what_an_atlas_exports(kind, stored, tmp_path):
         pytest.skip("no gltf-validator and ktx-parse beside WLM_THREE: npm install three gltf-validator ktx-parse")
     if shutil.which("node") is None:
         pytest.skip("no node: install nodejs")
-    model = random_model(charts(), kind, stored)
+    model = atlas_model(kind, stored, charts())
     export(model, tmp_path)
     words = ["node", "-e", _SCRIPT, "--", tmp_path, packages]
     done = subprocess.run(words, capture_output=True, text=True)
@@ -371,10 +366,7 @@ def test_an_atlas_node_gives_its_light(kind, tmp_path, monkeypatch):
     files = json.loads((tmp_path / "out" / "bundle.json").read_text())["textures"]
     assert set(script.settings) == {each["file"] for each in files.values()} and script.slots == [0]
     ((code, inputs),) = script.customs()
-    uv = np.random.default_rng(0).random((1000, 2)).astype(np.float32)
-    if model.method == "tiles":
-        place = (uv * model.sheets[0].size[::-1] - 0.5) / model.profile.tile
-        uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
+    uv = off_borders(model, np.random.default_rng(0).random((1000, 2)).astype(np.float32))
     bound = {f"wlm_atlas_{name}": pixels_of(str(tmp_path / "out" / each["file"])) for name, each in files.items()}
     # What is filtered are halves there; a table of coordinates is floats, which WebGPU doesn't filter.
     bound = {

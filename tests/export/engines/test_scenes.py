@@ -11,7 +11,7 @@ from builders.checks import error_of
 from builders.engine_scripts import Script, assert_csharp_parses, assert_gdscript_parses, node_gives, pixels_of
 from builders.scene_folders import expected_picture, scene_folder
 from builders.shader_runs import run_glsl
-from test_folders import TEXTS, UNITY, as_glsl, compiled
+from test_folders import TEXTS, as_glsl, surface_compiles
 
 from wlm.atlas.model import SHORT_ENTRY
 from wlm.export import ENGINES, export
@@ -173,10 +173,5 @@ def test_unitys_surface_compiles_and_its_component_parses(each_form, tmp_path):
     model = each_form
     export(model, tmp_path, "unity")
     assert (tmp_path / "factors.bytes").stat().st_size == 148 + 16 * len(model.states) * model.factor.shape[1]
-    text = re.search(r"HLSLPROGRAM(.*?)ENDHLSL", (tmp_path / "WlmScene.shader").read_text(), re.DOTALL)[1]
-    text = re.sub(r"^ *#pragma.*$", "", text, flags=re.MULTILINE).replace("sampler2D _MainTex;", "")
-    text = text.replace('#include "WlmScene.hlsl"', (tmp_path / "WlmScene.hlsl").read_text())
-    for stage in ("frag", "vert"):
-        own = UNITY + text.replace('#include "UnityCG.cginc"', "")
-        compiled(own, tmp_path, "-D", "-S", stage, "-e", stage, "--auto-map-bindings")
+    surface_compiles(tmp_path, "WlmScene")
     assert_csharp_parses(tmp_path / "WlmScene.cs")

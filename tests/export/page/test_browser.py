@@ -17,7 +17,6 @@ from wlm.atlas.model import unpack_entries
 from wlm.export import write_page
 from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
-from wlm.lightmap.data import from_arrays
 from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import TileKind
 from wlm.smoke.camera import Camera
@@ -69,14 +68,9 @@ def figure(page, name: str) -> str:
 
 @pytest.fixture(scope="module")
 def lightmaps():
-    """A dynamic, a static, a constant and an empty tile."""
-    frames = np.zeros((5, 256, 256, 3), np.float32)
-    frames[:, :128, :128] = small_sets.moving_light().light.frames
-    frames[:, :128, 128:] = small_sets.static_light().light.frames / 24.0
-    frames[:, 128:, :128] = (1.0 + np.arange(5.0))[:, None, None, None] / 5.0
-    mask = np.ones((256, 256), bool)
-    mask[128:, 128:] = mask[50:60, 90:200] = mask[::16, ::8] = False
-    return from_arrays(frames, small_sets.HOURS, mask, 24.0, name="four tiles")
+    holes = np.zeros((256, 256), bool)
+    holes[50:60, 90:200] = holes[::16, ::8] = True
+    return small_sets.four_tiles(holes)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from builders.atlas_meshes import charts
-from builders.atlas_models import KINDS, MIXED
+from builders.atlas_models import KINDS, MIXED, off_borders
 from builders.atlas_models import random_model as random_atlas
 from builders.exported import read_export
 from builders.metal import run_metal
@@ -51,11 +51,7 @@ def atlas(kind, _, colour="half") -> Subject:
     model = random_atlas(charts(), kind, colour)
     uv = np.random.default_rng(0).uniform(-0.1, 1.1, (1000, 2)).astype(np.float32)
     uv = np.concatenate([uv, [[0, 0], [1, 1], [0, 1], [0.5, 1]]]).astype(np.float32)
-    if model.method == "tiles":
-        # A point on a border of tiles may be read from either.
-        (sheet,) = model.sheets
-        place = (uv * [sheet.width, sheet.height] - 0.5) / model.profile.tile
-        uv = uv[np.abs(place - np.rint(place)).min(1) > 1e-4]
+    uv = off_borders(model, uv)
     bound = {"u_points": points_of(uv), "wlm_atlas_colour": rgba(model.texels[0])}
     if model.method != "plain":
         tiles = model.method == "tiles"
