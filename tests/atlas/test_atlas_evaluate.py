@@ -44,18 +44,15 @@ def _one(mesh, decoder, **options):
 
 
 def test_the_reference_is_exact(device):
-    report = _one(lit_cube(), _reader(lit_cube()), views=12, device=device)
+    mesh = lit_cube()
+    report = _one(mesh, _reader(mesh), views=12, device=device)
     assert report.views == 12 and report.pixels > 4000 and report.name == "cube"
     assert report.psnr == report.psnr_worst == report.texel_psnr == metrics.PSNR_CAP_DB
     assert report.one_minus_ssim == report.seam_error == report.rest_error == 0.0 and math.isnan(report.seam_ratio)
     values = json.loads(json.dumps(report.to_json(), allow_nan=False))
     assert values["psnr"] == 120.0 and values["seam_ratio"] is None and values["one_minus_ssim"] == 0.0
-
-
-def test_an_upside_down_lightmap_is_terrible():
-    mesh = lit_cube()
-    image = torch.tensor(mesh.sheets[0].lightmap).flip(0).contiguous()
-    report = _one(mesh, lambda points, state: raster.texture(image, points.uv), views=12)
+    upside_down = torch.tensor(mesh.sheets[0].lightmap, device=device).flip(0).contiguous()
+    report = _one(mesh, lambda points, state: raster.texture(upside_down, points.uv), views=12, device=device)
     assert report.psnr < 12.0 and report.texel_psnr < 12.0 and report.one_minus_ssim > 0.5
 
 
@@ -144,7 +141,7 @@ def test_errors_beside_seams_stand_out():
         return change
 
     decoders = {f"{width}": _reader(mesh, frame(width)) for width in (0.006, 0.05)}
-    reports = compare(mesh, decoders | {"even": _reader(mesh, _offset(0.1))}, views=8, resolution=128)
+    reports = compare(mesh, decoders | {"even": _reader(mesh, _offset(0.1))}, views=6, resolution=112)
     # A hundredth of a face is less than a pixel, so that it lies within one of the border; a tenth is about three.
     assert 0.1 < reports["0.006"].seam_error < 0.3 and reports["0.006"].seam_ratio > 10.0
     assert 0.4 < reports["0.05"].seam_error < 0.5 and 4.0 < reports["0.05"].seam_ratio < 6.0
@@ -333,32 +330,27 @@ def test_even_views_are_spread_all_around():
 
 
 def test_random_views_by_their_seed():
-    first, again, second = (np.stack([v.axes for v in sphere_views(2000, seed)]) for seed in (7, 7, 8))
+    first, again, second = (np.stack([v.axes for v in sphere_views(500, seed)]) for seed in (7, 7, 8))
     np.testing.assert_array_equal(first, again)
     assert (first != second).any(axis=(1, 2)).all()
     eyes = first[:, 2]
-    # Uniform: mean 0, each coordinate squared 1/3; four deviations of 2000 samples.
-    assert np.abs(eyes.mean(axis=0)).max() < 4.0 * (1 / 3 / 2000) ** 0.5
-    assert np.abs((eyes**2).mean(axis=0) - 1 / 3).max() < 4.0 * (4 / 45 / 2000) ** 0.5
+    # Uniform: mean 0, each coordinate squared 1/3; four deviations of 500 samples.
+    assert np.abs(eyes.mean(axis=0)).max() < 4.0 * (1 / 3 / 500) ** 0.5
+    assert np.abs((eyes**2).mean(axis=0) - 1 / 3).max() < 4.0 * (4 / 45 / 500) ** 0.5
     generator = np.random.default_rng(7)
     assert not np.array_equal(sphere_views(1, generator)[0].axes, sphere_views(1, generator)[0].axes)
 
 
-@pytest.mark.parametrize(
-    "direction", [[0, 1, 0], [0, -1, 0], [1e-9, 1, 1e-9], [1, 2, 3], [0, 0, -1e-200], [1e300, 0, 0]]
-)
-def test_axes_also_at_the_poles(direction):
-    axes = View.of(direction).axes
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
-    unit = np.array(direction) / np.abs(direction).max()
-    np.testing.assert_allclose(axes[2], unit / np.linalg.norm(unit), atol=1e-12)
-
-
-@pytest.mark.parametrize("direction", [[0, 0, 0], [np.nan, 1, 0], [np.inf, 0, 0], [1, 0]])
-def test_what_is_no_direction(direction):
-    with pytest.raises(ValueError, match="direction"):
-        View.of(direction)
+def test_axes_also_at_the_poles():
+    for direction in ([0, 1, 0], [0, -1, 0], [1e-9, 1, 1e-9], [1, 2, 3], [0, 0, -1e-200], [1e300, 0, 0]):
+        axes = View.of(direction).axes
+        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+        unit = np.array(direction) / np.abs(direction).max()
+        np.testing.assert_allclose(axes[2], unit / np.linalg.norm(unit), atol=1e-12)
+    for wrong in ([0, 0, 0], [np.nan, 1, 0], [np.inf, 0, 0], [1, 0]):
+        with pytest.raises(ValueError, match="direction"):
+            View.of(wrong)
 
 
 def test_the_picture_just_holds_the_sphere():
@@ -410,11 +402,10 @@ def test_each_face_from_its_own_side(device):
 
 def test_inactive_triangles_hide_and_are_not_seen():
     """Two sheets one behind the other; half of the front one has no area in UV."""
-    sheet = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]], np.float64)
-    position = np.concatenate([sheet + [0, 0, 0.5], sheet - [0, 0, 0.5]])
-    triangle = np.array([[0, 1, 2], [2, 1, 3], [4, 5, 6], [6, 5, 7]])
-    uv = np.array([[0, 0], [1, 0], [0, 1], [0.5, 0.5], [0, 0], [1, 0], [0, 1], [1, 1]], np.float64)
-    mesh = from_arrays(position, triangle, uv, waves())
+    position = np.concatenate([SQUARE + [0, 0, 0.5], SQUARE - [0, 0, 0.5]])
+    uv = np.concatenate([SQUARE_UV, SQUARE_UV])
+    uv[3] = 0.5
+    mesh = from_arrays(position, np.concatenate([TWO, TWO + 4]), uv, waves())
     assert mesh.sheets[0].active.tolist() == [True, False, True, True]
     visible, barycentric, at = _drawn(mesh, [0, 0, 1])
     assert set(np.unique(visible)) == {-1, 0}
@@ -436,16 +427,14 @@ def test_visibility_counts_every_covered_pixel_once(device):
     assert (count[mesh.sheets[0].mask] > 0).mean() > 0.7 and not count[~mesh.sheets[0].mask].any()
 
 
-def test_visibility_of_one_side_and_of_none():
+def test_visibility_of_one_side_and_of_none_and_at_the_end():
     mesh = lit_cube(1)
     count = visibility(mesh, [View.of(DIRECTIONS[4])], 64, HEIGHT, WIDTH, "cpu").numpy()
     chart = np.zeros((HEIGHT, WIDTH), bool)
     chart[HEIGHT // 2 :, WIDTH // 3 : 2 * WIDTH // 3] = True
     assert count[chart].sum() > 500 and not count[~chart].any()
     assert not visibility(mesh, [], 64, 4, 4, "cpu").any()
-
-
-def test_a_uv_at_the_end_is_in_the_last_cell():
+    # A UV of 1 is in the last cell.
     position = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0]], np.float64)
     mesh = from_arrays(position, np.array([[0, 1, 2]]), np.array([[1 - 1e-7, 1], [1, 1], [1, 1 - 1e-7]]), waves())
     count = visibility(mesh, [View.of([0, 0, 1])], 32, 8, 8, "cpu").numpy()

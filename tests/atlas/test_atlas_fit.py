@@ -348,19 +348,3 @@ def test_light_that_a_small_budget_loses_is_said():
     assert "1 texel among the brightest of the lightmap lost more than half" in first and "of 1e+04 decodes" in first
     assert "most of the lightmap, are off by more than half of their own light" in second
     assert "lost light" not in compress(mesh, PLAIN, views=4).report
-
-
-def test_several_lightmaps_share_tiles():
-    """Whatever the profile's method and colour are for one lightmap; a cascade takes one alone."""
-    (own,) = sheet().sheets
-    light = np.stack([own.lightmap, 0.5 * own.lightmap])
-    scene = from_arrays(own.position, own.triangle, own.uv, light)
-    model = compress(scene, "standard", views=1, budget=0.3, tile=4)
-    assert model.method == "shared" and model.states == ("0", "1") and model.profile.budget == 0.3
-    assert Profile.load("standard").checked(2)[0].budget == 0.05
-    for profile, line in (
-        ("paper", "method: expected tiles for several lightmaps or mips, found cascade"),
-        ("astc", "colour: expected rgb9e5 or"),
-    ):
-        with pytest.raises(WlmError, match=line):
-            compress(scene, profile)

@@ -107,8 +107,9 @@ def test_a_project_is_told_piece_by_piece(tmp_path):
     assert len(lines) == 4 and all(line.removeprefix(f"{tmp_path}/unity: ") in text.splitlines() for line in lines)
     assert "LICENSE" not in text and text.count("set") < 20
     export(wlm.load(FILES / "atlas-tiles.wlm"), tmp_path / "engine", "unity")
-    # No command takes it.
+    # No command takes it, nor any of its files.
     assert told(tmp_path / "engine").endswith(" -> ")
+    assert "a model that wlm export wrote" in inspect(tmp_path / "engine" / "colour.bytes")[0].what
 
 
 SCENE = {"name": "tiny", "grid": {"cells": [8, 8, 8], "cell": 0.025}, "frames": 1, "rate": 1000.0}

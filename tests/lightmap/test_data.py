@@ -102,14 +102,10 @@ def test_mask_png_of_any_mode(tmp_path, mode):
     _save_mask(tmp_path / "mask.png", mask, mode)
     lightmaps = load(_write_set(tmp_path, _frames(), mask="mask.png"))
     np.testing.assert_array_equal(lightmaps.mask, mask)
-
-
-def test_mask_png_counts_any_colour_and_any_level(tmp_path):
     picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    picture[1, 2, 0] = picture[3, 4, 2] = 1
+    picture[1, 2, 0] = picture[3, 4, 2] = 1  # any colour and any level
     Image.fromarray(picture).save(tmp_path / "mask.png")
-    lightmaps = load(_write_set(tmp_path, _frames(), mask="mask.png"))
-    np.testing.assert_array_equal(lightmaps.mask, picture.any(axis=2))
+    np.testing.assert_array_equal(load(tmp_path).mask, picture.any(axis=2))
 
 
 def test_mask_argument_replaces_that_of_the_set(tmp_path):
@@ -175,63 +171,29 @@ def test_mask_errors(tmp_path):
     assert "mask.png: cannot read the mask" in error_of(load, path)
 
 
-def test_nan_and_inf_inside_take_the_nearest_finite_texel(tmp_path):
-    frames = _frames()
-    mask = np.ones((HEIGHT, WIDTH), bool)
+def test_repairs_are_made_everywhere_and_counted_inside_the_mask(tmp_path):
+    frames, mask = _frames(), np.ones((HEIGHT, WIDTH), bool)
     mask[:, 0] = False
+    frames[0, 0, 0] = frames[1, 0, 0, 0] = np.nan
+    frames[0, 1, 0] = -5.0
+    frames[0, 1, 1], frames[0, 1, 2, 0] = (-1.0, 2.0, -3.0), -1e-6
+    frames[0, 4, 4], frames[0, 4, 5] = (60_000.0, 65_504.0, 0.0), (70_000.0, 1.0, 1e30)
     frames[1, 2, 1, 2] = np.nan  # nearest finite inside: not column 0, which is outside
     frames[1, 2, 2:4, 0] = np.inf
-    frames[1, 0, 0] = np.nan
     frames[2, 4, 6, 1] = -np.inf
-    expected = frames.copy()
-    _save_mask(tmp_path / "mask.png", mask)
-    lightmaps = load(_write_set(tmp_path, frames, mask="mask.png"))
-    expected[1, 0, 0] = 0.0
+    given = frames.copy()
+    lightmaps = from_arrays(frames, TIMES, mask)
+    np.testing.assert_array_equal(frames, given)  # the caller's array is left alone
     assert tuple(lightmaps.frames[1, 2, 1]) in {tuple(frames[1, 1, 1]), tuple(frames[1, 3, 1])}
     assert tuple(lightmaps.frames[2, 4, 6]) in {tuple(frames[2, 3, 6]), tuple(frames[2, 4, 5])}
-    repaired = np.zeros((len(TIMES), HEIGHT, WIDTH), bool)
-    repaired[1, 2, 1:4] = repaired[2, 4, 6] = True
-    np.testing.assert_array_equal(lightmaps.frames[~repaired], expected[~repaired])
-    assert np.isfinite(lightmaps.frames).all()
-    assert len(lightmaps.warnings) == 2
-    assert lightmaps.warnings[0].startswith("b.exr: 3 texels NaN or infinite")
-    assert lightmaps.warnings[1].startswith("c.exr: 1 texel NaN or infinite")
-
-
-def test_frame_without_a_finite_texel_inside_is_an_error(tmp_path):
-    frames = _frames()
+    expected = np.clip(np.where(np.isfinite(frames).all(-1, keepdims=True), frames, 0.0), 0.0, 65_504.0)
+    expected[1, 2, 1:4], expected[2, 4, 6] = lightmaps.frames[1, 2, 1:4], lightmaps.frames[2, 4, 6]
+    np.testing.assert_array_equal(lightmaps.frames, expected)
+    told = [text.partition(": ")[2] for text in lightmaps.warnings]
+    assert told[:2] == ["2 texels negative: clamped to 0", "1 texel above 65,504: clamped to it"]
+    assert told[2].startswith("3 texels NaN or infinite") and told[3].startswith("1 texel NaN or infinite")
     frames[1, :, 1:] = np.nan
-    mask = np.ones((HEIGHT, WIDTH), bool)
-    mask[:, 0] = False
-    _save_mask(tmp_path / "mask.png", mask)
-    message = error_of(load, _write_set(tmp_path, frames, mask="mask.png"))
-    assert "b.exr" in message and "finite" in message
-
-
-def test_negative_radiance_is_clamped_and_counted():
-    frames = _frames()
-    frames[0, 1, 1] = (-1.0, 2.0, -3.0)
-    frames[0, 1, 2, 0] = -1e-6
-    frames[0, 0, 0] = -5.0
-    mask = np.ones((HEIGHT, WIDTH), bool)
-    mask[0, 0] = False
-    lightmaps = from_arrays(frames, TIMES, mask)
-    np.testing.assert_array_equal(lightmaps.frames[0, 1, 1], (0.0, 2.0, 0.0))
-    np.testing.assert_array_equal(lightmaps.frames, np.maximum(frames, 0.0))
-    assert lightmaps.warnings == ("frame 0 (time 0): 2 texels negative: clamped to 0",)
-    assert frames[0, 1, 1, 0] == -1.0  # the caller's array is left alone
-
-
-def test_hdr_passes_up_to_the_largest_half():
-    frames = _frames()
-    frames[0, 0, 0] = (60_000.0, 65_504.0, 0.0)
-    lightmaps = from_arrays(frames, TIMES)
-    np.testing.assert_array_equal(lightmaps.frames, frames)
-    assert lightmaps.warnings == ()
-    frames[2, 0, 0] = (70_000.0, 1.0, 1e30)
-    lightmaps = from_arrays(frames, TIMES)
-    np.testing.assert_array_equal(lightmaps.frames[2, 0, 0], (65_504.0, 1.0, 65_504.0))
-    assert lightmaps.warnings == ("frame 2 (time 18.55): 1 texel above 65,504: clamped to it",)
+    assert "frame 1 (time 6.5)" in error_of(from_arrays, frames, TIMES, mask)
 
 
 def test_repair_takes_neighbours_as_they_are_after_clamping():
@@ -256,23 +218,16 @@ def test_equal_times_name_both_files(tmp_path):
     assert "a.exr and c.exr" in message and "3" in message
 
 
-@pytest.mark.parametrize("time", [24.0, -0.5, 25.0])
-def test_time_outside_the_period_is_an_error(tmp_path, time):
-    path = _write_set(tmp_path, _frames())
-    message = error_of(load, path, times=[0, 1, time])
-    assert "c.exr" in message and "24" in message
-    _write_set(tmp_path, _frames(), period_hours=None)
-    assert time in load(path, times=[0, 1, time]).times
-
-
-@pytest.mark.parametrize("time", [float("nan"), float("inf")])
-def test_time_that_is_not_finite_is_an_error(time):
-    assert "frame 1" in error_of(from_arrays, _frames(), [0, time, 2])
+@pytest.mark.parametrize("time", [24.0, -0.5, float("nan"), float("inf")])
+def test_time_outside_the_period_or_not_finite_is_an_error(time):
+    assert "the time of frame 1 (time" in error_of(from_arrays, _frames(), [0, time, 2], period=24.0)
+    if np.isfinite(time):
+        assert time in from_arrays(_frames(), [0, time, 2]).times
 
 
 @pytest.mark.parametrize("period", [0.0, -24.0, float("nan"), float("inf")])
 def test_bad_period_is_an_error(period):
-    assert "period" in error_of(from_arrays, _frames(), TIMES, period=period)
+    assert "expected a finite period above 0" in error_of(from_arrays, _frames(), TIMES, period=period)
 
 
 def test_sizes_that_disagree_name_both_files(tmp_path):
@@ -302,17 +257,14 @@ def test_missing_truncated_and_misnamed_exr_name_the_file(tmp_path):
     ("changes", "expected"),
     [
         ({"width": None}, "width and height: expected both or neither, found one"),
-        ({"height": "5"}, "height: expected a valid integer, got '5'"),
         ({"width": 0}, "width: expected greater than 0, got 0"),
         ({"name": " "}, "name: expected a name that is not blank"),
         ({"period_hours": 0}, "period_hours: expected greater than 0, got 0"),
-        ({"lightmaps": None}, "lightmaps: expected a value, found none"),
         ({"lightmaps": []}, "lightmaps: expected at least 1 entries, found 0"),
         ({"lightmaps": ["a.exr"]}, "lightmaps.0: expected a mapping, got 'a.exr'"),
         ({"lightmaps": [{"time_hours": 0}]}, "lightmaps.0.file: expected a value, found none"),
         ({"lightmaps": [{"time_hours": 0, "file": "a\0.exr"}]}, "lightmaps.0.file: expected a name"),
         ({"lightmaps": [{"file": "a.exr"}]}, "lightmaps.0.time_hours: expected a finite number, found none"),
-        ({"lightmaps": [{"time_hours": True, "file": "a.exr"}]}, "lightmaps.0.time_hours: expected a valid number"),
         ({"lightmaps": [{"time_hours": float("nan"), "file": "a.exr"}]}, "lightmaps.0.time_hours: expected a finite"),
     ],
 )
@@ -449,17 +401,13 @@ def test_from_arrays_checks_shapes():
         ("0:24:1", [float(i) for i in range(24)]),
         ("0:3:1,18.45, 19:21:1", [0.0, 1.0, 2.0, 18.45, 19.0, 20.0]),
         ("2:0:-1", [2.0, 1.0]),
+        ("0.1:0.4:0.1", [0.1, 0.2, 0.3]),
+        ("0:24:0.1", [0.1 * i for i in range(240)]),
+        ("0:1:0.3", [0.0, 0.3, 0.6, 0.9]),
     ],
 )
 def test_parse_times(text, expected):
-    assert parse_times(text) == expected
-
-
-def test_parse_times_rounds_no_step_in():
-    assert len(parse_times("0:1:0.1")) == 10
-    assert len(parse_times("0.1:0.4:0.1")) == 3
-    assert len(parse_times("0:24:0.1")) == 240
-    assert len(parse_times("0:1:0.3")) == 4
+    assert parse_times(text) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("text", ["", "a", "1,,2", "0:24", "0:24:0", "0:24:-1", "3:3:1", "nan", "0:inf:1", "0:24:1e-9"])
@@ -630,20 +578,16 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"layers": {}}, "layers: expected at least 1 entries, found 0"),
         ({"layers": {"light": "srgb"}}, "layers.light.encoding: expected 'radiance', 'unit' or 'signed'"),
         ({"layers": {"light": {"encoding": "unit", "channels": []}}}, "layers.light.channels"),
         ({"layers": {"a\nb": "unit"}}, "printable"),
-        ({"atlases": None}, "atlases: expected a value, found none"),
         ({"atlases": {"0": {"width": 3, "height": 4}}}, "a.exr: has 5x2 pixels, but"),
-        ({"atlases": {"0": {"width": 3}}}, "atlases.0: width and height: expected both or neither"),
         ({"atlases": {"0": {}, "1": {}}}, "atlas 1: expected a picture of it in an entry of lightmaps, found none"),
         ({"atlases": {"0": {"mask": "alpha"}}}, "expected a channel A"),
         (
             {"lightmaps": [{"time_hours": 1.0, "files": {"0": {}}}]},
             "lightmaps.0.files: expected a picture, found none of the atlases",
         ),
-        ({"lightmaps": [{"time_hours": 1.0, "file": "a.exr"}]}, "lightmaps.0.files: expected a value, found none"),
         ({"lightmaps": [{"time_hours": 1.0, "files": {"0": {"light": "../a.exr"}}}]}, "found ../a.exr; trust=True"),
         ({"lightmaps": [{"time_hours": 1.0, "files": {"0": {"light": "a.png"}}}]}, "expected a lightmap, EXR"),
         (

@@ -41,6 +41,8 @@ TIMES = (0.0, 7.5, 10.0, 13.0, 21.7, 23.99)
         {"time_axis": "paper", "period": None, "interpolation": "network"},
         {"gelu": "tanh", "hidden": 16, "uvt_slices": 1},
         {"hidden": 17, "time_axis": "paper"},
+        {"kinds": (4, 3, 1, 4)},
+        {"kinds": (4, 3, 1, 4), "interpolation": "network"},
     ],
     ids=str,
 )
@@ -59,7 +61,7 @@ def test_the_decoder_agrees(settings, device):
             assert bounds[number] == pytest.approx(bound, rel=1e-6)
             if bound > 0:
                 share = np.minimum(colour / bound, 1.0)
-                assert np.abs(codes[number, ..., :3] / 255.0 - share).max() < 0.5 / 255.0 + 1e-5
+                assert np.abs(codes[number, ..., :3] / 255.0 - share).max() < 0.502 / 255.0
 
 
 def test_a_network_that_passes_its_features_through():
@@ -98,29 +100,19 @@ def test_what_is_not_there():
 
 
 DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "city"
-KINDS = (4, 3, 1, 4)
-FRAME_TIMES = (7.5, 10.0, 23.0)
 
 
-@pytest.mark.parametrize("interpolation", ["radiance", "network"])
-def test_decoders_agree_with_the_float64_path(interpolation, device):
+def test_frames_at_run_time(device):
     """The blocks are of all modes."""
-    model = random_sheet(KINDS, interpolation=interpolation)
+    model = random_sheet((4, 3, 1, 4))
     decoder, runtime = SheetDecoder(model, device), FrameDecoder(model, device)
     assert runtime.numbers.tolist() == [0, 3]
-    for time in FRAME_TIMES:
-        light, (codes, bounds) = decoder.tiles([0, 1, 3], time), decoder.tiles_8bit([0, 1, 3], time)
-        for place, number in ((0, 0), (2, 3)):
-            expected = decode_tile64(model, number, time)
-            np.testing.assert_allclose(light[place], expected, rtol=0, atol=1e-5 * expected.max())
-            assert abs(bounds[place] - bound64(model, number, time)) < 1e-6
-            share = np.minimum(colour_tile64(model, number, time) / bounds[place], 1.0)
-            assert np.abs(codes[place, ..., :3] / 255.0 - share).max() < 0.502 / 255.0
-            assert (codes[place, ..., 3] == 255).all()
+    for time in (7.5, 10.0, 23.0):
+        codes, bounds = decoder.tiles_8bit([0, 3], time)
         runtime.set_time(time)
         runtime.decode()
-        assert np.abs(runtime.numpy().astype(int) - codes[[0, 2]]).max() <= (time != 7.5)
-        np.testing.assert_array_equal(runtime.bounds, bounds[[0, 2]])
+        assert np.abs(runtime.numpy().astype(int) - codes).max() <= (time != 7.5)
+        np.testing.assert_array_equal(runtime.bounds, bounds)
     with pytest.raises(WlmError, match="finite"):
         runtime.set_time(float("nan"))
     with pytest.raises(WlmError, match="expected at least one tile that is stored as frames"):

@@ -22,8 +22,12 @@ from wlm_kernels.shared_exponent import unpack_rgb9e5 as unpack_kernel
 KINDS = (3, 2, 3, 1, 0, 3)  # the static tile's place lies between two dynamic ones
 
 
-def test_strip_and_exact_agree_at_any_time(device):
-    model = random_sheet(KINDS, hidden=16)
+@pytest.mark.parametrize(
+    ("hidden", "gelu"),
+    [(16, "tanh"), *(pytest.param(*shape, marks=pytest.mark.slow) for shape in ((17, "exact"), (64, "tanh")))],
+)
+def test_strip_and_exact_agree_at_any_time(device, hidden, gelu):
+    model = random_sheet(KINDS, hidden=hidden, gelu=gelu)
     strip, exact, decoder = StripDecoder(model, device), ExactDecoder(model, device), SheetDecoder(model, device)
     assert strip.numbers.tolist() == exact.numbers.tolist() == [0, 2, 5]
     for time in (None, 13.0, 21.7, 3.1):

@@ -86,7 +86,7 @@ class Decoder:
         Raises:
             ValueError: No such state, or the model has no mips.
         """
-        if lod is not None and not self.model.mips:
+        if lod is not None and not self.model.levels:
             raise ValueError("lod: expected None for a model without mip levels, got numbers")
         if self.model.method == "shared":
             return self._read_shared(uv, sheet, state, lod)

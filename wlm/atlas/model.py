@@ -278,11 +278,6 @@ class AtlasModel(Model):
         return len(self.sheets) + len(self.levels) if self.later else 0
 
     @property
-    def mips(self) -> bool:
-        """Whether the model has mip levels."""
-        return bool(self.levels)
-
-    @property
     def first_block_code(self) -> int:
         """The smallest size code with which an entry of T_c names blocks, from the function `first_block_code`."""
         return first_block_code(self.colour)

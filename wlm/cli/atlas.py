@@ -242,7 +242,7 @@ def _facts(model: "AtlasModel") -> dict[str, Any]:
         "colour_format": model.colour,
         "lookup_texture": "x".join(map(str, model.lut.shape[1::-1])) if model.lut.size else "none",
         "UVs": f"new, for {len(model.uv):,} triangles" if len(model.uv) else "those of the mesh",
-        "smaller_levels": model.mips,
+        "smaller_levels": bool(model.levels),
         "GPU_bytes": -(-model.bits // 8),
         "saved_GPU_bytes": f"{model.compression_ratio:.2%}",
     }

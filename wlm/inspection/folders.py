@@ -9,6 +9,7 @@ from pathlib import Path
 
 from wlm.atlas.listing import tiles_of
 from wlm.errors import WlmError
+from wlm.formats.folder import read_index
 from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_users
 from wlm.formats.light import SUFFIXES
@@ -138,19 +139,18 @@ def _entries(folder: Path) -> list[Path]:
 
 
 def _inside(path: Path) -> Finding | None:
-    """Describes a file together with those beside it, if it is part of an export or of a flip book."""
-    try:
-        files = [entry for entry in _entries(path.parent) if entry.is_file()]
-    except WlmError:
-        return None
-    documents = [file for file in files if file.suffix.lower() == ".json"][:_DOCUMENTS]
-    if path not in documents:
-        stated = next(filter(None, map(document_of, documents)), None)
-        if stated not in (None, BAKED, FRAMES):
-            return Finding(path, f"a file of the folder {path.parent}: {stated}")
+    """Describes a file together with those beside it, if it is part of a flip book or of an export."""
     names = {name for back in (False, True) for name, _ in _book_names(path, back)}
-    beside = [file for file in files if file == path or file.name.lower() in names]
-    return next((finding for finding, its in _flip_books(path.parent, beside) if path in its), None)
+    with suppress(WlmError):
+        beside = [entry for entry in _entries(path.parent) if entry == path or entry.name.lower() in names]
+        for finding, its in _flip_books(path.parent, beside) if names else ():
+            if path in its:
+                return finding
+    index = path.with_name("bundle.json")
+    stated, listed = document_of(index), read_index(index).get("files")
+    if stated is None or not isinstance(listed, list) or path.name not in listed:
+        return None
+    return Finding(path, f"a file of the folder {path.parent}: {stated}")
 
 
 def _book_names(file: Path, back: bool = False) -> list[tuple[str, str]]:

@@ -28,7 +28,8 @@ DISTANCE = 3.0
 _SPHERE = math.sqrt(3.0)
 
 ZOOM = math.sqrt(DISTANCE**2 - _SPHERE**2) / _SPHERE
-"""Ratio of clip x to the distance from the camera's axis; w is the distance along the axis."""
+"""Clip x of a point over its distance to the right of the camera's axis, in units of the scaled mesh; likewise clip y
+and the distance upwards. Clip w is the distance along the axis."""
 
 _NEAR, _FAR = DISTANCE - _SPHERE, DISTANCE + _SPHERE
 # If y of the direction is larger (within 26 degrees of a pole), the image's up axis is z instead of y.

@@ -102,32 +102,6 @@ def _system(
 
 
 @wp.kernel
-def _gather(
-    light: wp.array3d[float],
-    grid: Grid,
-    out: wp.array3d[float],
-):
-    t, channel = wp.tid()
-    for s in range(grid.nx * grid.ny):
-        out[t, channel, s] = 0.0
-    for r in range(grid.points):
-        sums = _Row()
-        for c in range(grid.points):
-            value = light[t, channel, r * grid.points + c]
-            j = grid.first_x[c]
-            k = wp.min(j + 1, grid.nx - 1)
-            a = grid.share_x[c]
-            sums[j] += (1.0 - a) * value
-            sums[k] += a * value
-        i = grid.first_y[r] * grid.nx
-        k = wp.min(grid.first_y[r] + 1, grid.ny - 1) * grid.nx
-        a = grid.share_y[r]
-        for j in range(grid.nx):
-            out[t, channel, i + j] += (1.0 - a) * sums[j]
-            out[t, channel, k + j] += a * sums[j]
-
-
-@wp.kernel
 def _solve(
     light: wp.array3d[float],
     weight: wp.array2d[float],
@@ -248,11 +222,6 @@ def gather_system(weight: wp.array, scale: wp.array, grid: Grid, system: System)
     """Writes the normal equations of T tiles to `system`. The squared error at a point has the weight `weight`, float
     [T, m * m], times its tile's factor `scale`, float [T]."""
     wp.launch(_system, weight.shape[0], inputs=[weight, scale, grid, system], device=weight.device, block_dim=_BLOCK)
-
-
-def gather(light: wp.array, grid: Grid, out: wp.array) -> None:
-    """Applies the transpose of interpolation: from `light` at points, [T, 3, m * m], to samples `out`, [T, 3, S]."""
-    wp.launch(_gather, light.shape[:2], inputs=[light, grid, out], device=light.device, block_dim=_BLOCK)
 
 
 def solve(

@@ -86,25 +86,24 @@ def find_mixtures(
         return _first_best(torch.from_numpy(kept), torch.from_numpy(energy)).numpy()
 
     spaces = [_subspace(moment.sum(0), few)]
-    lost = energy - _kept(flat, spaces)[:, 0]
+    lost = energy - flat @ _projections(spaces)[0]
     while len(spaces) < min(count, len(moment)):
         share = lost.clip(min=0.0)
         if not share.sum() > _ALIKE * energy.sum():
             break
         spaces.append(_subspace(moment[random.choice(len(share), p=share / share.sum())], few))
-        lost = np.minimum(lost, energy - _kept(flat, spaces[-1:])[:, 0])
+        lost = np.minimum(lost, energy - flat @ _projections(spaces[-1:])[0])
     for _ in range(_ROUNDS):
-        nearest = best_of(_kept(flat, spaces))
+        nearest = best_of(flat @ _projections(spaces).T)
         spaces = [_subspace(moment[nearest == g].sum(0), few) for g in np.unique(nearest)]
-    kept = [_projection(space) for space in spaces]
-    nearest = best_of(flat @ np.stack(kept).T)
+    kept = _projections(spaces)
+    nearest = best_of(flat @ kept.T)
     if few < rank:
         # A mixture that lost its tiles in the last round has arbitrary directions.
         spaces = [_subspace(moment[nearest == g].sum(0), rank) for g, space in enumerate(spaces)]
     offset = np.stack([_offset(space, texels[nearest == g]) for g, space in enumerate(spaces)])
     factor = np.stack([space.transpose(1, 2, 0) for space in spaces])
-    parts = factor, offset, np.stack(kept)
-    return Mixtures(*(torch.from_numpy(np.ascontiguousarray(each)).float() for each in parts))
+    return Mixtures(*(torch.from_numpy(np.ascontiguousarray(each)).float() for each in (factor, offset, kept)))
 
 
 def _first_best(kept: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
@@ -121,13 +120,10 @@ def _subspace(moment: np.ndarray, rank: int) -> np.ndarray:
     return space
 
 
-def _projection(space: np.ndarray) -> np.ndarray:
-    return np.einsum("cmk,cnk->cmn", space, space).ravel()
-
-
-def _kept(flat: np.ndarray, spaces: list[np.ndarray]) -> np.ndarray:
-    """Returns the energy of each tile that each of G subspaces keeps, [T, G]."""
-    return flat @ np.stack([_projection(each) for each in spaces]).T
+def _projections(spaces: list[np.ndarray]) -> np.ndarray:
+    """Returns `Mixtures.kept` of G subspaces, [G, 3 M M]; its product with a tile's moments is the energy kept."""
+    stack = np.stack(spaces)
+    return np.einsum("gcmk,gcnk->gcmn", stack, stack).reshape(len(spaces), -1)
 
 
 def _offset(space: np.ndarray, texels: np.ndarray) -> np.ndarray:

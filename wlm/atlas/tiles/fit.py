@@ -217,11 +217,9 @@ def solve(tiles: Tiles, nx: int, ny: int, rounds: int = _FINE) -> torch.Tensor:
             interop.to_warp(space(nx * ny)) for _ in range(5)
         )
         kernels.gather_system(weight, scale, grid, system)
-        start = space(3, nx * ny)
-        kernels.gather(light, grid, interop.to_warp(start))
         # With equal weights the equations separate by axis.
-        across, down = (_axis(samples, grid.points, str(start.device))[3] for samples in (nx, ny))
-        start = _laid_out((down @ start.unflatten(2, (ny, nx)) @ across).flatten(2))
+        across, down = (_axis(samples, grid.points, str(tiles.light.device))[3] for samples in (nx, ny))
+        start = _laid_out((down @ tiles.light.unflatten(2, (grid.points, grid.points)) @ across.T).flatten(2))
         *work, out = (space(3, nx * ny) for _ in range(4))
         ridge = _RIDGE * grid.points**2 / (nx * ny)
         arrays = [interop.to_warp(each) for each in (start, *work, out)]
@@ -259,8 +257,8 @@ def _empty(tiles: Tiles, *shape: int) -> torch.Tensor:
 @functools.cache
 def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, ...]:
     """Returns the linear interpolation from samples to points along an axis: the sample before each point and the
-    weight of the next one, [points] each; the matrix, float [points, samples]; and the inverse of its Gram matrix,
-    which is slow to compute on a GPU."""
+    weight of the next one, [points] each; the matrix, float [points, samples]; and its pseudoinverse, which is slow to
+    compute on a GPU."""
     place, row = (torch.arange(points) + 0.5) / points * (samples - 1), torch.arange(points)
     first = place.floor().clamp(max=max(samples - 2, 0))
     share, before = place - first, first.long()
@@ -268,8 +266,8 @@ def _axis(samples: int, points: int, device: str) -> tuple[torch.Tensor, ...]:
     matrix[row, before] = 1.0 - share
     if samples > 1:
         matrix[row, before + 1] = share
-    inverse = torch.linalg.inv(matrix.double().T @ matrix.double())
-    return tuple(each.to(device) for each in (before.int(), share, matrix, inverse.float()))
+    inverse = torch.linalg.pinv(matrix.double()).float()
+    return tuple(each.to(device) for each in (before.int(), share, matrix, inverse))
 
 
 def errors(tiles: Tiles, samples: torch.Tensor) -> torch.Tensor:

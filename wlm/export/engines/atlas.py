@@ -45,7 +45,7 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
         WlmError: The colours are ASTC blocks, which the engine's kit can't load, the engine can't read the UV set, or
             a texture is larger than the engine accepts.
     """
-    if bundle.model.mips:
+    if bundle.model.levels:
         bundle = make_bundle(bundle.model.without_mips())
     pictures = engine in ("godot", "unreal")
     entries = _write_pictures(bundle, folder, engine) if pictures else _write_textures(bundle, folder, engine)
