@@ -22,6 +22,7 @@ DAMAGED_PICTURE = (
     TypeError,
     LookupError,
     ArithmeticError,
+    RuntimeError,
     AttributeError,
     EOFError,
     MemoryError,
@@ -30,7 +31,7 @@ DAMAGED_PICTURE = (
     zlib.error,
     Image.DecompressionBombError,
 )
-"""Exceptions that Pillow raises for a damaged picture or other content."""
+"""Exceptions that Pillow and imagecodecs raise for a damaged picture or other content."""
 
 
 def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int], others: str = "") -> np.ndarray:
