@@ -103,7 +103,7 @@ def test_the_kernel_reads_what_the_reference_does(scene, model, device):
 
 def test_blocks_of_bc6h_or_none(scene, model, tmp_path):
     """Phones have no blocks."""
-    plain = compress(scene, "standard", colour="rgb9e5", **QUICK)
+    plain = compress(scene, "standard", colour="rgb9e5", views=1, budget=0.2, tile=3)
     assert model.colour == "mixed" and model.report["tiles of blocks"] > 0
     assert plain.colour == "rgb9e5" and not plain.block_texels.size and not plain.report["tiles of blocks"]
     assert "wlm_scene_blocks" in glsl(model) and "wlm_scene_blocks" not in glsl(plain)
@@ -351,12 +351,12 @@ def test_hard_cases_of_a_scene(tmp_path):
     black = np.zeros((3, SIDE, SIDE, 3))
     uvs, light = (0.3 + 0.4 * (uv % [1 / 3, 0.5]), tiny, uv), (lights(0), lights(1), black)
     parts = [from_arrays(position, triangle, *each) for each in zip(uvs, light, strict=True)]
-    model = compress(scene := join(parts), views=1, budget=0.4, tile=4)
+    model = compress(scene := join(parts), views=1, budget=0.4, tile=3)
     decoder = Decoder(model)
     assert not decoder.lightmap(2, 1).any()
     score = compare(scene, {"it": decoder}, views=2, resolution=32)["it"]
     assert score.psnr > 35.0
-    dark = compress(_with(parts[0].sheets[0], black), views=1, budget=0.3, tile=4)
+    dark = compress(_with(parts[0].sheets[0], black), views=1, budget=0.4, tile=3)
     assert not Decoder(dark).lightmap(0, 2).any()
 
 

@@ -218,7 +218,7 @@ def test_a_contact_sheet(tmp_path):
             np.testing.assert_array_equal(sheet[y : y + 10, x : x + 12], rows[label][i])
     assert contact_sheet(tmp_path / "b.png", {"": rows["one"][:1]}) == (0,)
     for wrong in ({"a": rows["one"], "b": rows["one"][:3]}, {}, {"a": []}, {"a": [sheet, rows["one"][0]]}):
-        with pytest.raises(ValueError, match="expected rows"):
+        with pytest.raises(ValueError, match="rows: expected equally"):
             contact_sheet(tmp_path / "c.png", wrong)
     with pytest.raises(ValueError, match="titles"):
         contact_sheet(tmp_path / "c.png", rows, ["a"])

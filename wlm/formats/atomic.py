@@ -23,7 +23,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     # Links are resolved first: os.replace would replace the link itself.
     target = Path(os.path.realpath(path))
-    with _as_wlm_error(path):
+    try:
         # Renaming over a device such as /dev/null would destroy it.
         if os.path.lexists(target) and not stat.S_ISREG(os.stat(target).st_mode):
             raise WlmError(f"{path}: cannot write: expected a file or none, found a folder, a device or a pipe")
@@ -39,6 +39,8 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
                 os.close(handle)
             os.replace(part, target)
             sync_folder(target.parent)
+    except OSError as error:
+        raise WlmError(f"{path}: cannot write: {error.strerror or error}") from error
 
 
 def sync_folder(folder: Path) -> None:
@@ -59,12 +61,3 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | Iterable[bytes]) ->
     chunks = [data] if isinstance(data, bytes | bytearray | memoryview) else data
     with atomic_path(path) as part, open(part, "wb") as file:
         return sum(map(file.write, chunks))
-
-
-@contextmanager
-def _as_wlm_error(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turns an `OSError` in the block into a `WlmError` that names the output file."""
-    try:
-        yield
-    except OSError as error:
-        raise WlmError(f"{path}: cannot write: {error.strerror or error}") from error

@@ -7,7 +7,7 @@ result is a document without the extension, whose compressed parts are in new bu
 import copy
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -92,13 +92,8 @@ def _unpack_views(path: str | os.PathLike[str], content: dict, buffers: list[byt
         where = f"{path}: bufferViews[{number}].{name}"
         meshopt = _needed(path, "meshopt", name)
         packed = view["extensions"].pop(name)
-        count, stride, start, length = (
-            packed["count"],
-            packed["byteStride"],
-            packed.get("byteOffset", 0),
-            packed["byteLength"],
-        )
-        source = packed["buffer"]
+        count, stride, length, source = (packed[each] for each in ("count", "byteStride", "byteLength", "buffer"))
+        start = packed.get("byteOffset", 0)
         if not all(isinstance(each, int) and each >= 0 for each in (count, stride, start, length, source)):
             raise WlmError(f"{where}: expected whole numbers of 0 or more")
         if source >= len(buffers) or start + length > len(buffers[source]):
@@ -112,19 +107,15 @@ def _unpack_views(path: str | os.PathLike[str], content: dict, buffers: list[byt
         view |= {"byteOffset": 0} | _add(content, buffers, np.asarray(data).tobytes(), **rows)
 
 
-def _packed_primitives(content: dict) -> Iterator[tuple[str, dict, dict]]:
-    """Yields the place of each primitive that Draco compresses, the primitive, and its extension, which is removed."""
-    for i, mesh in enumerate(content.get("meshes", [])):
-        for k, primitive in enumerate(mesh["primitives"]):
-            packed = primitive.get("extensions", {}).pop(DRACO, None)
-            if packed is not None:
-                yield f"meshes[{i}].primitives[{k}].{DRACO}", primitive, packed
-
-
 def _unpack_primitives(
     path: str | os.PathLike[str], content: dict, buffers: list[bytes], held: int, components: dict[int, str]
 ) -> None:
-    found = list(_packed_primitives(content))
+    found = [
+        (f"meshes[{i}].primitives[{k}].{DRACO}", primitive, primitive["extensions"].pop(DRACO))
+        for i, mesh in enumerate(content.get("meshes", []))
+        for k, primitive in enumerate(mesh["primitives"])
+        if DRACO in primitive.get("extensions", {})
+    ]
     if not found:
         return
     _needed(path, "DracoPy", DRACO)

@@ -112,7 +112,10 @@ def encode_glb(
             meshes[node] = meshes[node] if node in meshes else tree.own_mesh(node)
             tree.replace(meshes[node]["primitives"][each.primitive.primitive], each, uv_set)
         tree.embed_images()
-        tree.drop_unused()
+        # An extension may refer to data in an unknown way.
+        if all(name.startswith(_HARMLESS) for name in tree.content.get("extensionsUsed", [])):
+            tree.keep("accessors", _accessor_slots)
+            tree.payloads = [tree.payloads[number] for number in tree.keep("bufferViews", _view_slots)]
     return _pack(document.path if path is None else path, tree.content, tree.payloads)
 
 
@@ -174,15 +177,7 @@ class _Tree:
             del image["uri"]
             image |= {"bufferView": self._view(data, {}), "mimeType": kind}
 
-    def drop_unused(self) -> None:
-        """Drops unused accessors and buffer views, unless an extension may refer to them."""
-        used = self.content.get("extensionsUsed", [])
-        if all(name.startswith(_HARMLESS) for name in used):
-            self._keep("accessors", _accessor_slots)
-            numbers = self._keep("bufferViews", _view_slots)
-            self.payloads = [self.payloads[number] for number in numbers]
-
-    def _keep(self, kind: str, slots: Callable[[dict], Iterable[tuple[dict, str]]]) -> list[int]:
+    def keep(self, kind: str, slots: Callable[[dict], Iterable[tuple[dict, str]]]) -> list[int]:
         """Drops the entries of list `kind` that no reference in `slots` uses; returns the old indices of those kept."""
         places = list(slots(self.content))
         numbers = sorted({holder[key] for holder, key in places})

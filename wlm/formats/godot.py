@@ -53,7 +53,7 @@ _SIZES = {1: 0, 2: 4, 3: 4, 20: 16, 23: 4, 40: 8, 41: 8, 42: 0, 43: 0, 45: 8, 46
 _PACKED_REALS = {_VECTOR3S: 3, 37: 2, 53: 4}
 _PACKED_SIZES = {_BYTES: 1, _INTS: 4, 33: 4, _COLOURS: 16, 48: 8, 49: 8}
 # Kinds of references to a resource: no content, two strings (in old files), an index, an index.
-_EMPTY, _EXTERNAL_PATH, _INTERNAL, _EXTERNAL = range(4)
+_EMPTY, _EXTERNAL_PATH, _, _EXTERNAL = range(4)
 
 # A value or name counts as so many bytes, and all may take so many: a million for any size of file.
 _COST, _SURE, _GROWTH = 32, 32 << 20, 8
@@ -360,7 +360,13 @@ class _Reader:
             names, subnames = struct.unpack(self.order + "HH", self.take(4))
             self._repeat(names + (subnames & 0x7FFF), self._skip_name)
         elif kind == _OBJECT:
-            self._skip_object()
+            reference = self.u32()
+            if reference > _EXTERNAL:
+                raise WlmError(f"{self.path}: damaged: expected a reference of kind 0 to 3, found {reference}")
+            if reference == _EXTERNAL_PATH:
+                self._repeat(2, self.string)
+            elif reference != _EMPTY:
+                self.take(4)
         elif kind == _DICTIONARY:
             self._repeat(2 * (self.u32() & 0x7FFFFFFF), lambda: self.skip(depth + 1))
         elif kind == _ARRAY:
@@ -375,15 +381,6 @@ class _Reader:
         index = self.u32()
         if index & 0x80000000:
             self.take(index & 0x7FFFFFFF)
-
-    def _skip_object(self) -> None:
-        kind = self.u32()
-        if kind == _EXTERNAL_PATH:
-            self._repeat(2, self.string)
-        elif kind in (_INTERNAL, _EXTERNAL):
-            self.take(4)
-        elif kind != _EMPTY:
-            raise WlmError(f"{self.path}: damaged: expected a reference of kind 0 to 3, found {kind}")
 
     def _repeat(self, count: int, read: Callable[[], object]) -> None:
         # Each call reads at least four bytes, so the size of the file bounds the loop.
