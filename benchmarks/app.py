@@ -33,57 +33,53 @@ app = typer.Typer(
 )
 
 
-def _option(kind: Any, flag: str, text: str, **more: Any) -> Any:
-    """Returns the type annotation from which typer makes a command line option: its type, flag and help text."""
-    return Annotated[kind, typer.Option(flag, help=text, **more)]
+def _option(kind: Any, flag: str, default: Any = None, **more: Any) -> tuple[Any, Any]:
+    """Returns the annotation and the default from which typer makes an option; `more` has its help text."""
+    return Annotated[kind, typer.Option(flag, **more)], default
 
 
-_PROFILE = "Name or YAML file of the profile whose settings are varied."
+_Path = Path | None
+_Paths = list[Path] | None
+_Names = list[str] | None
 # The annotation and the default of each option, by the name of its argument.
 _OPTIONS: dict[str, tuple[Any, Any]] = {
-    "quick": (_option(bool, "--quick", "Measure fewer, smaller cases: minutes on a CPU."), False),
+    "quick": _option(bool, "--quick", False, help="Measure fewer, smaller cases, which takes minutes on a CPU."),
     "device": (Device, "cpu"),
-    "set_path": (_option(Path | None, "--set", "Lightmap set to measure. Default: the demo's.", metavar="SET"), None),
-    "profiles": (_option(list[str] | None, "--profile", "Profile or its YAML file. Repeatable.", metavar="NAME"), None),
-    "profile": (_option(str, "--profile", _PROFILE, metavar="NAME"), "paper"),
-    "rivals": (_option(bool, "--rivals/--no-rivals", "Measure rival methods too: minutes on a CPU."), True),
-    "rivals_only": (_option(bool, "--rivals-only", "Measure only the rival methods."), False),
-    "rival_names": (_option(list[str] | None, "--rival", "Measure only this rival. Repeatable.", metavar="NAME"), None),
-    "rivals_at": (
-        _option(Path | None, "--rivals-at", "Measure only rivals, at our models' sizes in FILE.", metavar="FILE.json"),
-        None,
+    "set_path": _option(_Path, "--set", help="Lightmap set to measure. Default: that of the demo.", metavar="SET"),
+    "profiles": _option(
+        _Names, "--profile", help="Name or YAML file of a profile to measure. Repeatable.", metavar="NAME"
     ),
-    "probes_path": (_option(Path | None, "--probes", "Light probe file. Default: the demo's.", metavar="FILE"), None),
-    "keys": (_option(list[str] | None, "--key", "Name of an array of --probes to measure. Repeatable."), None),
-    "volume_only": (_option(bool, "--volume-only", "Measure only the cascaded probe volume."), False),
-    "meshes_path": (
-        _option(Path | None, "--meshes", "Folder of a .glb, its .exr and mask.png, or of such folders.", metavar="DIR"),
-        None,
+    "profile": _option(str, "--profile", "paper", help="Name or YAML file of the profile to vary.", metavar="NAME"),
+    "rivals": _option(bool, "--rivals/--no-rivals", True, help="Measure rival methods too, which takes minutes."),
+    "rivals_only": _option(bool, "--rivals-only", False, help="Measure only the rival methods."),
+    "rival_names": _option(
+        _Names, "--rival", help="Name of a rival method; measure only these. Repeatable.", metavar="NAME"
     ),
-    "mesh_path": (_option(Path | None, "--mesh", "One mesh in place of --meshes.", metavar="FILE"), None),
-    "lightmap_paths": (
-        _option(list[Path] | None, "--lightmap", "A lightmap of --mesh. Repeatable.", metavar="FILE.exr"),
-        None,
+    "rivals_at": _option(
+        _Path, "--rivals-at", help="Measure only rivals, in as many bytes as our rows in FILE.", metavar="FILE.json"
     ),
-    "mask_path": (_option(Path | None, "--mask", "Image of the valid texels of --lightmap.", metavar="FILE.png"), None),
-    "scene_path": (_option(Path, "--set", "A lightmap set that names its mesh.", metavar="SET"), ...),
-    "hours": (_option(list[float] | None, "--hour", "An hour to measure. Repeatable; default: all."), None),
-    "side": (_option(int | None, "--side", "Texels of the set's longer side after downsampling.", min=1), None),
-    "budget": (_option(float | None, "--budget", "Maximum share of the input's bits. Default: the profile's."), None),
-    "parts": (_option(bool, "--parts/--no-parts", "Also compress each object in each state alone."), True),
-    "steps": (_option(int | None, "--steps", "Steps of each fit. Default: the profile's.", min=1), None),
-    "only": (
-        _option(list[str] | None, "--only", "A variant to measure. Repeatable; default: all.", metavar="ROW"),
-        None,
+    "probes_path": _option(_Path, "--probes", help="Light probe file. Default: that of the demo.", metavar="FILE"),
+    "keys": _option(_Names, "--key", help="Name of an array in the file of --probes to measure. Repeatable."),
+    "volume_only": _option(bool, "--volume-only", False, help="Measure only the cascaded probe volume."),
+    "meshes_path": _option(
+        _Path, "--meshes", help="Folder of a .glb, its .exr lightmaps and mask.png, or of such folders.", metavar="DIR"
     ),
-    "networks": (
-        _option(list[Path] | None, "--network", "File of a trained network. Repeatable.", metavar="FILE"),
-        None,
+    "mesh_path": _option(_Path, "--mesh", help="Mesh to measure, in place of --meshes.", metavar="FILE.glb"),
+    "lightmap_paths": _option(_Paths, "--lightmap", help="Lightmap of the --mesh. Repeatable.", metavar="FILE.exr"),
+    "mask_path": _option(
+        _Path, "--mask", help="Image that is white at valid texels of --lightmap.", metavar="FILE.png"
     ),
-    "json_path": (
-        _option(Path | None, "--json", "Write results and machine to this result file.", metavar="FILE.json"),
-        None,
+    "scene_path": _option(Path, "--set", ..., help="Lightmap set that names its mesh.", metavar="SET"),
+    "hours": _option(list[float] | None, "--hour", help="Hour of the set to measure. Repeatable; default: all."),
+    "side": _option(int | None, "--side", help="Texels of the set's longer side after downsampling.", min=1),
+    "budget": _option(
+        float | None, "--budget", help="Largest share of the input's bits, 0 to 1. Default: the profile's."
     ),
+    "parts": _option(bool, "--parts/--no-parts", True, help="Compress each object at each hour alone, too."),
+    "steps": _option(int | None, "--steps", help="Optimisation steps of each fit. Default: the profile's.", min=1),
+    "only": _option(_Names, "--only", help="Name of a variant to measure. Repeatable; default: all.", metavar="ROW"),
+    "networks": _option(_Paths, "--network", help="File of a trained network to measure. Repeatable.", metavar="FILE"),
+    "json_path": _option(_Path, "--json", help="Result file to write, with the machine.", metavar="FILE.json"),
 }
 _MESHES = ("meshes_path", "mesh_path", "lightmap_paths", "mask_path")
 # The help text and the options of each measuring command, in the order in which result files state them.
@@ -142,7 +138,8 @@ def _add_command(name: str, summary: str, options: tuple[str, ...]) -> None:
     # typer reads both.
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    app.command(name, help=summary)(command)
+    command.__doc__ = summary
+    app.command(name)(command)
 
 
 def _measure(name: str, values: dict[str, Any]) -> None:
@@ -221,7 +218,7 @@ def report(
 def plot(
     files: _Results,
     system: Annotated[
-        str, typer.Option(metavar="NAME", help="lightmap, atlas, probe, smoke or smoke-network: whose results to draw.")
+        str, typer.Option(metavar="NAME", help="System to draw: lightmap, atlas, probe, smoke or smoke-network.")
     ],
     output: Annotated[Path, output_option("FILE.png", "The picture, .png, .svg or .pdf.")],
 ) -> None:

@@ -55,7 +55,7 @@ class Panel:
     def __post_init__(self) -> None:
         for name in (self.x, self.y):
             if name not in FIGURES:
-                raise WlmError(f"plot: unknown measured quantity {name!r}; known are psnr, bpp, decode_ms ...")
+                raise WlmError(f"plot: unknown measured quantity {name!r}: see FIGURES in benchmarks/figures.py")
 
     def position(self, row: Row) -> tuple[float, float] | None:
         """Returns a row's values on the x and y axis; None if the panel does not show the row or it lacks a value."""

@@ -62,7 +62,7 @@ class Row:
         """
         for name in self.figures:
             if name not in FIGURES:
-                raise ValueError(f"unknown measured quantity {name!r}; benchmarks.figures lists the known")
+                raise ValueError(f"unknown measured quantity {name!r}: see FIGURES in benchmarks/figures.py")
         measured = {name: value for name, value in self.figures.items() if value is not None and math.isfinite(value)}
         # NumPy's numbers don't fit JSON.
         plain = {name: value if isinstance(value, int) else float(value) for name, value in measured.items()}

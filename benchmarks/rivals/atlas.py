@@ -128,7 +128,7 @@ def _fitting_size(sheet: Sheet, share: float, block: tuple[int, int], bits: int)
         else:
             high = middle - 1
     if low == 0:
-        raise ValueError(f"share: {share} of the bits of {sheet.mask.size} texels is less than a block, {bits} bits")
+        raise ValueError(f"share: {share} of {sheet.mask.size} texels of 48 bits is less than one block, {bits} bits")
     return size(low), _read_blocks(sheet, size(low), block)
 
 

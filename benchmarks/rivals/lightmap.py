@@ -105,7 +105,7 @@ def usual(device: str, quick: bool = False) -> tuple[str, ...]:
 def check_rival(name: str) -> None:
     """Raises a `WlmError` if `RIVALS` has no method of this name."""
     if name not in RIVALS:
-        raise WlmError(f"baselines: unknown method {name!r}, expected one of {', '.join(RIVALS)}")
+        raise WlmError(f"rivals: unknown method {name!r}, expected one of {', '.join(RIVALS)}")
 
 
 def encode_set(

@@ -39,10 +39,10 @@ def prepare(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """
     frames = np.asarray(frames)
     if frames.ndim < 3 or frames.shape[-1] != 3 or 0 in frames.shape:
-        raise WlmError(f"baselines: expected lightmaps [..., H, W, 3], got {frames.shape}")
+        raise WlmError(f"lightmaps: expected lightmaps [..., H, W, 3], got shape {frames.shape}")
     filled = fill_gaps(frames, mask)
     if not np.isfinite(filled).all():
-        raise WlmError("baselines: the lightmap is NaN or infinite at valid texels")
+        raise WlmError("lightmaps: expected finite light at valid texels, found NaN or infinite")
     return np.clip(filled, 0.0, HALF_MAX).astype(np.float32)
 
 

@@ -312,4 +312,4 @@ def _check_bits(bits: int | None) -> None:
 
 def _in_range(name: str, value: float, low: float, high: float = np.inf) -> None:
     if not low <= value <= high or not np.isfinite(value):
-        raise ValueError(f"expected {name} from {low} to {high}, got {value}")
+        raise ValueError(f"{name}: expected a number from {low} to {high}, got {value}")

@@ -27,13 +27,13 @@ def billboard(baked: SixWay, source: Camera, camera: Camera, pivot: np.ndarray) 
         ValueError: A camera is in perspective, or the lightmaps aren't those of `source`.
     """
     if source.perspective or camera.perspective:
-        raise ValueError("a billboard needs orthographic cameras, as the lightmaps do")
+        raise ValueError("source, camera: expected orthographic cameras for a billboard, got perspective")
     if tuple(baked.lightmaps.shape[1:]) != (source.height, source.width):
         raise ValueError(
             f"baked: expected {source.height} x {source.width} pixels, got {tuple(baked.lightmaps.shape[1:])}"
         )
     if baked.transparency is None:
-        raise ValueError("baked: expected lightmaps with their transparency")
+        raise ValueError("baked: expected six-way lightmaps with their transparency, found none")
     planes = [baked.lightmaps, 1.0 - baked.transparency[None]]
     if baked.emission is not None:
         planes.append(baked.emission[None])

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid import engine
+from wlm.fluid import lattice as lattice_module
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, MAX_SPEED, Domain, Lattice
 from wlm_kernels.fluid.lattice_fields import voxelise_sphere
@@ -37,7 +37,7 @@ def test_not_a_number_is_reported(where: tuple[int, int, int], device: str):
     q = 4
     populations = state["populations"].reshape(-1, *SHAPE)
     populations[(q, *where)] = np.nan
-    box._engine.buffers[0].assign(state["populations"])
+    box._buffers[0].assign(state["populations"])
     with pytest.raises(WlmError, match=r"blew up in step 5 at cell \(\d+, \d+, \d+\): not a number") as caught:
         box.step(CHECK_EVERY)
     assert "\n" not in str(caught.value)
@@ -119,7 +119,7 @@ def test_too_fast(device: str):
 
 def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
     """The error names the memory needed and that available, before anything is allocated."""
-    monkeypatch.setattr(engine, "free_memory", lambda _device: 3 * 2**29)
+    monkeypatch.setattr(lattice_module, "free_memory", lambda _device: 3 * 2**29)
     with pytest.raises(WlmError, match=r"256 x 256 x 256 cells need 2\.4 GiB on .*: expected at most the 1\.5 GiB"):
         Lattice((256, 256, 256), viscosity=0.02, device=device)
     with pytest.raises(WlmError, match="fewer than 2"):
@@ -169,7 +169,7 @@ def test_wrong_calls(device: str):
         box.step()
     box.set_wall("+x")
     box.step()
-    with pytest.raises(ValueError, match="before the flow"):
+    with pytest.raises(ValueError, match="before set_flow"):
         box.set_wall("-y")
 
 

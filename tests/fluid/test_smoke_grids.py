@@ -229,7 +229,9 @@ def test_one_grid_for_a_sequence(tmp_path: Path):
     write(tmp_path / "s_0001.vdb", "smoke")
     assert not load_frames(tmp_path, up="y").load(1).density.any()
     assert load_frames(tmp_path, up="y", density="smoke").load(1).density.any()
-    with pytest.raises(WlmError, match="fog: expected one of its grids of floats, found smoke, flame, density"):
+    with pytest.raises(
+        WlmError, match="fog: expected the name of one of the file's grids of floats, found smoke, flame, density"
+    ):
         load_frames(tmp_path, density="fog")
 
 

@@ -11,7 +11,7 @@ from wlm import fluid
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES, axis_ends
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
-from wlm.fluid.obstacles import Mesh, Sphere, Trajectory, box_mesh
+from wlm.fluid.obstacles import Mesh, Sphere, Trajectory, box_mesh, surface
 from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source, require_memory
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm_kernels.fluid.advection_places import CLOSED, OPEN, PERIODIC
@@ -138,6 +138,16 @@ def test_obstacles_cover_what_they_should(device: str):
     np.testing.assert_array_equal(solid == 2, (np.abs(x - (14, 5, 5)) < (2, 3, 1)).all(-1))
     # The sphere moves 3 cells in 60 steps, and is placed where it is in the middle of the first two.
     np.testing.assert_array_equal(solid == 1, np.linalg.norm(x - (9.05, 5, 5), axis=-1) < 2)
+
+
+@pytest.mark.parametrize(("shape", "volume"), [("sphere", 4 / 3 * np.pi), ("box", 8.0), ("cylinder", 2 * np.pi)])
+def test_surfaces_are_closed(shape: str, volume: float):
+    """Each edge has two triangles, one on either side, and all of them face outwards."""
+    points, triangles = surface(shape)
+    edges = {(a, b) for t in triangles.tolist() for a, b in zip(t, t[1:] + t[:1], strict=True)}
+    assert len(edges) == 3 * len(triangles) and edges == {(b, a) for a, b in edges}
+    a, b, c = points[triangles].transpose(1, 0, 2)
+    assert np.einsum("fk,fk->", a, np.cross(b, c)) / 6 == pytest.approx(volume, rel=0.01)
 
 
 def test_paths():

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 from reference import lattice as reference
 
-from wlm.fluid import engine
+from wlm.fluid import lattice as lattice_module
 from wlm.fluid.lattice import Lattice
 from wlm_kernels.fluid.lattice import CAUSES, trouble_of
 from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
@@ -212,10 +212,10 @@ def test_sixteen_bits(lattice: str, device: str):
 def test_indices_of_64_bits(storage: str, tolerance: float, device: str, monkeypatch: pytest.MonkeyPatch):
     """The indices of a domain of more populations than 32 bits count, in a small one."""
     closed = {face: ("wall", np.zeros(3)) for face in ("-y", "+y")}
-    assert not Pair("D3Q19", device, closed, storage=storage).device._engine.spec.wide
-    monkeypatch.setattr(engine, "NARROW", 0)
+    assert not Pair("D3Q19", device, closed, storage=storage).device._spec.wide
+    monkeypatch.setattr(lattice_module, "NARROW", 0)
     pair = Pair("D3Q19", device, closed, storage=storage)
-    assert pair.device._engine.spec.wide
+    assert pair.device._spec.wide
     _run(pair, tolerance)
 
 

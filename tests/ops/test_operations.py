@@ -354,7 +354,11 @@ REFUSED = [
     ("mlp-8", {"hidden": torch.zeros(3, 27, 8)}, "hidden: expected float32 [3, 26, 8], got"),
     ("mlp-8", {"output": torch.zeros(2, 9, 3)}, "output: expected float32 [3, 9, 3], got"),
     ("mlp-8", {"hidden": torch.zeros(3, 83, 65), "output": torch.zeros(3, 66, 3)}, "hidden: expected 1 to 64 units"),
-    ("gaussian_sum", {"rows": torch.zeros(3, 10)}, "rows: expected more than 10 columns, got 10"),
+    (
+        "gaussian_sum",
+        {"rows": torch.zeros(3, 10)},
+        "rows: expected 10 columns and at least one of a latent, got 10 columns",
+    ),
     ("gaussian_sum", {"cut": 0.0}, "cut: expected a number above 0, got 0.0"),
     ("gaussian_sum", {"support": "cube"}, "support: expected one of ellipsoid, sphere, got 'cube'"),
     ("march", {"density": -torch.ones(6, 7, 8)}, "density: expected numbers from 0 to inf, found -1"),

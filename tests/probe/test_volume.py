@@ -109,7 +109,7 @@ def test_nearest_blocks_first(device: str):
     assert {level for _, level in ranks[:90]} == {0, 1, 2, 3}
 
 
-def test_blocks_have_the_stated_field(device: str):
+def test_blocks_have_the_stated_light(device: str):
     """Those that few probes decide, against a dense system; of the others the probes are spread over their reach."""
     position = _surface(250)
     values = _field(position)
@@ -135,7 +135,7 @@ def test_blocks_have_the_stated_field(device: str):
     )
 
 
-def test_read_at_a_probe_is_that_probes_field(device: str):
+def test_read_at_a_probe_is_that_probes_light(device: str):
     """Most of a light without likeness from probe to probe comes back, where a mean leaves little; a constant all."""
     random = np.random.default_rng(3)
     grid = np.stack(np.meshgrid(np.arange(30.0), 0.0, np.arange(30.0)), -1).reshape(-1, 3)

@@ -12,7 +12,7 @@ from reference.transport import scattered_twice
 
 from benchmarks.path_tracer import PathTracer
 from wlm.errors import WlmError
-from wlm.fluid.obstacles import box
+from wlm.fluid.obstacles import surface
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.launch import medium_of
@@ -127,7 +127,7 @@ def test_obstacles_block(device: str):
     """A plate towards the light removes its light, one in front of the camera hides everything, one aside nothing."""
     volume = ball(device=device)
     camera = facing(volume, size=8)
-    corners, triangles = box()
+    corners, triangles = surface("box")
 
     def shot(place: tuple, half: tuple, samples: int = 256) -> Transport:
         plate = (corners * np.array(half) + volume.centre + np.array(place), triangles)

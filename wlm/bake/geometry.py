@@ -129,7 +129,7 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
         number = own if settings.uv_set is None else settings.uv_set
         usual = number == own
         if not any(number in each.uv for each in primitives):
-            raise WlmError(f"{path}: expected lightmap UVs in TEXCOORD_{number}; lightmap.unwrap: true creates UVs")
+            raise WlmError(f"{path}: no lightmap UVs in TEXCOORD_{number}: lightmap.unwrap: true creates new UVs")
     cache: dict[int | None, Material] = {}
     surfaces = []
     normals = vertex_normals(document, primitives)
@@ -220,7 +220,7 @@ def unwrap(
         raise WlmError(f"{document.path}: uvunwrap: {one_line(error)}") from error
     if atlas.page_count != 1 or max(atlas.width, atlas.height) > settings.resolution:
         raise WlmError(
-            f"{document.path}: charts don't fit on {settings.resolution} texels: use more texels, or less padding"
+            f"{document.path}: charts don't fit: raise lightmap.resolution ({settings.resolution}) or lower its padding"
         )
     scale = np.array([atlas.width, atlas.height]) / settings.resolution
     replacements = []
@@ -248,7 +248,7 @@ def _without_lightmap(
     content = copy.deepcopy(document.content)
     for material in content.get("materials", []):
         if used := [one for one in _texture_sets(material) if one >= _UNWRAPPED]:
-            raise WlmError(f"{document.path}: a texture reads TEXCOORD_{used[0]}, which new lightmap UVs would replace")
+            raise WlmError(f"{document.path}: a texture uses TEXCOORD_{used[0]}, which lightmap.unwrap replaces")
     for mesh in content.get("meshes", []):
         for primitive in mesh["primitives"]:
             for name in [name for name in primitive["attributes"] if name.startswith("TEXCOORD_")]:

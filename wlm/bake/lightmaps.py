@@ -129,7 +129,9 @@ def bake_lightmaps(
     back = np.mean([each["back"] for each in results], axis=0)
     visible = back <= _HIDDEN
     if not visible.any():
-        raise WlmError(f"{task.geometry}: every texel seems to be inside an object: do its faces point inwards?")
+        raise WlmError(
+            f"{task.geometry}: every texel is inside an object, by the faces around it: turn its faces round"
+        )
     mask = texels.image(visible.astype(np.float32)) > 0
     light = np.stack([_finished(texels, each["light"], mask, denoise).astype(np.float16) for each in results])
     noise = np.stack([texels.image(each["noise"]).astype(np.float16) for each in results])

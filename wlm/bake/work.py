@@ -63,7 +63,7 @@ def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bo
         picture = named_file(path, scene.sky.file, f"{path}: sky.file", trust)
         sky = np.ascontiguousarray(read_light(picture)[0][..., :3])
         if not np.isfinite(sky).all() or (sky < 0).any():
-            raise WlmError(f"{picture}: expected finite light of at least 0, found other values")
+            raise WlmError(f"{picture}: expected finite light of at least 0, found negative, infinite or NaN pixels")
         if sky.shape[1] != 2 * sky.shape[0]:
             raise WlmError(f"{picture}: expected an image twice as wide as high, found {sky.shape[1]}x{sky.shape[0]}")
         digest.update(sky)

@@ -52,14 +52,14 @@ def make_face(
     size = tuple(np.delete(shape, FACES.index(name) // 2).tolist())
     velocity = np.asarray(velocity, np.float64)
     if velocity.shape not in ((3,), (*size, 3)):
-        raise ValueError(f"velocity: expected shape (3,) or {(*size, 3)}, got {velocity.shape}")
+        raise ValueError(f"velocity: expected shape (3,), or {(*size, 3)} for each cell, got {velocity.shape}")
     if not np.isfinite(velocity).all():
         raise ValueError("velocity: expected finite numbers, got NaN or infinity")
     if density is not None and not (np.isfinite(density) and density > 0.0):
-        raise ValueError(f"density: expected a positive number, got {density}")
+        raise ValueError(f"density: expected an outlet's density, a number above 0, got {density}")
     opened = np.ones(size, bool) if where is None else np.asarray(where, bool)
     if opened.shape != size:
-        raise ValueError(f"where: expected the shape {size} of the face, got {opened.shape}")
+        raise ValueError(f"where: expected a mask of the cells of the face, shape {size}, got shape {opened.shape}")
     velocity = np.where(opened[..., None], velocity, 0.0)
     still = ~opened | ((kind == BOUNCE) & ~velocity.any(-1))
     rank = np.where(still, _STILL, _RANKS[kind])
@@ -76,7 +76,7 @@ def bounded_axes(faces: Mapping[str, Face]) -> tuple[int, int, int]:
     for low, high in zip(FACES[::2], FACES[1::2], strict=True):
         if (low in faces) != (high in faces):
             missing = high if low in faces else low
-            raise ValueError(f"face {missing!r}: expected a wall, an inlet or an outlet, since the other end has one")
+            raise ValueError(f"face {missing!r}: expected a wall, an inlet or an outlet, as the opposite face has one")
         bounded.append(int(low in faces))
     return bounded[0], bounded[1], bounded[2]
 

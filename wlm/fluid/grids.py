@@ -96,7 +96,7 @@ def choose(
     first = {head.name: head for head in reversed(heads)}
     for name in (density, temperature):
         if name is not None and not (name in first and first[name].is_number):
-            raise WlmError(f"{where}: {name}: expected one of its grids of floats, found {found}")
+            raise WlmError(f"{where}: {name}: expected the name of one of the file's grids of floats, found {found}")
     names = list(dict.fromkeys(head.name for head in heads if head.is_number and head.group not in _SHAPES))
     warnings = []
     if density is None:
@@ -146,14 +146,14 @@ def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lat
     ends = [_ends(grid, matrix, 0.0 if same else 0.5) for (grid, matrix), same in zip(turned, kept, strict=True)]
     farthest = float(np.abs(ends).max()) / voxel
     if not farthest <= _FARTHEST:
-        raise WlmError(f"{first.name}: expected voxel coordinates up to {_FARTHEST}, found {farthest:.4g}")
+        raise WlmError(f"{first.name}: expected voxels within {_FARTHEST} voxels of the origin, found {farthest:.4g}")
     low = np.floor(np.min([(begin - corner) / voxel for begin, _ in ends], axis=0) + _APART)
     high = np.ceil(np.max([(end - corner) / voxel for _, end in ends], axis=0) - _APART)
     size = [max(int(n), 1) for n in high - low]
     if math.prod(size) > most:
         raise WlmError(
-            f"{first.name}: expected at most {most} cubic voxels with the grid's shortest edge, {voxel:.4g}, "
-            f"found {' x '.join(map(str, size))}"
+            f"{first.name}: expected at most {most} cubic voxels after resampling to the grid's shortest edge, "
+            f"{voxel:.4g}, found {' x '.join(map(str, size))}"
         )
     lattice = Lattice(voxel, tuple(map(float, corner + low * voxel)), tuple(size))
     return lattice, [_on(lattice, grid, matrix) for grid, matrix in turned]

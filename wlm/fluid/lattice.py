@@ -6,18 +6,25 @@ Lengths are in cells, times in steps, and the density of air at rest is 1; `Doma
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
 from wlm.errors import WlmError
-from wlm.fluid.engine import BODIES, PERIOD, Engine, require_free
-from wlm.fluid.faces import Face, make_face
+from wlm.fluid.faces import Face, bounded_axes, face_links, make_face, walled_axes
 from wlm.formats.parts import Part, check_parts
-from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, trouble_of
+from wlm.interop import free_memory, no_collection
+from wlm_kernels.fluid import lattice_links
+from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
+from wlm_kernels.fluid.lattice_fields import fluid_kernels
 from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
+from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, tables
+from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
+
+BODIES = 256
+"""Number of bodies that uint8 can index, including the fluid."""
 
 CHECK_EVERY = 48
 """Steps between two checks for a flow that blew up; a multiple of the steps in a graph."""
@@ -62,6 +69,21 @@ class Domain:
         return value * self.step**2 / self.cell
 
 
+def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp.Device, remedy: str) -> None:
+    """Checks that `needed` bytes for a grid are free; `name` and `remedy` are words for the error message.
+
+    Raises:
+        WlmError: There is not enough; the message names the grid, the required and free memory, and the remedy.
+    """
+    free = free_memory(device)
+    if needed > free:
+        cells = " x ".join(map(str, shape))
+        raise WlmError(
+            f"{name}: {cells} cells need {needed / 2**30:.1f} GiB on {device}: expected at most the"
+            f" {free / 2**30:.1f} GiB that are free: use {remedy}"
+        )
+
+
 class Lattice:
     """A box of air, initially at rest, periodic along every axis without faces.
 
@@ -89,7 +111,7 @@ class Lattice:
         WlmError: There is not enough memory.
     """
 
-    period = PERIOD
+    period = 2  # the two buffers have then swapped back
 
     def __init__(
         self,
@@ -113,16 +135,32 @@ class Lattice:
         spec = Spec(lattice, operator, storage, eddies=smagorinsky > 0.0)
         needed = self.bytes_needed(self.shape, storage, lattice)
         require_free("lattice", self.shape, needed, self.device, "fewer cells or storage='float16'")
-        tau, eddy = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky)
+        self._n, self._cells = wp.vec3i(*self.shape), math.prod(self.shape)
+        self._set, self._tables = velocity_set(lattice), tables(lattice, str(self.device))
+        size = (len(self._set.c), self._cells)
+        # The settings for which the kernel of a step is specialised.
+        self._spec = replace(spec, wide=math.prod(size) > NARROW)
+        self._f = [wp.zeros(size, dtype=STORAGES[storage][0], device=self.device) for _ in range(2)]
         # A ramp of one step is no ramp: inflow begins after it.
-        self._engine = Engine(self.shape, spec, tau, eddy, 1.0 / max(ramp, 1), self.device)
+        self._tau, self._eddy, self._rise = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky), 1.0 / max(ramp, 1)
+        # The counter of steps and the first error, see `wlm_kernels.fluid.lattice.step_kernel`.
+        self._clock, self._sums = self._zeros(2, int), self._zeros(2, wp.float64)
+        self._trouble = wp.full(1, QUIET, dtype=wp.int64, device=self.device)
+        # The number of the body of each cell, 0 for fluid; of size 0 while no cell has ever been solid.
+        self._solid = self._zeros(0, wp.uint8)
+        self._velocity = self._zeros(BODIES, wp.vec3)
+        self._forces = self._zeros(0, wp.vec3)
         self._faces: dict[str, Face] = {}
-        self._begun = False
+        self._links: lattice_links.Links | None = None
+        self._graph: wp.Graph | None = None
+        # Steps that this object launched itself; replays of a user's CUDA graph are counted only by the clock.
+        self._done, self._begun = 0, False
 
     @staticmethod
     def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
         """Returns the memory in bytes that a lattice takes, without small arrays; arguments as for `Lattice`."""
-        return Engine.bytes_needed(math.prod(shape), lattice, storage)
+        size = wp.types.type_size_in_bytes(STORAGES[storage][0])
+        return 2 * len(velocity_set(lattice).c) * math.prod(shape) * size
 
     # Setting up.
 
@@ -175,12 +213,25 @@ class Lattice:
         new, vectors = self._mask(mask), np.atleast_2d(np.asarray(velocity, np.float32))
         if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) >= BODIES or not np.isfinite(vectors).all():
             shapes = f"(3,) or [K, 3] for at most {BODIES - 1} bodies"
-            raise ValueError(f"velocity: expected finite numbers of shape {shapes}, got shape {np.shape(velocity)}")
+            raise ValueError(
+                f"velocity: expected finite numbers of shape {shapes}, got NaN or shape {np.shape(velocity)}"
+            )
         rows = np.zeros((BODIES, 3), np.float32)
         rows[1 : len(vectors) + 1] = vectors
-        self._engine.velocity.assign(rows)
+        self._velocity.assign(rows)
         self._prepare()
-        _check_speed(self._engine.cover(new), "a body")
+        if self._solid.shape[0] == 0:
+            self._solid, self._graph = self._zeros(self._cells, wp.uint8), None
+        self._spec = replace(self._spec, solids=True)
+        now, spare = self._buffers
+        common = [self._tables, self._n, self._bounded]
+        inputs = [*common, now, self._solid, new]
+        self._launch(self._fluid_kernels.neighbours, self._cells, inputs, [spare])
+        inputs = [*common, self._walled, self._solid, new, spare]
+        self._launch(self._fluid_kernels.uncover, self._cells, inputs, [now])
+        wp.copy(self._solid, new)
+        self._find_links()
+        self._apply_links(self._links.faces, now)
 
     def set_force(self, force: ArrayLike | wp.array | None) -> None:
         """Sets the force on the air.
@@ -190,15 +241,15 @@ class Lattice:
                 [X, Y, Z] on the lattice's device, is not copied, and its values may change between steps. None: no
                 force.
         """
-        if force is None:
-            self._engine.set_force(None)
-        elif isinstance(force, wp.array):
+        forces = self._zeros(0, wp.vec3)
+        if isinstance(force, wp.array):
             if force.shape != self.shape or force.dtype != wp.vec3 or force.device != self.device:
-                found = f"{force.shape} on {force.device}"
+                found = f"{force.dtype.__name__} {force.shape} on {force.device}"
                 raise ValueError(f"force: expected an array of vec3 {self.shape} on {self.device}, got {found}")
-            self._engine.set_force(force.flatten())
-        else:
-            self._engine.set_force(self._vectors("force", force))
+            forces = force.flatten()
+        elif force is not None:
+            forces = self._vectors("force", force)
+        self._spec, self._forces, self._graph = replace(self._spec, forced=force is not None), forces, None
 
     def set_flow(self, velocity: ArrayLike = (0.0, 0.0, 0.0), density: ArrayLike = 1.0) -> None:
         """Sets all air to the equilibrium of a velocity and a density.
@@ -211,7 +262,12 @@ class Lattice:
         drho = (np.broadcast_to(np.asarray(density, np.float64), self.shape) - 1.0).astype(np.float32).ravel()
         if not np.isfinite(drho).all():
             raise ValueError("density: expected finite numbers, got NaN or infinity")
-        self._engine.start(wp.array(drho, device=self.device), self._vectors("velocity", velocity))
+        inputs = [self._tables, wp.array(drho, device=self.device), self._vectors("velocity", velocity)]
+        now, spare = self._buffers
+        spare.zero_()
+        self._sums.zero_()
+        self._launch(self._fluid_kernels.start, self._cells, inputs, [now])
+        self._apply_links(0, now)
         self._begun = True
 
     @property
@@ -232,29 +288,25 @@ class Lattice:
         """
         if steps < 0:
             raise ValueError(f"steps: expected at least 0, got {steps}")
-        engine = self._engine
         if self.device.is_cuda and self.device.is_capturing:
-            if not self._begun or steps % PERIOD or engine.done % PERIOD:
-                found = f"got {steps} in it and {engine.done} before it"
-                raise ValueError(f"steps: expected a multiple of {PERIOD} in a CUDA graph and before it, {found}")
-            engine.run(steps)
+            if not self._begun or steps % self.period or self._done % self.period:
+                found = f"got {steps} in the graph and {self._done} before it"
+                raise ValueError(f"steps: expected a multiple of {self.period} in a CUDA graph and before it, {found}")
+            self._run(steps)
             return
         self._prepare()
         self._begun = True
-        graphs = self.device.is_cuda and steps >= _GRAPH_FROM
+        run = self._run_in_graphs if self.device.is_cuda and steps >= _GRAPH_FROM else self._run
         while steps > 0:
             chunk = min(steps, CHECK_EVERY)
-            if graphs:
-                engine.run_in_graphs(chunk)
-            else:
-                engine.run(chunk)
+            run(chunk)
             steps -= chunk
             self.check()
 
     @property
     def steps(self) -> int:
         """Number of steps done, including replays of graphs; waits for the device."""
-        return int(self._engine.clock.numpy()[self._engine.done % 2])
+        return int(self._clock.numpy()[self._done % 2])
 
     def check(self) -> None:
         """Checks that the flow has not blown up, which every step records on the device; waits for the device.
@@ -262,7 +314,7 @@ class Lattice:
         Raises:
             WlmError: The flow has blown up; the message names the first step, the cell and the cause.
         """
-        key = int(self._engine.trouble.numpy()[0])
+        key = int(self._trouble.numpy()[0])
         if key == QUIET:
             return
         step, cell, cause = trouble_of(key)
@@ -278,14 +330,14 @@ class Lattice:
         """Returns the velocity, vec3 [X, Y, Z], in cells per step; in a solid cell it is the velocity of the body."""
         self._prepare()
         out = wp.empty(self.shape, dtype=wp.vec3, device=self.device) if out is None else out
-        self._engine.fields(self._engine.zeros(0, float), out.flatten())
+        self._write_fields(self._zeros(0, float), out.flatten())
         return out
 
     def excess_density(self, out: wp.array | None = None) -> wp.array:
         """Returns the density minus 1, float [X, Y, Z], which float32 resolves better; 0 in a solid cell."""
         self._prepare()
         out = wp.empty(self.shape, dtype=float, device=self.device) if out is None else out
-        self._engine.fields(out.flatten(), self._engine.zeros(0, wp.vec3))
+        self._write_fields(out.flatten(), self._zeros(0, wp.vec3))
         return out
 
     def density(self) -> np.ndarray:
@@ -294,8 +346,8 @@ class Lattice:
 
     def mass(self) -> float:
         """Returns the mass of all fluid cells, summed in float64."""
-        solid = int(np.count_nonzero(self._engine.solid.numpy()))
-        return self._engine.cells - solid + float(self.excess_density().numpy().sum(dtype=np.float64))
+        solid = int(np.count_nonzero(self._solid.numpy()))
+        return self._cells - solid + float(self.excess_density().numpy().sum(dtype=np.float64))
 
     def force_on_solid(self, body: int = 1) -> np.ndarray:
         """Returns the force of the air on a body in the last step, by momentum exchange, float64 (3,).
@@ -305,16 +357,19 @@ class Lattice:
         if not 0 < body < BODIES:
             raise ValueError(f"body: expected 1 to {BODIES - 1}, got {body}")
         self._prepare()
-        return self._engine.force_on_bodies()[body]
+        total = self._zeros(BODIES, wp.vec3d)
+        if self._solid.shape[0] > 0:
+            inputs = [self._tables, self._n, self._bounded, self._links, self._solid, self._buffers[0]]
+            self._launch(self._link_kernels.force, self._links.cell.shape[0], inputs, [total])
+        return total.numpy()[body]
 
     def state(self) -> dict[str, np.ndarray]:
         """Returns the state, for `load`: populations as stored, solid cells and their motion, number of steps done."""
-        engine = self._engine
         # On a CPU .numpy() shares the array's memory, which the next step modifies.
         return {
-            "populations": engine.buffers[0].numpy().copy(),
-            "solid": engine.solid.numpy().copy(),
-            "bodies": engine.velocity.numpy().copy(),
+            "populations": self._buffers[0].numpy().copy(),
+            "solid": self._solid.numpy().copy(),
+            "bodies": self._velocity.numpy().copy(),
             "steps": np.array(self.steps, np.int64),
         }
 
@@ -327,12 +382,11 @@ class Lattice:
         Raises:
             WlmError: The state has another shape, lattice or storage, or contains NaN or infinity.
         """
-        engine = self._engine
-        now = engine.buffers[0]
+        now = self._buffers[0]
         table = {
             "populations": Part(wp.dtype_to_numpy(now.dtype), now.shape),
             # Empty while no cell has ever been solid.
-            "solid": Part(np.uint8, (0 if np.shape(state.get("solid")) == (0,) else engine.cells,)),
+            "solid": Part(np.uint8, (0 if np.shape(state.get("solid")) == (0,) else self._cells,)),
             "bodies": Part(np.float32, (BODIES, 3)),
             "steps": Part(np.int64, (), least=0, most=_MOST_STEPS),
         }
@@ -341,17 +395,25 @@ class Lattice:
         except ValueError as error:
             raise WlmError(f"lattice state: {error}") from error
         self._prepare()
-        engine.velocity.assign(state["bodies"])
-        self._begun = True
-        fastest = engine.restore(state["populations"], state["solid"], int(state["steps"]))
-        _check_speed(fastest, "a body")
+        self._velocity.assign(state["bodies"])
+        self._begun, self._done, self._graph = True, int(state["steps"]), None
+        self._clock.fill_(self._done)
+        self._trouble.fill_(QUIET)
+        self._solid = wp.array(state["solid"], dtype=wp.uint8, device=self.device)
+        self._spec = replace(self._spec, solids=len(state["solid"]) > 0)
+        now, spare = self._buffers
+        now.assign(state["populations"])
+        spare.zero_()
+        self._find_links()
+
+    # Checked arguments.
 
     def _vectors(self, name: str, value: ArrayLike) -> wp.array:
         """Returns vectors, (3,) for all cells or [X, Y, Z, 3], as a vec3 [N] on the device."""
         vectors = np.asarray(value, np.float32)
         if vectors.shape not in ((3,), (*self.shape, 3)) or not np.isfinite(vectors).all():
             shapes = f"(3,) or {(*self.shape, 3)}"
-            raise ValueError(f"{name}: expected finite numbers of shape {shapes}, got shape {vectors.shape}")
+            raise ValueError(f"{name}: expected finite numbers of shape {shapes}, got NaN or shape {vectors.shape}")
         vectors = np.ascontiguousarray(np.broadcast_to(vectors, (*self.shape, 3)).reshape(-1, 3))
         return wp.array(vectors, dtype=wp.vec3, device=self.device)
 
@@ -359,25 +421,119 @@ class Lattice:
         face = make_face(self.shape, name, kind, *args, **settings)
         _check_speed(float(np.linalg.norm(face.velocity, axis=-1).max()), f"face {name!r}")
         if name not in self._faces and self._begun:
-            raise ValueError(f"face {name!r}: expected faces to be set before the flow and before the first step")
+            raise ValueError(f"face {name!r}: expected this face to be set before set_flow and before the first step")
         self._faces[name] = face
-        self._engine.set_faces(self._faces)
-
-    def _prepare(self) -> None:
-        _check_speed(self._engine.prepare(), "a body")
+        self._links = self._graph = None
 
     def _mask(self, mask) -> wp.array:
         if isinstance(mask, wp.array):
             if mask.shape != self.shape or mask.dtype != wp.uint8 or mask.device != self.device:
-                found = f"{mask.shape} on {mask.device}"
+                found = f"{mask.dtype.__name__} {mask.shape} on {mask.device}"
                 raise ValueError(f"mask: expected an array of uint8 {self.shape} on {self.device}, got {found}")
             return mask.flatten()
         mask = np.asarray(mask)
         if mask.shape != self.shape or mask.dtype.kind not in "biu":
             raise ValueError(f"mask: expected bool or integers {self.shape}, got {mask.dtype} {mask.shape}")
         if mask.min() < 0 or mask.max() >= BODIES:
-            raise ValueError(f"mask: expected numbers of bodies, 0 to {BODIES - 1}, got {mask.min()} to {mask.max()}")
+            raise ValueError(f"mask: expected 0 (fluid) or a body, 1 to {BODIES - 1}, got {mask.min()} to {mask.max()}")
         return wp.array(mask.astype(np.uint8).ravel(), dtype=wp.uint8, device=self.device)
+
+    # On the device.
+
+    @property
+    def _buffers(self) -> tuple[wp.array, wp.array]:
+        """The array of populations that the next step reads, and the array that it writes."""
+        return self._f[self._done % 2], self._f[1 - self._done % 2]
+
+    def _prepare(self) -> None:
+        """Applies new boundary conditions."""
+        if self._links is not None:
+            return
+        self._bounded = wp.vec3i(*bounded_axes(self._faces))
+        walls = walled_axes(self._faces)
+        self._spec = replace(self._spec, walls=walls)
+        self._walled = wp.vec3i(*(int(wall) for wall in walls))
+        kinds = {int(kind) for face in self._faces.values() for kind in np.unique(face.kind)}
+        sets = self._spec.lattice, self._spec.storage
+        self._link_kernels = lattice_links.link_kernels(*sets, OUTLET in kinds)
+        self._fluid_kernels = fluid_kernels(*sets, walls)
+        columns = face_links(self.shape, self._set, self._faces)
+        self._links = self._make_links(columns, len(columns[0]))
+        self._find_links()
+
+    def _find_links(self) -> None:
+        """Lists the populations that solids send back (see `lattice_links`), and checks the speed of the solids."""
+        # The count is also set without solids: the state before may have had some.
+        count, fastest = 0, 0.0
+        if self._solid.shape[0] > 0:
+            count, fastest = self._search()
+            links = self._links
+            if count > links.cell.shape[0] - links.faces:
+                columns = [array.numpy()[: links.faces] for array in (links.cell, links.code, links.term)]
+                # Spare elements: the number of links of a moving body varies.
+                self._links = self._make_links(columns, links.faces + count + count // 4)
+                self._graph = None
+                self._search()
+        self._links.used.fill_(self._links.faces + count)
+        _check_speed(fastest, "a body")
+
+    def _make_links(self, columns, size: int) -> lattice_links.Links:
+        links = lattice_links.Links()
+        links.faces = len(columns[0])
+        dtypes = {"cell": np.int32, "code": np.uint8, "term": np.float32}
+        for (name, dtype), column in zip(dtypes.items(), columns, strict=True):
+            padded = np.zeros(size, dtype)
+            padded[: links.faces] = column
+            setattr(links, name, wp.array(padded, device=self.device))
+        links.value = self._zeros(size, float)
+        links.used = wp.full(1, links.faces, dtype=int, device=self.device)
+        return links
+
+    def _search(self) -> tuple[int, float]:
+        where = [self._tables, self._n, self._bounded, self._solid, self._velocity, self._links]
+        count, fastest = lattice_links.find_links(*where)
+        return int(count.numpy()[0]), float(fastest.numpy()[0])
+
+    def _run(self, steps: int) -> None:
+        """Queues steps on the device and returns without waiting."""
+        for _ in range(steps):
+            now, out = self._buffers
+            inputs = [self._n, now, self._solid, self._tau, self._eddy, self._forces, self._done % 2]
+            self._launch(step_kernel(self._spec), self._cells, inputs, [self._clock, self._trouble, self._sums, out])
+            self._apply_links(0, out)
+            self._done += 1
+
+    def _run_in_graphs(self, steps: int) -> None:
+        """Queues steps as replays of a CUDA graph of `self.period` steps, and remaining steps without the graph."""
+        while steps > 0:
+            if steps < self.period or self._done % self.period or self._graph is None:
+                # The first steps load the kernels' modules, which is not allowed during a capture.
+                eager = min(steps, self.period - self._done % self.period)
+                self._run(eager)
+                steps -= eager
+                if self._graph is None and self._done % self.period == 0:
+                    with no_collection(), wp.ScopedCapture(self.device) as capture:
+                        self._run(self.period)
+                    self._graph, self._done = capture.graph, self._done - self.period
+            else:
+                wp.capture_launch(self._graph)
+                self._done += self.period
+                steps -= self.period
+
+    def _write_fields(self, drho: wp.array, u: wp.array) -> None:
+        """Writes the density minus 1 of each cell to `drho` and the velocity to `u`; an array of size 0 is skipped."""
+        inputs = [self._n, self._buffers[0], self._solid, self._velocity, self._forces]
+        self._launch(self._fluid_kernels.fields, self._cells, inputs, [drho, u])
+
+    def _apply_links(self, first: int, f: wp.array) -> None:
+        where = [self._tables, self._n, self._bounded, first, self._links, self._solid]
+        lattice_links.apply(self._link_kernels, *where, self._clock, self._rise, f, self._sums)
+
+    def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _zeros(self, size: int, dtype) -> wp.array:
+        return wp.zeros(size, dtype=dtype, device=self.device)
 
 
 def _checked_shape(shape, lattice: str) -> tuple[int, int, int]:
@@ -387,7 +543,7 @@ def _checked_shape(shape, lattice: str) -> tuple[int, int, int]:
     if lattice == "D2Q9" and z != 1:
         raise ValueError(f"shape: expected one cell along z for D2Q9, got {z}")
     if x * y * z >= 2**31:
-        raise WlmError(f"lattice: {x} x {y} x {z} cells: expected fewer than 2^31")
+        raise WlmError(f"lattice: {x} x {y} x {z} cells: expected fewer than 2^31 cells in all")
     return x, y, z
 
 

@@ -5,53 +5,33 @@ triangles, anticlockwise from outside: corners float64 [V, 3], triangles int64 [
 """
 
 import hashlib
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import warp as wp
+from scipy.spatial import ConvexHull
 
 from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 
 _SIDES = 24  # segments of a sphere from pole to pole; there are twice as many around it
 
 
-def sphere() -> tuple[np.ndarray, np.ndarray]:
-    """Makes the surface of a sphere of radius 1 around the origin."""
-    polar = np.linspace(0.0, np.pi, _SIDES + 1)
-    return _revolved(np.sin(polar), np.cos(polar))
-
-
-def cylinder() -> tuple[np.ndarray, np.ndarray]:
-    """Makes the surface of a cylinder along y, with radius 1 and height 2, around the origin."""
-    return _revolved(np.array([0.0, 1.0, 1.0, 0.0]), np.array([1.0, 1.0, -1.0, -1.0]))
-
-
-def box() -> tuple[np.ndarray, np.ndarray]:
-    """Makes the surface of a cube with edge 2 around the origin."""
-    points = np.array([[i >> 2 & 1, i >> 1 & 1, i & 1] for i in range(8)]) * 2.0 - 1.0
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    return points, np.array([half for a, b, c, d in quads for half in ((a, b, c), (a, c, d))])
-
-
-def _revolved(radius: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Makes a surface of revolution about y from the radii and heights of rings, top first, between two end points."""
-    columns = 2 * _SIDES
-    angle = np.linspace(0.0, 2.0 * np.pi, columns, endpoint=False)
-    middle = slice(1, -1)
-    ring = np.stack(np.broadcast_arrays(np.cos(angle), 0.0, np.sin(angle)), -1)
-    rings = radius[middle, None, None] * ring + height[middle, None, None] * np.array([0.0, 1.0, 0.0])
-    points = np.concatenate([[[0, height[0], 0]], rings.reshape(-1, 3), [[0, height[-1], 0]]])
-    here = np.arange(columns)
-    beside = (here + 1) % columns
-    last = len(points) - 1
-    triangles = [np.stack([np.zeros_like(here), 1 + beside, 1 + here], 1)]
-    for row in range(len(radius) - 3):
-        a, b = 1 + row * columns + here, 1 + row * columns + beside
-        triangles += [np.stack([a, b, a + columns], 1), np.stack([b, b + columns, a + columns], 1)]
-    first = last - columns
-    triangles.append(np.stack([np.full_like(here, last), first + here, first + beside], 1))
-    return points, np.concatenate(triangles)
+def surface(shape: str) -> tuple[np.ndarray, np.ndarray]:
+    """Makes a surface around the origin: a "sphere" of radius 1, a "box" with edge 2, or a "cylinder" along y with
+    radius 1 and height 2."""
+    if shape == "box":
+        points = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    else:
+        polar, angle = np.linspace(0.0, np.pi, _SIDES + 1), np.arange(2 * _SIDES) * (np.pi / _SIDES)
+        radius, height = (np.sin(polar), np.cos(polar)) if shape == "sphere" else (np.ones(2), np.array([1.0, -1.0]))
+        rings = np.outer(radius, np.cos(angle)), np.outer(height, np.ones(len(angle))), np.outer(radius, np.sin(angle))
+        points = np.unique(np.stack(rings, -1).reshape(-1, 3).round(12), axis=0)
+    hull = ConvexHull(points)
+    a, b, c = points[hull.simplices].transpose(1, 0, 2)
+    outward = np.einsum("fk,fk->f", np.cross(b - a, c - a), hull.equations[:, :3]) > 0
+    return points, np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1]).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +55,7 @@ class Trajectory:
         """
         p, t = np.atleast_2d(np.asarray(positions, np.float64)), np.asarray(times, np.float64)
         if t.ndim != 1 or len(t) == 0 or p.shape != (len(t), 3):
-            raise ValueError(f"path: expected positions [K, 3] and times [K], got {p.shape} and {t.shape}")
+            raise ValueError(f"path: expected positions [K, 3] and times [K], got shapes {p.shape} and {t.shape}")
         if not (np.isfinite(p).all() and np.isfinite(t).all()):
             raise ValueError("path: expected finite positions and times, got NaN or infinity")
         if (np.diff(t) <= 0).any():
@@ -149,7 +129,7 @@ class Mesh:
     def __post_init__(self) -> None:
         v, t = np.asarray(self.vertices), np.asarray(self.triangles)
         if v.ndim != 2 or v.shape[1] != 3 or not np.isfinite(v).all():
-            raise ValueError(f"vertices: expected finite numbers of shape [V, 3], got shape {v.shape}")
+            raise ValueError(f"vertices: expected finite numbers of shape [V, 3], got NaN or shape {v.shape}")
         if t.ndim != 2 or t.shape[1] != 3 or len(t) == 0:
             raise ValueError(f"triangles: expected indices of vertices of shape [T, 3], T >= 1, got shape {t.shape}")
         if t.min() < 0 or t.max() >= len(v):
@@ -186,5 +166,5 @@ def box_mesh(path: Trajectory, size: Sequence[float]) -> Mesh:
     edges = np.asarray(size, np.float64)
     if edges.shape != (3,) or not ((edges > 0.0) & np.isfinite(edges)).all():
         raise ValueError(f"size: expected three lengths above 0, got {size}")
-    corners, triangles = box()
+    corners, triangles = surface("box")
     return Mesh(path, (0.5 * corners * edges).astype(np.float32), triangles.astype(np.int32))

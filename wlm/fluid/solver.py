@@ -18,9 +18,8 @@ import numpy as np
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid.engine import require_free
 from wlm.fluid.faces import axis_ends
-from wlm.fluid.lattice import Lattice
+from wlm.fluid.lattice import Lattice, require_free
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact, write_artifact
@@ -106,7 +105,7 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
     """
     x, y, z = shape
     if x * y * z >= 2**31:
-        raise WlmError(f"smoke: {x} x {y} x {z} cells: expected fewer than 2^31: use a lower refinement")
+        raise WlmError(f"smoke: {x} x {y} x {z} cells: expected fewer than 2^31 cells in all: use a lower refinement")
     remedy = "a lower refinement, storage='float16' or the scheme 'semi-lagrangian'"
     require_free("smoke", shape, cell_bytes * x * y * z, device, remedy)
 
@@ -236,8 +235,8 @@ class Solver:
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
             raise ValueError(
-                f"steps: expected a multiple of {self.period} in a CUDA graph and before it, at least one before it, "
-                f"substeps a multiple of {self.lattice.period}, and obstacles at rest; got {steps} after {self._done}"
+                f"steps: expected obstacles at rest, substeps a multiple of {self.lattice.period}, and a multiple of "
+                f"{self.period} steps in the captured CUDA graph and before it; got {steps} after {self._done}"
             )
         for _ in range(steps):
             if not capturing:

@@ -26,7 +26,7 @@ from wlm.formats.nanovdb import NanoVdbFile
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import FileBytes, open_file, read_file
 from wlm.formats.vdb import LARGEST, GridHead, VdbFile
-from wlm.interop import check_device, device_name, to_warp
+from wlm.interop import check_device, to_warp
 
 EDGE = 8
 """Voxels along an edge of a brick."""
@@ -167,7 +167,7 @@ def from_array(
         # Kernels take both in one type.
         heat = _check(name, _TEMPERATURE, temperature, device, warnings, smoke.dtype)
         if heat.shape != smoke.shape:
-            raise WlmError(f"{name}: {_TEMPERATURE}: expected {tuple(smoke.shape)} voxels, found {tuple(heat.shape)}")
+            raise WlmError(f"{name}: {_TEMPERATURE}: expected shape {tuple(smoke.shape)}, found {tuple(heat.shape)}")
         heat = _dimmed(name, heat, emission, voxel, warnings)
     corner = tuple(float(o) for o in origin)
     return DensityVolume(smoke, float(extinction), float(voxel), corner, heat, float(emission), tuple(warnings))
@@ -223,10 +223,11 @@ def load_volume(
         volume = _turned(volume, up) if up != "y" else volume
     else:
         grids, warnings = _read_grids(path, names, trust)
-        volume = _from_parts(grids, up, trust, **factors)
+        most = LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * sum(g.values.numel() for g in grids)))
+        lattice, (smoke, *heat) = on_one_lattice(grids, most, up)
+        place = {"voxel": lattice.voxel, "origin": lattice.origin, "device": device}
+        volume = from_array(smoke, temperature=heat[0] if heat else None, **place, **factors)
         volume = replace(volume, warnings=(*warnings, *volume.warnings))
-        heat = None if volume.temperature is None else volume.temperature.to(device)
-        volume = replace(volume, density=volume.density.to(device), temperature=heat)
         if not told and is_long_along_z(volume):
             warning = f"{path}: longest along z: if that is up, as in Blender and Unreal, say so (--volume up=z)"
             volume = replace(volume, warnings=(*volume.warnings, warning))
@@ -272,9 +273,8 @@ def _turned(volume: DensityVolume, up: str) -> DensityVolume:
     parts = [Grid(_DENSITY, volume.density, matrix)]
     if volume.temperature is not None:
         parts.append(Grid(_TEMPERATURE, volume.temperature, matrix))
-    lattice, values = on_one_lattice(parts, LARGEST, up)
-    heat = values[1] if len(values) > 1 else None
-    return replace(volume, density=values[0], temperature=heat, origin=lattice.origin)
+    lattice, (smoke, *heat) = on_one_lattice(parts, LARGEST, up)
+    return replace(volume, density=smoke, temperature=heat[0] if heat else None, origin=lattice.origin)
 
 
 def save_volume(path: str | os.PathLike[str], volume: DensityVolume, *, bricks: bool = False) -> None:
@@ -316,14 +316,14 @@ def _check(
     if not isinstance(values, torch.Tensor):
         values = np.asarray(values)
         if values.dtype.kind not in "iuf" or values.dtype == np.longdouble:
-            raise WlmError(f"{name}: {field}: expected numbers, found {values.dtype}")
+            raise WlmError(f"{name}: {field}: expected an array of real numbers, found the type {values.dtype}")
         kept = np.float16 if values.dtype == np.float16 else np.float32
         with np.errstate(over="ignore"):  # values too large become infinite, which is repaired below
             values = torch.from_numpy(np.array(values, kept, order="C"))
     elif values.dtype.is_complex or values.dtype == torch.bool:
-        raise WlmError(f"{name}: {field}: expected numbers, found {values.dtype}")
+        raise WlmError(f"{name}: {field}: expected an array of real numbers, found the type {values.dtype}")
     if values.ndim != 3 or 0 in values.shape or values.numel() > LARGEST:
-        raise WlmError(f"{name}: {field}: expected [X, Y, Z] voxels, found {tuple(values.shape)}")
+        raise WlmError(f"{name}: {field}: expected [X, Y, Z], 1 to {LARGEST} voxels, found {tuple(values.shape)}")
     dtype = dtype or (torch.float16 if values.dtype == torch.float16 else torch.float32)
     values = values.detach().to(device, dtype).contiguous()
     low, high = torch.aminmax(values)
@@ -377,7 +377,7 @@ def _read_npz(path: Path, names: tuple[str | None, str | None], device: str, tru
         if value is None:
             continue
         if value.dtype.kind not in "iuf" or value.size != size or not np.isfinite(value).all():
-            raise WlmError(f"{path}: {field}: expected {size} finite numbers, found {value.dtype} {value.shape}")
+            raise WlmError(f"{path}: {field}: expected {size} finite numbers, found {value.dtype} {value.shape} or NaN")
         arrays[field] = float(value.item()) if size == 1 else tuple(map(float, value.ravel()))
     for field in (_DENSITY, _TEMPERATURE):
         if isinstance(arrays.get(field), np.ndarray) and arrays[field].dtype in (np.float16, np.float32):
@@ -390,7 +390,7 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
     """Returns a file's arrays with fields that are stored as bricks expanded to tensors [X, Y, Z] on a device."""
     shape, numbers = arrays.pop("shape", np.zeros(0)), arrays.pop(_BRICKS)
     if shape.shape != (3,) or shape.dtype.kind not in "iu" or not (shape.min() >= 1 and shape.max() <= most):
-        raise WlmError(f"{path}: shape: expected 3 whole numbers from 1 to {most}, found {shape.dtype} {shape.shape}")
+        raise WlmError(f"{path}: shape: expected 3 whole numbers from 1 to {most}, found {shape.ravel()[:4].tolist()}")
     sides = shape.tolist()
     counts = [-(-n // EDGE) for n in sides]
     if math.prod(sides) > most:
@@ -399,24 +399,18 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
         stored = sum(array.nbytes for array in arrays.values())
         check_growth(f"{path}: shape", stored, 4 * math.prod(counts) * EDGE**3, sure=4 * SURE_VOXELS)
     if numbers.ndim != 1 or numbers.dtype != np.int32 or (np.diff(numbers.astype(np.int64)) < 1).any():
-        raise WlmError(f"{path}: {_BRICKS}: expected increasing int32 [N], found {numbers.dtype} {numbers.shape}")
+        raise WlmError(f"{path}: {_BRICKS}: expected rising int32 [N], found {numbers.dtype} {numbers.shape}")
     if len(numbers) and not (numbers[0] >= 0 and numbers[-1] < math.prod(counts)):
-        raise WlmError(f"{path}: {_BRICKS}: expected 0 to {math.prod(counts) - 1}, found {numbers[0]} to {numbers[-1]}")
+        raise WlmError(
+            f"{path}: {_BRICKS}: expected numbers from 0 to {math.prod(counts) - 1}, found {numbers[[0, -1]]}"
+        )
     places = torch.from_numpy(numbers).to(device)
     for name in [name for name in arrays if name.endswith("_bricks")]:
         cut = arrays.pop(name)
         if cut.shape != (len(numbers), EDGE, EDGE, EDGE) or cut.dtype not in (np.float16, np.float32):
-            raise WlmError(f"{path}: {name}: expected {len(numbers)} bricks of floats, found {cut.dtype} {cut.shape}")
+            raise WlmError(f"{path}: {name}: expected floats [{len(numbers)}, 8, 8, 8], found {cut.dtype} {cut.shape}")
         arrays[name.removesuffix("_bricks")] = scatter(places, torch.from_numpy(cut).to(device), sides)
     return arrays
-
-
-def _from_parts(parts: Sequence[Grid], up: str, trust: bool, **factors: Any) -> DensityVolume:
-    voxels = sum(part.values.numel() for part in parts)
-    lattice, values = on_one_lattice(parts, LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * voxels)), up)
-    place = {"voxel": lattice.voxel, "origin": lattice.origin, "device": device_name(values[0].device)}
-    heat = values[1] if len(values) > 1 else None
-    return from_array(values[0], temperature=heat, **place, **factors)
 
 
 def grid_heads(path: Path) -> tuple[GridHead, ...]:
@@ -447,7 +441,7 @@ def _read_grids(path: Path, names: tuple[str | None, str | None], trust: bool) -
         matrix[:3, 3] += matrix[:3, :3] @ grid.low
         if name == density and is_level_set(grid, same[0].group):
             if names[0] is None:
-                raise WlmError(f"{where}: expected density, found a level set: --volume density={name} fills it")
+                raise WlmError(f"{where}: expected a density, found a level set: --volume density={name} fills it")
             # Smoke fills the inside, and fades to the surface within the narrow band.
             values = np.clip(-values / grid.background, 0.0, 1.0)
             warnings.append(f"{where}: a level set, which is filled with smoke of density 1")

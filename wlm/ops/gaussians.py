@@ -49,7 +49,7 @@ def gaussian_sum(
         raise ValueError(f"cut: expected a number above 0, got {cut}")
     check("rows", rows, (None, None))
     if rows.shape[1] <= LATENT:
-        raise ValueError(f"rows: expected more than {LATENT} columns, got {rows.shape[1]}")
+        raise ValueError(f"rows: expected {LATENT} columns and at least one of a latent, got {rows.shape[1]} columns")
     check("points", points, (..., 3), rows.device)
     check_finite(rows=rows, points=points)
     sums = _GaussianSum.apply(rows, points.reshape(-1, 3), float(cut), support)

@@ -43,7 +43,7 @@ def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: st
     check("hidden", hidden, (*networks, x.shape[-1] + width + 2, width), x.device)
     check("output", output, (*networks, width + 1, outputs), x.device)
     if not (1 <= width <= WIDEST and x.shape[-1] and outputs):
-        raise ValueError(f"hidden: expected 1 to {WIDEST} units, and inputs and outputs, got {tuple(hidden.shape)}")
+        raise ValueError(f"hidden: expected 1 to {WIDEST} units, some inputs and outputs, got {tuple(hidden.shape)}")
     check_finite(x=x, hidden=hidden, output=output)
     if x.ndim == 2:
         return _Mlp.apply(x[None], hidden[None], output[None], gelu)[0]

@@ -18,7 +18,7 @@ from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings, load_settings, profile_path
 from wlm.fluid.faces import FACES
-from wlm.fluid.obstacles import box, cylinder, sphere
+from wlm.fluid.obstacles import surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, Ramp
 
@@ -254,7 +254,7 @@ class ObstacleSettings(_Settings):
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the surface relative to the centre: corners, float64 [V, 3], and triangles, int64 [F, 3]."""
-        points, triangles = {"sphere": sphere, "box": box, "cylinder": cylinder}[self.shape]()
+        points, triangles = surface(self.shape)
         return points * np.asarray(self.radius), triangles
 
 

@@ -8,8 +8,6 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
-SPACES = ("clip", "uv")
-
 MOST_PIXELS = 16384
 """Maximum number of pixels along one axis; beyond it, terms of the exact edge function would not fit a float64."""
 
@@ -307,9 +305,3 @@ def frame(height: int, width: int, space: str) -> Frame:
     else:
         out.x, out.y, out.y_step, out.scale = 1 - width, height - 1, -2, 1
     return out
-
-
-def check_position(position, space: str) -> None:
-    columns = 2 if space == "uv" else 4
-    if position.ndim != 2 or position.shape[1] != columns:
-        raise ValueError(f"position: expected shape [any, {columns}] in {space} space, got {tuple(position.shape)}")

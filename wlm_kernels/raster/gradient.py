@@ -7,7 +7,7 @@ Read `wlm/ops/plain.py` first (`corner_weights`), which computes barycentrics in
 
 import warp as wp
 
-from wlm_kernels.raster.edges import Frame, centre, check_position, corners_of, frame, functions, has_corners, total_of
+from wlm_kernels.raster.edges import Frame, centre, corners_of, frame, functions, has_corners, total_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -135,7 +135,6 @@ def rasterize_backward(position, triangle, visible, grad_barycentric, grad, spac
         grad: Shaped like `position`; the gradient is added to it.
         space: "clip" or "uv", as for `Rasterizer`.
     """
-    check_position(position, space)
     inputs = [position, triangle, frame(*visible.shape, space), visible, grad_barycentric]
     wp.launch(_rasterize_backward, visible.shape, inputs=inputs, outputs=[grad], device=position.device)
 

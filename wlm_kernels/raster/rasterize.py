@@ -31,12 +31,10 @@ import warp as wp
 
 from wlm_kernels.raster.edges import (
     MOST_PIXELS,
-    SPACES,
     Box,
     Corners,
     Frame,
     box_of,
-    check_position,
     corners_of,
     covers,
     edges_at,
@@ -304,7 +302,7 @@ class Rasterizer:
         raster: `Raster`, the output of `run`.
 
     Raises:
-        ValueError: An argument is wrong, or there are too many triangles for an image of this size.
+        ValueError: The height or width is out of range, or there are too many triangles for an image of this size.
     """
 
     def __init__(
@@ -320,14 +318,9 @@ class Rasterizer:
         split: int | None = None,
         empty: Callable[..., Any] | None = None,
     ) -> None:
-        if space not in SPACES:
-            raise ValueError(f"space: expected {' or '.join(SPACES)}, got {space!r}")
-        if triangle.ndim != 2 or triangle.shape[1] != 3:
-            raise ValueError(f"triangle: expected shape [triangles, 3], got {tuple(triangle.shape)}")
         device, count = triangle.device, triangle.shape[0]
         empty = empty or (lambda shape, dtype: wp.empty(shape, dtype=dtype, device=device))
         self._triangle = triangle
-        self._space = space
         self._frame = frame(height, width, space)
         self._cull = int(cull)
         self._split = split if split is not None else MOST_PIXELS**2 if device.is_cpu else _SMALL
@@ -361,11 +354,7 @@ class Rasterizer:
 
         Returns:
             The attribute `raster`, which the next run overwrites.
-
-        Raises:
-            ValueError: `position` has a wrong shape for the space.
         """
-        check_position(position, self._space)
         device, count = self._triangle.device, self._triangle.shape[0]
         self._keys.fill_(_EMPTY)
         self._queued.zero_()

@@ -214,11 +214,6 @@ def codes(filter: str, boundary: str) -> tuple[int, int]:
     return FILTERS.index(filter), BOUNDARIES.index(boundary)
 
 
-def _check(texture) -> None:
-    if texture.ndim != 3 or 0 in texture.shape:
-        raise ValueError(f"texture: expected shape [height, width, channels], each above 0, got {tuple(texture.shape)}")
-
-
 def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp") -> None:
     """Reads a texture at N points with any coordinates.
 
@@ -228,7 +223,6 @@ def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp")
         out: float [N, C], written.
         filter, boundary: Names, see `codes`.
     """
-    _check(texture)
     inputs = [texture, uv, *codes(filter, boundary)]
     wp.launch(_sample, uv.shape, inputs=inputs, outputs=[out], device=texture.device)
 
@@ -247,6 +241,5 @@ def sample_backward(
         grad_texture: float [H, W, C], to which the gradient is added; of shape [0, 0, 0] if it is not wanted.
         grad_uv: vec2 [N], written; of shape [0] if it is not wanted.
     """
-    _check(texture)
     inputs = [texture, uv, *codes(filter, boundary), grad_out]
     wp.launch(_sample_backward, uv.shape, inputs=inputs, outputs=[grad_texture, grad_uv], device=texture.device)
