@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import imagecodecs
 import numpy as np
+import OpenEXR
 import pytest
 from builders.checks import error_of
 from builders.gltf_maker import GltfMaker
@@ -332,6 +333,18 @@ def test_uvs_that_the_light_does_not_fit(tmp_path, dilated):
     low = UV * [1, 0.6]
     write_exr(tmp_path / "b.exr", light(low, dilated, 2 / 0.6))
     assert "TEXCOORD_0 (--uv-set 0) with the lightmap upside down (--flip)" in doubts([0, 1] + low * [1, -1], OTHER)[0]
+
+
+@pytest.mark.parametrize("corner", [0, 4])
+def test_texels_that_a_data_window_leaves_out_say_nothing_about_uvs(tmp_path, corner):
+    whole, low, high = light(dilated=True), corner, SIDE - (corner or SIDE // 2)
+    part = {name: np.ascontiguousarray(whole[corner : SIDE - corner, low:high, i]) for i, name in enumerate("RGB")}
+    window = (low, corner), (high - 1, SIDE - corner - 1)
+    header = {"displayWindow": ((0, 0), (SIDE - 1, SIDE - 1)), "dataWindow": window}
+    OpenEXR.File(header, part).write(str(tmp_path / "b.exr"))
+    warnings = load(scene(tmp_path, {}, sets=[UV]), tmp_path / "b.exr").warnings
+    assert any("texels outside it are 0" in line for line in warnings)
+    assert not [line for line in warnings if "smoother" in line or "belong" in line]
 
 
 def test_rectangles_counted_from_the_other_side(tmp_path):

@@ -27,6 +27,7 @@ from wlm.atlas.matching import all_by_name, chart_map, choose_mesh, fits_flipped
 from wlm.atlas.materials import Readings, Rectangle, own_lightmaps, settle, slot_readings
 from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
+from wlm.formats.exr import CROPPED
 from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf
 from wlm.formats.gltf_slots import usual_set
 from wlm.formats.light import noted, read_light
@@ -626,7 +627,10 @@ def _checked(
     if len(lightmaps):
         chart = chart_map(position, uv, triangle[active], *lightmaps.shape[1:3])
         used = f"TEXCOORD_{uv_set}"
-        lines = misfits(name, lightmaps[0], position, triangle[active], uv, chart, used, alternatives)
+        # Without the texels that a file leaves out, stretched UVs would seem to fit the light better.
+        cropped = any(CROPPED in line for line in warnings)
+        given = name, lightmaps[0], position, triangle[active], uv, chart, used, alternatives
+        lines = [] if cropped else misfits(*given)
         mask, repairs = _checked_light(name, uv, triangle[active], chart, used, lightmaps, mask, names)
         warnings += lines + repairs
         lightmaps = fill_gaps(lightmaps, mask)

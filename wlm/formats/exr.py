@@ -23,6 +23,9 @@ from wlm.formats.stderr import captured_stderr
 HALF_MAX = 65504.0
 """The largest finite half float."""
 
+CROPPED = "texels outside it are 0"
+"""Words of the note about a data window that leaves texels of the display window out."""
+
 _COLOUR = ("R", "G", "B")
 _ALPHA = "A"
 _LETTERS = {"r": "R", "red": "R", "g": "G", "green": "G", "b": "B", "blue": "B", "a": "A", "alpha": "A"}
@@ -207,7 +210,7 @@ def _framed(where: str, part: OpenEXR.Part, plane: np.ndarray, notes: list[str])
     framed[rows, columns] = inside
     line = f"the data window, {data[2]}x{data[3]} at ({x}, {y}), is placed in the display window, {width}x{height}"
     if inside.size < framed.size:
-        line += f": {framed.size - inside.size} texels outside it are 0"
+        line += f": {framed.size - inside.size} {CROPPED}"
     if inside.size < plane.size:
         line += f"{';' if inside.size < framed.size else ':'} {plane.size - inside.size} texels beyond it are left out"
     if line not in notes:
