@@ -23,7 +23,7 @@ MODELS = (
     "atlas-bc6h",
     "smoke",
 )
-MOST = 10  # parts of a file that are tried: a network's weights are all alike
+MOST = 6  # parts of a file that are tried: a network's weights are all alike
 
 # What is a good value after all.
 ACCEPTED = {

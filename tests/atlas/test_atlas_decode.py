@@ -1,5 +1,6 @@
 """The runtime path: models of all three methods against float64, and the lightmap in its own layout."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -114,6 +115,9 @@ def test_the_lightmap_in_its_own_layout(device: str):
 
 
 def test_another_mesh_is_refused():
+    model = models(sheet)["plain with uv"]
+    with pytest.raises(WlmError, match="triangles, but its new UVs are for"):
+        _ = replace(model, uv=model.uv[1:]).scene
     model = models(sheet)["tiles"]
     with pytest.raises(WlmError, match="sheet: expected a sheet of the size in the model, found 48x41"):
         Decoder(model).texels(sheet(height=41).sheets[0])

@@ -118,7 +118,7 @@ def test_a_set_that_does_not_fit_is_one_line(fitted):
     lightmaps, model, _ = fitted
     frames, times, mask = lightmaps.light.frames, lightmaps.times, lightmaps.light.mask
     for other, says in (
-        (from_arrays(frames[:, :-1], times, mask[:-1]), "has 228x199 texels, but the file four 228x200"),
+        (from_arrays(frames[:, :-1], times, mask[:-1]), "has 228x199 texels, but the file four has 228x200"),
         (from_arrays(frames[:3], times[:3], mask), "has 3 times, but the file four holds 5"),
         (from_arrays(frames, times + 0.1, mask), "time 0 is 0.1, but in the file four it is 0"),
         (from_arrays(frames, times, ~mask), "no tile of the file four has a valid texel"),

@@ -59,7 +59,13 @@ _Times = Annotated[
         "0,1,...,23; default as set.json or the names state."
     ),
 ]
-_Mask = Annotated[str | None, typer.Option(help='Valid texels: a PNG, "alpha" or "all"; default as set.json states.')]
+_Mask = Annotated[
+    str | None,
+    typer.Option(
+        help='Texels that belong to charts: a PNG (above 0), "alpha" (of the lightmaps, above 0) or "all"; default as '
+        "set.json states."
+    ),
+]
 _Period = Annotated[
     float | None,
     typer.Option(
@@ -188,7 +194,9 @@ def decode(
     layer: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the layer; default the first layer of radiance.")
     ] = None,
-    atlas: Annotated[str | None, typer.Option(metavar="NAME", help="Name of the atlas; default the first.")] = None,
+    atlas: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Name of the atlas; default the first that has the layer.")
+    ] = None,
     device: Device = "cpu",
 ) -> None:
     """Decode a whole lightmap at one time."""

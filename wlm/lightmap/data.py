@@ -436,9 +436,15 @@ class _Reader:
         def put(index: int, pixels: np.ndarray, names: tuple[str, ...]) -> int:
             place, source = self._place[index], sources[index]
             if pixels.shape[:2] != size:
-                raise WlmError(f"{source.path}: has {_size(pixels.shape)} pixels, but {first.path} has {_size(size)}")
+                raise WlmError(
+                    f"{source.path}: has {_size(pixels.shape)} pixels, but {first.path} has {_size(size)}; all times "
+                    "of a layer need one size"
+                )
             if layer.encoding != LIGHT.encoding and names != known:
-                raise WlmError(f"{source.path}: channels {', '.join(names)}, but {first.path} has {', '.join(known)}")
+                raise WlmError(
+                    f"{source.path}: has the channels {', '.join(names)}, but {first.path} has {', '.join(known)}; all "
+                    "times of a layer need the same"
+                )
             for sheet, frames in stack.frames.items():
                 frames[place] = sheet.to_levels(pixels[..., [names.index(name) for name in sheet.channels]])
             if stack.alpha is None:
@@ -525,7 +531,9 @@ def _part(pixels: np.ndarray, source: Source) -> np.ndarray:
         return pixels
     height, rest = divmod(len(pixels), source.slices)
     if rest or not height:
-        raise WlmError(f"{source.path}: expected {source.slices} slices of equal height, found {len(pixels)} rows")
+        raise WlmError(
+            f"{source.path}: expected {source.slices} slices of equal height, found {len(pixels)} rows of pixels"
+        )
     return pixels[source.slice * height : (source.slice + 1) * height]
 
 

@@ -323,7 +323,7 @@ def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
     count, height, width = lightmaps.frames.shape[:3]
     if (height, width) != (model.height, model.width):
         raise WlmError(
-            f"{lightmaps.name}: has {width}x{height} texels, but the file {model.name} {model.width}x{model.height}"
+            f"{lightmaps.name}: has {width}x{height} texels, but the file {model.name} has {model.width}x{model.height}"
         )
     if count != len(model.times):
         raise WlmError(f"{lightmaps.name}: has {count} times, but the file {model.name} holds {len(model.times)}")

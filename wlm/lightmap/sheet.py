@@ -118,7 +118,7 @@ def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: 
     if not named:
         names = ", ".join(dict.fromkeys(f"{sheet.atlas}/{sheet.layer}" for sheet in sheets))
         asked = f"{'any atlas' if atlas is None else atlas}/{'any layer' if layer is None else layer}"
-        raise WlmError(f"{where}: expected one of {names}, got {asked}")
+        raise WlmError(f"{where}: atlas/layer: expected one of {names}, got {asked}")
     first = first_light(named)
     return [sheet for sheet in named if (sheet.atlas, sheet.layer) == (first.atlas, first.layer)]
 

@@ -192,7 +192,7 @@ def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
         step = most.astype(np.float32) / np.float32(LEVELS)
         q = np.rint(np.divide(weights, step, out=np.zeros(weights.shape, np.float32), where=step > 0))
         if not np.array_equal((q * step).astype(np.float16), weights):
-            raise WlmError("net: expected weights that 8 bits store exactly, found others")
+            raise WlmError("net: expected weights that 8 bits store exactly (net_bits is 8), found others")
         whole.append(q.astype(np.int8).ravel())
         halves += [most, bias]
     return np.concatenate([np.concatenate(whole).view(np.uint8), _apart(np.concatenate(halves))])
