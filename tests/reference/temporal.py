@@ -86,3 +86,8 @@ def emphasised(
     if exponent == 0.0:
         return weight
     return weight * (shift + spread * target).clamp(min=0.02) ** exponent
+
+
+def losses(answer: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Weighted mean squared error of each tile: [N, B, 3] each -> [N]."""
+    return (weight * (answer - target) ** 2).mean((1, 2))
