@@ -4,6 +4,7 @@ Lengths are in cells of the lattice, times in its steps, as in `wlm.fluid.lattic
 triangles, anticlockwise from outside: corners float64 [V, 3], triangles int64 [F, 3].
 """
 
+import functools
 import hashlib
 import itertools
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 _SIDES = 24  # segments of a sphere from pole to pole; there are twice as many around it
 
 
+@functools.cache  # pictures ask for it at each frame
 def surface(shape: str) -> tuple[np.ndarray, np.ndarray]:
     """Makes a surface around the origin: a "sphere" of radius 1, a "box" with edge 2, or a "cylinder" along y with
     radius 1 and height 2."""
@@ -31,7 +33,10 @@ def surface(shape: str) -> tuple[np.ndarray, np.ndarray]:
     hull = ConvexHull(points)
     a, b, c = points[hull.simplices].transpose(1, 0, 2)
     outward = np.einsum("fk,fk->f", np.cross(b - a, c - a), hull.equations[:, :3]) > 0
-    return points, np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1]).astype(np.int64)
+    faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1]).astype(np.int64)
+    for array in (points, faces):
+        array.flags.writeable = False
+    return points, faces
 
 
 @dataclass(frozen=True, eq=False)

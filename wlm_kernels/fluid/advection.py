@@ -54,6 +54,7 @@ from wlm_kernels.fluid.advection_places import (
     in_domain,
     into_domain,
     is_solid,
+    side_of,
     stencil,
     trace_back,
     wall_at,
@@ -144,9 +145,12 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         at = stencil(box.n, box.periodic, p)
         total = float(0.0)
         weight = float(0.0)
+        # Integer divisions are slow: one cell is found by them, the others by its neighbours along each axis.
+        first = cell_of(box.n, at.base)
+        along = wp.vec3i(at.step[0] // (box.n[1] * box.n[2]), at.step[1] // box.n[2], at.step[2])
         for k in range(8):
             i, w = corner(at, k)
-            if not is_solid(box, walls, cell_of(box.n, i)):
+            if not is_solid(box, walls, first + wp.cw_mul(side_of(k), along)):
                 total += w * value_at(field, i)
                 weight += w
         # The result is 0 if all eight cells are solid.

@@ -157,9 +157,15 @@ def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
 
 
 @wp.func
+def side_of(k: int) -> wp.vec3i:
+    """Returns for each axis whether the cell k of eight around a point is the lower one, 0, or the upper one, 1."""
+    return wp.vec3i(k // 4, k // 2 % 2, k % 2)
+
+
+@wp.func
 def corner(at: Stencil, k: int):
     """Returns the index of the cell k of eight around a point, and its trilinear weight."""
-    side = wp.vec3i(k // 4, k // 2 % 2, k % 2)
+    side = side_of(k)
     weight = float(1.0)
     for a in range(3):
         weight *= wp.where(side[a] == 0, 1.0 - at.f[a], at.f[a])
