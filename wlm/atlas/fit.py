@@ -78,8 +78,8 @@ def compress(
     Raises:
         WlmError: No such profile or device, a wrong setting, a missing package, a lightmap that is too large, or a
             budget that the smallest model exceeds.
-        KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written in a stage that
-            it keeps.
+        KeyboardInterrupt: Raised by `progress`, after the finished work of long stages has been written to the
+            checkpoint, if there is one; other stages run again on resuming.
     """
     device = interop.check_device(device)
     profile, method = Profile.load(profile).override(settings).checked(len(scene.sheets) * len(scene.states))

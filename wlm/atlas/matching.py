@@ -182,8 +182,8 @@ def misfits(
     used: str,
     alternatives: Sequence[tuple[str, np.ndarray]],
 ) -> list[str]:
-    """Returns a line of doubt if a lightmap [H, W, 3] fits its charts badly: other UVs make it clearly smoother in the
-    charts, the light and the charts lie in different places, or the charts leave nearly all of the light out.
+    """Returns a list of one line of doubt if a lightmap [H, W, 3] fits its charts badly, else an empty list: other UVs
+    make it clearly smoother in the charts, light and charts lie apart, or the charts leave nearly all of the light out.
 
     Args:
         name: The lightmap's name.

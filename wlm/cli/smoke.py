@@ -67,7 +67,7 @@ _SceneScale = Annotated[
 ]
 _Albedo = Annotated[
     str | None,
-    typer.Option(metavar="R,G,B", help="Single scattering albedo, one number or three; default the scene's."),
+    typer.Option(metavar="R,G,B", help="Single scattering albedo, one number or three; default the scene's, or 1."),
 ]
 _G = Annotated[float, typer.Option(min=-0.99, max=0.99, help="Mean cosine of the Henyey-Greenstein phase function.")]
 _Lightmaps = Annotated[Path, output_option("OUT", "The .exr to write; for a folder of frames, a folder.")]

@@ -18,7 +18,7 @@ PROBES, LIGHTING = "LightProbes", "LightingDataAsset"
 
 
 def main(data: bytes) -> dict[str, np.ndarray]:
-    """Returns what `encode` returns for the objects of a file."""
+    """Reads the bytes of a serialized Unity file, and returns what `encode` returns for its objects."""
     # `UnityPy.load` would decompress by any method that a file names.
     from UnityPy.files import SerializedFile
     from UnityPy.streams import EndianBinaryReader

@@ -39,7 +39,7 @@ class Slider:
     views: tuple[str, ...] = ()
 
     def text(self, value: float) -> str:
-        """Label for a value."""
+        """Returns the label that shows a value of the slider: name, number and unit, and the clock time of an hour."""
         shown = f"{self.name} {value:{self.form}}{self.unit}"
         minutes = round(value * 60.0) % 1440
         return f"{shown} ({minutes // 60}:{minutes % 60:02})" if self.clock else shown

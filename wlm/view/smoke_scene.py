@@ -186,7 +186,7 @@ class _VolumeScene(Scene):
         return f"{shape} voxels{drawn}, extinction {volume.extinction:g}{frames}"
 
     def _world(self, state: State) -> np.ndarray:
-        """Returns the direction to the light in the world; a turn of 0 is along the last axis that is not up."""
+        """Returns the unit vector to the light in the world; a turn of 0 is along z if y is up, along -y if z is up."""
         x, y, z = _toward(state)
         return np.array([x, y, z] if self.up == 1 else [x, -z, y])
 

@@ -135,20 +135,21 @@ def guide_nodes(medium: Medium, up: Sequence[float], step: float) -> wp.array:
 def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bool = True) -> None:
     """Computes a guiding map (algorithm 1): smoke lit from the front, top and bottom, its transparency and its depth.
 
-    Line 9 of the paper's algorithm lacks the step length h as a factor of the light; here each step is integrated
-    exactly. The paper's two lights from the sides, along the cross product of the view and the world's z, would be at
-    the left and the right where z points up; here they are above and below the camera. Each pixel's samples are shifted
-    by a random number, the jitter.
+    Two things differ from the paper's algorithm. Its line 9 lacks the step length h as a factor of the light; here each
+    step is integrated exactly. Its two lights from the sides lie along the cross product of the view and the world's z,
+    so at the left and the right where z is up; here they are above and below the camera. Each pixel's samples are
+    shifted by a random number, the jitter.
 
     Args:
         medium: The smoke, of albedo 1.
         view: The camera, [H, W] pixels.
         march: Settings; its step is also the step towards the lights. Its cutoff causes an error of at most the cutoff
             in transparency, and 2.5 times the cutoff in light (for g = 0).
-        out: float [3, H, W], written: scattered light under lights of irradiance 4 pi; transparency; distance from the
-            camera to the first sample denser than the threshold, 0 if there is none.
-        shared: Whether the depths to the top and the bottom are interpolated from `guide_nodes`; otherwise each sample
-            marches to the lights itself, which is slower and more exact.
+        out: float [3, H, W], written: sum of the light scattered under the three lights, each of irradiance 4 pi;
+            transparency; distance from the camera, in the unit of `View.voxel`, to the first sample denser than the
+            threshold, 0 if there is none.
+        shared: Whether the optical depths to the top and the bottom are interpolated from `guide_nodes`; otherwise each
+            sample marches to the lights itself, which is slower and more exact.
     """
     nodes = guide_nodes(medium, view.up, march.step) if shared else medium.buffer((0, 0, 0), wp.vec2)
     _guide(medium, out.shape[1:], [nodes, view, parameters(march)], [out], shared)

@@ -1,4 +1,4 @@
-"""Chooses the number of components of each tile and their size, and places them on pages of the colour texture T_p."""
+"""Chooses how many components each tile is a weighted sum of, and their size; places them in the colour texture."""
 
 import math
 from dataclasses import dataclass

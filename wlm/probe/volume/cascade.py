@@ -242,7 +242,7 @@ class Volume:
             viewpoint: [3], in the unit of the positions.
 
         Returns:
-            The work of the frame.
+            The work of the frame: numbers of blocks and probes, and its duration.
 
         Raises:
             WlmError: The viewpoint is not three finite numbers, or is so far away that the coordinates of its block

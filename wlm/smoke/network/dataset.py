@@ -151,7 +151,7 @@ class _Maker:
         self._device = check_device(device)
 
     def pool(self, first: int, count: int, progress: OnProgress | None) -> Pool:
-        """Returns the samples of consecutive sequences."""
+        """Simulates and renders `count` sequences from number `first` on; returns the samples of all in one pool."""
         meter = Meter(progress, "dataset", count)
         pools: list[Pool] = []
         samples = skipped = dropped = 0

@@ -117,7 +117,7 @@ def encode_lightmaps(six: SixWay) -> torch.Tensor:
         ValueError: The lightmaps have no transparency.
     """
     if six.transparency is None:
-        raise ValueError("six: expected lightmaps with transparency, got none")
+        raise ValueError("six: expected lightmaps with transparency, got lightmaps without it")
     transparency = six.transparency
     glow = torch.zeros_like(transparency) if six.emission is None else six.emission.clamp(min=0.0)
     return torch.cat([to_srgb(six.lightmaps), torch.stack([1.0 - transparency, to_srgb(glow / (1.0 + glow))])])
