@@ -174,7 +174,7 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
         raise WlmError(f"{path}: expected an artifact (safetensors), found a file of {size} bytes")
     (length,) = _LENGTH.unpack_from(content)
     start = _LENGTH.size + length
-    if length > _HEADER_LIMIT or content[_LENGTH.size : _LENGTH.size + 1] not in (b"{", b""):
+    if not _has_header(content):
         raise WlmError(f"{path}: expected an artifact (safetensors), found other content")
     if start > size:
         raise WlmError(f"{path}: the artifact is cut short: expected a header of {length} bytes, found fewer")
@@ -225,12 +225,17 @@ def _little_endian(name: str, array: np.ndarray) -> np.ndarray:
     return np.asarray(array, dtype=dtype, order="C")
 
 
+def _has_header(begin: bytes) -> bool:
+    """Whether a file that starts with these bytes, at least 8, can be a safetensors file whose header we accept."""
+    return begin[_LENGTH.size : _LENGTH.size + 1] in (b"{", b"") and _LENGTH.unpack_from(begin)[0] <= _HEADER_LIMIT
+
+
 def _read(path: str | os.PathLike[str]) -> bytes:
     # A mapping would show what another process writes after the digest was checked, or end this one where it is cut.
     try:
         with open_file(path, "the artifact") as file:
             head = file.read(_LENGTH.size + 1)
-            if not is_compact(head) and (head[_LENGTH.size :] != b"{" or _LENGTH.unpack_from(head)[0] > _HEADER_LIMIT):
+            if len(head) > _LENGTH.size and not (is_compact(head) or _has_header(head)):
                 return head  # which is enough to refuse it
             file.seek(0)
             return file.read()

@@ -40,7 +40,7 @@ _DARK = 0.02  # of the mean light: at the borders of cells, and in a cell withou
 
 
 class _Stated(BaseModel, strict=True, allow_inf_nan=False):
-    """What `write_book` states about a texture."""
+    """The description of a texture that `write_book` stores in its document."""
 
     layout: Literal[tuple(LAYOUTS)]  # type: ignore[valid-type]
     rows: int = Field(ge=1, le=4096)
