@@ -197,10 +197,10 @@ def _object(entry: Any, convention: str, where: str) -> Any:
 
 
 def numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
-    """Checks four finite numbers, a list or an object with the given keys.
+    """Returns four numbers of a JSON document, written as a list or as an object with the four `keys`.
 
     Raises:
-        WlmError: They are not; `where` names their place.
+        WlmError: It is something else, or a number is not finite; `where` names its place.
     """
     if isinstance(value, dict) and set(keys) <= set(value):
         value = [value[key] for key in keys]

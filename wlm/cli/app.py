@@ -71,7 +71,7 @@ class Group(TyperGroup):
 
 
 def _cache_hint(error: OSError) -> str:
-    """Tells how to move the cache of compiled kernels if the error can come from it."""
+    """Returns words for an error message on how to move the cache of compiled kernels; "" if it is not the cause."""
     if "warp" not in sys.modules or error.errno not in (errno.ENOSPC, errno.EROFS, errno.EACCES):
         return ""
     import warp as wp

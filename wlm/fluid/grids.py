@@ -160,7 +160,7 @@ def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lat
 
 
 def _turned(grid: Grid, up: str) -> np.ndarray:
-    """Returns the transform [4, 4] of the corners of a grid's voxels to the world in which +y is up."""
+    """Returns the transform [4, 4] from voxel corners (i, j, k) of a grid to the world, turned so that +y is up."""
     matrix = np.eye(4)
     matrix[:3, :3] = UPS[up]
     matrix = matrix @ grid.matrix
@@ -185,7 +185,7 @@ def _between(voxel: float, origin: np.ndarray, matrix: np.ndarray) -> tuple[np.n
 
 
 def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Returns whether a transform of `_between` maps voxels exactly to voxels, so that no resampling is needed."""
+    """Returns whether a matrix and shift between voxels only permute, flip and move them by whole voxels."""
     turn, shift = between
     axes = np.abs(turn).round()
     straight = np.abs(np.abs(turn) - axes).max() <= _CUBIC and (axes.sum(0) == 1).all() and (axes.sum(1) == 1).all()
