@@ -260,7 +260,7 @@ def features(inputs: Inputs, light: int) -> torch.Tensor:
 
 
 def at(inputs: Inputs, albedo: float) -> Inputs:
-    """Returns the inputs at one of their albedos alone."""
+    """Returns the inputs with light by diffusion at one albedo, which must be one of theirs, and no other."""
     n = inputs.albedos.index(albedo)
     planes = {name: getattr(inputs, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
     return replace(inputs, **planes, albedos=(albedo,))
