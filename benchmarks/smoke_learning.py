@@ -140,7 +140,7 @@ class Lesson:
     light: torch.Tensor
 
     def multiple(self) -> torch.Tensor:
-        """Returns R of `transport.orders`: light scattered more than once divided by the squared albedo, [A, H, W]."""
+        """Returns light scattered more than once, divided by the squared albedo, at each of A albedos, [A, H, W]."""
         albedo = torch.tensor(ALBEDOS).to(self.light)[:, None, None]
         return (self.light - albedo * self.inputs.single[0]) / albedo**2
 

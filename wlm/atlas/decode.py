@@ -115,7 +115,7 @@ class Decoder:
             texture.sample(self._texels, uv, interop.to_warp(out))
 
     def __call__(self, points: Points, state: float = 0.0) -> torch.Tensor:
-        """Returns light at points of the scene, float32 [N, 3]."""
+        """Returns light at N surface points of the scene in a state (a fraction lies between two), float32 [N, 3]."""
         uv = points.uv
         if len(self._corner):
             uv = (self._corner[points.triangle] * points.weight[:, :, None]).sum(1)

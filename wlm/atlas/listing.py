@@ -101,7 +101,7 @@ class Listing:
 
     @contextmanager
     def opened(self, name: str, trust: bool) -> Iterator[tuple[str, str]]:
-        """Yields the path of a picture and its name for messages; one that is held is in a file without a name."""
+        """Yields a picture's path and its name for messages; bytes in `held` are put into an unnamed temporary file."""
         if name not in self.held:
             path = str(self.file(name, trust))
             yield path, path

@@ -167,7 +167,7 @@ def _encoded(texels: Texels, mean: np.ndarray, normal: np.ndarray, mask: np.ndar
 
 
 def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
-    """Returns a float32 image with gaps filled from the nearest texel, optionally denoised."""
+    """Makes an image of the texels' values; gaps take the nearest value, and `denoise`, unless None, filters it."""
     picture = fill_gaps(texels.image(values), mask)
     if denoise is not None:
         try:

@@ -121,8 +121,8 @@ def choose(
 
 
 def is_level_set(grid: VdbGrid, group: str) -> bool:
-    """Whether the values of a grid of a class are distances to a surface: by its class, or else because the background
-    is above 0 and a value below."""
+    """Tests whether a grid's values are distances to a surface: its background is above 0, and its class `group` is
+    level set, or is not fog while a value is below 0."""
     return grid.background > 0 and group != _FOG and (group == _LEVEL_SET or bool(grid.values.min() < 0))
 
 

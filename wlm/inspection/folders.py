@@ -97,7 +97,7 @@ _REFUSED = {
 
 
 def _folder_system(folder: Path) -> str:
-    """Returns the system that compresses a folder, a key of `_REFUSED` if it cannot be compressed, or ""."""
+    """Returns "lightmap" for a folder that it compresses; "smoke", "export" or "meshes" if no system does; or ""."""
     if (folder / SET_FILE).is_file() or state_folders(folder):
         return "lightmap"
     files = [entry for entry in _entries(folder) if entry.is_file()]

@@ -609,7 +609,7 @@ class _States:
         warnings: Sequence[str] = (),
         mesh: Path | None = None,
     ) -> SheetFrames:
-        """Checks and repairs the frames of a sheet by the module's rules."""
+        """Checks and repairs a sheet's frames in place (NaN, negative and missing texels); returns them as a sheet."""
         where, period = self.where, self.period
         if not mask.any():
             raise WlmError(f"{where}: the mask is empty: no texel is valid ({self.mask_from})")

@@ -53,7 +53,7 @@ class Slider:
 
 
 def frame_slider(count: int, views: tuple[str, ...] = ()) -> tuple[Slider, ...]:
-    """A slider of frame numbers from 1 to `count`; no slider for a single frame."""
+    """Returns a tuple with a slider of frame numbers from 1 to `count`; empty for a single frame."""
     if count < 2:
         return ()
     return (Slider("frame", 1, count, 1, 1, ".0f", f" of {count}", whole=True, views=views),)

@@ -139,8 +139,8 @@ def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
-    """Returns for each triangle the index in `SIZES` of the smallest size not below its longest edge in texels (eq. 1),
-    int32 [F]."""
+    """Returns for each triangle the index in `SIZES` of its patch's size, int32 [F]: the smallest not below its longest
+    edge in texels (eq. 1), at most `largest`."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)

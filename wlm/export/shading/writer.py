@@ -64,11 +64,11 @@ class Writer(ABC):
         return "\n".join([*self.head(), *lines, *self.foot()]) + "\n"
 
     def head(self) -> list[str]:
-        """Returns the lines before the first declaration."""
+        """Returns the lines before the first declaration: none, unless a subclass overrides this."""
         return []
 
     def foot(self) -> list[str]:
-        """Returns the lines after the last declaration."""
+        """Returns the lines after the last declaration: none, unless a subclass overrides this."""
         return []
 
     @abstractmethod
