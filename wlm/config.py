@@ -200,7 +200,7 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
 
 
 def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
-    """Returns the known keys of the mapping that has an unknown key, or only the known key that is most similar."""
+    """Returns the end of a message about an unknown key: the most similar known key, or else all; "" if unknown."""
     model: Any = cls
     for part in location[:-1]:
         field = model.model_fields.get(part)

@@ -132,7 +132,7 @@ def bake_lightmaps(
 
 
 def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
-    """Returns a float32 image with gaps filled from the nearest texel, optionally denoised."""
+    """Makes an image of the texels' values; gaps take the nearest value, and `denoise`, unless None, filters it."""
     picture = fill_gaps(texels.image(values), mask)
     if denoise is not None:
         try:

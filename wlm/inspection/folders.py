@@ -97,7 +97,7 @@ _REFUSED = {
 
 
 def _folder_system(folder: Path) -> str:
-    """Returns the system that compresses a folder, a key of `_REFUSED` if it cannot be compressed, or ""."""
+    """Returns "lightmap" for a folder that it compresses; "smoke", "export" or "meshes" if no system does; or ""."""
     if (folder / SET_FILE).is_file() or state_folders(folder):
         return "lightmap"
     files = [entry for entry in _entries(folder) if entry.is_file()]
@@ -154,7 +154,7 @@ def _inside(path: Path) -> Finding | None:
 
 
 def _book_names(file: Path, back: bool = False) -> list[tuple[str, str]]:
-    """Returns the names, in lower case, that the other texture of a flip book may have, each with a layout."""
+    """Returns possible file names, in lower case, of a flip book's second texture (`back`: first), with its layout."""
     if file.suffix.lower() not in _BOOKS:
         return []
     # This imports torch, which takes seconds.
@@ -252,7 +252,7 @@ def _godot(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes pairs of textures that are named as six-way lightmaps are, or as pairs whose light is that of them."""
+    """Describes pairs of textures that by names, perhaps also light, are a flip book of six-way lightmaps."""
     pictures = {file.name.lower(): file for file in files if file.suffix.lower() in _BOOKS}
     found: _Found = []
     taken: set[Path] = set()
@@ -357,6 +357,7 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
 def _of_mesh(
     folder: Path, what: str, mesh: Path | None, pictures: Sequence[Path], problems: Sequence[str] = ()
 ) -> tuple[Finding, set[Path]]:
+    """Describes a folder's lightmaps of meshes, and how to compress them if the `mesh` file is known, not None."""
     if mesh is None:
         return Finding(folder, f"{what}; compress them with their mesh", problems=tuple(problems)), set(pictures)
     words, notes = scene_command(mesh, folder)
@@ -364,7 +365,7 @@ def _of_mesh(
 
 
 def _lightmaps_of(mesh: Path | None, pictures: Sequence[Path]) -> str:
-    """Describes lightmaps that their names divide among UDIM tiles or the meshes of a file; "" for others."""
+    """Describes lightmaps that are named by UDIM tiles, or after the meshes of a file, in words; "" for others."""
     if tiles := tiles_of([file.stem for file in pictures]):
         return f"{count_of(pictures, 'lightmap')} of the UDIM tiles {', '.join(map(str, tiles[:8]))}"
     if mesh is None or len(pictures) < 2:
@@ -379,6 +380,7 @@ def _lightmaps_of(mesh: Path | None, pictures: Sequence[Path]) -> str:
 
 
 def _mesh_folders(folder: Path, files: Sequence[Path]) -> _Found:
+    """Describes subfolders of lightmaps named by UDIM tiles or after meshes, if one glTF file lies beside them."""
     meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
     if len(meshes) != 1:
         return []

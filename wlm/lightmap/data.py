@@ -412,7 +412,7 @@ class _Reader:
         self._budget = Budget(f"{listing.where}: lightmaps", most, "decoded bytes")
 
     def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None, leads: bool) -> _Stack | None:
-        """Reads the pictures of a layer; None if there is none. `leads`: whether the set may state their size."""
+        """Reads a layer's pictures at all times; None without any. With `leads`, checks the atlas's stated size."""
         key = atlas.name, layer.name
         sources = {i: state[key] for i, state in enumerate(self._listing.states) if key in state}
         if not sources:
@@ -457,7 +457,7 @@ class _Reader:
             return int(np.count_nonzero(~np.isfinite(alpha)))
 
         def put_all(path: str) -> None:
-            """Reads a file once, for all times that it serves."""
+            """Reads a file once and stores its pictures for all times that use the file."""
             indices = files[path]
             at, read = indices[0], (whole, names)
             if at != start:
@@ -606,7 +606,7 @@ class _States:
         warnings: Sequence[str] = (),
         mesh: Path | None = None,
     ) -> SheetFrames:
-        """Checks and repairs the frames of a sheet by the module's rules."""
+        """Checks and repairs a sheet's frames in place (NaN, negative and missing texels); returns them as a sheet."""
         where, period = self.where, self.period
         if not mask.any():
             raise WlmError(f"{where}: the mask is empty: no texel is valid ({self.mask_from})")

@@ -200,7 +200,7 @@ def _check_count(where: Path, items: Sequence[object], times: Sequence[float], n
 
 
 def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, noun: str) -> dict[str, Any]:
-    """Returns the times of lightmaps, given or of their names without suffixes, as fields of a `Listing`."""
+    """Returns the `times` of lightmaps, or hours from their names `stems` if it is None, as fields of a `Listing`."""
     if times is not None:
         _check_count(folder, stems, times, noun)
         return {"times": times, "period": None, "origin": _GIVEN}

@@ -280,7 +280,7 @@ class MapTiles(DeviceTiles):
         return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
 
     def state(self, time: float, state: decode_kernels.TimeState | None = None) -> decode_kernels.TimeState:
-        """Returns what the decode kernels need for one time; it overwrites `state`, or allocates it if it is None."""
+        """Returns a time's position, encoding and tile scales for the decode kernels, in `state` unless it is None."""
         before, after, share = self._axis.neighbours(time)
         if state is None:
             state = decode_kernels.TimeState()
@@ -374,7 +374,7 @@ def network_starts(sheet: SheetModel) -> np.ndarray:
 
 
 def image_rows(sheet: SheetModel) -> np.ndarray:
-    """Returns the image of each tile with maps in the textures, where dynamic tiles come first, int [N_m]."""
+    """Returns for each tile with maps the index of its image in the textures, dynamic tiles first, int [N_m]."""
     static = sheet.kind[sheet.mapped] == TileKind.STATIC
     rows = np.empty(len(static), int)
     rows[np.argsort(static, kind="stable")] = np.arange(len(static))
