@@ -17,7 +17,7 @@ def codes_at(decoder: RuntimeDecoder, time: float) -> np.ndarray:
 
 
 def shares_of(model: SheetModel, numbers: Sequence[int] | np.ndarray, time: float) -> np.ndarray:
-    """Returns the colour of tiles divided by their bounds, at most 1, float64 [n, 128, 128, 3]; 0 where a bound is 0."""
+    """Returns the colour of tiles divided by their bounds, at most 1, float64 [n, 128, 128, 3]; 0 for a bound of 0."""
     bounds = np.array([bound64(model, int(number), time) for number in numbers])[:, None, None, None]
     colours = np.stack([colour_tile64(model, int(number), time) for number in numbers])
     return np.minimum(np.divide(colours, bounds, out=np.zeros_like(colours), where=bounds > 0), 1.0)

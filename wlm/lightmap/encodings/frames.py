@@ -164,8 +164,8 @@ class FrameTiles(DeviceTiles):
         self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
 
     def bounds(self, time: float) -> np.ndarray:
-        """Returns an upper bound of each tile's colour at a time, in gamma space, float32 [n]; between two stored times the
-        larger of their bounds."""
+        """Returns an upper bound of each tile's colour at a time, in gamma space, float32 [n]; between two stored times
+        the larger of their bounds."""
         before, after, share = self._axis.neighbours(time)
         return self._greatest[:, before] if share == 0 else self._greatest[:, [before, after]].max(1)
 
