@@ -65,7 +65,7 @@ def encode_bc6h(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival
 
 
 def _reused(data: bytes, *images: np.ndarray) -> bytes:
-    """Repeats blocks, see `reuse_blocks`; its arguments after the blocks are images [H, W, C] here."""
+    """Replaces blocks by earlier ones where that adds little error; `images` [H, W, C]: the further arguments."""
     return reuse_blocks(np.frombuffer(data, np.uint8).reshape(-1, 16), *map(by_block, images)).tobytes()
 
 

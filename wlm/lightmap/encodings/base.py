@@ -62,7 +62,7 @@ class Encoding(ABC):
     codes: ClassVar[tuple[int, ...]]
 
     def packed_size(self, sheet: SheetModel, number: int) -> int:
-        """Returns the number of bytes that `pack` gives for a tile."""
+        """Returns the number of bytes that `pack` gives for a tile: 0, unless a subclass overrides both."""
         return 0
 
     def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
