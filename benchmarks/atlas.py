@@ -459,15 +459,20 @@ def means(rows: Sequence[Row], lightmaps: int, of: str = "") -> list[Row]:
     return made
 
 
-def warm_up(profile: Profile, device: str) -> None:
-    """Compiles all kernels of compression and decoding by compressing and decoding a square of 32 x 32 texels."""
+def make_square(states: int) -> LightmappedScene:
+    """Makes a small scene with which kernels are compiled: a square of 32 x 32 texels in some lighting states."""
     side = np.linspace(0.1, 1.0, 32)
     image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
-    square = from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, image, name="square")
+    light = np.stack([image ** (1 + state) for state in range(states)])
+    return from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, light, name="square")
+
+
+def warm_up(profile: Profile, device: str) -> None:
+    """Compiles all kernels of compression and decoding, by a small scene of one state."""
     small = {"views": 1, "steps": min(profile.steps, 4), "resolution": 64}
     small |= {"budget": 1.0} if profile.method == "tiles" else {}
-    model = compress(square, profile.model_copy(update=small), device=device)
+    model = compress(make_square(1), profile.model_copy(update=small), device=device)
     Decoder(model, device).lightmap()
 
 

@@ -194,12 +194,7 @@ def fit_orders(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) 
 
 
 def learn(
-    views: int,
-    *,
-    samples: int = 512,
-    seed: int = 0,
-    device: str = "cpu",
-    report: Callable[[int], None] | None = None,
+    views: int, *, samples: int = 512, seed: int = 0, device: str = "cpu", report: Callable[[int], None] | None = None
 ) -> OrdersModel:
     """Draws random smoke, traces its light and fits the weights; the weights that ship with wlm are from 2000 views.
 

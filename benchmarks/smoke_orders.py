@@ -204,7 +204,8 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
         traced.append(tuple(_trace(shot, sizes.samples // 2, salt) for salt in (0, 1)))
         once = _once(shot)
         opacity.append(1.0 - once.transparency)
-        by_angle = {_OCTAVES: _by_angle(shot, _octaves(shot)), _FILTER: _by_angle(shot, _planes(shot))}
+        each = [octaves(shot.volume, shot.camera, [light]) for light in shot.lights]
+        by_angle = {_OCTAVES: _by_angle(shot, each), _FILTER: _by_angle(shot, _planes(shot))}
         fitted = {_GAIN: once.shade()[None]} | by_angle
         for albedo in ALBEDOS:
             pictures = {way: make(shot, albedo) for way, make in _ways().items()}
@@ -251,10 +252,6 @@ def _once(shot: Shot) -> LitSmoke:
 def _denoised(shot: Shot, albedo: float) -> torch.Tensor:
     settings = {"albedo": (albedo,) * 3, "samples": 1, "orders": 0, "seed": shot.seed}
     return denoised_picture(trace(shot.volume, shot.camera, shot.lights, **settings).total)
-
-
-def _octaves(shot: Shot) -> list[torch.Tensor]:
-    return [octaves(shot.volume, shot.camera, [light]) for light in shot.lights]
 
 
 def _planes(shot: Shot) -> list[torch.Tensor]:
@@ -359,7 +356,6 @@ def _flicker(
 
 
 def _lights(random: np.random.Generator, ways: Sequence[Sequence[float]]) -> tuple[Light, ...]:
-    """Returns lights from the given directions with random colours."""
     colours = random.dirichlet(np.ones(3), len(ways)) * 3.0 / len(ways) * _FOUR_PI
     return tuple(Light(tuple(way), tuple(map(float, colour))) for way, colour in zip(ways, colours, strict=True))
 

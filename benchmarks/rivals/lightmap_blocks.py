@@ -20,7 +20,7 @@ from types import ModuleType
 import numpy as np
 
 from benchmarks.rivals.lightmap_levels import TileRanges, clear_unseen, prepare, seen_texels, to_codes
-from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure
+from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure, need_bc
 from wlm.errors import WlmError
 from wlm.formats import bc7, hdr_blocks
 from wlm.formats.hdr_blocks import need
@@ -38,7 +38,7 @@ _NO_LIMIT_DB = 999.0
 
 def encode_bc6h(frame: np.ndarray, mask: np.ndarray) -> Rival:
     """Encodes a lightmap as unsigned BC6H, 8 bits a texel, with Intel's ISPC texture compressor."""
-    _need_bc()
+    need_bc()
     image = prepare(frame, mask)
     padded = _pad(clear_unseen(image, seen_texels(mask), _BC_BLOCK)).astype(np.float16)
 
@@ -61,7 +61,7 @@ def ispc_bc6h(texels: np.ndarray) -> bytes:
 
 def encode_bc7(frame: np.ndarray, mask: np.ndarray) -> Rival:
     """Encodes a lightmap as BC7 with gamma 2.2, scaled by each tile's range; 8 bits a texel and 12 bytes a tile."""
-    _need_bc()
+    need_bc()
     image = prepare(frame, mask)
     levels, ranges = _levels(image, mask, _BC_BLOCK)
     padded = _pad((levels * 255.0 + 0.5).astype(np.uint8))
@@ -139,11 +139,6 @@ def _measured(
         bytes=lambda data: len(data) + len(ranges),
         disk_bytes=lambda data: disk_size(data + ranges),
     )
-
-
-def _need_bc() -> None:
-    for package in ("ispc_texcomp", "imagecodecs"):  # importing them is not part of the encode time
-        need(package, EXTRA)
 
 
 def _levels(image: np.ndarray, mask: np.ndarray, block: int) -> tuple[np.ndarray, TileRanges]:

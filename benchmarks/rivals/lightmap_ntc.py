@@ -199,8 +199,6 @@ class _Places:
 
 
 class _Fit:
-    """Fits the latents and the network of one region to its lightmaps."""
-
     def __init__(
         self,
         levels: np.ndarray,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.rivals.lightmap_levels import TileRanges, areas, prepare, seen_texels, to_codes
-from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure
+from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure, need_bc
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import need
 from wlm.lightmap.tiles import TILE
@@ -55,8 +55,7 @@ def encode_pca_bc4(frames: np.ndarray, mask: np.ndarray, components: int = 4) ->
     """
     if components < 1:
         raise WlmError(f"pca: expected at least 1 component, got {components}")
-    for package in ("ispc_texcomp", "imagecodecs"):  # importing them is not part of the encode time
-        need(package, EXTRA)
+    need_bc()
     images = prepare(frames, mask)
 
     def encode() -> tuple[TileRanges, list[tuple[_Tile, list[tuple[bytes, np.ndarray]]]]]:
@@ -136,11 +135,7 @@ def _from_bc4(data: bytes, scale: np.ndarray, tile: _Tile) -> np.ndarray:
     return texels[tile.inside] / np.float32(255.0) * scale[1] + scale[0]
 
 
-def _decode(
-    tiles: Iterator[tuple[_Tile, np.ndarray]],
-    ranges: TileRanges,
-    shape: tuple[int, ...],
-) -> np.ndarray:
+def _decode(tiles: Iterator[tuple[_Tile, np.ndarray]], ranges: TileRanges, shape: tuple[int, ...]) -> np.ndarray:
     """Decodes lightmaps [T, H, W, 3] from each tile's coefficients [N, K]; black where no texel is coded."""
     levels = np.zeros(shape, np.float32)
     for tile, coefficients in tiles:

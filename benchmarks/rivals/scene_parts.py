@@ -63,11 +63,7 @@ class SceneParts:
 
 
 def scene_parts(
-    scene: LightmappedScene,
-    weights: Sequence[np.ndarray],
-    bits: float,
-    colour: str = "mixed",
-    device: str = "cpu",
+    scene: LightmappedScene, weights: Sequence[np.ndarray], bits: float, colour: str = "mixed", device: str = "cpu"
 ) -> SceneParts:
     """Compresses each lightmap of a scene alone, with a share of the given bits.
 
