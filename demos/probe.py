@@ -24,9 +24,9 @@ from wlm.view.opening import open_scene
 from wlm.view.window import Window
 
 HERE = Path(__file__).resolve().parent
-STEPS = 5000
+STEPS = 3500
 KEY = "12.00"
-FRAMES = 200
+FRAMES = 100
 
 # Seed 0 gives 8,177 bytes; seeds 0 to 3 gave 41.8 to 42.0 dB, and 36.7 to 37.1 dB of the irradiance on the CPU.
 MOST_BYTES = 8_600
