@@ -263,7 +263,7 @@ def _piece(
 
 
 def _objects(position: np.ndarray, triangle: np.ndarray, chart: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Returns the object number of each chart, int [charts]; objects with more texels have lower numbers."""
+    """Joins charts to connected objects, small ones to the nearest large one; returns each chart's, largest first."""
     size = max(float(np.ptp(position, axis=0).max()), 1e-30)
     grid = np.round(position / (_SAME_PLACE * size)).astype(np.int64)
     corner = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)[triangle]

@@ -127,7 +127,7 @@ class Lesson:
     light: torch.Tensor
 
     def multiple(self) -> torch.Tensor:
-        """Returns R of `transport.orders`: light scattered more than once divided by the squared albedo, [A, H, W]."""
+        """Returns light scattered more than once, divided by the squared albedo, at each of A albedos, [A, H, W]."""
         albedo = torch.tensor(ALBEDOS).to(self.light)[:, None, None]
         return (self.light - albedo * self.inputs.single[0]) / albedo**2
 
@@ -242,7 +242,7 @@ def features(inputs: Inputs, light: int) -> torch.Tensor:
 
 
 def at(inputs: Inputs, albedo: float) -> Inputs:
-    """Returns the inputs at one of their albedos alone."""
+    """Returns the inputs with light by diffusion at one albedo, which must be one of theirs, and no other."""
     n = inputs.albedos.index(albedo)
     planes = {name: getattr(inputs, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
     return replace(inputs, **planes, albedos=(albedo,))

@@ -155,7 +155,7 @@ def _bits(placed: Layout | None, part: _Part, share: float, profile: Profile) ->
 def _by_part(
     samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]], parts: list[_Part]
 ) -> list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]]:
-    """Splits `samples`, the result of `solved`, by parts, and numbers the tiles of each part from 0."""
+    """Splits groups of tiles (their numbers, samples and weights) by parts; numbers the tiles of each part from 0."""
     ends = np.array([part.tiles.stop for part in parts])
     result: list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]] = [[] for _ in parts]
     for members, values, weight in samples:

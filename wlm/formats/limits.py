@@ -134,10 +134,10 @@ def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure:
 
 
 class Budget:
-    """Work or memory that the read of one file may still take; all loops of the read spend from it beforehand."""
+    """The work or memory that reading one file may still take; each loop of the reader takes from it beforehand."""
 
     def __init__(self, where: str, most: int, unit: str, hint: str = "") -> None:
-        """Starts with `most` of a unit. For messages: the file, the unit in plural, and advice that follows."""
+        """Allows `most` units. `where` (the file), `unit` (plural) and `hint` (advice at the end) are for messages."""
         self._left = most
         self._text = f"{where}: expected at most {most} {unit} for the size of the file, found more{hint}"
 

@@ -45,7 +45,7 @@ class Slider:
         return f"{shown} ({minutes // 60}:{minutes % 60:02})" if self.clock else shown
 
     def fit(self, value: float) -> float:
-        """Nearest allowed value."""
+        """Returns a value wrapped or clamped to the slider's range, and rounded if only integers are allowed."""
         if self.wraps and not self.low <= value <= self.high:
             value = self.low + (value - self.low) % (self.high - self.low)
         value = min(max(value, self.low), self.high)
@@ -53,7 +53,7 @@ class Slider:
 
 
 def frame_slider(count: int, views: tuple[str, ...] = ()) -> tuple[Slider, ...]:
-    """A slider of frame numbers from 1 to `count`; no slider for a single frame."""
+    """Returns a tuple with a slider of frame numbers from 1 to `count`; empty for a single frame."""
     if count < 2:
         return ()
     return (Slider("frame", 1, count, 1, 1, ".0f", f" of {count}", whole=True, views=views),)
@@ -81,7 +81,7 @@ class State:
         return int(self.values.get("frame", 1)) - 1
 
     def display(self, exposure: float) -> Display:
-        """Display settings; `exposure` is the exposure at 0 EV."""
+        """Returns how light is shown by the sliders of exposure and error; `exposure` is the factor at 0 EV."""
         return Display(exposure * 2.0 ** self.values.get("exposure", 0.0), self.tone, self.values.get("error", 1.0))
 
 

@@ -44,8 +44,8 @@ def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
 
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
-    """Returns the CUDA code with which a function begins that evaluates the network for a block of probes
-    (`native/layers.cuh`)."""
+    """Returns the CUDA code of the network's layers for a block of probes (`native/layers.cuh`), with sizes as
+    constants; kernels append their own code."""
     sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
     return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
 

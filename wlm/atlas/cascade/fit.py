@@ -359,7 +359,7 @@ class _Views:
         self._rasterizer.run(self._clip_array)
 
     def pairs(self, values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns the differences between neighbours, of values [N, 3]: the image's gradient (section 3.3.3)."""
+        """Returns the differences of pixel values [N, 3] between vertical and between horizontal neighbours."""
         image = values.unflatten(0, (self._side, self._side))
         return image.diff(dim=0), image.diff(dim=1)
 
@@ -391,6 +391,6 @@ class _Surface:
 
     @staticmethod
     def pairs(values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns the differences within the pairs, of values [N, 3]."""
+        """Returns the difference of the values [N, 3] at the two points of each pair, [N / 2, 3]."""
         first, second = values.chunk(2)
         return (first - second,)
