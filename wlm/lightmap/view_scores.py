@@ -340,7 +340,7 @@ class Tally:
                 self._border += len(crossing) * np.array([across, inner.mean() / span**2])
 
     def _add_interval(self, index: int) -> None:
-        """Scores `between` and `flicker` in the interval after a stored time."""
+        """Scores the light halfway from stored time `index` to the next, and the flicker in small steps in between."""
         after = (index + 1) % self._count
         first, second = self._lightmaps.frames[index], self._lightmaps.frames[after]
         middle = float(self._middles[index])
