@@ -218,8 +218,6 @@ def _shown(value: object) -> str:
 
 
 class _Short(reprlib.Repr):
-    """Formats a value for an error message like `repr`, and cuts it short if it is long."""
-
     def __init__(self) -> None:
         super().__init__()
         self.maxlevel = 3

@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 import warp as wp
-from builders.synthetic import random_model, random_sheet
-from typer.testing import CliRunner
+from builders.synthetic import random_sheet
 
 from wlm import interop
-from wlm.cli.app import app
 from wlm.errors import WlmError
-from wlm.formats.dds import read_dds, write_dds
 from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.exact import colour_tile64
@@ -180,20 +177,3 @@ def test_mips_leave_out_tiles_that_the_file_lacks(device):
     stored[:128, 128:] = False
     # The mean is rounded at each level.
     np.testing.assert_allclose(decoder.numpy(whole)[0, 0], light[stored].mean(0), rtol=0.03)
-
-
-def test_the_command_writes_the_texture(tmp_path):
-    model = random_model(MAP_KINDS, hidden=16)
-    model.save(tmp_path / "a.wlm")
-    files = ["-o", str(tmp_path / "a.exr"), "--texture", str(tmp_path / "a.dds")]
-    assert CliRunner().invoke(app, ["decode", str(tmp_path / "a.wlm"), "--time", "9", *files]).exit_code == 0
-    (sheet,) = model.sheets.values()
-    decoder = MapDecoder(sheet)
-    decoder.set_time(9.0)
-    decoder.decode()
-    image, _ = read_dds(tmp_path / "a.dds")
-    np.testing.assert_array_equal(image, decoder.numpy())
-    size = sum(level.size for level in decoder.levels) * 4
-    assert (tmp_path / "a.dds").stat().st_size == 148 + size
-    with pytest.raises(ValueError, match="mips: expected 0 to 3, got 4"):
-        write_dds(tmp_path / "b.dds", b"", 8, 8, fmt="R9G9B9E5_SHAREDEXP", mips=4)

@@ -25,10 +25,6 @@ _Scene = Annotated[
 def lightmaps(
     scene: _Scene,
     output: Annotated[Path, output_option("DIR", "Folder to write the set to.")],
-    directional: Annotated[
-        bool,
-        typer.Option("--directional", help="Also bake the main direction of the light, a layer like Unity's comp_dir."),
-    ] = False,
     device: Device = "cpu",
     resume: Resume = False,
     trust: Trust = False,
@@ -43,7 +39,7 @@ def lightmaps(
     from wlm.formats.folder import claim
 
     claim(output, INDEX, FORMAT)
-    task = open_task(scene, trust, directional)
+    task = open_task(scene, trust)
     checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
     note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:

@@ -294,7 +294,6 @@ def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tu
 def _check_extents(
     path: str | os.PathLike[str], entries: dict[str, tuple[str, tuple[int, ...], int, int]], payload: int
 ) -> None:
-    """Checks that the parts fill the file after the header, with no gap and no overlap."""
     reached = 0
     for name, (_, _, begin, end) in sorted(entries.items(), key=lambda item: item[1][2:]):
         if begin != reached:

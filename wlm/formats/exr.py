@@ -219,7 +219,6 @@ def _framed(where: str, part: OpenEXR.Part, plane: np.ndarray, notes: list[str])
 
 
 def _window(part: OpenEXR.Part, name: str) -> tuple[int, int, int, int]:
-    """Returns the left and top, the width and the height of a window in the header of a part."""
     (left, top), (right, bottom) = (np.asarray(corner).tolist() for corner in part.header[name])
     return left, top, right - left + 1, bottom - top + 1
 

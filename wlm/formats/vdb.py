@@ -358,7 +358,6 @@ class _Tree:
         return values
 
     def _numbers(self, count: int) -> np.ndarray:
-        """Reads and decompresses the next numbers, float32 [count]."""
         cursor, half, size = self._cursor, self._many == "<f2", count * self._bytes
         if not count and half:
             return np.zeros(0, np.float32)

@@ -188,7 +188,6 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _simulated(folder: Path) -> Finding:
-    """Describes frames of smoke that wlm wrote."""
     from wlm.smoke.data import load_frames
 
     try:
@@ -200,7 +199,6 @@ def _simulated(folder: Path) -> Finding:
 
 
 def _unity(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes states of light that Unity baked, in the folder itself or in folders inside it."""
     states = state_folders(folder)
     if not states or (folder / SET_FILE).is_file():
         return []
@@ -241,7 +239,6 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _godot(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes bakes of Godot together with the textures that their meshes read."""
     found: _Found = []
     for file in files:
         if file.suffix.lower() != ".lmbake":
@@ -302,7 +299,6 @@ def _light(files: Sequence[Path]) -> dict[Path, Picture]:
 
 
 def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes pictures of light: lightmaps over time, frames of smoke, or lightmaps with their mesh."""
     heads = _light(files)
     smoke = [file for file, head in heads.items() if head.is_six_way]
     if smoke:
@@ -397,7 +393,6 @@ def _mesh_folders(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _volumes(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes numbered volumes as frames of smoke, by the last of them."""
     volumes = [file for file in files if file.suffix.lower() in (".vdb", ".nvdb")]
     if len(volumes) < 2:
         return []

@@ -490,7 +490,6 @@ class _Reader:
         alpha: bool,
         first: Path,
     ) -> _Stack:
-        """Allocates memory for a layer, given the size and the channels of its first picture."""
         channels = layer.channels or (_LIGHT_CHANNELS if layer.encoding == LIGHT.encoding else names)
         if missing := [channel for channel in channels if channel not in names]:
             found = ", ".join(names)
@@ -526,7 +525,6 @@ class _Reader:
 
 
 def _part(pixels: np.ndarray, source: Source) -> np.ndarray:
-    """Returns the rows of a file's pixels [H, W, C] that belong to a picture."""
     if source.slices == 1:
         return pixels
     height, rest = divmod(len(pixels), source.slices)
@@ -538,7 +536,6 @@ def _part(pixels: np.ndarray, source: Source) -> np.ndarray:
 
 
 def _read(path: Path, layer: LayerInfo, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a file. Returns its values [H, W, C] and the names of its channels; `notes` gets its assumptions."""
     light = layer.encoding == LIGHT.encoding
     if light and layer.stored is not None:
         pixels, names = read_encoded(path, layer.stored, notes), _LIGHT_CHANNELS
@@ -685,7 +682,6 @@ def _fill_in_time(frames: np.ndarray, covered: np.ndarray, times: np.ndarray, pe
 
 
 def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:
-    """Returns a hash of the input, 16 hexadecimal digits, which is the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(np.asarray(frames.shape, "<i8").tobytes())
     digest.update(np.asarray(times, "<f8").tobytes())

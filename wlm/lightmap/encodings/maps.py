@@ -118,7 +118,6 @@ def clear_unread(parts: Mapping[str, np.ndarray], used: np.ndarray, reads: Reads
 
 
 def _by_block(texels: np.ndarray) -> np.ndarray:
-    """Rearranges texels [4 h, 4 w] into 4x4 blocks, [h w, 16]."""
     h, w = texels.shape
     return texels.reshape(h // 4, 4, w // 4, 4).swapaxes(1, 2).reshape(-1, 16)
 
@@ -147,7 +146,6 @@ def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: b
 
 
 def _unpacked(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Splits BC7 mode 6 blocks, uint8 [n, 16], into endpoints, uint8 [n, 2, 4], and texel indices [n, 16]."""
     try:
         return unpack_mode6(blocks)
     except WlmError as error:
@@ -166,7 +164,6 @@ def _split_blocks(blocks: np.ndarray) -> list[np.ndarray]:
 
 
 def _join_blocks(data: np.ndarray) -> np.ndarray:
-    """Inverts `_split_blocks`: converts its bytes, uint8 [16 n], to BC7 blocks, uint8 [n, 16]."""
     ends, indices = data.reshape(2, -1, 8)
     if (ends[:, 1:] > 127).any():
         raise ValueError("expected endpoints of 7 bits, found larger values")
@@ -215,7 +212,6 @@ def unpack_network(data: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
 
 
 def _layers(net: np.ndarray, inputs: int, hidden: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Splits a network into the weights [inputs, units] and biases [units] of each layer."""
     split = (inputs + hidden + 2) * hidden
     rows, output = net[:split].reshape(-1, hidden), net[split:].reshape(-1, 3)
     return [(rows[:inputs], rows[inputs]), (rows[inputs + 1 : -1], rows[-1]), (output[:-1], output[-1])]
@@ -227,7 +223,6 @@ def _apart(halves: np.ndarray) -> np.ndarray:
 
 
 def _together(data: np.ndarray) -> np.ndarray:
-    """Inverts `_apart`: converts its bytes to half floats."""
     return np.ascontiguousarray(data.reshape(2, -1).T).view("<f2").ravel()
 
 
