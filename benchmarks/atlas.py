@@ -316,7 +316,7 @@ class _AtlasBench(Bench):
         return _Entry(row, Decoder(model, self.device), decode, model)
 
     def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
-        """Fits the first cascade's textures in rendered views, then in UV space. Returns an entry for each fit."""
+        """Fits the first cascade's textures in its space, then in the other (UV or views); returns an entry each."""
         cascade = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
         if cascade is None:
             return []

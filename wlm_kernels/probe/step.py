@@ -395,7 +395,7 @@ def _block_sum(vec_sums, numbers: int):
 
 @functools.cache
 def update_kernel(latent: int):
-    """Builds (once) the kernel of `StepKernels.update` for latent vectors of length `latent`."""
+    """Builds (once) the kernel for an Adam step of Gaussians and network, for latent vectors of length `latent`."""
     fn = functions(latent)
     vec_sums, chain = fn.vec_sums, fn.chain
     channels = LATENT + latent
