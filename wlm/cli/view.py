@@ -30,12 +30,6 @@ def view(
         str | None,
         typer.Option(help="Picture to show: light or tiles of lightmaps; balls, gaussians or volume of probes."),
     ] = None,
-    outside: Annotated[
-        bool,
-        typer.Option(
-            "--outside", help="Also draw the walls of a room that are seen from outside, which are hidden else."
-        ),
-    ] = False,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,
     sliders: Annotated[
         list[str] | None,
@@ -101,8 +95,6 @@ def view(
     window = Window(scene, size=pixels, rate=rate, off_screen=screenshot is not None or movie is not None)
     try:
         window.tone(tone)
-        if outside:
-            window.outside(True)
         if view is not None or walk is not None:
             window.choose(view or "volume")
         window.look()

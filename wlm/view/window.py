@@ -13,7 +13,7 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.hdr_blocks import need
 from wlm.system import Meter, OnProgress
-from wlm.view.canvas import Canvas, Hit
+from wlm.view.canvas import Canvas
 from wlm.view.display import TONES
 from wlm.view.pictures import save_png
 from wlm.view.rendering import require_opengl
@@ -29,7 +29,7 @@ _HIDDEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # windows that VTK 
 _BACKGROUND, _STRIP, _INK, _BAR = "#5a5d63", "#25272b", "#e8e8ea", "#8ab4f8"
 _TITLE_PIXELS, _FONT, _TITLE_FONT = 26, 9, 10
 # Positions in the strip, as fractions of its height and width.
-_LABELS, _BARS, _CAPTION, _TOLD, _INDENT, _LEAST_CELLS = 0.76, 0.64, 0.30, 0.06, 0.01, 3
+_LABELS, _BARS, _CAPTION, _KEYS, _INDENT, _LEAST_CELLS = 0.76, 0.64, 0.30, 0.06, 0.01, 3
 _EYE = (1.0, 0.8, 1.0)  # direction of the first camera, with y up
 _MARGIN = 1.06
 _SWEEP = 12.0  # seconds to play a slider of real values once
@@ -83,7 +83,6 @@ class Window:
             raise WlmError("view: expected a display, found none; --screenshot and --movie need none")
         self.canvas = Canvas(pyvista, self._plotter, count)
         self._widgets: dict[str, tuple[Any, Any]] = {}
-        self._hit: Hit | None = None
         self._furnish()
         self.draw()
         self.look()
@@ -123,17 +122,6 @@ class Window:
         self.state.tone = name
         self.draw()
 
-    def outside(self, seen: bool) -> None:
-        """Shows or hides the walls of a room that are seen from outside.
-
-        Raises:
-            WlmError: The scene is not a room.
-        """
-        if not self.scene.room:
-            raise WlmError(f"{self.scene.title}: --outside: expected the mesh of a room, whose walls face its middle")
-        self.state.outside = seen
-        self.draw()
-
     def turn(self, degrees: float) -> None:
         """Turns the camera about the scene's upward axis.
 
@@ -171,12 +159,8 @@ class Window:
         chosen = "   ".join(f"[{i} {v}]" if v == self.state.view else f"{i} {v}" for i, v in enumerate(views, 1))
         parts = [f"view: {chosen}" if len(views) > 1 else "", self.scene.caption(self.state)]
         self._texts["caption"].SetInput("      ".join(filter(None, parts)))
-        self._tell()
-
-    def tell(self, x: int, y: int) -> str:
-        """Describes the point at a pixel, counted from the lower left, and shows the text in the window."""
-        self._hit = self.canvas.hit(x, y)
-        return self._tell()
+        # Keys have no effect in a picture or a movie.
+        self._texts["keys"].SetInput("" if self._plotter.off_screen else self.help())
 
     def picture(self) -> np.ndarray:
         """Renders the window, uint8 [H, W, 3]."""
@@ -231,7 +215,6 @@ class Window:
         if self.scene.flat:
             interactor.enable_2d_style()
         interactor.add_observer("TimerEvent", lambda *_: self._tick())
-        interactor.add_observer("MouseMoveEvent", lambda *_: self._hover())
         interactor.create_timer(_TICK, repeating=True)
         self._plotter.show(auto_close=True)
 
@@ -261,7 +244,7 @@ class Window:
                 "", position=(x, y), viewport=True, font_size=_FONT, color=_INK, name=name, font="arial"
             )
 
-        self._texts = {"caption": text("caption", _INDENT, _CAPTION), "told": text("told", _INDENT, _TOLD)}
+        self._texts = {"caption": text("caption", _INDENT, _CAPTION), "keys": text("keys", _INDENT, _KEYS)}
         for name, slider in self.sliders.items():
             label = text(f"slider {name}", 0.0, _LABELS)
             widget = plotter.add_slider_widget(
@@ -290,8 +273,6 @@ class Window:
             "Left": lambda: self._move(self._main(), -1),
             "Right": lambda: self._move(self._main(), 1),
         }
-        if self.scene.room:
-            self._keys["b"] = lambda: self.outside(not self.state.outside)
         for number, view in enumerate(self.scene.views, 1):
             self._keys[str(number)] = lambda view=view: self.choose(view)
         # The default keys of the plotter and VTK would switch to stereo and wireframe.
@@ -311,12 +292,6 @@ class Window:
         name = self.scene.plays
         return name if name is not None and self._shows(name) else None
 
-    def _tell(self) -> str:
-        told = self.scene.describe(self._hit, self.state) if self._hit is not None else ""
-        # Keys have no effect in a picture or a movie.
-        self._texts["told"].SetInput(told or ("" if self._plotter.off_screen else self.help()))
-        return told
-
     def help(self) -> str:
         """One line about the keys that have an effect in this view."""
         moved, views = self._main(), len(self.scene.views)
@@ -327,7 +302,6 @@ class Window:
             "- +": "error" if "error" in self.sliders else None,
             "T": "tone",
             f"1 to {views}": "view" if views > 1 else None,
-            "B": "walls from outside" if self.scene.room else None,
             "R": "first camera",
             "Q": "closes",
         }
@@ -368,11 +342,6 @@ class Window:
             now = time.perf_counter()
             self.advance(now - self._last)
             self._last = now
-            self._plotter.render()
-
-    def _hover(self) -> None:
-        before = self._texts["told"].GetInput()
-        if self.tell(*self._plotter.iren.interactor.GetEventPosition()) != before:
             self._plotter.render()
 
     def _count(self, frames: int | None) -> int:
