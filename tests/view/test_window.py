@@ -1,6 +1,5 @@
 """The window: every kind of file has a picture that follows its controls, and what has none is said in one line."""
 
-import itertools
 import re
 import sys
 
@@ -376,33 +375,15 @@ def test_the_walls_of_a_room_are_left_out_from_outside(lightmaps, tmp_path, show
     assert changed(window, inside)
 
 
-def test_a_movie_plays_the_day_once(lightmaps, tmp_path, show):
-    window = show(lightmaps / "four.wlm")
-    reports = []
-    assert window.movie(tmp_path / "day.gif", 4, progress=reports.append) == 4
-    assert reports[-1].done == reports[-1].total == 4
-    with Image.open(tmp_path / "day.gif") as movie:
-        assert movie.n_frames == 4 and movie.size == SIZE
-        frames = []
-        for number in range(4):
-            movie.seek(number)
-            frames.append(np.asarray(movie.convert("RGB")).astype(int))
-    assert all(np.abs(one - two).max() > 12 for one, two in itertools.pairwise(frames))
-    with pytest.raises(WlmError, match="ends in .gif or .webp, found .mp4"):
-        window.movie(tmp_path / "day.mp4")
-
-
-def test_the_command_writes_a_picture_and_a_movie(lightmaps, tmp_path, show):
+def test_the_command_writes_a_picture(lightmaps, tmp_path, show):
     del show  # only for its check of OpenGL
-    out, movie = tmp_path / "out.png", tmp_path / "out.webp"
+    out = tmp_path / "out.png"
     options = ["--set", "hour=18.5", "--set", "exposure=1", "--view", "tiles", "--size", "400x300", "--tone", "filmic"]
-    outputs = ["--screenshot", str(out), "--movie", str(movie), "--frames", "2"]
+    outputs = ["--screenshot", str(out)]
     result = CliRunner().invoke(app, ["view", str(lightmaps / "four.wlm"), *options, *outputs])
     assert result.exit_code == 0, result.output
     with Image.open(out) as picture:
         assert picture.size == (400, 300) and np.ptp(np.asarray(picture)) > 100
-    with Image.open(movie) as played:
-        assert played.n_frames == 2
 
 
 def test_what_has_no_picture_is_said_in_one_line(lightmaps, tmp_path):
@@ -449,8 +430,6 @@ def test_the_command_refuses_in_one_line(lightmaps, tmp_path, monkeypatch, show)
         (["--view", "volume", *out], "--view: expected light or tiles"),
         (["--size", "10", *out], "--size: expected a width and a height"),
         (["--rate", "0", *out], "--rate"),
-        (["--frames", "3", *out], "--frames: has no meaning without --movie"),
-        (["--movie", str(tmp_path / "a.gif"), "--frames", "0"], "--frames: expected at least 1"),
         (["--screenshot", str(tmp_path / "out.jpg")], "ends in .png"),
     ):
         result = CliRunner().invoke(app, ["view", str(lightmaps / "four.wlm"), *options])

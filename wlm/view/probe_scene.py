@@ -257,7 +257,6 @@ def _coefficients(outputs: int, title: str) -> int:
 
 
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns vertices [V, 3] of unit length and triangles [F, 3] of a sphere."""
     sphere = creation.icosphere(subdivisions=subdivisions)
     return np.array(sphere.vertices), np.array(sphere.faces)
 

@@ -207,7 +207,6 @@ def _coarser(volume: DensityVolume, most: int) -> DensityVolume:
 
 
 def _squares(height: int, width: int) -> np.ndarray:
-    """Makes a checkerboard, float32 [height, width, 3]."""
     side = max(height, width) / _SQUARES
     rows, columns = (np.arange(n) // side for n in (height, width))
     odd = (rows[:, None] + columns) % 2

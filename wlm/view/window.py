@@ -1,26 +1,18 @@
-"""A window that shows a scene: panels side by side, sliders below them, keys; on screen, as a picture or a movie."""
+"""A window that shows a scene: panels side by side, sliders below them, keys; on screen or as a picture."""
 
 import os
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from wlm.errors import WlmError
-from wlm.formats.atomic import atomic_path
 from wlm.formats.hdr_blocks import need
-from wlm.system import Meter, OnProgress
 from wlm.view.canvas import Canvas
 from wlm.view.display import TONES
 from wlm.view.pictures import save_png
 from wlm.view.rendering import require_opengl
 from wlm.view.scene import Scene, Slider, State
-
-MOVIES = {".gif": "GIF", ".webp": "WEBP"}
-"""Formats of movies by file suffix."""
 
 STRIP = 108
 """Height in pixels of the strip with the sliders at the bottom; at most half of the window's height."""
@@ -34,7 +26,6 @@ _EYE = (1.0, 0.8, 1.0)  # direction of the first camera, with y up
 _MARGIN = 1.06
 _SWEEP = 12.0  # seconds to play a slider of real values once
 _TICK = 30  # milliseconds
-_FRAMES = 48  # of a movie
 _EXPOSURE = Slider("exposure", -8.0, 8.0, 0.0, 0.5, "+.1f", unit=" EV")
 _ERROR = Slider("error", 1.0, 64.0, 8.0, 1.0, ".0f", "×", whole=True)
 
@@ -80,7 +71,7 @@ class Window:
             )
         if not off_screen and self._plotter.render_window.GetClassName() in _HIDDEN:
             self._plotter.close()
-            raise WlmError("view: expected a display, found none; --screenshot and --movie need none")
+            raise WlmError("view: expected a display, found none; --screenshot needs none")
         self.canvas = Canvas(pyvista, self._plotter, count)
         self._widgets: dict[str, tuple[Any, Any]] = {}
         self._furnish()
@@ -159,7 +150,7 @@ class Window:
         chosen = "   ".join(f"[{i} {v}]" if v == self.state.view else f"{i} {v}" for i, v in enumerate(views, 1))
         parts = [f"view: {chosen}" if len(views) > 1 else "", self.scene.caption(self.state)]
         self._texts["caption"].SetInput("      ".join(filter(None, parts)))
-        # Keys have no effect in a picture or a movie.
+        # Keys have no effect in a picture.
         self._texts["keys"].SetInput("" if self._plotter.off_screen else self.help())
 
     def picture(self) -> np.ndarray:
@@ -175,38 +166,6 @@ class Window:
             WlmError: The file cannot be written.
         """
         save_png(path, self.picture())
-
-    def movie(
-        self, path: str | os.PathLike[str], frames: int | None = None, *, progress: OnProgress | None = None
-    ) -> int:
-        """Plays the scene once and writes it as a GIF or WebP that loops.
-
-        Args:
-            path: A path with a suffix in `MOVIES`.
-            frames: Number of pictures; None for 48, or for all frames if frames are played.
-            progress: Called about twice a second.
-
-        Returns:
-            The number of pictures.
-
-        Raises:
-            WlmError: The file cannot be written, or the number of pictures is not at least 1.
-        """
-        suffix = Path(path).suffix.lower()
-        if suffix not in MOVIES:
-            raise WlmError(f"{path}: expected a name that ends in {' or '.join(MOVIES)}, found {suffix or 'none'}")
-        if frames is not None and frames < 1:
-            raise WlmError(f"--frames: expected at least 1, got {frames}")
-        count = self._count(frames)
-        pictures, meter = [], Meter(progress, "draw", count)
-        for picture in self._played_once(count):
-            pictures.append(Image.fromarray(picture))
-            if meter.due(len(pictures)):
-                meter.report(len(pictures))
-        options = {"save_all": True, "append_images": pictures[1:], "duration": 1000.0 / self._rate, "loop": 0}
-        with atomic_path(path) as temporary:
-            pictures[0].save(temporary, format=MOVIES[suffix], **options)
-        return len(pictures)
 
     def show(self) -> None:
         """Shows the window until the user closes it."""
@@ -229,7 +188,6 @@ class Window:
             self._plotter.render()
 
     def _furnish(self) -> None:
-        """Adds titles, sliders, texts and keys."""
         plotter = self._plotter
         for number, title in enumerate(self.scene.panels):
             plotter.subplot(0, number)
@@ -283,12 +241,10 @@ class Window:
             plotter.add_key_event(key, lambda key=key: self.press(key))
 
     def _shows(self, name: str) -> bool:
-        """Returns whether a slider has an effect in the current view."""
         views = self.sliders[name].views
         return not views or self.state.view in views
 
     def _player(self) -> str | None:
-        """Name of the slider that playing moves in this view; None if the camera turns."""
         name = self.scene.plays
         return name if name is not None and self._shows(name) else None
 
@@ -308,7 +264,6 @@ class Window:
         return "keys:   " + "   ".join(f"{key} {what}" for key, what in does.items() if what)
 
     def _lay_out(self) -> None:
-        """Places the sliders of the view side by side, with their values."""
         shown = [name for name in self.sliders if self._shows(name)]
         cell = 1.0 / max(len(shown), _LEAST_CELLS)
         for name, slider in self.sliders.items():
@@ -343,25 +298,6 @@ class Window:
             self.advance(now - self._last)
             self._last = now
             self._plotter.render()
-
-    def _count(self, frames: int | None) -> int:
-        """Returns the number of pictures of a movie; `frames` if given."""
-        name = self._player()
-        slider = None if name is None else self.sliders[name]
-        return frames or (round(slider.high - slider.low) + 1 if slider is not None and slider.whole else _FRAMES)
-
-    def _played_once(self, count: int) -> Iterator[np.ndarray]:
-        name = self._player()
-        if name is None:
-            for _ in range(count):
-                yield self.picture()
-                self.turn(360.0 / count)
-            return
-        slider = self.sliders[name]
-        ends = slider.high - slider.low
-        for number in range(count):
-            self.set(name, slider.low + ends * number / (count if slider.wraps else max(count - 1, 1)))
-            yield self.picture()
 
     def look(self) -> None:
         """Places the camera so that it sees the whole scene."""
