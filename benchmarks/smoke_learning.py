@@ -242,7 +242,7 @@ def features(inputs: Inputs, light: int) -> torch.Tensor:
 
 
 def at(inputs: Inputs, albedo: float) -> Inputs:
-    """Returns the inputs with light by diffusion at one albedo, which must be one of theirs, and no other."""
+    """Returns a copy of the inputs that keeps the light by diffusion of one albedo alone, which must be among them."""
     n = inputs.albedos.index(albedo)
     planes = {name: getattr(inputs, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
     return replace(inputs, **planes, albedos=(albedo,))
