@@ -204,14 +204,6 @@ def _load_ms(model: SheetModel) -> float | None:
     return 1e3 * float(np.median(seconds))
 
 
-def _matrix(model: SheetModel, device: str, gelu: str | None) -> MatrixDecoder:
-    return MatrixDecoder(model, device)
-
-
-def _fast(model: SheetModel, device: str, gelu: str | None) -> StripDecoder | MatrixDecoder:
-    return fast_decoder(model, device)
-
-
 class _LightmapBench(Bench):
     """The benchmark of one lightmap set, with the times at which errors are measured."""
 
@@ -433,8 +425,12 @@ class _LightmapBench(Bench):
         """Makes the decoders of all tiles with feature maps or stored frames; tiles of constant light need none."""
         decoders: list[RuntimeDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
-            make = {"exact": ExactDecoder, "strip": StripDecoder, "matrix": _matrix, "fast": _fast}[path]
-            decoders.append(make(model, self.device, gelu))
+            if path == "fast":
+                decoders.append(fast_decoder(model, self.device))
+            elif path == "matrix":
+                decoders.append(MatrixDecoder(model, self.device))
+            else:
+                decoders.append({"exact": ExactDecoder, "strip": StripDecoder}[path](model, self.device, gelu))
         if (model.kind == TileKind.STATIC).any():
             decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
         if len(model.frames):

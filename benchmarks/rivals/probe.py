@@ -141,11 +141,7 @@ def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
 
 
 def at_bytes(
-    name: str,
-    position: np.ndarray,
-    values: np.ndarray,
-    budget_bytes: int,
-    bits: Sequence[int | None] = WEIGHT_BITS,
+    name: str, position: np.ndarray, values: np.ndarray, budget_bytes: int, bits: Sequence[int | None] = WEIGHT_BITS
 ) -> Rival:
     """Searches for the settings with which one method has the least squared error within a size in bytes.
 

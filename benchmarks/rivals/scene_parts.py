@@ -23,10 +23,7 @@ from wlm.atlas.views import Points
 from wlm.atlas.weights import FineGrid
 
 _FORMATS = (TEXELS, BLOCKS)  # of the textures of the colours that scenes have
-_TRIES, _CLOSE = (
-    8,
-    1.005,
-)  # attempts to find the share with the bits that are asked for, and the ratio that is close enough
+_TRIES, _CLOSE = 8, 1.005  # attempts to find the share that has the requested bits, and the ratio that is close enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +63,7 @@ class SceneParts:
 
 
 def scene_parts(
-    scene: LightmappedScene,
-    weights: Sequence[np.ndarray],
-    bits: float,
-    colour: str = "mixed",
-    device: str = "cpu",
+    scene: LightmappedScene, weights: Sequence[np.ndarray], bits: float, colour: str = "mixed", device: str = "cpu"
 ) -> SceneParts:
     """Compresses each lightmap of a scene alone, with a share of the given bits.
 

@@ -307,8 +307,6 @@ def _settings(path: Path) -> Finding:
         return Finding(path, what, command("smoke", "simulate", path, "-o", "DIR"))
     if "geometry" in values:
         return Finding(path, "a scene for wlm bake lightmaps and wlm bake probes")
-    if isinstance(values.get("smoke"), str):
-        return Finding(path, "a scene for wlm bake sixway")
     fitting, faults = [], {}
     for system in _MODELS:
         profile = import_module(f"wlm.{system}").Profile

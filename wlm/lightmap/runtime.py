@@ -17,7 +17,7 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import gelu_of
-from wlm.lightmap.encodings.base import DeviceTiles, inverse_of, rgba
+from wlm.lightmap.encodings.base import inverse_of, rgba
 from wlm.lightmap.encodings.constant import ConstantTiles
 from wlm.lightmap.encodings.frames import FrameTiles
 from wlm.lightmap.encodings.maps import MapTiles
@@ -37,7 +37,7 @@ class RuntimeDecoder:
             or RGB9E5.
     """
 
-    _tiles: DeviceTiles
+    _tiles: MapTiles | FrameTiles
 
     def __init__(self, model: SheetModel, device: str, shared: bool) -> None:
         """Allocates the output: RGB9E5 if `shared`, else 8-bit RGBA. The time is initially the first stored one."""

@@ -91,5 +91,5 @@ def comparison(
         light = [encode(picture, hit, white) for picture in pictures.values()]
         errors = (np.abs(pictures[name] - pictures["original"]) * gain for name in samplers)
         rows[label] = light + [encode(error, hit, white) for error in errors]
-    titles = ["original", *samplers, *(f"error × {gain:g}, {name}" for name in samplers)]
+    titles = ["original", *samplers, *(f"error x {gain:g}, {name}" for name in samplers)]
     contact_sheet(path, rows, titles, columns=len(titles))

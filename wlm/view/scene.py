@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wlm.view.canvas import Canvas, Hit
+from wlm.view.canvas import Canvas
 from wlm.view.display import TONES, Display
 
 
@@ -67,13 +67,11 @@ class State:
         values: Values of the sliders by name.
         view: One of the scene's views.
         tone: One of `wlm.view.display.TONES`.
-        outside: Whether the walls of a room are also drawn when seen from outside.
     """
 
     values: dict[str, float]
     view: str
     tone: str = TONES[0]
-    outside: bool = False
 
     @property
     def frame(self) -> int:
@@ -120,7 +118,3 @@ class Scene(ABC):
     def box(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Lowest and highest corner of the region that the first camera shows; None for everything that is drawn."""
         return None
-
-    def describe(self, hit: Hit, state: State) -> str:
-        """One line about the point under the cursor; may be empty."""
-        return ""

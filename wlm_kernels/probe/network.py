@@ -68,8 +68,8 @@ class NetworkKernels:
         return CPU_LANES if self.device_kind == "cpu" else probes // self.probes
 
     def load(self, device) -> None:
-        """Compiles the kernels for a device now."""
-        self._kernel.module.load(wp.get_device(device))
+        """Compiles the kernel for a device, which would otherwise happen at the first launch."""
+        wp.load_module(self._kernel.module, device, block_dim=THREADS)
 
     def launch(self, groups, f, target, weight, net, grad_f, partial, loss, base=0, count=None) -> None:
         """Computes the loss, the sum of weight * error^2 over all numbers of all probes, and its gradients.

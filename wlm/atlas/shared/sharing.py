@@ -257,7 +257,7 @@ def _allocated(cut: Cut, tried: list[Candidate], factor: np.ndarray, numbers: in
 
 
 def _cut(planes: list[Plane], units: list[np.ndarray], bits: float, tile: int, device: str) -> Cut:
-    """Places all planes in T_c, and cuts their light into tiles, after division by the unit of each state."""
+    """Places all planes in T_c and cuts their light, divided by each state's unit, into tiles; returns it all."""
     total, grid = sum(float(plane.weight.sum()) for plane in planes), []
     texels, weights, numbers, owner = [], [], [], []
     for number, (plane, unit) in enumerate(zip(planes, units, strict=True)):

@@ -18,7 +18,7 @@ from wlm.bundle import Texture
 from wlm.errors import WlmError
 from wlm.formats.bc7 import BLOCK_BYTES, pack_mode6, unpack_mode6
 from wlm.formats.folder import rounded
-from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, rgba, side_by_side
+from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, side_by_side
 from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import SheetModel, decode_scale
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
@@ -276,6 +276,8 @@ class MapTiles(DeviceTiles):
         self.device_bytes = sum(array.capacity for array in (*maps.values(), hidden, output))
 
     def bounds(self, time: float) -> np.ndarray:
+        """Returns an upper bound of each tile's colour at a time, in gamma space, float32 [n]; between two stored times
+        the larger of their bounds."""
         before, after, share = self._axis.neighbours(time)
         return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
 
@@ -316,15 +318,6 @@ class MapTiles(DeviceTiles):
         if len(reads) == 1:
             return self._decoded(rows, reads[0][0], 0).numpy()
         return sum(np.float32(share) * self._decoded(rows, stamp, 0).numpy() for stamp, share in reads)
-
-    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
-        if len(self._axis.reads(time)) == 1:
-            return rgba(self._decoded(rows, time, 1))
-        factor = inverse_of(self.bounds(time)[rows])[:, None, None, None]
-        colour = self.radiance(rows, time) ** (1.0 / self.model.profile.gamma) * factor
-        out = np.full((len(rows), TILE, TILE, 4), 255, np.uint8)
-        out[..., :3] = np.clip(colour, 0.0, 1.0) * 255.0 + 0.5
-        return out
 
 
 # ---- textures, networks and tables of the shader ----
