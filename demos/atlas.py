@@ -88,7 +88,7 @@ def draw_comparison(path: Path, scene: wlm.atlas.LightmappedScene, samplers: dic
     for number, (pictures, hit) in enumerate(drawn, 1):
         errors = [8.0 * np.abs(pictures[name] - pictures["original"]) for name in samplers]
         rows[f"view {number}"] = [encode(each, hit, white) for each in (*pictures.values(), *errors)]
-    titles = ["original", *samplers, *(f"error × 8, {name}" for name in samplers)]
+    titles = ["original", *samplers, *(f"8 times the error, {name}" for name in samplers)]
     contact_sheet(path, rows, titles, columns=len(titles))
 
 
