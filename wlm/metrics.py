@@ -96,7 +96,7 @@ def check_pair(
 
 
 def psnr_from_mse(error: float, peak: float) -> float:
-    """Converts a mean squared error to PSNR, with `psnr`'s cap; NaN if the error is NaN or the peak is not positive."""
+    """Converts a mean squared error to PSNR in dB, at most 120; NaN if the error is NaN or the peak is not above 0."""
     if math.isnan(error) or not peak > 0.0:
         return math.nan
     if error == 0.0:

@@ -184,7 +184,7 @@ Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 def document_from_arrays(
     position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
 ) -> tuple[GltfDocument, GltfPrimitive]:
-    """Makes a glTF document of one mesh from arrays, see `document_from_meshes`; returns it with its primitive."""
+    """Makes a glTF document of one mesh from arrays as `Arrays` describes them; returns it with its only primitive."""
     document, (primitive,) = document_from_meshes([(name, position, triangle, uv)], name)
     return document, primitive
 

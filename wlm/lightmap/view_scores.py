@@ -143,7 +143,8 @@ def views_of(
         lightmaps, count, indices, device: As for `Views`.
 
     Returns:
-        The views, or None without a mesh or with a count of 0; and a warning if the mesh cannot be read, else None.
+        The views, or None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh
+        cannot be read, else none.
 
     Raises:
         WlmError: The count is negative, or there is no such device.
