@@ -445,6 +445,8 @@ def _read_grids(path: Path, names: tuple[str | None, str | None], trust: bool) -
             # Smoke fills the inside, and fades to the surface within the narrow band.
             values = np.clip(-values / grid.background, 0.0, 1.0)
             warnings.append(f"{where}: a level set, which is filled with smoke of density 1")
+        elif name == density and grid.background > 0:
+            warnings.append(f"{where}: the background, {grid.background:.4g}, counts as 0 outside the grid's box")
         grids.append(Grid(where, torch.from_numpy(np.ascontiguousarray(values)), matrix))
     return grids, warnings
 

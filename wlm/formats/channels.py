@@ -5,6 +5,7 @@ Here p is a stored colour value in [0, 1], a the stored alpha, and L the sRGB cu
 ==========  ========================  ==========================================================="""
 
 import os
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,11 @@ def read_encoded(path: str | os.PathLike[str], encoding: str, notes: list[str] |
         raise WlmError(
             f"{path}: encoding: expected a {KINDS} of integers, found a format that states its encoding itself"
         )
-    pixels, names = read_levels(path, kind, notes)
+    entries: dict[Any, Any] = {}
+    pixels, names = read_levels(path, kind, notes, entries)
+    stated = "srgb" if "srgb" in entries else {1.0: "linear", 0.45455: "srgb"}.get(entries.get("gamma", 0.0))
+    if stated and name in ("linear", "srgb") and stated != name:
+        notes.append(f"the PNG says that its levels are {stated}: is its encoding {stated}, not {name}?")
     if name in _ALPHA and "A" not in names:
         raise WlmError(f"{path}: encoding {name}: expected a picture with alpha, found the channels {''.join(names)}")
     colour, alpha = (pixels[..., :-1], pixels[..., -1:]) if "A" in names else (pixels, None)

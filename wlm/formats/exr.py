@@ -59,6 +59,8 @@ def read_exr(
     chosen = _light_channels(path, list(channels), layer, notes)
     pixels = _pixels(path, channels, list(chosen.values()), notes)
     header = channels[chosen["R"]][0].header
+    if "envmap" in header:
+        notes.append("its header says that it is an environment map: is it a lightmap?")
     to_rec709(pixels, _chromaticities(path, header, notes), f"{path}: chromaticities", notes)
     return pixels, tuple(chosen)
 

@@ -33,6 +33,7 @@ VK_FORMATS = {
 }
 """Formats that can be written, with their Vulkan numbers: 16 or 32 bits per channel, RGB9E5, or blocks of 16 bytes."""
 
+_OTHERS = {"none of Vulkan's, as of Basis Universal": 0, "8-bit RGB": 23, "8-bit RGBA": 37, "8-bit sRGB with alpha": 43}
 MAGIC = b"\xabKTX 20\xbb\r\n\x1a\n"
 VOLUME_HEAD = 32
 """Bytes at the beginning of a file that tell whether it is a volume."""
@@ -221,7 +222,7 @@ def _read(path: str | os.PathLike[str], volume: bool, notes: list[str]) -> tuple
         number, _, width, height, depth, layers, faces, _, scheme = fields[1:10]
         descriptor, pairs = fields[10:12], fields[12:14]
         start, stored, size = fields[16:19]
-        name, layout = texels.layout_of(path, "vkFormat", number, _LAYOUTS, VK_FORMATS, _EXPECTED)
+        name, layout = texels.layout_of(path, "vkFormat", number, _LAYOUTS, VK_FORMATS | _OTHERS, _EXPECTED)
         check_fields(
             path,
             ("pixelHeight", height, height > 0, "at least 1 (2D)"),

@@ -83,6 +83,8 @@ def read_light(path: str | os.PathLike[str], notes: _Notes | None = None) -> tup
     found = next((name for magic, name in _OTHERS.items() if first.startswith(magic)), "other content")
     if first[4:12] == b"ftypavif":
         found = "an AVIF: convert it to a PNG, and state its --encoding"
+    elif not first:
+        found = "an empty file"
     elif os.fspath(path).lower().endswith(".tga"):
         found = f"a TGA{_STATE_IT}"
     raise WlmError(f"{path}: expected a lightmap, {EXPECTED}, found {found}")

@@ -6,6 +6,7 @@ into triangles. Normals, colours and materials are left out. The v of these form
 in glTF.
 """
 
+import codecs
 import io
 import os
 import re
@@ -21,6 +22,10 @@ from wlm.formats.reading import damaged, read_file
 
 SUFFIXES = (".obj", ".ply", ".stl", ".off")
 """File name extensions that are read here."""
+
+_LINE = re.compile(rb"^ *(vt|vn|v|f) ([^\r\n]*)", re.MULTILINE)
+_RELATIVE = re.compile(rb"^ *f [^\r\n]*-", re.MULTILINE)
+_ZERO = re.compile(rb"^ *f [^\r\n]*[ /]0(?=[ /\r\n]|\Z)", re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +58,9 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
             f"{path}: expected a mesh file ({', '.join(SUFFIXES)}), found {suffix or 'a name without an ending'}"
         )
     data = read_file(path, MODEL_BYTES, f"the {suffix[1:].upper()} file")
+    if suffix == ".obj":
+        with damaged(f"{path}: malformed OBJ", ValueError, MemoryError):
+            data = _absolute(data)
     # A number of a text takes trimesh up to 100 bytes, and a file of many materials the square of their number in time.
     numbers = sum(map(data.count, (b" ", b"\n", b"\r", b"\t")))
     Budget(str(path), max(SURE_CORNERS, len(data) // NUMBER_BYTES), "numbers").spend(numbers)
@@ -74,6 +82,37 @@ def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
         None if any(each is None for each in uv) else np.concatenate(uv),
         np.concatenate([each + start for each, start in zip(triangle, first, strict=True)], dtype=np.int32),
     )
+
+
+def _absolute(data: bytes) -> bytes:
+    """Returns an OBJ with absolute numbers of vertices: trimesh counts relative ones back from the last vertex of the
+    file. A byte order mark and tabs, with which it overlooks lines, are left out.
+
+    Raises:
+        ValueError: A face names vertex 0, or one before the first.
+    """
+    data = data.removeprefix(codecs.BOM_UTF8).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").replace(b"\t", b" ")
+    if _ZERO.search(data):
+        raise ValueError("expected vertices counted from 1, found 0")
+    if not _RELATIVE.search(data):
+        return data
+    counts = {b"v": 0, b"vt": 0, b"vn": 0}
+
+    def number(text: bytes, count: int) -> bytes:
+        value = count + 1 + int(text) if text.startswith(b"-") else int(text or b"1")
+        if value < 1:
+            raise ValueError(f"expected at most {count} earlier vertices, found {int(text)}")
+        return b"%d" % value if text else b""
+
+    def line(found: re.Match[bytes]) -> bytes:
+        word, rest = found.groups()
+        if word != b"f":
+            counts[word] += 1
+            return found[0]
+        corners = [zip(corner.split(b"/"), counts.values(), strict=False) for corner in rest.split()]
+        return b"f " + b" ".join(b"/".join(number(*each) for each in corner) for corner in corners)
+
+    return _LINE.sub(line, data)
 
 
 def _checked(mesh) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -10,6 +11,8 @@ from wlm.formats.reading import open_file
 from wlm.lightmap.listing import Listing, Source
 from wlm.lightmap.sheet import LIGHT
 
+# Endings that Bakery and others give to what lies beside the light.
+_OTHER_MAP = re.compile(r"_(dir|l1[xyz]?|rnm[0-2]|ao|normal|mask|shadowmask)$", re.IGNORECASE)
 _NAMED = 8  # names that a line lists
 
 
@@ -29,6 +32,11 @@ def set_lines(listing: Listing, period: float | None = None) -> Iterator[str]:
         yield f"{listing.origin}: {_some(pairs)}" + (f"; period {period:g}" if period else "")
     if listing.doubt:
         yield listing.doubt
+    light = [state.get((LIGHT.atlas, LIGHT.layer)) for state in listing.states]
+    if others := [
+        source.label for source in light if source and len(times) > 1 and _OTHER_MAP.search(source.path.stem)
+    ]:
+        yield f"{_some(others)}: by the names directions or masks, not light of a time: list them as layers in a set.json"
     if len(times) > 1 and not period:
         yield (
             f"no period is stated: before {min(times):.6g} and after {max(times):.6g} the first and the last lightmap "

@@ -311,6 +311,8 @@ def read_table(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
         while not first and (line := file.readline(_LONGEST_LINE)):
             first, skipped = line.partition(b"#")[0].strip(b" \t\r\n\xef\xbb\xbf"), skipped + 1
         text = first.decode("utf-8", "replace")
+        if "\0" in text:
+            raise WlmError(f"{path}: expected a table in UTF-8, found UTF-16 or bytes that are no text")
         mark = next((mark for mark in ";\t," if mark in text), None)
         names = cells = [cell.strip().strip('"') for cell in text.split(mark)]
         if len(cells) > NUMBERS + 3:

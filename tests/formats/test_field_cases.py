@@ -1,0 +1,123 @@
+"""Inputs that people report in trackers of other software: each gives its light, a doubt, or the cause in one line."""
+
+import re
+import struct
+import zlib
+
+import numpy as np
+import OpenEXR
+import pytest
+from builders.textures import make_ktx2
+
+import wlm
+from wlm.errors import WlmError
+from wlm.formats.channels import read_encoded
+from wlm.formats.light import read_light
+from wlm.formats.meshes import read_mesh
+
+SQUARE = "v 0 0 {z}\nv 1 0 {z}\nv 0 1 {z}\nv 1 1 {z}\nvt 0 0\nvt 0.5 0\nvt 0 1\nvt 0.5 1\n"
+ONE, TWO = SQUARE.format(z=0), SQUARE.format(z=1)
+FACE, BACK = "f 1/1 2/2 4/4\n", "f -4/-4 -3/-3 -1/-1\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "heights"),
+    [
+        (
+            ONE + BACK + TWO + BACK,
+            [0, 1],
+        ),  # counted back from the last vertex before the face, not from that of the file
+        ("o a\n" + ONE + BACK + "o b\n" + TWO + BACK, [0, 1]),
+        (ONE + TWO + "vn 0 0 1\nf -4/-4/1 \\\n -3/-3/-1 -1/-1/1\n" + FACE, [1, 0]),
+        ("\ufeff" + ONE + "v 9 9 9\n" + FACE, [0]),
+        ((ONE + FACE).replace(" ", "\t"), [0]),
+        ((ONE + BACK).replace("\n", "\r\n"), [0]),
+        ("mtllib gone.mtl\nusemtl x\n" + ONE + FACE, [0]),
+    ],
+)
+def test_an_obj_of_another_writer(tmp_path, text, heights):
+    (tmp_path / "a.obj").write_text(text, newline="")
+    mesh = read_mesh(tmp_path / "a.obj")
+    corners = mesh.position[mesh.triangle]
+    assert sorted(corners[:, 0, 2].tolist()) == sorted(heights)
+    np.testing.assert_array_equal(corners[..., :2], [[[0, 0], [1, 0], [1, 1]]] * len(heights))
+    np.testing.assert_array_equal(mesh.uv[mesh.triangle], [[[0, 1], [0.5, 1], [0.5, 0]]] * len(heights))
+
+
+@pytest.mark.parametrize(
+    ("face", "reason"),
+    [
+        ("f 0/0 1/1 2/2\n", "vertices counted from 1, found 0"),
+        ("f 1/0 2/1 3/2\n", "vertices counted from 1, found 0"),
+        ("f -5/-4 -3/-3 -1/-1\n", "at most 4 earlier vertices, found -5"),
+        ("f 1/1 2/2 9/4\n", "malformed OBJ: "),
+    ],
+)
+def test_an_obj_that_names_vertices_that_are_not_there(tmp_path, face, reason):
+    (tmp_path / "a.obj").write_text(ONE + face)
+    with pytest.raises(WlmError, match=reason):
+        read_mesh(tmp_path / "a.obj")
+
+
+def png(*chunks: tuple[bytes, bytes]) -> bytes:
+    """A PNG of 2 x 1 grey levels of 16 bits with the chunks before its pixels."""
+    head = (b"IHDR", struct.pack(">2I5B", 2, 1, 16, 0, 0, 0, 0))
+    parts = (head, *chunks, (b"IDAT", zlib.compress(b"\0" + struct.pack(">2H", 0x8000, 0xFFFF))), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in parts
+    )
+
+
+GAMMA, SRGB = (b"gAMA", struct.pack(">I", 100_000)), (b"sRGB", b"\0")
+
+
+@pytest.mark.parametrize(
+    ("chunks", "encoding", "stated"),
+    [((GAMMA,), "srgb", "linear"), ((SRGB,), "linear", "srgb"), ((GAMMA,), "linear", ""), ((), "srgb", "")],
+)
+def test_a_png_that_states_another_encoding(tmp_path, chunks, encoding, stated):
+    (tmp_path / "a.png").write_bytes(png(*chunks))
+    notes: list[str] = []
+    light = read_encoded(tmp_path / "a.png", encoding, notes)
+    assert light[0, 0, 0] == pytest.approx(0.5 if encoding == "linear" else 0.214, abs=1e-3)
+    said = [line for line in notes if "the PNG says" in line]
+    assert said == (
+        [f"the PNG says that its levels are {stated}: is its encoding {stated}, not {encoding}?"] * bool(stated)
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "found an empty file"),
+        (make_ktx2(0, 4, 4, [bytes(128)]), re.escape("found 0 (none of Vulkan's, as of Basis Universal)")),
+        (make_ktx2(43, 4, 4, [bytes(64)]), "found 43 .8-bit sRGB with alpha"),
+    ],
+)
+def test_light_that_is_none_is_named(tmp_path, content, reason):
+    (tmp_path / "a.ktx2").write_bytes(content)
+    with pytest.raises(WlmError, match=reason):
+        read_light(tmp_path / "a.ktx2")
+
+
+def test_an_environment_map_is_doubted(tmp_path):
+    planes = {channel: np.ones((2, 4), np.float32) for channel in "RGB"}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "envmap": OpenEXR.ENVMAP_LATLONG}
+    OpenEXR.File(header, planes).write(str(tmp_path / "a.exr"))
+    notes: list[str] = []
+    assert (read_light(tmp_path / "a.exr", notes)[0] == 1).all()
+    assert notes == ["its header says that it is an environment map: is it a lightmap?"]
+
+
+def test_a_table_in_utf_16_is_named(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,sh0,sh1,sh2\n0,0,0,1,1,1\n", "utf-16")
+    with pytest.raises(WlmError, match="expected a table in UTF-8, found UTF-16"):
+        wlm.probe.load(tmp_path / "a.csv")
+
+
+def test_directions_beside_light_are_not_times_of_it(tmp_path):
+    for name in ("LMA0_final", "LMA0_L1x"):
+        planes = {channel: np.ones((2, 4), np.float32) for channel in "RGB"}
+        OpenEXR.File({}, planes).write(str(tmp_path / f"{name}.exr"))
+    lines = wlm.lightmap.load(tmp_path, times=[0, 1]).warnings
+    assert any("LMA0_L1x.exr: by the names directions or masks" in line for line in lines), lines
