@@ -120,4 +120,28 @@ def test_directions_beside_light_are_not_times_of_it(tmp_path):
         planes = {channel: np.ones((2, 4), np.float32) for channel in "RGB"}
         OpenEXR.File({}, planes).write(str(tmp_path / f"{name}.exr"))
     lines = wlm.lightmap.load(tmp_path, times=[0, 1]).warnings
-    assert any("LMA0_L1x.exr: by the names directions or masks" in line for line in lines), lines
+    assert any("LMA0_L1x.exr: by their names no light of a time" in line for line in lines), lines
+
+
+def test_subsampled_channels_are_refused(tmp_path):
+    def attribute(name: str, kind: str, value: bytes) -> bytes:
+        return f"{name}\0{kind}\0".encode() + struct.pack("<I", len(value)) + value
+
+    window = struct.pack("<4i", 0, 0, 7, 7)
+    head = struct.pack("<2I", 20000630, 2)
+    for each in (
+        ("channels", "chlist", b"Y\0" + struct.pack("<i4x2i", 2, 2, 2) + b"\0"),
+        ("compression", "compression", b"\0"),
+        ("dataWindow", "box2i", window),
+        ("displayWindow", "box2i", window),
+        ("lineOrder", "lineOrder", b"\0"),
+        ("pixelAspectRatio", "float", struct.pack("<f", 1)),
+        ("screenWindowCenter", "v2f", bytes(8)),
+        ("screenWindowWidth", "float", struct.pack("<f", 1)),
+    ):
+        head += attribute(*each)
+    rows = [struct.pack("<2i", y, 16 * (y % 2 == 0)) + np.ones(4 * (y % 2 == 0), "<f4").tobytes() for y in range(8)]
+    starts = np.cumsum([len(head) + 1 + 64, *map(len, rows[:-1])]).astype("<u8")
+    (tmp_path / "a.exr").write_bytes(head + b"\0" + starts.tobytes() + b"".join(rows))
+    with pytest.raises(WlmError, match="channel Y: expected 8x8 pixels in the data window, found 4x4"):
+        read_light(tmp_path / "a.exr")

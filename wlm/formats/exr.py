@@ -196,14 +196,14 @@ def _pixels(path: str | os.PathLike[str], channels: _Channels, names: Sequence[s
 def _framed(where: str, part: OpenEXR.Part, plane: np.ndarray, notes: list[str]) -> np.ndarray:
     """Places the pixels of the data window, float32 [h, w], in the display window, 0 elsewhere: [H, W]."""
     data, display = _window(part, "dataWindow"), _window(part, "displayWindow")
-    if data == display:
-        return plane
-    left, top, width, height = display
-    x, y = data[0] - left, data[1] - top
     if plane.shape != (data[3], data[2]):
         raise WlmError(
             f"{where}: expected {data[2]}x{data[3]} pixels in the data window, found {plane.shape[1]}x{plane.shape[0]}"
         )
+    if data == display:
+        return plane
+    left, top, width, height = display
+    x, y = data[0] - left, data[1] - top
     rows, columns = (slice(max(at, 0), max(at + size, 0)) for at, size in ((y, data[3]), (x, data[2])))
     framed = np.zeros((height, width), np.float32)
     inside = plane[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]

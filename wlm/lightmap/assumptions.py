@@ -36,7 +36,7 @@ def set_lines(listing: Listing, period: float | None = None) -> Iterator[str]:
     if others := [
         source.label for source in light if source and len(times) > 1 and _OTHER_MAP.search(source.path.stem)
     ]:
-        yield f"{_some(others)}: by the names directions or masks, not light of a time: list them as layers in a set.json"
+        yield f"{_some(others)}: by their names no light of a time: list them as layers in a set.json"
     if len(times) > 1 and not period:
         yield (
             f"no period is stated: before {min(times):.6g} and after {max(times):.6g} the first and the last lightmap "
