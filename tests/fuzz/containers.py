@@ -20,7 +20,7 @@ from numpy.lib import format as npy
 
 from wlm.formats import zstd
 
-from .mutate import corrupt, vary_array, vary_json, vary_numbers
+from .mutate import NAMES, corrupt, vary_array, vary_json, vary_numbers
 
 # Artifacts.
 
@@ -60,6 +60,11 @@ def _sign(header: Any, body: bytes) -> bytes:
     head = struct.pack("<Q", len(text)) + text
     actual = hashlib.blake2b(head + body, digest_size=16).hexdigest()
     return head.replace(f' {digest}"'.encode(), f' {actual}"'.encode(), 1) + body
+
+
+def signed(head: bytes, body: bytes) -> bytes:
+    """An artifact of a header with its length, and of other bytes of its parts."""
+    return _sign(json.loads(head[8:]), body)
 
 
 def vary_artifact(draw: Random, data: bytes) -> bytes:
@@ -154,6 +159,9 @@ _OBJECTS = (
     np.float64(3),
 )
 
+# Most often those that are read.
+_METHODS = (*(zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) * 4, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+
 
 def _member(array: np.ndarray) -> bytes:
     """A `.npy` file."""
@@ -186,8 +194,10 @@ def vary_npz(draw: Random, data: bytes) -> bytes:
             content = draw.choice((b"", b"xx", content[:9], content[:64]))
         members[name] = content
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", draw.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as archive:
+    with zipfile.ZipFile(buffer, "w", draw.choice(_METHODS)) as archive:
         for name, content in members.items():
+            if draw.random() < 0.02:
+                content += bytes(1 << draw.choice((20, 25)))
             # A fixed date: a case is the same on every day.
             archive.writestr(zipfile.ZipInfo(name, (2000, 1, 1, 0, 0, 0)), content)
     result = buffer.getvalue()
@@ -217,8 +227,29 @@ def vary_gltf(draw: Random, data: bytes) -> bytes:
         head, _, body = buffer["uri"].partition(",")
         buffer["uri"] = f"{head},{base64.b64encode(corrupt(draw, base64.b64decode(body))).decode()}"
     else:
-        content = vary_json(draw, content)
+        content = vary_json(draw, _multiplied(draw, content) if draw.random() < 0.2 else content)
     return json.dumps(content).encode()
+
+
+def _multiplied(draw: Random, content: Any) -> Any:
+    """A glTF file whose nodes draw many primitives, some of accessors without data, or that names other files."""
+    kind, meshes = draw.randrange(4), content["meshes"]
+    if kind == 0:
+        content["accessors"].append(
+            {"componentType": 5126, "type": "VEC3", "count": draw.choice((1, 3, 1 << 20, 1 << 28))}
+        )
+        for primitive in meshes[0]["primitives"]:
+            primitive["attributes"][draw.choice(("POSITION", "NORMAL"))] = len(content["accessors"]) - 1
+    elif kind == 1:
+        for primitive in meshes[0]["primitives"]:
+            primitive["attributes"].pop("POSITION", None)
+    if kind <= 2:
+        meshes[0]["primitives"] *= draw.choice((1, 30, 1000))
+        content["nodes"] += [{"mesh": 0}] * draw.choice((1, 30, 1000))
+        content["scenes"] = [{"nodes": list(range(len(content["nodes"])))[draw.choice((0, -1, -500)) :]}]
+    else:
+        draw.choice(content["images"] + content["buffers"])["uri"] = draw.choice(NAMES)
+    return content
 
 
 def vary_glb(draw: Random, data: bytes) -> bytes:
@@ -228,7 +259,9 @@ def vary_glb(draw: Random, data: bytes) -> bytes:
     if draw.random() < 0.2:
         binary = corrupt(draw, binary)
     else:
-        text = json.dumps(vary_json(draw, json.loads(text))).encode()
+        content = json.loads(text)
+        content = _multiplied(draw, content) if draw.random() < 0.2 and "images" in content else content
+        text = json.dumps(vary_json(draw, content)).encode()
     text += b" " * (-len(text) % 4)
     binary += b"\0" * (-len(binary) % 4)
     chunks = struct.pack("<2I", len(text), 0x4E4F534A) + text + struct.pack("<2I", len(binary), 0x004E4942) + binary
@@ -254,6 +287,17 @@ def vary_exr(draw: Random, data: bytes, note: str = "") -> bytes:
     for each in attributes:
         if each[0] == note.encode() and draw.random() < 0.7:
             each[2] = json.dumps(vary_json(draw, json.loads(each[2]))).encode()
+    flags = data[4:8]
+    if draw.random() < 0.1:
+        # Deep, of several parts, with long names, tiled; the type may say another than the flags.
+        flags = bytes([2, draw.choice((0x02, 0x04, 0x08, 0x10, 0x18)) ^ data[5], 0, 0])
+        kind = draw.choice((b"deepscanline", b"deeptile", b"tiledimage", b"scanlineimage"))
+        attributes = [each for each in attributes if each[0] != b"type"] + [[b"type", b"string", kind]]
+    for each in attributes:
+        if each[0] == b"channels" and draw.random() < 0.1:
+            # The sampling of the first channel.
+            at = each[2].index(0) + 9
+            each[2] = each[2][:at] + struct.pack("<2i", *draw.choices((0, 1, 2, -1, 1 << 30), k=2)) + each[2][at + 8 :]
     for _ in range(draw.choice((0, 1, 1) if note else (1, 1, 2))):
         chosen, kind = draw.choice(attributes), draw.randrange(8)
         if kind == 0 and len(attributes) > 1:
@@ -276,7 +320,7 @@ def vary_exr(draw: Random, data: bytes, note: str = "") -> bytes:
     body = bytearray(data[table:])
     for place in range(0, struct.unpack_from("<Q", data, table)[0] - table, 8):
         struct.pack_into("<Q", body, place, struct.unpack_from("<Q", body, place)[0] + moved)
-    return data[:8] + header + b"\0" + bytes(body)
+    return data[:4] + flags + header + b"\0" + bytes(body)
 
 
 def vary_png(draw: Random, data: bytes) -> bytes:

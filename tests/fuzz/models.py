@@ -2,10 +2,11 @@
 
 import functools
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from random import Random
 from typing import Any
 from unittest.mock import patch
 
@@ -13,9 +14,12 @@ import numpy as np
 import torch
 from builders.probe_sets import synthetic
 from builders.small_sets import moving_light, tiny_profile
+from typer.testing import CliRunner
 
 import wlm
+from wlm.cli import app
 from wlm.errors import WlmError
+from wlm.formats.exr import read_every_channel
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
 from wlm.smoke.fit import train
@@ -26,8 +30,8 @@ from wlm.smoke.simulation import make_solver
 from wlm.smoke.transport.orders import load_orders
 from wlm.system import Meter
 
-from .containers import vary_artifact, vary_compact, vary_npz
-from .reader import Reader, check_digest, check_finite, stored
+from .containers import signed, vary_artifact, vary_compact, vary_npz
+from .reader import Reader, check_digest, check_finite, corpus, stored
 
 
 def _lightmap(path: Path) -> None:
@@ -75,6 +79,30 @@ def _network(path: Path) -> None:
     if model.settings.guide == "paper":
         planes = model.decoder(height=16, width=16)(guide)
         assert planes.shape == (8, 16, 16), f"decodes to {tuple(planes.shape)}"
+    words = [path.with_name("volume.npz"), "--network", path, "--resolution", "16", "-o", path.with_name("out.exr")]
+    result = CliRunner().invoke(app, ["smoke", "predict", *map(str, words)])
+    try:
+        if result.exit_code != 2:
+            assert result.exit_code == 0, repr(result.exception)
+            check_finite(planes=read_every_channel(path.with_name("out.exr"))[0])
+    finally:
+        path.with_name("out.exr").unlink(missing_ok=True)
+
+
+def _extreme(draw: Random, data: bytes) -> bytes:
+    """Scales weights of a network to the ends of half floats, or changes an artifact in any other way."""
+    if draw.random() < 0.6:
+        return vary_artifact(draw, data)
+    size = 8 + int.from_bytes(data[:8], "little")
+    weights = np.frombuffer(data[size:], "<f2").astype(np.float64)
+    first, last = sorted(draw.choices(range(len(weights)), k=2))
+    with np.errstate(over="ignore"):
+        weights[first:last] = (weights[first:last] * draw.choice((0.0, 1e-9, 30.0, 1e3, 1e5, -1e9))).clip(-65504, 65504)
+    return signed(data[:size], weights.astype("<f2").tobytes())
+
+
+def _plume() -> Mapping[str, bytes]:
+    return {"volume.npz": corpus("volume.npz")()[0]}
 
 
 @functools.cache
@@ -233,7 +261,7 @@ READERS = (
     Reader("lightmap", "a.wlm", stored(*_LIGHTMAPS), vary_artifact, _lightmap),
     Reader("probe", "a.wlm", stored("probe.wlm", "probe-pca.wlm"), vary_compact, _probe),
     Reader("atlas", "a.wlm", stored(*(f"atlas-{kind}.wlm" for kind in _ATLASES)), vary_artifact, _atlas),
-    Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
+    Reader("smoke-network", "a.wlm", stored("smoke.wlm"), _extreme, _network, _plume, cost=2),
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
     _checkpoints(lightmap_fit, "lightmap", cost=8),
     _checkpoints(probe_fit, "probe", cost=4),

@@ -30,6 +30,20 @@ _TEXTS = (
     "../x",
     "/dev/zero",
 )
+NAMES = (
+    "../a.exr",
+    "/etc/passwd",
+    "/dev/zero",
+    "/dev/stdin",
+    "..",
+    ".",
+    "x" * 5000,
+    "\ud800",
+    "a.exr\n",
+    "mask.png",
+)
+"""File names that a reader must not follow, or cannot."""
+
 _VALUES = (*INTEGERS, *_SIGNED, *FLOATS, *_TEXTS, None, True, False, [], {}, [[]], [1, 2, 3], {"a": 1})
 _TYPES = ("?", "u1", "i1", "<u2", "<i2", "<f2", "<u4", "<i4", "<f4", ">f4", "<u8", "<i8", "<f8", "<c8", "S4", "<U3")
 

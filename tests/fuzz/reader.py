@@ -13,8 +13,8 @@ import numpy as np
 from .containers import compact_digest
 from .mutate import corrupt
 
-_CORPUS = Path(__file__).parent / "corpus"
-_FILES = Path(__file__).resolve().parents[1] / "files"
+CORPUS = Path(__file__).parent / "corpus"
+FILES = Path(__file__).resolve().parents[1] / "files"
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,12 @@ class Reader:
 
 def corpus(*names: str) -> Callable[[], Sequence[bytes]]:
     """The committed good files of these names."""
-    return functools.cache(lambda: tuple((_CORPUS / name).read_bytes() for name in names))
+    return functools.cache(lambda: tuple((CORPUS / name).read_bytes() for name in names))
 
 
 def stored(*names: str) -> Callable[[], Sequence[bytes]]:
     """Good files of the other tests."""
-    return functools.cache(lambda: tuple((_FILES / name).read_bytes() for name in names))
+    return functools.cache(lambda: tuple((FILES / name).read_bytes() for name in names))
 
 
 def check_finite(**arrays: Any) -> None:

@@ -8,6 +8,7 @@ import base64
 import functools
 import gzip
 import json
+import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -40,9 +41,9 @@ from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.network.settings import DatasetSettings
 from wlm.smoke.scene import Scene
 
-from . import models
+from . import models, used
 from .containers import vary_exr, vary_glb, vary_gltf, vary_npz, vary_png
-from .mutate import corrupt, vary_json, vary_numbers, vary_text
+from .mutate import NAMES, corrupt, vary_json, vary_numbers, vary_text
 from .reader import Reader, check_finite, corpus
 from .textures import vary_dds, vary_ktx2, vary_radiance
 
@@ -52,6 +53,10 @@ _PROFILES = Path(__file__).resolve().parents[2] / "configs"
 def _json(draw: Random, data: bytes) -> bytes:
     """Changes a JSON value; now and then its text is nested deeper than any stack."""
     text = json.dumps(vary_json(draw, json.loads(data))).encode()
+    if draw.random() < 0.1:
+        # Any of its texts that might be a name.
+        names = re.findall(rb'"[^"]*\\.[a-z0-9]+"', text)
+        text = text.replace(draw.choice(names), json.dumps(draw.choice(NAMES)).encode()) if names else text
     if draw.random() > 0.03:
         return text
     at = draw.randrange(len(text))
@@ -247,6 +252,28 @@ def _grid(draw: Random, data: bytes) -> bytes:
     return vary_numbers(draw, data, _grid_fields(data))
 
 
+def _tiles(draw: Random, data: bytes) -> bytes:
+    """A tree with several nodes and tiles at its root, many of which overlap; or other numbers in a file."""
+    if draw.random() < 0.7:
+        return _grid(draw, data)
+    random = np.random.default_rng(draw.getrandbits(32))
+    blocks = random.choice([0.0, 0.5, 2.0, 1e30, np.nan, -1.0], (4, 2, 3)).astype(np.float32)
+    values = np.kron(blocks, np.ones((8, 8, 8), np.float32))
+    node = tree(values, np.ones(values.shape, bool), ACTIVE_MASK)[
+        28:
+    ]  # of tiles, without the root's head and its place
+    nodes, tiles = (
+        draw.choice(((1, 0), (2, 0), (1, 40), (6, 3), (0, 2000))),
+        (0, 8, -8, 1, 100, 4095, 4096, -4096, 1 << 20),
+    )
+    root = struct.pack("<If2I", 1, draw.choice((0.0, 1.0, -1.0)), nodes[1], nodes[0])
+    for _ in range(nodes[1]):
+        root += struct.pack("<3if?", *draw.choices(tiles, k=3), draw.choice((0.0, 0.5, 1e30)), draw.random() < 0.9)
+    for _ in range(nodes[0]):
+        root += struct.pack("<3i", *draw.choices(tiles, k=3)) + node
+    return vdb_file({"density": (scaled(0.5, 0.5, 0.5), root, ACTIVE_MASK, False)})
+
+
 def _table(draw: Random, data: bytes) -> bytes:
     return vary_text(draw, data.decode(), (",", ";", "r0", "x", "sh", "#", "\t", "1e999", "nan"))
 
@@ -271,27 +298,23 @@ def _godot(draw: Random, data: bytes) -> bytes:
 
 # Folders with an index.
 
-_ELSEWHERE = (
-    "../a.exr",
-    "/etc/passwd",
-    "/dev/zero",
-    "/dev/stdin",
-    "..",
-    ".",
-    "x" * 5000,
-    "\ud800",
-    "a.exr\n",
-    "mask.png",
-)
-
 
 def _set(draw: Random, data: bytes) -> bytes:
     content = vary_json(draw, json.loads(data))
     entries = content.get("lightmaps") if isinstance(content, dict) else None
     if isinstance(entries, list) and entries and isinstance(entries[0], dict) and draw.random() < 0.3:
-        entries[0]["file"] = draw.choice(_ELSEWHERE)
+        entries[0]["file"] = draw.choice(NAMES)
+    if isinstance(entries, list) and entries and isinstance(entries[0], dict) and draw.random() < 0.1:
+        # Many times of files whose alpha is the mask.
+        content["mask"], content["lightmaps"] = (
+            "alpha",
+            [
+                entries[0] | {"time_hours": 0.01 * i, "file": draw.choice(("b.exr", "b.exr", "a.exr"))}
+                for i in range(draw.choice((2, 100, 2000)))
+            ],
+        )
     if isinstance(content, dict) and draw.random() < 0.2:
-        content["mask"] = draw.choice(_ELSEWHERE)
+        content["mask"] = draw.choice(NAMES)
     return json.dumps(content).encode()
 
 
@@ -354,6 +377,17 @@ _FRAGMENTS = [
 0b2
 0o9
 1_000
+59:59.9
+-190:20:30.15
+1:2:3:4:5:6:7:8:9.9
+9:99999999999999999999.5
+1e-999
+-0.0
+1_0:2_0.5
+.5e+5000
+4.9e-324
+1.7976931348623157e+308
+[1e308, -1e308, .inf]
 "\x1b[31m"
 "\uD800"
 yes
@@ -367,7 +401,18 @@ yes
 {a: 1
 :
 """.strip().split("\n"),
-    *("0x" + "f" * 5000, "1" * 5000, "[" * 300, "{" * 300, "- " * 300, "\0", "\t"),
+    *(
+        "0x" + "f" * 5000,
+        "1" * 5000,
+        "1" * 400 + ".5",
+        "9:" * 300 + "9.5",
+        "0b" + "1" * 5000,
+        "[" * 300,
+        "{" * 300,
+        "- " * 300,
+        "\0",
+        "\t",
+    ),
 ]
 
 
@@ -410,6 +455,7 @@ _FRAME = {"frame_0001.npz": "volume.npz"}
 
 _ALL = (
     *models.READERS,
+    *used.READERS,
     Reader("exr", "a.exr", corpus("zip.exr", "piz.exr", "b44.exr", "dwaa.exr", "tiled.exr"), vary_exr, _exr),
     Reader("exr-layers", "a.exr", corpus("layers.exr", "parts.exr"), corrupt, _layered),
     Reader("radiance", "a.hdr", corpus("runs.hdr", "plain.hdr"), vary_radiance, _light_file),
@@ -441,7 +487,7 @@ _ALL = (
     Reader("positions-json", "a.json", corpus("positions.json"), _json, _positions),
     Reader("volume-npz", "a.npz", corpus("volume.npz", "volume-bricks.npz"), vary_npz, _volume),
     Reader("volume-nvdb", "a.nvdb", _grids, _grid, _volume, cost=2),
-    Reader("volume-vdb", "a.vdb", _vdbs, _grid, _volume, cost=2),
+    Reader("volume-vdb", "a.vdb", _vdbs, _tiles, _volume, cost=2),
     Reader("lightmap-layers-set", "set.json", _layers, _json, _lightmap_set, _beside(_SET)),
     Reader("lightmap-set", "set.json", corpus("set.json"), _set, _lightmap_set, _beside(_SET)),
     Reader("smoke-frames", "scene.json", corpus("scene.json"), _json, _frames, _beside(_FRAME)),

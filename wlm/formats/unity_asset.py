@@ -79,7 +79,10 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
         return _read_text(path, data)
     if data.startswith(_BUNDLE):
         raise WlmError(f"{path}: expected an asset of Unity's editor, found an asset bundle")
-    need("UnityPy", _EXTRA)
+    try:
+        need("UnityPy", _EXTRA)
+    except WlmError as error:
+        raise WlmError(f"{path}: {error}") from error
     with damaged(f"{path}: the asset is damaged, or UnityPy cannot read its version", ValueError):
         tables = run_child(unity_child, data)
     position, light = tables[POSITIONS], tables[LIGHT]
