@@ -146,6 +146,7 @@ def _use(path: Path) -> None:
     words, files = json.loads(path.read_bytes()), _files()
     folder = path.parent / "used"
     shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
     try:
         for name in {each for word in words for each in files if each == word or each.startswith(f"{word}/")}:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

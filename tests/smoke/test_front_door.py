@@ -1,5 +1,7 @@
 """The calls of `wlm.smoke` as in the README, and the three ways to make lightmaps."""
 
+import dataclasses
+
 import pytest
 import torch
 from builders.smoke_plumes import plume
@@ -63,3 +65,10 @@ def test_a_network_of_extreme_weights_is_an_error(smoke):
             weight.fill_(65504.0)
     with pytest.raises(WlmError, match="the network predicts NaN or infinite light"):
         wlm.smoke.predict(smoke, wlm.smoke.Camera.around(smoke, pixels=16), model)
+
+
+@pytest.mark.parametrize(("voxel", "origin"), [(1e-30, 0.0), (1.0, 1e30)])
+def test_smoke_that_no_camera_can_frame_is_refused(voxel, origin):
+    tiny = dataclasses.replace(plume(), voxel=voxel, origin=(origin, 0.0, 0.0))
+    with pytest.raises(WlmError, match="camera: the smoke is too small, or too far from 0"):
+        wlm.smoke.Camera.around(tiny, pixels=8)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm_kernels.smoke.march import View, make_view
 
@@ -178,6 +179,7 @@ class Camera:
 
         Raises:
             ValueError: A direction has length 0, or a size is not above 0.
+            WlmError: Numbers of float64 cannot tell the eye from the target.
         """
         if isinstance(smoke, DensityVolume):
             smoke = (smoke.origin, smoke.voxel * np.asarray(smoke.shape))
@@ -189,6 +191,8 @@ class Camera:
         if distance is None:
             # At least as far away as the box is large, which avoids an extreme perspective.
             distance = nearest + float(np.linalg.norm(size))
+            if not _SHORTEST < np.linalg.norm((target + distance * toward) - target):
+                raise WlmError(f"camera: the smoke is too small, or too far from 0 for its size: {size} at {origin}")
         width = max(round(pixels * aspect), 1)
         shape = {"height": pixels, "width": width, "world_up": up, "perspective": perspective}
         camera = Camera.look_at(target + distance * toward, target, extent=1.0 if extent is None else extent, **shape)
