@@ -39,7 +39,7 @@ TIMES = (0.0, 7.5, 10.0, 13.0, 21.7, 23.99)
         {"times": (3.0,)},
         {"period": None},
         {"time_axis": "paper", "period": None, "interpolation": "network"},
-        {"gelu": "tanh", "hidden": 16, "uvt_slices": 1},
+        {"uvt_slices": 1},
         {"hidden": 17, "time_axis": "paper"},
         {"kinds": (4, 3, 1, 4)},
         {"kinds": (4, 3, 1, 4), "interpolation": "network"},

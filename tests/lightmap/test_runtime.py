@@ -24,7 +24,7 @@ KINDS = (3, 2, 3, 1, 0, 3)  # the static tile's place lies between two dynamic o
 
 @pytest.mark.parametrize(
     ("hidden", "gelu"),
-    [(16, "tanh"), *(pytest.param(*shape, marks=pytest.mark.slow) for shape in ((17, "exact"), (64, "tanh")))],
+    [(8, "tanh"), *(pytest.param(*shape, marks=pytest.mark.slow) for shape in ((17, "exact"), (64, "tanh")))],
 )
 def test_strip_and_exact_agree_at_any_time(device, hidden, gelu):
     model = random_sheet(KINDS, hidden=hidden, gelu=gelu)
@@ -36,10 +36,10 @@ def test_strip_and_exact_agree_at_any_time(device, hidden, gelu):
                 runtime.set_time(time)
             runtime.decode()
         codes, bounds = decoder.tiles_8bit([0, 2, 5], model.times[0] if time is None else time)
-        # Between stored times the two are mixed after each was rounded.
+        # Between stored times the two are mixed after each was rounded, in steps of its own range.
         stored = time in (None, 13.0)
-        assert np.abs(exact.numpy().astype(int) - codes).max() <= (0 if stored else 2)
-        assert np.abs(strip.numpy().astype(int) - codes).max() <= (1 if stored else 2)
+        assert np.abs(exact.numpy().astype(int) - codes).max() <= (0 if stored else 3)
+        assert np.abs(strip.numpy().astype(int) - codes).max() <= (1 if stored else 3)
         np.testing.assert_allclose(strip.bounds, bounds, rtol=1e-6)
 
 
@@ -135,7 +135,7 @@ def test_texels_are_packed_as_on_the_host(device):
 def test_the_map_is_that_of_the_host(time, device):
     mask = np.zeros((236, 375), bool)
     mask[20:60, 30:128] = mask[100:180, 60:90] = mask[40:200, 126:150] = mask[130:200, 200:340] = True
-    model = random_sheet(MAP_KINDS, mask=mask, hidden=16, columns=3)
+    model = random_sheet(MAP_KINDS, mask=mask, columns=3)
     decoder = MapDecoder(model, device)
     decoder.set_time(time)
     decoder.decode()
@@ -148,7 +148,7 @@ def test_the_map_is_that_of_the_host(time, device):
 def test_mips_hold_charts_alone(device):
     mask = np.zeros((236, 247), bool)
     mask[:64, 5:70] = mask[117:, 90:] = mask[235, 0] = True
-    model = random_sheet((3, 3, 1, 3), mask=mask, hidden=16)
+    model = random_sheet((3, 3, 1, 3), mask=mask)
     decoder = MapDecoder(model, device)
     decoder.decode()
     assert [level.shape for level in decoder.levels] == [(236 >> i, 247 >> i) for i in range(8)]
@@ -173,7 +173,7 @@ def test_mips_hold_charts_alone(device):
 
 
 def test_mips_leave_out_tiles_that_the_file_lacks(device):
-    decoder = MapDecoder(random_sheet((3, 0, 1, 3), hidden=16), device)
+    decoder = MapDecoder(random_sheet((3, 0, 1, 3)), device)
     decoder.decode()
     light, whole = decoder.numpy().astype(np.float64), len(decoder.levels) - 1
     stored = np.ones(light.shape[:2], bool)
@@ -183,7 +183,7 @@ def test_mips_leave_out_tiles_that_the_file_lacks(device):
 
 
 def test_the_command_writes_the_texture(tmp_path):
-    model = random_model(MAP_KINDS, hidden=16)
+    model = random_model(MAP_KINDS)
     model.save(tmp_path / "a.wlm")
     files = ["-o", str(tmp_path / "a.exr"), "--texture", str(tmp_path / "a.dds")]
     assert CliRunner().invoke(app, ["decode", str(tmp_path / "a.wlm"), "--time", "9", *files]).exit_code == 0
