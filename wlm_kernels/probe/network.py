@@ -69,7 +69,7 @@ class NetworkKernels:
 
     def load(self, device) -> None:
         """Compiles the kernels for a device now."""
-        self._kernel.module.load(wp.get_device(device))
+        wp.load_module(self._kernel.module, device, block_dim=THREADS)
 
     def launch(self, groups, f, target, weight, net, grad_f, partial, loss, base=0, count=None) -> None:
         """Computes the loss, the sum of weight * error^2 over all numbers of all probes, and its gradients.

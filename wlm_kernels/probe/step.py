@@ -158,8 +158,10 @@ class StepKernels:
 
     def load(self, device) -> None:
         """Compiles the kernels for a device now."""
-        for kernel in (self._shapes, self._features, self._collect, self._update, _touch):
-            kernel.module.load(wp.get_device(device))
+        for kernel in (self._shapes, self._update, _touch):
+            wp.load_module(kernel.module, device)
+        for kernel, threads in ((self._features, GROUP), (self._collect, _COLLECTORS)):
+            wp.load_module(kernel.module, device, block_dim=threads)
 
     def shapes(self, rows, bounds, quantised, levels, cut, sphere, used, shapes) -> None:
         """Rounds the Gaussians' parameters as a model file stores them, and prepares the Gaussians for evaluation.
