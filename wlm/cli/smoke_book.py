@@ -265,7 +265,7 @@ def _source(
 
 
 def _say(notes: Sequence[str]) -> None:
-    """Prints the first assumption, and each warning once."""
+    """Prints the first of the notes about an input, and every warning among them, each text once."""
     for line in dict.fromkeys(line for i, line in enumerate(notes) if not i or "warning: " in line):
         note(line)
 

@@ -23,7 +23,7 @@ from wlm.formats import bc7
 from wlm.formats.bc7 import BLOCK_BYTES
 from wlm.formats.block_reuse import by_block, reuse_blocks
 from wlm.formats.folder import rounded
-from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, rgba, side_by_side
+from wlm.lightmap.encodings.base import DeviceTiles, Encoding, side_by_side
 from wlm.lightmap.encodings.maps import tile_bytes
 from wlm.lightmap.model import BLOCKS, SheetModel
 from wlm.lightmap.profile import Profile
@@ -164,6 +164,8 @@ class FrameTiles(DeviceTiles):
         self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
 
     def bounds(self, time: float) -> np.ndarray:
+        """Returns an upper bound of each tile's colour at a time, in gamma space, float32 [n]; between two stored times
+        the larger of their bounds."""
         before, after, share = self._axis.neighbours(time)
         return self._greatest[:, before] if share == 0 else self._greatest[:, [before, after]].max(1)
 
@@ -182,12 +184,6 @@ class FrameTiles(DeviceTiles):
         out = wp.empty((len(rows), TILE, TILE), dtype=wp.vec3, device=self._device)
         self.decode(time, wp.array(rows, dtype=int, device=self._device), out)
         return out.numpy()
-
-    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
-        out = wp.empty((len(rows), TILE, TILE), dtype=wp.uint32, device=self._device)
-        inverse = wp.array(inverse_of(self.bounds(time)), dtype=float, device=self._device)
-        self.decode(time, wp.array(rows, dtype=int, device=self._device), out, inverse)
-        return rgba(out)
 
 
 class Frames(Encoding):

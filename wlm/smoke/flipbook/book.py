@@ -263,7 +263,7 @@ def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, t
 
 
 def _write_page(path: Path, page: np.ndarray, text: str) -> int:
-    """Writes a texture [H, W, 3 or 4] with the `text` of `NOTE`, and returns the number of clipped values."""
+    """Writes a texture [H, W, 3 or 4] with its description `text` as an image; returns how many values are clipped."""
     if not np.isfinite(page).all():
         raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
     if suffix_of(path) == ".exr":
