@@ -80,9 +80,6 @@ def simulate(
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
     frames: _SceneFrames = None,
     scale: _SceneScale = 1.0,
-    velocity: Annotated[
-        bool, typer.Option("--velocity", help="Also write the air's velocity of each frame, for flipbook --motion.")
-    ] = False,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
     device: Device = "cpu",
@@ -114,7 +111,7 @@ def simulate(
             most = max(most, figures.get("smoke", 0.0))
             report(now)
 
-        options = {"resume": resume, "checkpoint_every": checkpoint_every, "velocity": velocity}
+        options = {"resume": resume, "checkpoint_every": checkpoint_every}
         first = simulate(folder, solver=solver, progress=progress, **options)
     if resume and first == 1:
         note(f"{output}: there was nothing to resume; started at frame 1")
