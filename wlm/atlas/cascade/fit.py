@@ -46,7 +46,7 @@ from wlm.ops.views import DISTANCE, ZOOM, normalised, sphere_views
 from wlm.system import Meter, OnProgress
 from wlm.texels import fill_gaps
 from wlm_kernels.atlas.patches import ORDERS
-from wlm_kernels.atlas.surface import surface_points
+from wlm_kernels.atlas.surface import loss_gradient, surface_points
 from wlm_kernels.raster.gradient import interpolate
 from wlm_kernels.raster.rasterize import Rasterizer
 
@@ -235,7 +235,7 @@ class _Step:
         seed: int,
         device: str,
     ) -> None:
-        self._gradient = profile.gradient
+        self._weight = profile.gradient
         # A black lightmap has no mean to divide by, and needs none.
         self._unit = float(sheet.lightmap[sheet.mask].mean(dtype=np.float64)) or 1.0
         self._colour = torch.tensor(textures.colour / np.float32(self._unit), device=device).requires_grad_()
@@ -253,37 +253,37 @@ class _Step:
         self._adam = torch.optim.Adam(groups, capturable=device != "cpu", fused=True)
         self._image = torch.tensor(sheet.lightmap / np.float32(self._unit), device=device)
         self._step = torch.zeros(1, dtype=torch.int32, device=device)
-        # An inactive triangle hides what is behind it; NaN excludes it from the loss.
-        corners = np.where(sheet.active[:, None, None], np.concatenate([sheet.uv[sheet.triangle], uv], 2), np.nan)
-        self._corners = wp.array(corners.reshape(-1, 4).astype(np.float32), device=device)
-        self._triangle = wp.array(np.arange(corners.shape[0] * 3).reshape(-1, 3), dtype=int, device=device)
+        # An inactive triangle hides what is behind it; NaN excludes it from the loss, as does one more triangle, which
+        # stands for "none".
+        active, nothing = sheet.active[:, None, None], np.full((1, 3, 2), np.nan)
+        self._corners = [
+            wp.array(
+                np.concatenate([np.where(active, each, np.nan), nothing], dtype=np.float32).reshape(-1, 2),
+                device=device,
+            )
+            for each in (sheet.uv[sheet.triangle], uv)
+        ]
+        self._rows = wp.array(np.arange(3 * len(uv) + 3).reshape(-1, 3), dtype=int, device=device)
         kind = _Views if profile.space == "views" else _Surface
         self.points = kind(sheet, profile, self._step, seed, device)
-        self._uv = torch.empty(*self.points.triangle.shape, 4, device=device)
-        self._points = [
-            interop.to_warp(self.points.triangle),
-            interop.to_warp(self.points.barycentric, wp.vec2),
-            interop.to_warp(self._uv),
-        ]
+        self._triangle = torch.empty_like(self.points.triangle)
+        self._uv, self._new_uv = (torch.empty_like(self.points.barycentric) for _ in range(2))
+        self._gradient = self._uv.new_empty(*self._triangle.shape, 3)
 
     def __call__(self) -> None:
         self.points.draw()
-        interpolate(self._corners, self._triangle, *self._points)
-        old, new = self._uv.masked_fill(self.points.triangle[..., None] < 0, torch.nan).split(2, -1)
+        torch.remainder(self.points.triangle, len(self._rows), out=self._triangle)
+        points = interop.to_warp(self._triangle), interop.to_warp(self.points.barycentric, wp.vec2)
+        for corners, uv in zip(self._corners, (self._uv, self._new_uv), strict=True):
+            interpolate(corners, self._rows, *points, interop.to_warp(uv))
         if "lut" in self._tuned:
-            colour = texture(self._colour, texture(self._lut, new), boundary="mirror")
+            colour = texture(self._colour, texture(self._lut, self._new_uv), boundary="mirror")
         else:
-            colour = texture(self._colour, new)
-        # The gradient of the L1 is a sign; autograd would keep several images of intermediate values.
-        with torch.no_grad():
-            difference = (colour - texture(self._image, old)).nan_to_num_()
-            gradient = difference.sign()
-            for first, second in self.points.pairs:
-                sign = (difference[first] - difference[second]).sign_()
-                gradient[first].add_(sign, alpha=self._gradient)
-                gradient[second].sub_(sign, alpha=self._gradient)
+            colour = texture(self._colour, self._new_uv)
+        images = (colour.detach(), texture(self._image, self._uv))
+        loss_gradient(*map(interop.to_warp, images), self._weight, self.points.across, interop.to_warp(self._gradient))
         self._adam.zero_grad(set_to_none=False)
-        colour.backward(gradient)
+        colour.backward(self._gradient)
         for rate, now in zip(self._rate, self._rates.index_select(0, self._step)[0], strict=True):
             rate.copy_(now)
         self._adam.step()
@@ -338,9 +338,10 @@ class _Views:
     Attributes:
         triangle, barycentric: int32 [H, W], the triangle at each point, -1 for none; float32 [H, W, 2], the weights of
             its corners 0 and 1.
-        pairs: Indices of [H, W, 3] values, whose differences the loss has: rows and the rows above, columns and the
-            columns to the left.
+        across: Whether horizontal neighbours are compared too, besides vertical ones.
     """
+
+    across = True
 
     def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
         self._side = profile.resolution
@@ -353,8 +354,6 @@ class _Views:
         self._rasterizer = Rasterizer(wp.array(sheet.triangle, dtype=int, device=device), self._side, self._side)
         raster = self._rasterizer.raster
         self.triangle, self.barycentric = wp.to_torch(raster.triangle), wp.to_torch(raster.barycentric)
-        later, earlier = slice(1, None), slice(None, -1)
-        self.pairs = [(later, earlier), ((slice(None), later), (slice(None), earlier))]
 
     def draw(self) -> None:
         axes = self._axes.index_select(0, self._step)[0]
@@ -370,7 +369,7 @@ class _Surface:
     """Supplies the points of each step for the space "uv": new pairs of random points on the mesh, with the attributes
     of `_Views`; H is 2, and the points of a column are a pair."""
 
-    pairs = ((0, 1),)
+    across = False
 
     def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
         pairs = max(1, profile.resolution**2 // (2 * _PIXELS_PER_POINT))
