@@ -8,14 +8,7 @@ from scipy.special import eval_legendre, sph_harm_y
 
 from wlm.errors import WlmError
 from wlm.probe.conventions import CANONICAL, CONVENTIONS, from_canonical, to_canonical
-from wlm.probe.sphere import (
-    basis,
-    coefficient_bands,
-    cosine_factor,
-    fibonacci_sphere,
-    irradiance,
-    sh_count,
-)
+from wlm.probe.sphere import basis, coefficient_bands, cosine_factor, fibonacci_sphere, irradiance, sh_count
 
 RNG = np.random.default_rng(5)
 

@@ -14,12 +14,7 @@ from wlm.fluid.solver import LEAST_HALF_LOSS
 from wlm.smoke.lightmaps import axis_faults
 from wlm.smoke.march.six_way import bake
 from wlm.smoke.network import dataset
-from wlm.smoke.network.dataset import (
-    ATTEMPTS,
-    make_pool,
-    make_validation,
-    pool_of_volume,
-)
+from wlm.smoke.network.dataset import ATTEMPTS, make_pool, make_validation, pool_of_volume
 from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, Pool
 from wlm.smoke.network.scenes import Tilted, draw_scene
 from wlm.smoke.network.settings import DatasetSettings
