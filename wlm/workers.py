@@ -169,10 +169,6 @@ class Processes(Workers):
         for number in list(self._processes):
             self._end(number, _PATIENCE)
 
-    def kill(self, number: int) -> None:
-        """Kills one process immediately, as the operating system does when memory runs out."""
-        self._processes[number].kill()
-
     def _start(self, number: int) -> None:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
         # Without this, NumPy would start one thread per core in each process.
