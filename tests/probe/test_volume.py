@@ -568,12 +568,6 @@ def test_no_probe_and_coincident_ones():
     assert len(BlockIndex(np.full((7, 3), 0.5), 1.0, (1,)).block) == 1  # at its centre, that block alone
 
 
-def test_index_refuses():
-    for position in (np.array([[0, np.nan, 0]]), np.full((1, 3), 1e101)):
-        with pytest.raises(ValueError, match="position: expected numbers"):
-            BlockIndex(position, 1.0, (1,))
-
-
 def test_side_follows_the_spacing():
     random = np.random.default_rng(0)
     plane = np.stack([*random.uniform(0, 30, (2, 900)), np.zeros(900)], 1)
@@ -583,5 +577,8 @@ def test_side_follows_the_spacing():
     # Fewer blocks than probes could not tell them apart.
     assert len(BlockIndex(lattice, finest_side(lattice), (1,)).block) >= 2 * len(lattice)
     assert finest_side(np.zeros((0, 3))) == finest_side(np.ones((5, 3))) == 1.0
+    for position in (np.array([[0, np.nan, 0]]), np.full((1, 3), 1e101)):
+        with pytest.raises(ValueError, match="position: expected numbers"):
+            BlockIndex(position, 1.0, (1,))
     with pytest.raises(WlmError, match="positions: expected distances"):
         finest_side(np.array([[0.0, 0.0, 0.0], [1e300, 1e300, 1e300]]))
