@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.checks import put
 from builders.kept_files import KEPT, Kept
-from builders.resigned import GONE, WEIRD, put, rewrite, rewrite_number
+from builders.resigned import GONE, WEIRD, rewrite, rewrite_number
 
 import wlm
 from wlm.errors import WlmError

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from builders.atlas_meshes import charts, sheet, triangle
 from builders.atlas_models import KINDS, MIXED, random_model, save_plainly, shared_model
-from builders.checks import assert_same
-from builders.resigned import GONE, put, rewrite
+from builders.checks import assert_same, put
+from builders.resigned import GONE, rewrite
 
 import wlm
 from wlm.atlas import codec, colour
