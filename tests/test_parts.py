@@ -36,7 +36,6 @@ ACCEPTED = {
     ("report", "mapping"),
     ("summary", "mapping"),
 }
-COUNTS = ("size", "texels", "probes", "outputs", "gaussians", "dropped", "period")
 
 
 @pytest.fixture
