@@ -101,15 +101,6 @@ def test_what_a_fit_starts_from():
     assert (initial(lightmap, half, _profile()).colour == 0.25).all()
 
 
-def test_the_least_textures():
-    """One texel each, and no table."""
-    lightmap = np.full((1, 1, 3), 2.0, np.float32)
-    start = initial(lightmap, np.ones((1, 1), bool), _profile())
-    np.testing.assert_array_equal(start.colour, lightmap)
-    np.testing.assert_array_equal(start.lut, [[[0.5, 0.5]]])
-    assert initial(lightmap, np.ones((1, 1), bool), _profile(lut_scale=0.0)).lut.shape == (0, 0, 2)
-
-
 @pytest.mark.parametrize(("space", "lut_scale"), [("views", 0.7), ("views", 0.0), ("uv", 0.7)])
 def test_a_steps_gradient(device: str, space: str, lut_scale: float):
     """Against autograd through a float64 reading and the losses; of a view also through `wlm.ops.raster`."""

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from builders.exported import read_export
 from builders.probe_models import random_model
 from reference import volume as reference
@@ -307,7 +308,7 @@ def test_dead_probes_are_left_out(device: str):
 
 def test_a_model_is_decoded_where_it_is_asked(device: str):
     """Blocks from a model are those from what it decodes to."""
-    model = random_model(outputs=12, latent=5)
+    model = random_model(outputs=12)
     random = np.random.default_rng(4)
     position = model.origin + model.extent * model.size * random.random((90, 3))
     decoder = model.decoder(device)
@@ -334,29 +335,25 @@ def test_a_wrong_viewpoint_changes_nothing(viewpoint: object):
     volume.update([0.0, 0.0, 0.0])
     points = _surface(100)
     before = volume.read(points).values
-    with pytest.raises(WlmError, match="viewpoint: expected") as caught:
-        volume.update(viewpoint)
-    assert "\n" not in str(caught.value)
+    assert "viewpoint: expected" in error_of(volume.update, viewpoint)
     np.testing.assert_array_equal(volume.read(points).values, before)
     assert volume.update([0.0, 0.0, 0.0]).entered == 0
 
 
 @pytest.mark.parametrize(
-    ("settings", "word"),
+    "settings",
     [
-        ({"block": 0.0}, "block"),
-        ({"ratios": ()}, "ratios"),
-        ({"ratios": (1, 3)}, "ratios"),
-        ({"ratios": (1, 2, 2)}, "ratios"),
-        ({"side": 3}, "side"),
-        ({"budget": 0}, "budget"),
-        ({"rows": 63}, "rows"),
+        {"block": 0.0},
+        {"ratios": ()},
+        {"ratios": (1, 3)},
+        {"ratios": (1, 2, 2)},
+        {"side": 3},
+        {"budget": 0},
+        {"rows": 63},
     ],
 )
-def test_wrong_settings(settings: dict, word: str):
-    with pytest.raises(WlmError, match=f"volume {word}") as caught:
-        _volume(_surface(10), **settings)
-    assert "\n" not in str(caught.value)
+def test_wrong_settings(settings: dict):
+    assert f"volume {next(iter(settings))}" in error_of(_volume, _surface(10), **settings)
 
 
 def test_wrong_arrays():

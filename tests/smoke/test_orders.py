@@ -231,10 +231,7 @@ def test_files_of_models(tmp_path):
     save_orders(model, tmp_path / "a.npz")
     again = load_orders(tmp_path / "a.npz")
     assert torch.equal(model.weights, again.weights) and torch.equal(model.known, again.known)
-    wrong = {
-        "weights": (torch.zeros(3, 3), model.known),
-        "range": (model.weights, torch.tensor([2.0, 1.0])),
-    }
+    wrong = {"weights": (torch.zeros(3, 3), model.known), "range": (model.weights, torch.tensor([2.0, 1.0]))}
     for name, arrays in wrong.items():
         save_orders(OrdersModel(*arrays), tmp_path / "b.npz")
         with pytest.raises(WlmError, match=rf"b.npz: {name}: expected"):

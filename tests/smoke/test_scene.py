@@ -20,15 +20,7 @@ from wlm.fluid.faces import FACES
 from wlm.fluid.volume import save_volume
 from wlm.formats.exr import read_planes, write_planes
 from wlm.smoke import simulation
-from wlm.smoke.data import (
-    CHECKPOINT,
-    NumberedFiles,
-    load_frames,
-    open_frames,
-    read_six_way,
-    spread,
-    write_six_way,
-)
+from wlm.smoke.data import CHECKPOINT, NumberedFiles, load_frames, open_frames, read_six_way, spread, write_six_way
 from wlm.smoke.march.six_way import bake
 from wlm.smoke.scene import (
     CameraSettings,
@@ -311,10 +303,7 @@ def test_folders_that_are_none(tmp_path):
         open_frames(tmp_path / "a", scene)
     with pytest.raises(WlmError, match="cannot write: the folder .* does not exist"):
         open_frames(tmp_path / "none" / "b", scene)
-    with pytest.raises(
-        WlmError,
-        match=r"or one sequence of volumes .*, found neither scene.json nor any",
-    ):
+    with pytest.raises(WlmError, match=r"or one sequence of volumes .*, found neither scene.json nor any"):
         load_frames(tmp_path / "a")
     for content, said in (
         ("{", "found other content"),
