@@ -41,8 +41,8 @@ def raw_grid(
     voxel: float = 0.5,
     origin: tuple[float, float, float] = (1, 2, 3),
 ) -> bytes:
-    """A grid of values [X, Y, Z], multiples of 8, from voxel (0, 0, 0) on, whose centre is `origin`; leaves of one value
-    are tiles."""
+    """A grid of values [X, Y, Z], multiples of 8, from voxel (0, 0, 0) on, whose centre is `origin`; leaves of one
+    value are tiles."""
     wide = kind == "double"
     number, top = ("<d" if wide else "<f"), (96 if wide else 64)
     bits = {"fp4": 4, "fp8": 8, "fp16": 16}.get(kind, bits)
