@@ -146,6 +146,7 @@ def test_a_changed_payload_or_name_is_told_by_the_digest(artifact):
     whole = artifact.read_bytes()
     message = "the artifact is damaged: its content does not match its digest"
     assert _refusal(artifact, whole[:-1] + bytes([whole[-1] ^ 1])) == message
+    assert "expected the end of the file, found 1 more" in _refusal(artifact, whole + b"\0")
     assert _refusal(artifact, whole.replace(b'"codes"', b'"coder"')) == message
     assert _refusal(artifact, whole.replace(b"'tile':128", b"'tile':129")) == message
     assert _refusal(artifact, whole.replace(SOURCE.encode(), SOURCE[::-1].encode())) == message
