@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.checks import put
 from builders.kept_files import KEPT, Kept
-from builders.resigned import GONE, WEIRD, put, rewrite, rewrite_number
+from builders.resigned import GONE, WEIRD, rewrite, rewrite_number
 
 import wlm
 from wlm.errors import WlmError
@@ -36,7 +37,6 @@ ACCEPTED = {
     ("report", "mapping"),
     ("summary", "mapping"),
 }
-COUNTS = ("size", "texels", "probes", "outputs", "gaussians", "dropped", "period")
 
 
 @pytest.fixture
@@ -167,16 +167,6 @@ def test_settings_out_of_range_are_one_line(name, settings, words, path):
     kept = written(path, name)
     rewrite(path, settings)
     refused(kept, path, words)
-
-
-def test_tables_in_place_of_lists(path):
-    kept = written(path, "lightmap")
-    rewrite(path, tensors={"times": lambda v: v.reshape(2, 2)})
-    refused(kept, path, "part times is float32 (2, 2), expected float32 or float64 (any)")
-    for wrong in (lambda v: v.reshape(2, 2), lambda v: v.astype(np.float32)):
-        written(path, "lightmap")
-        rewrite(path, tensors={"0.kind": wrong})
-        refused(kept, path, "part kind is ", "expected uint8 (4)")
 
 
 def test_a_few_bytes_that_claim_a_large_lightmap(path):

@@ -94,14 +94,6 @@ def test_body_over_everything(device: str):
     assert box.mass() == 0.0
 
 
-@pytest.mark.parametrize("inlet", [False, True])
-def test_one_voxel(inlet: bool, device: str):
-    box = _box(device, (1, 1, 1), inlet)
-    box.step(50)
-    assert np.isfinite(box.velocity().numpy()).all()
-    assert box.mass() == pytest.approx(1.0, abs=1e-6)
-
-
 def test_too_fast(device: str):
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     for wrong in (

@@ -216,9 +216,6 @@ def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: Path):
     blown, kept = int(words[words.index("step") + 1]), int(words[words.index("kept") - 2])
     assert solver.lattice.steps <= blown + CHECK_EVERY + 2
     assert 8 <= kept <= blown
-    again = make()
-    again.load(path)
-    assert again.lattice.steps == kept
     # An error names the file that was loaded if there is none newer; a state that blew up isn't saved over it.
     content = path.read_bytes()
     with pytest.raises(WlmError, match="blew up in step"):
@@ -226,12 +223,9 @@ def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: Path):
     assert path.read_bytes() == content
     resumed = make()
     resumed.load(path)
+    assert resumed.lattice.steps == kept and np.isfinite(resumed.lattice.velocity().numpy()).all()
     with pytest.raises(WlmError, match=re.escape(f"; the state of step {kept} is kept in {path}")):
         resumed.step(500)
-    assert np.isfinite(_numbers(again)).all() and np.isfinite(again.lattice.velocity().numpy()).all()
-    again.step(1)
-    with pytest.raises(WlmError, match="blew up"):
-        solver.step(1)
 
 
 def test_no_smoke(device: str):

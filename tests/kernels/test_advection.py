@@ -157,8 +157,7 @@ def test_a_turn_converges(scheme: str, order: float, most: float, device: str):
     assert np.log2(errors[0] / errors[1]) >= order
 
 
-@pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize(("scheme", "storage"), [("maccormack", "float32"), ("semi-lagrangian", "float16")])
 def test_a_constant_stays(scheme: str, storage: str, device: str):
     """In any air, where nothing comes in: bit for bit, and to rounding beside solids."""
     rng = np.random.default_rng(2)

@@ -108,21 +108,6 @@ def test_what_is_not_there():
 DEMO = Path(__file__).resolve().parents[2] / "demos" / "data" / "city"
 
 
-def test_frames_at_run_time(device):
-    """The blocks are of all modes."""
-    model = random_sheet((4, 3, 1, 4))
-    runtime = FrameDecoder(model, device)
-    assert runtime.numbers.tolist() == [0, 3]
-    for time in (7.5, 10.0, 23.0):
-        off = np.abs(codes_at(runtime, time)[..., :3] - 255.0 * shares_of(model, [0, 3], time))
-        assert off.max() < (0.51 if time == 7.5 else 1.51)
-        np.testing.assert_allclose(runtime.bounds, [bound64(model, number, time) for number in (0, 3)], rtol=1e-6)
-    with pytest.raises(WlmError, match="finite"):
-        runtime.set_time(float("nan"))
-    with pytest.raises(WlmError, match="expected at least one tile that is stored as frames"):
-        FrameDecoder(random_sheet((3, 0)), device)
-
-
 def test_the_blocks_that_a_read_reaches():
     mask = np.zeros((250, 260), bool)
     mask[125, 130] = mask[249, 0] = True
