@@ -257,7 +257,7 @@ def test_an_index_beyond_the_vertices(tmp_path):
         ("data:;base64,?", "buffers[0].uri: expected base64"),
         ("data:;base64", "buffers[0].uri: expected a data: URI with a comma"),
         ("data:;base64,AAAA", "buffers[0]: expected 500 bytes, found 3"),
-        (None, "buffers[0]: has no uri, and the file has no binary chunk"),
+        (None, "buffers[0]: expected a uri; only buffers[0] of a .glb with a binary chunk has none"),
     ],
 )
 def test_a_buffer_that_cannot_be_read(tmp_path, uri, words):

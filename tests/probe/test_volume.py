@@ -578,7 +578,7 @@ def test_side_follows_the_spacing():
     assert len(BlockIndex(lattice, finest_side(lattice), (1,)).block) >= 2 * len(lattice)
     assert finest_side(np.zeros((0, 3))) == finest_side(np.ones((5, 3))) == 1.0
     for position in (np.array([[0, np.nan, 0]]), np.full((1, 3), 1e101)):
-        with pytest.raises(ValueError, match="position: expected numbers"):
+        with pytest.raises(ValueError, match="position: expected probes"):
             BlockIndex(position, 1.0, (1,))
     with pytest.raises(WlmError, match="positions: expected distances"):
         finest_side(np.array([[0.0, 0.0, 0.0], [1e300, 1e300, 1e300]]))
