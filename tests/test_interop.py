@@ -131,28 +131,6 @@ def test_each_call_of_a_step_graph_is_one_step(device, warmup):
         assert graph.captured == (device != "cpu" and count > warmup)
 
 
-def test_a_captured_optimiser_step_equals_an_eager_one(device):
-    def train(captured: bool) -> torch.Tensor:
-        weight = torch.full((16,), 2.0, device=device, requires_grad=True)
-        gradient = torch.zeros(16, device=device)
-        weight.grad = gradient
-        optimiser = torch.optim.Adam([weight], lr=0.1, capturable=device != "cpu")
-        array, grad = to_warp(weight), to_warp(gradient)
-
-        def step() -> None:
-            gradient.zero_()
-            wp.launch(_add, dim=16, inputs=[array], outputs=[grad], device=device)
-            optimiser.step()
-
-        run = StepGraph(step, device) if captured else step
-        for _ in range(10):
-            run()
-        return weight.detach().clone()
-
-    assert torch.equal(train(True), train(False))
-    assert torch.all(train(True) < 1.5)
-
-
 def test_a_step_graph_passes_an_error_on_and_wants_a_warm_up(device):
     def broken() -> None:
         raise KeyError("x")

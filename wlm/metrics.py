@@ -329,8 +329,8 @@ class LostLight:
     Attributes:
         count: Number of such points among the brightest of their group.
         worst: The brightest counted point: its value, decoded value and location; None if `count` is 0.
-        hidden: Number of such points in groups where most points have an error of more than half of their own light
-            and the maximum is at least ten times the median.
+        hidden: Number of points with an error, up or down, of more than half of their own light, in groups where most
+            lit points have such an error and the maximum is more than ten times the median.
     """
 
     def __init__(self) -> None:

@@ -142,7 +142,7 @@ def _measured(
 
 
 def _levels(image: np.ndarray, mask: np.ndarray, block: int) -> tuple[np.ndarray, TileRanges]:
-    """Returns a lightmap as levels [H, W, 3] in [0, 1] relative to the range of each tile, and the ranges."""
+    """Gamma-encodes a lightmap; returns it as levels [H, W, 3], 0 to 1 within each tile's range, and the ranges."""
     codes, seen = to_codes(image), seen_texels(mask)
     ranges = TileRanges.of(codes, seen)
     return clear_unseen(ranges.levels(codes), seen, block), ranges

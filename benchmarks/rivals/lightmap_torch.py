@@ -30,7 +30,9 @@ _LEAST = 0.02  # smallest colour, over its scale, that weights an error: it keep
 
 @dataclass(frozen=True)
 class Features:
-    """Sizes of a tile's feature maps. F_uv and F_uvt take 8 bits a texel, in blocks; F_ut and F_vt 8 bits a channel.
+    """Sizes of a tile's feature maps, as `wlm.lightmap` has them.
+
+    F_uv and F_uvt take 8 bits a texel, in blocks; F_ut and F_vt 8 bits a channel.
 
     Attributes:
         uv: Number of maps F_uv over texture coordinates u and v, each of 128 x 128 texels and 4 channels.

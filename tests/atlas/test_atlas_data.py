@@ -456,13 +456,6 @@ def test_each_picture_of_a_folder_is_a_sheet(tmp_path):
     assert "box.exr and wall.exr are both lightmaps of room" in found.problems[1] and not found.command
 
 
-def test_the_list_in_a_folder_is_read(tmp_path):
-    picture(tmp_path / "noon.exr", 16)
-    entries = [{"time_hours": 12, "file": "noon.exr"}]
-    (tmp_path / "set.json").write_text(json.dumps({"width": 16, "height": 16, "lightmaps": entries}))
-    assert read_listing(tmp_path).states == ("12 h",)
-
-
 MAP_SIDE = 96
 
 

@@ -439,15 +439,3 @@ def test_visibility_of_one_side_and_of_none_and_at_the_end():
     mesh = from_arrays(position, np.array([[0, 1, 2]]), np.array([[1 - 1e-7, 1], [1, 1], [1, 1 - 1e-7]]), waves())
     count = visibility(mesh, [View.of([0, 0, 1])], 32, 8, 8, "cpu").numpy()
     assert count[7, 7] == count.sum() > 50
-
-
-def test_views_that_are_refused():
-    mesh, views = lit_cube(1), sphere_views(1)
-    with pytest.raises(ValueError, match="at least 1"):
-        visibility(mesh, views, 16, 0, 4, "cpu")
-    with pytest.raises(WlmError, match="gpu"):
-        visibility(mesh, views, 16, 4, 4, "gpu")
-    with pytest.raises(ValueError, match="16,?384|height"):
-        list(visible_uv(mesh, views, 0, "cpu"))
-    for tensor in next(visible_uv(mesh, views, 16, "cpu")):
-        assert isinstance(tensor, torch.Tensor) and not tensor.requires_grad

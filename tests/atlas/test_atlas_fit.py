@@ -231,18 +231,6 @@ def test_a_budget_without_room_for_tiles():
         assert 1.0 - model.compression_ratio <= budget
 
 
-def test_wrong_settings():
-    for arguments, line in (
-        ({"device": "tpu"}, "device 'tpu'"),
-        ({"profile": "none"}, "profile 'none' of atlas"),
-        ({"budget": 0.0}, "budget: expected"),
-        ({"bugdet": 0.1}, "unknown key 'bugdet'; did you mean 'budget'"),
-        ({"profile": "paper", "budget": 0.1}, "budget: expected none for method cascade"),
-    ):
-        with pytest.raises(WlmError, match=line):
-            compress(sheet(), **arguments)
-
-
 @pytest.mark.parametrize(
     ("name", "texels"), [*((name, (1, 1)) for name in NAMES), ("standard", (4, 4)), ("standard", (2, 256))]
 )
@@ -298,8 +286,8 @@ def test_tiles_of_blocks(name: str):
     assert owner.max() == 1
 
 
-FAST = [("standard", "soft"), (PLAIN, "noise"), ("astc", "stripes")]
 CASES = [(name, kind) for name in NAMES for kind in ("soft", "noise", "stripes")]
+FAST = [("standard", "soft"), (PLAIN, "noise")]
 
 
 @pytest.mark.parametrize(

@@ -354,28 +354,6 @@ def test_entries(colour: str):
             pack_entries(*each, blocks, code)
 
 
-def test_layout_of_two_textures():
-    """Rectangles lie apart in textures of their own, blocks on whole ones, and all bits are within the room."""
-    random = np.random.default_rng(1)
-    sizes = allocation.sizes_of(Profile(name="a", colour="mixed", tile=11))
-    bits = np.array([size.bits for size in sizes])
-    assert bits.min() == 32 and max(size.nx for size in sizes) == 12
-    error = random.random((len(sizes), 60)) ** 4 / bits[:, None]
-    room = 60 * 700.0
-    packed = allocation.layout(error, sizes, room, 0.0)
-    chosen = [sizes[number] for number in packed.chosen]
-    assert {size.second for size in chosen} == {False, True}
-    used = [np.zeros(shape, int) for shape in packed.shapes]
-    for size, (x, y) in zip(chosen, packed.first, strict=True):
-        assert not size.second or (x % 4 == 0 and y % 4 == 0)
-        used[size.second][y : y + size.ny, x : x + size.nx] += 1
-    assert [image.max() for image in used] == [1, 1] and [image.sum() for image in used] == [
-        sum(size.nx * size.ny for size in chosen if size.second == second) for second in (False, True)
-    ]
-    assert room * 0.85 < 32 * used[0].size + 8 * used[1].size <= room
-    assert allocation.layout(error, sizes, 60 * 31.0, 0.0) is None
-
-
 def _smooth(height: int, width: int) -> np.ndarray:
     y, x = np.mgrid[:height, :width] / 20.0
     return (0.5 + (np.sin(y + 0.5) * np.cos(x) + 1.0) ** 2)[..., None] * np.array([1.0, 0.8, 0.5])
@@ -427,15 +405,6 @@ def test_what_is_refused():
             decode(bad, 8, 8, "astc")
     with pytest.raises(ValueError, match="uint8"):
         decode(blocks[:0], 0, 8, "astc")
-
-
-def test_a_block_that_breaks_the_format():
-    blocks, _ = encode(_smooth(8, 12), "astc")
-    blocks[4] = 0  # a reserved block mode
-    with pytest.raises(WlmError, match="row 1, column 1"):
-        decode(blocks, 8, 12, "astc")
-    # BC6H has a colour for every pattern: reserved modes are black.
-    assert not decode(np.full((1, 16), 0b10011, np.uint8), 4, 4, "bc6h").any()
 
 
 def test_a_missing_package_names_the_extra(monkeypatch):

@@ -263,11 +263,3 @@ def test_too_large():
     mesh = _mesh(_quad(5, 5, 50, 30))
     with pytest.raises(WlmError, match="array: scale: too large: .* expected at most 16384 a side"):
         pack(mesh, None, 400.0)
-
-
-def test_wrong_arguments():
-    mesh = _mesh(_quad(5, 5, 8, 6))
-    with pytest.raises(ValueError, match="scale: expected a number above 0, got 0"):
-        pack(mesh, None, 0.0)
-    with pytest.raises(ValueError, match="clusters: expected groups of 2 triangles, got those of 3"):
-        pack(mesh, grouped([0, 1, 2]), 0.5)

@@ -1,7 +1,5 @@
 """Ablation of the cascade on two small lightmaps: rows are of what they name."""
 
-import sys
-
 import pytest
 from builders.atlas_meshes import charts, sheet
 from builders.bench_rows import check_outputs, keys
@@ -61,9 +59,3 @@ def test_each_row_lacks_its_part(rows):
     assert cube["ASTC"]["bpp"] < whole["bpp"] and cube["ASTC"]["colour_width"] == whole["colour_width"]
     assert cube["scale 0.3"]["lut_width"] < whole["lut_width"] < cube["lut_scale 1"]["lut_width"]
     assert cube["colour_scale 0.8"]["colour_width"] == pytest.approx(2 * whole["colour_width"], abs=1)
-
-
-def test_a_missing_package(lightmaps, monkeypatch):
-    monkeypatch.setitem(sys.modules, "astc_encoder", None)  # as if it weren't installed
-    missing, kept = run_rows(lightmaps[:1], PROFILE, ["ASTC", "no repacking"], device="cpu", **VIEWS)[::-1]
-    assert not missing.figures and "astc_encoder is missing" in missing.notes and kept["psnr"] > 5.0

@@ -7,9 +7,8 @@ import pytest
 from builders.bench_rows import check_outputs, keys
 
 import benchmarks.lightmap as bench
-from benchmarks.lightmap import PANELS, _quick_times, run, run_rows
+from benchmarks.lightmap import PANELS, run, run_rows
 from benchmarks.rivals.lightmap import FEW, usual
-from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.profile import Profile
 
@@ -108,13 +107,6 @@ def test_frames_have_nothing_to_fit(lightmaps):
     assert rows[0]["psnr"] > 45.0 and rows[0]["decode_ms"] > 0.0 and rows[0]["load_ms"] > 0.0
 
 
-def test_what_is_refused(lightmaps):
-    with pytest.raises(WlmError, match="device 'tpu'"):
-        run_rows(lightmaps, [Profile(name="M")], device="tpu", chosen=[0])
-    with pytest.raises(ValueError, match="at least one profile and one time"):
-        run_rows(lightmaps, [Profile(name="M")], device="cpu", chosen=[])
-
-
 def test_a_quick_run_has_few_rivals_and_a_full_one_all(monkeypatch):
     calls = []
     monkeypatch.setattr(bench, "load", lambda path: from_arrays(np.ones((1, 8, 8, 3)), [12.0]))
@@ -136,10 +128,3 @@ def test_the_rivals_alone(rows, lightmaps, monkeypatch):
         assert row["psnr"] == beside[row.method, row.option]["psnr"] and row["times_scored"] == 3
     (one,) = run(quick=True, device="cpu", set_path="set", rival_names=["bc7"])
     assert one.figures["psnr"] == alone[0]["psnr"]
-
-
-def test_quick_times():
-    assert _quick_times(np.array([0.0, 9.0, 12.0, 18.45, 21.0])).tolist() == [1, 2, 4]
-    assert _quick_times(np.arange(7.0)).tolist() == [0, 3, 6]
-    assert _quick_times(np.array([5.0])).tolist() == [0]
-    assert _quick_times(np.array([1.0, 2.0])).tolist() == [0, 1]

@@ -71,58 +71,6 @@ def test_panels_name_the_rows_that_have_their_values(tmp_path, as_text):
     assert [p.name for p in tmp_path.iterdir()] == ["p.svg"]
 
 
-def test_a_panel_of_errors_shows_its_methods_and_falls(tmp_path, as_text, monkeypatch):
-    from matplotlib.figure import Figure
-
-    seen = []
-    original = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (seen.extend(self.axes), original(self, *a, **k))[1])
-    path = tmp_path / "p.svg"
-    costs = [(4.0, 1e-7), (2.0, 1e-6), (3.0, 1e-5), (1.0, 1e-2)]
-    rows = [
-        Row("probe", "city", "decode", f"way {i}", {"decode_ms": x, "max_error": y}) for i, (x, y) in enumerate(costs)
-    ]
-    figures = {"decode_ms": 0.5, "max_error": 1e-9, "psnr": 40.0, "bpp": 5.0}
-    other = Row("probe", "city", "ours", "standard", figures)
-    plot([*rows, other], path, x=(Panel("bpp"), Panel("decode_ms", "max_error", ("decode",))))
-    texts = svg_texts(path)
-    assert texts.count("ours standard") == 1 and texts.count("largest error") == 1
-    assert all(texts.count(f"decode way {i}") == 1 for i in range(4))
-    axes = seen[1]
-    assert axes.get_yscale() == "log" and seen[0].get_yscale() == "linear"
-    # The front passes the three that no other beats, from the quickest to the most exact, and way 2 lies above it.
-    front = next(line for line in axes.lines if len(line.get_xdata()) == 4)
-    assert front.get_xydata()[:3].tolist() == [[1.0, 1e-2], [2.0, 1e-6], [4.0, 1e-7]]
-
-
-def test_labels_of_a_crowd_do_not_overlap(tmp_path, monkeypatch):
-    """Eight rows in a small corner: the boxes of their labels stay apart and inside the picture."""
-    from matplotlib.figure import Figure
-    from matplotlib.text import Text
-
-    seen = {}
-    original = Figure.savefig
-
-    def spy(self, *args, **kwargs):
-        renderer = self.canvas.get_renderer()
-        self.canvas.draw()
-        seen["frame"] = self.axes[0].get_window_extent(renderer)
-        names = [text for text in self.axes[0].texts if text.get_text() != "Pareto front"]
-        seen["boxes"] = [Text.get_window_extent(text, renderer) for text in names]
-        return original(self, *args, **kwargs)
-
-    monkeypatch.setattr(Figure, "savefig", spy)
-    places = [(1.0 + 0.01 * (i % 3), 40.0 + 0.05 * i) for i in range(8)]
-    crowd = [Row("l", "c", "method", f"no {i}", {"bpp": x, "psnr": y}) for i, (x, y) in enumerate(places)]
-    plot([*crowd, Row("l", "c", "far", "", {"bpp": 8.0, "psnr": 50.0})], tmp_path / "p.png", x="bpp")
-    boxes = seen["boxes"]
-    assert len(boxes) == 9
-    for i, a in enumerate(boxes):
-        assert seen["frame"].x0 <= a.x0 and a.x1 <= seen["frame"].x1
-        for b in boxes[:i]:
-            assert a.x1 <= b.x0 or b.x1 <= a.x0 or a.y1 <= b.y0 or b.y1 <= a.y0
-
-
 @pytest.mark.parametrize(
     ("rows", "name", "x", "message"),
     [

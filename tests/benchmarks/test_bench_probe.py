@@ -6,7 +6,6 @@ from builders.bench_rows import check_outputs, keys
 
 import benchmarks.probe as bench
 from benchmarks.probe import PANELS, run, run_rows
-from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
 from wlm.probe.views import KINDS
@@ -94,10 +93,3 @@ def test_rivals_alone_are_the_same(sets, rows, monkeypatch):
     assert keys(alone) == keys(beside)
     for name in ("bytes", "psnr"):
         assert [row.get(name) for row in alone] == [row.get(name) for row in beside]
-
-
-def test_what_is_refused(sets):
-    with pytest.raises(WlmError, match="device 'tpu'"):
-        run_rows(sets, PROFILES, device="tpu", ratios=(), shares=(), frames=1)
-    with pytest.raises(ValueError, match="at least one set and one profile"):
-        run_rows(sets, [], device="cpu", ratios=(), shares=(), frames=1)

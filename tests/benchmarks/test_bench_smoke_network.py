@@ -1,6 +1,5 @@
 """The networks' benchmark on tiny grids: every row has its figures, and they agree with what they are of."""
 
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,22 +10,19 @@ from builders.bench_rows import by_option, check_outputs
 
 import benchmarks.smoke_network as bench
 from benchmarks import path_tracer
-from benchmarks.path_tracer import PathTracer, choose_variant, denoise
+from benchmarks.path_tracer import PathTracer, denoise
 from benchmarks.runner import Bench
 from benchmarks.smoke_network import (
-    FULL,
     PANELS,
     QUICK,
     NetworkBench,
     Subject,
     open_subjects,
     plotted,
-    run,
     run_rows,
     score,
 )
 from wlm.errors import WlmError
-from wlm.smoke.codec import shipped
 from wlm.smoke.march.six_way import bake
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
@@ -158,16 +154,6 @@ def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     assert points[0].option == "step 4" and points[-3].option == "h 0.8, nodes 4"
 
 
-def test_networks_and_profiles_of_a_run(monkeypatch):
-    calls = []
-    monkeypatch.setattr(bench, "run_rows", lambda sizes, subjects, **options: calls.append((sizes, subjects)))
-    run(quick=True, device="cpu")
-    run(profiles=["paper"], quick=False, device="cpu")
-    (first, shipped_ones), (second, untrained) = calls
-    assert (first, second) == (QUICK, FULL)
-    assert [each.name for each in (*shipped_ones, *untrained)] == [shipped().stem, "network-paper untrained"]
-
-
 def test_without_the_extra(monkeypatch):
     monkeypatch.setattr(path_tracer, "has_tracer", lambda: False)
     monkeypatch.setattr(path_tracer, "has_denoiser", lambda: False)
@@ -202,19 +188,6 @@ def test_a_path_tracer_finds_the_same_light():
 def _plume():
     volume = make_plume(24, hot=False, extinction=14.0)
     return volume, make_camera(CameraSettings(resolution=24).turned(20.0), volume.origin, (1.0, 1.0, 1.0))
-
-
-@pytest.mark.parametrize(
-    ("backends", "llvm", "variant"),
-    [(("llvm",), 19, "llvm_ad_rgb"), (("llvm",), 18, "scalar_rgb"), (("cuda",), 19, "scalar_rgb")],
-)
-def test_the_variant_is_the_fastest_that_works(monkeypatch, backends, llvm, variant):
-    detail = SimpleNamespace(llvm_version=lambda: (llvm, 1, 0))
-    names = SimpleNamespace(LLVM="llvm")
-    module = SimpleNamespace(JitBackend=names, has_backend=lambda name: name in backends, detail=detail)
-    monkeypatch.setitem(sys.modules, "drjit", module)
-    monkeypatch.setattr(path_tracer, "has_tracer", lambda: True)
-    assert choose_variant() == variant
 
 
 @pytest.mark.parametrize("denoiser", [True, False])

@@ -33,12 +33,10 @@ class Command:
 
 @dataclass
 class Counts:
-    """Counts of the kills of one command."""
+    """Kills of one command by signal, and runs that came to an end."""
 
     kills: dict[str, int] = field(default_factory=lambda: {"SIGKILL": 0, "SIGTERM": 0})
     runs: int = 0
-    saved: int = 0
-    lost: float = 0.0
 
 
 def drive(command: Command, folder: Path, *, kills: int, seed: int) -> Counts:
@@ -101,13 +99,12 @@ class Run:
                 stderr=errors,
                 env=environment,
             )
-        self.start, self.number, self._begin = time.monotonic(), 0, None
+        self.start, self.number = time.monotonic(), 0
 
     def wait_for_work(self) -> float:
         """Waits for a sign of work; returns the seconds since the start."""
         while self.process.poll() is None and not self._works():
             time.sleep(0.002)
-        self._begin = time.time()
         return time.monotonic() - self.start
 
     def _works(self) -> bool:
@@ -126,18 +123,8 @@ class Run:
         """Sends a signal, and counts it if the process is stopped by it."""
         self.number = number
         self.process.send_signal(number)
-        now = time.time()
-        if self.wait() == 0:
-            return
-        counts.kills[signal.Signals(number).name] += 1
-        if self.command.partial is None:
-            return
-        # Of frames each is a save.
-        kept = [self.command.partial(self.output), *(self.output.iterdir() if self.output.is_dir() else ())]
-        saves = [path.stat().st_mtime for path in kept if path.exists()]
-        counts.saved += kept[0].exists()
-        if number == signal.SIGKILL and self._begin is not None:
-            counts.lost = max(counts.lost, now - max([self._begin, *saves]))
+        if self.wait() != 0:
+            counts.kills[signal.Signals(number).name] += 1
 
     def wait(self) -> int:
         return self.process.wait(LONGEST)

@@ -32,9 +32,17 @@ def _leaf(values: np.ndarray, kind: str, bits: int) -> bytes:
     return head + struct.pack("<2f", low, quantum) + bytes(8) + packed.tobytes()
 
 
-def raw_grid(values: np.ndarray, kind: str = "float", name: str = "density", group: int = FOG, bits: int = 8) -> bytes:
-    """A grid of values [X, Y, Z], multiples of 8, from voxel (0, 0, 0) on, with voxels of 0.5; leaves of one value are
-    tiles."""
+def raw_grid(
+    values: np.ndarray,
+    kind: str = "float",
+    name: str = "density",
+    group: int = FOG,
+    bits: int = 8,
+    voxel: float = 0.5,
+    origin: tuple[float, float, float] = (1, 2, 3),
+) -> bytes:
+    """A grid of values [X, Y, Z], multiples of 8, from voxel (0, 0, 0) on, whose centre is `origin`; leaves of one
+    value are tiles."""
     wide = kind == "double"
     number, top = ("<d" if wide else "<f"), (96 if wide else 64)
     bits = {"fp4": 4, "fp8": 8, "fp16": 16}.get(kind, bits)
@@ -65,8 +73,8 @@ def raw_grid(values: np.ndarray, kind: str = "float", name: str = "density", gro
     head = struct.pack("<8sQ2I2IQ", b"NanoVDB1", 0, _VERSION, 0, 0, 1, 672 + len(nodes)) + name.encode().ljust(
         256, b"\0"
     )
-    head = head.ljust(384, b"\0") + struct.pack("<9d", *(0.5 * np.eye(3)).ravel())
-    head = head.ljust(528, b"\0") + struct.pack("<3d", 1, 2, 3)
+    head = head.ljust(384, b"\0") + struct.pack("<9d", *(voxel * np.eye(3)).ravel())
+    head = head.ljust(528, b"\0") + struct.pack("<3d", *origin)
     return head.ljust(632, b"\0") + struct.pack("<2I", group, _TYPES[kind]).ljust(40, b"\0") + nodes
 
 

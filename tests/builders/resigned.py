@@ -54,14 +54,3 @@ def rewrite_number(path: Path, key: str, text: str) -> None:
     digest = re.search(rb'"wlm":"[^"]* ([0-9a-f]{32})"', content)[1]
     content = content.replace(digest, b"0" * 32, 1)
     path.write_bytes(content.replace(b"0" * 32, hashlib.blake2b(content, digest_size=16).hexdigest().encode(), 1))
-
-
-def put(index: Any, value: float) -> Callable[[np.ndarray], np.ndarray]:
-    """A change of one number of a part."""
-
-    def change(array: np.ndarray) -> np.ndarray:
-        array = array.copy()
-        array[index] = value
-        return array
-
-    return change

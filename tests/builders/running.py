@@ -43,23 +43,18 @@ def report_always(monkeypatch):
     monkeypatch.setattr(Meter, "due", lambda self, done: True)
 
 
-def press_ctrl_c(monkeypatch):
-    """Makes every report of progress of a command come with a Ctrl-C."""
+def check_a_stop_is_resumed(monkeypatch, folder, words):
+    """Stops a compression by Ctrl-C: it is kept, not taken for one of another seed, and resumed to the same bytes."""
+    whole, out = folder / "whole.wlm", folder / "a.wlm"
 
     @contextmanager
     def bar(what):
         yield lambda done, total, text: os.kill(os.getpid(), signal.SIGINT)
 
-    report_always(monkeypatch)
-    monkeypatch.setattr(wlm.cli.console, "progress_bar", bar)
-
-
-def check_a_stop_is_resumed(monkeypatch, folder, words):
-    """Stops a compression by Ctrl-C: it is kept, not taken for one of another seed, and resumed to the same bytes."""
-    whole, out = folder / "whole.wlm", folder / "a.wlm"
     call(*words, "-o", whole)
     with monkeypatch.context() as patched:
-        press_ctrl_c(patched)
+        report_always(patched)
+        patched.setattr(wlm.cli.console, "progress_bar", bar)
         assert call(*words, "-o", out, code=130) == ""
     stopped = f"stopped at step 5: repeat the command with --resume to continue from {out}.partial"
     assert [line for line in call.stderr.splitlines() if not line.startswith("warning: ")] == [stopped]

@@ -1,35 +1,9 @@
-"""Engines' texture files taken apart and made by their specifications' offsets, with no code of ours."""
+"""Engines' texture files made by their specifications' offsets, with no code of ours."""
 
 import struct
 import zlib
-from dataclasses import dataclass
-from pathlib import Path
 
 import imagecodecs
-
-from wlm.formats.dds import DXGI_FORMATS
-
-
-@dataclass(frozen=True)
-class Texture:
-    """The size in texels, the format's name, and the texels or blocks."""
-
-    width: int
-    height: int
-    fmt: str
-    data: bytes
-
-
-def open_dds(path: Path) -> Texture:
-    """A DDS file with a DX10 header."""
-    content = path.read_bytes()
-    height, width = struct.unpack_from("<2I", content, 12)
-    (number,) = struct.unpack_from("<I", content, 128)
-    return Texture(width, height, _name(DXGI_FORMATS, number), content[148:])
-
-
-def _name(formats: dict[str, int], number: int) -> str:
-    return {value: name for name, value in formats.items()}[number]
 
 
 def make_ktx2(

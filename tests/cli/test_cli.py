@@ -1,7 +1,6 @@
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -60,13 +59,6 @@ def test_the_version_is_quick_to_tell():
     )
     done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False)
     assert done.returncode == 0
-
-
-def test_help_lists_the_commands():
-    verbs = "compress evaluate decode export info inspect view web doctor probe smoke bake"
-    assert set(verbs.split()) <= set(call().split())
-    for group, commands in {"probe": "volume", "smoke": "simulate bake shade flipbook train export-onnx"}.items():
-        assert set(commands.split()) <= set(call(group, "--help").split())
 
 
 def test_doctor_names_the_devices_and_the_cache():
@@ -237,27 +229,6 @@ def test_an_unknown_exception_is_a_bug_and_shows(fitted, monkeypatch):
 def test_a_ctrl_c_is_kept_and_resumed_to_the_same_bytes(folder, profile, tmp_path, monkeypatch):
     words = ["compress", folder, "--profile", profile, "--steps", 40]
     check_a_stop_is_resumed(monkeypatch, tmp_path, words)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_keeps_the_fit(number, code, folder, profile, tmp_path):
-    # Ten thousand times more steps than can be done before the signal comes.
-    words = ["compress", folder, "--profile", profile, "--steps", 3_000_000]
-    program = (
-        "import sys\nfrom wlm.cli import main\nfrom wlm.cli import console\n"
-        "console._PLAIN_REPORTS = 10**7\nmain()\n"  # a line at every report
-    )
-    with spawn(*words, "-o", tmp_path / "a.wlm", code=program) as process:
-        for line in process.stderr:
-            if line.startswith("fit: "):
-                process.send_signal(number)
-                break
-        text, errors = process.communicate()
-    assert process.returncode == code and text == ""
-    assert re.search(r"^stopped at step \d+: .* --resume to continue from .+a\.wlm\.partial$", errors, re.MULTILINE)
-    assert "Traceback" not in errors
-    assert [path.name for path in tmp_path.iterdir()] == ["a.wlm.partial"]
 
 
 def test_a_closed_pipe_is_no_traceback():

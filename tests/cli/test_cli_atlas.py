@@ -118,15 +118,6 @@ def test_wrong_words_are_one_line(inputs, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-def test_an_interrupt_leaves_nothing(inputs, tmp_path, monkeypatch):
-    def interrupted(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(wlm.atlas, "compress", interrupted)
-    call("compress", *inputs, "-o", tmp_path / "a.wlm", code=130)
-    assert os.listdir(tmp_path) == []
-
-
 @pytest.mark.parametrize("kind", ["tiles", "cascade"])
 def test_evaluate(kind, inputs, request, tmp_path):
     """The report of the library."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from builders.nvdb_files import LEVEL_SET, nvdb_file, raw_grid
-from builders.vdb_files import ACTIVE_MASK, ZIP, scaled, tree, vdb_file
+from builders.vdb_files import ACTIVE_MASK, scaled, tree, vdb_file
 
 from wlm.errors import WlmError
 from wlm.fluid.grids import choose
@@ -37,9 +37,9 @@ def distances(shape: tuple[int, int, int] = (16, 16, 16)) -> np.ndarray:
     return np.clip(np.linalg.norm(places, axis=-1) - 5, -3, 3).astype(np.float32)
 
 
-def grid(values: np.ndarray, background: float = 0.0, one: str = "f", edge: float = 0.5) -> tuple:
-    nodes = tree(values, np.ones(values.shape, bool), ACTIVE_MASK, False, background, one)
-    return scaled(edge, edge, edge), nodes, ACTIVE_MASK, False
+def grid(values: np.ndarray, background: float = 0.0) -> tuple:
+    nodes = tree(values, np.ones(values.shape, bool), ACTIVE_MASK, False, background)
+    return scaled(0.5, 0.5, 0.5), nodes, ACTIVE_MASK, False
 
 
 def write(path: Path, *names: str, values: np.ndarray | None = None) -> Path:
@@ -114,18 +114,6 @@ def test_nanovdb_that_claims_too_much(tmp_path: Path):
         path.write_bytes(bytes(data))
         with pytest.raises(WlmError, match=rf"a\.nvdb: .*{message}"):
             load_volume(path)
-
-
-def test_doubles_of_openvdb(tmp_path: Path):
-    values = smoke().astype(np.float64)
-    for flags in (ACTIVE_MASK, ACTIVE_MASK | ZIP):
-        for half in (False, True):
-            nodes = tree(values, values > 0.6, flags, half, 0.0, "d")
-            data = vdb_file({"density|fog volume|double": (scaled(0.5, 0.5, 0.5), nodes, flags, half)})
-            (tmp_path / "a.vdb").write_bytes(data)
-            np.testing.assert_allclose(
-                load_volume(tmp_path / "a.vdb", up="y").density, values, rtol=1e-3 if half else 0
-            )
 
 
 def test_tiles_that_overlap(tmp_path: Path):

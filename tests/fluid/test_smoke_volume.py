@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from builders.nvdb_files import nvdb_file, raw_grid
 from builders.vdb_files import ACTIVE_MASK, BLOSC, ZIP, affine, scaled, tree, vdb_file
 
 from wlm.errors import WlmError
@@ -18,28 +19,11 @@ from wlm.formats.vdb import VdbFile
 from wlm.inspection import inspect
 from wlm.smoke.data import load_frames
 
-_GRID_INDEX, _GRID_NAME, _HEADER, _METADATA = 24, 40, 16, 176
 
-
-def _nvdb(path: Path, density: np.ndarray, voxel: float = 0.5, at: tuple = (1.0, 2.0, 3.0)) -> None:
+def _nvdb(path: Path, density: np.ndarray) -> None:
     empty = 0.0 if density.ndim == 3 else (0.0,) * 3
-    volume = wp.Volume.load_from_numpy(density, min_world=at, voxel_size=voxel, bg_value=empty, device="cpu")
+    volume = wp.Volume.load_from_numpy(density, min_world=(1, 2, 3), voxel_size=0.5, bg_value=empty, device="cpu")
     volume.save_to_nvdb(path)
-
-
-def _joined(path: Path, parts: dict[str, Path]) -> None:
-    """Joins files of one unnamed grid into a file of several named ones."""
-    heads, grids = [], []
-    for i, (name, part) in enumerate(parts.items()):
-        data = part.read_bytes()
-        head, grid = data[_HEADER : _HEADER + _METADATA], bytearray(data[_HEADER + _METADATA + 1 :])
-        text = name.encode() + b"\0"
-        heads.append(head[:136] + struct.pack("<I", len(text)) + head[140:] + text)
-        grid[_GRID_INDEX : _GRID_INDEX + 8] = struct.pack("<II", i, len(parts))
-        grid[_GRID_NAME : _GRID_NAME + len(text)] = text
-        grids.append(bytes(grid))
-    first = next(iter(parts.values())).read_bytes()[:_HEADER]
-    path.write_bytes(first[:12] + struct.pack("<HH", len(parts), 0) + b"".join(heads) + b"".join(grids))
 
 
 def test_npz(tmp_path: Path, device: str):
@@ -149,9 +133,8 @@ def test_nvdb_of_two_grids(tmp_path: Path):
     """The grid named density needn't be the first; temperature is read too."""
     random = np.random.default_rng(1)
     density, hot = (random.uniform(0.1, 1, (8, 8, 8)).astype(np.float32) for _ in range(2))
-    for name, values in (("d", density), ("t", hot)):
-        _nvdb(tmp_path / f"{name}.nvdb", values)
-    _joined(tmp_path / "both.nvdb", {"temperature": tmp_path / "t.nvdb", "density": tmp_path / "d.nvdb"})
+    grids = [raw_grid(hot, name="temperature"), raw_grid(density)]
+    (tmp_path / "both.nvdb").write_bytes(nvdb_file(*grids))
     volume = load_volume(tmp_path / "both.nvdb")
     np.testing.assert_array_equal(volume.density, density)
     np.testing.assert_array_equal(volume.temperature, hot)
@@ -159,17 +142,12 @@ def test_nvdb_of_two_grids(tmp_path: Path):
     np.testing.assert_array_equal(by_name.density, hot)
     assert by_name.temperature is None
     with pytest.raises(
-        WlmError,
-        match="both.nvdb: heat: expected the name of one of the file's grids of floats, found temperature, density",
+        WlmError, match="both.nvdb: heat: expected the name of one of .* floats, found temperature .*, density"
     ):
         load_volume(tmp_path / "both.nvdb", temperature="heat")
     # Each in a segment of its own, as converters append them; and the temperature in finer voxels, further on.
-    _nvdb(tmp_path / "t.nvdb", np.ones_like(hot), voxel=0.25, at=(2.875, 2.0, 3.0))
-    parts = []
-    for name, letter in (("density", "d"), ("temperature", "t")):
-        _joined(tmp_path / "one.nvdb", {name: tmp_path / f"{letter}.nvdb"})
-        parts.append((tmp_path / "one.nvdb").read_bytes())
-    (tmp_path / "both.nvdb").write_bytes(b"".join(parts))
+    finer = raw_grid(np.ones_like(hot), name="temperature", voxel=0.25, origin=(2.875, 2, 3))
+    (tmp_path / "both.nvdb").write_bytes(nvdb_file(grids[1]) + nvdb_file(finer))
     volume = load_volume(tmp_path / "both.nvdb")
     np.testing.assert_array_equal(volume.density[:8], density)
     assert volume.origin == (0.75, 1.75, 2.75) and volume.shape == (9, 8, 8) and not volume.density[8].any()
@@ -177,32 +155,20 @@ def test_nvdb_of_two_grids(tmp_path: Path):
     np.testing.assert_allclose(volume.temperature[:, 1, 1], [0, 0, 0, 0, 1, 1, 1, 1, 0.0], atol=1e-5)
 
 
-def test_damaged_nvdb(tmp_path: Path):
-    """Cut short anywhere, or not the file at all: one line."""
-    path = tmp_path / "a.nvdb"
-    _nvdb(path, np.ones((8, 8, 8), np.float32))
-    whole = path.read_bytes()
-    for size in (0, 10, 16, 100, 192, 193, 500, 900, len(whole) // 2, len(whole) - 1):
-        path.write_bytes(whole[:size])
-        with pytest.raises(WlmError, match=r"a\.nvdb: cannot read the NanoVDB file"):
-            load_volume(path)
-    path.write_bytes(b"no volume at all" * 100)
-    with pytest.raises(WlmError, match="cannot read the NanoVDB file"):
-        load_volume(path)
-
-
-def test_unsupported_nvdb(tmp_path: Path):
-    """Grids of vectors are refused, and those whose voxels have no volume."""
+def test_wrong_nvdb(tmp_path: Path):
+    """Files cut short, other files, grids of vectors, and voxels that have no volume: one line."""
     path = tmp_path / "a.nvdb"
     _nvdb(path, np.ones((8, 8, 8, 3), np.float32))
-    with pytest.raises(WlmError, match="expected a grid of floats"):
-        load_volume(path)
-    _nvdb(path, np.ones((8, 8, 8), np.float32))
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<d", data, _HEADER + _METADATA + 1 + 384, 0.0)  # the first number of the map
-    path.write_bytes(data)
-    with pytest.raises(WlmError, match="expected an invertible transform to the world"):
-        load_volume(path)
+    whole = path.read_bytes()
+    for content, message in (
+        *((whole[:size], "cannot read the NanoVDB file") for size in (0, 16, 193, len(whole) // 2, len(whole) - 1)),
+        (b"no volume at all" * 100, "cannot read the NanoVDB file"),
+        (whole, "expected a grid of floats"),
+        (raw_grid(np.ones((8, 8, 8)), voxel=0.0), "expected an invertible transform to the world"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(WlmError, match=rf"a\.nvdb: .*{message}"):
+            load_volume(path)
 
 
 @pytest.mark.parametrize(
@@ -321,7 +287,8 @@ def test_what_openvdb_writes(tmp_path: Path):
 @pytest.mark.parametrize("half", [False, True])
 @pytest.mark.parametrize("packing", [0, ZIP, BLOSC])
 @pytest.mark.parametrize("masked", [0, ACTIVE_MASK])
-def test_each_way_of_storing(packing: int, masked: int, half: bool):
+@pytest.mark.parametrize("kind", ["float", "double"])
+def test_each_way_of_storing(kind: str, packing: int, masked: int, half: bool):
     """What isn't active has none, one or two values, the background, its negative or others."""
     values, active = smoke()
     ways = [(), (0.0,), (0.25,), (-0.25,), (0.25, -0.25), (0.25, 7.0), (3.0, 7.0), (3.0, 7.0, 9.0)]
@@ -332,8 +299,8 @@ def test_each_way_of_storing(packing: int, masked: int, half: bool):
         else:
             active[part] = True
     for background in (0.25, 0.0):
-        nodes = tree(values, active, packing | masked, half, background)
-        file = VdbFile(vdb_file({"a": (scaled(1, 1, 1), nodes, packing | masked, half)}), "a")
+        nodes = tree(values, active, packing | masked, half, background, kind[0])
+        file = VdbFile(vdb_file({f"a|fog volume|{kind}": (scaled(1, 1, 1), nodes, packing | masked, half)}), "a")
         grid = file.read("a", False)
         assert grid.low == (0, 0, 0)
         np.testing.assert_array_equal(grid.values, values)

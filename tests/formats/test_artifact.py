@@ -100,12 +100,6 @@ def test_the_safetensors_library_reads_it(artifact):
     assert json.loads(settings.translate(swap)) == SETTINGS
 
 
-def test_the_same_arguments_give_the_same_bytes(tmp_path, artifact):
-    again = tmp_path / "b.wlm"
-    size = write_artifact(again, "lightmap", SETTINGS, dict(reversed(_tensors().items())), SOURCE)
-    assert again.read_bytes() == artifact.read_bytes() and size == len(artifact.read_bytes())
-
-
 def test_a_source_of_zeros_is_not_taken_for_the_digest(tmp_path):
     path = tmp_path / "z.wlm"
     write_artifact(path, "probe", {"text": "0" * 32}, {}, "0" * 32)
@@ -120,18 +114,6 @@ def test_strided_and_big_endian_arrays_are_stored_as_their_values(tmp_path):
     found = read_artifact(path).tensors
     assert np.array_equal(found["t"], base.T) and np.array_equal(found["step"], base[:, ::2])
     assert np.array_equal(found["big"], base)
-
-
-def test_the_header_is_small(tmp_path):
-    tensors = {f"part_{i}": np.zeros((64, 32, 32, 2 + i), np.uint8) for i in range(7)}
-    settings = {f"setting_{i:02}": i * 0.125 for i in range(16)}
-    text = json.dumps(settings, separators=(",", ":"))
-    assert 290 <= len(text) <= 310
-    write_artifact(tmp_path / "a.wlm", "lightmap", settings, tensors, SOURCE)
-    found = read_artifact(tmp_path / "a.wlm")
-    # safetensors itself takes 48 bytes a tensor before its name and numbers; the settings cost no escapes.
-    assert found.header_bytes <= len(text) + 660
-    assert found.header_bytes % 8 == 0
 
 
 def test_no_later_change_of_the_file_reaches_an_artifact(artifact):
@@ -160,32 +142,11 @@ def test_other_files_are_refused(tmp_path):
     assert "expected a text of four words and settings" in _refusal(path)
 
 
-def test_a_file_cut_anywhere_is_refused(artifact):
-    whole = artifact.read_bytes()
-    for length in [*range(0, len(whole), 5), *range(len(whole) - 20, len(whole))]:
-        line = _refusal(artifact, whole[:length])
-        assert "cut short" in line or "found a file of" in line, (length, line)
-    assert "expected the end of the file, found 1 more" in _refusal(artifact, whole + b"\0")
-
-
-def test_any_changed_byte_is_found(artifact):
-    whole = artifact.read_bytes()
-    rng = np.random.default_rng(11)
-    # Every third byte once with a random other value, and some bits of the length and the metadata.
-    changes = [(place, int(rng.integers(1, 256))) for place in range(0, len(whole), 3)]
-    changes += [(place, 1 << bit) for place in range(120) for bit in (0, 7)]
-    for place, change in changes:
-        damaged = bytearray(whole)
-        damaged[place] ^= change
-        _refusal(artifact, damaged)
-    artifact.write_bytes(whole)
-    read_artifact(artifact)
-
-
 def test_a_changed_payload_or_name_is_told_by_the_digest(artifact):
     whole = artifact.read_bytes()
     message = "the artifact is damaged: its content does not match its digest"
     assert _refusal(artifact, whole[:-1] + bytes([whole[-1] ^ 1])) == message
+    assert "expected the end of the file, found 1 more" in _refusal(artifact, whole + b"\0")
     assert _refusal(artifact, whole.replace(b'"codes"', b'"coder"')) == message
     assert _refusal(artifact, whole.replace(b"'tile':128", b"'tile':129")) == message
     assert _refusal(artifact, whole.replace(SOURCE.encode(), SOURCE[::-1].encode())) == message

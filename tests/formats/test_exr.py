@@ -72,17 +72,6 @@ def test_channels_are_ordered_by_name_and_others_left_out(tmp_path):
     assert np.array_equal(pixels, np.stack([planes[name] for name in "RGB"], -1))
 
 
-def test_tiles_are_read(tmp_path):
-    path = tmp_path / "a.exr"
-    header = {
-        "compression": OpenEXR.PIZ_COMPRESSION,
-        "type": OpenEXR.tiledimage,
-        "tiles": OpenEXR.TileDescription(),
-    }
-    OpenEXR.File(header, _planes("RGB")).write(str(path))
-    assert np.array_equal(read_exr(path)[0], _pixels(3))
-
-
 @pytest.mark.parametrize("size", [(30, 50), (15, 50), (15, 20)])
 @pytest.mark.parametrize("corner", [(0, 0), (4, 3), (-2, -3), (-6, 12)])
 def test_the_data_window_is_placed_in_the_display_window(tmp_path, corner, size):
@@ -285,7 +274,7 @@ def test_a_file_cut_anywhere_is_refused_in_silence(tmp_path, kind, capfd):
         header["tiles"] = OpenEXR.TileDescription()
     OpenEXR.File(header, {"RGB": _pixels(3, 40, 9).astype(np.float16)}).write(str(path))
     whole = path.read_bytes()
-    read_exr(path)
+    np.testing.assert_array_equal(read_exr(path)[0], _pixels(3, 40, 9))
     # Every length near the ends, where the header, the chunk table and the last chunk end, and some between.
     lengths = [*range(0, 420, 7), *range(420, len(whole) - 20, 97), *range(len(whole) - 20, len(whole))]
     for length in lengths:

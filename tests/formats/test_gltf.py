@@ -12,7 +12,7 @@ from builders.checks import error_of
 from builders.gltf_maker import GltfMaker
 from scipy.spatial.transform import Rotation
 
-from wlm.formats.gltf import GltfPrimitive, document_from_arrays, read_gltf
+from wlm.formats.gltf import GltfPrimitive, read_gltf
 
 POINTS = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [2, 3, 1], [9, 9, 9]], np.float32)
 PLACES = np.array([[0, 0], [0.5, 0], [0, 0.75], [0.5, 0.75], [1, 1]], np.float32)
@@ -257,7 +257,7 @@ def test_an_index_beyond_the_vertices(tmp_path):
         ("data:;base64,?", "buffers[0].uri: expected base64"),
         ("data:;base64", "buffers[0].uri: expected a data: URI with a comma"),
         ("data:;base64,AAAA", "buffers[0]: expected 500 bytes, found 3"),
-        (None, "buffers[0]: has no uri, and the file has no binary chunk"),
+        (None, "buffers[0]: expected a uri; only buffers[0] of a .glb with a binary chunk has none"),
     ],
 )
 def test_a_buffer_that_cannot_be_read(tmp_path, uri, words):
@@ -283,11 +283,3 @@ def test_other_and_damaged_files_are_refused(tmp_path):
     assert "bytes at byte 12 exceeds the file of" in error_of(read_gltf, path)
     path.write_bytes(struct.pack("<4s2I", b"glTF", 2, 12))
     assert "no JSON chunk" in error_of(read_gltf, path)
-
-
-def test_a_document_of_arrays():
-    document, primitive = document_from_arrays(POINTS, TRIANGLES, PLACES, "thing")
-    np.testing.assert_array_equal(primitive.position, POINTS)
-    np.testing.assert_array_equal(primitive.triangle, TRIANGLES)
-    np.testing.assert_array_equal(primitive.uv[0], PLACES)
-    assert document.content["buffers"][0]["byteLength"] == len(document.buffers[0]) == 60 + 40 + 24

@@ -33,7 +33,7 @@ class Case:
 
     temporal: bool = True
     hidden: int = 16
-    gelu: str = "exact"
+    gelu: str = "tanh"
     samples: int = 256
     shape: tuple[int, int, int, int] = (12, 3, 7, 4)
     periodic: bool = True

@@ -85,7 +85,7 @@ def test_file_is_what_was_trained(device: str, temporal: bool, periodic: bool):
 
     Bit for bit on the CPU; a GPU's compiler may contract the same operations differently in two kernels.
     """
-    case = Case(temporal=temporal, periodic=periodic, gelu="tanh", samples=8192)
+    case = Case(temporal=temporal, periodic=periodic, samples=8192)
     fit = trainer(case, device)
     fit.run(6)
     model = _stored(fit, case)

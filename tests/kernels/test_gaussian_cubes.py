@@ -10,16 +10,11 @@ from kernels.compare import array
 from wlm.ops import plain
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
-from wlm_kernels.probe.cubes import Cubes, cube_of
+from wlm_kernels.probe.cubes import Cubes
 
 CUT = 3.0
 LOW, HIGH = [-0.2, 0.0, 0.1], [1.0, 0.7, 0.9]
 LOOSE = 3e-4  # of a reach: what a list may hold beyond what meets its cube
-
-
-@wp.kernel(enable_backward=False)
-def _cube_of(cubes: Cubes, x: wp.array1d[wp.vec3], out: wp.array1d[int]):
-    out[wp.tid()] = cube_of(cubes, x[wp.tid()])
 
 
 def _gaussians(count: int, anisotropy: float, longest: float = 0.2, seed: int = 1) -> np.ndarray:
@@ -65,7 +60,9 @@ def _distances(rows: np.ndarray, cubes: Cubes, support: str) -> np.ndarray:
     apart = np.maximum(low[:, None] - centre, 0.0) + np.minimum(high[:, None] - centre, 0.0)
     if support == "sphere":
         return np.linalg.norm(apart, axis=2) / reference.reach(rows, CUT, "sphere").max(1)
-    whiten = reference.whitening(torch.tensor(rows, dtype=torch.float64)).numpy()
+    exact_rows = torch.tensor(rows, dtype=torch.float64)
+    # W = S^-1 R^T.
+    whiten = (plain.rotations(exact_rows[:, 6:10]) / exact_rows[:, None, 3:6].exp()).transpose(1, 2).numpy()
     nearest = [
         reference.nearest(w, c, a, b) if (c < a).any() or (c > b).any() else 0.0
         for a, b in zip(low, high, strict=True)

@@ -9,7 +9,7 @@ from reference.single_light import march_lit
 
 from kernels.compare import array, close
 from wlm_kernels.smoke import march_six, marches
-from wlm_kernels.smoke.march import Medium, View, make_view, occupied
+from wlm_kernels.smoke.march import Medium, make_view, occupied
 from wlm_kernels.smoke.settings import March
 
 TYPES = {"float": wp.float32, "half": wp.float16}
@@ -31,18 +31,14 @@ def _scene(turned: bool, perspective: bool = False, inside: bool = False, seed: 
     return Scene(density, 0.3, origin, *axes, pitch, 14, 11, perspective)
 
 
-def _view(scene: Scene) -> View:
-    return make_view(
-        scene.origin, scene.right, scene.up, -scene.toward, scene.pitch, scene.width, scene.height, scene.perspective
-    )
-
-
 def _run(launch, planes: tuple, scene: Scene, device: str, *arguments, dtype=wp.float32, hot=None, **options):
     """Returns the result of a march; `hot`: temperature and emission."""
     heat = () if hot is None else (array(hot[0], dtype, device), hot[1])
     medium = Medium(array(scene.density, dtype, device), scene.extinction, *heat)
     out = wp.full((*planes, scene.height, scene.width), np.nan, dtype=float, device=device)
-    launch(medium, _view(scene), *arguments, out, **options)
+    s = scene
+    view = make_view(s.origin, s.right, s.up, -s.toward, s.pitch, s.width, s.height, s.perspective)
+    launch(medium, view, *arguments, out, **options)
     return out.numpy()
 
 
@@ -52,10 +48,6 @@ def _guide(scene: Scene, device: str, dtype=wp.float32, shared: bool = True, **m
 
 def _six(scene: Scene, device: str, dtype=wp.float32, hot=None, **march) -> np.ndarray:
     return _run(march_six.six_way, (8,), scene, device, March(**march), dtype=dtype, hot=hot)
-
-
-def _lit(scene: Scene, device: str, toward: np.ndarray, **march) -> np.ndarray:
-    return _run(march_lit, (), scene, device, toward, March(**march))
 
 
 @pytest.mark.parametrize(
@@ -168,14 +160,11 @@ def test_empty_bricks(device: str):
     toward = np.array([0.6, 0.0, 0.8])
     expected = reference.lit(scene, toward, 0.4, 0.0)
     assert expected.max() > 0.1
-    close(_lit(scene, device, toward, step=0.4), expected, LOOSE, "light")
+    close(_run(march_lit, (), scene, device, toward, March(step=0.4)), expected, LOOSE, "light")
 
 
 def test_wrong_camera():
-    medium, out = (
-        Medium(wp.zeros((2, 2, 2), dtype=float, device="cpu"), 1.0),
-        wp.zeros((8, 2, 2), dtype=float, device="cpu"),
-    )
+    density, out = (wp.zeros(shape, dtype=float, device="cpu") for shape in ((2, 2, 2), (8, 2, 2)))
     view = make_view((0, 0, 5), (1, 0, 0), (0, 1, 0), (0, 0, -1), 0.1, 2, 2, perspective=True)
     with pytest.raises(ValueError, match="need an orthographic camera"):
-        march_six.six_way(medium, view, March(), out)
+        march_six.six_way(Medium(density, 1.0), view, March(), out)

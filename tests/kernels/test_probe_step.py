@@ -21,10 +21,6 @@ CENTRE, LATENT = slice(0, 3), slice(10, None)
 SUMS = {"centre": slice(0, 3), "scale": slice(3, 6), "rotation": slice(6, 9), "latent": slice(9, None)}
 
 
-def _kind(device: str) -> str:
-    return "cpu" if device == "cpu" else "cuda"
-
-
 def _rows(count: int, latent: int = 9, longest: float = 0.15, seed: int = 1) -> np.ndarray:
     random = np.random.default_rng(seed)
     rows = random.normal(size=(count, 10 + latent)).astype(np.float32)
@@ -61,7 +57,7 @@ class Step:
         self.groups.middle = array((self.low + self.high) / 2, wp.vec3, device)
         self.groups.half = array((self.high - self.low) / 2 + 1e-6, wp.vec3, device)
         self.groups.count = len(self.x)
-        self.launches = probe_step.step_kernels(latent, _kind(device))
+        self.launches = probe_step.step_kernels(latent, "cpu" if device == "cpu" else "cuda")
 
         def nan(*shape: int) -> wp.array:
             return wp.full(shape, np.nan, dtype=float, device=device)

@@ -73,17 +73,11 @@ def test_planes_of_heads_and_a_filter(device, size, stem, half):
     assert result[LIGHTS:].max() <= 1 and (result - expected).abs().max() < 1e-5 * expected.max()
 
 
-@pytest.mark.parametrize("edge, planes", [(1, 0), (1, 2), (3, 1)])
-@pytest.mark.parametrize("reach", [4, 32])
+@pytest.mark.parametrize("edge, planes, reach", [(5, 0, 8), pytest.param(3, 1, 32, marks=pytest.mark.slow)])
 def test_other_filters_and_reaches(device, edge, planes, reach):
-    heads, guide, filters = (
-        noise(False, 2, 40, 41, 50),
-        noise(False, 3, 41, 50),
-        noise(False, PLANES, 2, 3, 3),
-    )
-    filters = filters[:, :planes, :edge, :edge].contiguous()
-    blocks = [-(-41 // reach), -(-50 // reach)]
-    smoke = np.zeros(blocks, dtype=np.int32)
+    heads, guide = noise(False, 2, 40, 41, 50), noise(False, 3, 41, 50)
+    filters = noise(False, PLANES, 2, edge, edge)[:, :planes].contiguous()
+    smoke = np.zeros([-(-41 // reach), -(-50 // reach)], dtype=np.int32)
     smoke[-1, -1] = 1
     arguments = (heads, guide, filters, _EVERY, 1, smoke.tolist())
     result = _compose(*arguments, reach=reach, device=device)
@@ -92,19 +86,16 @@ def test_other_filters_and_reaches(device, edge, planes, reach):
 
 
 def test_a_nan_stays_where_smoke_is_near_and_only_there(device):
-    heads, guide, filters = (
-        noise(False, 2, 40, 32, 32),
-        noise(False, 3, 32, 32),
-        noise(False, PLANES, 2, 3, 3),
-    )
+    heads, guide, filters = noise(False, 2, 40, 32, 32), noise(False, 3, 32, 32), noise(False, PLANES, 2, 5, 5)
     heads[:, :, 2, 2] = heads[:, :, 20, 20] = guide[:, 9, 30] = torch.nan
     smoke = [[1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]
     result = _compose(heads, guide, filters, _EVERY, 1, smoke, device=device)
     assert result[:, 2, 2].isnan().all() and int(result.isnan().sum()) == PLANES
 
 
-@pytest.mark.parametrize("half", [False, True])
-@pytest.mark.parametrize("reach", [4, 8, 32])
+@pytest.mark.parametrize(
+    "half, reach", [(False, 8), (True, 8)] + [pytest.param(False, reach, marks=pytest.mark.slow) for reach in (4, 32)]
+)
 @pytest.mark.parametrize("size", [(1, 1), (8, 5), (17, 70), (100, 33)])
 def test_blocks_with_smoke(device, size, reach, half):
     """A single pixel counts, also the last of a block; 0, negative values and NaN do not."""

@@ -57,9 +57,10 @@ def test_static_step(device: str, hidden: int, quantised: bool):
     _hold(fit, twin)
 
 
-def test_tanh_step(device: str):
-    """The cheaper GELU that a fit may use."""
-    case = Case(gelu="tanh", emphasis=1.0)
+@pytest.mark.slow
+def test_exact_step(device: str):
+    """The exact GELU, which costs a fit more."""
+    case = Case(gelu="exact", emphasis=1.0)
     fit = trainer(case, device)
     _hold(fit, problem(fit, case, False))
 

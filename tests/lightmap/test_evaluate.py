@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builders.running import report_always
 from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 
 import wlm
@@ -86,16 +85,6 @@ def test_only_the_tiles_of_the_file_are_scored(fitted):
     # The part of the map that tiles 1 and 2 cover.
     assert report.bpp == 50_000 * 8 / ((128 * 100 + 72 * 128) * 5)
     assert bits_per_texel(whole.sheets[LIGHT], lightmaps.light.mask, 50_000) == 50_000 * 8 / (200 * 228 * 5)
-
-
-def test_metrics_not_asked_for_are_null(fitted, monkeypatch):
-    lightmaps, model, _ = fitted
-    calls = []
-    report_always(monkeypatch)
-    report = evaluate(model, lightmaps, metrics=("psnr",), progress=lambda now: calls.append((now.done, now.total)))
-    document = report.to_json()
-    assert document["ssim"] is None and document["flip"] is None and document["psnr"] == report.psnr
-    assert calls == [(i, 5) for i in range(1, 6)]
 
 
 def test_another_source_is_scored_with_a_warning(fitted):

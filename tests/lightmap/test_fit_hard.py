@@ -153,7 +153,7 @@ def test_charts_of_one_texel_and_across_borders(tmp_path):
     for chart in (within, across, along):
         mask[chart] = True
     lightmaps = moving_light(128, 256, mask=mask)
-    decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=500, samples=512, uvt_resolution=16))
+    decoder = through_file(tmp_path, lightmaps, tiny_profile(hidden=16, steps=500, samples=512, uvt_resolution=16))
     error = np.square(decoded(decoder) - lightmaps.light.frames).mean((0, -1))
     alone = np.s_[4:124:6, 4:60:6]
     for part in (alone, across, along, np.s_[30:90, 127:129]):

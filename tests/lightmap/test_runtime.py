@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from builders.lightmap_codes import codes_at, shares_of
+from builders.lightmap_codes import shares_of
 from builders.synthetic import random_sheet
 
 from wlm import interop
@@ -22,7 +22,7 @@ KINDS = (3, 2, 3, 1, 0, 3)  # the static tile's place lies between two dynamic o
 
 @pytest.mark.parametrize(
     ("hidden", "gelu"),
-    [(16, "tanh"), *(pytest.param(*shape, marks=pytest.mark.slow) for shape in ((17, "exact"), (64, "tanh")))],
+    [(8, "tanh"), *(pytest.param(*shape, marks=pytest.mark.slow) for shape in ((17, "exact"), (64, "tanh")))],
 )
 def test_strip_and_exact_agree_at_any_time(device, hidden, gelu):
     model = random_sheet(KINDS, hidden=hidden, gelu=gelu)
@@ -33,11 +33,11 @@ def test_strip_and_exact_agree_at_any_time(device, hidden, gelu):
             if time is not None:
                 runtime.set_time(time)
             runtime.decode()
-        # Between stored times the two are mixed after each was rounded.
+        # Between stored times the two are mixed after each was rounded, in steps of its own range.
         stored, at = time in (None, 13.0), model.times[0] if time is None else time
         shares = shares_of(model, strip.numbers, at)
-        assert np.abs(exact.numpy()[..., :3] - 255.0 * shares).max() < (0.51 if stored else 2.51)
-        assert np.abs(strip.numpy()[..., :3] - 255.0 * shares).max() < (1.51 if stored else 2.51)
+        assert np.abs(exact.numpy()[..., :3] - 255.0 * shares).max() < (0.51 if stored else 3.51)
+        assert np.abs(strip.numpy()[..., :3] - 255.0 * shares).max() < (1.51 if stored else 3.51)
         np.testing.assert_allclose(strip.bounds, [bound64(model, number, at) for number in strip.numbers], rtol=1e-6)
 
 
@@ -49,13 +49,6 @@ def test_a_cheaper_gelu_stays_close(gelu, most, device):
     strip.decode()
     share = np.minimum(colour_tile64(model, 0, 7.5) / strip.bounds[0], 1.0)
     assert np.abs(strip.numpy()[0, ..., :3] / 255.0 - share).max() < 0.5 / 255.0 + most
-
-
-def test_static_tiles(device):
-    model = random_sheet(KINDS)
-    exact = ExactDecoder(model, device, kind=TileKind.STATIC)
-    assert exact.numbers.tolist() == [1]
-    assert np.abs(codes_at(exact, 13.0)[..., :3] - 255.0 * shares_of(model, [1], 13.0)).max() < 0.51
 
 
 @pytest.mark.parametrize("hidden", [16, 48, 64])
@@ -131,7 +124,7 @@ def test_texels_are_packed_as_on_the_host(device):
 def test_the_map_is_that_of_the_host(time, device):
     mask = np.zeros((236, 375), bool)
     mask[20:60, 30:128] = mask[100:180, 60:90] = mask[40:200, 126:150] = mask[130:200, 200:340] = True
-    model = random_sheet(MAP_KINDS, mask=mask, hidden=16, columns=3)
+    model = random_sheet(MAP_KINDS, mask=mask, columns=3)
     decoder = MapDecoder(model, device)
     decoder.set_time(time)
     decoder.decode()
@@ -144,7 +137,7 @@ def test_the_map_is_that_of_the_host(time, device):
 def test_mips_hold_charts_alone(device):
     mask = np.zeros((236, 247), bool)
     mask[:64, 5:70] = mask[117:, 90:] = mask[235, 0] = True
-    model = random_sheet((3, 3, 1, 3), mask=mask, hidden=16)
+    model = random_sheet((3, 3, 1, 3), mask=mask)
     decoder = MapDecoder(model, device)
     decoder.decode()
     assert [level.shape for level in decoder.levels] == [(236 >> i, 247 >> i) for i in range(8)]
@@ -169,7 +162,7 @@ def test_mips_hold_charts_alone(device):
 
 
 def test_mips_leave_out_tiles_that_the_file_lacks(device):
-    decoder = MapDecoder(random_sheet((3, 0, 1, 3), hidden=16), device)
+    decoder = MapDecoder(random_sheet((3, 0, 1, 3)), device)
     decoder.decode()
     light, whole = decoder.numpy().astype(np.float64), len(decoder.levels) - 1
     stored = np.ones(light.shape[:2], bool)

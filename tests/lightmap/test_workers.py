@@ -125,13 +125,6 @@ def test_wrong_places_are_told_at_once(options, says):
         fit.compress(None, PROFILE, **options)
 
 
-def test_workers_follow_the_cores_and_the_work(monkeypatch):
-    monkeypatch.setattr(dispatch, "cores", lambda: 64)
-    counts = [len(dispatch.worker_devices("cpu", None, None, samples)) for samples in (0, 10**6, 10**8, 10**12)]
-    assert counts == [1, 1, 5, 32]
-    assert len(dispatch.worker_devices("cpu", 3, None, 0)) == 3
-
-
 def processes_of(parent):
     """Processes that another one has started."""
     found = []
@@ -313,41 +306,6 @@ def test_a_resumed_fit_gives_the_bytes_of_one_that_was_not_interrupted(tmp_path,
     assert steps[0] > step and steps[-1] == 80, "what was done is not done again"
     checkpoint.remove()
     assert [path.name for path in tmp_path.iterdir() if "partial" in path.name] == []
-
-
-def test_what_is_kept_comes_back(tmp_path):
-    lightmaps = moving_light(40, 24)
-    checkpoint = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE)
-    assert checkpoint.finished(0, {}) is None and checkpoint.running(0) is None
-    table = {"uv": Part(np.uint8, (2, 3, 4)), "net": Part(np.float16, (2, 5))}
-    parts = {"uv": np.arange(24, dtype=np.uint8).reshape(2, 3, 4), "net": np.ones((2, 5), np.float16)}
-    checkpoint.add_finished(0, parts)
-    checkpoint.save({1: {"maps": np.arange(5.0, dtype=np.float32), "adam.0.step": np.array(7.0, np.float32)}})
-
-    back = open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True)
-    assert back.resumed
-    for name, value in parts.items():
-        np.testing.assert_array_equal(back.finished(0, table)[name], value)
-        assert back.finished(0, table)[name].dtype == value.dtype
-    assert back.running(1)["adam.0.step"] == 7.0 and back.running(1)["adam.0.step"].shape == ()
-    assert back.finished(1, table) is None and back.running(0) is None
-
-    back.add_finished(1, parts)
-    assert open_checkpoint(tmp_path / "a.wlm", lightmaps, PROFILE, resume=True).running(1) is None
-
-
-def test_it_is_due_a_while_after_the_last_save(tmp_path, monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
-    checkpoint = open_checkpoint(tmp_path / "a.wlm", moving_light(40, 24), PROFILE, every=2.0)
-    dues = []
-    for now[0] in (101.0, 102.0, 103.0, 104.0, 105.0, 106.0):
-        dues.append(checkpoint.due())
-        if dues[-1]:
-            checkpoint.save({0: {"step": np.array(now[0])}})
-    assert dues == [False, True, False, True, False, True]
-    checkpoint.add_finished(0, {"uv": np.zeros(4, np.uint8)})
-    assert not checkpoint.due()
 
 
 @pytest.mark.parametrize(("every", "waits"), [(10.0, [10.0, 10.0, 57.0]), (0.0, [0.0, 0.0, 0.0])])

@@ -1,6 +1,7 @@
 """Probes for three.js, Unity, Unreal and Godot: the layout, the light that an engine shows, and what is refused."""
 
 import json
+import re
 import shutil
 import struct
 import subprocess
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from builders.godot_bakes import Writer, bake
 from builders.probe_models import random_model
+from builders.shader_runs import run_glsl
 
 import wlm
 from benchmarks.rivals.probe import pack_unreal, unpack_unreal
@@ -81,75 +83,24 @@ def test_unity_shows_the_same_light(mirror, outputs, tmp_path):
 FILES = ("ambient.dds", *SH_FILES)
 _HEADER = 148
 
-# HLSL as C++.
+# HLSL as GLSL: a volume is an array of slices.
 _PRELUDE = """
-#include <algorithm>
-#include <cmath>
-#include <cstdio>
-#include <vector>
-#define OPERATORS(T, EACH) \\
-    T operator*(T a, T b) { return EACH(*); } T operator+(T a, T b) { return EACH(+); } \\
-    T operator-(T a, T b) { return EACH(-); } T operator/(T a, T b) { return EACH(/); } \\
-    T operator*(T a, double b) { return a * T(b); } T operator-(T a, double b) { return a - T(b); } \\
-    T& operator+=(T& a, T b) { return a = a + b; }
-struct float3 {
-    float x, y, z;
-    float3() {} float3(double v) : x(v), y(v), z(v) {} float3(double a, double b, double c) : x(a), y(b), z(c) {}
-};
-struct float4 {
-    float x, y, z, w;
-    float4() {} float4(double v) : x(v), y(v), z(v), w(v) {}
-    float4(double a, double b, double c, double d) : x(a), y(b), z(c), w(d) {}
-    float3 three() { return float3(x, y, z); }
-};
-#define THREE(o) float3(a.x o b.x, a.y o b.y, a.z o b.z)
-#define FOUR(o) float4(a.x o b.x, a.y o b.y, a.z o b.z, a.w o b.w)
-OPERATORS(float3, THREE)
-OPERATORS(float4, FOUR)
-float3 max(float3 a, float3 b) { return float3(std::max(a.x, b.x), std::max(a.y, b.y), std::max(a.z, b.z)); }
-struct SamplerState {};
-struct Texels {
-    int size[3];
-    std::vector<float4> texel;
-    float4 SampleLevel(SamplerState, float3 uvw, int) {
-        float place[3] = {uvw.x, uvw.y, uvw.z};
-        float4 sum(0);
-        for (int corner = 0; corner < 8; corner++) {
-            int at = 0;
-            float weight = 1;
-            for (int a = 2; a >= 0; a--) {
-                float x = place[a] * size[a] - 0.5f, whole = std::floor(x);
-                int side = corner >> a & 1;
-                weight *= side ? x - whole : 1 - (x - whole);
-                at = at * size[a] + std::min(std::max(int(whole) + side, 0), size[a] - 1);
-            }
-            sum += texel[at] * weight;
-        }
-        return sum;
-    }
-};
-typedef Texels& Texture3D;
-#define out
-#define xyz three()
+#define float3 vec3
+#define float4 vec4
+#define Texture3D sampler2DArray
+#define SamplerState int
+vec4 sampled(sampler2DArray slices, vec3 uvw)
+{
+    float count = float(textureSize(slices, 0).z), z = clamp(uvw.z * count - 0.5, 0.0, count - 1.0);
+    return mix(texture(slices, vec3(uvw.xy, floor(z))), texture(slices, vec3(uvw.xy, ceil(z))), fract(z));
+}
 """
 _MAIN = """
-int main()
-{
-    Texels t[7];
-    for (Texels& each : t) {
-        std::fread(each.size, 4, 3, stdin);
-        each.texel.resize(each.size[0] * each.size[1] * each.size[2]);
-        std::fread(each.texel.data(), 16, each.texel.size(), stdin);
-    }
-    float p[6];
-    while (std::fread(p, 4, 6, stdin) == 6) {
-        float3 sh[9], n(p[3], p[4], p[5]), place(p[0], p[1], p[2]);
-        WlmProbeSh(t[0], t[1], t[2], t[3], t[4], t[5], t[6], SamplerState(), place, sh);
-        std::fwrite(sh, 4, 27, stdout);
-        float3 light = WlmProbeDiffuse(t[0], t[1], t[2], t[3], t[4], t[5], t[6], SamplerState(), place, n);
-        std::fwrite(&light, 4, 3, stdout);
-    }
-}
+    vec3 place = texelFetch(u_points, ivec2(pixel.x, 0), 0).xyz;
+    vec3 normal = texelFetch(u_points, ivec2(pixel.x, 1), 0).xyz;
+    vec3 sh[9];
+    WlmProbeSh(TEXTURES, 0, place, sh);
+    light = vec4(pixel.y < 9 ? sh[pixel.y] : WlmProbeDiffuse(TEXTURES, 0, place, normal), 1.0);
 """
 
 
@@ -183,7 +134,6 @@ def model() -> wlm.probe.ProbeModel:
     return wlm.probe.compress(wlm.probe.from_arrays(position, values), positions=True)
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler is installed")
 def test_the_shader_reads_the_light(model, tmp_path):
     paths = export(model, tmp_path / "out", "unreal", cells=6)
     assert {path.name for path in paths} == {*FILES, "WlmProbes.usf", "light.json", "bundle.json"}
@@ -195,16 +145,16 @@ def test_the_shader_reads_the_light(model, tmp_path):
     light = model.decoder().decode(centre).reshape(-1, 9, 3)
     turned = from_canonical(light.astype(float), "unreal")
     stored = unpack_unreal(pack_unreal(turned.reshape(-1, 27), 3), 27, 3).reshape(-1, 9, 3)
-    textures = b"".join(count.astype("<i4").tobytes() + _texture(path.read_bytes()).tobytes() for path in paths[:7])
-    normal = fibonacci_sphere(len(centre))
+    textures = {f"u_{path.stem}": _texture(path.read_bytes()) for path in paths[:7]}
     middle = 0.5 * (centre[0] + centre[1])
-    sent = np.concatenate([np.concatenate([centre, middle[None]]), np.concatenate([normal, normal[:1]])], 1)
-    (tmp_path / "run.cpp").write_text(_PRELUDE + paths[7].read_text() + "#undef out\n" + _MAIN)
-    subprocess.run(["g++", "-O1", "-std=c++17", "-o", "run", "run.cpp"], cwd=tmp_path, check=True)
-    done = subprocess.run(
-        [tmp_path / "run"], input=textures + sent.astype("<f4").tobytes(), capture_output=True, check=True
-    )
-    got = np.frombuffer(done.stdout, "<f4").reshape(-1, 10, 3)
+    normal = fibonacci_sphere(len(centre))
+    sent = np.stack([np.concatenate([centre, middle[None]]), np.concatenate([normal, normal[:1]])])
+    head = "".join(f"uniform sampler2DArray {name};\n" for name in textures) + "uniform sampler2D u_points;\n"
+    text = re.sub(r"(\w+)\.SampleLevel\(state, uvw, 0\)", r"sampled(\1, uvw)", paths[7].read_text())
+    text = _PRELUDE + head + text.replace("static const", "const")
+    main = _MAIN.replace("TEXTURES", ", ".join(textures))
+    drawn = run_glsl(text, main, (10, len(centre) + 1), textures | {"u_points": sent.astype(np.float32)})
+    got = drawn[..., :3].transpose(1, 0, 2)
     peak = light[:, 0].max()
     np.testing.assert_allclose(got[:-1, :9], stored, atol=1e-4 * peak)
     np.testing.assert_allclose(got[:-1, :9], turned, atol=0.03 * peak)

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from builders.checks import assert_same
+from builders.checks import assert_same, put
 from builders.probe_models import random_model, whole_model, with_whole
 from builders.probe_sets import synthetic
 from builders.resigned import GONE, WEIRD
@@ -83,15 +83,6 @@ def stored(model, tmp_path):
         return load(path, "probe")
 
     return header, parts, read
-
-
-def put(index, value):
-    def change(part):
-        part = part.copy()
-        part[index] = value
-        return part
-
-    return change
 
 
 GAUSSIANS = [

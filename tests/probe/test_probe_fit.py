@@ -84,7 +84,7 @@ def test_hard_sets(kind, tmp_path):
 
 
 def test_more_gaussians_than_places_are_not_made():
-    probes = from_arrays(np.repeat(RANDOM.random((6, 3)), 5, 0), RANDOM.normal(size=(30, 3)).astype(np.float32))
+    probes = from_arrays(np.repeat(RANDOM.random((6, 3)), 5, 0), RANDOM.normal(size=(30, 27)).astype(np.float32))
     model = compress(probes, SMALL, ratio=1.0)
     assert model.content.count + model.content.dropped == 6
 
@@ -92,7 +92,7 @@ def test_more_gaussians_than_places_are_not_made():
 def test_useless_gaussians_are_dropped_within_the_bound(monkeypatch):
     probes = synthetic(200)
     monkeypatch.setattr(training, "_PRUNE", 0.03)
-    profile = SMALL.override({"steps": 200, "ratio": 0.3})
+    profile = SMALL.override({"steps": 100, "ratio": 0.3})
     x, values = _input(probes)
     trainer = Trainer(x, values, profile, 0, "cpu")
     try:
@@ -200,22 +200,19 @@ def test_few_components_are_the_best_directions():
     assert fewer.count == 2 and fewer.nbytes < components.nbytes and error > ENOUGH
 
 
-HARD_COMPONENTS = {
-    "coincident": (np.zeros((9, 3)), NORMAL.normal(size=(9, 27))),
-    "constant": (NORMAL.random((9, 3)), np.full((9, 27), 0.25)),
-    "huge": (NORMAL.random((9, 3)), NORMAL.normal(size=(9, 27)) * 1e18),
-    "tiny": (NORMAL.random((9, 3)), NORMAL.normal(size=(9, 27)) * 1e-30),
-    "HDR": (NORMAL.random((9, 3)), NORMAL.normal(size=(9, 27)) * 10.0 ** np.arange(-18, 18, 4)[:, None]),
-    "negative": (NORMAL.random((9, 3)), -np.ones((9, 12))),
-    "one live": (NORMAL.random((9, 3)), np.eye(9)[:, :1] * np.ones(27)),
-    "far away": (NORMAL.random((9, 3)) + 1e9, NORMAL.normal(size=(9, 27))),
+NINE = PLACES[:9]
+HARD_COMPONENTS = HARD | {
+    "huge values": (NINE, VALUES[:9] * 1e18),
+    "tiny values": (NINE, VALUES[:9] * 1e-30),
+    "HDR": (NINE, VALUES[:9] * 10.0 ** np.arange(-18, 18, 4)[:, None]),
+    "negative": (NINE, -np.ones((9, 12))),
+    "one live": (NINE, np.eye(9)[:, :1] * np.ones(27)),
 }
 
 
 @pytest.mark.parametrize("kind", HARD_COMPONENTS)
 def test_hard_sets_of_components(kind, tmp_path):
     position, values = HARD_COMPONENTS[kind]
-    values = values.copy()
     probes = from_arrays(position, values)
     model = wlm.probe.compress(probes, positions=True)
     model.save(tmp_path / "a.wlm")
@@ -248,10 +245,10 @@ def test_light_between_probes_is_read_from_a_volume(tmp_path):
 def test_the_choice_is_by_error_at_equal_gpu_bytes():
     # Light that is smooth over thousands of probes suits Gaussians; white noise suits neither, and stays PCA's.
     smooth = synthetic(600)
-    model = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.02, latent=3, hidden=8, steps=900))
+    model = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.02, latent=3, hidden=16, steps=600))
     assert model.method == "gaussians" and model.choice.startswith("Gaussians: ")
     assert model.profile.method == "gaussians"
-    unfinished = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.3, latent=3, hidden=8, steps=10))
+    unfinished = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.3, latent=3, hidden=16, steps=10))
     assert unfinished.method == "pca" and "PCA: " in unfinished.choice
     assert unfinished.profile == Profile(name="tiny", method="pca")
 

@@ -1,7 +1,8 @@
 """Reading a cascade by torch's own operations, with losses that autograd takes back."""
 
 import torch
-from torch.nn.functional import grid_sample
+
+from wlm.ops.plain import texture
 
 
 def wave(x: torch.Tensor) -> torch.Tensor:
@@ -9,16 +10,9 @@ def wave(x: torch.Tensor) -> torch.Tensor:
     return (x - 2.0 * torch.round(x.detach() / 2.0)).abs()
 
 
-def bilinear(image: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
-    """Reads [H, W, C], clamped, at uv [N, 2]: [N, C]."""
-    grid = (2.0 * uv - 1.0)[None, None]
-    found = grid_sample(image.movedim(-1, 0)[None], grid, mode="bilinear", padding_mode="border", align_corners=False)
-    return found[0, :, 0].T
-
-
 def sample(colour: torch.Tensor, lut: torch.Tensor | None, uv: torch.Tensor) -> torch.Tensor:
     """Eq. 7 at uv [N, 2]: [N, 3]."""
-    return bilinear(colour, uv if lut is None else wave(bilinear(lut, uv)))
+    return texture(colour, uv if lut is None else wave(texture(lut, uv)))
 
 
 def image_loss(difference: torch.Tensor, weight: float) -> torch.Tensor:

@@ -7,11 +7,6 @@ from scipy.optimize import lsq_linear
 from wlm.ops import plain
 
 
-def whitening(rows: torch.Tensor) -> torch.Tensor:
-    """W = S^-1 R^T, [K, 3, 3]."""
-    return plain.rotations(rows[:, 6:10]).transpose(1, 2) / rows[:, 3:6].exp()[:, :, None]
-
-
 def gradients(rows: np.ndarray, x: np.ndarray, grad_f: np.ndarray, cut: float, support: str = "ellipsoid"):
     """The sum [L, N], and the gradient of sum(f * grad_f) by the rows [K, 10 + L]."""
     leaf = torch.tensor(rows, dtype=torch.float64, requires_grad=True)

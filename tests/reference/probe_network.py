@@ -15,16 +15,14 @@ def layers(net: torch.Tensor, inputs: int, hidden: int, outputs: int) -> list[to
     return [part.view(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
-def outputs_of(net: torch.Tensor, f: torch.Tensor, x: torch.Tensor, hidden: int, outputs: int) -> torch.Tensor:
-    """The decoded numbers [D, N] from the Gaussians' sums [L, N] and the positions [N, 3]."""
-    first, second, third = layers(net, len(f) + 3, hidden, outputs)
+def loss(net, f, x, target, weight, hidden: int) -> torch.Tensor:
+    """Sum over the probes and numbers of weight [D] times squared error against target [D, N].
+
+    The network decodes the Gaussians' sums f [L, N] and the positions x [N, 3].
+    """
+    first, second, third = layers(net, len(f) + 3, hidden, len(target))
     h = torch.cat([f.T, x], 1)
     h = torch.sigmoid(h @ first[:-1] + first[-1])
     h = torch.sigmoid(h @ second[:-1] + second[-1])
-    return (h @ third[:-1] + third[-1])[:, :outputs].T
-
-
-def loss(net, f, x, target, weight, hidden: int) -> torch.Tensor:
-    """Sum over the probes and numbers of weight [D] times squared error against target [D, N]."""
-    error = outputs_of(net, f, x, hidden, len(target)) - target
+    error = (h @ third[:-1] + third[-1])[:, : len(target)].T - target
     return (weight[:, None] * error * error).sum()

@@ -9,52 +9,6 @@ from wlm.ops import plain
 SIZE = 128
 
 
-def byte_levels(values: torch.Tensor, quantised: bool) -> torch.Tensor:
-    """A plane's values as used: clamped, or the nearest of 256 levels; straight through."""
-    used = values.clamp(0.0, 1.0)
-    if quantised:
-        used = torch.floor(used * 255.0 + 0.5) / 255.0
-    return plain.straight_through(values, used)
-
-
-def features_of(
-    uv: torch.Tensor,
-    temporal: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None,
-    tile: torch.Tensor,
-    place: torch.Tensor,
-    tau: torch.Tensor,
-    encoding: torch.Tensor,
-    periodic: bool,
-) -> torch.Tensor:
-    """The network's inputs, before noise and centring.
-
-    Args:
-        uv: Texels of F_uv, [N, 128, 128, 4].
-        temporal: Texels of F_uvt [N, S, R, R, 4], F_ut and F_vt [N, rows, columns, 2]; None for static tiles.
-        tile: int [M], the tile of each sample.
-        place: int [M, 2], its (y, x).
-        tau: [M], its place on the time axis.
-        encoding: [M, 4], gamma(t) of eq. 4.
-        periodic: Whether the time axis wraps.
-
-    Returns:
-        [M, 16], or [M, 4] for static tiles.
-    """
-    found = uv[tile, place[:, 0], place[:, 1]]
-    if temporal is None:
-        return found
-    uvt, ut, vt = temporal
-    v, u = ((place.double() + 0.5) / SIZE).unbind(1)
-    parts = [
-        found,
-        plain.volume(uvt, torch.stack([u, v, tau], 1), layer=tile, periodic=periodic),
-        plain.plane(ut, torch.stack([u, tau], 1), layer=tile, periodic=periodic),
-        plain.plane(vt, torch.stack([v, tau], 1), layer=tile, periodic=periodic),
-        encoding,
-    ]
-    return torch.cat(parts, 1)
-
-
 def centre(features: torch.Tensor) -> torch.Tensor:
     """Map features v -> (v - 1/2) sqrt(12); the encoded time (from column 12 on) as it is."""
     return torch.cat([(features[:, :12] - 0.5) * math.sqrt(12.0), features[:, 12:]], 1)
@@ -69,14 +23,35 @@ def train_features(
     periodic: bool,
     quantised: bool,
 ) -> torch.Tensor:
-    """`features_of` from maps in training; keys and shapes as in `wlm.lightmap.trainer.Trainer.views`."""
+    """The network's inputs, before noise and centring, from maps in training.
+
+    Args:
+        maps: Keys and shapes as in `wlm.lightmap.trainer.Trainer.views`.
+        tile: int [M], the tile of each sample.
+        place: int [M, 2], its (y, x).
+        tau: [M], its place on the time axis.
+        encoding: [M, 4], gamma(t) of eq. 4.
+        periodic: Whether the time axis wraps.
+        quantised: Whether values are put on the levels of the file; gradients pass straight through.
+
+    Returns:
+        [M, 16], or [M, 4] for static tiles.
+    """
     uv = plain.bc7_texels(maps["uv_endpoints"], maps["uv_weights"], quantised=quantised)
-    temporal = None
-    if "uvt_weights" in maps:
-        uvt = plain.bc7_texels(maps["uvt_endpoints"], maps["uvt_weights"], quantised=quantised)
-        planes = (byte_levels(maps[key], quantised) for key in ("ut", "vt"))
-        temporal = (uvt.reshape(len(uv), -1, *uvt.shape[1:]), *planes)
-    return features_of(uv, temporal, tile, place, tau, encoding, periodic)
+    found = uv[tile, place[:, 0], place[:, 1]]
+    if "uvt_weights" not in maps:
+        return found
+    uvt = plain.bc7_texels(maps["uvt_endpoints"], maps["uvt_weights"], quantised=quantised)
+    v, u = ((place.double() + 0.5) / SIZE).unbind(1)
+    at = torch.stack([u, v, tau], 1)
+    parts = [found, plain.volume(uvt.reshape(len(uv), -1, *uvt.shape[1:]), at, layer=tile, periodic=periodic)]
+    for key, axes in (("ut", [0, 2]), ("vt", [1, 2])):
+        used = maps[key].clamp(0.0, 1.0)
+        if quantised:
+            used = torch.floor(used * 255.0 + 0.5) / 255.0
+        plane = plain.straight_through(maps[key], used)
+        parts.append(plain.plane(plane, at[:, axes], layer=tile, periodic=periodic))
+    return torch.cat([*parts, encoding], 1)
 
 
 def emphasised(

@@ -14,19 +14,11 @@ from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import DIRECTIONS, RULES, VECTORS, Camera, weights
 from wlm.smoke.lightmaps import SixWay, axis_faults
 from wlm.smoke.march.six_way import bake
+from wlm.smoke.synthetic import make_plume
 
 
-def _plume(device: str = "cpu", n: int = 28, extinction: float = 0.25, seed: int = 2) -> DensityVolume:
-    """Makes a leaning column of billows."""
-    random = np.random.default_rng(seed)
-    x, y, z = unit_grid(n)
-    density = np.zeros((n, n, n))
-    for _ in range(14):
-        height = random.uniform(-0.7, 0.7)
-        at = np.array([0.15 * height, height, 0.0]) + random.normal(0, 0.12, 3)
-        r = np.sqrt((x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2)
-        density += np.clip(1.3 - 4.5 * r, 0, 1)
-    return from_array(density.astype(np.float32), extinction=extinction, device=device)
+def _plume(device: str = "cpu", extinction: float = 7.0) -> DensityVolume:
+    return make_plume(28, hot=False, extinction=extinction, device=device)
 
 
 @pytest.mark.parametrize("way", [(0.0, 0.0, 1.0), (1.0, 0.5, -0.3), (0.0, 1.0, 0.0)])
@@ -48,7 +40,7 @@ def test_names_of_the_axes(device: str, way: tuple):
 
 def test_halving_the_step(device: str):
     """Halving the step at least halves the error, until rounding; the estimate exceeds the remaining error."""
-    volume = _plume(device, extinction=0.8)
+    volume = _plume(device, 24.0)
     camera = facing(volume, (0.4, 0.3, 1.0))
     fine = bake(volume, camera, step=1 / 16, estimate=False)
     errors, stated = [], []
@@ -113,7 +105,7 @@ def test_emission(device: str):
 
 
 def test_wrong_settings():
-    volume = _plume(n=4)
+    volume = _plume()
     camera = facing(volume)
     for options in ({"step": -1.0}, {"g": -1.0}, {"supersample": 0}):
         with pytest.raises(ValueError, match=next(iter(options))):

@@ -14,12 +14,7 @@ from wlm.fluid.solver import LEAST_HALF_LOSS
 from wlm.smoke.lightmaps import axis_faults
 from wlm.smoke.march.six_way import bake
 from wlm.smoke.network import dataset
-from wlm.smoke.network.dataset import (
-    ATTEMPTS,
-    make_pool,
-    make_validation,
-    pool_of_volume,
-)
+from wlm.smoke.network.dataset import ATTEMPTS, make_pool, make_validation, pool_of_volume
 from wlm.smoke.network.planes import EMISSION_PLANE, GUIDES, OPACITY_PLANE, Pool
 from wlm.smoke.network.scenes import Tilted, draw_scene
 from wlm.smoke.network.settings import DatasetSettings
@@ -30,7 +25,7 @@ SMALL = DatasetSettings(
     cells=16, refine=2, resolution=32, frames=2, views_a_frame=2, sequences=3, warmup=0.7, hot=0.4, moving=0.0
 )
 FEW = SMALL.model_copy(
-    update={"cells": 16, "sequences": 1, "frames": 1, "resolution": 24, "warmup": 0.6}
+    update={"refine": 1, "sequences": 1, "frames": 1, "resolution": 24, "warmup": 0.6}
     | {"validation_sequences": 1, "views": 4}
 )
 NAMES = tuple(field.name for field in dataclasses.fields(Pool))
@@ -52,14 +47,6 @@ def pool():
     """A round on the CPU, and its progress reports."""
     reports = []
     return make_pool(SMALL, seed=5, progress=reports.append), reports
-
-
-def _same(first: Pool, second: Pool) -> bool:
-    return all(torch.equal(getattr(first, name), getattr(second, name)) for name in NAMES)
-
-
-def _counts(reports) -> dict[str, float]:
-    return reports[-1].figures
 
 
 def test_scenes_are_repeatable():
@@ -151,19 +138,18 @@ def test_sequences_with_their_own_cells(monkeypatch):
 
 def test_guides_of_six_lights(few):
     """The kind of guide changes only the guide, which then has less error for each light."""
-    still = FEW.model_copy(update={"jitter": 0.0})  # the two march with jitters of their own
-    six, paper = (make_pool(still.model_copy(update={"guide": kind}), seed=5) for kind in ("six", "paper"))
+    six = make_pool(FEW.model_copy(update={"guide": "six", "jitter": 0.0}), seed=5)
     assert six.guides.shape == (len(few), 2, 9, 24, 24) and six.guides.dtype == torch.float16
     assert all(torch.equal(getattr(six, name), getattr(few, name)) for name in NAMES[1:])
-    torch.testing.assert_close(six.guides[:, :, -2:], paper.guides[:, :, 1:], rtol=0, atol=1e-3)
     off = (six.guides[:, :, :6].float() - six.targets[:, :, :6].float()).square().mean((0, 1, 3, 4))
-    worse = (paper.guides[:, :, :1].float() - six.targets[:, :, :6].float()).square().mean((0, 1, 3, 4))
+    worse = (few.guides[:, :, :1].float() - six.targets[:, :, :6].float()).square().mean((0, 1, 3, 4))
     assert (off < 0.2 * worse).all()
 
 
 def test_same_bits(device: str, few):
     first = few if device == "cpu" else make_pool(FEW, seed=5, device=device)
-    assert _same(first, make_pool(FEW, seed=5, device=device))
+    again = make_pool(FEW, seed=5, device=device)
+    assert all(torch.equal(getattr(first, name), getattr(again, name)) for name in NAMES)
 
 
 def test_a_gpu_sees_the_same(device: str, pool):
@@ -180,7 +166,7 @@ def test_what_a_pool_holds(pool):
     """Half floats within their ranges, a plausible amount of smoke, and right directions."""
     samples, reports = pool
     assert [(progress.done, progress.total) for progress in reports] == [(1, 3), (2, 3), (3, 3)]
-    assert _counts(reports)["samples"] == len(samples)
+    assert reports[-1].figures["samples"] == len(samples)
     assert len(samples) == 12 and all(getattr(samples, name).dtype == torch.float16 for name in NAMES[:3])
     for name in NAMES[:3]:
         assert torch.isfinite(getattr(samples, name)).all()
@@ -245,13 +231,6 @@ def test_validation(validation, monkeypatch):
     assert all((a != b).any() for a, b in zip(validation.targets, validation.targets[1:], strict=False))
 
 
-def test_a_moving_obstacle():
-    settings = FEW.model_copy(update={"moving": 1.0, "hot": 0.0})
-    index = next(i for i in range(99) if any(len(b.path) > 1 for b in draw_scene(settings, 5, i * ATTEMPTS).obstacles))
-    samples = make_pool(settings, seed=5, round=index)
-    assert len(samples) == 2 and samples.motion.abs().max() > 0
-
-
 def _unstable(settings: DatasetSettings, seed: int, index: int, *, validation: bool = False):
     """Makes the first scene of each sequence unstable: no turbulence model, no viscosity, too fast."""
     scene = draw_scene(settings, seed, index, validation=validation)
@@ -270,7 +249,7 @@ def test_an_unstable_scene(monkeypatch: pytest.MonkeyPatch):
     # A round whose first scene is a jet, whose speed is fixed.
     number = next(k for k in range(99) if draw_scene(settings, 2, k * ATTEMPTS).name.startswith("jet"))
     samples = make_pool(settings, seed=2, round=number, progress=reports.append)
-    assert _counts(reports)["skipped"] == 1 and torch.isfinite(samples.targets).all()
+    assert reports[-1].figures["skipped"] == 1 and torch.isfinite(samples.targets).all()
     assert set(samples.sequence.tolist()) == {number * ATTEMPTS + 1}
 
 
@@ -288,7 +267,7 @@ def test_nan_never_enters(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(dataset, "bake", broken)
     reports = []
     samples = make_pool(FEW, seed=5, progress=reports.append)
-    assert _counts(reports)["skipped"] == 1 and torch.isfinite(samples.targets).all()
+    assert reports[-1].figures["skipped"] == 1 and torch.isfinite(samples.targets).all()
     monkeypatch.setattr(dataset, "ATTEMPTS", 2)
     nan = torch.full((24, 24), float("nan"))
     monkeypatch.setattr(dataset, "bake", lambda *a, **k: dataclasses.replace(bake(*a, **k), transparency=nan))
@@ -301,10 +280,9 @@ def test_frames_without_smoke():
     nothing = FEW.model_copy(update={"least_coverage": 1.0, "kept_empty": 0.0})
     reports = []
     samples = make_pool(nothing, seed=5, progress=reports.append)
-    assert len(samples) == 0 and _counts(reports)["dropped"] == 2 and samples.guides.shape[1:] == (2, 3, 24, 24)
-    assert len(make_pool(nothing.model_copy(update={"kept_empty": 1.0}), seed=5)) == 2
-    start = FEW.model_copy(update={"warmup": 0.0, "hot": 0.0, "kept_empty": 1.0})
-    assert torch.isfinite(make_pool(start, seed=5).targets).all()
+    assert len(samples) == 0 and reports[-1].figures["dropped"] == 2 and samples.guides.shape[1:] == (2, 3, 24, 24)
+    start = make_pool(nothing.model_copy(update={"warmup": 0.0, "hot": 0.0, "kept_empty": 1.0}), seed=5)
+    assert len(start) == 2 and torch.isfinite(start.targets).all()
 
 
 def test_look():

@@ -215,14 +215,8 @@ def test_wrong_files(tmp_path: Path):
 
     refused("a_1.png: cannot read the PNG")
     write_book(_book(_frames(1)), tmp_path / "a.png")
-    refused(
-        "expected textures that divide into 4 rows and 4 columns of cells, found a height of 6 and a width of 9",
-        cells=4,
-    )
-    refused(
-        "expected textures that divide into 12 rows and 12 columns of cells, found a height of 6 and a width of 9",
-        cells=12,
-    )
+    for cells in (4, 12):
+        refused(f"{cells} rows and {cells} columns of cells, found a height of 6 and a width of 9", cells=cells)
     Image.new("RGB", (9, 5)).save(paths[1])
     refused("textures of one size")
     Image.new("L", (9, 6)).save(paths[1])

@@ -10,6 +10,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.fluid.volume import save_volume
 from wlm.smoke.codec import open_network
+from wlm.smoke.network import prediction
 
 
 @pytest.fixture
@@ -28,27 +29,11 @@ def test_the_snippet(smoke):
     torch.testing.assert_close(over, image + 0.5 * six.transparency[..., None])
 
 
-def test_three_ways_to_the_same_lightmaps(smoke):
-    """On dense smoke both other methods are near the fine march."""
-    dense = wlm.smoke.DensityVolume(smoke.density, 8.0, smoke.voxel, smoke.origin, smoke.temperature)
-    camera = wlm.smoke.Camera.around(dense, toward=(0.3, 0.2, 1.0), pixels=96)
-    baked = wlm.smoke.bake(dense, camera)
-    march = wlm.smoke.March(step=0.5, jitter=0.0)
-    for six, most in (
-        (wlm.smoke.bake_coarse(dense, camera, march), 0.02),
-        (wlm.smoke.predict(dense, camera, seed=3), 0.1),
-    ):
-        assert six.camera == camera and six.emission is not None
-        for name in ("lightmaps", "transparency"):
-            difference = getattr(six, name) - getattr(baked, name)
-            assert difference.square().mean().sqrt() < most * getattr(baked, name).square().mean().sqrt(), name
-    assert baked.error.rms < 0.05
-
-
-def test_a_predictor_for_many_frames(smoke):
-    """One predictor serves several sizes; the seed is that of the guiding map."""
+def test_a_predictor_for_many_frames(smoke, monkeypatch):
+    """One predictor serves more sizes than it keeps; the seed is that of the guiding map."""
+    monkeypatch.setattr(prediction, "_SIZES", 1)
     predictor = wlm.smoke.SmokePredictor()
-    cameras = [wlm.smoke.Camera.around(smoke, pixels=pixels) for pixels in (16, 8, 10, 12, 14)]
+    cameras = [wlm.smoke.Camera.around(smoke, pixels=pixels) for pixels in (16, 8)]
     first = [wlm.smoke.predict(smoke, camera, predictor, seed=1) for camera in cameras]
     again = [predictor(smoke, camera, 1) for camera in cameras]
     assert all(torch.equal(a.lightmaps, b.lightmaps) for a, b in zip(first, again, strict=True))

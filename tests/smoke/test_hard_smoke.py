@@ -1,12 +1,20 @@
 """Every march with extreme input: no smoke, opaque smoke, one voxel, NaN, and a camera inside or turned away."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from builders.smoke_plumes import facing
 
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.six_way import bake, bake_coarse, guide
+from wlm.smoke.shading import Light, PointLight
+from wlm.smoke.synthetic import make_plume
+from wlm.smoke.transport.lighting import light_smoke
+from wlm.smoke.transport.orders import scatter
+from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.settings import March
 
 STEPS = March(2.0, jitter=0.0, threshold=1e-6)
@@ -68,3 +76,28 @@ def test_hard_smoke(device: str, way: str, name: str, dtype: type):
         assert way == "bake" or 29 < result.depth[4, 4].item() < 31
     else:
         assert centre < 0.9 and light[:, 4, 4].max() > 0.05
+
+
+WHITE = (1.0, 1.0, 1.0)
+PICTURES = {
+    "trace": lambda *smoke, albedo=WHITE: trace(*smoke, albedo=albedo, samples=64).total,
+    "march": lambda *smoke, albedo=WHITE: light_smoke(*smoke).shade(albedo=albedo),
+    "orders": lambda *smoke, albedo=WHITE: scatter(*smoke, albedo).shade(),
+}
+
+
+@pytest.mark.parametrize("way", PICTURES)
+def test_pictures_of_hard_smoke(device: str, way: str):
+    """No smoke and black smoke scatter nothing; opaque smoke, one voxel and smoke around the camera finite light."""
+    picture, lights = PICTURES[way], [Light(WHITE), PointLight((0.5, 0.5, 0.4), radius=0.1)]
+    fire = make_plume(10, extinction=10.0, device=device)
+    smoke, camera = replace(fire, temperature=None), facing(fire, size=6)
+    assert not picture(replace(smoke, density=torch.zeros_like(smoke.density)), camera, lights).any()
+    assert not picture(smoke, camera, lights, albedo=(0.0, 0.0, 0.0)).any()
+    within = Camera.look_at((0.5, 0.5, 0.5), (0.5, 0.5, 0.0), extent=1.0, height=6, width=6, perspective=True)
+    voxel = from_array(np.ones((1, 1, 1)), device=device)
+    seen = ((replace(smoke, extinction=1000.0), camera), (voxel, facing(voxel, size=6)), (smoke, within))
+    for made in (*(picture(*each, lights) for each in seen), picture(fire, camera, [])):
+        assert torch.isfinite(made).all() and (made >= 0).all() and made.any()
+    with pytest.raises(ValueError, match="albedo"):
+        picture(smoke, camera, lights, albedo=(1.0, 2.0, 0.0))

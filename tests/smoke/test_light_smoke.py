@@ -74,23 +74,6 @@ def test_the_whole_picture_is_the_tracers(device: str):
     assert rms(made, wanted) < 0.02
 
 
-def test_hard_smoke(device: str):
-    volume = make_plume(16, extinction=10.0, device=device)
-    none = light_smoke(volume, facing(volume, size=6), [])
-    assert none.planes.shape == (0, 6, 6) and none.emission.any() and none.shade().any()
-    empty = light_smoke(from_array(np.zeros((1, 1, 1)), device=device), facing(volume, size=6), [Light((1, 1, 1))])
-    assert not empty.shade().any() and (empty.transparency == 1).all() and empty.emission is None
-    thick = from_array(np.full((8, 8, 8), 1e6), device=device)
-    made = light_smoke(thick, facing(thick, size=6), [Light((0, 0, 1)), PointLight((4.0, 4.0, 4.0))])
-    assert torch.isfinite(made.shade()).all() and (made.transparency[2:4, 2:4] == 0).all()
-    within = Camera.look_at((0.5, 0.5, 0.5), (0.5, 0.9, 0.5), extent=1.0, height=6, width=6, perspective=True)
-    seen = light_smoke(volume, within, [PointLight((0.5, 0.5, 0.4)), Light((0, 1, 0))])
-    assert torch.isfinite(seen.shade()).all() and seen.planes.any()
-    made = light_smoke(volume, facing(volume, size=6), [Light((1, 1, 1), (4 * math.pi,) * 3)])
-    with pytest.raises(ValueError, match="albedo"):
-        made.shade(albedo=(2.0, 1.0, 1.0))
-
-
 def test_a_sky_is_twelve_lights(device: str):
     """The lights have all light of the sky, and the picture is near the traced one."""
     sky = (0.3, 0.3, 0.6)

@@ -24,18 +24,6 @@ def test_parts_are_computed_only_where_they_weigh():
     assert float(losses(targets + 0.1, targets, pool.motion, 0.0)["mse"]) == pytest.approx(0.01, rel=1e-4)
 
 
-def test_warping_moves_an_image_by_its_motion():
-    earlier = torch.rand(1, 2, 12, 16)
-    motion = torch.zeros(1, 2, 12, 16)
-    motion[:, 0], motion[:, 1] = 3, -2  # to the right and up
-    warped, inside = warp(earlier, motion)
-    assert torch.allclose(warped[:, :, :10, 3:], earlier[:, :, 2:, :13], atol=1e-5)
-    assert (inside[0, 0, :10, 3:] == 1).all() and inside.sum() == 10 * 13
-    motion[:, 0], motion[:, 1] = 0.5, 0
-    between = 0.5 * (earlier[..., 1:] + earlier[..., :-1])
-    assert torch.allclose(warp(earlier, motion)[0][..., 1:], between, atol=1e-5)
-
-
 def test_warping_by_nan_or_infinity_is_outside():
     image = torch.rand(1, 2, 4, 5, requires_grad=True)
     motion = torch.zeros(1, 2, 4, 5)

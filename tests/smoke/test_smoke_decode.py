@@ -21,15 +21,7 @@ def _expected(model: SmokeModel, guide: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("size", [(32, 32), (17, 23), (1, 9), (1, 1)])
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {},
-        {"stem": 2},
-        {"adapters": False, "stem": 2},
-        {"guide": "six", "stem": 2},
-    ],
-)
+@pytest.mark.parametrize("settings", [{}, {"stem": 2}, {"adapters": False, "stem": 2}, {"guide": "six", "stem": 2}])
 def test_folded_weights_give_the_same_planes(settings, size):
     model = random_model(**settings)
     decoder = model.decoder(height=size[0], width=size[1])

@@ -29,10 +29,6 @@ def _network(seed: int = 0, **settings) -> SmokeModel:
     return random_model(0.1, seed, levels=2, **settings)
 
 
-def _targets(pool: Pool, part: slice) -> torch.Tensor:
-    return pool.targets[part].float()
-
-
 def test_scores_are_those_worked_out_by_hand(device):
     pool = small_pool().to(device)
     guides, targets = (part.float().cpu().numpy().astype(float) for part in (pool.guides, pool.targets))
@@ -55,13 +51,11 @@ def test_scores_are_those_worked_out_by_hand(device):
             assert getattr(result, name) == pytest.approx(expected, rel=1e-3), name
 
 
-def test_the_targets_are_perfect_and_as_steady_as_themselves():
-    result = score(_targets, small_pool())
+def test_noise_flickers_and_the_targets_are_perfect():
+    result = score(lambda pool, part: pool.targets[part].float(), small_pool())
     assert result.psnr == result.lowest == result.highest == result.planes[0] == 120.0
     assert result.flicker_ratio == 1.0 and result.flicker > 0
 
-
-def test_noise_flickers():
     def noisy(pool: Pool, part: slice) -> torch.Tensor:
         random = torch.Generator().manual_seed(part.start)
         planes = pool.targets[part].float()

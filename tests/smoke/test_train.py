@@ -56,15 +56,14 @@ def _curves(path) -> list[dict[str, float]]:
 
 def test_it_learns_a_small_pool_by_heart(tmp_path, device):
     pool = small_pool(2, resolution=16).to(device)
-    network = NetworkSettings(width=8, levels=3)
-    before = score(of_network(SixWayNetwork(network).to(device)), pool)
-    profile = _profile(network, rounds=1, steps=80, batch=2, average=0.9, rate=3e-3)
+    before = score(of_network(SixWayNetwork(TINY).to(device)), pool)
+    profile = _profile(rounds=1, steps=50, batch=2, average=0.9, rate=3e-3)
     options = {"make_pool": lambda *a, **k: pool, "make_validation": lambda *a, **k: pool}
     training = _train(tmp_path / "a", profile, device=device, **options)
-    # 33.9 dB after 80 steps, on the CPU.
-    assert training.finished and training.best > max(32.0, before.psnr + 6)
+    # 32.3 dB after 50 steps, on the CPU; 22.1 dB before.
+    assert training.finished and training.best > max(30.0, before.psnr + 6)
     assert training.score.lowest <= training.score.psnr <= training.score.highest
-    assert training.steps == 80 and training.skipped == 0
+    assert training.steps == 50 and training.skipped == 0
     model = wlm.load(tmp_path / "a")
     assert wlm.smoke.evaluate(model, pool, device=device, half=False).psnr == pytest.approx(training.best, abs=0.05)
     assert model.summary == training.model.summary and model.summary["psnr"] == training.best

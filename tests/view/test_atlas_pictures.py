@@ -6,11 +6,10 @@ import torch
 from builders.atlas_meshes import charts, constant, sheet
 
 from wlm.atlas.evaluation import original
-from wlm.errors import WlmError
 from wlm.ops.views import View
 from wlm.view.atlas import draw
 from wlm.view.display import white_of
-from wlm.view.pictures import encode, save_png
+from wlm.view.pictures import encode
 
 FRONT = View.of((0.2, 0.1, 1.0))
 
@@ -47,9 +46,3 @@ def test_exposure():
     dark[0] = 3.0
     assert white_of(dark) == 3.0, "one lamp in the dark"
     assert white_of(np.arange(1001.0)) == pytest.approx(995.0)
-
-
-def test_a_picture_in_no_folder(tmp_path):
-    with pytest.raises(WlmError, match="cannot write"):
-        save_png(tmp_path / "none" / "a.png", np.zeros((2, 2, 3), np.uint8))
-    assert not list(tmp_path.iterdir())

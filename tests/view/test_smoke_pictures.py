@@ -156,15 +156,6 @@ def test_shadow_of_a_box(device, toward, perspective):
     assert (result[~sure] == 1).all()
 
 
-def test_shadow_falls_behind_only(device):
-    """Smoke between light and obstacle is lit."""
-    camera = Camera.look_at((0, 0, 10), (0, 0, 0), extent=4.0, height=9, width=9)
-    box = ObstacleSettings(shape="box", radius=(1, 1, 0.1), path=((0.0, 0, 0, 0),))
-    for depth, expected in ((8.0, 1.0), (12.0, 0.0)):
-        result = shadow_of(torch.full((9, 9), depth, device=device), camera, (0, 0, 1), box)
-        assert float(result[4, 4]) == expected and float(result[0, 0]) == 1.0
-
-
 @pytest.mark.parametrize("far", [0.0, 1000.0])
 def test_shadow_of_a_sphere(device, far):
     """The shadow has the area of a circle, also a thousand radii from the origin."""

@@ -58,7 +58,6 @@ def _tiles(model: AtlasModel, uv: np.ndarray, row: np.ndarray, state: int) -> np
 
 
 def _bilinear(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Reads a texture [H, W, C] bilinearly at UVs [N, 2], clamped at its edges."""
     size = np.array(texels.shape[1::-1])
     place, page = (uv * size - 0.5).clip(0, size - 1), np.zeros(len(uv), np.int64)
     return _between(texels[None], page, np.zeros(2, np.int64), size - 1, place)

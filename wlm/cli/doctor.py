@@ -47,7 +47,6 @@ def doctor() -> None:
 
 
 def _size_of(folder: Path) -> int:
-    """Returns the total bytes of the files under a folder, even while other processes add and remove files."""
     total = 0
     for parent, _, files in os.walk(folder):
         for name in files:
@@ -57,7 +56,6 @@ def _size_of(folder: Path) -> int:
 
 
 def _extras() -> dict[str, list[str]]:
-    """Returns the optional dependency groups (extras) of wlm, each with its packages that are not installed."""
     try:
         requirements = metadata.requires("wlm") or []
     except metadata.PackageNotFoundError:

@@ -30,7 +30,8 @@ def volume(
     probes_path: Annotated[
         Path | None,
         typer.Argument(
-            metavar="PROBES", help="File with positions and normals of the probes; default those in FILE.wlm."
+            metavar="PROBES",
+            help="File that was compressed, for its positions and normals; default FILE.wlm's positions.",
         ),
     ] = None,
     at: Annotated[

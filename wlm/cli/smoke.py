@@ -129,7 +129,6 @@ def simulate(
 
 
 def _scene(name: str, scale: float, frames: int | None) -> "Scene":
-    """Loads a scene with a factor on its cells and, unless None, another number of frames."""
     from wlm.smoke.scene import load_scene
 
     scene = load_scene(name)
@@ -409,7 +408,6 @@ def run(
 
 
 def _given_albedo(text: str | None) -> tuple[float, float, float] | None:
-    """Parses `--albedo`, one number or R,G,B; None if it is not given."""
     if text is None:
         return None
     values = vector("--albedo", text if "," in text else ",".join([text] * 3))

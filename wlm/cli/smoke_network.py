@@ -97,7 +97,9 @@ def export_onnx(
         Path | None,
         typer.Argument(metavar="NETWORK", help="Network that wlm smoke train wrote; default the shipped one."),
     ] = None,
-    resolution: Annotated[int, typer.Option(min=1, max=16384, help="Edge of the square image in pixels.")] = 512,
+    resolution: Annotated[
+        int, typer.Option(min=1, max=16384, help="Height and width of the network's images in pixels.")
+    ] = 512,
 ) -> None:
     """Write a network as ONNX: from encoded guiding maps to encoded lightmaps, of a fixed size, in float32."""
     check_output(output, ".onnx")

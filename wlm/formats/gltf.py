@@ -552,7 +552,7 @@ def _load_buffers(
             data, length = b"", 0
         elif uri is None:
             if number or binary is None:
-                raise WlmError(f"{where}: has no uri, and the file has no binary chunk")
+                raise WlmError(f"{where}: expected a uri; only buffers[0] of a .glb with a binary chunk has none")
             data = binary
         elif uri.startswith("data:"):
             data = _data_uri(f"{where}.uri", uri)

@@ -131,7 +131,6 @@ def write_ktx2(
 
 
 def _pair(key: str, value: str) -> bytes:
-    """Encodes one key and its value: their length, the text, and zeros up to a multiple of 4 bytes."""
     text = f"{key}\0{value}\0".encode()
     return struct.pack("<I", len(text)) + text + bytes(-len(text) % 4)
 

@@ -242,7 +242,6 @@ def _has_light(folder: Path) -> bool:
 
 
 def _unity_files(folder: Path) -> list[tuple[tuple[str, str], Path]]:
-    """Returns the files of a folder that have Unity's names, by atlas and layer; hidden files are left out."""
     found = [(match, path) for path in folder.iterdir() if (match := _UNITY.fullmatch(path.name))]
     return [((match[1], match[2].lower()), path) for match, path in found if path.name[0] != "." and path.is_file()]
 

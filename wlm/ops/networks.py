@@ -86,5 +86,4 @@ def _arrays(network: MlpKernels, x: torch.Tensor, hidden: torch.Tensor, output: 
 
 
 def _weights(h: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """Returns the gradient of a layer's weights, and of its biases as the last row, from inputs h and gradient d."""
     return torch.cat([h.transpose(1, 2) @ d, d.sum(1, keepdim=True)], 1)

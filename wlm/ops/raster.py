@@ -254,6 +254,5 @@ class _Texture(torch.autograd.Function):
 
 
 def _checked_triangles(triangle: torch.Tensor, corners: torch.Tensor) -> torch.Tensor:
-    """Returns the triangles as int32, after checking that all indices refer to existing corners."""
     check_index("triangle", triangle, len(corners), (None, 3), corners.device)
     return triangle.to(torch.int32)

@@ -454,7 +454,6 @@ def _probes(count: int) -> str:
 
 
 def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
-    """Returns a hash of the input, 16 hexadecimal digits, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(np.asarray(values.shape, "<i8").tobytes())
     digest.update(np.ascontiguousarray(position, "<f8"))

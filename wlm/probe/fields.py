@@ -202,7 +202,6 @@ def _list_of_probes(content: Any) -> tuple[str, list] | None:
 
 
 def _is_scene(content: dict[str, Any]) -> bool:
-    """Whether the content is an object of three.js (Object3D.toJSON)."""
     metadata = content.get("metadata")
     return isinstance(content.get("object"), dict) and isinstance(metadata, dict) and metadata.get("type") == "Object"
 
@@ -288,7 +287,6 @@ def _array(value: object, kinds: str) -> np.ndarray | None:
 
 
 def _kind(value: object) -> str:
-    """Returns a short description of a JSON value for messages."""
     text = "an object" if isinstance(value, dict) else json.dumps(value)
     return text if len(text) <= 60 else text[:57] + "..."
 

@@ -87,7 +87,6 @@ def _doubt(sample: np.ndarray, order: str, convention: str) -> tuple[float, floa
 
 
 def _better(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Compares two orders by their shares of impossible probes and of colour: whether `one` is plausible and better."""
     if one[0] > _APART or one[0] > other[0] + _FEW:
         return False
     return other[0] > one[0] + _APART or other[1] > max(_TINTED, 3.0 * one[1])

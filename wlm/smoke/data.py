@@ -490,7 +490,6 @@ def read_shaded(
 
 @contextmanager
 def _writing(folder: Path) -> Iterator[None]:
-    """Converts an error of the file system to a WlmError that names the folder."""
     try:
         yield
     except OSError as error:

@@ -146,7 +146,8 @@ def axis_faults(lightmaps: torch.Tensor) -> tuple[str, ...]:
     brighter under a light from the front than from behind.
 
     Returns:
-        A line for each fault; none for black lightmaps, and where the light shows no direction.
+        A line for each pair of directions that may be exchanged, or one that names the black lightmaps if some are;
+        none if all six are black, or where the light shows no direction.
     """
     maps = lightmaps.reshape(-1, *lightmaps.shape[-3:])
     dark = [name for name, light in zip(DIRECTIONS, maps.amax((0, 2, 3)).tolist(), strict=True) if not light > 0.0]

@@ -262,6 +262,5 @@ def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _normals(geometry: Geometry) -> np.ndarray:
-    """Returns vertex normals, float64 [V, 3]; upwards at vertices without triangles."""
     normals = unit_or_zero(Trimesh(geometry.position, geometry.triangle, process=False).vertex_normals)
     return np.where(normals.any(1, keepdims=True), normals, [0.0, 1.0, 0.0])

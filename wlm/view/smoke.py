@@ -169,7 +169,6 @@ class Drawing:
         return self.image
 
     def _of_albedo(self, planes: torch.Tensor) -> torch.Tensor:
-        """Multiplies light scattered once, [L, H, W], by the albedo: [L, H, W, 3]."""
         return torch.stack([value * planes for value in self._albedo], -1)
 
     def _as_lamps(self) -> kernels.Lamps:

@@ -76,10 +76,10 @@ class WholeNumbers:
         ]
 
     def codes(self) -> dict[str, np.ndarray]:
-        """Returns the arrays `code`, `levels`, `bounds` and `net` of `Gaussians`.
+        """Computes from whole numbers what a GPU holds: `code`, `levels`, `bounds` and `net` of `Gaussians`.
 
         Raises:
-            ValueError: A number does not fit 16 bits, or a rotation exceeds half a turn.
+            ValueError: The whole numbers of a channel span more than 16 bits, or a rotation exceeds half a turn.
         """
         low, high = self.gaussians.min(0), self.gaussians.max(0)
         turn = self.gaussians[:, STORED_ROTATION] * self.step[STORED_ROTATION]

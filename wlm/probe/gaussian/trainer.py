@@ -182,7 +182,7 @@ class Trainer:
                 self._stages[stage]()
 
     def _enter(self, stage: int) -> None:
-        """Starts a stage: 1 sets the range of the codes; 2 fixes the Gaussians and drops those that no probe needs."""
+        """Starts stage 1 (sets the codes' range) or 2 (freezes the Gaussians; drops those that hardly matter)."""
         t = self._tensors
         if stage == 1:
             t["bounds"].copy_(torch.stack([t["rows"].amin(0), t["rows"].amax(0)]))

@@ -59,7 +59,7 @@ class BlockIndex:
         """
         position = np.asarray(position, np.float64)
         if not (np.abs(position) <= _FARTHEST).all():
-            raise ValueError(f"position: expected numbers of at most {_FARTHEST:g}, got NaN or a larger number")
+            raise ValueError(f"position: expected probes within {_FARTHEST:g} of the origin, got NaN or one beyond")
         self.count = len(position)
         self.ratios = tuple(ratios)
         widest = 2 * self.ratios[-1]  # cells along a side of the coarsest block

@@ -182,7 +182,6 @@ def pack_book(
 
 
 def _rate(shots: Sequence[Shot]) -> float:
-    """Returns the frames per second, from the times of the first and the last frame, or `RATE` without a scene."""
     first, last = shots[0].looks, shots[-1].looks
     if first is None or last is None or not last.time > first.time:
         return RATE

@@ -167,7 +167,6 @@ def _colour(colour: tuple[float, float, float]) -> str:
 
 
 def _number(number: float) -> str:
-    """Returns a number as a float literal of GLSL ES; negative numbers are in brackets."""
     text = f"{number:.9g}"
     text = text if "." in text or "e" in text else f"{text}.0"
     return f"({text})" if number < 0 else text
