@@ -191,7 +191,7 @@ class Camera:
         if distance is None:
             # At least as far away as the box is large, which avoids an extreme perspective.
             distance = nearest + float(np.linalg.norm(size))
-            if not _SHORTEST < np.linalg.norm((target + distance * toward) - target):
+            if not np.linalg.norm((target + distance * toward) - target) > _SHORTEST:
                 raise WlmError(f"camera: the smoke is too small, or too far from 0 for its size: {size} at {origin}")
         width = max(round(pixels * aspect), 1)
         shape = {"height": pixels, "width": width, "world_up": up, "perspective": perspective}
