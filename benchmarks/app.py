@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     cls=Group,
     name="benchmarks",
-    help="Measure the speed and the error of every system and of rival methods.",
+    help="Commands that each measure one system beside rivals, or show results.",
     pretty_exceptions_enable=False,
     add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -11,8 +11,8 @@ The results table of each set of probes has these rows, by method:
   many steps on CUDA and only a few on a CPU.
 - The rivals of `benchmarks.rivals.probe` at given percentages of the probes' size as float32, and Unreal's packing,
   which has one size. The list of dead probes is counted for rivals too; positions are counted for no method.
-- "held out": every fifth probe is left out of a fit by the first profile. The model predicts the light at these probes
-  and half-way between probes; for comparison two simple interpolations of the uncompressed other probes predict it.
+- "held out": every fifth probe is left out of a fit by the first profile, which predicts its light, as do two simple
+  interpolations of the uncompressed other probes. "half-way" is the error of the full fit between probes.
 - "volume", the first profile: a viewer walks through the cascaded volume, which is filled from the original probes
   ("lossless") or from a model. Times are means and 95th percentiles over frames. The PSNR compares light read from the
   volume at probes near the viewer with the input; further columns have the PSNR of the decoded probes at the same

@@ -92,7 +92,7 @@ def _bilinear(new: int, old: int) -> sparse.csr_matrix:
 
 
 def _box(new: int, old: int) -> sparse.csr_matrix:
-    """Makes the matrix [new, old] that averages `old` texels over the squares of `new` texels."""
+    """Makes the matrix [new, old] that averages a row of `old` texels over each of `new` ones."""
     side, texel = np.arange(new + 1) * (old / new), np.arange(old)
     weight = np.minimum(side[1:, None], texel + 1.0) - np.maximum(side[:-1, None], texel)
     weight = np.maximum(weight, 0.0)

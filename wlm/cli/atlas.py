@@ -62,7 +62,7 @@ _UvSet = Annotated[
 _Node = Annotated[str | None, typer.Option(help="Name of the node that has the lightmap; default the best fit.")]
 _Slot = Annotated[
     str | None,
-    typer.Option(help="Material slot whose textures are the lightmaps, without LIGHTMAPS: occlusion or emissive."),
+    typer.Option(help="Without LIGHTMAPS: read them from this slot of the materials, occlusion or emissive."),
 ]
 _Flip = Annotated[bool, typer.Option("--flip", help="The top row of the lightmap is at v = 1 instead of v = 0.")]
 _Views = Annotated[

@@ -197,7 +197,7 @@ class _Grid:
         return np.concatenate(found), np.concatenate(places)
 
     def _leaves(self, nodes: np.ndarray, places: np.ndarray, values: np.ndarray) -> None:
-        """Decodes leaves of 8^3 voxels at byte offsets `nodes` into the box `values`, at `places` [N, 3] in leaves."""
+        """Decodes leaves at byte offsets `nodes` to cubes of 8^3 voxels of `values` with indices `places` [N, 3]."""
         x, y, z = (n // LEAF for n in values.shape)
         cut = values.reshape(x, LEAF, y, LEAF, z, LEAF).transpose(0, 2, 4, 1, 3, 5)
         form = {"float": "<f4", "double": "<f8"}.get(self._type, "")

@@ -146,18 +146,17 @@ def touches(shape: Shape, middle: wp.vec3, half: wp.vec3) -> bool:
 
 @dataclass(frozen=True)
 class GaussianFunctions:
-    """The `wp.func`s on Gaussians with latent vectors of one length L.
+    """The `wp.func`s on Gaussians with latent vectors of one length L; the module defines rows, F_k and w_k.
 
-    `rows` is float [K, 10 + L], k the index of a Gaussian, and `cut` the radius of its support in standard deviations.
+    `rows` is float [K, 10 + L], k an index, `shape` = `shape_of` that row, `cut` its reach in standard deviations.
 
     Attributes:
         vec_latent: vec of L floats.
         vec_sums: vec of 9 + L floats, the backward pass's sums over points.
         add: (f, shape, rows, k, x, cut) -> f plus F_k w_k(x).
         accumulate: (sums, shape, rows, k, x, grad_f, cut) -> `sums` plus the terms of point x.
-        slope: (shape, rows, k, x, grad_f, cut) -> contribution of Gaussian k to the gradient of x.
-        chain: (sums, shape, rows, k) -> gradient of the first ten numbers of a row; the last L sums are the gradient of
-            the latent.
+        slope: (shape, rows, k, x, grad_f, cut) -> k's part of the gradient of x.
+        chain: (sums, shape, rows, k) -> gradient of a row but for the latent, whose gradient is the last L sums.
     """
 
     vec_latent: Any

@@ -147,8 +147,8 @@ def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
 
 
 def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None) -> list[tuple[int, np.ndarray]]:
-    """Forms groups of alike triangles; returns the representative and all members of each group of several. Of
-    triangles with equally many edges to alike ones, that with the least `number`, int [M], becomes representative."""
+    """Forms groups of alike triangles; returns the node of the representative and all members of each group of several.
+    The node with the most edges becomes representative; of equals, that with the least `number`, int [M]."""
     count = len(number)
     left = np.arange(count)
     drawn = np.random.default_rng(0).permutation(count)  # the order in which nodes get into samples

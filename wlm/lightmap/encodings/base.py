@@ -36,7 +36,7 @@ class DeviceTiles(ABC):
 
     @abstractmethod
     def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
-        """Decodes tiles to radiance, float32 [k, 128, 128, 3]; `rows` [k] indexes `numbers`; gaps are not filled."""
+        """Decodes the k tiles `numbers[rows]` to radiance, float32 [k, 128, 128, 3]; gaps between charts stay."""
 
 
 class Encoding(ABC):

@@ -276,8 +276,8 @@ class MapTiles(DeviceTiles):
         self.device_bytes = sum(array.capacity for array in (*maps.values(), hidden, output))
 
     def bounds(self, time: float) -> np.ndarray:
-        """Returns an upper bound of each tile's colour at a time, in gamma space, float32 [n]; between two stored times
-        the larger of their bounds."""
+        """Returns the gamma-space colour that byte 255 of each tile stands for at a time, float32 [n]; between two
+        stored times the larger one."""
         before, after, share = self._axis.neighbours(time)
         return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
 
