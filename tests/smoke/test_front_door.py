@@ -54,6 +54,6 @@ def test_a_network_of_extreme_weights_is_an_error(smoke):
 
 @pytest.mark.parametrize(("voxel", "origin"), [(1e-30, 0.0), (1.0, 1e30)])
 def test_smoke_that_no_camera_can_frame_is_refused(voxel, origin):
-    tiny = dataclasses.replace(plume(), voxel=voxel, origin=(origin, 0.0, 0.0))
+    tiny = dataclasses.replace(plume(), voxel=voxel, origin=(origin,) * 3)
     with pytest.raises(WlmError, match="camera: the smoke is too small, or too far from 0"):
         wlm.smoke.Camera.around(tiny, pixels=8)
