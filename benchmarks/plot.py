@@ -198,7 +198,6 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], panel: Panel, methods: Sequence
 
 
 def _wide(values: Sequence[float]) -> bool:
-    """Returns whether the values span so large a range that the axis should be logarithmic."""
     return min(values) > 0.0 and max(values) / min(values) > _LOG_RATIO
 
 

@@ -33,6 +33,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks.plot import Panel
+from benchmarks.probe_exact import decode64
 from benchmarks.rivals.probe import WEIGHT_BITS, at_bytes, unreal_packing
 from benchmarks.rivals.probe_torch import DenseFit
 from benchmarks.rivals.rival import Rival
@@ -43,7 +44,6 @@ from wlm.formats import zstd
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet, from_arrays, load
 from wlm.probe.evaluation import Report, between_psnr, by_distance, score
-from wlm.probe.exact import decode64
 from wlm.probe.fit import compress
 from wlm.probe.gaussian.decode import GaussianDecoder, Points
 from wlm.probe.gaussian.trainer import CODE_BITS, FINAL_RATE

@@ -683,7 +683,6 @@ def _rms(values: torch.Tensor) -> float:
 
 
 def _relative(values: torch.Tensor, exact: torch.Tensor) -> float:
-    """Returns the RMS error relative to the RMS of the exact values."""
     return _rms(values.double() - exact.double()) / _rms(exact)
 
 

@@ -149,7 +149,6 @@ def _levels(image: np.ndarray, mask: np.ndarray, block: int) -> tuple[np.ndarray
 
 
 def _pad(image: np.ndarray) -> np.ndarray:
-    """Pads an image to whole blocks of 4 x 4 texels by repeating its last row and column."""
     height, width = image.shape[:2]
     return np.pad(image, ((0, -height % _BC_BLOCK), (0, -width % _BC_BLOCK), (0, 0)), mode="edge")
 

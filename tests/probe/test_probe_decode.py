@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
+from benchmarks import probe_exact as exact
+from benchmarks.probe_exact import decode64
 from wlm.errors import WlmError
-from wlm.probe import exact
-from wlm.probe.exact import decode64
 from wlm.probe.gaussian.decode import GaussianDecoder
 from wlm.probe.gaussian.model import CUT, check_outputs
 from wlm_kernels.probe.network import most_outputs

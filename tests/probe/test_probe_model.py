@@ -8,8 +8,8 @@ from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model, whole_mode
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
+from benchmarks.probe_exact import decode64
 from wlm.errors import WlmError
-from wlm.probe.exact import decode64
 from wlm.probe.gaussian.model import (
     CENTRE,
     CUT,

@@ -13,9 +13,9 @@ from builders.shader_runs import run_glsl
 from builders.shader_subjects import points_of
 
 import wlm
+from benchmarks.probe_exact import decode64
 from wlm.errors import WlmError
 from wlm.export import export
-from wlm.probe.exact import decode64
 from wlm.probe.gaussian.shader import probe_glsl
 from wlm.probe.volume.shader import volume_glsl
 

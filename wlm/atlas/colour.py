@@ -92,7 +92,6 @@ def _by_block(texels: torch.Tensor) -> torch.Tensor:
 
 
 def _of_blocks(texels: torch.Tensor, count: int, ny: int, nx: int) -> torch.Tensor:
-    """Joins blocks of 4x4 texels [N, 16, 3] to tiles [T, ny, nx, 3], the inverse of `_by_block`."""
     cells = texels.view(count, ny // BLOCK_SIDE, nx // BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE, 3)
     return cells.transpose(2, 3).reshape(count, ny, nx, 3)
 

@@ -307,5 +307,4 @@ def _joined(primitives: Sequence[GltfPrimitive], uv_set: int) -> tuple[np.ndarra
 
 
 def _neighbours(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns two views of an array: without the last, and without the first, element along an axis."""
     return values.take(range(values.shape[axis] - 1), axis), values.take(range(1, values.shape[axis]), axis)

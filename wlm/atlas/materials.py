@@ -257,7 +257,6 @@ def _needle(document: GltfDocument, node: dict[str, Any]) -> _Slot | None:
 
 
 def _emission(material: dict[str, Any]) -> Any:
-    """Returns a material's emissive factor times its strength, [3]; 1 where the factor is 0 or not stated."""
     factor = np.array(material.get("emissiveFactor", (0.0, 0.0, 0.0)), np.float64)
     strength = material.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
     return (factor * strength).tolist() if factor.any() else 1.0

@@ -72,7 +72,6 @@ def _quarters(texels: torch.Tensor) -> torch.Tensor:
 
 
 def _largest(values: torch.Tensor) -> torch.Tensor:
-    """Returns for each cell the largest value within a texel of it."""
     window = 2 * _BORDER + 1
     across = max_pool2d(values[None, None], (1, window), 1, (0, _BORDER))
     return max_pool2d(across, (window, 1), 1, (_BORDER, 0))[0, 0]

@@ -284,7 +284,6 @@ def _interaction(p: mi.Point3f, normal: mi.Vector3f) -> mi.Interaction3f:
 
 
 def _heuristic(pdf: mi.Float, other: mi.Float) -> mi.Float:
-    """Returns the power heuristic's weight of a sample of density `pdf` against the other strategy's density."""
     a, b = dr.square(pdf), dr.square(other)
     return dr.select(a > 0, a / (a + b), 0.0)
 

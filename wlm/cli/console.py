@@ -297,7 +297,6 @@ def running(
 
 
 def _named_figure(name: str, value: float) -> str:
-    """Formats a figure whose name ends with a unit: `PSNR dB` and 41.2 become "PSNR 41.2 dB"."""
     label, _, unit = name.partition(" ")
     return " ".join(filter(None, (label, number(value, ".4g"), unit)))
 

@@ -257,7 +257,6 @@ def _source(
 
 
 def _say(notes: Sequence[str]) -> None:
-    """Prints the first of the notes about an input, and every warning among them, each text once."""
     for line in dict.fromkeys(line for i, line in enumerate(notes) if not i or "warning: " in line):
         note(line)
 

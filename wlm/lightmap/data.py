@@ -692,5 +692,4 @@ def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:
 
 
 def _size(shape: Sequence[int]) -> str:
-    """Returns the size of a [H, W, ...] array in pixels as text, width first, such as "512x256"."""
     return f"{shape[1]}x{shape[0]}"

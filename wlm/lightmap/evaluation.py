@@ -250,7 +250,6 @@ def _lost_light(model: SheetModel, lightmaps: SheetFrames, device: str) -> list[
 
 
 def _windows(model: SheetModel) -> Iterator[tuple[int, tuple[slice, slice]]]:
-    """Yields the number of each tile that is not empty, and its window (rows and columns) in the map."""
     for tile in np.flatnonzero(model.kind).tolist():
         yield tile, model.grid.window(tile)
 
@@ -282,7 +281,6 @@ def count_kinds(model: SheetModel) -> dict[str, int]:
 
 
 def _stored(model: SheetModel) -> np.ndarray:
-    """Returns which texels lie in tiles that are not empty, bool [H, W]."""
     grid = model.grid
     return grid.texels_of((model.kind != TileKind.EMPTY).reshape(grid.rows, grid.cols))
 

@@ -278,7 +278,6 @@ def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[s
 
 
 def _labelled(path: Path, *place: int) -> Source:
-    """Returns a picture with the name of its folder in the label, because the folder's name identifies the state."""
     return Source(path, f"{path.parent.name}/{path.name}", *place)
 
 

@@ -284,7 +284,6 @@ def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGri
 
 
 def _whole(valid: np.ndarray) -> np.ndarray:
-    """Pads the mask [h, w] of a tile at the map's end to [128, 128] with false."""
     mask = np.zeros((TILE, TILE), bool)
     mask[: valid.shape[0], : valid.shape[1]] = valid
     return mask

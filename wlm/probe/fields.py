@@ -161,12 +161,10 @@ def _columns(first: dict[str, Any]) -> _Columns:
 
 
 def _plain(name: str) -> str:
-    """Returns a name in lower case without the prefix m_ and without any signs."""
     return re.sub(r"[^0-9a-z]", "", name.lower().removeprefix("m_"))
 
 
 def _axes(names: list[str]) -> list[str]:
-    """Returns the names that are coordinates, x, y and z; none if one is missing."""
     found = {match[1]: name for name in reversed(names) if (match := _AXIS.fullmatch(_plain(name)))}
     return [found[axis] for axis in "xyz"] if len(found) == 3 else []
 

@@ -507,7 +507,6 @@ def _read_scene(folder: Path) -> Scene:
 
 
 def _simulated(scene: Scene) -> dict[str, Any]:
-    """Returns the settings on which the frames of a simulation depend."""
     appearance = {"smoke": {"extinction", "glow"}, "obstacles": {"__all__": {"colour"}}}
     others = dict.fromkeys(("name", "frames", "camera", "lights", "background"), True)
     return json.loads(scene.model_dump_json(exclude=others | appearance))

@@ -235,7 +235,6 @@ def _launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, output:
 
 
 def _weights(layer: nn.Conv2d, device: str, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the weights of a convolution, with channels last in memory as in the images, and its biases."""
     return layer.weight.to(device, dtype, memory_format=torch.channels_last), layer.bias.to(device, dtype)
 
 

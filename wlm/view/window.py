@@ -333,7 +333,6 @@ class Window:
 
 
 def _turned(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotates a vector about a unit axis (Rodrigues)."""
     return (
         vector * np.cos(angle) + np.cross(axis, vector) * np.sin(angle) + axis * (axis @ vector) * (1.0 - np.cos(angle))
     )

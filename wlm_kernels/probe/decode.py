@@ -2,7 +2,7 @@
 
 On CUDA a block of 128 threads decodes up to 64 points: several threads share the Gaussians that a point's cube lists,
 their sums are added in shared memory, and the network runs on all points together (`native/layers.cuh`, then
-`native/decode.cuh`). On the CPU a thread decodes one point. The reference is `wlm/probe/exact.py`.
+`native/decode.cuh`). On the CPU a thread decodes one point. The reference is `benchmarks/probe_exact.py`.
 """
 
 import functools

@@ -134,5 +134,4 @@ def _as_colours(pixels: np.ndarray) -> np.ndarray:
 
 
 def _rows(table: np.ndarray) -> np.ndarray:
-    """Reshapes RGBA floats [N, 4] to a picture [rows, 1024, 4]; the last row is padded with zeros."""
     return np.pad(table, ((0, -len(table) % _ROW), (0, 0))).reshape(-1, _ROW, 4)

@@ -152,7 +152,6 @@ def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _half_above(numbers: np.ndarray) -> np.ndarray:
-    """Rounds numbers up to the next half floats, returned as float64."""
     near = numbers.astype(np.float16)
     return np.where(near < numbers, np.nextafter(near, np.float16(np.inf)), near).astype(np.float64)
 

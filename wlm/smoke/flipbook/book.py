@@ -195,7 +195,6 @@ def _brightest_gain(frames: Sequence[SixWay]) -> float:
 
 
 def _channels(frames: Sequence[SixWay], layout: str) -> tuple[tuple[str, ...], ...]:
-    """Returns the names of the two textures' channels, without a last channel that no frame has."""
     planes = {ALPHA: "transparency", EMISSION: "emission"}
     absent = [name for name, plane in planes.items() if all(getattr(frame, plane) is None for frame in frames)]
     return tuple(names[:-1] if names[-1] in absent else names for names in LAYOUTS[layout])

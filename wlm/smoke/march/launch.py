@@ -83,6 +83,5 @@ class VolumeGraph(Generic[_Made]):
 
 
 def _kind(volume: DensityVolume) -> tuple:
-    """Returns the properties of a volume that a captured graph cannot change."""
     place = (volume.voxel, tuple(volume.origin), volume.extinction, volume.emission)
     return (volume.shape, volume.density.dtype, volume.temperature is not None, *place)

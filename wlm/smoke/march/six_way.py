@@ -71,7 +71,6 @@ def bake(
 
 
 def _planes(volume: DensityVolume, camera: Camera, march: March, supersample: int) -> torch.Tensor:
-    """Returns the six lightmaps, the transparency and the emission, [8, H, W]."""
     out = run(march_six.six_way, volume, camera.finer(supersample), (8,), march)
     return out if supersample == 1 else torch.nn.functional.avg_pool2d(out[None], supersample)[0]
 

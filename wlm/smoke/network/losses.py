@@ -78,7 +78,6 @@ class _Bilinear(torch.autograd.Function):
 
 
 def _spread(index: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """Expands indices [N, 1, H, W] to [N, C, H * W], with the C channels of `like`."""
     return index.flatten(2).expand(-1, like.shape[1], -1)
 
 

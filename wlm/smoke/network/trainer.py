@@ -187,7 +187,6 @@ class Trainer:
 
 
 def _mirrored(planes: tuple[str, ...], device: str) -> torch.Tensor:
-    """Returns for each plane the index of the plane that replaces it when images are mirrored left to right."""
     return torch.tensor([planes.index(_MIRRORED.get(name, name)) for name in planes], device=device)
 
 

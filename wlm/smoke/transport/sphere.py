@@ -66,7 +66,6 @@ def bake_sphere(
 
 
 def _sums(weigh: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
-    """Returns six weighted sums [6, H, W] of planes [L, H, W], with weights [L, 6]."""
     return torch.einsum("lp,lhw->phw", weigh, planes)
 
 

@@ -1,6 +1,6 @@
 // The network of a block of points (gaussian-probe-compression, eq. 7), after layers.cuh: the partial sums of each point's
 // Gaussians are added in shared memory, and the outputs are written in rows.
-// The reference is wlm/probe/exact.py; layers.cuh gives the reason for native code.
+// The reference is benchmarks/probe_exact.py; layers.cuh gives the reason for native code.
 
 const int t = threadIdx.x, first = block * P, part = t / P, point = t % P;
 const float* w1 = net.data, *w2 = w1 + SECOND, *w3 = w1 + THIRD;
