@@ -174,7 +174,8 @@ def test_kinds_are_told_by_content(tmp_path):
     (tmp_path / "a.exr").write_bytes(make_ktx2(106, 5, 3, [light.tobytes()]))
     np.testing.assert_array_equal(read_light(tmp_path / "a.exr")[0], light)
     for content, found in (
-        (b"", "other content"),
+        (b"", "an empty file"),
+        (b"no lightmap", "other content"),
         (
             b"\x89PNG\r\n\x1a\n",
             "a PNG: state what light its numbers stand for with --encoding (linear, srgb, rgbm, ...)",
