@@ -9,6 +9,7 @@ def exr_header(
     names: Sequence[str] = ("B", "G", "R"),
     window: tuple[int, int, int, int] = (0, 0, 15, 15),
     kind: int = 1,
+    sampling: int = 1,
     compression: int = 3,
     flags: int = 0,
 ) -> bytes:
@@ -19,10 +20,13 @@ def exr_header(
         names: Names of the channels.
         window: The data window and display window: left, top, right, bottom.
         kind: Type of the samples: 0 uint, 1 half, 2 float.
+        sampling: Distance between the samples of every channel, along x and y.
         compression: Number of the compression; 3 is ZIP, 13 zstd.
         flags: Flags of the version: 0x200 tiles, 0x800 deep data, 0x1000 several parts.
     """
-    channels = b"".join(name.encode() + b"\0" + struct.pack("<iB3xii", kind, 0, 1, 1) for name in names) + b"\0"
+    channels = (
+        b"".join(name.encode() + b"\0" + struct.pack("<iB3xii", kind, 0, sampling, sampling) for name in names) + b"\0"
+    )
     box = struct.pack("<4i", *window)
     fields = [
         ("channels", "chlist", channels),

@@ -7,6 +7,7 @@ import zlib
 import numpy as np
 import OpenEXR
 import pytest
+from builders.exr import exr_header
 from builders.textures import make_ktx2
 
 import wlm
@@ -124,24 +125,9 @@ def test_directions_beside_light_are_not_times_of_it(tmp_path):
 
 
 def test_subsampled_channels_are_refused(tmp_path):
-    def attribute(name: str, kind: str, value: bytes) -> bytes:
-        return f"{name}\0{kind}\0".encode() + struct.pack("<I", len(value)) + value
-
-    window = struct.pack("<4i", 0, 0, 7, 7)
-    head = struct.pack("<2I", 20000630, 2)
-    for each in (
-        ("channels", "chlist", b"Y\0" + struct.pack("<i4x2i", 2, 2, 2) + b"\0"),
-        ("compression", "compression", b"\0"),
-        ("dataWindow", "box2i", window),
-        ("displayWindow", "box2i", window),
-        ("lineOrder", "lineOrder", b"\0"),
-        ("pixelAspectRatio", "float", struct.pack("<f", 1)),
-        ("screenWindowCenter", "v2f", bytes(8)),
-        ("screenWindowWidth", "float", struct.pack("<f", 1)),
-    ):
-        head += attribute(*each)
+    head = exr_header(names=["Y"], window=(0, 0, 7, 7), kind=2, sampling=2, compression=0)
     rows = [struct.pack("<2i", y, 16 * (y % 2 == 0)) + np.ones(4 * (y % 2 == 0), "<f4").tobytes() for y in range(8)]
-    starts = np.cumsum([len(head) + 1 + 64, *map(len, rows[:-1])]).astype("<u8")
-    (tmp_path / "a.exr").write_bytes(head + b"\0" + starts.tobytes() + b"".join(rows))
+    starts = np.cumsum([len(head) + 64, *map(len, rows[:-1])]).astype("<u8")
+    (tmp_path / "a.exr").write_bytes(head + starts.tobytes() + b"".join(rows))
     with pytest.raises(WlmError, match="channel Y: expected 8x8 pixels in the data window, found 4x4"):
         read_light(tmp_path / "a.exr")

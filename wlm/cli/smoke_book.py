@@ -108,15 +108,13 @@ def shade(
 
     single, shots = _source(lightmaps, textures, cells, source_layout, straight, from_gain, device)
     plain = Looks(lights=[LightSettings(toward=(1, 1, 1))])
-    file = outputs(lightmaps, single, output, "shade", ".png") if single else None
+    file = outputs(lightmaps, single, output, "shade", ".png")
     rows = table(str(lightmaps), ["file", "covered pixels", "mean", "largest", "clipped pixels"])
     pictures, most = [], 0.0
     with running("shade") as progress:
         for shot in shots(None, progress):
             if shot.six.transparency is None:
                 raise WlmError(f"{lightmaps}: no opacity: expected an alpha channel, or a third texture by --with")
-            # A folder is made once there is a picture for it.
-            file = file or outputs(lightmaps, single, output, "shade", ".png")
             looks = shot.looks or plain
             given = lights or [settings.light() for settings in looks.lights]
             extra = {"albedo": looks.albedo, "ramp": looks.ramp, "obstacles": looks.obstacles, "time": looks.time}

@@ -321,10 +321,10 @@ class NumberedFiles:
         run: Mapping[str, Any] | None = None,
         resume: bool = False,
     ) -> None:
-        """Creates the folder, or checks that an existing one contains only files of an earlier run.
+        """Checks that the folder can be made, or that an existing one contains only files of an earlier run.
 
         Args:
-            folder: The folder; created if its parent exists.
+            folder: The folder, whose parent must exist; it is made for the first file.
             stem, suffix: Stem and suffix of the files, as for `numbered`.
             others: Names of further files that a run may write into the folder.
             run: Settings on which the results depend, as JSON values; None: the run cannot be resumed.
@@ -340,10 +340,13 @@ class NumberedFiles:
         # In JSON's types, which have no tuples, as they are read back.
         self._run = None if run is None else json.loads(json.dumps({**run, "wlm": __version__}))
         with _writing(self.folder):
+            made = not self.folder.exists()
             self.folder.mkdir(exist_ok=True)
             earlier = self._earlier()
             others = (path for path in sorted(self.folder.iterdir()) if path not in earlier)
             foreign = next((path for path in others if not is_passing(path.name)), None)
+            if made:
+                self.folder.rmdir()
         if foreign is not None:
             raise WlmError(f"{folder}: expected an empty folder or results of an earlier run, found {foreign.name}")
         if resume and self.partial.is_file():
@@ -361,13 +364,14 @@ class NumberedFiles:
             self.partial.unlink(missing_ok=True)
 
     def file(self, number: int) -> Path:
-        """Returns the path of a frame's result; the first call removes the files of an earlier run.
+        """Returns the path of a frame's result; the first call makes the folder or removes the files of an earlier run.
 
         Raises:
             WlmError: The earlier files cannot be removed.
         """
         if not self._cleared:
             with _writing(self.folder):
+                self.folder.mkdir(exist_ok=True)
                 for path in self._earlier():
                     path.unlink(missing_ok=True)
             if self._run is not None:

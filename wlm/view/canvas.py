@@ -48,7 +48,7 @@ class Canvas:
         texture = self._pyvista.Texture(np.ascontiguousarray(picture))
         texture.interpolate, texture.repeat = not nearest, False
         drawn[0].texture = texture
-        self._drawn[panel, name][0].prop.culling = "back" if one_sided else "none"
+        drawn[0].prop.culling = "back" if one_sided else "none"
         drawn[0].visibility = True
 
     def coloured(

@@ -255,27 +255,28 @@ class _Step:
         self._step = torch.zeros(1, dtype=torch.int32, device=device)
         # An inactive triangle hides what is behind it; NaN excludes it from the loss, as does one more triangle, which
         # stands for "none".
-        active, nothing = sheet.active[:, None, None], np.full((1, 3, 2), np.nan)
-        self._corners = [
-            wp.array(
-                np.concatenate([np.where(active, each, np.nan), nothing], dtype=np.float32).reshape(-1, 2),
-                device=device,
-            )
-            for each in (sheet.uv[sheet.triangle], uv)
-        ]
-        self._rows = wp.array(np.arange(3 * len(uv) + 3).reshape(-1, 3), dtype=int, device=device)
+        corners = np.full((2, len(uv) + 1, 3, 2), np.nan, np.float32)
+        corners[:, :-1][:, sheet.active] = np.stack([sheet.uv[sheet.triangle], uv])[:, sheet.active]
+        self._none = len(uv)
+        rows = wp.array(np.arange(3 * len(uv) + 3).reshape(-1, 3), dtype=int, device=device)
         kind = _Views if profile.space == "views" else _Surface
         self.points = kind(sheet, profile, self._step, seed, device)
         self._triangle = torch.empty_like(self.points.triangle)
         self._uv, self._new_uv = (torch.empty_like(self.points.barycentric) for _ in range(2))
         self._gradient = self._uv.new_empty(*self._triangle.shape, 3)
+        # Of fixed addresses, and so wrapped once.
+        points = interop.to_warp(self._triangle), interop.to_warp(self.points.barycentric, wp.vec2)
+        uvs = map(interop.to_warp, (self._uv, self._new_uv))
+        self._interpolated = [
+            (wp.array(each.reshape(-1, 2), device=device), rows, *points, uv)
+            for each, uv in zip(corners, uvs, strict=True)
+        ]
 
     def __call__(self) -> None:
         self.points.draw()
-        torch.remainder(self.points.triangle, len(self._rows), out=self._triangle)
-        points = interop.to_warp(self._triangle), interop.to_warp(self.points.barycentric, wp.vec2)
-        for corners, uv in zip(self._corners, (self._uv, self._new_uv), strict=True):
-            interpolate(corners, self._rows, *points, interop.to_warp(uv))
+        torch.remainder(self.points.triangle, self._none + 1, out=self._triangle)
+        for arrays in self._interpolated:
+            interpolate(*arrays)
         if "lut" in self._tuned:
             colour = texture(self._colour, texture(self._lut, self._new_uv), boundary="mirror")
         else:
