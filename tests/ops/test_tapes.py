@@ -18,6 +18,7 @@ from wlm.interop import to_warp
 WITHOUT = {
     "Raster": "a class",
     "bc7_blocks": "refuses gradients",
+    "funcs": "for use inside kernels",
     "plain": "the references in torch",
 }
 """Names of `wlm.ops` that aren't differentiable operations."""

@@ -20,6 +20,7 @@ _PLACES = {
     "bc7_blocks": "wlm.ops.blocks",
     "bc7_map": "wlm.ops.blocks",
     "bc7_texels": "wlm.ops.blocks",
+    "funcs": "wlm.ops.funcs",
     "gaussian_sum": "wlm.ops.gaussians",
     "interpolate": "wlm.ops.raster",
     "march": "wlm.ops.marching",

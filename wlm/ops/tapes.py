@@ -82,7 +82,7 @@ def _call(
 
     def tensor_of(name: str, value: Any) -> Any:
         if is_dataclass(value):
-            return replace(value, **{field: tensor_of(f"{name}.{field}", v) for field, v in vars(value).items()})
+            return _changed(value, lambda field, v: tensor_of(f"{name}.{field}", v))
         if isinstance(value, torch.Tensor):
             raise ValueError(f"{name}: expected a Warp array as for other arguments, got a tensor: use wp.from_torch")
         if not isinstance(value, wp.array):
@@ -99,7 +99,7 @@ def _call(
         if isinstance(value, tuple):
             return tuple(map(array_of, value))
         if is_dataclass(value):
-            return replace(value, **{field: array_of(v) for field, v in vars(value).items()})
+            return _changed(value, lambda _, v: array_of(v))
         if not isinstance(value, torch.Tensor):
             return value
         array = to_warp(value)
@@ -128,6 +128,10 @@ def _call(
         # An array without elements has no gradient to set to zero.
         tape.record_func(backward, [array for array, _ in (*leaves, *results) if array.size])
     return returned
+
+
+def _changed(record: Any, change: Callable[[str, Any], Any]) -> Any:
+    return replace(record, **{field: change(field, value) for field, value in vars(record).items()})
 
 
 def _tensor(name: str, array: wp.array) -> torch.Tensor:
