@@ -3,6 +3,7 @@
 import inspect
 import math
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -201,7 +202,11 @@ REFUSED = [
     ("march", {"direction": torch.ones(39, 3)}, "direction: expected float32 [40, 3], got"),
     ("march", {"toward": torch.zeros(2, 3)}, "length of toward: expected numbers from 0.999 to 1.001, found 0"),
     ("march", {"toward": None}, "toward, colour: expected both arguments or neither"),
-    ("march", {"origin": torch.zeros(40, 3).requires_grad_()}, "origin: expected a tensor that requires no gradient"),
+    (
+        "march",
+        {"origin": torch.zeros(40, 3).requires_grad_()},
+        "origin: expected an argument that requires no gradient",
+    ),
     ("march", {"emission": torch.zeros(6, 7, 8)}, "emission: expected float32 [6, 7, 8, 3], got"),
     ("march", {"step": 0.0}, "step: expected a number above 0, got 0.0"),
     ("march", {"g": 1.0}, "g: expected a number between -1 and 1, got 1.0"),
@@ -372,16 +377,25 @@ def test_same_bits_every_time():
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "ops.md").read_text(encoding="utf-8")
-BLOCKS = dict(re.findall(r"^## (\S+?),?(?: [^\n]*)?\n(?:(?!^## ).)*?```python\n(.*?)```", PAGE, re.S | re.M))
+BLOCKS = {
+    f"{section}-{i}": block
+    for section, text in re.findall(r"^## ([\w]+)[^\n]*\n((?:(?!^## ).)*)", PAGE, re.S | re.M)
+    for i, block in enumerate(re.findall(r"```python\n(.*?)```", text, re.S))
+}
 
 
 @pytest.mark.parametrize("section", BLOCKS)
-def test_block(section: str):
+def test_block(section: str, tmp_path: Path):
     torch.manual_seed(0)
-    exec(compile(BLOCKS[section], f"docs/ops.md, {section}", "exec"), {"__name__": "__main__"})
+    # Warp reads a kernel's lines from its file.
+    path = tmp_path / "block.py"
+    path.write_text(BLOCKS[section], encoding="utf-8")
+    runpy.run_path(str(path), run_name=f"block_{section.replace('-', '_')}")
 
 
 def test_page():
-    assert [*BLOCKS] == ["bc7_map", "plane", "mlp", "gaussian_sum", "rasterize", "march"]
+    kernels = ["Tapes-0", *(f"funcs-{i}" for i in range(4))]
+    torch_alone = [f"{name}-0" for name in ("bc7_map", "plane", "mlp", "gaussian_sum", "rasterize", "march")]
+    assert [*BLOCKS] == kernels + torch_alone
     for target in re.findall(r"\]\(([^)#\s]+)\)", PAGE):
         assert (ROOT / "docs" / target).exists(), target

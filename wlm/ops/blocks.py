@@ -86,7 +86,7 @@ def bc7_blocks(endpoints: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
         uint8 [H/4, W/4, 16] or [L, H/4, W/4, 16], BC7 blocks of mode 6.
 
     Raises:
-        ValueError: See `bc7_map`.
+        ValueError: See `bc7_map`; or an array requires a gradient while a tape is active.
     """
     _check(endpoints, weights)
     *layers, height, width = weights.shape
