@@ -1,6 +1,7 @@
 """Functions for kernels of one's own, against the twins in float64 and the operations of the same names."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -166,32 +167,33 @@ def test_layers_and_arrays_without_a_gradient(device: str):
     close(grads["values"], leaf.grad[..., 0], 1e-5)
 
 
+def _texels_on_tape(leaves: dict, quantised: bool, adjoint: np.ndarray, device: str) -> tuple[wp.array, dict]:
+    endpoints = _array(leaves["endpoints"], device)
+    weights = wp.array(leaves["weights"], dtype=float, device=device, requires_grad=True)
+    result = wp.zeros(weights.shape, dtype=wp.vec4, device=device, requires_grad=True)
+    arguments = {"endpoints": endpoints, "weights": weights, "quantised": quantised}
+    return result, _on_tape(_texels, weights.shape, arguments, result, adjoint)
+
+
 @pytest.mark.parametrize("quantised", [False, True])
 def test_texels(device: str, quantised: bool):
     """The texels and straight-through gradients of `bc7_texels`, inside [0, 1] and outside."""
     leaves = {"endpoints": uniform(-0.3, 1.3, 2, 3, 2, 4), "weights": uniform(-0.3, 1.3, 8, 12)}
-    arrays = {
-        "endpoints": _array(leaves["endpoints"], device),
-        "weights": wp.array(leaves["weights"], dtype=float, device=device, requires_grad=True),
-        "quantised": quantised,
-    }
-    result = wp.zeros((8, 12), dtype=wp.vec4, device=device, requires_grad=True)
     adjoint = normal(8, 12, 4)
-    grads = _on_tape(_texels, (8, 12), arrays, result, adjoint)
+    result, grads = _texels_on_tape(leaves, quantised, adjoint, device)
     exact = {name: torch.tensor(values, dtype=torch.float64).requires_grad_() for name, values in leaves.items()}
     texels = plain.bc7_texels(**exact, quantised=quantised)
     texels.backward(torch.tensor(adjoint, dtype=torch.float64))
     close(result, texels, 1e-6)
     for name, leaf in exact.items():
         close(grads[name], leaf.grad, 1e-5, name)
-    if quantised:
-        return
+
+
+def test_texels_against_differences(device: str):
+    """Inside [0, 1] and without rounding the straight-through gradient is the slope."""
     leaves = {"endpoints": uniform(0.1, 0.9, 2, 3, 2, 4), "weights": uniform(0.1, 0.9, 8, 12)}
-    arrays["endpoints"].assign(leaves["endpoints"])
-    arrays["weights"].assign(leaves["weights"])
-    for array in (arrays["endpoints"], arrays["weights"]):
-        array.grad.zero_()
-    grads = _on_tape(_texels, (8, 12), arrays, result, adjoint)
+    adjoint = normal(8, 12, 4)
+    _, grads = _texels_on_tape(leaves, False, adjoint, device)
     for name, (along, slope) in _twin(plain.bc7_texels, leaves, adjoint)[1].items():
         assert abs(float((grads[name] * along).sum()) - slope) < 1e-4 * abs(slope)
 
@@ -239,3 +241,10 @@ def test_what_a_network_refuses():
         funcs.network(0, 8, 3)
     with pytest.raises(ValueError, match="^MLP: expected sizes above 0 and GELU .*relu"):
         funcs.network(2, 8, 3, "relu")
+
+
+@pytest.mark.slow
+def test_compiled_for_cuda(tmp_path: Path):
+    """The functions and their gradients compile for a GPU on machines without one."""
+    made = wp.compile_aot_module(_plane.module, arch=[90], module_dir=tmp_path, use_ptx=True)
+    assert [path for path in made if path.suffix == ".ptx" and path.stat().st_size > 0]

@@ -144,8 +144,8 @@ def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", bo
         float [..., C].
 
     Raises:
-        ValueError: No such filter or boundary, a tensor's shape, type or device doesn't fit, or `uv` requires a gradient
-            with the filter "nearest".
+        ValueError: No such filter or boundary, a tensor's shape, type or device doesn't fit, or `uv` requires a
+            gradient with the filter "nearest".
     """
     texture_kernels.codes(filter, boundary)
     check("image", image, (None, None, None))
