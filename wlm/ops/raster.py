@@ -12,7 +12,7 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from wlm.interop import to_warp, torch_memory
-from wlm.ops.tapes import no_gradient, takes_arrays
+from wlm.ops.tapes import NoGradientError, takes_arrays
 from wlm.ops.tensors import check, check_index, dense, on_stream, optional_array, zeros_for
 from wlm_kernels.raster import gradient as raster_gradient
 from wlm_kernels.raster import rasterize as kernels
@@ -153,7 +153,7 @@ def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", bo
         raise ValueError(f"image: expected at least one texel and one channel, got {tuple(image.shape)}")
     check("uv", uv, (..., 2), image.device)
     if filter == "nearest" and uv.requires_grad:
-        raise no_gradient("uv", "the filter nearest")
+        raise NoGradientError("uv", "the filter nearest")
     texels = _Texture.apply(image, uv.reshape(-1, 2), filter, boundary)
     return texels.reshape(*uv.shape[:-1], image.shape[2])
 

@@ -24,12 +24,15 @@ R = TypeVar("R")
 
 
 class NoGradientError(WlmError, ValueError):
-    """An argument requires a gradient that the operation doesn't have."""
+    """An argument requires a gradient that the operation doesn't have.
 
+    Args:
+        name: The argument.
+        operation: What has no gradient for it.
+    """
 
-def no_gradient(name: str, operation: str) -> NoGradientError:
-    """Returns the error for an argument that requires a gradient, but has none in an operation."""
-    return NoGradientError(f"{name}: expected an argument that requires no gradient; {operation} has none for it")
+    def __init__(self, name: str, operation: str) -> None:
+        super().__init__(f"{name}: expected an argument that requires no gradient; {operation} has none for it")
 
 
 def takes_arrays(*differentiable: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -90,7 +93,7 @@ def _call(
         tensor = _tensor(name, value)
         if tape is not None and value.requires_grad:
             if name not in differentiable:
-                raise no_gradient(name, operation.__name__)
+                raise NoGradientError(name, operation.__name__)
             # Other types than floats are refused by the operation.
             leaves.append((value, tensor.requires_grad_(tensor.is_floating_point())))
         return tensor
