@@ -344,6 +344,10 @@ def test_other_refusals(device: str):
     record = wp.zeros(3, dtype=_Record, device=device)
     for call, message in (
         (lambda: ops.plane(values, wp.to_torch(points)), "points: expected a Warp array as for other arguments, got a"),
+        (
+            lambda: ops.plane(wp.to_torch(values), points),
+            "points: expected a torch tensor, float32 .*, got warp.*array",
+        ),
         (lambda: ops.plane(record, points), "values: cannot use an array of _Record here: "),
         (lambda: ops.plane(values, points.numpy()), "points: expected a torch tensor, float32 .*, got numpy.ndarray"),
         (lambda: ops.plane(values, points, reduce=3), "unexpected keyword argument 'reduce'"),

@@ -57,7 +57,10 @@ def takes_arrays(*differentiable: str) -> Callable[[Callable[P, R]], Callable[P,
 
         @functools.wraps(operation)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            array = None if torch.compiler.is_compiling() else next(_arrays((*args, *kwargs.values())), None)
+            # The first test is for speed.
+            if (args and isinstance(args[0], torch.Tensor)) or torch.compiler.is_compiling():
+                return operation(*args, **kwargs)
+            array = next(_arrays((*args, *kwargs.values())), None)
             if array is None:
                 return operation(*args, **kwargs)
             given = signature.bind(*args, **kwargs).arguments
