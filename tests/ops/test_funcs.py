@@ -86,7 +86,7 @@ def _on_tape(
     with tape:
         wp.launch(kernel, size, inputs=[*arguments.values()], outputs=[result], device=result.device)
     tape.backward(grads={result: wp.array(adjoint, dtype=result.dtype, device=result.device)})
-    return {n: a.grad.numpy() for n, a in arguments.items() if isinstance(a, wp.array) and a.requires_grad}
+    return {n: a.grad.numpy().copy() for n, a in arguments.items() if isinstance(a, wp.array) and a.requires_grad}
 
 
 def _twin(run: Callable, leaves: dict[str, np.ndarray], adjoint: np.ndarray) -> tuple[np.ndarray, dict]:
