@@ -6,17 +6,16 @@ BIN := .venv/bin
 # The target is a stamp and not the folder, whose modification time changes with every file added.
 STAMP := .venv/.installed
 
+DEMOS := lightmap atlas probe bake smoke smoke_light smoke_network ops_march ops_bc7
+
+# Two demos at a time, in this order: compiling kernels, which takes most of the time, keeps one core busy. The gallery
+# shows files of the others.
 demo: $(STAMP)
-	$(BIN)/python demos/lightmap.py
-	$(BIN)/python demos/atlas.py
-	$(BIN)/python demos/probe.py
-	$(BIN)/python demos/bake.py
-	$(BIN)/python demos/smoke.py
-	$(BIN)/python demos/smoke_light.py
-	$(BIN)/python demos/smoke_network.py
-	$(BIN)/python demos/ops_march.py
-	$(BIN)/python demos/ops_bc7.py
+	$(MAKE) --no-print-directory -j 2 $(DEMOS:%=%.demo)
 	$(BIN)/python demos/gallery.py
+
+%.demo:
+	$(BIN)/python demos/$*.py
 
 demo-network: $(STAMP)
 	$(BIN)/python demos/smoke_network.py --train

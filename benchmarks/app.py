@@ -55,9 +55,6 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
     "rival_names": _option(
         _Names, "--rival", help="Name of a rival method; measure only these. Repeatable.", metavar="NAME"
     ),
-    "rivals_at": _option(
-        _Path, "--rivals-at", help="Measure only rivals, in as many bytes as our rows in FILE.", metavar="FILE.json"
-    ),
     "probes_path": _option(_Path, "--probes", help="Light probe file. Default: that of the demo.", metavar="FILE"),
     "keys": _option(_Names, "--key", help="Name of an array in the file of --probes to measure. Repeatable."),
     "volume_only": _option(bool, "--volume-only", False, help="Measure only the cascaded probe volume."),
@@ -94,11 +91,11 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "probe": (
         "Measure light probes: PSNR, size and decode time of profiles, decoders and rivals.",
-        ("volume_only", "rivals_at", "quick", "rivals", "device", "probes_path", "keys"),
+        ("volume_only", "rivals_only", "quick", "rivals", "device", "probes_path", "keys"),
     ),
     "atlas": (
         "Measure lightmaps of meshes: PSNR, SSIM, size and decode time of profiles and their rivals.",
-        ("rivals_at", "quick", "rivals", "device", *_MESHES, "profiles"),
+        ("quick", "rivals", "device", *_MESHES, "profiles"),
     ),
     "atlas-scene": (
         "Measure scenes: PSNR of one model of all objects and hours, and of a model for each in as many bits.",

@@ -36,8 +36,8 @@ import warp as wp
 from benchmarks.plot import Panel
 from benchmarks.rivals.atlas import RIVALS, share_of
 from benchmarks.rivals.rival import Rival
-from benchmarks.rows import MEAN, Row, read_json
-from benchmarks.runner import Bench, Note, demo_data, exact_errors, expect_alone
+from benchmarks.rows import MEAN, Row
+from benchmarks.runner import Bench, Note, demo_data, exact_errors
 from wlm import interop
 from wlm.atlas.codec import sizes
 from wlm.atlas.data import LightmappedScene, Sheet, from_arrays
@@ -61,7 +61,6 @@ _RIVALS = {
 }
 _METHODS = tuple(_RIVALS)
 _SMALLER = (0.925, 0.95)  # CRs that the first profile is measured at too
-_HELD_TO = ("standard", "standard, CR 92.5%", "standard, CR 95%", "astc")  # bits of rivals that run alone
 _FIRST = "downsampling"  # the rival of every run
 VIEWS, RESOLUTION = 50, 512  # section 4.1.4; the paper doesn't say at which resolution it scores
 QUICK_VIEWS, QUICK_RESOLUTION = 8, 256
@@ -100,7 +99,6 @@ def run(
     device: str,
     profiles: Sequence[str] | None = None,
     rivals: bool = True,
-    rivals_at: str | os.PathLike[str] | None = None,
     progress: Note | None = None,
     **paths: Any,
 ) -> list[Row]:
@@ -112,7 +110,6 @@ def run(
         device: "cpu" or "cuda:0", for compressions, views and decodes; the rivals are compressed on the CPU.
         profiles: Names or YAML files of profiles; None: `PROFILES`.
         rivals: Whether to measure block codecs, which take minutes on the CPU. Downsampling is always measured.
-        rivals_at: A result file. If given, only rivals are measured, on the CPU, in as many bits as our models in it.
         progress: Called with a line before each part of the work.
         paths: The arguments of `read_lightmaps`.
 
@@ -120,16 +117,12 @@ def run(
         The rows of each lightmap, in the order in which the module's docstring lists them, then their means.
 
     Raises:
-        WlmError: A file, a profile or the device does not exist, options contradict each other, the result file lacks
-            a lightmap, or a compression failed.
+        WlmError: A file, a profile or the device does not exist, paths were given that don't go together, or a
+            compression failed.
     """
     device = interop.check_device(device)
     loaded = [Profile.load(name) for name in profiles or PROFILES]
     lightmaps = read_lightmaps(**paths)
-    if rivals_at is not None:
-        others = {"--quick": quick, "--profile": profiles, "--no-rivals": not rivals, "--device": device != "cpu"}
-        expect_alone("--rivals-at", others)
-        return rival_rows(rivals_at, lightmaps, progress=progress)
     if quick:
         loaded = [each.model_copy(update=_QUICK_CASCADE) if each.method == "cascade" else each for each in loaded]
     return run_rows(
@@ -193,37 +186,6 @@ def _lightmaps(mesh: Path, lightmaps: Sequence[Path], mask: str | os.PathLike[st
     scenes = [name if path.stem == name else f"{name} {path.stem}" for path in lightmaps]
     meshes = (load_scene(mesh, path, mask_path=mask) for path in lightmaps)
     return [Lightmap(*pair) for pair in zip(scenes, meshes, strict=True)]
-
-
-def rival_rows(
-    results: str | os.PathLike[str], lightmaps: Sequence[Lightmap], *, progress: Note | None = None
-) -> list[Row]:
-    """Measures the rivals alone, in as many bits as our models took in a former run.
-
-    Args:
-        results: The result file of the former run.
-        lightmaps: The lightmaps of the former run, at least one.
-        progress: As for `run`.
-
-    Returns:
-        The rows of the rivals, measured on the CPU, and their means.
-
-    Raises:
-        WlmError: `results` can't be read, or lacks a lightmap.
-    """
-    ours = [row for row in read_json(results)[0] if (row.system, row.method) == ("atlas", "ours")]
-    rows: list[Row] = []
-    for lightmap in lightmaps:
-        shares = {
-            row.option: _share(row)
-            for row in ours
-            if row.scene == lightmap.scene and row.option in _HELD_TO and row.get("bpp")
-        }
-        if not shares:
-            raise WlmError(f"{results}: expected a row of the method 'ours' and the scene {lightmap.scene}, found none")
-        bench = _AtlasBench(lightmap, "cpu", progress, 1)
-        rows += bench.scored(bench.rivals(shares, _METHODS), VIEWS, RESOLUTION)
-    return rows + means(rows, len(lightmaps))
 
 
 def run_rows(
@@ -354,7 +316,7 @@ class _AtlasBench(Bench):
         return _Entry(row, Decoder(model, self.device), decode, model)
 
     def tuned(self, entries: Sequence[_Entry]) -> list[_Entry]:
-        """Fits the first cascade's textures in rendered views, then in UV space. Returns an entry for each fit."""
+        """Fits the first cascade's textures in its space, then in the other (UV or views); returns an entry each."""
         cascade = next((entry for entry in entries if entry.model and "fit" in entry.model.report["seconds"]), None)
         if cascade is None:
             return []
@@ -497,15 +459,20 @@ def means(rows: Sequence[Row], lightmaps: int, of: str = "") -> list[Row]:
     return made
 
 
-def warm_up(profile: Profile, device: str) -> None:
-    """Compiles all kernels of compression and decoding by compressing and decoding a square of 32 x 32 texels."""
+def make_square(states: int) -> LightmappedScene:
+    """Makes a small scene with which kernels are compiled: a square of 32 x 32 texels in some lighting states."""
     side = np.linspace(0.1, 1.0, 32)
     image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
     uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
-    square = from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, image, name="square")
+    light = np.stack([image ** (1 + state) for state in range(states)])
+    return from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, light, name="square")
+
+
+def warm_up(profile: Profile, device: str) -> None:
+    """Compiles all kernels of compression and decoding, by a small scene of one state."""
     small = {"views": 1, "steps": min(profile.steps, 4), "resolution": 64}
     small |= {"budget": 1.0} if profile.method == "tiles" else {}
-    model = compress(square, profile.model_copy(update=small), device=device)
+    model = compress(make_square(1), profile.model_copy(update=small), device=device)
     Decoder(model, device).lightmap()
 
 

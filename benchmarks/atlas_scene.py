@@ -23,6 +23,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from benchmarks.atlas import make_square
 from benchmarks.rivals.scene_parts import scene_parts
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
@@ -123,7 +124,7 @@ class _SceneBench(Bench):
         """Returns the row of the scene and, if `parts`, the row of its objects compressed alone in each state."""
         scene, device = self._scene, self.device
         self.note(f"{profile.name}: compiling kernels")
-        compress(_small(len(scene.states)), profile.override({"budget": 1.0, "views": 1}), device=device)
+        compress(make_square(max(len(scene.states), 2)), profile.override({"budget": 1.0, "views": 1}), device=device)
         self.note(f"{profile.name}: compressing the scene")
         fit = self.fit(profile.name, lambda: compress(scene, profile, device=device))
         model = fit.model
@@ -149,11 +150,8 @@ class _SceneBench(Bench):
             plain = sum(each.method == "plain" for of_sheet in alone.models for each in of_sheet)
             share = alone.bits / model.source_bits
             notes = f"each object and state alone, {plain} of them plain smaller lightmaps; no file"
-            rows.append(
-                self.row(
-                    "parts", f"bits of {profile.name}", notes, bpp=self._bpp(alone.bits), compression_ratio=1.0 - share
-                )
-            )
+            sizes_of_parts = {"bpp": self._bpp(alone.bits), "compression_ratio": 1.0 - share}
+            rows.append(self.row("parts", f"bits of {profile.name}", notes, **sizes_of_parts))
         self.note("measuring errors in views")
         scores = compare(scene, decoders, device=device, **self._views)
         for number, name in enumerate(scores):
@@ -161,24 +159,12 @@ class _SceneBench(Bench):
             rows[number] = rows[number].with_figures(**figures)
         if parts:
             gains = np.subtract(*(scores[name].psnr_by_state for name in ("scene", "parts")))
-            rows[0] = rows[0].with_figures(
-                gain=scores["scene"].psnr - scores["parts"].psnr,
-                gain_min=float(np.nanmin(gains)),
-            )
+            gain = scores["scene"].psnr - scores["parts"].psnr
+            rows[0] = rows[0].with_figures(gain=gain, gain_min=float(np.nanmin(gains)))
         return rows
 
     def _bpp(self, bits: float) -> float:
-        """Returns the bits per texel and lighting state, for a total number of bits."""
         return bits / self._scene.texels
-
-
-def _small(states: int) -> LightmappedScene:
-    """Makes a scene of one square in this many lighting states, whose compression compiles all kernels beforehand."""
-    side = np.linspace(0.1, 1.0, 32)
-    image = np.stack([np.outer(side, side), np.outer(side, side[::-1]), np.outer(side, side) ** 2], -1)
-    uv = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
-    light = np.stack([image ** (1 + state) for state in range(max(states, 2))])
-    return from_arrays(np.insert(uv, 2, 0.0, 1), np.array([[0, 1, 2], [2, 1, 3]]), uv, light, name="square")
 
 
 def read_scene(
@@ -277,7 +263,7 @@ def _piece(
 
 
 def _objects(position: np.ndarray, triangle: np.ndarray, chart: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Returns the object number of each chart, int [charts]; objects with more texels have lower numbers."""
+    """Joins charts to connected objects, small ones to the nearest large one; returns each chart's, largest first."""
     size = max(float(np.ptp(position, axis=0).max()), 1e-30)
     grid = np.round(position / (_SAME_PLACE * size)).astype(np.int64)
     corner = np.unique(grid, axis=0, return_inverse=True)[1].reshape(-1)[triangle]

@@ -204,14 +204,6 @@ def _load_ms(model: SheetModel) -> float | None:
     return 1e3 * float(np.median(seconds))
 
 
-def _matrix(model: SheetModel, device: str, gelu: str | None) -> MatrixDecoder:
-    return MatrixDecoder(model, device)
-
-
-def _fast(model: SheetModel, device: str, gelu: str | None) -> StripDecoder | MatrixDecoder:
-    return fast_decoder(model, device)
-
-
 class _LightmapBench(Bench):
     """The benchmark of one lightmap set, with the times at which errors are measured."""
 
@@ -396,13 +388,13 @@ class _LightmapBench(Bench):
         decode: Callable[[float], np.ndarray] | None = None,
         views: int = VIEWS,
     ) -> dict[str, float]:
-        """Returns the errors of lightmaps at the chosen times and, if `decode` is given, those of `view_scores`."""
+        """Returns errors of lightmaps at the chosen times and, with `decode`, of their light as a renderer shows it."""
         tally = None if decode is None else self._tally(name, decode, views)
         pairs = zip(self.chosen.tolist(), frames, strict=True)
         return self._figures([self._frame(name, tally, i, frame, metrics) for i, frame in pairs], tally)
 
     def _tally(self, name: str, decode: Callable[[float], np.ndarray] | None = None, views: int = VIEWS) -> Tally:
-        """Makes the object that collects the errors of `wlm.lightmap.view_scores`."""
+        """Makes the object that collects errors of light as a renderer shows it: filtered, between times, in views."""
         whole = len(self.chosen) == len(self.lightmaps.times)
         seen_from, warnings = views_of(self.lightmaps, views if whole else 0, device=self.device)
         for warning in warnings:
@@ -419,7 +411,7 @@ class _LightmapBench(Bench):
         return scores
 
     def _figures(self, frames: Sequence[FrameMetrics], tally: Tally | None) -> dict[str, float]:
-        """Returns PSNR, SSIM and FLIP, the number of scored times, and the errors of `view_scores`."""
+        """Returns PSNR, SSIM, FLIP, the number of scored times, and with `tally` errors of light as shown."""
         summary = summarise(frames)
         figures = {"psnr": summary.psnr, "ssim": summary.ssim, "flip": summary.flip, **self.scored}
         if tally is None:
@@ -433,8 +425,12 @@ class _LightmapBench(Bench):
         """Makes the decoders of all tiles with feature maps or stored frames; tiles of constant light need none."""
         decoders: list[RuntimeDecoder] = []
         if (model.kind == TileKind.DYNAMIC).any():
-            make = {"exact": ExactDecoder, "strip": StripDecoder, "matrix": _matrix, "fast": _fast}[path]
-            decoders.append(make(model, self.device, gelu))
+            if path == "fast":
+                decoders.append(fast_decoder(model, self.device))
+            elif path == "matrix":
+                decoders.append(MatrixDecoder(model, self.device))
+            else:
+                decoders.append({"exact": ExactDecoder, "strip": StripDecoder}[path](model, self.device, gelu))
         if (model.kind == TileKind.STATIC).any():
             decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
         if len(model.frames):

@@ -138,7 +138,6 @@ def _style(method: str, methods: Sequence[str]) -> tuple[str, str]:
 
 
 def _ink(colour: str) -> tuple[float, ...]:
-    """Returns a darker shade of a colour, so that thin letters are legible on white."""
     from matplotlib.colors import to_rgb
 
     return tuple(_INK * channel for channel in to_rgb(colour))

@@ -88,7 +88,7 @@ def run(
     probes_path: str | os.PathLike[str] | None = None,
     keys: Sequence[str] | None = None,
     rivals: bool = True,
-    rivals_at: str | os.PathLike[str] | None = None,
+    rivals_only: bool = False,
     volume_only: bool = False,
     progress: Note | None = None,
 ) -> list[Row]:
@@ -101,7 +101,7 @@ def run(
         probes_path: A file that `wlm.probe.load` can read; None: the checkout's `demos/data/probes/street.npz`.
         keys: Names of arrays in the file, each one a set of probes; None: the only array, or the demo's noon and night.
         rivals: Whether to measure PCA methods and Unreal's packing, which take minutes on the CPU and need no GPU.
-        rivals_at: A result file. If given, only the rivals are measured, at the same percentages as in that file.
+        rivals_only: Whether to measure only the rivals, on the CPU, at all sizes of `SHARES`.
         volume_only: Whether to measure only the volume, filled from the original probes and from principal components.
         progress: Called with a line before each part of the work.
 
@@ -112,13 +112,13 @@ def run(
         WlmError: The file, a key or the device does not exist, options contradict each other, or a fit diverged.
     """
     if volume_only:
-        expect_alone("--volume-only", {"--quick": quick, "--no-rivals": not rivals, "--rivals-at": rivals_at})
-    if rivals_at is not None:
-        expect_alone("--rivals-at", {"--quick": quick, "--no-rivals": not rivals, "--device": device != "cpu"})
+        expect_alone("--volume-only", {"--quick": quick, "--no-rivals": not rivals, "--rivals-only": rivals_only})
+    if rivals_only:
+        expect_alone("--rivals-only", {"--quick": quick, "--no-rivals": not rivals, "--device": device != "cpu"})
     if probes_path is None:
         probes_path, keys = demo_data("probes/street.npz", "--probes FILE"), keys or _DEMO_KEYS[: 1 if quick else None]
     sets = [load(probes_path, key=key) for key in keys or (None,)]
-    if volume_only or rivals_at is not None:
+    if volume_only or rivals_only:
         benches = [ProbeBench(probes, device, progress) for probes in sets]
         return [row for bench in benches for row in (bench.volume() if volume_only else bench.rival_rows(SHARES))]
     profiles = [Profile.load(name) for name in PROFILES]

@@ -138,7 +138,7 @@ class Bench:
             return Fit(option, load(path, model.SYSTEM), model, size, fitted - start, written - writing)
 
     def replay(self, call: Callable[[], object]) -> StepGraph:
-        """Returns a call that does the same: on CUDA by replaying a CUDA graph, on a CPU by simply calling it."""
+        """Wraps a call so that on CUDA it is captured once and replayed as a CUDA graph; on a CPU it is just called."""
         return StepGraph(call, self.device, warmup=1)
 
     def time(self, calls: Mapping[Any, Callable[[], object]], *, few: bool = False) -> dict[Any, Timing]:

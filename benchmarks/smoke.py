@@ -101,18 +101,7 @@ class Sizes:
     exact: float = 0.5  # step in voxels of the march that guiding maps are compared with
     guide_shared: tuple[float, ...] = (2, 3, 5, 10, 15, 20)  # steps of guiding maps whose pixels share marches
     guide_alone: tuple[float, ...] = (1, 2, 3, 5, 10, 15, 20)  # steps of guiding maps with marches for each pixel
-    six: tuple[float, ...] = (
-        20.0,
-        15.0,
-        10.0,
-        7.0,
-        5.0,
-        3.0,
-        2.0,
-        1.0,
-        0.5,
-        0.25,
-    )  # steps of the six-way march
+    six: tuple[float, ...] = (20.0, 15.0, 10.0, 7.0, 5.0, 3.0, 2.0, 1.0, 0.5, 0.25)  # steps of the six-way march
     plume: int = 64  # pixels along an edge of the image of the plume
     scale: float = 1.0  # factor on the number of cells of the scene
     frames: int = 40  # frames of the scene before the timed frame
@@ -452,16 +441,23 @@ def make_cloud(n: int, device: str, seed: int = 0) -> torch.Tensor:
     Returns:
         The density, float32 [n, n, n] in [0, 1].
     """
-    random = np.random.default_rng(seed)
-    noise = torch.zeros((1, 1, n, n, n), device=device)
-    for octave in _OCTAVES:
-        k = min(2**octave + 1, n)
-        coarse = torch.from_numpy(random.standard_normal((1, 1, k, k, k), np.float32)).to(device)
-        noise += _GAIN**octave * interpolate(coarse, (n, n, n), mode="trilinear", align_corners=True)
+    noise = make_noise(np.random.default_rng(seed), n, _OCTAVES, _GAIN, device)
     at = torch.linspace(-1.0, 1.0, n, device=device)
     x, y, z = torch.meshgrid(at, at, at, indexing="ij")
     radius = ((x - 0.2 * y) ** 2 + z**2).sqrt() / (0.35 + 0.125 * (y + 1.0))
-    return ((1.5 * noise[0, 0] + 0.9 - radius).clamp(0.0, 1.0) * (y.abs() < 0.95)).contiguous()
+    return ((1.5 * noise + 0.9 - radius).clamp(0.0, 1.0) * (y.abs() < 0.95)).contiguous()
+
+
+def make_noise(
+    random: np.random.Generator, n: int, octaves: Iterable[int], gain: float, device: str = "cpu"
+) -> torch.Tensor:
+    """Sums octaves of noise, float32 [n, n, n]: octave o is normal noise at 2^o + 1 nodes an edge, times gain^o."""
+    noise = torch.zeros((1, 1, n, n, n), device=device)
+    for octave in octaves:
+        k = min(2**octave + 1, n)
+        coarse = torch.from_numpy(random.standard_normal((1, 1, k, k, k), np.float32)).to(device)
+        noise += gain**octave * interpolate(coarse, (n, n, n), mode="trilinear", align_corners=True)
+    return noise[0, 0]
 
 
 def guide_rows(bench: SmokeBench) -> Iterator[Row]:

@@ -12,7 +12,8 @@ import torch
 import torch.nn.functional as F
 import warp as wp
 
-from wlm.fluid.volume import DensityVolume, from_array
+from benchmarks.smoke import make_noise
+from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_path
 from wlm.interop import device_name, stream, to_warp
 from wlm.metrics import psnr_from_mse
@@ -43,25 +44,14 @@ FAINT = 0.03
 """Light below which errors have the same weight."""
 
 
-def make_billows(n: int = 48, *, seed: int = 1, extinction: float = 1.0, device: str = "cpu") -> DensityVolume:
-    """Makes smoke in the shape of a ball, column, shell or fog, rotated and stretched, with edges perturbed by noise.
-
-    Args:
-        n, extinction, device: As for `make_plume`.
-        seed: Seed of the shape, its softness, and the noise.
-
-    Raises:
-        WlmError: The device does not exist.
-    """
+def _billows(n: int, seed: int) -> torch.Tensor:
+    """Makes the density [n, n, n] of smoke in the shape of a ball, column, shell or fog, rotated and stretched, with
+    edges perturbed by noise; n is at least 2."""
     random = np.random.default_rng(seed)
     shape = _SHAPES[int(random.integers(len(_SHAPES)))]
     roughness, wisps = random.uniform(0.35, 0.75), random.uniform(0.0, 0.6)
     sharpness = float(np.exp(random.uniform(np.log(0.7), np.log(8.0))))
-    noise = torch.zeros(1, 1, n, n, n)
-    for octave in _OCTAVES:
-        k = min(2**octave + 1, n)
-        coarse = torch.from_numpy(random.standard_normal((1, 1, k, k, k), np.float32))
-        noise += roughness**octave * F.interpolate(coarse, (n, n, n), mode="trilinear", align_corners=k > 1)
+    noise = make_noise(random, n, _OCTAVES, roughness)
     noise /= noise.std(correction=0).clamp(min=1e-6)
     turn, _ = np.linalg.qr(random.standard_normal((3, 3)))
     radii = random.uniform(0.2, 0.5, 3)
@@ -70,11 +60,9 @@ def make_billows(n: int = 48, *, seed: int = 1, extinction: float = 1.0, device:
     along = np.einsum("ij,jxyz->ixyz", turn, place) / radii[:, None, None, None]
     across = np.sqrt((along[:2] ** 2).sum(0))
     away = np.sqrt(across**2 + along[2] ** 2)
-    distance = {"ball": away, "column": across, "shell": 2.5 * np.abs(away - 0.7), "fog": np.full_like(away, 0.5)}[
-        shape
-    ]
-    density = np.clip(sharpness * (1.0 - distance + wisps * noise[0, 0].numpy()), 0.0, 1.0).astype(np.float32)
-    return from_array(density, extinction=extinction, voxel=1.0 / n, device=device)
+    distance = {"ball": away, "column": across, "shell": 2.5 * np.abs(away - 0.7), "fog": np.full_like(away, 0.5)}
+    density = np.clip(sharpness * (1.0 - distance[shape] + wisps * noise.numpy()), 0.0, 1.0)
+    return torch.from_numpy(density.astype(np.float32))
 
 
 def draw_view(
@@ -115,10 +103,9 @@ def draw_lesson(seed: int, number: int, *, lights: int = 4) -> tuple[DensityVolu
 
 
 def _any_smoke(random: np.random.Generator, n: int) -> torch.Tensor:
-    """Returns the density [n, n, n] of smoke of a random kind and seed."""
+    """Returns the density [n, n, n] of billows or of a plume, each in half of the cases, from a random seed."""
     seed = int(random.integers(2**31))
-    made = make_billows(n, seed=seed) if random.random() < 0.5 else make_plume(n, seed=seed, hot=False)
-    return made.density
+    return _billows(n, seed) if random.random() < 0.5 else make_plume(n, seed=seed, hot=False).density
 
 
 def _seen(
@@ -140,7 +127,7 @@ class Lesson:
     light: torch.Tensor
 
     def multiple(self) -> torch.Tensor:
-        """Returns R of `transport.orders`: light scattered more than once divided by the squared albedo, [A, H, W]."""
+        """Returns light scattered more than once, divided by the squared albedo, at each of A albedos, [A, H, W]."""
         albedo = torch.tensor(ALBEDOS).to(self.light)[:, None, None]
         return (self.light - albedo * self.inputs.single[0]) / albedo**2
 
@@ -207,12 +194,7 @@ def fit_orders(lessons: Sequence[Lesson], *, pixels: int = 1024, seed: int = 0) 
 
 
 def learn(
-    views: int,
-    *,
-    samples: int = 512,
-    seed: int = 0,
-    device: str = "cpu",
-    report: Callable[[int], None] | None = None,
+    views: int, *, samples: int = 512, seed: int = 0, device: str = "cpu", report: Callable[[int], None] | None = None
 ) -> OrdersModel:
     """Draws random smoke, traces its light and fits the weights; the weights that ship with wlm are from 2000 views.
 
@@ -260,7 +242,7 @@ def features(inputs: Inputs, light: int) -> torch.Tensor:
 
 
 def at(inputs: Inputs, albedo: float) -> Inputs:
-    """Returns the inputs at one of their albedos alone."""
+    """Returns a copy of the inputs that keeps the light by diffusion of one albedo alone, which must be among them."""
     n = inputs.albedos.index(albedo)
     planes = {name: getattr(inputs, name)[:, n : n + 1] for name in ("diffused", "from_thin")}
     return replace(inputs, **planes, albedos=(albedo,))

@@ -44,7 +44,7 @@ import torch
 import torch.nn.functional as F
 
 from benchmarks.path_tracer import denoised_picture, denoiser_device, has_denoiser
-from benchmarks.rivals.smoke_orders import FITTED, diffused, filter_planes, octaves, three_octaves
+from benchmarks.rivals.smoke_orders import diffused, filter_planes, octaves, three_octaves
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from benchmarks.smoke import make_cloud
@@ -204,7 +204,9 @@ def _scored(bench: Bench, name: str, shots: Sequence[Shot], sizes: OrdersSizes) 
         traced.append(tuple(_trace(shot, sizes.samples // 2, salt) for salt in (0, 1)))
         once = _once(shot)
         opacity.append(1.0 - once.transparency)
-        fitted = {_GAIN: once.shade()[None], _OCTAVES: _octaves_by_angle(shot), _FILTER: _filter_by_angle(shot)}
+        each = [octaves(shot.volume, shot.camera, [light]) for light in shot.lights]
+        by_angle = {_OCTAVES: _by_angle(shot, each), _FILTER: _by_angle(shot, _planes(shot))}
+        fitted = {_GAIN: once.shade()[None]} | by_angle
         for albedo in ALBEDOS:
             pictures = {way: make(shot, albedo) for way, make in _ways().items()}
             for way, picture in (pictures | fitted).items():
@@ -252,25 +254,19 @@ def _denoised(shot: Shot, albedo: float) -> torch.Tensor:
     return denoised_picture(trace(shot.volume, shot.camera, shot.lights, **settings).total)
 
 
-def _octaves_by_angle(shot: Shot) -> torch.Tensor:
-    """Returns O octaves' pictures times 3 powers of the cosine between light and camera, summed: [3 O, H, W, 3]."""
-    height, width = shot.camera.height, shot.camera.width
-    parts = torch.zeros((_POWERS, len(FITTED), height, width, 3), device=shot.volume.device)
-    for light in shot.lights:
-        cosine = float(unit(light.toward) @ np.asarray(shot.camera.toward))
-        made = octaves(shot.volume, shot.camera, [light])
-        for power in range(_POWERS):
-            parts[power] += cosine**power * made
-    return parts.flatten(0, 1)
+def _planes(shot: Shot) -> list[torch.Tensor]:
+    """Returns for each light the P planes of the filter in the light's colour, [P, H, W, 3]."""
+    pairs = zip(filter_planes(shot.volume, shot.camera, shot.lights), shot.lights, strict=True)
+    return [each[..., None] * torch.tensor(light.irradiance, device=each.device) / _FOUR_PI for each, light in pairs]
 
 
-def _filter_by_angle(shot: Shot) -> torch.Tensor:
-    """Returns P filter planes times 3 powers of the cosine between light and camera, summed: [3 P, H, W, 3]."""
+def _by_angle(shot: Shot, planes: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Multiplies the N planes [N, H, W, 3] of each light by powers 0, 1 and 2 of the cosine between light and camera,
+    and returns their sums over the lights, [3 N, H, W, 3]."""
     parts = 0.0
-    for light, planes in zip(shot.lights, filter_planes(shot.volume, shot.camera, shot.lights), strict=True):
+    for light, each in zip(shot.lights, planes, strict=True):
         cosine = float(unit(light.toward) @ np.asarray(shot.camera.toward))
-        powers = torch.cat([cosine**power * planes for power in range(_POWERS)])
-        parts = parts + powers[..., None] * torch.tensor(light.irradiance, device=planes.device) / _FOUR_PI
+        parts = parts + torch.cat([cosine**power * each for power in range(_POWERS)])
     return parts
 
 
@@ -360,7 +356,6 @@ def _flicker(
 
 
 def _lights(random: np.random.Generator, ways: Sequence[Sequence[float]]) -> tuple[Light, ...]:
-    """Returns lights from the given directions with random colours."""
     colours = random.dirichlet(np.ones(3), len(ways)) * 3.0 / len(ways) * _FOUR_PI
     return tuple(Light(tuple(way), tuple(map(float, colour))) for way, colour in zip(ways, colours, strict=True))
 

@@ -1,6 +1,6 @@
-"""One page of all four systems, of what the other demos leave.
+"""Makes an HTML page of each of the four systems from the files of the other demos, and a page that frames these four.
 
-`gallery.html` opens by double click, with the four pages beside it.
+The pages need no server: a double click on `gallery.html` opens them.
 """
 
 import argparse

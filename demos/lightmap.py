@@ -61,7 +61,7 @@ def run(out: Path, device: str) -> dict[str, float]:
     decoded = np.stack([decoder.frame(stamp) for stamp in model.times])
     light = lightmaps.light
     white = white_of(light.frames[:, light.mask])
-    rows = {"original": light.frames, "decoded": decoded, "error × 8": 8.0 * np.abs(decoded - light.frames)}
+    rows = {"original": light.frames, "decoded": decoded, "error x 8": 8.0 * np.abs(decoded - light.frames)}
     pictures = {name: [encode(frame, light.mask, white) for frame in frames] for name, frames in rows.items()}
     contact_sheet(out / "city.png", pictures, [f"{hour:g} h" for hour in light.times])
     lap("draw")

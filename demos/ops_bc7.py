@@ -46,14 +46,18 @@ LEAST_PSNR, LEAST_GAIN = 35.5, 2.0
 def visible(
     scene: LightmappedScene, directions: Sequence, pixels: int, device: str
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Finds the pixels that show the mesh, bool [views, pixels, pixels], and their UVs [views, pixels, pixels, 2]."""
+    """Finds the pixels of V square views that show the mesh, bool [V, H, W], and their lightmap UVs, [V, H, W, 2]."""
     views = visible_uv(scene, [View.of(direction) for direction in directions], pixels, device)
     triangle, _, uv = map(torch.stack, zip(*views, strict=True))
     return triangle >= 0, uv
 
 
 def endpoints_of(texels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Endpoints and weights of a texture [H, W, 4]: each block on the line along which its colours spread most."""
+    """Returns first endpoints and weights of a texture [H, W, 4], whose colours are in [0, 1].
+
+    The endpoints [H / 4, W / 4, 2, 4] of each block of 4 x 4 texels lie on the line along which the block's colours
+    spread most; the weights [H, W] are places between the two.
+    """
     rows, columns = (size // 4 for size in texels.shape[:2])
     colours = texels.reshape(rows, 4, columns, 4, 4).transpose(1, 2).reshape(rows, columns, 16, 4)
     mean = colours.mean(2, keepdim=True)
@@ -66,7 +70,7 @@ def endpoints_of(texels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def fit(endpoints: torch.Tensor, weights: torch.Tensor, uv: torch.Tensor, target: torch.Tensor) -> None:
-    """Moves endpoints and weights to where the map read at `uv` [N, 2] is nearest to `target` [N, 3]."""
+    """Changes endpoints and weights in place until the texture read at UVs [N, 2] is close to `target` [N, 3]."""
     optimizer = torch.optim.Adam([endpoints.requires_grad_(), weights.requires_grad_()], lr=RATE)
     for step in range(STEPS):
         # The second half runs on the levels that the file has, with smaller steps: a level is 1/255 or 1/15.
@@ -116,7 +120,7 @@ def run(out: Path, device: str) -> dict[str, float]:
 
 
 def _picture(path: Path, scene: LightmappedScene, images: dict[str, torch.Tensor]) -> None:
-    """The held-out view by each image, and the errors against the first."""
+    """Writes the held-out view with each image as the texture, and below it the error against the first image."""
     device = str(images["lightmap"].device)
     hit, uv = visible(scene, [HELD_OUT], DRAWN, device)
     rows, columns = (torch.nonzero(hit[0].any(axis))[:, 0] for axis in (1, 0))

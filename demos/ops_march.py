@@ -39,7 +39,13 @@ LEAST_VIEWS, LEAST_HELD_OUT = 37.0, 30.5
 
 
 def rays(degrees: float, size: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Origins and directions [PIXELS, PIXELS, 3] of an orthographic view of a cube, in voxels; y is up."""
+    """Returns the origins and the directions, [PIXELS, PIXELS, 3] each, of the rays of an orthographic view of a grid.
+
+    Args:
+        degrees: Angle of the view about the vertical axis y.
+        size: Voxels along an edge of the grid; a voxel is the unit of length.
+        device: "cpu" or "cuda:N".
+    """
     angle = math.radians(degrees)
     forward = torch.tensor([-math.sin(angle), 0.0, -math.cos(angle)], device=device)
     up = torch.tensor([0.0, 1.0, 0.0], device=device)
@@ -50,7 +56,8 @@ def rays(degrees: float, size: int, device: str) -> tuple[torch.Tensor, torch.Te
 
 
 def look(density: torch.Tensor, angles: tuple[float, ...]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Radiance [views, PIXELS, PIXELS, 3] and transmittance [views, PIXELS, PIXELS] from some angles."""
+    """Renders a density [size, size, size] from V angles in degrees. Returns radiance [V, PIXELS, PIXELS, 3] and
+    transmittance [V, PIXELS, PIXELS]."""
     device = str(density.device)
     views = [rays(angle, len(density), device) for angle in angles]
     toward = torch.nn.functional.normalize(torch.tensor([*LIGHTS], device=device), dim=1)
@@ -59,20 +66,20 @@ def look(density: torch.Tensor, angles: tuple[float, ...]) -> tuple[torch.Tensor
 
 
 def picture(radiance: torch.Tensor, transmittance: torch.Tensor) -> np.ndarray:
-    """A view over the background, enlarged: uint8 [H, W, 3]."""
+    """Returns a view over the background, `ZOOM` times as wide and high, for a screen: uint8 [H, W, 3]."""
     light = radiance + transmittance[..., None] * torch.tensor(BACKGROUND, device=radiance.device)
     enlarged = torch.nn.functional.interpolate(light.movedim(-1, 0)[None], scale_factor=ZOOM, mode="bilinear")
     return to_bytes(enlarged[0].movedim(0, -1))
 
 
 def psnr(first: Sequence[torch.Tensor], second: Sequence[torch.Tensor]) -> float:
-    """PSNR over radiance and transmittance together, with 1 as the peak."""
+    """Returns the PSNR in dB over all numbers of two sequences of tensors, with a peak of 1."""
     error = torch.cat([(a - b).detach().flatten() for a, b in zip(first, second, strict=True)])
     return -10.0 * math.log10(float(error.square().mean()))
 
 
 def reconstruct(pictures: tuple[torch.Tensor, torch.Tensor], size: int) -> torch.Tensor:
-    """The density [size, size, size] that looks like the pictures of `VIEWS`."""
+    """Fits a density [size, size, size] to radiance and transmittance as seen from the angles `VIEWS`; returns it."""
     density = torch.full((size,) * 3, HAZE, device=pictures[0].device, requires_grad=True)
     optimizer = torch.optim.Adam([density], lr=RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)

@@ -1,7 +1,7 @@
 """Lights smoke by a network's six-way lightmaps, beside a fine and a coarse march, and checks the results.
 
-There are three scenes: a jet under a turning camera and light, a sphere that crosses a jet, and a glowing explosion.
-Each leaves a contact sheet. The network is the shipped one or that of `--network`; `--train` first trains a
+There are two scenes: a jet past a sphere under a turning camera and light, and a glowing explosion. Each leaves a
+contact sheet. The network is the shipped one or that of `--network`; `--train` first trains a
 small network, for half a minute.
 
 The coarse march is the network's guide. On grids as small as these its steps are shorter than a voxel, so that it is
@@ -48,7 +48,7 @@ HERE = Path(__file__).resolve().parent
 SCALE, REFINE, SUBSTEPS = 0.24, 2, 4
 STEP = 0.5  # voxels, of the fine march
 RESOLUTION, FRAMES = 96, 4
-RATES = {"jet-sphere": 1.5, "jet-moving": 1.5, "explosion": 6.0}  # frames a second
+RATES = {"jet-sphere": 1.5, "explosion": 6.0}  # frames a second
 TURNED, TURN = "jet-sphere", 90.0  # degrees by which its camera turns; its lights turn the other way
 
 # Largest loss in dB of a frame by the network against its guide, which only a guide of six lightmaps has.

@@ -10,7 +10,7 @@ and viewers of models read bundles: the raw folder and the engine kits of `wlm.e
               factors
     probe                                            gaussians, network,           position, values
                                                      positions
-    smoke     first, second, motion, depth
+    smoke     first, second, depth
 
 `valid` is R8_UNORM and 255 inside charts. The textures of smoke are R8G8B8A8_UNORM. A texture or buffer that a model
 has no use for is left out. From a bundle's `document` they read these keys, among others:
@@ -19,8 +19,8 @@ has no use for is left out. From a bundle's `document` they read these keys, amo
               tile_size, hidden, gamma, tiles; images: by texture name the size [width, height] of one tile's image and
               the number of images across; values (of a part that is not light): what 0 and 1 stand for
     atlas     uv_set, states, sheets, objects (label, node, sheet, scale_offset)
-    smoke     layout, channels, rows, columns, frames, frame_size, padding, levels, gain, rate, extent, motion_scale,
-              clipped (numbers above the range of 8 bits)
+    smoke     layout, channels, rows, columns, frames, frame_size, padding, levels, gain, rate, extent, clipped
+              (numbers above the range of 8 bits)
 """
 
 from collections.abc import Mapping

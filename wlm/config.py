@@ -200,7 +200,7 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
 
 
 def _suggestion(cls: type[BaseModel], location: tuple[int | str, ...]) -> str:
-    """Returns the known keys of the mapping that has an unknown key, or only the known key that is most similar."""
+    """Returns the end of a message about an unknown key: the most similar known key, or else all; "" if unknown."""
     model: Any = cls
     for part in location[:-1]:
         field = model.model_fields.get(part)
@@ -218,8 +218,6 @@ def _shown(value: object) -> str:
 
 
 class _Short(reprlib.Repr):
-    """Formats a value for an error message like `repr`, and cuts it short if it is long."""
-
     def __init__(self) -> None:
         super().__init__()
         self.maxlevel = 3

@@ -6,9 +6,8 @@ tile's own dynamic range (maximum minus minimum of the valid reference, all chan
 report is the mean over all tiles of all lightmaps of a scene.
 
 The paper does not define the following cases. A tile with fewer than `MIN_VALID_TEXELS` valid texels or a range of
-zero has no score and is counted separately. PSNR is capped at `PSNR_CAP_DB`. A tile whose range is a few half-float
-steps is part of the mean, and the mean without such tiles is reported too. FLIP depends on a neighbourhood and on the
-display but not on a range, so it is computed over the whole lightmap and its map is averaged in each tile. FLIP
+zero has no score and is counted separately. PSNR is capped at `PSNR_CAP_DB`. FLIP depends on a neighbourhood and on
+the display but not on a range, so it is computed over the whole lightmap and its map is averaged in each tile. FLIP
 replaces the paper's LPIPS, a network trained on display-referred photographs.
 
 SSIM: Wang et al. 2004, "Image quality assessment: from error visibility to structural similarity". FLIP: Andersson et
@@ -30,9 +29,6 @@ from wlm.texels import fill_gaps
 METRICS = ("psnr", "ssim", "flip")
 # Four 4x4 blocks: with fewer, one bad block would determine the tile's score.
 MIN_VALID_TEXELS = 64
-# In a tile whose range is at most this number of half-float steps at its brightest value, rounding to half float
-# limits the score of every codec (to about 29 dB at 8 steps).
-FORMAT_LIMITED_ULPS = 8
 
 # An exact reconstruction has infinite PSNR and would dominate every mean. Rounding to half float alone gives
 # 70 to 90 dB in a tile that contains black, so no lossy half-float codec comes near 120; a float32 path that
@@ -100,28 +96,13 @@ def check_pair(
 
 
 def psnr_from_mse(error: float, peak: float) -> float:
-    """Converts a mean squared error to PSNR, with `psnr`'s cap; NaN if the error is NaN or the peak is not positive."""
+    """Converts a mean squared error to PSNR in dB, at most 120; NaN if the error is NaN or the peak is not above 0."""
     if math.isnan(error) or not peak > 0.0:
         return math.nan
     if error == 0.0:
         return PSNR_CAP_DB
     # Two logarithms avoid squaring the peak: the square of a peak of 1e-200 would underflow to zero.
     return min(PSNR_CAP_DB, 20.0 * math.log10(peak) - 10.0 * math.log10(error))
-
-
-def half_ulp(value: float) -> float:
-    """Returns the step between neighbouring half floats at `value`: the resolution of a stored lightmap.
-
-    Args:
-        value: Any finite number; magnitudes above 65,504 return the step of the largest half float.
-
-    Returns:
-        The step in the units of `value`, at least 2**-24.
-    """
-    magnitude = np.float16(min(abs(float(value)), float(np.finfo(np.float16).max)))
-    if magnitude == np.finfo(np.float16).max:
-        return 32.0  # the next larger value, to which np.spacing measures, is infinity
-    return float(np.spacing(magnitude))
 
 
 def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray, data_range: float) -> float:
@@ -149,7 +130,6 @@ def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray, data_range: float)
 
 
 def _ssim_filled(ref: np.ndarray, test: np.ndarray, valid: np.ndarray, data_range: float) -> float:
-    """Computes `ssim` of float64 images that are already checked, and equal outside the mask."""
     # Imported here because scikit-image takes longer to import than most commands take to run.
     from skimage.metrics import structural_similarity
 
@@ -427,8 +407,6 @@ class FrameMetrics:
         max_abs_error: Largest absolute error in the images' units, for every tile with a valid texel, scored
             or not; NaN without one.
         range: Dynamic range in the images' units, or the peak that was given; NaN without a valid texel.
-        half_step: Step between half floats at the tile's largest magnitude, in the images' units; NaN without a
-            valid texel.
         valid: Number of valid texels.
         metrics: The requested metrics.
     """
@@ -438,7 +416,6 @@ class FrameMetrics:
     flip: np.ndarray
     max_abs_error: np.ndarray
     range: np.ndarray
-    half_step: np.ndarray
     valid: np.ndarray
     metrics: tuple[str, ...]
 
@@ -447,11 +424,6 @@ class FrameMetrics:
         """`[ny, nx]` bool: tiles that count in the means."""
         return (self.valid >= MIN_VALID_TEXELS) & (self.range > 0.0)
 
-    @property
-    def format_limited(self) -> np.ndarray:
-        """`[ny, nx]` bool: scored tiles whose range is at most `FORMAT_LIMITED_ULPS` half-float steps."""
-        return self.scored & (self.range <= FORMAT_LIMITED_ULPS * self.half_step)
-
 
 @dataclass(frozen=True)
 class Summary:
@@ -459,38 +431,27 @@ class Summary:
 
     Attributes:
         psnr, ssim, flip: Mean over every scored tile of every lightmap.
-        psnr_unlimited: Mean PSNR over the scored tiles except the tiles in `format_limited`.
-        psnr_by_tile, ssim_by_tile, flip_by_tile: `[ny, nx]`, mean over the lightmaps.
+        psnr_by_tile: `[ny, nx]`, mean over the lightmaps.
         psnr_by_time, ssim_by_time, flip_by_time: `[T]`, mean over the tiles of one lightmap.
-        worst_psnr: Lowest PSNR of a tile.
-        worst_tile: `(lightmap, tile row, tile column)` of that tile; None if no tile is scored.
+        worst_tile: The tile with the lowest PSNR, as `lowest` returns it; None if no tile is scored.
         max_abs_error: Largest absolute error of a valid texel, scored or not, in the images' units.
-        tiles: Number of tiles in all lightmaps.
         scored: Number of tiles that count in the means.
         few_texels: Number of tiles excluded for fewer than `MIN_VALID_TEXELS` valid texels, including empty tiles.
         zero_range: Number of tiles excluded because the reference is constant.
-        format_limited: `(lightmap, tile row, tile column)` of each scored tile that spans only a few
-            half-float steps.
     """
 
     psnr: float
     ssim: float
     flip: float
-    psnr_unlimited: float
     psnr_by_tile: np.ndarray
-    ssim_by_tile: np.ndarray
-    flip_by_tile: np.ndarray
     psnr_by_time: np.ndarray
     ssim_by_time: np.ndarray
     flip_by_time: np.ndarray
-    worst_psnr: float
-    worst_tile: tuple[int, int, int] | None
+    worst_tile: dict[str, float | int] | None
     max_abs_error: float
-    tiles: int
     scored: int
     few_texels: int
     zero_range: int
-    format_limited: list[tuple[int, int, int]]
 
 
 def evaluate_frame(
@@ -535,7 +496,7 @@ def evaluate_frame(
     height, width = valid.shape
     shape = (-(-height // tile), -(-width // tile))
     result = FrameMetrics(
-        *(np.full(shape, math.nan) for _ in range(6)),
+        *(np.full(shape, math.nan) for _ in range(5)),
         valid=np.zeros(shape, np.int64),
         metrics=tuple(metrics),
     )
@@ -553,7 +514,6 @@ def evaluate_frame(
         a, b = ref[area][inside], test[area][inside]
         span = float(np.ptp(a)) if peak is None else peak
         result.range[index] = span
-        result.half_step[index] = half_ulp(np.abs(a).max())
         result.max_abs_error[index] = np.abs(a - b).max()
         if count < MIN_VALID_TEXELS or span == 0.0:
             continue
@@ -566,8 +526,12 @@ def evaluate_frame(
     return result
 
 
-def summarise(frames: Sequence[FrameMetrics]) -> Summary:
-    """Averages the scores of a scene's lightmaps, in order of time, over all tiles and lightmaps.
+def summarise(frames: Sequence[FrameMetrics], times: Sequence[float] | np.ndarray | None = None) -> Summary:
+    """Averages the scores of a scene's lightmaps over all tiles and lightmaps.
+
+    Args:
+        frames: The scores of each lightmap, in order of time.
+        times: The time of each lightmap; None: 0, 1, 2 and so on.
 
     Raises:
         WlmError: No frames, or frames of different grids or metrics.
@@ -583,32 +547,40 @@ def summarise(frames: Sequence[FrameMetrics]) -> Summary:
     )
     valid = np.stack([f.valid for f in frames])
     scored = np.stack([f.scored for f in frames])
-    limited = np.stack([f.format_limited for f in frames])
     enough = valid >= MIN_VALID_TEXELS
 
-    worst_tile = None
-    if not np.isnan(psnr).all():
-        worst_tile = tuple(int(i) for i in np.unravel_index(np.nanargmin(psnr), psnr.shape))
     return Summary(
         psnr=float(nanmean(psnr)),
         ssim=float(nanmean(ssim)),
         flip=float(nanmean(flip)),
-        psnr_unlimited=float(nanmean(np.where(limited, math.nan, psnr))),
         psnr_by_tile=nanmean(psnr, axis=0),
-        ssim_by_tile=nanmean(ssim, axis=0),
-        flip_by_tile=nanmean(flip, axis=0),
         psnr_by_time=nanmean(psnr, axis=(1, 2)),
         ssim_by_time=nanmean(ssim, axis=(1, 2)),
         flip_by_time=nanmean(flip, axis=(1, 2)),
-        worst_psnr=math.nan if worst_tile is None else float(psnr[worst_tile]),
-        worst_tile=worst_tile,
+        worst_tile=lowest(psnr, range(len(frames)) if times is None else times),
         max_abs_error=math.nan if np.isnan(errors).all() else float(np.nanmax(errors)),
-        tiles=scored.size,
         scored=int(scored.sum()),
         few_texels=int((~enough).sum()),
         zero_range=int((enough & ~scored).sum()),
-        format_limited=[tuple(int(i) for i in where) for where in np.argwhere(limited)],
     )
+
+
+def lowest(psnr: np.ndarray, times: Sequence[float] | np.ndarray) -> dict[str, float | int] | None:
+    """Returns the lowest PSNR of tiles and its place.
+
+    Args:
+        psnr: [T, ny, nx], in dB; NaN for tiles without a score.
+        times: The T times.
+
+    Returns:
+        `psnr`; `time`; `tile`, the number of the tile, row by row; its `row` and `column`. None if all are NaN.
+    """
+    if np.isnan(psnr).all():
+        return None
+    at = np.unravel_index(np.nanargmin(psnr), psnr.shape)
+    index, row, column = (int(i) for i in at)
+    place = {"tile": row * psnr.shape[2] + column, "row": row, "column": column}
+    return {"psnr": float(psnr[at]), "time": float(times[index])} | place
 
 
 def nanmean(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:

@@ -169,10 +169,6 @@ class Processes(Workers):
         for number in list(self._processes):
             self._end(number, _PATIENCE)
 
-    def kill(self, number: int) -> None:
-        """Kills one process immediately, as the operating system does when memory runs out."""
-        self._processes[number].kill()
-
     def _start(self, number: int) -> None:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}
         # Without this, NumPy would start one thread per core in each process.
@@ -192,7 +188,6 @@ class Processes(Workers):
             _send(process.stdin, (self._make.__module__, self._make.__qualname__, self._arguments[number]))
 
     def _listen(self, number: int, process: subprocess.Popen[bytes], errors: IO[bytes]) -> None:
-        """Receives the results of a process until it ends."""
         try:
             while True:
                 self._answers.put((number, pickle.load(process.stdout)))

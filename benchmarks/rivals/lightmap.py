@@ -13,9 +13,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from benchmarks.rivals.lightmap_blocks import encode_8bit, encode_astc, encode_bc6h, encode_bc7
+from benchmarks.rivals.lightmap_blocks import encode_astc, encode_bc6h, encode_bc7
 from benchmarks.rivals.lightmap_ntc import LADDER, encode_ntc
-from benchmarks.rivals.lightmap_pca import encode_pca, encode_pca_bc4
+from benchmarks.rivals.lightmap_pca import encode_pca_bc4
 from benchmarks.rivals.lightmap_video import encode_av1
 from benchmarks.rivals.rival import Rival
 from wlm.errors import WlmError
@@ -52,25 +52,15 @@ class Method:
 RIVALS: dict[str, Method] = {
     "bc6h": Method("BC6H", "", encode_bc6h),
     "bc7": Method("BC7", "", encode_bc7),
-    "bc6h-rdo-1": Method("BC6H", "RDO 1", functools.partial(encode_bc6h, loss=1.0)),
-    **{
-        f"bc7-rdo-{loss:g}": Method("BC7", f"RDO {loss:g}", functools.partial(encode_bc7, loss=loss))
-        for loss in (0.5, 1.0, 2.0)
-    },
     **{
         f"astc{side}": Method("ASTC", f"{side}x{side}", functools.partial(encode_astc, block=side))
         for side in (4, 5, 6, 8, 10, 12)
     },
-    "8bit": Method("8 bits", "", encode_8bit),
     **{
         f"pca-bc4-{count}": Method(
             "PCA in BC4", f"{count}", functools.partial(encode_pca_bc4, components=count), alone=False
         )
         for count in (2, 4, 8, 16)
-    },
-    **{
-        f"pca-{step:g}": Method("PCA", f"step {step:g}", functools.partial(encode_pca, step=step), alone=False)
-        for step in (0.16, 0.08, 0.04, 0.02)
     },
     **{
         f"ntc-{name}": Method("NTC", name, functools.partial(encode_ntc, latents=name), alone=False, fitted=True)
@@ -85,7 +75,7 @@ RIVALS: dict[str, Method] = {
 }
 """All methods by name."""
 
-FEW = ("bc6h", "bc7", "astc6", "astc8", "astc12", "8bit", "pca-bc4-4", "av1-75", "av1-92")
+FEW = ("bc6h", "bc7", "astc6", "astc8", "astc12", "pca-bc4-4", "av1-75", "av1-92")
 """Rivals of a quick run, which need no GPU."""
 
 _FEW_FITTED = ("ntc-medium",)

@@ -1,15 +1,12 @@
-"""Block codecs that engines use for lightmaps: BC6H, BC7 and ASTC, each at its best quality; and plain 8 bits.
+"""Block codecs that engines use for lightmaps: BC6H, BC7 and ASTC, each at its best quality.
 
 Each encoder takes one lightmap [H, W, 3] in linear RGB and its mask [H, W], true where a texel is valid, and returns a
 `Rival` whose `decoded` is the lightmap, float32 [H, W, 3]. Negative radiance becomes 0, and values above 65,504,
 the largest half float, are clamped; with an empty mask a black lightmap is encoded. Gaps between charts are dilated
 from the nearest valid texel first, as every engine does: zeros there cost 10 dB at the edges of charts. Blocks that no
-read reaches are black. 8 bits and the LDR formats store levels between minimum and maximum of a tile, with a gamma
+read reaches are black. BC7 and ASTC's LDR profile store levels between minimum and maximum of a tile, with a gamma
 (`benchmarks.rivals.lightmap_levels`). Times are those of the codec alone on one thread, without the preparation. Sizes
 include the padding to whole blocks.
-
-BC6H and BC7 can be optimised for rate and distortion (`wlm.formats.block_reuse`): `loss` is the root mean square error,
-in levels of 255, by which a block may become worse to compress better; 0 leaves the encoder's blocks as they are.
 
 All functions raise a `WlmError` if shapes do not fit, a valid texel is NaN or infinite, a setting is out of range, or a
 package is missing.
@@ -23,17 +20,15 @@ from types import ModuleType
 import numpy as np
 
 from benchmarks.rivals.lightmap_levels import TileRanges, clear_unseen, prepare, seen_texels, to_codes
-from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure
+from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure, need_bc
 from wlm.errors import WlmError
 from wlm.formats import bc7, hdr_blocks
-from wlm.formats.block_reuse import by_block, reuse_blocks
 from wlm.formats.hdr_blocks import need
 from wlm.lightmap.tiles import TILE
 from wlm.metrics import evaluate_frame, summarise
 
 _BC_BLOCK = 4  # texels along a block's side
 _BC_PROFILE = "slow"
-_RING_WEIGHT = 0.25
 _ASTC_BLOCKS = (4, 5, 6, 8, 10, 12)
 _ASTC_PROFILES = ("best", "ldr", "hdr")
 _ASTC_THOROUGH = 98.0  # astcenc's preset "thorough"
@@ -41,32 +36,16 @@ _ASTC_THOROUGH = 98.0  # astcenc's preset "thorough"
 _NO_LIMIT_DB = 999.0
 
 
-def encode_bc6h(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival:
+def encode_bc6h(frame: np.ndarray, mask: np.ndarray) -> Rival:
     """Encodes a lightmap as unsigned BC6H, 8 bits a texel, with Intel's ISPC texture compressor."""
-    _check_bc("bc6h", loss)
+    need_bc()
     image = prepare(frame, mask)
-    seen = seen_texels(mask)
-    padded = _pad(clear_unseen(image, seen, _BC_BLOCK)).astype(np.float16)
+    padded = _pad(clear_unseen(image, seen_texels(mask), _BC_BLOCK)).astype(np.float16)
 
     def decode(data: bytes) -> np.ndarray:
         return hdr_blocks.decode_bc6h(data, *padded.shape[:2], EXTRA)
 
-    def encode() -> bytes:
-        data = ispc_bc6h(padded)
-        if loss == 0.0:
-            return data
-        # Errors of codes, as shares of their tile's range.
-        codes = _pad(to_codes(image))
-        span = _pad(TileRanges.of(to_codes(image), seen).span(*seen.shape))
-        weight = _weight(mask)
-        return _reused(data, to_codes(decode(data)), codes, weight / np.square(span), weight * (loss / 255.0) ** 2)
-
-    return _cropped(_measured(_with_loss("bc6h", loss), encode, decode), image)
-
-
-def _reused(data: bytes, *images: np.ndarray) -> bytes:
-    """Repeats blocks, see `reuse_blocks`; its arguments after the blocks are images [H, W, C] here."""
-    return reuse_blocks(np.frombuffer(data, np.uint8).reshape(-1, 16), *map(by_block, images)).tobytes()
+    return _cropped(_measured("bc6h", lambda: ispc_bc6h(padded), decode), image)
 
 
 def ispc_bc6h(texels: np.ndarray) -> bytes:
@@ -80,24 +59,20 @@ def ispc_bc6h(texels: np.ndarray) -> bytes:
     return texcomp.compress_blocks_bc6h(surface, texcomp.BC6HEncSettings.from_profile(_BC_PROFILE))
 
 
-def encode_bc7(frame: np.ndarray, mask: np.ndarray, loss: float = 0.0) -> Rival:
+def encode_bc7(frame: np.ndarray, mask: np.ndarray) -> Rival:
     """Encodes a lightmap as BC7 with gamma 2.2, scaled by each tile's range; 8 bits a texel and 12 bytes a tile."""
-    _check_bc("bc7", loss)
+    need_bc()
     image = prepare(frame, mask)
     levels, ranges = _levels(image, mask, _BC_BLOCK)
-    padded = _pad(_to_bytes(levels))
+    padded = _pad((levels * 255.0 + 0.5).astype(np.uint8))
 
     def decode(data: bytes) -> np.ndarray:
         return need("imagecodecs", EXTRA).bcn_decode(data, 7, shape=(*padded.shape[:2], 4))[..., :3]
 
     def encode() -> bytes:
-        data = bc7.encode_image(padded, EXTRA, _BC_PROFILE).tobytes()
-        if loss == 0.0:
-            return data
-        weight = _weight(mask)
-        return _reused(data, decode(data) / np.float32(255.0), _pad(levels), weight, weight * (loss / 255.0) ** 2)
+        return bc7.encode_image(padded, EXTRA, _BC_PROFILE).tobytes()
 
-    rival = _cropped(_measured(_with_loss("bc7", loss), encode, decode, ranges.tobytes()), image)
+    rival = _cropped(_measured("bc7", encode, decode, ranges.tobytes()), image)
     return replace(rival, decoded=ranges.radiance(rival.decoded / np.float32(255.0)))
 
 
@@ -126,19 +101,6 @@ def encode_astc(frame: np.ndarray, mask: np.ndarray, block: int = 12, profile: s
         for rival in (ldr, hdr)
     ]
     return hdr if scores[1] > scores[0] else ldr  # without any score, as of one texel, LDR
-
-
-def encode_8bit(frame: np.ndarray, mask: np.ndarray) -> Rival:
-    """Encodes a lightmap in 3 bytes per texel with gamma 2.2, scaled by each tile's range: about BC7's best quality."""
-    image = prepare(frame, mask)
-    levels, ranges = _levels(image, mask, 1)
-    rival = _measured(
-        "8bit",
-        lambda: _to_bytes(levels).tobytes(),
-        lambda data: ranges.radiance(np.frombuffer(data, np.uint8).reshape(image.shape) / np.float32(255.0)),
-        ranges.tobytes(),
-    )
-    return _cropped(rival, image)
 
 
 def _astc(image: np.ndarray, mask: np.ndarray, block: int, profile: str) -> Rival:
@@ -179,35 +141,11 @@ def _measured(
     )
 
 
-def _check_bc(codec: str, loss: float) -> None:
-    for package in ("ispc_texcomp", "imagecodecs"):  # importing them is not part of the encode time
-        need(package, EXTRA)
-    if not 0.0 <= loss <= 255.0:
-        raise WlmError(f"{codec}: expected a loss from 0 to 255, got {loss:g}")
-
-
-def _with_loss(name: str, loss: float) -> str:
-    return f"{name}-rdo-{loss:g}" if loss else name
-
-
-def _weight(mask: np.ndarray) -> np.ndarray:
-    """Returns weights of squared errors, float32 [H, W, 3] padded to blocks; texels just outside charts count less."""
-    valid = np.asarray(mask).astype(bool)
-    weight = np.where(valid, 1.0, np.where(seen_texels(valid, ring=1), _RING_WEIGHT, 0.0)).astype(np.float32)
-    height, width = valid.shape
-    padded = np.pad(weight, ((0, -height % _BC_BLOCK), (0, -width % _BC_BLOCK)))
-    return np.repeat(padded[..., None], 3, axis=2)
-
-
 def _levels(image: np.ndarray, mask: np.ndarray, block: int) -> tuple[np.ndarray, TileRanges]:
     """Returns a lightmap as levels [H, W, 3] in [0, 1] relative to the range of each tile, and the ranges."""
     codes, seen = to_codes(image), seen_texels(mask)
     ranges = TileRanges.of(codes, seen)
     return clear_unseen(ranges.levels(codes), seen, block), ranges
-
-
-def _to_bytes(levels: np.ndarray) -> np.ndarray:
-    return (levels * 255.0 + 0.5).astype(np.uint8)
 
 
 def _pad(image: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ A texel is called seen if it is valid or within two texels of a valid one: a bil
 beyond a chart, and a bilinear read of its first mip two texels.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,16 @@ def seen_texels(mask: np.ndarray, ring: int = 2) -> np.ndarray:
     return binary_dilation(np.asarray(mask).astype(bool), np.ones((side, side), bool))
 
 
+def areas(height: int, width: int, side: int) -> Iterator[tuple[slice, slice]]:
+    """Yields the rows and columns of squares that cover a map of `height` x `width` texels, row by row from the top.
+
+    A square has `side` texels along an edge, or fewer at the map's lower and right edges.
+    """
+    for y in range(0, height, side):
+        for x in range(0, width, side):
+            yield slice(y, min(y + side, height)), slice(x, min(x + side, width))
+
+
 def clear_unseen(image: np.ndarray, seen: np.ndarray, block: int) -> np.ndarray:
     """Makes blocks black in which renderers read no texel, as black compresses to few bytes. Returns the new image.
 
@@ -86,8 +97,7 @@ class TileRanges:
         height, width = seen.shape
         shape = (*codes.shape[:-3], -(-height // TILE), -(-width // TILE), 3)
         low, high = np.zeros(shape, np.float16), np.zeros(shape, np.float16)
-        for row, column in np.ndindex(shape[-3:-1]):
-            area = slice(row * TILE, (row + 1) * TILE), slice(column * TILE, (column + 1) * TILE)
+        for (row, column), area in zip(np.ndindex(shape[-3:-1]), areas(height, width, TILE), strict=True):
             inside = seen[area]
             if inside.any():
                 texels = codes[(..., *area, slice(None))][..., inside, :]

@@ -20,14 +20,13 @@ Errors have weights half-way between equal ones and PSNR's, like ours, and texel
 import itertools
 import lzma
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch.nn import functional
 
-from benchmarks.rivals.lightmap_levels import GAMMA, TileRanges, prepare, seen_texels, to_codes
+from benchmarks.rivals.lightmap_levels import GAMMA, TileRanges, areas, prepare, seen_texels, to_codes
 from benchmarks.rivals.rival import Rival, measure
 from wlm.errors import WlmError
 from wlm.interop import check_device
@@ -142,7 +141,7 @@ def encode_ntc(
         ranges = TileRanges.over_times(codes, seen)
         levels, weight = ranges.levels(codes), _weight(images, codes, ranges, mask)
         regions = []
-        for number, area in enumerate(_areas(*seen.shape)):
+        for number, area in enumerate(areas(*seen.shape, NETWORK_TEXELS)):
             if seen[area].any():
                 everywhere = (slice(None), *area)
                 fit = _Fit(levels[everywhere], weight[everywhere], seen[area], sizes, samples, seed + number, device)
@@ -177,13 +176,6 @@ def _weight(images: np.ndarray, codes: np.ndarray, ranges: TileRanges, mask: np.
     return (np.maximum(slope, _LEAST_WEIGHT) * ring).astype(np.float32)
 
 
-def _areas(height: int, width: int) -> Iterator[tuple[slice, slice]]:
-    side = NETWORK_TEXELS
-    for y in range(0, height, side):
-        for x in range(0, width, side):
-            yield slice(y, min(y + side, height)), slice(x, min(x + side, width))
-
-
 class _Places:
     """Nodes, bilinear weights and positions at which the N decoded texels of a region read the grids of latents."""
 
@@ -207,8 +199,6 @@ class _Places:
 
 
 class _Fit:
-    """Fits the latents and the network of one region to its lightmaps."""
-
     def __init__(
         self,
         levels: np.ndarray,

@@ -1,16 +1,8 @@
 """Principal components over the hours: a few maps of coefficients for each tile, and how each changes over the day.
 
 In each 128 x 128 tile a texel's levels at T hours (`benchmarks.rivals.lightmap_levels`; the ranges are over all hours)
-are a vector of 3 T numbers. A texel keeps the coefficients of its vector along the tile's first K principal axes; the
-tile keeps the axes and the mean vector as half floats. Two functions store the maps of coefficients differently:
-
-- `encode_pca_bc4`: K maps as BC4 textures, 4 bits a texel each.
-- `encode_pca`: every map rounded with the same step, which gives the smallest squared error at a given rate; K follows
-  from the step. A map takes a byte per texel in memory, and on disk it is lossless JPEG XL, a quarter smaller than
-  with zstd.
-
-Both take lightmaps [T, H, W, 3] in linear RGB and their mask [H, W], and return a `Rival` whose `decoded` is float32
-[T, H, W, 3]. They raise a `WlmError` like the block codecs.
+are a vector of 3 T numbers. A texel keeps the coefficients of its vector along the tile's first K principal axes, in K
+BC4 textures of 4 bits a texel each; the tile keeps the axes and the mean vector as half floats.
 """
 
 from collections.abc import Iterator
@@ -18,15 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.rivals.lightmap_levels import TileRanges, prepare, seen_texels, to_codes
-from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure
+from benchmarks.rivals.lightmap_levels import TileRanges, areas, prepare, seen_texels, to_codes
+from benchmarks.rivals.rival import EXTRA, Rival, disk_size, measure, need_bc
 from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import need
 from wlm.lightmap.tiles import TILE
 from wlm.texels import fill_gaps
 
 _BC4_BLOCK = 4
-_MOST_LEVELS = 255  # levels of a map in bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +43,19 @@ def encode_pca_bc4(frames: np.ndarray, mask: np.ndarray, components: int = 4) ->
     """Encodes K principal coefficients per texel as BC4 textures, whose 256 levels span a map's range in a tile.
 
     Args:
-        frames, mask: The lightmaps [T, H, W, 3] and their mask [H, W].
+        frames: Lightmaps at T times, [T, H, W, 3], linear RGB.
+        mask: [H, W], true where a texel is valid.
         components: K, at least 1; a tile has at most 3 T coefficients per texel.
+
+    Returns:
+        The rival; `decoded` is float32 [T, H, W, 3].
+
+    Raises:
+        WlmError: As for the block codecs, or `components` is below 1.
     """
     if components < 1:
         raise WlmError(f"pca: expected at least 1 component, got {components}")
-    for package in ("ispc_texcomp", "imagecodecs"):  # the time to import them isn't the codec's
-        need(package, EXTRA)
+    need_bc()
     images = prepare(frames, mask)
 
     def encode() -> tuple[TileRanges, list[tuple[_Tile, list[tuple[bytes, np.ndarray]]]]]:
@@ -84,44 +81,6 @@ def encode_pca_bc4(frames: np.ndarray, mask: np.ndarray, components: int = 4) ->
     )
 
 
-def encode_pca(frames: np.ndarray, mask: np.ndarray, step: float = 0.04) -> Rival:
-    """Encodes principal coefficients rounded to multiples of a step, and leaves out maps that become zero.
-
-    Args:
-        frames, mask: The lightmaps [T, H, W, 3] and their mask [H, W].
-        step: Step of the rounding, above 0, where levels range from 0 to 1. A map that would need more than 256 steps
-            gets a wider step.
-    """
-    if not 0.0 < step < np.inf:
-        raise WlmError(f"pca: expected a step above 0, got {step:g}")
-    need("imagecodecs", EXTRA)
-    images = prepare(frames, mask)
-
-    def encode() -> tuple[TileRanges, list[tuple[_Tile, list[np.ndarray], np.ndarray]]]:
-        ranges, tiles = _tiles(images, mask)
-        return ranges, [(tile, *_rounded(tile, step)) for tile in tiles]
-
-    def decode(payload: tuple) -> np.ndarray:
-        ranges, tiles = payload
-        read = ((tile, planes * scale[:, 1] + scale[:, 0]) for tile, planes, scale in tiles)
-        return _decode(read, ranges, images.shape)
-
-    def size(payload: tuple) -> int:
-        """Returns the size in bytes in a GPU's memory, where a map takes one byte per texel."""
-        ranges, tiles = payload
-        texels = sum(tile.inside.size * planes.shape[1] for tile, planes, _ in tiles)
-        rest = sum(len(_basis(tile, planes.shape[1])) + scale.nbytes for tile, planes, scale in tiles)
-        return texels + rest + len(ranges.tobytes())
-
-    def disk_bytes(payload: tuple) -> int:
-        ranges, tiles = payload
-        rest = [ranges.tobytes(), *(_basis(tile, planes.shape[1]) + scale.tobytes() for tile, planes, scale in tiles)]
-        maps = sum(len(_lossless(plane, tile)) for tile, planes, _ in tiles for plane in planes.T)
-        return maps + disk_size(b"".join(rest))
-
-    return measure(f"pca-{step:g}", encode, decode, bytes=size, disk_bytes=disk_bytes)
-
-
 def _tiles(images: np.ndarray, mask: np.ndarray) -> tuple[TileRanges, list[_Tile]]:
     """Computes the ranges of all tiles, and the principal components of every tile that has a texel to encode."""
     seen = seen_texels(mask)
@@ -129,18 +88,12 @@ def _tiles(images: np.ndarray, mask: np.ndarray) -> tuple[TileRanges, list[_Tile
     ranges = TileRanges.over_times(codes, seen)
     levels = ranges.levels(codes)
     tiles = []
-    for area in _areas(*seen.shape):
+    for area in areas(*seen.shape, TILE):
         inside = seen[area]
         if inside.any():
             vectors = levels[(slice(None), *area)][:, inside].transpose(1, 0, 2).reshape(np.count_nonzero(inside), -1)
             tiles.append(_Tile(area, inside, *_principal(vectors)))
     return ranges, tiles
-
-
-def _areas(height: int, width: int) -> Iterator[tuple[slice, slice]]:
-    for y in range(0, height, TILE):
-        for x in range(0, width, TILE):
-            yield slice(y, min(y + TILE, height)), slice(x, min(x + TILE, width))
 
 
 def _principal(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -154,21 +107,6 @@ def _principal(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def _basis(tile: _Tile, components: int) -> bytes:
     return tile.mean.tobytes() + tile.axes[:components].tobytes()
-
-
-def _rounded(tile: _Tile, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rounds a tile's coefficients. Returns bytes [N, K] of K maps, and each map's minimum and step, float32 [K, 2]."""
-    span = np.ptp(tile.coefficients, axis=0)
-    steps = np.maximum(np.float32(step), span / np.float32(_MOST_LEVELS - 1))
-    whole = np.rint(tile.coefficients / steps)
-    kept = np.flatnonzero(whole.any(axis=0))
-    count = kept[-1] + 1 if kept.size else 0  # those in between are kept: they cost nothing
-    least = whole[:, :count].min(axis=0)
-    return (whole[:, :count] - least).astype(np.uint8), np.stack([least * steps[:count], steps[:count]], axis=1)
-
-
-def _lossless(plane: np.ndarray, tile: _Tile) -> bytes:
-    return need("imagecodecs", EXTRA).jpegxl_encode(_over_tile(plane, tile), lossless=True)
 
 
 def _over_tile(values: np.ndarray, tile: _Tile) -> np.ndarray:
@@ -197,11 +135,7 @@ def _from_bc4(data: bytes, scale: np.ndarray, tile: _Tile) -> np.ndarray:
     return texels[tile.inside] / np.float32(255.0) * scale[1] + scale[0]
 
 
-def _decode(
-    tiles: Iterator[tuple[_Tile, np.ndarray]],
-    ranges: TileRanges,
-    shape: tuple[int, ...],
-) -> np.ndarray:
+def _decode(tiles: Iterator[tuple[_Tile, np.ndarray]], ranges: TileRanges, shape: tuple[int, ...]) -> np.ndarray:
     """Decodes lightmaps [T, H, W, 3] from each tile's coefficients [N, K]; black where no texel is coded."""
     levels = np.zeros(shape, np.float32)
     for tile, coefficients in tiles:

@@ -202,7 +202,7 @@ class PlainFit:
 
     @torch.no_grad()
     def _stored(self) -> list[torch.Tensor]:
-        """Returns maps as `_maps` does, with values quantised as in a file."""
+        """Returns the texels of F_uv, F_uvt, F_ut and F_vt quantised as in a file; absent maps are left out."""
         maps = self._maps(quantised=True)
         count = len(maps) - len(self._planes)
         if self._features.blocks:

@@ -124,7 +124,7 @@ def unreal_packing(position: np.ndarray, values: np.ndarray) -> Rival:
 
 
 def pack_unreal(values: np.ndarray, bands: int) -> bytes:
-    """Packs spherical harmonics [N, D] up to `bands`: uint32 [N] ambient colours, uint8 [N, 3, bands² - 1] ratios."""
+    """Packs SH [N, D] up to `bands` to bytes: uint32 [N] ambient colours, then uint8 [N, 3, bands² - 1] ratios."""
     ambient, level = packed(np.asarray(values, np.float64).reshape(len(values), -1, 3)[:, : bands**2])
     return ambient.tobytes() + level.tobytes()
 
@@ -141,11 +141,7 @@ def unpack_unreal(payload: bytes, width: int, bands: int) -> np.ndarray:
 
 
 def at_bytes(
-    name: str,
-    position: np.ndarray,
-    values: np.ndarray,
-    budget_bytes: int,
-    bits: Sequence[int | None] = WEIGHT_BITS,
+    name: str, position: np.ndarray, values: np.ndarray, budget_bytes: int, bits: Sequence[int | None] = WEIGHT_BITS
 ) -> Rival:
     """Searches for the settings with which one method has the least squared error within a size in bytes.
 

@@ -73,7 +73,7 @@ class Solver:
             self.solve_weights()
 
     def error(self) -> float:
-        """Returns the sum of squared errors."""
+        """Returns the sum of squared errors of all probes' numbers with the current corners and weights."""
         return float(np.square(self._residual(self._at_probes())).sum())
 
     def solve_weights(self) -> None:

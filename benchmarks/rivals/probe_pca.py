@@ -175,7 +175,7 @@ def encode(values: np.ndarray, partition: Partition, components: int, bits: int 
 
 
 def decode(payload: bytes, position: np.ndarray) -> np.ndarray:
-    """Decodes the result of `encode`.
+    """Reconstructs the numbers of all probes from their parts' subspaces and weights, the bytes that `encode` returned.
 
     Args:
         payload: Bytes that `encode` returned.

@@ -70,6 +70,12 @@ def measure(
     return rival if disk_bytes is None else replace(rival, disk_bytes=disk_bytes(payload))
 
 
+def need_bc() -> None:
+    """Imports the packages of BC codecs, which would otherwise count as encode time; a `WlmError` if one is missing."""
+    for package in ("ispc_texcomp", "imagecodecs"):
+        need(package, EXTRA)
+
+
 def disk_size(data: bytes) -> int:
     """Returns the size in bytes of data under zstd, as in KTX2 files and game packages; at most its plain size.
 

@@ -23,10 +23,7 @@ from wlm.atlas.views import Points
 from wlm.atlas.weights import FineGrid
 
 _FORMATS = (TEXELS, BLOCKS)  # of the textures of the colours that scenes have
-_TRIES, _CLOSE = (
-    8,
-    1.005,
-)  # attempts to find the share with the bits that are asked for, and the ratio that is close enough
+_TRIES, _CLOSE = 8, 1.005  # attempts to find the share that has the requested bits, and the ratio that is close enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +63,7 @@ class SceneParts:
 
 
 def scene_parts(
-    scene: LightmappedScene,
-    weights: Sequence[np.ndarray],
-    bits: float,
-    colour: str = "mixed",
-    device: str = "cpu",
+    scene: LightmappedScene, weights: Sequence[np.ndarray], bits: float, colour: str = "mixed", device: str = "cpu"
 ) -> SceneParts:
     """Compresses each lightmap of a scene alone, with a share of the given bits.
 
@@ -162,7 +155,7 @@ def _bits(placed: Layout | None, part: _Part, share: float, profile: Profile) ->
 def _by_part(
     samples: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]], parts: list[_Part]
 ) -> list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]]:
-    """Splits `samples`, the result of `solved`, by parts, and numbers the tiles of each part from 0."""
+    """Splits groups of tiles (their numbers, samples and weights) by parts; numbers the tiles of each part from 0."""
     ends = np.array([part.tiles.stop for part in parts])
     result: list[list[tuple[np.ndarray, torch.Tensor, torch.Tensor]]] = [[] for _ in parts]
     for members, values, weight in samples:

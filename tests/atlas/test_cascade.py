@@ -125,7 +125,7 @@ def test_a_steps_gradient(device: str, space: str, lut_scale: float):
         step()
         grads = [each.grad.cpu().numpy() for each in step._tuned.values()]
         after = step.textures()
-    triangle, barycentric = step.points.triangle.cpu().long(), step.points.barycentric.cpu()
+    triangle, barycentric = step.points.triangle.flatten().cpu().long(), step.points.barycentric.reshape(-1, 2).cpu()
     if space == "views":
         clip = torch.tensor(
             clip_positions(normalised(sheet.position, sheet.triangle), sphere_views(profile.steps, 5)[0])

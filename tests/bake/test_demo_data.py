@@ -26,7 +26,7 @@ def test_lightmaps_are_of_the_scenes_hours():
 def test_probes_are_where_the_scene_has_them():
     task = open_task(ROOM / "room.yaml")
     scene, path = task.scene, task.geometry
-    places = place_probes(scene.probes, read_geometry(path, None), scene.seed)
+    places = place_probes(scene.probes, read_geometry(path, None))
     for hour in scene.hours:
         probes = load_probes(BAKED / "probes.npz", key=f"{hour:g}")
         np.testing.assert_allclose(probes.position, places, atol=1e-6)

@@ -12,12 +12,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders.bake_rooms import ROOM, quad
-from builders.gltf_scene import Thing, write_scene
 
-import wlm
 from wlm.bake.backend import start
 from wlm.bake.geometry import Geometry, Material
-from wlm.bake.lightmaps import _directions, bake_lightmaps, write_lightmaps
+from wlm.bake.lightmaps import bake_lightmaps
 from wlm.bake.probes import bake_probes
 from wlm.bake.settings import BakeScene, Daylight, Lamp, ProbeSettings, Sky
 from wlm.bake.texels import place_texels
@@ -39,12 +37,12 @@ FLOOR = quad([-1, 0, 1], [2, 0, 0], [0, 0, -2])
 SPOT = quad([-0.001, 0, 0.001], [0.002, 0, 0], [0, 0, -0.002])  # a point, nearly, that faces up
 
 
-def lit(surfaces, samples=1024, bounces=2, picture=None, hour=12.0, directional=False, **lights) -> np.ndarray:
-    """Irradiance of the texels of the surfaces with UVs, [T, 3], or [T, 6]."""
+def lit(surfaces, samples=1024, bounces=2, picture=None, hour=12.0, **lights) -> np.ndarray:
+    """Irradiance of the texels of the surfaces with UVs, [T, 3]."""
     scene = BakeScene(geometry="-", samples=samples, bounces=bounces, seed=1, **lights)
     now, tracing = world.make_hour(scene, Geometry(None, tuple(surfaces), ()), picture, hour)
     texels = place_texels("here", surfaces, 8, 2)
-    return paths.irradiance(now, texels, tracing, directional=directional).mean
+    return paths.irradiance(now, texels, tracing).mean
 
 
 def harmonics(position, surfaces=(), samples=1024, picture=None, hour=12.0, **lights) -> np.ndarray:
@@ -129,47 +127,6 @@ def test_a_sky_picture_is_the_right_way_round():
     assert y[2] > 0.9 * np.linalg.norm([x[2], y[2], z[2]])
     morning = harmonics([[0, 0, 0]], daylight=replace_direct(Daylight(latitude=0.0, day=81)), hour=7.0)[0]
     assert morning[3].min() > 0.2 * morning[1].min() > 0  # the sky is brighter around the sun, in the east
-
-
-def test_where_light_comes_from():
-    """A lamp's own direction; of an even sky the normal's, by the mean cosine of what it gives, 2/3; of two both."""
-    lamp = Lamp(position=(1, 2, 0), intensity=(4, 8, 12))
-    up = quad([-0.001, 0, 0.001], [0.002, 0, 0], [0, 0, -0.002])
-    direction = lambda **lights: _directions(lit([up], directional=True, **lights))  # noqa: E731
-    toward = np.array([1, 2, 0]) / math.sqrt(5)
-    assert direction(lamps=[lamp]) == pytest.approx(np.tile(toward, (64, 1)), abs=2e-3)
-    sky = direction(sky=Sky(radiance=(1, 2, 3)), samples=4096)
-    assert sky.mean(0) == pytest.approx([0, 2 / 3, 0], abs=2e-3) and np.abs(sky[:, [0, 2]]).max() < 0.01
-    other = Lamp(position=(-1, 2, 0), intensity=(4, 8, 12))
-    assert direction(lamps=[lamp, other], samples=4096).mean(0) == pytest.approx([0, toward[1], 0], abs=0.01)
-    day = Daylight(latitude=0.0, day=81)
-    sun = world.daylight(day, 15.0, 24.0)[0]
-    both, without = (lit([up], daylight=one, hour=15.0, directional=True) for one in (day, replace_direct(day)))
-    assert _directions(both - without).mean(0) == pytest.approx(sun.direction, abs=0.01)
-    assert not direction(lamps=[Lamp(position=(0, -1, 0))]).any()  # behind it: dark
-
-
-def test_a_directional_bake_is_a_set_with_layers(tmp_path):
-    """The way from each texel to a lamp, and its cosine, as the loader of Unity's layers reads them."""
-    floor = Thing("floor", FLOOR.position, FLOOR.triangle, [FLOOR.uv])
-    write_scene(tmp_path / "floor.gltf", [floor])
-    (tmp_path / "floor.yaml").write_text(
-        "{geometry: floor.gltf, samples: 64, lightmap: {resolution: 16},"
-        " lamps: [{position: [0.3, 2, 0.2], intensity: [9, 9, 9]}]}"
-    )
-    task = open_task(tmp_path / "floor.yaml", directional=True)
-    baked = bake_lightmaps(task, device=DEVICE)
-    write_lightmaps(tmp_path / "set", task, baked)
-    read = wlm.lightmap.load(tmp_path / "set")
-    light, toward = (read.sheets[sheet].frames[0] for sheet in read.sheets if sheet.channels == ("R", "G", "B"))
-    (alpha,) = (read.sheets[sheet].frames[0][..., 0] for sheet in read.sheets if sheet.channels == ("A",))
-    assert light.shape == toward.shape and read.warnings == ()
-    v, u = (np.mgrid[:16, :16] + 0.5) / 16
-    way = np.stack([0.3 - (2 * u - 1), np.full_like(u, 2.0), 0.2 - (1 - 2 * v)], -1)
-    way /= np.linalg.norm(way, axis=-1, keepdims=True)
-    # In half floats, and a texel is as wide as it is.
-    assert baked.mask.all() and 2.0 * toward - 1.0 == pytest.approx(way, abs=0.01)
-    assert alpha == pytest.approx(0.5 + 0.5 * way[..., 1], abs=2e-3)
 
 
 def test_harmonics_of_an_even_sky_are_one_number():

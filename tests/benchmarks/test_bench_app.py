@@ -34,7 +34,7 @@ COMMANDS = [
     (
         ["atlas", "--quick", "--meshes", "a/Cube", "--profile", "astc"],
         "atlas --quick --device cpu --meshes Cube --profile astc",
-        {"meshes_path": Path("a/Cube"), "profiles": ["astc"], "rivals": True, "rivals_at": None},
+        {"meshes_path": Path("a/Cube"), "profiles": ["astc"], "rivals": True},
     ),
     (
         ["atlas-scene", "--set", "town", "--hour", "6", "--side", "48", "--quick", "--budget", "0.1", "--no-parts"],
@@ -93,11 +93,10 @@ def test_some_rows_replace_those_alone(given_rows, tmp_path, monkeypatch):
         (["lightmap-ablation", "--only", "4D", "--set", "absent"], "--only: expected one of hybrid, 2D alone"),
         (["lightmap-ablation", "--steps", "0"], "--steps"),
         (["probe", "--volume-only", "--quick"], "--volume-only: cannot be combined with --quick"),
-        (["probe", "--rivals-at", "a.json", "--quick"], "--rivals-at: cannot be combined with --quick"),
+        (["probe", "--rivals-only", "--quick"], "--rivals-only: cannot be combined with --quick"),
         (["probe", "--probes", "absent.npz"], "No such file"),
         (["atlas", "--profile", "absent"], "profile"),
         (["atlas", "--meshes", "absent"], "absent: no such folder"),
-        (["atlas", "--rivals-at", "a.json", "--no-rivals"], "--rivals-at: cannot be combined with --quick"),
         (["atlas-scene"], "--set"),
         (["atlas-ablation", "--profile", "standard"], "--profile: expected a profile of method cascade"),
         (["atlas-ablation", "--only", "none", "--meshes", "absent"], "--only: expected one of whole"),

@@ -6,8 +6,7 @@ from builders.atlas_meshes import charts, constant, image, sheet, soft
 from builders.bench_rows import check_outputs, keys
 
 import benchmarks.atlas as bench
-from benchmarks import write_json
-from benchmarks.atlas import PANELS, Lightmap, plotted, read_lightmaps, rival_rows, run_rows
+from benchmarks.atlas import PANELS, Lightmap, plotted, read_lightmaps, run_rows
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.evaluation import compare
 from wlm.atlas.fit import compress
@@ -166,19 +165,3 @@ def test_what_is_refused(tmp_path, lightmaps):
         read_lightmaps(tmp_path)
     with pytest.raises(ValueError, match="at least one lightmap and one profile"):
         run_rows(lightmaps, [], device="cpu", views=1, resolution=32, whole=False)
-
-
-def test_the_rivals_alone(lightmaps, rows, tmp_path, monkeypatch):
-    """At the bits that a result file has, with the scores that they have in a whole run."""
-    monkeypatch.setattr(bench, "VIEWS", 3)
-    monkeypatch.setattr(bench, "RESOLUTION", 64)
-    write_json(tmp_path / "rows.json", rows, {})
-    alone = rival_rows(tmp_path / "rows.json", lightmaps[:1])
-    beside = [row for row in rows if row.scene == "sheet day" and row.method in RIVALS]
-    beside = [row for row in beside if row.option in {f"bits of {option}" for option in ("standard", *SMALLER)}]
-    assert keys(alone) == keys(beside)
-    for name in ("bytes", "psnr"):
-        assert [row[name] for row in alone] == [row[name] for row in beside]
-    write_json(tmp_path / "few.json", [row for row in rows if row.scene == "cube night"], {})
-    with pytest.raises(WlmError, match="expected a row of the method 'ours' and the scene sheet day"):
-        rival_rows(tmp_path / "few.json", lightmaps)

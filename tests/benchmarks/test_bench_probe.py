@@ -89,7 +89,7 @@ def test_rivals_keep_to_the_bytes(rows):
 def test_rivals_alone_are_the_same(sets, rows, monkeypatch):
     monkeypatch.setattr(bench, "load", lambda path, key: sets[0])
     monkeypatch.setattr(bench, "SHARES", (5, 10))
-    alone = run(probes_path="room.npz", rivals_at="rows.json")
+    alone = run(probes_path="room.npz", rivals_only=True)
     beside = [row for row in rows if row.scene == "room" and row.method in [*RIVALS, "Unreal packing"]]
     assert keys(alone) == keys(beside)
     for name in ("bytes", "psnr"):

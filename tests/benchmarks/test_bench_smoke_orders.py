@@ -37,8 +37,7 @@ WAYS = (
 def rows():
     with pytest.MonkeyPatch.context() as patch:
         # Of fifteen octaves a few: each is a march.
-        for module in (bench, rivals):
-            patch.setattr(module, "FITTED", FITTED[::4])
+        patch.setattr(rivals, "FITTED", FITTED[::4])
         return run(device="cpu", sizes=TINY)
 
 

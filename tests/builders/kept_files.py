@@ -164,7 +164,7 @@ def _simulation() -> Kept:
     ball = Sphere(Trajectory.of(np.array([[4.0, 4.0, 4.0]]), np.array([0.0])), 1.5)
     solver = Solver(Lattice((8, 8, 8), viscosity=0.1), refinement=1, obstacles=[ball])
     solver.step(2)
-    return Kept(_written(solver.save), solver.load, {}, {"lattice.steps": ((), -1)})
+    return Kept(_written(solver.save), solver.load, {}, {"lattice.steps": ((), -1), "density": ((0, 0, 0), -1.0)})
 
 
 KEPT: dict[str, Callable[[], Kept]] = {

@@ -4,11 +4,9 @@ import dataclasses
 
 import numpy as np
 import torch
-from reference.flipbook import between
 
 from wlm.smoke.camera import Camera
 from wlm.smoke.flipbook.book import Book, Shot, pack_book
-from wlm.smoke.flipbook.motion import ZERO
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light, Ramp
 
@@ -28,31 +26,20 @@ def random_frames(count: int = 5, size: tuple[int, int] = (12, 16), *, hot: bool
     return [SixWay(each[:6], each[6], each[7] if hot else None, camera) for each in maps]
 
 
-def random_book(frames: list[SixWay], *, moving: bool = False, ramp: Ramp | None = FIRE, padding: int = 2) -> Book:
-    """Packs frames into a flip book; `moving`: with the constant motion `MOVED`."""
+def random_book(frames: list[SixWay], *, ramp: Ramp | None = FIRE, padding: int = 2) -> Book:
+    """Packs frames into a flip book of 10 frames a second."""
     book = pack_book([Shot(i, six) for i, six in enumerate(frames, 1)], padding=padding, gain=1.0, rate=10.0)
-    book = dataclasses.replace(book, ramp=ramp if book.hot else None)
-    if not moving:
-        return book
-    motion = np.full((*book.first.shape[:2], 3), ZERO, np.float32)
-    motion[..., :2] += np.float32([MOVED[0], -MOVED[1]]) / (2.0 * SCALE)
-    return dataclasses.replace(book, motion=np.round(motion * 255.0) / np.float32(255.0), scale=SCALE)
-
-
-SCALE = 255.0 / 2.0 / 64.0 / 8.0
-"""Scale of the motion: 64 steps of 255 are an eighth of a frame."""
-MOVED = (0.125, -0.125)
-"""The constant motion to the right and down, as a fraction of a frame."""
+    return dataclasses.replace(book, ramp=ramp if book.hot else None)
 
 
 def shown(frames: list[SixWay], book: Book, time: float) -> np.ndarray:
     """Returns a billboard at a time in frames under the light and the sky: light and opacity, [H, W, 4]."""
     first = min(int(time), len(frames) - 1)
     one, other = frames[first], frames[min(first + 1, len(frames) - 1)]
-    moved = torch.zeros((2, *book.size))
-    if book.motion is not None:
-        moved += torch.tensor(MOVED)[:, None, None]
-    six = between(one, other, moved, time - first)
+    share = time - first
+    glow = None if one.emission is None else torch.lerp(one.emission, other.emission, share)
+    maps = torch.lerp(one.lightmaps, other.lightmaps, share)
+    six = SixWay(maps, torch.lerp(one.transparency, other.transparency, share), glow, one.camera)
     # Mixed in light, as textures are, and coloured then.
     light = six.shade([Light(TOWARD, IRRADIANCE)], ramp=book.ramp)
     light += six.lightmaps.mean(0)[..., None] * torch.tensor(SKY)

@@ -12,7 +12,6 @@ from builders.smoke_books import shown as shown_book
 
 from wlm.smoke.camera import LAYOUTS, Camera
 from wlm.smoke.flipbook.book import Shot, pack_book
-from wlm.smoke.flipbook.motion import ZERO
 from wlm.smoke.flipbook.shader import billboard_shader, smoke_shader
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light
@@ -58,41 +57,27 @@ vec4 shown(ivec2 pixel)
     return Subject(text, main, np.array(expected, np.float32)[None], bound, "", 2e-5)
 
 
-def smoke_motion(_) -> Subject:
-    """Compares the places at which two frames are read, from a texel of motion, and the mip level."""
-    random = np.random.default_rng(7)
-    scale = 0.07
-    text = smoke_shader(replace(random_book(random_frames(size=(24, 24)), padding=4), scale=scale))
-    asked = np.column_stack([random.random((12, 2)), np.linspace(0.0, 1.0, 12)])
-    way = np.column_stack([random.random((12, 2)), 2.0 ** random.uniform(-1, 5, 12)])
-    way[0, :2] = ZERO
-    moved = (way[:, :2] - ZERO) * 2.0 * scale * [1.0, -1.0]
-    before = np.clip(asked[:, :2] - asked[:, 2:] * moved, 0.0, 1.0)
-    after = np.clip(asked[:, :2] + (1.0 - asked[:, 2:]) * moved, 0.0, 1.0)
-    level = np.clip(np.log2(np.maximum(way[:, 2], 1.0)), 0.0, 3.0)
+def smoke_level(_) -> Subject:
+    """Compares the mip level with the logarithm of the width of a screen pixel in texels."""
+    text = smoke_shader(random_book(random_frames(size=(24, 24)), padding=4))
+    width = 2.0 ** np.random.default_rng(7).uniform(-1, 5, 12)
+    level = np.clip(np.log2(np.maximum(width, 1.0)), 0.0, 3.0)
     main = (
         POINTS
-        + """uniform sampler2D u_ways;
-vec4 shown(ivec2 pixel)
+        + """vec4 shown(ivec2 pixel)
 {
-    vec4 asked = texelFetch(u_points, pixel, 0);
-    vec4 way = texelFetch(u_ways, pixel, 0);
-    vec2 moved = wlm_smoke_motion(way);
-    vec2 before = wlm_smoke_before(asked.xy, moved, asked.z);
-    vec2 after = wlm_smoke_after(asked.xy, moved, asked.z);
-    return vec4(before.x - 2.0 * before.y, after.x - 2.0 * after.y, moved.y, wlm_smoke_level(way.z));
+    return vec4(wlm_smoke_level(texelFetch(u_points, pixel, 0).x));
 }
 """
     )
-    columns = [before @ [1.0, -2.0], after @ [1.0, -2.0], moved[:, 1], level]
-    bound = {"u_points": points_of(asked), "u_ways": points_of(way)}
-    return Subject(text, main, np.float32(np.column_stack(columns))[None], bound, "", 2e-5)
+    bound = {"u_points": points_of(np.repeat(width[:, None], 3, 1))}
+    return Subject(text, main, np.float32(np.repeat(level[:, None], 4, 1))[None], bound, "", 2e-5)
 
 
 def billboard(_) -> Subject:
-    """Compares a billboard with motion and fire with `shade`, at and between frames."""
+    """Compares a billboard of fire with `shade`, at and between frames."""
     frames = random_frames()
-    book = random_book(frames, moving=True)
+    book = random_book(frames)
     times = (0.0, 1.5, 3.25)
     expected = np.concatenate([shown_book(frames, book, time) for time in times])
     main = f"""
@@ -112,4 +97,4 @@ vec4 shown(ivec2 pixel)
 def smoke_subjects() -> dict[str, Callable[[object], Subject]]:
     """Returns all subjects by name."""
     layouts = {f"smoke {layout}": partial(smoke, layout) for layout in LAYOUTS}
-    return {"smoke motion": smoke_motion, "smoke billboard": billboard} | layouts
+    return {"smoke level": smoke_level, "smoke billboard": billboard} | layouts

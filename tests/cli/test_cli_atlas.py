@@ -239,7 +239,7 @@ def test_a_scene_is_one_command(tmp_path):
 def test_export_for_an_engine_and_in_a_language(tiles, tmp_path):
     out = ["export", tiles, "-o", tmp_path / "out"]
     assert "atlas.gdshader" in call(*out, "--engine", "godot")
-    assert "atlas.metal" in call(*out, "--shader", "msl")
+    assert "atlas.hlsl" in call(*out, "--shader", "hlsl")
     assert not (tmp_path / "out" / "atlas.gdshader").exists()
-    assert "float3 wlm_atlas(float2 uv) const" in (tmp_path / "out" / "atlas.metal").read_text()
+    assert "float3 wlm_atlas(float2 uv)" in (tmp_path / "out" / "atlas.hlsl").read_text()
     assert "--shader: has no meaning with --engine three" in fails(*out, "--engine", "three", "--shader", "wgsl")

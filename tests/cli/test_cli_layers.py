@@ -45,8 +45,6 @@ def test_decode_writes_a_layer_with_its_channels(made, tmp_path):
     pixels, names, _ = read_channels(out)
     assert names == ("R", "G", "B", "A")
     np.testing.assert_allclose(pixels, decoder.frame(6.0, "dir", "Lightmap-1"), atol=1e-3)
-    options = ["-o", out, "--layer", "dir", "--texture", tmp_path / "a.dds"]
-    assert "expected a layer of light" in fails("decode", folder / "a.wlm", "--time", 6, *options)
 
 
 def test_wrong_layers_and_export(made, tmp_path):

@@ -26,7 +26,7 @@ def room(tmp_path_factory):
 @pytest.fixture(scope="session")
 def profile(tmp_path_factory):
     path = tmp_path_factory.mktemp("profile") / "tiny.yaml"
-    settings = {"name": "tiny", "method": "gaussians", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 30}
+    settings = {"name": "tiny", "method": "gaussians", "ratio": 0.1, "hidden": 16, "latent": 3, "steps": 30}
     path.write_text(yaml.safe_dump(settings))
     return path
 
@@ -62,8 +62,9 @@ def test_compress_prints_one_table(room, profile, tmp_path):
 
 
 def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
-    out, other = tmp_path / "a.wlm", tmp_path / "b.wlm"
-    options = ["--profile", profile, "--ratio", 0.2, "--latent", 3, "--steps", 12, "--positions"]
+    out, other, wider = tmp_path / "a.wlm", tmp_path / "b.wlm", tmp_path / "wider.yaml"
+    wider.write_text(profile.read_text().replace("latent: 3", "latent: 4"))
+    options = ["--profile", wider, "--ratio", 0.2, "--latent", 3, "--steps", 12, "--positions"]
     call("compress", room, "-o", out, *options, "--key", "sh", "--convention", "threejs")
     model = wlm.load(out)
     settings = model.profile

@@ -115,7 +115,7 @@ def command(request, tmp_path_factory):
         case "probe compress":
             probes = probe_sets.synthetic(300, dead=5)
             save_probes(place / "room.npz", probes.position, probes.values)
-            tiny = {"name": "tiny", "method": "gaussians", "ratio": 0.1, "hidden": 16, "latent": 4, "steps": 400}
+            tiny = {"name": "tiny", "method": "gaussians", "ratio": 0.1, "hidden": 16, "latent": 3, "steps": 400}
             profile = settings(tiny)
             words += (place / "room.npz", "--profile", profile, *EVERY)
             return Command(words, "a.wlm", older("probe.wlm"), file_bytes, kept_or_whole, beside)

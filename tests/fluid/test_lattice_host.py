@@ -29,14 +29,11 @@ def _box(device: str, shape=SHAPE, inlet: bool = True, **settings) -> Lattice:
     return box
 
 
-@pytest.mark.parametrize("where", [(3, 2, 5), (11, 7, 7)])
-def test_not_a_number_is_reported(where: tuple[int, int, int], device: str):
+def test_not_a_number_is_reported(device: str):
     box = _box(device)
     box.step(5)
     state = box.state()
-    q = 4
-    populations = state["populations"].reshape(-1, *SHAPE)
-    populations[(q, *where)] = np.nan
+    state["populations"].reshape(-1, *SHAPE)[4, 11, 7, 7] = np.nan
     box._buffers[0].assign(state["populations"])
     with pytest.raises(WlmError, match=r"blew up in step 5 at cell \(\d+, \d+, \d+\): not a number") as caught:
         box.step(CHECK_EVERY)
@@ -106,15 +103,14 @@ def test_one_voxel(inlet: bool, device: str):
 
 
 def test_too_fast(device: str):
-    """Walls, inlets and bodies."""
     box = Lattice(SHAPE, viscosity=0.02, device=device)
-    for wrong in (lambda: box.set_wall("-y", (0.5, 0.0, 0.0)), lambda: box.set_inlet("-x", (0.31, 0.0, 0.0))):
-        with pytest.raises(WlmError, match=f"at most {MAX_SPEED}: use a shorter step"):
+    for wrong in (
+        lambda: box.set_wall("-y", (0.5, 0.0, 0.0)),
+        lambda: box.set_inlet("-x", (0.31, 0.0, 0.0)),
+        lambda: box.set_solid(np.indices(SHAPE)[0] < 4, (0.0, 0.4, 0.0)),
+    ):
+        with pytest.raises(WlmError, match=f"at most {MAX_SPEED}"):
             wrong()
-    mask = np.zeros(SHAPE, bool)
-    mask[4:8, 2:6, 3] = True
-    with pytest.raises(WlmError, match="a body moves at 0.4 cells per step"):
-        box.set_solid(mask, (0.0, 0.4, 0.0))
 
 
 def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
@@ -173,16 +169,11 @@ def test_wrong_calls(device: str):
         box.set_wall("-y")
 
 
-@pytest.mark.parametrize("storage", ["float32", "float16"])
-def test_a_state_goes_on_to_the_last_bit(storage: str, device: str):
+def test_a_state_goes_on_to_the_last_bit(device: str):
     """An odd number of steps in, with a body, an inlet that still rises and the other buffer stale."""
-
-    def make() -> Lattice:
-        return _box(device, storage=storage, ramp=40)
-
     mask = np.zeros(SHAPE, bool)
     mask[4:6, 3:5, 3:6] = True
-    first, second = make(), make()
+    first, second = (_box(device, ramp=40) for _ in range(2))
     first.set_solid(mask, (0.01, 0.0, 0.0))
     first.step(7)
     state = first.state()
@@ -209,23 +200,6 @@ def test_a_state_without_a_body_after_one(device: str):
         box.step(6)
     assert np.abs(free.velocity().numpy()).max() > 0.01
     np.testing.assert_array_equal(blocked.velocity().numpy(), free.velocity().numpy())
-
-
-def test_states_are_checked(device: str):
-    box = _box(device)
-    state = box.state()
-    missing = {name: value for name, value in state.items() if name != "bodies"}
-    for wrong, match in (
-        (missing, "part bodies is missing"),
-        (state | {"populations": state["populations"][:9]}, "populations is float32"),
-        (state | {"populations": state["populations"].astype(np.float16)}, "part populations is float16"),
-        (state | {"solid": np.zeros(3, np.uint8)}, r"part solid is uint8 \(3,\), expected uint8"),
-        (state | {"populations": np.full_like(state["populations"], np.nan)}, "part populations: expected finite"),
-        (state | {"steps": np.array(-1)}, "part steps: expected 0 to 2.14748e.09, found -1"),
-        (state | {"steps": np.array(2.5)}, "part steps is float64 .*, expected int64"),
-    ):
-        with pytest.raises(WlmError, match=match):
-            box.load(wrong)
 
 
 def test_a_body_that_moves_pushes_air(device: str):
@@ -332,8 +306,21 @@ STROUHAL = 0.3  # of a cylinder in a channel, 0.295 to 0.305 (Schaefer and Turek
 CUBIC_ARRAY = 4.292  # drag over Stokes's, spheres in a simple cubic array at 1/8 of the volume (Zick and Homsy 1982)
 
 
-def _cavity_error(reynolds: int, cells: int, steps: int, device: str, **settings) -> float:
-    """RMS error of u on the midline, in units of the lid's."""
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("reynolds", "cells", "steps", "settings", "most"),
+    [
+        (100, 64, 8000, {}, 0.006),  # 0.0030 when it no longer changes
+        (400, 64, 24000, {}, 0.02),  # 0.0044
+        (1000, 128, 100000, {}, 0.02),
+        # The lattices in three dimensions are one cell thick.
+        (400, 64, 24000, {"lattice": "D3Q19", "smagorinsky": 0.17}, 0.02),
+        (400, 64, 24000, {"lattice": "D3Q27"}, 0.02),
+        (400, 64, 24000, {"operator": "bgk"}, 0.02),
+    ],
+)
+def test_cavity(reynolds: int, cells: int, steps: int, settings: dict, most: float, device: str):
+    """The RMS error of u on the midline, in units of the lid's."""
     lid = 0.1
     settings = {"smagorinsky": 0.0, "lattice": "D2Q9", **settings}
     cavity = Lattice((cells, cells, 1), viscosity=lid * cells / reynolds, device=device, **settings)
@@ -346,26 +333,7 @@ def _cavity_error(reynolds: int, cells: int, steps: int, device: str, **settings
     y = np.concatenate([[0.0], (np.arange(cells) + 0.5) / cells, [1.0]])
     profile = np.interp(GHIA_Y, y, np.concatenate([[0.0], middle, [1.0]]))
     assert cavity.mass() == pytest.approx(cells**2, rel=1e-6)
-    return float(np.sqrt(np.mean((profile - GHIA[reynolds]) ** 2)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("reynolds", "cells", "steps", "settings", "most"),
-    [
-        (100, 64, 8000, {}, 0.006),  # 0.0030 when it no longer changes
-        (400, 64, 24000, {}, 0.02),  # 0.0044
-        (400, 128, 60000, {}, 0.02),
-        (1000, 128, 100000, {}, 0.02),
-        # The lattices in three dimensions are one cell thick.
-        (400, 64, 24000, {"lattice": "D3Q19"}, 0.02),
-        (400, 64, 24000, {"lattice": "D3Q19", "smagorinsky": 0.17}, 0.02),
-        (400, 64, 24000, {"lattice": "D3Q27"}, 0.02),
-        (400, 64, 24000, {"operator": "bgk"}, 0.02),
-    ],
-)
-def test_cavity(reynolds: int, cells: int, steps: int, settings: dict, most: float, device: str):
-    assert _cavity_error(reynolds, cells, steps, device, **settings) <= most
+    assert np.sqrt(np.mean((profile - GHIA[reynolds]) ** 2)) <= most
 
 
 def _vortex_ratio(cells: int, device: str, **settings) -> float:
@@ -388,11 +356,8 @@ def _vortex_ratio(cells: int, device: str, **settings) -> float:
     "settings",
     [
         {"lattice": "D2Q9", "operator": "bgk"},
-        {},
         {"storage": "float16"},
-        pytest.param({"lattice": "D2Q9"}, marks=pytest.mark.slow),
-        pytest.param({"operator": "bgk"}, marks=pytest.mark.slow),
-        pytest.param({"lattice": "D3Q27"}, marks=pytest.mark.slow),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ({"lattice": "D2Q9"}, {"lattice": "D3Q27"})),
     ],
     ids=str,
 )
@@ -407,22 +372,6 @@ def test_vortices_converge(device: str):
     assert 1.7 <= np.log2(errors[0] / errors[1]) <= 2.5
 
 
-def _channel_error(cells: int, device: str, operator: str, lattice: str) -> float:
-    """RMS error of Poiseuille's profile, in units of its peak."""
-    viscosity, peak = 0.1, 0.05
-    channel = Lattice(
-        (1, cells, 1), viscosity=viscosity, operator=operator, lattice=lattice, smagorinsky=0, device=device
-    )
-    channel.set_wall("-y")
-    channel.set_wall("+y")
-    channel.set_force((8 * viscosity * peak / cells**2, 0.0, 0.0))
-    # Until the start has decayed to exp(-pi^2 nu t / H^2) = 1e-6.
-    channel.step(int(14 * cells**2 / (np.pi**2 * viscosity)))
-    y = (np.arange(cells) + 0.5) / cells
-    profile = channel.velocity().numpy()[0, :, 0, 0] / peak
-    return float(np.sqrt(np.mean((profile - 4 * y * (1 - y)) ** 2)))
-
-
 @pytest.mark.parametrize(
     ("lattice", "operator"),
     [
@@ -432,8 +381,19 @@ def _channel_error(cells: int, device: str, operator: str, lattice: str) -> floa
     ],
 )
 def test_channel_is_of_second_order(lattice: str, operator: str, device: str):
-    """Poiseuille between half-way walls, driven by a force."""
-    errors = [_channel_error(cells, device, operator, lattice) for cells in (4, 8, 16)]
+    """Poiseuille between half-way walls, driven by a force: RMS errors of the profile, in units of its peak."""
+    viscosity, peak, errors = 0.1, 0.05, []
+    for cells in (4, 8, 16):
+        settings = {"operator": operator, "lattice": lattice, "smagorinsky": 0, "device": device}
+        channel = Lattice((1, cells, 1), viscosity=viscosity, **settings)
+        channel.set_wall("-y")
+        channel.set_wall("+y")
+        channel.set_force((8 * viscosity * peak / cells**2, 0.0, 0.0))
+        # Until the start has decayed to exp(-pi^2 nu t / H^2) = 1e-6.
+        channel.step(int(14 * cells**2 / (np.pi**2 * viscosity)))
+        y = (np.arange(cells) + 0.5) / cells
+        profile = channel.velocity().numpy()[0, :, 0, 0] / peak
+        errors.append(float(np.sqrt(np.mean((profile - 4 * y * (1 - y)) ** 2))))
     assert errors[0] <= 0.04
     for coarse, fine in itertools.pairwise(errors):
         assert 1.9 <= np.log2(coarse / fine) <= 2.1, errors
@@ -456,36 +416,27 @@ def test_sphere_in_a_cubic_array(device: str):
     assert push * cells**3 / (6 * np.pi * viscosity * radius * mean) == pytest.approx(CUBIC_ARRAY, rel=0.08)
 
 
-def _sphere_drag(diameter: int, ahead: float, behind: float, beside: float, device: str, **settings) -> np.ndarray:
-    """Drag of a sphere at Re 100, at intervals of 2 diameters of flow; lengths are diameters."""
-    speed = 0.1
-    side = round(beside * diameter)
-    shape = (round((ahead + behind) * diameter), side, side)
-    settings = {"smagorinsky": 0.0, **settings}
-    tunnel = Lattice(shape, viscosity=speed * diameter / 100, device=device, **settings)
+@pytest.mark.slow
+def test_sphere_drag(device: str):
+    """Of 14 cells a diameter, at Re 100; half-way walls on so coarse a sphere give a few percent too much."""
+    diameter, speed, shape = 14, 0.1, (154, 77, 77)
+    tunnel = Lattice(shape, viscosity=speed * diameter / 100, smagorinsky=0.0, device=device)
     tunnel.set_inlet("-x", (speed, 0.0, 0.0))
     tunnel.set_outlet("+x", 1.0)
-    for face in ("-y", "+y", "-z", "+z"):
+    for face in FACES[2:]:
         tunnel.set_wall(face, slip=True)
     tunnel.set_flow((speed, 0.0, 0.0))
     solid = wp.zeros(shape, dtype=wp.uint8, device=device)
-    voxelise_sphere(solid, 1, (round(ahead * diameter), 0.0, 0.0), diameter / 2)
+    voxelise_sphere(solid, 1, (5 * diameter, 0.0, 0.0), diameter / 2)
     tunnel.set_solid(solid)
     # The diameter of a sphere of as many cells.
     area = np.pi / 4 * (24 * np.count_nonzero(solid.numpy()) / np.pi) ** (2 / 3)
     drag = []
-    for _ in range(5):
-        tunnel.step(round(2 * diameter / speed))
+    for steps in (8, 2):
+        tunnel.step(round(steps * diameter / speed))
         drag.append(4 * tunnel.force_on_solid()[0] / (0.5 * speed**2 * area))
-    return np.array(drag)
-
-
-@pytest.mark.slow
-def test_sphere_drag(device: str):
-    """At 14 cells a diameter; half-way walls on so coarse a sphere give a few percent too much."""
-    drag = _sphere_drag(14, 5.0, 6.0, 5.5, device)
-    assert drag[-1] == pytest.approx(SPHERE_DRAG, rel=0.1), drag
-    assert abs(drag[-1] / drag[-2] - 1) <= 0.03, drag
+    assert drag[1] == pytest.approx(SPHERE_DRAG, rel=0.1), drag
+    assert abs(drag[1] / drag[0] - 1) <= 0.03, drag
 
 
 @pytest.mark.slow
@@ -521,47 +472,25 @@ def test_cylinder_sheds_vortices(operator: str, device: str):
     assert diameter / (period * mean) == pytest.approx(STROUHAL, rel=0.08)
 
 
-def _jet(shape: tuple[int, int, int], device: str, **settings) -> Lattice:
-    """A jet at u = 0.1 past a sphere in a box, at a viscosity near 0."""
-    x, y, z = shape
-    settings = {"viscosity": 1e-6, "ramp": 4 * x, **settings}
-    box = Lattice(shape, device=device, **settings)
+@pytest.mark.slow
+def test_jet_is_stable(device: str):
+    """A jet past a sphere at a viscosity near 0: the mass drifts by rounding, and there is no flutter of period 2."""
+    shape = x, y, z = (24, 12, 12)
+    box = Lattice(shape, viscosity=1e-6, ramp=4 * x, device=device)
     across = np.indices((y, z)) + 0.5 - np.array([y / 2, z / 2])[:, None, None]
     box.set_inlet("-x", (0.1, 0.0, 0.0), where=np.hypot(*across) < 0.2 * y)
     box.set_outlet("+x")
-    for face in ("-y", "+y", "-z", "+z"):
+    for face in FACES[2:]:
         box.set_wall(face)
     solid = wp.zeros(shape, dtype=wp.uint8, device=device)
     voxelise_sphere(solid, 1, (0.35 * x, 0.5 * y, 0.5 * z), 0.17 * y)
     box.set_solid(solid)
-    return box
-
-
-def _hold_jet(box: Lattice, steps: int, drift: float) -> None:
     mass = box.mass()
-    box.step(steps)
-    assert box.steps == steps
-    assert abs(box.mass() / mass - 1) <= drift
+    box.step(5000)
+    assert box.steps == 5000 and abs(box.mass() / mass - 1) <= 1e-6
     u = box.velocity().numpy()
     box.step()
-    flutter = np.abs(box.velocity().numpy() - u).max()
-    assert flutter <= 5e-3, flutter
+    assert np.abs(box.velocity().numpy() - u).max() <= 5e-3
     assert np.isfinite(u).all() and 0.08 <= np.linalg.norm(u, axis=-1).max() <= 0.2
     # As much goes out as comes in: the flux through a plane behind the sphere is the inlet's.
-    inflow = u[0, :, :, 0].sum()
-    assert u[-4:, :, :, 0].sum() / 4 == pytest.approx(inflow, rel=0.1)
-
-
-@pytest.mark.slow
-def test_jet_is_stable(device: str):
-    """With the default operator: the mass drifts by rounding, and there is no flutter of period 2."""
-    _hold_jet(_jet((24, 12, 12), device), 5000, 1e-6)
-
-
-def test_sixteen_bits_follow_the_jet(device: str):
-    """Before chaos sets in the two differ by the rounding to 11 bits."""
-    exact, half = (_jet((24, 12, 12), device, storage=storage) for storage in ("float32", "float16"))
-    for box in (exact, half):
-        box.step(300)
-    difference = np.linalg.norm(exact.velocity().numpy() - half.velocity().numpy(), axis=-1)
-    assert 0 < np.sqrt((difference**2).mean()) <= 2e-4
+    assert u[-4:, :, :, 0].sum() / 4 == pytest.approx(u[0, :, :, 0].sum(), rel=0.1)

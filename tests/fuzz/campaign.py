@@ -76,7 +76,7 @@ def campaign(
                 if answer is None:
                     for number, (_, _, end, _) in busy.items():
                         if end <= monotonic():
-                            pool.kill(number)
+                            pool._processes[number].kill()
                     continue
                 number, result = answer
                 name, index, end, prepared = busy.pop(number)

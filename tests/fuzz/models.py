@@ -11,7 +11,6 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-import warp as wp
 from builders.probe_sets import synthetic
 from builders.small_sets import moving_light, tiny_profile
 
@@ -20,7 +19,6 @@ from wlm.errors import WlmError
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
 from wlm.smoke.fit import train
-from wlm.smoke.march.motion import read_velocity, write_velocity
 from wlm.smoke.network.planes import Pool
 from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
 from wlm.smoke.scene import Scene
@@ -88,21 +86,6 @@ def _orders(path: Path) -> None:
     model = load_orders(path)
     check_finite(weights=model.weights, known=model.known)
     assert model.known[0] < model.known[1], "accepted an empty range"
-
-
-@functools.cache
-def _velocities() -> Sequence[bytes]:
-    cells = np.linspace(-1.0, 1.0, 3 * 4 * 5 * 6).reshape(4, 5, 6, 3)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "velocity_0001.npz"
-        write_velocity(path, wp.array(cells, dtype=wp.vec3, device="cpu"), 0.5)
-        return (path.read_bytes(),)
-
-
-def _velocity(path: Path) -> None:
-    velocity = read_velocity(path)
-    check_finite(velocity=velocity)
-    assert velocity.ndim == 4 and velocity.shape[3] == 3, f"accepted {velocity.shape}"
 
 
 def _bytes_of(make: Any) -> bytes:
@@ -252,7 +235,6 @@ READERS = (
     Reader("atlas", "a.wlm", stored(*(f"atlas-{kind}.wlm" for kind in _ATLASES)), vary_artifact, _atlas),
     Reader("smoke-network", "a.wlm", stored("smoke.wlm"), vary_artifact, _network),
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
-    Reader("smoke-velocity", "a.npz", _velocities, vary_npz, _velocity),
     _checkpoints(lightmap_fit, "lightmap", cost=8),
     _checkpoints(probe_fit, "probe", cost=4),
     Reader("smoke-checkpoint", "a.partial", _solver_states, vary_artifact, _smoke_checkpoint, cost=2),

@@ -307,14 +307,6 @@ def test_bricks_follow_the_smoke(device: str):
     assert still.computed == np.prod(grid.shape)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_one_cell(scheme: str, device: str):
-    for ends, expected in ((WRAPPED, 1.0), (SHUT, 1.0), (((OPEN, OPEN),) * 3, 0.0)):
-        grid = Grid(np.full((1, 1, 1, 3), 2.3), 1, ends, device, scheme=scheme)
-        got = grid.run(grid.fields(np.ones((1, 1, 1))), 1.0)
-        assert got.density.numpy()[0] == expected
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30, -1e30])
 def test_air_that_blew_up_does_no_harm(value: float, device: str):
     """All reads lie within the grid, and results are within range or NaN."""

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
+from builders.lightmap_codes import codes_at
 from builders.synthetic import random_sheet
 
 from kernels.compare import array, close
@@ -13,7 +14,7 @@ from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.maps import MapTiles
 from wlm.lightmap.exact import decode_tile64
 from wlm.lightmap.model import SheetModel
-from wlm.lightmap.runtime import StripDecoder
+from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileKind
 
 KINDS = (3, 2, 3, 1)  # dynamic, static, dynamic, constant
@@ -46,15 +47,13 @@ def _hold_strip(model: SheetModel, device: str, times: tuple[float, ...]) -> Non
 
     Between stored times, which it mixes after each was rounded, within two.
     """
-    strip, decoder = StripDecoder(model, device), SheetDecoder(model, device)
+    strip, exact = StripDecoder(model, device), ExactDecoder(model, device)
     for time in times:
-        strip.set_time(time)
-        strip.decode()
-        off = np.abs(strip.numpy().astype(int) - decoder.tiles_8bit(list(strip.numbers), time)[0])
+        off = np.abs(codes_at(strip, time).astype(int) - codes_at(exact, time))
         reads = model.axis.reads(time)
         if len(reads) == 2:
             # What a bound cuts off before the mix is another matter.
-            whole = np.all([decoder.tiles_8bit(list(strip.numbers), at)[0] < 255 for at, _ in reads], 0)
+            whole = np.all([codes_at(exact, at) < 255 for at, _ in reads], 0)
             assert whole.mean() > 0.5 and off[whole].max() <= 2 and (off[whole] == 0).mean() >= 0.6
             continue
         assert off.max() <= 1
@@ -100,12 +99,12 @@ def test_file_is_what_was_trained(device: str, temporal: bool, periodic: bool):
     net.forward(hidden, output, array(features, net.vec_in, device), answer)
     y = answer.numpy()
 
-    decoder = SheetDecoder(model, device)
-    tiles = MapTiles(model, TileKind.DYNAMIC if temporal else TileKind.STATIC, device, case.gelu)
+    kind = TileKind.DYNAMIC if temporal else TileKind.STATIC
+    exact, tiles = ExactDecoder(model, device, kind=kind), MapTiles(model, kind, device, case.gelu)
     wrong = total = 0
     levels = set()
     for k, time in enumerate(model.times):
-        codes, _ = decoder.tiles_8bit(list(range(fit.tiles)), time)
+        codes = codes_at(exact, time)
         state = tiles.state(time)
         for n in range(fit.tiles):
             chosen = place[n, :, 2] == k

@@ -13,7 +13,7 @@ from wlm_kernels.fluid.lattice import CAUSES, trouble_of
 from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import LATTICES
 
-STEPS = 3
+STEPS = 2  # one from each of the two buffers
 SHAPE = (5, 4, 3)
 TOLERANCE = 3e-7  # of a velocity of 0.05 and a density of 1
 HALF_TOLERANCE = 3e-5
@@ -91,9 +91,9 @@ class Pair:
         assert np.abs(got_u - u)[fluid].max() <= tolerance, "velocity"
 
 
-def _run(pair: Pair, tolerance: float = TOLERANCE, steps: int = STEPS) -> None:
+def _run(pair: Pair, tolerance: float = TOLERANCE) -> None:
     pair.hold(tolerance)
-    for _ in range(steps):
+    for _ in range(STEPS):
         pair.step()
         pair.hold(tolerance)
 
@@ -105,12 +105,10 @@ def _slow(*values: object) -> object:
 
 OPERATORS = [
     ("D2Q9", "bgk", 0.0),
-    ("D2Q9", "regularised", 0.17),
     ("D3Q19", "bgk", 0.0),
-    _slow("D3Q19", "bgk", 0.17),
     ("D3Q19", "regularised", 0.0),
     ("D3Q19", "regularised", 0.17),
-    _slow("D3Q27", "bgk", 0.0),
+    *(_slow(*each) for each in (("D2Q9", "regularised", 0.17), ("D3Q19", "bgk", 0.17), ("D3Q27", "bgk", 0.0))),
     ("D3Q27", "regularised", 0.17),
 ]
 
@@ -151,6 +149,7 @@ BOXES = {
     "slip and walls": {"-x": WALLS["-x"], "+x": WALLS["+x"], "-z": ("slip", (0, 0, 0)), "+z": ("slip", (0, 0, 0))},
     "tunnel": WALLS | TUNNEL,
     "open tunnel": TUNNEL | {"-y": ("slip", (0, 0, 0)), "+y": ("outlet", None)},
+    "tunnel over a belt": TUNNEL | {"-y": WALLS["-y"], "+y": ("wall", (0.1, 0.0, 0.0))},
     "pressure": WALLS | {"-z": ("inlet", (0.0, 0.0, 0.04)), "+z": ("outlet", 1.002), "+y": ("outlet", 1.0)},
     "two outlets": {"-x": ("outlet", None), "+x": ("outlet", None)},
 }
@@ -158,13 +157,8 @@ BOXES = {
 
 @pytest.mark.parametrize("name", BOXES)
 def test_faces(name: str, device: str):
-    """Every kind of face, alone and along edges with others."""
-    _run(Pair("D3Q19", device, faces=BOXES[name]))
-
-
-def test_ramp(device: str):
-    """Inlets rise smoothly, moving walls don't."""
-    _run(Pair("D3Q19", device, faces=TUNNEL | {"-y": WALLS["-y"], "+y": ("wall", (0.1, 0.0, 0.0))}, ramp=3))
+    """Every kind of face, alone and along edges with others; inlets rise smoothly, moving walls don't."""
+    _run(Pair("D3Q19", device, faces=BOXES[name], ramp=3))
 
 
 def _obstacles() -> np.ndarray:
@@ -176,23 +170,18 @@ def _obstacles() -> np.ndarray:
     return solid
 
 
-@pytest.mark.parametrize("faces", ["walls", "tunnel", "slip"])
+@pytest.mark.parametrize("faces", ["walls", "tunnel", "slip", ""])
 def test_solids(faces: str, device: str):
-    """Bodies at faces, over a part of the inlet, and thin ones, which move."""
-    solid = _obstacles()
-    _run(Pair("D3Q19", device, faces=BOXES[faces], solid=solid, velocity=(0.03, 0.01, -0.02), shape=solid.shape))
+    """Bodies at faces, over a part of the inlet, and thin ones, which move; and in a box without faces."""
+    solid, faces = _obstacles(), BOXES.get(faces, ())
+    _run(Pair("D3Q19", device, faces=faces, solid=solid, velocity=(0.03, 0.01, -0.02), shape=solid.shape))
 
 
-def test_solids_alone(device: str):
-    """In a box with no faces there are no other links."""
-    _run(Pair("D3Q19", device, solid=_obstacles(), shape=_obstacles().shape))
-
-
+@pytest.mark.slow
 def test_solids_with_other_lattices(device: str):
     """The tables of links serve D3Q27 and D2Q9 as well."""
     solid = _obstacles()
-    pair = Pair("D3Q27", device, faces=BOXES["tunnel"], solid=solid, shape=solid.shape)
-    _run(pair, steps=2)
+    _run(Pair("D3Q27", device, faces=BOXES["tunnel"], solid=solid, shape=solid.shape))
     flat = np.zeros((6, 6, 1), int)
     flat[2:4, 2] = 1
     faces = {name: WALLS[name] for name in ("-y", "+y")} | TUNNEL

@@ -17,7 +17,7 @@ def _run(kernel, dim, inputs, shape, half, device) -> np.ndarray:
 
 
 @pytest.mark.parametrize("half, error", [(False, 1e-5), (True, 2e-3)])
-@pytest.mark.parametrize("channels", [1, 8, 17, 40, 56, 128])
+@pytest.mark.parametrize("channels", [1, 17, 40, 128])
 def test_norm(device, half, error, channels):
     x, shift = 3 * noise(half, 10, channels), noise(False, 2, channels)
     x[4] = 0
@@ -46,7 +46,7 @@ def test_gate(device, half, error, size):
 
 
 @pytest.mark.parametrize("half, error", [(False, 1e-5), (True, 2e-3)])
-@pytest.mark.parametrize("channels", [5, 40, 48])
+@pytest.mark.parametrize("channels", [5, 40])
 def test_attend(device, half, error, channels):
     cuda = device != "cpu"
     n = channels

@@ -184,6 +184,14 @@ def test_two_lanes_equal_one():
     np.testing.assert_array_equal(two.collect(grad_f, 30, 41), one.collect(grad_f))
 
 
+def test_kernels_that_are_loaded_ahead_are_those_that_are_launched():
+    """A module is compiled anew for each size of blocks; on the CPU every launch has blocks of one thread."""
+    launches = probe_step.step_kernels(9, "cpu")
+    launches.load("cpu")
+    for kernel in (launches._shapes, launches._features, launches._collect, launches._update):
+        assert {threads for _, threads in kernel.module.execs} == {1}
+
+
 def test_levels(device: str):
     """Rows as the file holds them (eq. 13 and 14): rounded, held within the range, and no range at all."""
     step = Step(_x(GROUP), _rows(200), device)

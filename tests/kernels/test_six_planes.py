@@ -73,8 +73,7 @@ def test_planes_of_heads_and_a_filter(device, size, stem, half):
     assert result[LIGHTS:].max() <= 1 and (result - expected).abs().max() < 1e-5 * expected.max()
 
 
-@pytest.mark.parametrize("edge, planes", [(1, 0), (1, 2), (3, 1)])
-@pytest.mark.parametrize("reach", [4, 32])
+@pytest.mark.parametrize("edge, planes, reach", [(1, 0, 4), (1, 2, 4), (3, 1, 32)])
 def test_other_filters_and_reaches(device, edge, planes, reach):
     heads, guide, filters = (
         noise(False, 2, 40, 41, 50),
@@ -103,8 +102,7 @@ def test_a_nan_stays_where_smoke_is_near_and_only_there(device):
     assert result[:, 2, 2].isnan().all() and int(result.isnan().sum()) == PLANES
 
 
-@pytest.mark.parametrize("half", [False, True])
-@pytest.mark.parametrize("reach", [4, 8, 32])
+@pytest.mark.parametrize("half, reach", [(False, 4), (False, 8), (True, 8), (False, 32)])
 @pytest.mark.parametrize("size", [(1, 1), (8, 5), (17, 70), (100, 33)])
 def test_blocks_with_smoke(device, size, reach, half):
     """A single pixel counts, also the last of a block; 0, negative values and NaN do not."""

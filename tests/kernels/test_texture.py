@@ -56,21 +56,6 @@ def test_against_reference(device: str, shape: tuple[int, ...], filter: str, bou
     close(grad_uv, uv64.grad, 1e-4, "uv")
 
 
-@pytest.mark.parametrize("boundary", BOUNDARIES)
-def test_slope_against_finite_differences(device: str, boundary: str):
-    """Central differences between texel centres, exact for the linear piece but for float32."""
-    shape = (9, 6, 2)
-    image = np.random.default_rng(2).normal(size=shape).astype(np.float32)
-    uv = _points(shape)
-    toward = np.ones((len(uv), 2), np.float32)
-    _, grad_uv = Reading(image, uv, device, boundary=boundary).backward(toward)
-    for axis in range(2):
-        step = np.zeros(2, np.float32)
-        step[axis] = 2.0**-8
-        ends = [Reading(image, uv + sign * step, device, boundary=boundary).forward().sum(1) for sign in (-1, 1)]
-        close(grad_uv[:, axis], (ends[1] - ends[0]) / 2.0**-7, 1e-3, "slope")
-
-
 def test_a_texel_at_a_centre_stands_alone(device: str):
     """An infinite neighbour without weight isn't read."""
     image = np.array([[[1.0], [np.inf]], [[np.nan], [3.0]]], np.float32)

@@ -18,7 +18,7 @@ from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import TILE
 from wlm.metrics import evaluate_frame, summarise
 
-SUFFIXED = [f"{name}_by_{what}" for name in ("psnr", "ssim", "flip") for what in ("tile", "time")]
+SUFFIXED = ("psnr_by_tile", "psnr_by_time", "ssim_by_time", "flip_by_time")
 
 
 def four_tiles():
@@ -53,20 +53,13 @@ def test_the_scores_are_those_of_the_protocol(fitted, report):
         evaluate_frame(ref, decoder.frame(stamp), light.mask)
         for ref, stamp in zip(light.frames, light.times, strict=True)
     ]
-    expected = summarise(frames)
+    expected = summarise(frames, light.times)
     assert math.isfinite(report.psnr)
-    for name in ("psnr", "ssim", "flip", "worst_psnr", "max_abs_error", "psnr_unlimited"):
+    for name in ("psnr", "ssim", "flip", "worst_tile", "max_abs_error"):
         assert getattr(found, name) == getattr(expected, name)
     assert (report.psnr, report.ssim, report.flip) == (found.psnr, found.ssim, found.flip)
     for name in SUFFIXED:
         np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    time, row, column = expected.worst_tile
-    assert found.worst_tile == {
-        "time": light.times[time],
-        "tile": row * 2 + column,
-        "row": row,
-        "column": column,
-    }
 
 
 def test_what_is_scored_and_left_out_is_counted(fitted, report):

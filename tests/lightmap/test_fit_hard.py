@@ -53,8 +53,6 @@ def test_a_constant_tile_is_within_half_a_step_of_half_float(tmp_path):
     np.testing.assert_allclose(decoded(decoder), frames, rtol=2**-10)
     # Between two times a constant tile is interpolated as light is.
     np.testing.assert_allclose(decoder.frame(0.25)[5, 5], 0.75 * levels[0] + 0.25 * levels[1], rtol=2**-10)
-    (pixels,), peak = decoder.tiles_8bit([0], 2.0)
-    np.testing.assert_allclose((pixels[3, 3, :3] / 255.0 * peak[0]) ** 2.2, levels[2], rtol=1e-3)
 
 
 @pytest.mark.parametrize("level", [1e-40, 1e-7, 6.26e-7])
@@ -155,7 +153,7 @@ def test_charts_of_one_texel_and_across_borders(tmp_path):
     for chart in (within, across, along):
         mask[chart] = True
     lightmaps = moving_light(128, 256, mask=mask)
-    decoder = through_file(tmp_path, lightmaps, tiny_profile(steps=500, samples=512, uvt_resolution=16))
+    decoder = through_file(tmp_path, lightmaps, tiny_profile(hidden=16, steps=500, samples=512, uvt_resolution=16))
     error = np.square(decoded(decoder) - lightmaps.light.frames).mean((0, -1))
     alone = np.s_[4:124:6, 4:60:6]
     for part in (alone, across, along, np.s_[30:90, 127:129]):
@@ -196,8 +194,6 @@ def test_channels_that_are_black_at_one_time_or_always_stay_black(tmp_path):
     out = decoded(decoder)
     assert not out[1, ..., 2].any() and not out[3].any() and not out[..., 1].any()
     assert out[1, ..., 0].mean() > 0.05 and out[2, ..., 2].mean() > 0.05
-    pixels, peak = decoder.tiles_8bit([0], HOURS[3])
-    assert peak[0] == 0 and not pixels[..., :3].any()
 
 
 def test_a_subset_of_the_tiles(tmp_path):

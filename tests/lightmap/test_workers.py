@@ -211,7 +211,7 @@ def test_a_process_answers_or_says_why_not():
         answers = dict(workers.wait(60.0) for _ in range(2))
         assert answers[0] == 3 and isinstance(answers[1], ValueError)
         assert workers.wait(0.0) is None
-        workers.kill(0)
+        workers._processes[0].kill()
         assert "ended by signal 9" in str(workers.wait(60.0)[1])
         workers.renew(0)
         workers.call(0, "limit_denominator", 7)

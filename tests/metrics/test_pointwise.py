@@ -9,7 +9,7 @@ from scipy.ndimage import distance_transform_edt
 
 from wlm import texels
 from wlm.errors import WlmError
-from wlm.metrics import PSNR_CAP_DB, evaluate_frame, half_ulp, psnr_from_mse
+from wlm.metrics import PSNR_CAP_DB, evaluate_frame, psnr_from_mse
 from wlm.texels import fill_gaps
 
 
@@ -36,15 +36,6 @@ def test_bad_values_are_named_and_only_inside_the_mask(value):
         assert evaluate_frame(*pair, part).max_abs_error == 0.0
     assert "images [H, W, C] of one shape" in error_of(evaluate_frame, good, good[:3], whole)
     assert "expected a mask of (4, 5), got (3, 5)" in error_of(evaluate_frame, good, good, whole[:3])
-
-
-@pytest.mark.parametrize(
-    ("value", "step"),
-    [(1.0, 2.0**-10), (-1.0, 2.0**-10), (1.999, 2.0**-10), (2.0, 2.0**-9), (60000.0, 32.0), (0.0, 2.0**-24),
-     (65504.0, 32.0), (1e9, 32.0)],
-)  # fmt: skip
-def test_half_steps(value, step):
-    assert half_ulp(value) == step
 
 
 def test_fill_gaps_takes_the_nearest_valid_texel():

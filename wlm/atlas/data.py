@@ -175,7 +175,7 @@ class LightmappedScene:
 
     @cached_property
     def indoors(self) -> Indoors:
-        """Finds the places inside the scene where a camera can stand, see `wlm.ops.indoors`."""
+        """Returns the places inside the scene, at eye height above a floor, where a camera can stand."""
         return indoors(self.triangles.position, self.triangles.triangle, metres=self.metres)
 
 
@@ -474,8 +474,8 @@ def _select(
 def _placed(
     where: str, readers: list[GltfPrimitive], listing: Listing, places: dict[int, tuple[int, Rectangle]]
 ) -> list[tuple[GltfPrimitive, Placed]]:
-    """Returns the primitives that the objects of a list name, each with its place: its sheet, and its rectangle there,
-    which the object gives. A rectangle of a texture transform, by node in `places`, applies to the UVs before."""
+    """Returns the primitives that the objects of a list of lightmaps name, each with its sheet and its rectangle in the
+    sheet: the object's, applied to UVs after the rectangle of the node's texture transform, in `places`."""
     pairs = []
     for each in listing.objects or ():
         for primitive in named(where, readers, each.node):
@@ -493,7 +493,7 @@ def _placed(
 
 
 def _base(places: dict[int, tuple[int, Rectangle]], primitive: GltfPrimitive, sheet: int) -> Placed:
-    """Returns the place of a primitive in a sheet by its texture transform alone."""
+    """Returns a primitive's rectangle in a sheet: that of its node's texture transform, else the whole sheet."""
     rectangle = places[primitive.node][1] if primitive.node in places else _WHOLE
     return Placed(primitive.node, primitive.label, sheet, rectangle)
 

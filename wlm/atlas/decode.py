@@ -115,7 +115,7 @@ class Decoder:
             texture.sample(self._texels, uv, interop.to_warp(out))
 
     def __call__(self, points: Points, state: float = 0.0) -> torch.Tensor:
-        """Returns light at points of the scene, float32 [N, 3]."""
+        """Returns light at N surface points of the scene in a state (a fraction lies between two), float32 [N, 3]."""
         uv = points.uv
         if len(self._corner):
             uv = (self._corner[points.triangle] * points.weight[:, :, None]).sum(1)
@@ -124,7 +124,7 @@ class Decoder:
     def _read_shared(
         self, uv: torch.Tensor, sheet: torch.Tensor | int, state: float, lod: torch.Tensor | None
     ) -> torch.Tensor:
-        """Returns light, float32 [N, 3], from tiles that all states share or from each state's separate tiles."""
+        """Returns light at N UVs, float32 [N, 3], of tiles that all states share or interpolated between two states."""
         factors, stride = self.factors(state), self.model.stride
         if not isinstance(sheet, torch.Tensor):
             sheet = torch.full((len(uv),), sheet, dtype=torch.int32, device=uv.device)
@@ -155,7 +155,7 @@ class Decoder:
         return out
 
     def _between(self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, level: torch.Tensor) -> torch.Tensor:
-        """Returns light interpolated between two mip levels of each row of the table; level 0 is full resolution."""
+        """Returns light at N UVs, float32 [N, 3], interpolated between two mip levels of `row`; `level` 0 is `row`."""
         smaller = torch.from_numpy(self.model.table()[:, 6].astype(np.int64)).to(uv.device)
         near, far = row, torch.where(smaller[row] > 0, smaller[row], row)
         for number in range(1, 1 + len(self.model.levels)):

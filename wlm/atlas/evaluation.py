@@ -279,7 +279,7 @@ def _chart_numbers(scene: LightmappedScene) -> np.ndarray:
 
 
 def original(scene: LightmappedScene, device: str = "cpu") -> Sampler:
-    """Makes a decoder that reads the original lightmaps bilinearly."""
+    """Makes a function of points and a state that returns the original lightmaps' light there, read bilinearly."""
     return _Reference(scene, check_device(device)).light
 
 

@@ -67,8 +67,8 @@ def _bilinear(texels: np.ndarray, uv: np.ndarray) -> np.ndarray:
 def _between(
     texels: np.ndarray, page: np.ndarray, first: np.ndarray, last: np.ndarray, place: np.ndarray
 ) -> np.ndarray:
-    """Reads pages [pages, H, W, C] bilinearly at `place` [N, 2], in texels from texel 0's centre, clamped to the texels
-    from `first` to `last`."""
+    """Reads texture pages [pages, H, W, C] bilinearly at `place` [N, 2], x and y in texels from texel 0's centre, using
+    only the texels from `first` to `last` [N, 2]."""
     low = np.clip(np.floor(place).astype(np.int64), first, last)
     high = np.minimum(low + 1, last)
     share = (place - low)[:, :, None]

@@ -101,7 +101,7 @@ class Listing:
 
     @contextmanager
     def opened(self, name: str, trust: bool) -> Iterator[tuple[str, str]]:
-        """Yields the path of a picture and its name for messages; one that is held is in a file without a name."""
+        """Yields a picture's path and its name for messages; bytes in `held` are put into an unnamed temporary file."""
         if name not in self.held:
             path = str(self.file(name, trust))
             yield path, path
@@ -197,10 +197,10 @@ def _object(entry: Any, convention: str, where: str) -> Any:
 
 
 def numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
-    """Checks four finite numbers, a list or an object with the given keys.
+    """Returns four numbers of a JSON document, written as a list or as an object with the four `keys`.
 
     Raises:
-        WlmError: They are not; `where` names their place.
+        WlmError: It is something else, or a number is not finite; `where` names its place.
     """
     if isinstance(value, dict) and set(keys) <= set(value):
         value = [value[key] for key in keys]

@@ -84,7 +84,7 @@ def choose_mesh(
 
 def by_name(name: str, primitives: Sequence[GltfPrimitive]) -> list[GltfPrimitive]:
     """Returns the primitives of the node or the mesh whose name a lightmap's name contains as whole words, for example
-    Floor in Floor_baked.hdr; of several names the longest. None if there is no such name or it isn't unique."""
+    Floor in Floor_baked.hdr; of several names the longest. Empty if there is no such name or it isn't unique."""
     words = f"_{_words(Path(name).stem if name.lower().endswith(SUFFIXES) else name)}_"
     found: dict[str, list[GltfPrimitive]] = {}
     for each in primitives:
@@ -253,8 +253,8 @@ def misfits(
 
 
 def _stretched(uv: np.ndarray, triangle: np.ndarray, lit: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Returns the UVs stretched so that the charts' box is that of the lit texels, and scaled so that it is in the
-    middle of the square, if that changes them noticeably."""
+    """Returns alternative UVs, each after a text for messages: stretched so that the charts' box is that of the lit
+    texels, and scaled so that it is in the middle of the square; those that hardly change the UVs are left out."""
     corner = uv[triangle].reshape(-1, 2)
     low, high = corner.min(axis=0), corner.max(axis=0)
     at = [np.flatnonzero(lit.any(axis=axis)) for axis in (0, 1)]

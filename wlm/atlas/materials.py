@@ -136,7 +136,7 @@ def own_lightmaps(
 
 
 def _none(document: GltfDocument) -> str:
-    """Says that a document names no lightmap, and what it has instead."""
+    """Returns an error text: that a glTF document names no lightmap, which unknown extension or slots it has."""
     used = [
         one_line(each, 60) for each in document.content.get("extensionsUsed", []) if "lightmap" in str(each).lower()
     ]
@@ -235,7 +235,7 @@ _UNREAL = (
 
 
 def _needle(document: GltfDocument, node: dict[str, Any]) -> _Slot | None:
-    """Returns the lightmap of Needle's renderer on a node."""
+    """Returns the texture and rectangle of the lightmap that Needle's renderer on a node names; None without one."""
     textures = document.content.get("extensions", {}).get(_NEEDLE, {}).get("textures", [])
     for component in node.get("NEEDLE_components", {}).get("builtin_components", []):
         number = component.get("lightmapIndex")
@@ -257,14 +257,14 @@ def _needle(document: GltfDocument, node: dict[str, Any]) -> _Slot | None:
 
 
 def _emission(material: dict[str, Any]) -> Any:
-    """Returns the factor of the emissive texture; 1 where it is 0 or not stated, since the slot holds light."""
+    """Returns a material's emissive factor times its strength, [3]; 1 where the factor is 0 or not stated."""
     factor = np.array(material.get("emissiveFactor", (0.0, 0.0, 0.0)), np.float64)
     strength = material.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
     return (factor * strength).tolist() if factor.any() else 1.0
 
 
 def _factor(value: Any, where: str) -> float | list[float]:
-    """Checks a factor, of all channels or of each."""
+    """Checks a factor of the light, one number or one for each channel, and returns it; one if all are equal."""
     factor = np.array(value, np.float64)
     if factor.shape not in ((), (3,)) or not (np.isfinite(factor) & (factor >= 0)).all():
         raise WlmError(
@@ -276,8 +276,8 @@ def _factor(value: Any, where: str) -> float | list[float]:
 def _picture(
     document: GltfDocument, number: int, name: str, stated: str | None, held: dict[str, bytes | memoryview]
 ) -> tuple[str, str | None]:
-    """Returns the name of an image, that of its file or of its place in the document, whose bytes are added to `held`;
-    and its encoding, None for a format that defines its light itself."""
+    """Returns an image's name (its file, or its place in the document; its bytes are then added to `held`) and the
+    encoding of its light, None for a format that defines it."""
     data = held_image(document, number)
     if data is None:
         path = image_file(document, number)

@@ -56,7 +56,7 @@ def _along(matrix: sparse.csr_matrix, image: torch.Tensor) -> torch.Tensor:
 
 
 def _fit(filled: torch.Tensor, mask: torch.Tensor, start: torch.Tensor) -> torch.Tensor:
-    """Minimises the squared error at the mask's texels by conjugate gradients from `start`; returns [h, w, 3]."""
+    """Refines a small image by conjugate gradients, so that bilinear reads match `filled` at the mask; [h, w, 3]."""
     rows, columns = (_bilinear(new, old) for new, old in zip(mask.shape, start.shape[:2], strict=True))
     turned_rows, turned_columns = rows.T.tocsr(), columns.T.tocsr()
 

@@ -1,4 +1,4 @@
-"""Bakes light to compress: lightmaps and probes over the day with Mitsuba 3, six-way lightmaps with our path tracer.
+"""Bakes light to compress: lightmaps and probes over the day, with Mitsuba 3.
 
 The extra `bake` installs Mitsuba, which needs LLVM 16 or later on the CPU. The documentation is docs/bake.md.
 """
@@ -7,11 +7,8 @@ from wlm._facade import facade
 
 _PLACES = {
     "BakeScene": "wlm.bake.settings",
-    "SixWayScene": "wlm.bake.sixway",
     "bake_lightmaps": "wlm.bake.lightmaps",
     "bake_probes": "wlm.bake.probes",
-    "bake_sixway": "wlm.bake.sixway",
-    "load_sixway": "wlm.bake.sixway",
     "open_checkpoint": "wlm.bake.work",
     "open_task": "wlm.bake.work",
     "write_lightmaps": "wlm.bake.lightmaps",

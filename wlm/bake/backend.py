@@ -40,7 +40,7 @@ def start(device: str = "cpu") -> ModuleType:
 
 
 def _old_llvm() -> str | None:
-    """Returns the path of the loaded LLVM library if its version is below 16, the first that reports its version."""
+    """Returns the path of a loaded LLVM library below version 16, which cannot tell its version; None without one."""
     try:
         lines = _MAPS.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:  # only Linux lists the loaded libraries

@@ -259,7 +259,6 @@ def _without_lightmap(
 
 
 def _texture_sets(value: Any) -> list[int]:
-    """Returns the number n of each UV set `TEXCOORD_n` that a texture in this part of the document uses."""
     if isinstance(value, list):
         return [one for each in value for one in _texture_sets(each)]
     if not isinstance(value, dict):
@@ -302,7 +301,6 @@ def _material(document: GltfDocument, number: int | None) -> Material:
 
 
 def _texture(document: GltfDocument, number: int) -> np.ndarray:
-    """Reads an image as linear light, float32 [H, W, 3]."""
     where = f"{document.path}: textures[{number}]"
     source = texture_image(document, number)
     data = held_image(document, source)

@@ -27,16 +27,11 @@ FORMAT = "wlm-bake"
 _VERSION = 1
 SET_FILE = "set.json"
 _MESH, _MASK, _COVERAGE = "scene.glb", "mask.png", "coverage.exr"
-_ATLAS, _LIGHT, _DIRECTION = "0", "light", "dir"  # names in a set with layers
-_LUMINANCE = (0.212671, 0.715160, 0.072169)  # the weights that Mitsuba uses
-_NOISE = "noise"  # prefix of the names of noise images
 _HIDDEN = 0.5  # share of rays that hit back faces above which a texel counts as inside an object
 _ABOUT = (
-    "set.json lists the lightmaps, and of a directional bake dir_*.exr, where light comes from: 0.5 + 0.5 times the "
-    "mean direction, in glTF's axes, and 0.5 + 0.5 times its cosine to the normal. noise_*.exr: the standard error of "
-    "each texel's light before denoising, as noise.R, noise.G and noise.B. coverage.exr: coverage, the share of a "
-    "texel that is on a surface, and back, the share of rays that hit backs: above one half the texel is within an "
-    "object, and has its neighbours' light."
+    "set.json lists the lightmaps. noise_*.exr: the standard error of each texel's light before denoising, as noise.R, "
+    "noise.G and noise.B. coverage.exr: coverage, the share of a texel that is on a surface, and back, the share of "
+    "rays that hit backs: above one half the texel is within an object, and has its neighbours' light."
 )
 
 
@@ -52,10 +47,6 @@ class BakedLightmaps:
         coverage: float32 [H, W], the share of each texel that is on a surface.
         back: float32 [H, W], the share of rays that hit back faces.
         geometry: The surfaces, with their lightmap UVs.
-        direction: float16 [T, H, W, 4] or None, dominant light direction encoded like Unity's `comp_dir`, in glTF's
-            axes: 0.5 + 0.5 d, where d is the luminance-weighted mean of the directions of incident light (of length 1
-            for a single direction); then 0.5 + 0.5 n.d, with n the texel's normal. For a shading normal m, the light
-            is about (0.5 + 0.5 m.d) / (0.5 + 0.5 n.d) times the lightmap's.
     """
 
     hours: tuple[float, ...]
@@ -65,7 +56,6 @@ class BakedLightmaps:
     coverage: np.ndarray
     back: np.ndarray
     geometry: Geometry
-    direction: np.ndarray | None = None
 
     @property
     def error(self) -> list[float]:
@@ -106,16 +96,13 @@ def bake_lightmaps(
     geometry = read_geometry(task.geometry, scene.lightmap, task.trust)
     check_lamps(task.path, scene, geometry)
     texels = place_texels(str(task.geometry), geometry.surfaces, scene.lightmap.resolution, scene.lightmap.supersample)
-    hours, directional = sorted(scene.hours), scene.lightmap.directional
+    hours = sorted(scene.hours)
 
     def make(hour: float, report) -> dict[str, np.ndarray]:
         world, tracing = make_hour(scene, geometry, task.sky, hour)
-        gathered = irradiance(world, texels, tracing, directional=directional, report=report)
-        light, noise = (np.minimum(values[:, :3], HALF_MAX) for values in (gathered.mean, gathered.noise))
-        made = {"light": light, "noise": noise, "back": gathered.back}
-        if directional:
-            made["direction"] = _directions(gathered.mean)
-        return made
+        gathered = irradiance(world, texels, tracing, report=report)
+        light, noise = (np.minimum(values, HALF_MAX) for values in (gathered.mean, gathered.noise))
+        return {"light": light, "noise": noise, "back": gathered.back}
 
     count = len(texels.index)
     table = {
@@ -123,8 +110,6 @@ def bake_lightmaps(
         "noise": Part(np.float32, (count, 3), least=0.0),
         "back": Part(np.float32, (count,), least=0.0, most=1.0),
     }
-    if directional:
-        table["direction"] = Part(np.float32, (count, 3), least=-1.0, most=1.0)
     results = each_hour(hours, checkpoint, table, make, progress)
     back = np.mean([each["back"] for each in results], axis=0)
     visible = back <= _HIDDEN
@@ -135,10 +120,6 @@ def bake_lightmaps(
     mask = texels.image(visible.astype(np.float32)) > 0
     light = np.stack([_finished(texels, each["light"], mask, denoise).astype(np.float16) for each in results])
     noise = np.stack([texels.image(each["noise"]).astype(np.float16) for each in results])
-    direction = None
-    if directional:
-        normal = fill_gaps(texels.image(texels.mean_normal()), mask)
-        direction = np.stack([_encoded(texels, each["direction"], normal, mask, denoise) for each in results])
     return BakedLightmaps(
         tuple(hours),
         light,
@@ -147,27 +128,11 @@ def bake_lightmaps(
         texels.image(texels.coverage),
         texels.image(back.astype(np.float32)),
         geometry,
-        direction,
     )
 
 
-def _directions(sums: np.ndarray) -> np.ndarray:
-    """Computes mean directions [T, 3] from sums [T, 6], see `wlm.bake.paths.irradiance`; 0 without light."""
-    total = sums[:, :3] @ np.array(_LUMINANCE, np.float32)
-    mean = np.divide(sums[:, 3:], total[:, None], out=np.zeros_like(sums[:, 3:]), where=total[:, None] > 0)
-    # Rounding may make a single direction slightly longer than 1.
-    return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1.0)
-
-
-def _encoded(texels: Texels, mean: np.ndarray, normal: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
-    """Encodes mean directions [T, 3] for `BakedLightmaps.direction`, half floats [H, W, 4]."""
-    levels = np.clip(_finished(texels, 0.5 + 0.5 * mean, mask, denoise), 0.0, 1.0)
-    share = 0.5 + 0.5 * ((2.0 * levels - 1.0) * normal).sum(-1, keepdims=True)
-    return np.concatenate([levels, np.clip(share, 0.0, 1.0)], -1).astype(np.float16)
-
-
 def _finished(texels: Texels, values: np.ndarray, mask: np.ndarray, denoise) -> np.ndarray:
-    """Returns a float32 image with gaps filled from the nearest texel, optionally denoised."""
+    """Makes an image of the texels' values; gaps take the nearest value, and `denoise`, unless None, filters it."""
     picture = fill_gaps(texels.image(values), mask)
     if denoise is not None:
         try:
@@ -190,27 +155,16 @@ def write_lightmaps(folder: str | os.PathLike[str], task: Task, baked: BakedLigh
     listed: dict[str, object] = {"name": task.scene.name, "width": width, "height": height}
     if task.scene.period is not None:
         listed["period_hours"] = task.scene.period
-    about: dict[str, object] = {"mask": _MASK}
+    listed["mask"] = _MASK
     if baked.geometry.usual:  # readers of the set can only select the default UV set
-        about["mesh"] = _MESH
-    names = {layer: [f"{layer}_{stamp}.exr" for stamp in stamps] for layer in (_LIGHT, _DIRECTION)}
-    files: list[dict[str, object]] = [{"file": file} for file in names[_LIGHT]]
-    if baked.direction is None:
-        listed |= about
-    else:
-        listed["layers"] = {_LIGHT: "radiance", _DIRECTION: {"encoding": "unit", "channels": list("RGBA")}}
-        listed["atlases"] = {_ATLAS: about}
-        pairs = zip(names[_LIGHT], names[_DIRECTION], strict=True)
-        files = [{"files": {_ATLAS: {_LIGHT: light, _DIRECTION: toward}}} for light, toward in pairs]
-    listed["lightmaps"] = [{"time_hours": hour} | file for hour, file in zip(baked.hours, files, strict=True)]
+        listed["mesh"] = _MESH
+    files = [f"light_{stamp}.exr" for stamp in stamps]
+    listed["lightmaps"] = [{"time_hours": hour, "file": file} for hour, file in zip(baked.hours, files, strict=True)]
     with staged(folder, INDEX, FORMAT) as made:
-        for file, stamp, light, noise in zip(names[_LIGHT], stamps, baked.light, baked.noise, strict=True):
+        for file, stamp, light, noise in zip(files, stamps, baked.light, baked.noise, strict=True):
             write_exr(made / file, light)
             planes = dict(zip(("noise.R", "noise.G", "noise.B"), noise.transpose(2, 0, 1), strict=True))
-            write_planes(made / f"{_NOISE}_{stamp}.exr", planes)
-        if baked.direction is not None:
-            for file, direction in zip(names[_DIRECTION], baked.direction, strict=True):
-                write_exr(made / file, direction)
+            write_planes(made / f"noise_{stamp}.exr", planes)
         write_planes(made / _COVERAGE, {"coverage": baked.coverage, "back": baked.back})
         write_mask(made / _MASK, baked.mask)
         geometry = baked.geometry

@@ -99,14 +99,13 @@ class _Outside:
         return self.frame.to_world(mi.warp.square_to_uniform_cone(square, math.cos(SUN_ANGLE)))
 
 
-def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool = False, report: Any = None) -> Gathered:
+def irradiance(scene: Any, texels: Any, tracing: Tracing, *, report: Any = None) -> Gathered:
     """Computes irradiance at the texels of a lightmap, as the mean over their sample positions.
 
     `report` is called with the finished share of the work.
 
     Returns:
-        Estimates with three channels, RGB. With `directional` three more: the sum of the directions of incident light,
-        each weighted by the luminance (ITU-R BT.709) of its irradiance.
+        Estimates with three channels, RGB.
     """
     places = [mi.Point3f(texels.position.T), mi.Vector3f(texels.normal.T), mi.Vector3f(texels.face.T)]
     first = mi.UInt32(texels.first[:-1].astype(np.uint32))
@@ -123,30 +122,21 @@ def irradiance(scene: Any, texels: Any, tracing: Tracing, *, directional: bool =
         # Directions behind the geometric triangle contribute nothing, regardless of the shading normal.
         seen = (dr.dot(d, face) > 0) & (cosine > 0)
         light, back = _radiance(scene, it, d, cosine * dr.inv_pi, sky, rng, tracing.bounces, seen)
-        parts = [(light * dr.pi, d)]
+        total = light * dr.pi
         ds, weight = scene.sample_emitter_direction(it, mi.Point2f(rng.next_float32(), rng.next_float32()), True)
         cosine = dr.dot(ds.d, normal)
         ahead = (cosine > 0) & (dr.dot(ds.d, face) > 0)
         pdf = dr.select(ds.delta, 0.0, cosine * dr.inv_pi)
-        parts.append((dr.select(ahead, weight * cosine * _heuristic(ds.pdf, pdf), 0.0), ds.d))
+        total += dr.select(ahead, weight * cosine * _heuristic(ds.pdf, pdf), 0.0)
         if sky.has_sun and tracing.sun_direct:
             toward = sky.sample(rng)
             cosine = dr.dot(toward, normal)
             ahead = (cosine > 0) & (dr.dot(toward, face) > 0)
             ahead &= ~scene.ray_test(it.spawn_ray(toward), active=ahead)
-            parts.append((dr.select(ahead, sky.irradiance * cosine, 0.0), toward))
-        total = sum((value for value, _ in parts), mi.Color3f(0.0))
-        values = [total.x, total.y, total.z]
-        if directional:
-            values += [mi.Float(0.0)] * 3
-            for value, toward in parts:
-                shown = mi.luminance(value)
-                for c in range(3):
-                    # A light that wasn't sampled has no direction.
-                    values[3 + c] = values[3 + c] + dr.select(shown > 0, shown * toward[c], 0.0)
-        return values, dr.select(back, 1.0, 0.0)
+            total += dr.select(ahead, sky.irradiance * cosine, 0.0)
+        return [total.x, total.y, total.z], dr.select(back, 1.0, 0.0)
 
-    return _gather(one, len(texels.index), 6 if directional else 3, tracing, report)
+    return _gather(one, len(texels.index), 3, tracing, report)
 
 
 def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any = None) -> Gathered:
@@ -183,7 +173,6 @@ def harmonics(scene: Any, position: np.ndarray, tracing: Tracing, *, report: Any
 
 
 def _gather(one: Any, count: int, channels: int, tracing: Tracing, report: Any) -> Gathered:
-    """Averages samples in batches and estimates the noise from the differences between the batches' means."""
     each = -(-tracing.samples // _PARTS)
     at_once = max(1, _LANES // each)
     total, square = np.zeros((2, count, channels))

@@ -1,4 +1,4 @@
-"""Bakes a scene's light probes for each hour: RGB radiance in spherical harmonics, on surfaces or in a lattice."""
+"""Bakes a scene's light probes for each hour: RGB radiance in spherical harmonics, at the points of a lattice."""
 
 import os
 from dataclasses import dataclass
@@ -45,42 +45,22 @@ class BakedProbes:
         return [noise_share(v[on], e[on]) for v, e, on in zip(self.values, self.noise, lit, strict=True)]
 
 
-def place_probes(settings: ProbeSettings, geometry: Geometry, seed: int = 0) -> np.ndarray:
-    """Computes the probes' positions, float32 [N, 3]; `seed` selects the random positions on surfaces.
+def place_probes(settings: ProbeSettings, geometry: Geometry) -> np.ndarray:
+    """Computes the probes' positions, float32 [N, 3]: the middles of the cells of a lattice in the bounding box.
 
     Raises:
         WlmError: There would be more than a million probes.
     """
     low, high = geometry.box
-    if not settings.surfaces:
-        # Probes lie in the middle of cells; each axis has the number of cells that fit, at least one.
-        cells = np.maximum(1.0, np.floor((high - low) / settings.spacing + 1e-6))
-        _check_count(float(np.prod(cells)))
-        axes = [
-            start + (np.arange(int(count)) + 0.5) * ((stop - start) / count)
-            for start, stop, count in zip(low, high, cells, strict=True)
-        ]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
-    corner = np.concatenate([each.position[each.triangle] for each in geometry.surfaces])
-    a, b, c = corner.transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    double = np.linalg.norm(normal, axis=1)
-    count = double.sum() / 2.0 / settings.spacing**2
-    _check_count(count)
-    count = max(1, round(count))
-    generator = np.random.default_rng(seed)
-    # Positions are stratified by surface area, so that they are evenly distributed.
-    share = np.cumsum(double) / double.sum()
-    chosen = np.searchsorted(share, (np.arange(count) + generator.random(count)) / count).clip(max=len(share) - 1)
-    u, v = generator.random((2, count, 1))
-    root = np.sqrt(u)
-    place = (1.0 - root) * a[chosen] + root * (1.0 - v) * b[chosen] + root * v * c[chosen]
-    return (place + settings.lift * normal[chosen] / double[chosen, None]).astype(np.float32)
-
-
-def _check_count(count: float) -> None:
-    if not count <= _MOST:
+    # Each axis has the number of cells that fit, at least one.
+    cells = np.maximum(1.0, np.floor((high - low) / settings.spacing + 1e-6))
+    if (count := float(np.prod(cells))) > _MOST:
         raise WlmError(f"probes.spacing: expected at most {_MOST:,} probes, found {count:,.0f}: use a larger spacing")
+    axes = [
+        start + (np.arange(int(count)) + 0.5) * ((stop - start) / count)
+        for start, stop, count in zip(low, high, cells, strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
 
 
 def bake_probes(
@@ -107,7 +87,7 @@ def bake_probes(
 
     geometry = read_geometry(task.geometry, None, task.trust)
     check_lamps(task.path, scene, geometry)
-    position = place_probes(scene.probes, geometry, scene.seed)
+    position = place_probes(scene.probes, geometry)
     hours = sorted(scene.hours)
 
     def make(hour: float, report) -> dict[str, np.ndarray]:

@@ -115,7 +115,6 @@ class LightmapSettings(_Settings):
         unwrap: Whether to create new UVs, `TEXCOORD_1`, and write the mesh with them.
         padding: Distance between new charts, in texels.
         supersample: Number of sample positions along a texel's side; a texel is the mean over its samples.
-        directional: Whether to bake light directions, too.
     """
 
     resolution: int = Field(256, ge=8, le=4096)
@@ -123,22 +122,16 @@ class LightmapSettings(_Settings):
     unwrap: bool = False
     padding: int = Field(4, ge=0, le=64)
     supersample: int = Field(4, ge=1, le=8)
-    directional: bool = False
 
 
 class ProbeSettings(_Settings):
-    """Positions of the probes.
+    """Positions of the probes, which are in a lattice in the geometry's bounding box.
 
     Attributes:
         spacing: Distance between neighbouring probes, in metres.
-        surfaces: Whether the probes lie at random positions on surfaces, one per area of `spacing` squared; otherwise
-            in a lattice in the geometry's bounding box.
-        lift: Distance of probes on surfaces from their surface, in metres.
     """
 
     spacing: float = Field(1.0, gt=0.0, le=1e9)
-    surfaces: bool = False
-    lift: float = Field(0.05, ge=0.0, le=1e9)
 
 
 class BakeScene(_Settings):

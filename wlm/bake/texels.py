@@ -43,11 +43,6 @@ class Texels:
         picture[self.index] = values
         return picture.reshape(self.height, self.width, *values.shape[1:])
 
-    def mean_normal(self) -> np.ndarray:
-        """Returns the texels' mean shading normals, float32 [T, 3], of unit length."""
-        total = np.add.reduceat(self.normal, self.first[:-1])
-        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-20)
-
 
 def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, supersample: int) -> Texels:
     """Computes the sample positions of all texels: those points of a lattice in each texel that a triangle covers.

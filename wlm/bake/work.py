@@ -43,20 +43,16 @@ class Task:
     trust: bool
 
 
-def open_task(path: str | os.PathLike[str], trust: bool = False, directional: bool = False) -> Task:
+def open_task(path: str | os.PathLike[str], trust: bool = False) -> Task:
     """Reads a scene file and its environment map.
 
-    With `trust` the file may refer to files outside its folder. With `directional` light directions are baked even if
-    the file doesn't request them.
+    With `trust` the file may refer to files outside its folder.
 
     Raises:
         WlmError: A file can't be read, a setting is wrong, or the image isn't an environment map.
     """
     scene = load_settings(BakeScene, path)
     geometry = named_file(path, scene.geometry, f"{path}: geometry", trust)
-    if directional:
-        lightmap = scene.lightmap.model_copy(update={"directional": True})
-        scene = scene.model_copy(update={"lightmap": lightmap})
     digest = hashlib.blake2b(read_file(geometry, MESH_BYTES, "the glTF file"), digest_size=16)
     sky = None
     if scene.sky is not None and scene.sky.file is not None:

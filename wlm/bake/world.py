@@ -112,7 +112,6 @@ def daylight(settings: Daylight, hour: float, period: float) -> tuple[Sun | None
 
 
 def _eval(emitter: dict[str, Any], directions: np.ndarray) -> np.ndarray:
-    """Evaluates the radiance of a distant light in directions [3, N], float32 [N, 3]."""
     si = dr.zeros(mi.SurfaceInteraction3f, directions.shape[1])
     si.wi = -mi.Vector3f(directions.astype(np.float32))
     return np.asarray(mi.load_dict(emitter).eval(si)).T

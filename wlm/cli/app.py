@@ -71,7 +71,7 @@ class Group(TyperGroup):
 
 
 def _cache_hint(error: OSError) -> str:
-    """Tells how to move the cache of compiled kernels if the error can come from it."""
+    """Returns words for an error message on how to move the cache of compiled kernels; "" if it is not the cause."""
     if "warp" not in sys.modules or error.errno not in (errno.ENOSPC, errno.EROFS, errno.EACCES):
         return ""
     import warp as wp
@@ -133,7 +133,7 @@ def main() -> None:
 
 
 def _open_streams() -> None:
-    """Opens the null device in place of each standard stream that the caller closed, so that writing to it works."""
+    """Opens the null device in place of stdout and stderr if the caller closed them, so that writing to them works."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None:
             null = os.open(os.devnull, os.O_WRONLY)
@@ -144,7 +144,7 @@ def _open_streams() -> None:
 
 
 def run(command: Callable[[], Any]) -> None:
-    """Runs a command line with the signals and exit codes that the module describes."""
+    """Runs a command line; after Ctrl-C or SIGTERM the process ends with exit code 130 or 143."""
     _open_streams()
     try:
         # At the end everything is written. A late signal can stop nothing and must not change the exit code.

@@ -1,4 +1,4 @@
-"""`wlm bake`: makes lightmaps, probes and six-way lightmaps of a scene by path tracing."""
+"""`wlm bake`: makes lightmaps and probes of a scene by path tracing."""
 
 from pathlib import Path
 from typing import Annotated
@@ -8,9 +8,7 @@ import typer
 from wlm.cli.console import check_output, exclusive, note, note_start, quiet_warp, running, show, table
 from wlm.cli.options import Device, Resume, Trust, output_option
 
-app = typer.Typer(
-    help="Make inputs by path tracing: lightmaps and probes (by Mitsuba, extra `bake`), six-way lightmaps of smoke."
-)
+app = typer.Typer(help="Make inputs by path tracing: lightmaps and probes, by Mitsuba (extra `bake`).")
 
 _Scene = Annotated[
     Path,
@@ -25,10 +23,6 @@ _Scene = Annotated[
 def lightmaps(
     scene: _Scene,
     output: Annotated[Path, output_option("DIR", "Folder to write the set to.")],
-    directional: Annotated[
-        bool,
-        typer.Option("--directional", help="Also bake the main direction of the light, a layer like Unity's comp_dir."),
-    ] = False,
     device: Device = "cpu",
     resume: Resume = False,
     trust: Trust = False,
@@ -43,7 +37,7 @@ def lightmaps(
     from wlm.formats.folder import claim
 
     claim(output, INDEX, FORMAT)
-    task = open_task(scene, trust, directional)
+    task = open_task(scene, trust)
     checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
     note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
@@ -90,40 +84,3 @@ def probes(
         mean = f"{values[lit, 0].mean():.4g}" if lit.any() else "–"
         rows.add_row(f"{hour:g}", f"{len(values):,}", f"{int(lit.sum()):,}", mean, f"{error:.2%}")
     show(rows)
-
-
-@app.command()
-@exclusive
-def sixway(
-    scene: Annotated[
-        Path,
-        typer.Argument(
-            metavar="SCENE.yaml", help="YAML file of the scene: its smoke, its camera, and the paths per pixel."
-        ),
-    ],
-    output: Annotated[Path, output_option("OUT", "A .exr, or for frames a folder.")],
-    device: Device = "cpu",
-    resume: Resume = False,
-    trust: Trust = False,
-) -> None:
-    """Bake six-way lightmaps with all orders of scattering by path tracing; needs no extra.
-
-    For single scattering alone, wlm smoke bake makes lightmaps without noise.
-    """
-    quiet_warp()
-    from wlm.bake.sixway import bake_sixway, load_sixway
-    from wlm.cli.smoke_options import write_lightmaps
-    from wlm.interop import check_device
-
-    settings, frames = load_sixway(scene, device=check_device(device), trust=trust)
-    errors: list[float] = []
-
-    def make(volume, camera):
-        six, error = bake_sixway(volume, camera, settings)
-        errors.append(error)
-        return six
-
-    run = settings.model_dump(mode="json")
-    write_lightmaps(frames, settings.camera, output, make, run, resume=resume)
-    if errors:
-        note(f"noise: RMS of at most {max(errors):.2%} of the light in a frame")

@@ -38,7 +38,6 @@ from wlm.cli.options import (
     output_option,
 )
 from wlm.cli.settings import with_settings
-from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.lightmap import LightmapModel, LightmapSet, Report
@@ -187,10 +186,6 @@ def decode(
     file: ModelFile,
     time: Annotated[float, typer.Option(help="Time to decode, in the unit of the set; may be between stored times.")],
     output: Annotated[Path, output_option("FRAME.exr", "The EXR to write.")],
-    texture: Annotated[
-        Path | None,
-        typer.Option(metavar="MAP.dds", help="Also write the decoded light as a DDS texture: RGB9E5 with mips."),
-    ] = None,
     layer: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the layer; default the first layer of radiance.")
     ] = None,
@@ -201,25 +196,18 @@ def decode(
 ) -> None:
     """Decode a whole lightmap at one time."""
     check_output(output, ".exr")
-    if texture is not None:
-        check_output(texture, ".dds")
     quiet_warp()
     import numpy as np
 
     from wlm.formats.exr import write_planes
-    from wlm.lightmap.runtime import write_texture
     from wlm.system import load
 
     model = load(file, "lightmap")
     sheets = model.layer(layer, atlas)
-    if texture is not None and sheets[0].linear:
-        raise WlmError(f"--texture: expected a layer of light, found {sheets[0].layer}")
     decoder = model.decoder(device)
     frame = decoder.frame(time, layer, atlas)
     names = [name for sheet in sheets for name in sheet.channels]
     write_planes(output, dict(zip(names, np.moveaxis(frame, 2, 0), strict=True)))
-    if texture is not None:
-        write_texture(texture, model.sheets[sheets[0]], time, device)
     facts = {"file": output, "time": time, "layer": sheets[0].layer, "atlas": sheets[0].atlas, "channels": names}
     facts |= {"size": f"{frame.shape[1]}x{frame.shape[0]}", "mean": float(frame.mean()), "largest": float(frame.max())}
     show_facts(str(file), facts)
@@ -334,18 +322,17 @@ def _show_where_shown(report: "Report") -> None:
 
 def _note_worst(report: "SheetReport") -> None:
     """Prints the tile, time and view with the lowest scores, and how many tiles have no score."""
-    if report.worst_tile is not None:
-        worst = report.worst_tile
-        note(f"worst PSNR: {report.worst_psnr:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
-    for what, worst in (("filtered read", report.worst_seen), ("between stored times", report.worst_between)):
+    places = {
+        "": report.worst_tile,
+        ", filtered read": report.worst_seen,
+        ", between stored times": report.worst_between,
+    }
+    for what, worst in places.items():
         if worst is not None:
-            note(f"worst PSNR, {what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+            note(f"worst PSNR{what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
     if (worst := report.worst_view) is not None:
         place = f"camera {worst['view']} at {worst['time']:g}"
         note(f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, {place}")
     reasons = ", ".join(f"{count} {reason}" for reason, count in report.not_scored.items() if count)
     if reasons:
         note(f"tiles without a score, counted at each time: {reasons}")
-    if report.format_limited:
-        psnr = number(report.psnr_unlimited, ".2f")
-        note(f"{len(report.format_limited)} scored tiles span few half-float values; PSNR of the others: {psnr} dB")

@@ -53,7 +53,7 @@ Engine = Annotated[
     ),
 ]
 ShaderLanguage = Annotated[
-    Literal["glsl", "glsl-es", "hlsl", "msl", "wgsl"] | None,
+    Literal["glsl", "glsl-es", "hlsl", "wgsl"] | None,
     typer.Option(help="Language of the shader without --engine; default glsl."),
 ]
 ExactShader = Annotated[

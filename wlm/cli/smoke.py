@@ -80,9 +80,6 @@ def simulate(
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
     frames: _SceneFrames = None,
     scale: _SceneScale = 1.0,
-    velocity: Annotated[
-        bool, typer.Option("--velocity", help="Also write the air's velocity of each frame, for flipbook --motion.")
-    ] = False,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
     device: Device = "cpu",
@@ -114,7 +111,7 @@ def simulate(
             most = max(most, figures.get("smoke", 0.0))
             report(now)
 
-        options = {"resume": resume, "checkpoint_every": checkpoint_every, "velocity": velocity}
+        options = {"resume": resume, "checkpoint_every": checkpoint_every}
         first = simulate(folder, solver=solver, progress=progress, **options)
     if resume and first == 1:
         note(f"{output}: there was nothing to resume; started at frame 1")
@@ -132,7 +129,6 @@ def simulate(
 
 
 def _scene(name: str, scale: float, frames: int | None) -> "Scene":
-    """Loads a scene with a factor on its cells and, unless None, another number of frames."""
     from wlm.smoke.scene import load_scene
 
     scene = load_scene(name)
@@ -412,7 +408,6 @@ def run(
 
 
 def _given_albedo(text: str | None) -> tuple[float, float, float] | None:
-    """Parses `--albedo`, one number or R,G,B; None if it is not given."""
     if text is None:
         return None
     values = vector("--albedo", text if "," in text else ",".join([text] * 3))

@@ -162,10 +162,6 @@ def flipbook(
             min=1, max=6, help="Number of mip levels for which frames are padded so that they do not mix; default none."
         ),
     ] = None,
-    motion: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Add a texture of motion, from the folder of wlm smoke simulate --velocity."),
-    ] = None,
     device: Device = "cpu",
 ) -> None:
     """Pack six-way lightmaps into a flip book: two textures, or a folder that also has a shader.
@@ -180,25 +176,19 @@ def flipbook(
                 raise WlmError(f"--{option} needs a folder as the output, got the file {output}")
         gain = 1.0 if gain is None and output.suffix.lower() == ".exr" else gain
     quiet_warp()
-    from wlm.smoke.flipbook.book import pack_book, write_book
-    from wlm.smoke.flipbook.motion import mip_padding, open_motion
+    from wlm.smoke.flipbook.book import mip_padding, pack_book, write_book
 
     _, read = _source(lightmaps, textures, cells, source_layout, straight, from_gain, device)
-    if motion is not None and textures:
-        raise WlmError("--motion needs lightmaps of bake or predict, since a flip book does not state its camera")
     for option, value in (("gain", gain), ("rate", rate)):
         if value is not None and not 0 < value < float("inf"):
             raise WlmError(f"--{option}: expected a number above 0, got {value}")
-    air = None if motion is None else open_motion(motion, device)
     with running("flipbook") as progress:
         shots = list(read(count, progress))
     padding = 0 if in_files else _PADDING
     if mips is not None:
         padding = mip_padding(*shots[0].six.lightmaps.shape[1:], mips)
     try:
-        with running("motion") as progress:
-            report = None if air is None else progress
-            packed = pack_book(shots, layout, gain=gain, rate=rate, padding=padding, air=air, progress=report)
+        packed = pack_book(shots, layout, gain=gain, rate=rate, padding=padding)
     except ValueError as error:
         raise WlmError(f"{lightmaps}: {error}") from error
     if in_files:
@@ -265,7 +255,7 @@ def _source(
 
 
 def _say(notes: Sequence[str]) -> None:
-    """Prints the first assumption, and each warning once."""
+    """Prints the first of the notes about an input, and every warning among them, each text once."""
     for line in dict.fromkeys(line for i, line in enumerate(notes) if not i or "warning: " in line):
         note(line)
 
@@ -279,6 +269,4 @@ def _show(title: str, book: "Book", contents: Mapping[Path, Sequence[str]], clip
     around = f", padded by {book.padding}" if book.padding else ""
     rows.add_row("frames", f"{book.count:,}", f"{book.rows} x {book.columns} cells of {width} x {height}{around}")
     rows.add_row("gain", f"{book.gain:.4g}", f"{clipped:,} values clipped")
-    if book.scale is not None:
-        rows.add_row("largest motion", f"{book.scale:.4g}", "share of a frame, to the next frame")
     show(rows)

@@ -277,7 +277,7 @@ def write_lightmaps(
 
 
 def note_thickness(frames: "Frames", thickness: float) -> None:
-    """Prints a warning if the smoke of all frames together, of a largest optical thickness, is too thin or thick."""
+    """Prints a warning if the largest optical thickness of all frames is so low or high that smoke looks wrong."""
     from wlm.fluid.volume import thickness_hint
 
     if hint := thickness_hint(thickness, frames.extinction_used):

@@ -1,4 +1,4 @@
-"""`wlm view`: shows a file in a window, or writes a picture or an animation of it."""
+"""`wlm view`: shows a file in a window, or writes a picture of it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,12 +30,6 @@ def view(
         str | None,
         typer.Option(help="Picture to show: light or tiles of lightmaps; balls, gaussians or volume of probes."),
     ] = None,
-    outside: Annotated[
-        bool,
-        typer.Option(
-            "--outside", help="Also draw the walls of a room that are seen from outside, which are hidden else."
-        ),
-    ] = False,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,
     sliders: Annotated[
         list[str] | None,
@@ -60,20 +54,11 @@ def view(
         ),
     ] = None,
     up: Up = "y",
-    rate: Annotated[float, typer.Option(help="Frames per second of an animation or of smoke.")] = 24.0,
-    frames: Annotated[
-        int | None, typer.Option(help="Number of pictures of --movie; default 48, or all frames of smoke.")
-    ] = None,
+    rate: Annotated[float, typer.Option(help="Frames per second while smoke or a walk is played.")] = 24.0,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the window in pixels.")] = "1280x720",
     screenshot: Annotated[
         Path | None,
         typer.Option(metavar="OUT.png", help="Write a picture instead of opening a window; needs no display."),
-    ] = None,
-    movie: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="OUT.gif", help="Write an animation, .gif or .webp, instead of opening a window; needs no display."
-        ),
     ] = None,
 ) -> None:
     """Show lightmaps, probes or smoke in a window; with --original, beside the original and the error."""
@@ -83,10 +68,6 @@ def view(
         raise WlmError(f"--rate: expected a number above 0, at most 1000, got {rate:g}")
     if screenshot is not None:
         check_output(screenshot, ".png")
-    if movie is not None:
-        check_output(movie, ".gif", ".webp")
-    elif frames is not None:
-        raise WlmError("--frames: has no meaning without --movie")
     quiet_warp()
     from wlm.formats.hdr_blocks import need
     from wlm.view.opening import open_scene
@@ -98,11 +79,9 @@ def view(
     with running("view") as progress:
         many = len(files) > 1 or files[0].is_dir()
         scene = open_scene(files, **options, progress=progress if many else None)
-    window = Window(scene, size=pixels, rate=rate, off_screen=screenshot is not None or movie is not None)
+    window = Window(scene, size=pixels, rate=rate, off_screen=screenshot is not None)
     try:
         window.tone(tone)
-        if outside:
-            window.outside(True)
         if view is not None or walk is not None:
             window.choose(view or "volume")
         window.look()
@@ -110,17 +89,12 @@ def view(
             window.turn(values.pop("turn"))
         for name, value in values.items():
             window.set(name, value)
-        if screenshot is None and movie is None:
+        if screenshot is None:
             window.show()
             return
         rows = table(scene.title, ["written", "bytes"])
-        if screenshot is not None:
-            window.screenshot(screenshot)
-            rows.add_row(escape(str(screenshot)), f"{screenshot.stat().st_size:,}")
-        if movie is not None:
-            with running("movie") as progress:
-                window.movie(movie, frames, progress=progress)
-            rows.add_row(escape(str(movie)), f"{movie.stat().st_size:,}")
+        window.screenshot(screenshot)
+        rows.add_row(escape(str(screenshot)), f"{screenshot.stat().st_size:,}")
         show(rows)
     finally:
         window.close()

@@ -121,8 +121,8 @@ def choose(
 
 
 def is_level_set(grid: VdbGrid, group: str) -> bool:
-    """Whether the values of a grid of a class are distances to a surface: by its class, or else because the background
-    is above 0 and a value below."""
+    """Tests whether a grid's values are distances to a surface: its background is above 0, and its class `group` is
+    level set, or is not fog while a value is below 0."""
     return grid.background > 0 and group != _FOG and (group == _LEVEL_SET or bool(grid.values.min() < 0))
 
 
@@ -160,7 +160,7 @@ def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lat
 
 
 def _turned(grid: Grid, up: str) -> np.ndarray:
-    """Returns the transform [4, 4] of the corners of a grid's voxels to the world in which +y is up."""
+    """Returns the transform [4, 4] from voxel corners (i, j, k) of a grid to the world, turned so that +y is up."""
     matrix = np.eye(4)
     matrix[:3, :3] = UPS[up]
     matrix = matrix @ grid.matrix
@@ -185,7 +185,7 @@ def _between(voxel: float, origin: np.ndarray, matrix: np.ndarray) -> tuple[np.n
 
 
 def _is_kept(between: tuple[np.ndarray, np.ndarray]) -> bool:
-    """Returns whether a transform of `_between` maps voxels exactly to voxels, so that no resampling is needed."""
+    """Returns whether a matrix and shift between voxels only permute, flip and move them by whole voxels."""
     turn, shift = between
     axes = np.abs(turn).round()
     straight = np.abs(np.abs(turn) - axes).max() <= _CUBIC and (axes.sum(0) == 1).all() and (axes.sum(1) == 1).all()

@@ -446,7 +446,7 @@ class Lattice:
         return self._f[self._done % 2], self._f[1 - self._done % 2]
 
     def _prepare(self) -> None:
-        """Applies new boundary conditions."""
+        """Chooses kernels and lists links for the faces, if they have changed since the last call."""
         if self._links is not None:
             return
         self._bounded = wp.vec3i(*bounded_axes(self._faces))

@@ -226,7 +226,7 @@ def _little_endian(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _has_header(begin: bytes) -> bool:
-    """Whether a file that starts with these bytes, at least 8, can be a safetensors file whose header we accept."""
+    """Tests whether a file's first bytes, at least 8, can begin a safetensors file: header length within the limit."""
     return begin[_LENGTH.size : _LENGTH.size + 1] in (b"{", b"") and _LENGTH.unpack_from(begin)[0] <= _HEADER_LIMIT
 
 
@@ -294,7 +294,6 @@ def _entry(path: str | os.PathLike[str], name: str, entry: Any) -> tuple[str, tu
 def _check_extents(
     path: str | os.PathLike[str], entries: dict[str, tuple[str, tuple[int, ...], int, int]], payload: int
 ) -> None:
-    """Checks that the parts fill the file after the header, with no gap and no overlap."""
     reached = 0
     for name, (_, _, begin, end) in sorted(entries.items(), key=lambda item: item[1][2:]):
         if begin != reached:

@@ -149,7 +149,6 @@ def decode_bc6h(blocks: np.ndarray) -> np.ndarray:
 
 
 def _decode_mode(blocks: np.ndarray, mode: int) -> np.ndarray:
-    """Decodes blocks of one mode, uint8 [B, 16], to texels, half [B, 16, 3]."""
     bits = np.unpackbits(blocks, axis=1, bitorder="little").astype(np.int32)
     fields = np.zeros((PARTITION + 1, len(blocks)), np.int32)
     for place in np.flatnonzero(LAYOUT[mode] >= 0):

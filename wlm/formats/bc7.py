@@ -204,6 +204,5 @@ def _words(endpoints: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _mode_name(low: int) -> str:
-    """Names the mode of a block: the position of the lowest set bit; a first byte of zero is reserved."""
     byte = low & 0xFF
     return f"mode {(byte & -byte).bit_length() - 1}" if byte else "a reserved mode"

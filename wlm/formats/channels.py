@@ -120,7 +120,6 @@ def parse_encoding(encoding: str) -> tuple[str, float, float]:
 
 
 def _note_doubts(name: str, largest: float, colour: np.ndarray, alpha: np.ndarray | None, notes: list[str]) -> None:
-    """Adds lines about an assumed range, and about levels that do not look like the encoding."""
     if name in _RANGED and not largest:
         whose = "Unity in linear colour space, 34.49 a^2.2" if name == "rgbm" else "Babylon.js, p^2.2 / a"
         notes.append(f"{name} is taken to be that of {whose}: state another as {name}:RANGE:GAMMA")

@@ -21,7 +21,7 @@ _WAIT = 120.0  # wall-clock limit in seconds
 
 
 def run_child(reader: ModuleType, data: bytes, *arguments: str) -> dict[str, np.ndarray]:
-    """Returns the arrays that the `main` of a module, see above, makes of data and arguments.
+    """Runs the function `main` of a module on data and arguments in a limited process; returns its arrays by name.
 
     Raises:
         ValueError: The process raised an error, crashed or exceeded a limit, or could not be started.

@@ -144,7 +144,7 @@ def _layers(names: Iterable[str]) -> dict[str, dict[str, str]]:
 def _light_channels(
     path: str | os.PathLike[str], names: list[str], layer: str | None, notes: list[str]
 ) -> dict[str, str]:
-    """Chooses the channels of light by the rule of `read_exr`: for R, G, B and perhaps A the name in the file."""
+    """Returns for R, G, B and perhaps A the name of the file's channel that holds it, of `layer` or by `read_exr`."""
     layers = _layers(names)
     listed = ", ".join(f"{each!r}" for each in list(layers)[:_MOST_NAMES]) or "none"
     if layer is not None:
@@ -219,7 +219,6 @@ def _framed(where: str, part: OpenEXR.Part, plane: np.ndarray, notes: list[str])
 
 
 def _window(part: OpenEXR.Part, name: str) -> tuple[int, int, int, int]:
-    """Returns the left and top, the width and the height of a window in the header of a part."""
     (left, top), (right, bottom) = (np.asarray(corner).tolist() for corner in part.header[name])
     return left, top, right - left + 1, bottom - top + 1
 

@@ -75,7 +75,6 @@ def check_header(path: str | os.PathLike[str]) -> list[ExrHeader]:
 
 
 def _attributes(data: bytes, at: int, most: int) -> tuple[dict[str, tuple[str, bytes]], int]:
-    """Returns the attributes of a header that starts at `at`, and the position after it."""
     attributes: dict[str, tuple[str, bytes]] = {}
     while end := data.index(0, at) - at:
         name = data[at : at + end].decode("utf-8", "replace")

@@ -101,10 +101,10 @@ def decode_texels(
 
 
 def check_fields(path: str | os.PathLike[str], *fields: tuple[str, object, bool, object]) -> None:
-    """Checks fields of a header: name, value found, whether it fits, and words for what is expected.
+    """Raises an error for the first wrong field of a header, each given as name, value, whether it fits, expectation.
 
     Raises:
-        WlmError: A value doesn't fit.
+        WlmError: A field doesn't fit; the line has its name, the expected and the found value.
     """
     for field, found, fits, expected in fields:
         if not fits:
@@ -122,7 +122,7 @@ def layout_of(
     """Returns the name and the layout of a format by its number.
 
     Raises:
-        WlmError: It is not in `layouts`; the line names the field, what is expected, and a format of `others`.
+        WlmError: `layouts` lacks it; the line has field, expectation, number, and the format's name in `others`.
     """
     if number not in layouts:
         name = next((f" ({name})" for name, written in others.items() if written == number), "")

@@ -126,7 +126,7 @@ def _move(made: Path, folder: Path, index: str, format_name: str) -> None:
 
 
 def _listed(folder: Path, index: str) -> list[str]:
-    """Returns the files that the index of an earlier output lists, if they are at most one subfolder deep."""
+    """Returns the existing files that an earlier output's index lists, except hidden files and ones in deep folders."""
     listed = read_index(folder / index).get("files")
     names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
     safe = [name for name in names if _NAME.fullmatch(name) and not any(p.startswith(".") for p in name.split("/"))]

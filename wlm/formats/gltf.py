@@ -184,7 +184,7 @@ Arrays = tuple[str, np.ndarray, np.ndarray, np.ndarray]
 def document_from_arrays(
     position: np.ndarray, triangle: np.ndarray, uv: np.ndarray, name: str
 ) -> tuple[GltfDocument, GltfPrimitive]:
-    """Makes a glTF document of one mesh from arrays, see `document_from_meshes`; returns it with its primitive."""
+    """Makes a glTF document of one mesh from arrays as `Arrays` describes them; returns it with its only primitive."""
     document, (primitive,) = document_from_meshes([(name, position, triangle, uv)], name)
     return document, primitive
 
@@ -438,7 +438,6 @@ def _label(item: dict, other: str) -> str:
 
 
 def _count(document: GltfDocument, number: int) -> int:
-    """Returns the number of elements that an accessor states; 0 if the number is invalid."""
     count = document.item("accessors", number).get("count")
     return count if isinstance(count, int) else 0
 
@@ -453,7 +452,6 @@ def _floats(document: GltfDocument, number: int, kind: str) -> np.ndarray:
 
 
 def _corners(document: GltfDocument, where: str, primitive: dict, vertices: int) -> np.ndarray:
-    """Returns the vertex index of each corner of a primitive's triangles, int64 [N]."""
     if "indices" not in primitive:
         return np.arange(vertices)
     index = components(document, primitive["indices"], "SCALAR")[:, 0]
@@ -522,7 +520,6 @@ def _transform(node: dict) -> np.ndarray:
 
 
 def _split_glb(path: str | os.PathLike[str], data: bytes) -> tuple[bytes, bytes | None]:
-    """Returns the JSON chunk and the binary chunk of a `.glb`."""
     if len(data) < 12:
         raise WlmError(f"{path}: the file is cut short: expected a header of 12 bytes, found {len(data)}")
     version, length = struct.unpack_from("<2I", data, 4)
@@ -575,7 +572,6 @@ def _load_buffers(
 
 
 def _data_uri(where: str, uri: str) -> bytes:
-    """Returns the bytes that a `data:` URI holds."""
     head, comma, body = uri.partition(",")
     if not comma:
         raise WlmError(f"{where}: expected a data: URI with a comma before its content")

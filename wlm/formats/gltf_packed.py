@@ -77,7 +77,6 @@ def _needed(path: str | os.PathLike[str], package: str, extension: str) -> Any:
 
 
 def _add(content: dict, buffers: list[bytes], data: bytes, **extra: Any) -> dict[str, Any]:
-    """Adds a buffer; returns a view of all of it."""
     content["buffers"].append({"byteLength": len(data)})
     buffers.append(data)
     return {"buffer": len(buffers) - 1, "byteLength": len(data), **extra}

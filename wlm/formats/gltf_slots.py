@@ -81,7 +81,6 @@ def lightmap_uv(document: GltfDocument, primitive: GltfPrimitive, uv_set: int) -
 
 
 def _slots(holder: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yields the texture slots of a material with their names."""
     for key, value in holder.items() if isinstance(holder, dict) else ():
         if isinstance(value, dict) and key not in ("extras", "KHR_texture_transform"):
             if isinstance(value.get("index"), int):
@@ -91,7 +90,6 @@ def _slots(holder: Any, name: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _stem(document: GltfDocument, info: dict[str, Any]) -> str:
-    """Returns the name of a slot's image without its suffix."""
     try:
         number = texture_image(document, info["index"])
         image = document.item("images", number)

@@ -217,7 +217,6 @@ class _Tree:
         return self._known[key]
 
     def _view(self, data: bytes, head: dict) -> int:
-        """Adds a buffer view, unless one with the same bytes was added before; returns its index."""
         key = (hashlib.blake2b(data).digest(), tuple(head.items()))
         if key not in self._known:
             self.content["bufferViews"].append({"buffer": 0, "byteLength": len(data), **head})
@@ -246,7 +245,6 @@ def _check(new: Replacement, uv_set: int) -> None:
 
 
 def _accessor_slots(content: dict) -> Iterator[tuple[dict, str]]:
-    """Yields every reference to an accessor in core glTF, as an object and its key."""
     for mesh in content.get("meshes", []):
         for primitive in mesh["primitives"]:
             for attributes in (primitive["attributes"], *primitive.get("targets", [])):
@@ -264,7 +262,6 @@ def _accessor_slots(content: dict) -> Iterator[tuple[dict, str]]:
 
 
 def _view_slots(content: dict) -> Iterator[tuple[dict, str]]:
-    """Yields every reference to a buffer view in core glTF, as an object and its key."""
     for accessor in content["accessors"]:
         sparse = accessor.get("sparse", {})
         for holder in (accessor, sparse.get("indices", {}), sparse.get("values", {})):

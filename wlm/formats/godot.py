@@ -294,7 +294,7 @@ class _Reader:
         return self.refer(names[index])
 
     def refer(self, name: str) -> str:
-        """Returns a name that a value refers to, whose length counts at each use."""
+        """Returns `name` unchanged and takes its length from the budget: a value refers to it, perhaps many times."""
         self._budget.spend(len(name))
         return name
 

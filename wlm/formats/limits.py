@@ -63,7 +63,7 @@ CORNERS = 1 << 28
 """Largest number of drawn corners and vertices."""
 
 PICTURE_SIDE = 65_536
-"""Longest side of a lightmap file (EXR, Radiance, KTX2, DDS), in texels."""
+"""Longest side of a lightmap file (EXR, Radiance, PFM, TIFF, KTX2, DDS), in texels."""
 
 PICTURE_TEXELS = 1 << 28
 """Most texels of a lightmap file: 16384 x 16384, the largest texture of most GPUs."""
@@ -75,7 +75,7 @@ PICTURE_BYTES = 256 << 20
 """Decoded bytes that are allowed for any size of file: 6000 x 6000 black texels of half floats."""
 
 IMAGE_BYTES = 2 << 30
-"""Largest PNG or TGA: 16384 x 16384 texels of 8 bytes."""
+"""Largest PNG, JPEG, WebP, TGA or TIFF file, in bytes: 16384 x 16384 texels of 8 bytes."""
 
 TIMES = 100_000
 """Most lightmaps of a set."""
@@ -134,10 +134,10 @@ def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure:
 
 
 class Budget:
-    """Work or memory that the read of one file may still take; all loops of the read spend from it beforehand."""
+    """The work or memory that reading one file may still take; each loop of the reader takes from it beforehand."""
 
     def __init__(self, where: str, most: int, unit: str, hint: str = "") -> None:
-        """Starts with `most` of a unit. For messages: the file, the unit in plural, and advice that follows."""
+        """Allows `most` units. `where` (the file), `unit` (plural) and `hint` (advice at the end) are for messages."""
         self._left = most
         self._text = f"{where}: expected at most {most} {unit} for the size of the file, found more{hint}"
 

@@ -103,7 +103,7 @@ def _stem(target: Path) -> str:
 
 
 def _acquire(lock: Path, output: str | os.PathLike[str]) -> int | None:
-    """Locks a file, which is made if it does not exist; returns its handle, or None if it can't be locked."""
+    """Locks a file, made if missing; returns its handle, None if it can't be locked; WlmError if another has it."""
     while fcntl is not None:
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)

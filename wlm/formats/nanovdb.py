@@ -174,8 +174,8 @@ class _Grid:
     def _inner(
         self, nodes: np.ndarray, corners: np.ndarray, side: int, values: np.ndarray, first: np.ndarray, background: Any
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Reads inner nodes with `side` children along each edge and writes their tiles; returns their children that
-        are in the box, with offsets and corners."""
+        """Reads inner nodes with `side` children along each edge and writes constant children (tiles) to `values`;
+        returns the byte offsets and corners of those child nodes that overlap the box."""
         edge = LEAF if side == LOWER else LEAF * LOWER
         masks, table = side**3 // 8, -(-(_NODE + side**3 // 4 + (32 if self._type == "double" else 16)) // 32) * 32
         found, places = [np.zeros(0, np.int64)], [np.zeros((0, 3), np.int64)]
@@ -197,7 +197,7 @@ class _Grid:
         return np.concatenate(found), np.concatenate(places)
 
     def _leaves(self, nodes: np.ndarray, places: np.ndarray, values: np.ndarray) -> None:
-        """Writes the values of leaves at offsets, with places in leaves of the box."""
+        """Decodes leaves of 8^3 voxels at byte offsets `nodes` into the box `values`, at `places` [N, 3] in leaves."""
         x, y, z = (n // LEAF for n in values.shape)
         cut = values.reshape(x, LEAF, y, LEAF, z, LEAF).transpose(0, 2, 4, 1, 3, 5)
         form = {"float": "<f4", "double": "<f8"}.get(self._type, "")
@@ -233,7 +233,7 @@ class _Grid:
         return struct.unpack_from(form, self._data, at)[0]
 
     def _rows(self, offsets: np.ndarray, size: int, form: str = "u1") -> np.ndarray:
-        """Returns the `size` bytes at each offset as numbers [N, size / their bytes]."""
+        """Returns the `size` bytes at each of N byte offsets as numbers of the type `form`, [N, numbers]."""
         if len(offsets) and not 0 <= offsets.min() <= offsets.max() <= self._data.size - size:
             raise ValueError(f"expected nodes within its {self._data.size} bytes, found one outside")
         if not len(offsets):
@@ -242,7 +242,7 @@ class _Grid:
 
 
 def _codes(packed: np.ndarray, bits: int) -> np.ndarray:
-    """Returns codes of some bits each, the lowest bits of a byte first, as float32 [N, 512]."""
+    """Unpacks the 512 codes of N leaves, `bits` (1 to 16) each, lowest bits of a byte first: float32 [N, 512]."""
     if bits == 16:
         return packed.view("<u2").astype(np.float32)
     shifts = np.arange(0, 8, bits, dtype=np.uint8)

@@ -64,7 +64,7 @@ def read_npz(
 
 
 class _Pieces:
-    """A file that is read only in pieces: zipfile reads the list of members as one, of any claimed size."""
+    """A file that refuses to return more than `MEMBERS_BYTES` at once, which zipfile may ask for."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.seek, self.tell, self.seekable, self._file = file.seek, file.tell, file.seekable, file

@@ -80,7 +80,6 @@ def read_radiance(path: str | os.PathLike[str], notes: list[str] | None = None) 
 
 
 def _header(path: str | os.PathLike[str], head: bytes) -> tuple[list[bytes], int]:
-    """Returns the header's lines, the last of which states the size, and the offset of the first texel."""
     blank = head.find(b"\n\n")
     end = head.find(b"\n", blank + 2)
     if blank < 0 or end < 0:
@@ -128,7 +127,6 @@ def _header_fields(
 
 
 def _decode(path: str | os.PathLike[str], data: bytes, rows: int, columns: int) -> np.ndarray:
-    """Decodes all rows of a file, float32 [rows, columns, 3]."""
     codecs = need("imagecodecs", EXTRA)
     pixels = np.zeros((rows, columns, 3), np.float32)
     texels = np.frombuffer(data, np.uint8, min(len(data) // _TEXEL, rows * columns) * _TEXEL).reshape(-1, _TEXEL)

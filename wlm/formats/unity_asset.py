@@ -109,7 +109,6 @@ def _read_text(path: str | os.PathLike[str], data: bytes) -> LightingData:
 
 
 def _objects(data: bytes) -> list[tuple[str, bytes]]:
-    """Returns the type and the text of each object of an asset."""
     starts = list(_OBJECT.finditer(data))
     ends = [*(start.start() for start in starts), len(data)][1:]
     return [(start[1].decode(), data[start.end() : end]) for start, end in zip(starts, ends, strict=True)]

@@ -125,7 +125,7 @@ class GridFile(ABC):
 
     @abstractmethod
     def _list(self) -> Iterator[Any]:
-        """Yields an entry with a `head` for each grid."""
+        """Yields for each grid of the file an object whose attribute `head` is its `GridHead`."""
 
     @abstractmethod
     def _read(self, entry: Any, where: str, trust: bool) -> VdbGrid:
@@ -358,7 +358,6 @@ class _Tree:
         return values
 
     def _numbers(self, count: int) -> np.ndarray:
-        """Reads and decompresses the next numbers, float32 [count]."""
         cursor, half, size = self._cursor, self._many == "<f2", count * self._bytes
         if not count and half:
             return np.zeros(0, np.float32)
@@ -415,7 +414,7 @@ class Tiles:
 
     @staticmethod
     def paste_roots(values: np.ndarray, first: np.ndarray, corners: np.ndarray, constants: np.ndarray) -> None:
-        """Writes the tiles of a root with corners [N, 3] at different multiples of 4096."""
+        """Writes N constant cubes of 4096 voxels an edge, tiles of the root, with lowest voxels `corners` [N, 3]."""
         begins = np.maximum(corners - first, 0)
         ends = np.minimum(corners - first + _UPPER_EDGE, values.shape)
         for i in np.flatnonzero((begins < ends).all(1)).tolist():

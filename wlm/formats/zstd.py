@@ -103,5 +103,4 @@ def unpack_parts(tensors: Mapping[str, np.ndarray], shapes: Shapes, table: Mappi
 
 
 def _limit(size: int) -> int:
-    """Returns the largest decompressed size in bytes that is accepted for a frame of `size` bytes."""
     return _FREE + _MOST * size

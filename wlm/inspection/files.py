@@ -130,7 +130,6 @@ def _names(path: Path) -> list[str]:
 
 
 def _value_names(names: Sequence[str]) -> list[str]:
-    """Returns the names of the arrays of an .npz of probes that hold values."""
     return [name for name in names if name.startswith("sh")]
 
 
@@ -285,7 +284,6 @@ def _kind_of_json(path: Path) -> str:
 
 
 def _lights(path: Path) -> Finding:
-    """Describes a list of the lightmaps of a scene."""
     listing = read_listing(path)
     lists = f"{count_of(listing.sheets, 'lightmap')} at {count_of(listing.states, 'state')}"
     return Finding(path, f"a list of lightmaps of a scene: {lists}; compress it together with its mesh")
@@ -299,7 +297,6 @@ def _positions(path: Path) -> Finding:
 
 
 def _settings(path: Path) -> Finding:
-    """Describes a YAML file: a scene or a profile."""
     values = read_yaml(path)
     if "grid" in values:
         # This imports torch.
@@ -310,8 +307,6 @@ def _settings(path: Path) -> Finding:
         return Finding(path, what, command("smoke", "simulate", path, "-o", "DIR"))
     if "geometry" in values:
         return Finding(path, "a scene for wlm bake lightmaps and wlm bake probes")
-    if isinstance(values.get("smoke"), str):
-        return Finding(path, "a scene for wlm bake sixway")
     fitting, faults = [], {}
     for system in _MODELS:
         profile = import_module(f"wlm.{system}").Profile
@@ -333,7 +328,6 @@ def _checkpoint(path: Path) -> Finding:
 
 
 def _unity_asset(path: Path) -> Finding:
-    """Describes lighting data of Unity, which an optional package reads."""
     data = read_lighting_data(path)
     rectangles = f"{len(data.rectangles)} rectangles of renderers in lightmaps, without names"
     if not len(data.position):

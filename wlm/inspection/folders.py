@@ -97,7 +97,7 @@ _REFUSED = {
 
 
 def _folder_system(folder: Path) -> str:
-    """Returns the system that compresses a folder, a key of `_REFUSED` if it cannot be compressed, or ""."""
+    """Returns "lightmap" for a folder that it compresses; "smoke", "export" or "meshes" if no system does; or ""."""
     if (folder / SET_FILE).is_file() or state_folders(folder):
         return "lightmap"
     files = [entry for entry in _entries(folder) if entry.is_file()]
@@ -154,7 +154,7 @@ def _inside(path: Path) -> Finding | None:
 
 
 def _book_names(file: Path, back: bool = False) -> list[tuple[str, str]]:
-    """Returns the names, in lower case, that the other texture of a flip book may have, each with a layout."""
+    """Returns possible file names, in lower case, of a flip book's second texture (`back`: first), with its layout."""
     if file.suffix.lower() not in _BOOKS:
         return []
     # This imports torch, which takes seconds.
@@ -188,7 +188,6 @@ def _documents(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _simulated(folder: Path) -> Finding:
-    """Describes frames of smoke that wlm wrote."""
     from wlm.smoke.data import load_frames
 
     try:
@@ -200,7 +199,6 @@ def _simulated(folder: Path) -> Finding:
 
 
 def _unity(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes states of light that Unity baked, in the folder itself or in folders inside it."""
     states = state_folders(folder)
     if not states or (folder / SET_FILE).is_file():
         return []
@@ -241,7 +239,6 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _godot(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes bakes of Godot together with the textures that their meshes read."""
     found: _Found = []
     for file in files:
         if file.suffix.lower() != ".lmbake":
@@ -255,7 +252,7 @@ def _godot(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes pairs of textures that are named as six-way lightmaps are, or as pairs whose light is that of them."""
+    """Describes pairs of textures that by names, perhaps also light, are a flip book of six-way lightmaps."""
     pictures = {file.name.lower(): file for file in files if file.suffix.lower() in _BOOKS}
     found: _Found = []
     taken: set[Path] = set()
@@ -302,7 +299,6 @@ def _light(files: Sequence[Path]) -> dict[Path, Picture]:
 
 
 def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes pictures of light: lightmaps over time, frames of smoke, or lightmaps with their mesh."""
     heads = _light(files)
     smoke = [file for file, head in heads.items() if head.is_six_way]
     if smoke:
@@ -361,7 +357,7 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
 def _of_mesh(
     folder: Path, what: str, mesh: Path | None, pictures: Sequence[Path], problems: Sequence[str] = ()
 ) -> tuple[Finding, set[Path]]:
-    """Describes the lightmaps of a folder that belong to the meshes of a file, if it is known."""
+    """Describes a folder's lightmaps of meshes, and how to compress them if the `mesh` file is known, not None."""
     if mesh is None:
         return Finding(folder, f"{what}; compress them with their mesh", problems=tuple(problems)), set(pictures)
     words, notes = scene_command(mesh, folder)
@@ -369,7 +365,7 @@ def _of_mesh(
 
 
 def _lightmaps_of(mesh: Path | None, pictures: Sequence[Path]) -> str:
-    """Describes lightmaps that their names divide among UDIM tiles or the meshes of a file; "" for others."""
+    """Describes lightmaps that are named by UDIM tiles, or after the meshes of a file, in words; "" for others."""
     if tiles := tiles_of([file.stem for file in pictures]):
         return f"{count_of(pictures, 'lightmap')} of the UDIM tiles {', '.join(map(str, tiles[:8]))}"
     if mesh is None or len(pictures) < 2:
@@ -384,7 +380,7 @@ def _lightmaps_of(mesh: Path | None, pictures: Sequence[Path]) -> str:
 
 
 def _mesh_folders(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes folders of lightmaps beside the one glTF file that they belong to by their names."""
+    """Describes subfolders of lightmaps named by UDIM tiles or after meshes, if one glTF file lies beside them."""
     meshes = [file for file in files if file.suffix.lower() in (".glb", ".gltf")]
     if len(meshes) != 1:
         return []
@@ -397,7 +393,6 @@ def _mesh_folders(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _volumes(folder: Path, files: Sequence[Path]) -> _Found:
-    """Describes numbered volumes as frames of smoke, by the last of them."""
     volumes = [file for file in files if file.suffix.lower() in (".vdb", ".nvdb")]
     if len(volumes) < 2:
         return []

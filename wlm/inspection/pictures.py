@@ -47,7 +47,7 @@ class Picture:
 
     @property
     def is_light(self) -> bool:
-        """Whether the format may define light itself."""
+        """Whether the format can store linear light: EXR, Radiance, PFM, TIFF, KTX2 or DDS."""
         return self.kind not in ("PNG", "JPEG", "WebP", "TGA")
 
     @property
@@ -150,7 +150,7 @@ def inspect_picture(path: Path) -> Finding:
 
 
 def _halves(channels: Sequence[str]) -> list[str]:
-    """Returns the layers that six-way lightmaps would have beside those of the channels."""
+    """Returns the names that the other layer of six-way lightmaps may have, for each layer of the channels."""
     layers = {name.rpartition(".")[0] for name in channels} - {""}
     if not layers:
         return []

@@ -39,7 +39,7 @@ def inspect_set(path: Path) -> Finding:
 
 
 def named(path: Path, files: Sequence[Path]) -> set[Path]:
-    """Returns the files that a `set.json` names."""
+    """Returns which of `files` a `set.json` names as pictures or masks; none if it cannot be read."""
     try:
         listing = list_set(path)
     except WlmError:

@@ -49,7 +49,7 @@ def set_lines(listing: Listing, period: float | None = None) -> Iterator[str]:
 
 
 def size_line(atlas: str, layer: str, size: str, lead: str) -> str:
-    """Returns the line about a layer of another size, such as "64x32", than the `lead`, the atlas's first layer."""
+    """Returns a line: a layer's size, such as "64x32", differs from `lead`, the size of the atlas's first layer."""
     return f"{atlas}/{layer} is {size}, but the first layer of {atlas} is {lead}: each keeps its size"
 
 

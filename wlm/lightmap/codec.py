@@ -51,8 +51,6 @@ class _SheetHeader(Header):
 
 
 class _Header(Header):
-    """Settings of a file that all sheets share."""
-
     name: Name
     period: float | None = Field(gt=0)
     profile: Profile
@@ -183,7 +181,6 @@ def tile_sizes(sheet: SheetModel) -> np.ndarray:
 
 
 def _packed_tiles(sheet: SheetModel) -> list[int]:
-    """Returns the numbers of the tiles that have a zstd frame."""
     kinds = {int(kind): encoding_of(kind) for kind in np.unique(sheet.kind)}
     numbers = np.flatnonzero(sheet.kind).tolist()
     return [number for number in numbers if kinds[int(sheet.kind[number])].packed_size(sheet, number)]
@@ -203,7 +200,6 @@ def _pack_tiles(sheet: SheetModel) -> dict[str, np.ndarray]:
 
 
 def _unpack_tiles(sheet: SheetModel, packed: Mapping[str, np.ndarray]) -> None:
-    """Unpacks the zstd frames of all tiles into the arrays of a sheet."""
     numbers = _packed_tiles(sheet)
     for number in set(np.flatnonzero(sheet.kind).tolist()).difference(numbers):
         encoding_of(sheet.kind[number]).unpack(sheet, number, np.empty(0, np.uint8))
@@ -232,7 +228,6 @@ def _unpack_tiles(sheet: SheetModel, packed: Mapping[str, np.ndarray]) -> None:
 
 @contextmanager
 def _named(number: int) -> Iterator[None]:
-    """Context that adds the number of the sheet to the message of an error raised inside."""
     try:
         yield
     except (WlmError, ValueError) as error:

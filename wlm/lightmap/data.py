@@ -412,7 +412,7 @@ class _Reader:
         self._budget = Budget(f"{listing.where}: lightmaps", most, "decoded bytes")
 
     def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None, leads: bool) -> _Stack | None:
-        """Reads the pictures of a layer; None if there is none. `leads`: whether the set may state their size."""
+        """Reads a layer's pictures at all times; None without any. With `leads`, checks the atlas's stated size."""
         key = atlas.name, layer.name
         sources = {i: state[key] for i, state in enumerate(self._listing.states) if key in state}
         if not sources:
@@ -457,7 +457,7 @@ class _Reader:
             return int(np.count_nonzero(~np.isfinite(alpha)))
 
         def put_all(path: str) -> None:
-            """Reads a file once, for all times that it serves."""
+            """Reads a file once and stores its pictures for all times that use the file."""
             indices = files[path]
             at, read = indices[0], (whole, names)
             if at != start:
@@ -490,7 +490,6 @@ class _Reader:
         alpha: bool,
         first: Path,
     ) -> _Stack:
-        """Allocates memory for a layer, given the size and the channels of its first picture."""
         channels = layer.channels or (_LIGHT_CHANNELS if layer.encoding == LIGHT.encoding else names)
         if missing := [channel for channel in channels if channel not in names]:
             found = ", ".join(names)
@@ -526,7 +525,6 @@ class _Reader:
 
 
 def _part(pixels: np.ndarray, source: Source) -> np.ndarray:
-    """Returns the rows of a file's pixels [H, W, C] that belong to a picture."""
     if source.slices == 1:
         return pixels
     height, rest = divmod(len(pixels), source.slices)
@@ -538,7 +536,6 @@ def _part(pixels: np.ndarray, source: Source) -> np.ndarray:
 
 
 def _read(path: Path, layer: LayerInfo, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a file. Returns its values [H, W, C] and the names of its channels; `notes` gets its assumptions."""
     light = layer.encoding == LIGHT.encoding
     if light and layer.stored is not None:
         pixels, names = read_encoded(path, layer.stored, notes), _LIGHT_CHANNELS
@@ -609,7 +606,7 @@ class _States:
         warnings: Sequence[str] = (),
         mesh: Path | None = None,
     ) -> SheetFrames:
-        """Checks and repairs the frames of a sheet by the module's rules."""
+        """Checks and repairs a sheet's frames in place (NaN, negative and missing texels); returns them as a sheet."""
         where, period = self.where, self.period
         if not mask.any():
             raise WlmError(f"{where}: the mask is empty: no texel is valid ({self.mask_from})")
@@ -685,7 +682,6 @@ def _fill_in_time(frames: np.ndarray, covered: np.ndarray, times: np.ndarray, pe
 
 
 def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:
-    """Returns a hash of the input, 16 hexadecimal digits, which is the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(np.asarray(frames.shape, "<i8").tobytes())
     digest.update(np.asarray(times, "<f8").tobytes())

@@ -68,21 +68,6 @@ class SheetDecoder:
                 out[places] = tiles.radiance(rows, time)
         return out
 
-    def tiles_8bit(self, numbers: Sequence[int], time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Decodes tiles to 8-bit RGBA for a texture cache; gaps between charts are not filled.
-
-        Returns:
-            uint8 [n, 128, 128, 4] and the bound b of each tile, float32 [n]: radiance = (byte / 255 * b) ** gamma.
-            Alpha is 255, and 0 in empty tiles.
-        """
-        self.model.axis.wrap(time)
-        out, bounds = np.zeros((len(numbers), TILE, TILE, 4), np.uint8), np.zeros(len(numbers), np.float32)
-        for tiles in self._tiles:
-            places, rows = tiles.among(numbers)
-            if len(rows):
-                out[places], bounds[places] = tiles.colour_bytes(rows, time), tiles.bounds(time)[rows]
-        return out, bounds
-
     def frame(self, time: float) -> np.ndarray:
         """Decodes the map, float32 [H, W, 3]: radiance, or values in [0, 1] if it isn't light; 0 in empty tiles."""
         image = np.zeros((self._grid.height, self._grid.width, 3), np.float32)

@@ -157,7 +157,6 @@ class Dispatch:
         self._workers.call(number, "start", run.batch.fit.job(run.batch), state)
 
     def _restart(self, number: int, why: Lost) -> None:
-        """Restarts the batch of a dead worker from the batch's last saved state."""
         self._dead.add(number)
         run = self._running.pop(number, None)
         if run is None or self._stop is not None:

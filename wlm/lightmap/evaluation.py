@@ -21,7 +21,7 @@ from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.sheet import Sheet, first_light
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.view_scores import VIEWS, ShownScore, Tally, views_of
-from wlm.metrics import METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, nanmean, summarise
+from wlm.metrics import METRICS, FrameMetrics, LostLight, Summary, evaluate_frame, summarise
 from wlm.system import Meter, OnProgress
 
 SCORES = (*METRICS, "seen")
@@ -36,52 +36,28 @@ _TIME_TOLERANCE = 1e-6  # stored times are float32 if that keeps them distinct, 
 
 
 @dataclass(frozen=True)
-class SheetReport(ShownScore):
+class SheetReport(ShownScore, Summary):
     """Error and size of one sheet (up to three channels of a layer). Scores that were not computed are NaN.
 
-    The scores of `ShownScore` and `ViewScore` are attributes too.
+    The scores of `wlm.metrics.Summary`, over tiles and times, and those of `ShownScore` and `ViewScore` are attributes
+    too. PSNR is in dB, 120 for an exact tile; SSIM is in [-1, 1] and FLIP in [0, 1].
 
     Attributes:
-        psnr, ssim, flip: Means over all scored tiles and times. PSNR is in dB, 120 for an exact tile; SSIM is in [-1,
-            1] and FLIP in [0, 1].
-        psnr_unlimited: Mean PSNR in dB over the tiles and times that are not in `format_limited`.
         bytes: Bytes of the sheet in the file; the mask that an atlas's sheets share counts for the first of them.
         bpp: `bytes` as bits per texel and time, see `bits_per_texel`.
         memory_bpp: Bits per texel and time in the memory of a GPU, see `SheetModel.memory_bytes`.
         tiles: Number of tiles that are not empty.
-        psnr_by_tile, ssim_by_tile, flip_by_tile: float64 [rows, columns] of the grid, means over the times.
-        psnr_by_time, ssim_by_time, flip_by_time: float64 [T], means over the tiles.
-        worst_psnr: Lowest PSNR of any tile at any time.
-        worst_tile: Tile and time of `worst_psnr`: `time`, `tile` (its number), `row`, `column`; None without a score.
-        max_abs_error: Largest absolute error of a valid texel, scored or not, in the units of the input.
-        scored: Number of pairs of a tile and a time that count in the means.
         not_scored: Number of pairs that are not scored, by reason: `empty` (no valid texel), `not_held` (valid texels,
             but not in the file), `few_texels`, `zero_range` (see `wlm.metrics`).
-        format_limited: `time` and `tile` of the scored pairs whose range is only a few steps of half floats wide.
         kinds: Number of tiles of each kind: `empty`, `constant`, `static`, `dynamic`, `frames`.
         warnings: Lines about tiles that were not scored, and about lost light of few very bright texels.
     """
 
-    psnr: float
-    ssim: float
-    flip: float
-    psnr_unlimited: float
     bytes: int
     bpp: float
     memory_bpp: float
     tiles: int
-    psnr_by_tile: np.ndarray
-    ssim_by_tile: np.ndarray
-    flip_by_tile: np.ndarray
-    psnr_by_time: np.ndarray
-    ssim_by_time: np.ndarray
-    flip_by_time: np.ndarray
-    worst_psnr: float
-    worst_tile: dict[str, float | int] | None
-    max_abs_error: float
-    scored: int
     not_scored: dict[str, int]
-    format_limited: list[dict[str, float | int]]
     kinds: dict[str, int]
     warnings: list[str]
 
@@ -102,7 +78,6 @@ class Report(system.Report):
         seconds: Wall-clock time to decode and score everything; scoring takes most of it.
         profile: Name of the settings.
         sheets: The report of each sheet.
-        psnr_by_layer: For each layer, the mean PSNR in dB over the tiles of its sheets; channels have equal weights.
         warnings: Warnings of all sheets, and one if the file was made from another input.
     """
 
@@ -123,7 +98,6 @@ class Report(system.Report):
     seconds: float
     profile: str
     sheets: dict[Sheet, SheetReport]
-    psnr_by_layer: dict[str, float]
     warnings: list[str]
 
     @property
@@ -191,9 +165,6 @@ def evaluate(
     # Texels of one sheet of each atlas: layers share an area.
     areas = {sheet.atlas: _area(own, lightmaps.sheets[sheet].mask) for sheet, own in reversed(model.sheets.items())}
     texels = sum(areas.values()) * len(model.times)
-    layers: dict[str, list[np.ndarray]] = {}
-    for sheet, report in reports.items():
-        layers.setdefault(sheet.layer, []).append(report.psnr_by_tile.ravel().repeat(len(sheet.channels)))
     weights = [len(sheet.channels) for sheet in reports]
     return Report(
         **{name: _mean([getattr(report, name) for report in reports.values()], weights) for name in MEANS},
@@ -206,7 +177,6 @@ def evaluate(
         seconds=time.perf_counter() - start,
         profile=model.profile.name,
         sheets=reports,
-        psnr_by_layer={layer: float(nanmean(np.concatenate(grids))) for layer, grids in layers.items()},
         warnings=list(dict.fromkeys(warnings)),
     )
 
@@ -243,7 +213,6 @@ def _score(
 
 
 def _mean(values: Sequence[float], weights: Sequence[int]) -> float:
-    """Returns the weighted mean of the values that are not NaN."""
     counted = np.array([(v, w) for v, w in zip(values, weights, strict=True) if not np.isnan(v)]).reshape(-1, 2)
     return float(np.average(*counted.T[:1], weights=counted[:, 1])) if len(counted) else float("nan")
 
@@ -343,38 +312,25 @@ def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
 def _sheet_report(
     model: SheetModel, lightmaps: SheetFrames, size: int, frames: Sequence[FrameMetrics], shown: ShownScore
 ) -> SheetReport:
-    summary, columns, warnings = summarise(frames), model.grid.cols, []
+    summary, warnings = summarise(frames, model.times), []
     left_out = _left_out(model, lightmaps, summary)
     if left_out["not_held"]:
         missing = left_out["not_held"] // len(model.times)
         warnings.append(f"{model.name}: {missing} tiles with valid texels are not in the file, and not scored")
-
-    def place(where: tuple[int, int, int]) -> dict[str, float | int]:
-        i, row, column = where
-        return {"time": float(model.times[i]), "tile": row * columns + column, "row": row, "column": column}
-
-    scores = (f"{name}{suffix}" for name in METRICS for suffix in ("", "_by_tile", "_by_time"))
     return SheetReport(
-        **{name: getattr(summary, name) for name in scores},
+        **vars(summary),
         **vars(shown),
-        psnr_unlimited=summary.psnr_unlimited,
         bytes=size,
         bpp=bits_per_texel(model, lightmaps.mask, size),
         memory_bpp=bits_per_texel(model, lightmaps.mask, model.memory_bytes),
         tiles=int(np.count_nonzero(model.kind)),
-        worst_psnr=summary.worst_psnr,
-        worst_tile=None if summary.worst_tile is None else place(summary.worst_tile),
-        max_abs_error=summary.max_abs_error,
-        scored=summary.scored,
         not_scored=left_out,
-        format_limited=[place(where) for where in summary.format_limited],
         kinds=count_kinds(model),
         warnings=warnings,
     )
 
 
 def _left_out(model: SheetModel, lightmaps: SheetFrames, summary: Summary) -> dict[str, int]:
-    """Counts pairs of tile and time without a score by reason, see `SheetReport.not_scored`."""
     valid, times = model.grid.tiles_with(lightmaps.mask).ravel(), len(model.times)
     empty = int((~valid).sum()) * times
     not_held = int((valid & (model.kind == TileKind.EMPTY)).sum()) * times

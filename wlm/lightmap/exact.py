@@ -79,7 +79,6 @@ def _check(model: SheetModel, number: int, time: float) -> None:
 
 
 def _frame(model: SheetModel, number: int, at: int) -> np.ndarray:
-    """Decodes the frame of a tile at stored time `at` to gamma space, [128, 128, 3]."""
     row = model.row(number)
     levels = decode_image(model.frames[row, at])[..., :3] / 255.0
     least, greatest = model.ranges[row, at].astype(np.float64)
@@ -87,7 +86,6 @@ def _frame(model: SheetModel, number: int, at: int) -> np.ndarray:
 
 
 def _constant(model: SheetModel, number: int, time: float) -> np.ndarray:
-    """Returns the linear radiance of a constant tile at one time, [3]."""
     before, after, share = model.axis.neighbours(time)
     rows = model.constant[model.row(number)].astype(np.float64)
     return (1.0 - share) * rows[before] + share * rows[after]

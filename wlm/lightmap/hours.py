@@ -53,7 +53,7 @@ def hours_of_names(stems: Sequence[str]) -> tuple[list[float | None], str]:
 
 
 def _hour(match: re.Match[str] | None, minutes: bool, clock: bool) -> float | None:
-    """Returns the hour of a name; `minutes` and `clock` state how `18_30h` and `1830h` are read."""
+    """Returns the hour in a name, None if it has none; 18.5 for `18_30h` if `minutes`, for `1830h` if `clock`."""
     if match is None:
         return None
     if match["half"]:

@@ -200,7 +200,7 @@ def _check_count(where: Path, items: Sequence[object], times: Sequence[float], n
 
 
 def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, noun: str) -> dict[str, Any]:
-    """Returns the times of lightmaps, given or of their names without suffixes, as fields of a `Listing`."""
+    """Returns the `times` of lightmaps, or hours from their names `stems` if it is None, as fields of a `Listing`."""
     if times is not None:
         _check_count(folder, stems, times, noun)
         return {"times": times, "period": None, "origin": _GIVEN}
@@ -216,7 +216,6 @@ def _timed(folder: Path, stems: Sequence[str], times: Sequence[float] | None, no
 
 
 def _list_folder(folder: Path, times: Sequence[float] | None, levels: bool) -> Listing:
-    """Lists a folder of lightmaps, also of integers if `levels`; a "mask.png" in it is the mask."""
     suffixes = SUFFIXES + LEVEL_SUFFIXES * levels
     try:
         files = [f for f in folder.iterdir() if f.suffix.lower() in suffixes and f.is_file() and f.name != "mask.png"]
@@ -249,7 +248,6 @@ def _unity_files(folder: Path) -> list[tuple[tuple[str, str], Path]]:
 
 
 def _list_states(folder: Path, times: Sequence[float] | None, chosen: Sequence[str] | None) -> Listing:
-    """Lists a folder of lightmaps as Unity bakes them: one state of light, or a folder inside it for each state."""
     states = state_folders(folder)
     found: list[dict[tuple[str, str], dict[str, Path]]] = []
     for state in states:
@@ -286,7 +284,6 @@ def _labelled(path: Path, *place: int) -> Source:
 
 
 def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
-    """Reads a `set.json`."""
     content = read_json_file(path, "the set")
     kind = _Layered if isinstance(content, dict) and "layers" in content else _Plain
     checked = check_settings(kind, content, f"{path}: ", extra="ignore")

@@ -10,18 +10,14 @@ read across two tiles. It fills gaps between charts, and its mips average only t
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
-from wlm.formats.dds import write_dds
-from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import gelu_of
-from wlm.lightmap.encodings.base import DeviceTiles, inverse_of, rgba
+from wlm.lightmap.encodings.base import inverse_of, rgba
 from wlm.lightmap.encodings.constant import ConstantTiles
 from wlm.lightmap.encodings.frames import FrameTiles
 from wlm.lightmap.encodings.maps import MapTiles
@@ -41,7 +37,7 @@ class RuntimeDecoder:
             or RGB9E5.
     """
 
-    _tiles: DeviceTiles
+    _tiles: MapTiles | FrameTiles
 
     def __init__(self, model: SheetModel, device: str, shared: bool) -> None:
         """Allocates the output: RGB9E5 if `shared`, else 8-bit RGBA. The time is initially the first stored one."""
@@ -310,30 +306,6 @@ class MapDecoder:
     def numpy(self, level: int = 0) -> np.ndarray:
         """Copies a level (0: the map, 1: the first mip) to the host: linear radiance, float32 [h, w, 3]."""
         return unpack_rgb9e5(self.levels[level].numpy())
-
-
-def write_texture(path: str | os.PathLike[str], model: SheetModel, time: float, device: str = "cpu") -> None:
-    """Writes the map at one time as a renderer samples it: a DDS of RGB9E5 texels with all mips.
-
-    Args:
-        path: The DDS file to write.
-        model: The sheet.
-        time: In the unit of the set's times.
-        device: Device that decodes.
-
-    Raises:
-        WlmError: There is no such device, the time is not finite, the map is larger than a DDS may be, or the file can
-            not be written.
-    """
-    if max(model.height, model.width) > MOST_SIDE:
-        size = f"{model.width}x{model.height}"
-        raise WlmError(f"{model.name}: expected at most {MOST_SIDE} texels along each side of a DDS, found {size}")
-    decoder = MapDecoder(model, device)
-    decoder.set_time(time)
-    decoder.decode()
-    texels = b"".join(level.numpy().astype("<u4").tobytes() for level in decoder.levels)
-    mips = len(decoder.levels) - 1
-    write_dds(path, texels, model.width, model.height, fmt="R9G9B9E5_SHAREDEXP", mips=mips)
 
 
 def _halved(weight: np.ndarray) -> np.ndarray:

@@ -299,7 +299,6 @@ def _half_step(value: np.ndarray) -> np.ndarray:
 
 
 def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
-    """Returns whether the range of every channel of a tile is at most a step of half float at every time."""
     encoded = colour[:, valid].astype(np.float64)  # [T, K, 3]
     # Decoding is monotonic, so the extremes are taken before it.
     low, high = encoded.min(axis=1) ** gamma, encoded.max(axis=1) ** gamma
@@ -307,7 +306,6 @@ def _is_constant(colour: np.ndarray, valid: np.ndarray, gamma: float) -> bool:
 
 
 def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -> bool:
-    """Returns whether all texels are close to the channel means at every time, see `classify`."""
     linear = colour[:, valid].astype(np.float64) ** gamma
     error = np.abs(linear - linear.mean(axis=1, keepdims=True))
     allowed = peak * 10.0 ** (-_FLAT_DB / 20.0)
@@ -317,7 +315,6 @@ def _is_flat(colour: np.ndarray, valid: np.ndarray, gamma: float, peak: float) -
 def _is_static(
     colour: np.ndarray, valid: np.ndarray, means: np.ndarray, gamma: float, budget_db: float, set_peak: float | None
 ) -> bool:
-    """Returns whether the product of one colour per time, `means` [T, 3], and one pattern meets the budget."""
     pattern = static_pattern(colour[None], means[None])[0][valid] ** gamma  # [K, 3]
     for frame, mean in zip(colour, means, strict=True):
         linear = frame[valid].astype(np.float64) ** gamma

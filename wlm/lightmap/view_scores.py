@@ -36,7 +36,7 @@ from wlm.formats.geometry import Geometry, read_geometry
 from wlm.interop import check_device
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.tiles import TILE, TileGrid, valid_texels
-from wlm.metrics import MIN_VALID_TEXELS, FrameMetrics, Pictures, evaluate_frame, nanmean, psnr_from_mse
+from wlm.metrics import MIN_VALID_TEXELS, FrameMetrics, Pictures, evaluate_frame, lowest, nanmean, psnr_from_mse
 from wlm.ops import raster
 from wlm.ops.views import sphere_views, visible_points
 from wlm.texels import exposure, filmic, nearest_valid, to_srgb
@@ -143,7 +143,8 @@ def views_of(
         lightmaps, count, indices, device: As for `Views`.
 
     Returns:
-        The views, or None without a mesh or with a count of 0; and a warning if the mesh cannot be read, else None.
+        The views, or None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh
+        cannot be read, else none.
 
     Raises:
         WlmError: The count is negative, or there is no such device.
@@ -175,7 +176,7 @@ class ShownScore(ViewScore):
         seen: PSNR of bilinear reads at random points, dB, mean over tiles and times.
         seen_by_tile: float64 [rows, columns] of the grid, means over the times.
         seen_by_time: float64 [T], means over the tiles.
-        worst_seen: The tile and time with the lowest `seen`: `psnr`, `time`, `tile` (its number), `row`, `column`.
+        worst_seen: The tile and time with the lowest `seen`, as `wlm.metrics.lowest` returns them.
         ring: PSNR of the texels of gaps that touch a chart, dB, mean over tiles and times.
         between: PSNR half-way between stored times, dB, mean over tiles and intervals.
         worst_between: The tile and interval with the lowest `between`, as in `worst_seen`; `time` is the half-way time.
@@ -277,7 +278,6 @@ class Tally:
 
     def score(self) -> ShownScore:
         """Returns the scores of the added times."""
-        lightmaps = self._lightmaps
         by_time, by_tile = nanmean(self._seen, axis=(1, 2)), nanmean(self._seen, axis=0)
         across, inside = self._border
         border = math.sqrt(across / inside) if inside > 0 else (math.inf if across > 0 else math.nan)
@@ -286,10 +286,10 @@ class Tally:
             seen=float(nanmean(self._seen)),
             seen_by_tile=by_tile,
             seen_by_time=by_time,
-            worst_seen=self._place(self._seen, lightmaps.times),
+            worst_seen=lowest(self._seen, self._lightmaps.times),
             ring=float(nanmean(self._rings)),
             between=float(nanmean(self._between)),
-            worst_between=self._place(self._between, self._middles),
+            worst_between=lowest(self._between, self._middles),
             border=border,
             flicker=float(nanmean(np.array(self._flicker))),
         )
@@ -340,7 +340,6 @@ class Tally:
                 self._border += len(crossing) * np.array([across, inner.mean() / span**2])
 
     def _add_interval(self, index: int) -> None:
-        """Scores `between` and `flicker` in the interval after a stored time."""
         after = (index + 1) % self._count
         first, second = self._lightmaps.frames[index], self._lightmaps.frames[after]
         middle = float(self._middles[index])
@@ -366,20 +365,8 @@ class Tally:
             scale = 3 * self._valid.count * metrics.range
             self._flicker.append(np.divide(beyond, scale, out=np.full(scale.shape, math.nan), where=metrics.scored))
 
-    def _place(self, psnr: np.ndarray, times: np.ndarray) -> dict[str, float | int] | None:
-        """Returns the lowest of PSNRs [n, rows, columns] with its tile and time, as in `ShownScore.worst_seen`."""
-        if np.isnan(psnr).all():
-            return None
-        lowest = int(np.nanargmin(psnr))
-        index, tile = divmod(lowest, self._grid.count)
-        row, column = divmod(tile, self._grid.cols)
-        place = {"tile": tile, "row": row, "column": column}
-        return {"psnr": float(psnr.flat[lowest]), "time": float(times[index])} | place
-
 
 class _Texels:
-    """Selected texels of a map, whose values can be summed by tile."""
-
     def __init__(self, mask: np.ndarray, grid: TileGrid) -> None:
         self.at = np.nonzero(mask)
         self._tile = self.at[0] // TILE * grid.cols + self.at[1] // TILE

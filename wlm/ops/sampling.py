@@ -111,7 +111,7 @@ def sample(
     axes: int,
     names: tuple[str, str] = ("values", "points"),
 ) -> torch.Tensor:
-    """Implements `plane` (`axes` = 2) and `volume` (3); `names`: names of the values and the points in messages."""
+    """Interpolates a grid of 2 or 3 `axes` linearly at points, [..., C]; messages call values and points by `names`."""
     check(names[0], values, (None,) * (axes + 1 if layer is None else axes + 2))
     if 0 in values.shape:
         raise ValueError(f"{names[0]}: expected at least one cell and one channel, got {tuple(values.shape)}")

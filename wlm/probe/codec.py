@@ -146,7 +146,7 @@ def _planes(part: np.ndarray) -> bytes:
 
 
 def _split(frame: bytes, table: Mapping[str, Part], size: int) -> dict[str, np.ndarray]:
-    """Decompresses a zstd frame to a file's arrays and undoes `_planes`; `size` is the size of the file in bytes."""
+    """Decompresses a zstd frame of byte planes to a file's arrays, by name; `size` is the file's size in bytes."""
     sizes = {name: math.prod(part.shape) * np.dtype(part.dtype).itemsize for name, part in table.items()}
     total, most = sum(sizes.values()), _SURE + _PER_BYTE * size
     if total > most:

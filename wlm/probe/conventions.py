@@ -75,7 +75,7 @@ def _checked(values: np.ndarray) -> np.ndarray:
 
 
 def _factors(coefficients: int, name: str) -> np.ndarray:
-    """Returns the factors of an engine in the module's table, one per coefficient, float64 [C]."""
+    """Returns the factors from canonical coefficients to an engine's, one per coefficient, float64 [C]."""
     if name not in CONVENTIONS:
         raise WlmError(f"convention: expected {', '.join(CONVENTIONS)}, got {name!r}")
     if sh_count(3 * coefficients) is None:

@@ -277,7 +277,7 @@ def _lighting_data(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _only_sh(read: Callable[[Path], tuple], **known: str) -> Callable[[Path, str | None], _Raw]:
-    """Returns a reader of a kind of file with one array of values; `known` are fields of `_Raw` that hold for it."""
+    """Makes a function that reads a file of positions and one array "sh"; `known` are further fields of its result."""
 
     def reader(path: Path, key: str | None) -> _Raw:
         position, values, *remark = read(path)
@@ -454,7 +454,6 @@ def _probes(count: int) -> str:
 
 
 def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
-    """Returns a hash of the input, 16 hexadecimal digits, the same on every machine."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(np.asarray(values.shape, "<i8").tobytes())
     digest.update(np.ascontiguousarray(position, "<f8"))

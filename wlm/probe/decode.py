@@ -37,7 +37,6 @@ class Decoder(ABC):
             self._position = np.array(position, np.float64)
 
     def _put(self, array: np.ndarray, dtype: type) -> wp.array:
-        """Copies a part of the model to the device."""
         self._arrays.append(wp.array(array, dtype=dtype, device=self.device))
         return self._arrays[-1]
 

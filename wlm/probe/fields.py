@@ -135,7 +135,7 @@ def _fields(path: Path, content: Any) -> Fields:
 
 
 def _columns(first: dict[str, Any]) -> _Columns:
-    """Finds the members that hold the position and the light among `first`, those of an object with examples."""
+    """Finds by their names which members of a JSON object hold a probe's position and light; `first` has examples."""
     names = list(first)
     known = {_plain(name): name for name in reversed(names)}
     place = [_POSITION] if _POSITION in first else [known[each] for each in _PLACES if each in known][:1]
@@ -172,7 +172,7 @@ def _axes(names: list[str]) -> list[str]:
 
 
 def _light(names: list[str]) -> tuple[list[str], bool]:
-    """Finds names with consecutive numbers (`sh0`, `sh[ 1]`), or with these for each colour channel (`shr0`, `c0_g`).
+    """Finds names with consecutive numbers (`sh0`, `sh[ 1]`), or one such series per colour channel (`shr0`, `c0_g`).
 
     Returns:
         The names in order, and whether they go channel by channel; no names if they do not form a full set.
@@ -202,7 +202,6 @@ def _list_of_probes(content: Any) -> tuple[str, list] | None:
 
 
 def _is_scene(content: dict[str, Any]) -> bool:
-    """Whether the content is an object of three.js (Object3D.toJSON)."""
     metadata = content.get("metadata")
     return isinstance(content.get("object"), dict) and isinstance(metadata, dict) and metadata.get("type") == "Object"
 
@@ -260,7 +259,7 @@ def _numbers(path: Path, field: str, rows: list) -> np.ndarray:
 
 
 def _listed(value: Any, depth: int) -> Any:
-    """Replaces objects by lists: members x y z or r g b in this order, numbered ones in theirs, a single one alone."""
+    """Replaces JSON objects in a value by lists of members x, y, z or r, g, b or numbered; a lone member by itself."""
     if depth > _DEEPEST or not isinstance(value, dict | list):
         return value
     if isinstance(value, list):
@@ -288,7 +287,6 @@ def _array(value: object, kinds: str) -> np.ndarray | None:
 
 
 def _kind(value: object) -> str:
-    """Returns a short description of a JSON value for messages."""
     text = "an object" if isinstance(value, dict) else json.dumps(value)
     return text if len(text) <= 60 else text[:57] + "..."
 

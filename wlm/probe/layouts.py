@@ -73,8 +73,8 @@ def choose_order(values: np.ndarray, convention: str, order: str | None) -> tupl
 
 
 def _doubt(sample: np.ndarray, order: str, convention: str) -> tuple[float, float]:
-    """Returns the share of probes [N, 3 C] that exceed the bound of light, and the share of squares in differences of
-    channels."""
+    """Reads probes [N, 3 C] in an order; returns the share of them that cannot be light, and the share of the sum of
+    squares that is in differences between channels."""
     sample = sample / np.abs(sample).max(axis=1, keepdims=True)
     light = to_canonical(coefficients_first(sample, order), convention)
     band, first = coefficient_bands(light.shape[1]), light[:, 0]
@@ -87,7 +87,6 @@ def _doubt(sample: np.ndarray, order: str, convention: str) -> tuple[float, floa
 
 
 def _better(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Whether light in one order, by `_doubt`, is plausible and clearly more so than in the other."""
     if one[0] > _APART or one[0] > other[0] + _FEW:
         return False
     return other[0] > one[0] + _APART or other[1] > max(_TINTED, 3.0 * one[1])

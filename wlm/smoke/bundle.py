@@ -14,8 +14,6 @@ _ABOUT = {
     "textures": "Frames of six-way lightmaps are in rows of cells from the top left, each of frame_size pixels with "
     "padding around it. They are linear and premultiplied by the opacity; light is multiplied by gain. channels names "
     "the direction from which the light of each channel comes, as seen from the camera.",
-    "motion": "Motion to the right and up until the next frame, in fractions of a frame: 127/255 + motion / (2 "
-    "motion_scale).",
     "rate": "Frames per second.",
     "extent": "Width and height of the region that a frame shows, in world units.",
     "levels": "Number of mip levels; beyond them frames bleed into their neighbours.",
@@ -59,7 +57,6 @@ def bundle(book: Book, *, name: str = "smoke", device: str = "cpu") -> Bundle:
         "gain": book.gain,
         "rate": book.rate,
         "extent": [book.extent * width / height, book.extent],
-        "motion_scale": book.scale,
         "clipped": clipped,
     }
     return Bundle("smoke", name, billboard_shader(book), document, textures)

@@ -278,8 +278,7 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
     with _writing(folder):
         folder.mkdir(exist_ok=True)
         if not resume:
-            earlier = [path for stem in ("frame", "velocity") for path in numbered(folder, stem, ".npz").values()]
-            for path in (*earlier, folder / CHECKPOINT):
+            for path in (*numbered(folder, "frame", ".npz").values(), folder / CHECKPOINT):
                 path.unlink(missing_ok=True)
     content = {"format": _FORMAT, "version": _VERSION, "scene": scene.model_dump(mode="json")}
     atomic_write(folder / SCENE_FILE, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
@@ -491,7 +490,6 @@ def read_shaded(
 
 @contextmanager
 def _writing(folder: Path) -> Iterator[None]:
-    """Converts an error of the file system to a WlmError that names the folder."""
     try:
         yield
     except OSError as error:

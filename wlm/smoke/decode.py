@@ -221,7 +221,7 @@ class _Tail:
         self._smoke = torch.empty(blocks, dtype=torch.int32, device=device)
 
     def __call__(self, heads: torch.Tensor, guide: torch.Tensor, planes: torch.Tensor) -> None:
-        """Writes planes [8, H, W] from the outputs of `_Body` and the guide [C, H, W]."""
+        """Writes `planes` [8, H, W]: the heads' outputs plus the filtered guide [C, H, W], and 0 far from smoke."""
         kernels, source = self._kernels, to_warp(guide)
         _launch(kernels.near, kernels.lanes * self._smoke.numel(), [source], self._smoke)
         pixels = to_warp(heads.permute(0, 2, 3, 1))

@@ -17,7 +17,6 @@ from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked
 from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
-from wlm.smoke.march.motion import velocity_file, write_velocity
 from wlm.smoke.scene import Inlet, ObstacleSettings, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
 
@@ -96,7 +95,6 @@ def simulate(
     device: str = "cpu",
     resume: bool = False,
     checkpoint_every: float = EVERY,
-    velocity: bool = False,
     progress: OnProgress | None = None,
 ) -> int:
     """Simulates a scene and writes its frames.
@@ -112,7 +110,6 @@ def simulate(
         device: Device that `wlm.interop.check_device` returned.
         resume: Whether to continue from a saved state, if there is one. A state past the last requested frame is kept.
         checkpoint_every: Seconds between two saves of the state; 0: after every step.
-        velocity: Whether to write the air's velocity beside each frame; flip books need it for motion vectors.
         progress: Called after each frame, with the figures `smoke`, the integral of the density over the box, and
             `frame s`, the seconds of the frame; and about twice a second within a frame, without figures.
 
@@ -125,7 +122,6 @@ def simulate(
     """
     with locked(frames.path):
         scene, checkpoint = frames.scene, frames.path / CHECKPOINT
-        reach = scene.grid.cell * scene.steps
         missing = sorted(set(range(1, scene.frames + 1)) - set(frames.numbers))
         saved = resume and checkpoint.exists()
         if resume and not saved and not missing:
@@ -154,8 +150,6 @@ def simulate(
                     solver.check()
                     volume = volume_of(scene, solver)
                     # Written before the state: a state without its frame could not be resumed.
-                    if velocity:
-                        write_velocity(velocity_file(frames.path, frame), solver.velocity, reach)
                     save_volume(frames.file(frame), volume, bricks=True)
                 if pace.due():
                     with pace.saving():

@@ -1,7 +1,6 @@
 """Draws named meshes, lines and volumes in the panels of a window; drawing a name again updates it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -9,23 +8,6 @@ import numpy as np
 
 _LEVELS = 256  # of the opacity table of smoke
 _STEP = 0.5  # voxels between two samples of smoke; 1 shows stripes, and much smaller steps lose colour to rounding
-
-
-@dataclass(frozen=True)
-class Hit:
-    """The point of a mesh under the cursor.
-
-    Attributes:
-        panel: Index of the panel.
-        name: Name of the mesh.
-        cell: Index of the triangle.
-        weights: float64 [3], barycentric weights of the triangle's corners at the point.
-    """
-
-    panel: int
-    name: str
-    cell: int
-    weights: np.ndarray
 
 
 class Canvas:
@@ -36,7 +18,6 @@ class Canvas:
         self._pyvista, self._plotter = pyvista, plotter
         self.renderers = plotter.renderers[:panels]
         self._drawn: dict[tuple[int, str], tuple[Any, Any]] = {}  # the actor and its data
-        self._one_sided: set[tuple[int, str]] = set()
 
     def textured(
         self,
@@ -67,7 +48,7 @@ class Canvas:
         texture = self._pyvista.Texture(np.ascontiguousarray(picture))
         texture.interpolate, texture.repeat = not nearest, False
         drawn[0].texture = texture
-        self._leave_out(panel, name, one_sided)
+        self._drawn[panel, name][0].prop.culling = "back" if one_sided else "none"
         drawn[0].visibility = True
 
     def coloured(
@@ -96,7 +77,7 @@ class Canvas:
             mesh = self._triangles(position, triangle)
             mesh.point_data["colours"] = colours
             self._add(panel, name, mesh, scalars="colours", rgb=True, lighting=shape)
-        self._leave_out(panel, name, one_sided)
+        self._drawn[panel, name][0].prop.culling = "back" if one_sided else "none"
 
     def line(self, panel: int, name: str, points: np.ndarray, colour: str, *, closed: bool = False) -> None:
         """Draws a line through points [N, 3]."""
@@ -155,41 +136,6 @@ class Canvas:
             if (panel, name) in self._drawn:
                 self._drawn[panel, name][0].visibility = False
 
-    def hit(self, x: int, y: int) -> Hit | None:
-        """Finds the mesh triangle at a pixel of the window (origin at the lower left); None if there is none."""
-        from vtkmodules.vtkRenderingCore import vtkCellPicker
-
-        for panel, renderer in enumerate(self.renderers):
-            if not renderer.IsInViewport(x, y):
-                continue
-            here = {name: drawn for (where, name), drawn in self._drawn.items() if where == panel}
-            # The picker also hits hidden back faces, so one-sided meshes are intersected without it.
-            walls = {name for name in here if (panel, name) in self._one_sided and here[name][0].visibility}
-            for name, (actor, _) in here.items():
-                actor.pickable = name not in walls
-            picker = vtkCellPicker()
-            picker.SetTolerance(0.0)
-            picker.Pick(x, y, 0, renderer)
-            origin = _world(renderer, x, y, 0.0)
-            ray = _world(renderer, x, y, 1.0) - origin
-            hits = [
-                (distance, Hit(panel, name, cell, weights))
-                for name in walls
-                for distance, cell, weights in _front_hits(here[name][1], origin, ray)
-            ]
-            for name, (actor, _) in here.items():
-                if actor is picker.GetActor():
-                    r, s, _ = picker.GetPCoords()
-                    distance = (np.array(picker.GetPickPosition()) - origin) @ ray / (ray @ ray)
-                    hits.append((distance, Hit(panel, name, picker.GetCellId(), np.array([1.0 - r - s, r, s]))))
-            return min(hits, key=lambda hit: hit[0])[1] if hits else None
-        return None
-
-    def _leave_out(self, panel: int, name: str, one_sided: bool) -> None:
-        """Hides or shows the back faces of a mesh."""
-        self._drawn[panel, name][0].prop.culling = "back" if one_sided else "none"
-        (self._one_sided.add if one_sided else self._one_sided.discard)((panel, name))
-
     def _triangles(self, position: np.ndarray, triangle: np.ndarray) -> Any:
         points = np.asarray(position, np.float32)
         return self._pyvista.PolyData.from_regular_faces(points, np.asarray(triangle, np.int64))
@@ -200,31 +146,3 @@ class Canvas:
         actor = self._plotter.add_mesh(mesh, name=f"{panel} {name}", render=False, reset_camera=False, **options)
         self._drawn[panel, name] = actor, mesh
         return actor, mesh
-
-
-def _world(renderer: Any, x: int, y: int, depth: float) -> np.ndarray:
-    """Returns the point float64 [3] at a pixel and a depth between the near plane, 0, and the far plane, 1."""
-    renderer.SetDisplayPoint(x, y, depth)
-    renderer.DisplayToWorld()
-    *point, share = renderer.GetWorldPoint()
-    return np.array(point) / share
-
-
-def _front_hits(mesh: Any, origin: np.ndarray, direction: np.ndarray) -> list[tuple[float, int, np.ndarray]]:
-    """Finds the nearest front face that a ray hits: distance in lengths of `direction`, index, barycentric weights."""
-    a, b, c = np.asarray(mesh.points, np.float64)[mesh.regular_faces].transpose(1, 0, 2)
-    across, along = b - a, c - a  # as Möller and Trumbore 1997
-    turned = np.cross(direction, along)
-    scale = np.einsum("fk,fk->f", across, turned)
-    front = np.flatnonzero(scale > 0.0)  # the others face away or are edge-on
-    scale, turned, across, along = scale[front], turned[front], across[front], along[front]
-    away = origin - a[front]
-    r = np.einsum("fk,fk->f", away, turned) / scale
-    lifted = np.cross(away, across)
-    s = lifted @ direction / scale
-    distance = np.einsum("fk,fk->f", along, lifted) / scale
-    met = np.flatnonzero((r >= 0.0) & (s >= 0.0) & (r + s <= 1.0) & (distance >= 0.0))
-    if not len(met):
-        return []
-    first = met[np.argmin(distance[met])]
-    return [(float(distance[first]), int(front[first]), np.array([1.0 - r[first] - s[first], r[first], s[first]]))]

@@ -21,7 +21,7 @@ from wlm.probe.sphere import irradiance, irradiance_weights, sh_count, unit_or_z
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.walk import camera_path, settle
-from wlm.view.canvas import Canvas, Hit
+from wlm.view.canvas import Canvas
 from wlm.view.scene import Scene, Slider, State, frame_slider
 from wlm.view.surface import compared
 
@@ -41,7 +41,6 @@ class Probes:
 
     Attributes:
         position: float64 [N, 3].
-        number: int [N], index of each probe in the file.
         values: float32 [N, C, 3] by name, "decoded" or "original" or both.
         decode: Function that returns light float32 [M, 3 C] at points [M, 3].
         model: The model, if it has Gaussians; otherwise None.
@@ -49,7 +48,6 @@ class Probes:
     """
 
     position: np.ndarray
-    number: np.ndarray
     values: dict[str, np.ndarray]
     decode: Callable[[np.ndarray], np.ndarray]
     model: ProbeModel | None
@@ -71,7 +69,7 @@ def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key
     shapes = model if isinstance(model.content, Gaussians) else None
     gaussians = "" if shapes is None else f"{shapes.content.count:,} Gaussians, "
     note = f"{model.name}, {len(places):,} probes, {gaussians}profile {model.profile.name}"
-    return Probes(places, np.flatnonzero(live), values, decoder.decode, shapes, note)
+    return Probes(places, values, decoder.decode, shapes, note)
 
 
 def set_probes(probes: ProbeSet, title: str) -> Probes:
@@ -89,7 +87,7 @@ def set_probes(probes: ProbeSet, title: str) -> Probes:
 
     shown = {"original": values.reshape(-1, count, 3)}
     note = f"{probes.name}, {len(places):,} live probes, {probes.key}"
-    return Probes(places, np.flatnonzero(probes.live), shown, nearest, None, note)
+    return Probes(places, shown, nearest, None, note)
 
 
 def probe_scene(
@@ -172,8 +170,7 @@ class _ProbeScene(Scene):
                 decoded = name != "error" and (name == "decoded" or "decoded" not in self.panels)
                 lit = display.picture(self._surface) if decoded else np.full(self._surface.shape, _GREY, np.uint8)
                 place = self.geometry.position, self.geometry.triangle
-                hidden = self.room and not state.outside
-                canvas.coloured(panel, _MESH, *place, lit, shape=not decoded, one_sided=hidden)
+                canvas.coloured(panel, _MESH, *place, lit, shape=not decoded, one_sided=self.room)
         windows = [f"window {level}" for level in range(len(self.volume.sizes))]
         if state.view != "balls":
             canvas.hide(0, _BALLS, _MESH)
@@ -199,16 +196,6 @@ class _ProbeScene(Scene):
             size = self.volume.sizes[0]
             text += f"; {held:,} blocks, the finest {size:.3g} wide, {self._stats.updated} new, {waiting:,} waiting"
         return text
-
-    def describe(self, hit: Hit, state: State) -> str:
-        if hit.name == _BALLS:
-            probe = hit.cell // len(self._ball_faces)
-            place = ", ".join(f"{x:.4g}" for x in self.probes.position[probe])
-            values = (f"{name} {_mean(sh[probe])}" for name, sh in self.probes.values.items())
-            return f"probe {self.probes.number[probe]} at {place}   mean radiance: {', '.join(values)}"
-        if hit.name == _GAUSSIANS:
-            return f"Gaussian {hit.cell // len(self._ball_faces)}"
-        return ""
 
     def _draw_gaussians(self, canvas: Canvas, state: State) -> None:
         model = self.probes.model
@@ -269,12 +256,7 @@ def _coefficients(outputs: int, title: str) -> int:
     return count
 
 
-def _mean(values: np.ndarray) -> str:
-    return " ".join(f"{value:.4g}" for value in values[0] / math.sqrt(4.0 * math.pi))
-
-
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns vertices [V, 3] of unit length and triangles [F, 3] of a sphere."""
     sphere = creation.icosphere(subdivisions=subdivisions)
     return np.array(sphere.vertices), np.array(sphere.faces)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wlm.view.canvas import Canvas, Hit
+from wlm.view.canvas import Canvas
 from wlm.view.display import TONES, Display
 
 
@@ -45,7 +45,7 @@ class Slider:
         return f"{shown} ({minutes // 60}:{minutes % 60:02})" if self.clock else shown
 
     def fit(self, value: float) -> float:
-        """Nearest allowed value."""
+        """Returns a value wrapped or clamped to the slider's range, and rounded if only integers are allowed."""
         if self.wraps and not self.low <= value <= self.high:
             value = self.low + (value - self.low) % (self.high - self.low)
         value = min(max(value, self.low), self.high)
@@ -53,7 +53,7 @@ class Slider:
 
 
 def frame_slider(count: int, views: tuple[str, ...] = ()) -> tuple[Slider, ...]:
-    """A slider of frame numbers from 1 to `count`; no slider for a single frame."""
+    """Returns a tuple with a slider of frame numbers from 1 to `count`; empty for a single frame."""
     if count < 2:
         return ()
     return (Slider("frame", 1, count, 1, 1, ".0f", f" of {count}", whole=True, views=views),)
@@ -67,13 +67,11 @@ class State:
         values: Values of the sliders by name.
         view: One of the scene's views.
         tone: One of `wlm.view.display.TONES`.
-        outside: Whether the walls of a room are also drawn when seen from outside.
     """
 
     values: dict[str, float]
     view: str
     tone: str = TONES[0]
-    outside: bool = False
 
     @property
     def frame(self) -> int:
@@ -81,7 +79,7 @@ class State:
         return int(self.values.get("frame", 1)) - 1
 
     def display(self, exposure: float) -> Display:
-        """Display settings; `exposure` is the exposure at 0 EV."""
+        """Returns how light is shown by the sliders of exposure and error; `exposure` is the factor at 0 EV."""
         return Display(exposure * 2.0 ** self.values.get("exposure", 0.0), self.tone, self.values.get("error", 1.0))
 
 
@@ -120,7 +118,3 @@ class Scene(ABC):
     def box(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Lowest and highest corner of the region that the first camera shows; None for everything that is drawn."""
         return None
-
-    def describe(self, hit: Hit, state: State) -> str:
-        """One line about the point under the cursor; may be empty."""
-        return ""

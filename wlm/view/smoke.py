@@ -114,7 +114,7 @@ class Drawing:
         return (points - np.asarray(self._camera.position)).astype(np.float32), triangles, owner
 
     def draw_obstacles(self) -> None:
-        """Fills `solid_light` and `solid_depth`."""
+        """Draws the obstacles at their current positions into `solid_light` and `solid_depth`."""
         if not self._obstacles:
             return
         with stream(self._device):
@@ -122,7 +122,7 @@ class Drawing:
             kernels.light_solids(self._solids, self._as_lamps(), _AMBIENT, self._camera.in_world(), *out)
 
     def draw_shadows(self, surface: torch.Tensor) -> None:
-        """Fills `visibility` for a surface of smoke at distances [H, W] along the rays; 0: no surface, which is lit."""
+        """Writes to `visibility` which lights reach the smoke's surface at distances [H, W]; 0: no surface, lit."""
         if self._obstacles:
             with stream(self._device):
                 view = self._camera.in_world()
@@ -139,7 +139,7 @@ class Drawing:
             `image`.
 
         Raises:
-            ValueError: The lightmaps lack a plane, or a light is a point light.
+            ValueError: Transparency or depth is missing, or six-way lightmaps are drawn under a point light.
         """
         six = smoke if isinstance(smoke, SixWay) else None
         seen = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke

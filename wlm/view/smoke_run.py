@@ -138,8 +138,6 @@ def run(
 
 
 class _Clock:
-    """Measures the duration of stages, each until the device has finished."""
-
     def __init__(self, device: str) -> None:
         self._device, self.seconds = device, {}
         self._begin = self._now()

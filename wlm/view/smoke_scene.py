@@ -18,7 +18,7 @@ from wlm.smoke.data import Frames, read_six_way
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.shading import Light
 from wlm.system import Meter, OnProgress
-from wlm.view.canvas import Canvas, Hit
+from wlm.view.canvas import Canvas
 from wlm.view.display import Display
 from wlm.view.scene import Scene, Slider, State, frame_slider
 from wlm.view.surface import flat_geometry
@@ -135,18 +135,6 @@ class _SixWayScene(Scene):
         count, light = len(self.frames), "right {:.2f}, up {:.2f}, front {:.2f}".format(*_toward(state))
         return f"{width} × {height}, {count} frame{'s' * (count > 1)}; light from {light}"
 
-    def describe(self, hit: Hit, state: State) -> str:
-        if hit.name != _SMOKE:
-            return ""
-        frame = self._frame(state)
-        height, width = frame.lightmaps.shape[1:]
-        board = flat_geometry(height, width)
-        u, v = hit.weights @ board.uv[board.triangle[hit.cell]]
-        column, row = min(int(u * width), width - 1), min(int(v * height), height - 1)
-        values = [f"{name} {float(frame[name][row, column]):.3g}" for name in DIRECTIONS]
-        values.append(f"alpha {1.0 - float(frame.transparency[row, column]):.3g}")
-        return f"pixel {column}, {row}   {', '.join(values)}"
-
     def _frame(self, state: State) -> SixWay:
         return self.frames[state.frame]
 
@@ -219,7 +207,6 @@ def _coarser(volume: DensityVolume, most: int) -> DensityVolume:
 
 
 def _squares(height: int, width: int) -> np.ndarray:
-    """Makes a checkerboard, float32 [height, width, 3]."""
     side = max(height, width) / _SQUARES
     rows, columns = (np.arange(n) // side for n in (height, width))
     odd = (rows[:, None] + columns) % 2

@@ -16,7 +16,7 @@ from wlm.lightmap.model import SheetModel
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.texels import exposure, fill_gaps
-from wlm.view.canvas import Canvas, Hit
+from wlm.view.canvas import Canvas
 from wlm.view.display import heat
 from wlm.view.scene import Scene, Slider, State
 
@@ -70,10 +70,6 @@ class SurfaceScene(Scene):
         """Light float32 [H, W, 3] by name, "decoded" or "original" or both, with the gaps between charts filled."""
 
     @abstractmethod
-    def tell_texel(self, row: int, column: int, state: State) -> str:
-        """Text with further facts about a texel, besides its position and light."""
-
-    @abstractmethod
     def tile_colours(self) -> np.ndarray:
         """Colours [H, W, 3] in [0, 1] of the texels' tiles, for the view "tiles"."""
 
@@ -91,20 +87,8 @@ class SurfaceScene(Scene):
                 mixed = _SHARE * 255.0 * self.tile_colours() + (1.0 - _SHARE) * picture
                 picture = (mixed + 0.5).astype(np.uint8)
             shape = self.geometry
-            place, hidden = (shape.position, shape.triangle, shape.uv), self.room and not state.outside
-            canvas.textured(panel, _MESH, *place, picture, nearest=self.flat, one_sided=hidden)
-
-    def describe(self, hit: Hit, state: State) -> str:
-        u, v = hit.weights @ self.geometry.uv[self.geometry.triangle[hit.cell]]
-        column = int(np.clip(np.floor(u * self.width), 0, self.width - 1))
-        row = int(np.clip(np.floor(v * self.height), 0, self.height - 1))
-        values = ", ".join(f"{name} {_rgb(light[row, column])}" for name, light in self.lights(state).items())
-        parts = (f"texel {column}, {row}", f"UV {u:.4f} {v:.4f}", self.tell_texel(row, column, state), values)
-        return "   ".join(filter(None, parts))
-
-
-def _rgb(light: np.ndarray) -> str:
-    return " ".join(f"{value:.4g}" for value in light)
+            place = shape.position, shape.triangle, shape.uv
+            canvas.textured(panel, _MESH, *place, picture, nearest=self.flat, one_sided=self.room)
 
 
 def lightmap_scene(
@@ -196,14 +180,6 @@ class _LightmapScene(SurfaceScene):
         whole[:, ::TILE] *= 0.3
         return whole[: self.height, : self.width]
 
-    def tell_texel(self, row: int, column: int, state: State) -> str:
-        outside = "" if self.mask is None or self.mask[row, column] else "outside the mask"
-        if self.model is None:
-            return outside
-        number = row // TILE * self.model.grid.cols + column // TILE
-        told = f"tile {number} ({TileKind(self.model.kind[number]).name.lower()})"
-        return "   ".join(filter(None, (told, outside)))
-
     def caption(self, state: State) -> str:
         self.lights(state)
         note = f"; {self._shown[2]}" if self._shown[2] else ""
@@ -281,19 +257,6 @@ class _AtlasScene(SurfaceScene):
         colours[::side] *= 0.7
         colours[:, ::side] *= 0.7
         return colours
-
-    def tell_texel(self, row: int, column: int, state: State) -> str:
-        outside = "" if self.mask[row, column] else "outside charts"
-        if self.model is None or self.model.method != "tiles":
-            return outside
-        side = self.model.profile.tile
-        y, x = (
-            min(place // side, count - 1) for place, count in zip((row, column), self.model.lut.shape, strict=False)
-        )
-        entries = unpack_entries(self.model.lut, self.model.first_block_code)
-        (left, top), (wide, high), (blocks, _) = (part[y, x] for part in entries)
-        text = f"tile {x}, {y}: {wide} × {high} texels{' of blocks' * bool(blocks)} at {left}, {top}"
-        return text + f"   {outside}" * bool(outside)
 
     def caption(self, state: State) -> str:
         if self.model is None:

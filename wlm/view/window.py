@@ -1,26 +1,18 @@
-"""A window that shows a scene: panels side by side, sliders below them, keys; on screen, as a picture or a movie."""
+"""A window that shows a scene: panels side by side, sliders below them, keys; on screen or as a picture."""
 
 import os
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from wlm.errors import WlmError
-from wlm.formats.atomic import atomic_path
 from wlm.formats.hdr_blocks import need
-from wlm.system import Meter, OnProgress
-from wlm.view.canvas import Canvas, Hit
+from wlm.view.canvas import Canvas
 from wlm.view.display import TONES
 from wlm.view.pictures import save_png
 from wlm.view.rendering import require_opengl
 from wlm.view.scene import Scene, Slider, State
-
-MOVIES = {".gif": "GIF", ".webp": "WEBP"}
-"""Formats of movies by file suffix."""
 
 STRIP = 108
 """Height in pixels of the strip with the sliders at the bottom; at most half of the window's height."""
@@ -29,12 +21,11 @@ _HIDDEN = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")  # windows that VTK 
 _BACKGROUND, _STRIP, _INK, _BAR = "#5a5d63", "#25272b", "#e8e8ea", "#8ab4f8"
 _TITLE_PIXELS, _FONT, _TITLE_FONT = 26, 9, 10
 # Positions in the strip, as fractions of its height and width.
-_LABELS, _BARS, _CAPTION, _TOLD, _INDENT, _LEAST_CELLS = 0.76, 0.64, 0.30, 0.06, 0.01, 3
+_LABELS, _BARS, _CAPTION, _KEYS, _INDENT, _LEAST_CELLS = 0.76, 0.64, 0.30, 0.06, 0.01, 3
 _EYE = (1.0, 0.8, 1.0)  # direction of the first camera, with y up
 _MARGIN = 1.06
 _SWEEP = 12.0  # seconds to play a slider of real values once
 _TICK = 30  # milliseconds
-_FRAMES = 48  # of a movie
 _EXPOSURE = Slider("exposure", -8.0, 8.0, 0.0, 0.5, "+.1f", unit=" EV")
 _ERROR = Slider("error", 1.0, 64.0, 8.0, 1.0, ".0f", "×", whole=True)
 
@@ -80,10 +71,9 @@ class Window:
             )
         if not off_screen and self._plotter.render_window.GetClassName() in _HIDDEN:
             self._plotter.close()
-            raise WlmError("view: expected a display, found none; --screenshot and --movie need none")
+            raise WlmError("view: expected a display, found none; --screenshot needs none")
         self.canvas = Canvas(pyvista, self._plotter, count)
         self._widgets: dict[str, tuple[Any, Any]] = {}
-        self._hit: Hit | None = None
         self._furnish()
         self.draw()
         self.look()
@@ -123,17 +113,6 @@ class Window:
         self.state.tone = name
         self.draw()
 
-    def outside(self, seen: bool) -> None:
-        """Shows or hides the walls of a room that are seen from outside.
-
-        Raises:
-            WlmError: The scene is not a room.
-        """
-        if not self.scene.room:
-            raise WlmError(f"{self.scene.title}: --outside: expected the mesh of a room, whose walls face its middle")
-        self.state.outside = seen
-        self.draw()
-
     def turn(self, degrees: float) -> None:
         """Turns the camera about the scene's upward axis.
 
@@ -171,12 +150,8 @@ class Window:
         chosen = "   ".join(f"[{i} {v}]" if v == self.state.view else f"{i} {v}" for i, v in enumerate(views, 1))
         parts = [f"view: {chosen}" if len(views) > 1 else "", self.scene.caption(self.state)]
         self._texts["caption"].SetInput("      ".join(filter(None, parts)))
-        self._tell()
-
-    def tell(self, x: int, y: int) -> str:
-        """Describes the point at a pixel, counted from the lower left, and shows the text in the window."""
-        self._hit = self.canvas.hit(x, y)
-        return self._tell()
+        # Keys have no effect in a picture.
+        self._texts["keys"].SetInput("" if self._plotter.off_screen else self.help())
 
     def picture(self) -> np.ndarray:
         """Renders the window, uint8 [H, W, 3]."""
@@ -192,38 +167,6 @@ class Window:
         """
         save_png(path, self.picture())
 
-    def movie(
-        self, path: str | os.PathLike[str], frames: int | None = None, *, progress: OnProgress | None = None
-    ) -> int:
-        """Plays the scene once and writes it as a GIF or WebP that loops.
-
-        Args:
-            path: A path with a suffix in `MOVIES`.
-            frames: Number of pictures; None for 48, or for all frames if frames are played.
-            progress: Called about twice a second.
-
-        Returns:
-            The number of pictures.
-
-        Raises:
-            WlmError: The file cannot be written, or the number of pictures is not at least 1.
-        """
-        suffix = Path(path).suffix.lower()
-        if suffix not in MOVIES:
-            raise WlmError(f"{path}: expected a name that ends in {' or '.join(MOVIES)}, found {suffix or 'none'}")
-        if frames is not None and frames < 1:
-            raise WlmError(f"--frames: expected at least 1, got {frames}")
-        count = self._count(frames)
-        pictures, meter = [], Meter(progress, "draw", count)
-        for picture in self._played_once(count):
-            pictures.append(Image.fromarray(picture))
-            if meter.due(len(pictures)):
-                meter.report(len(pictures))
-        options = {"save_all": True, "append_images": pictures[1:], "duration": 1000.0 / self._rate, "loop": 0}
-        with atomic_path(path) as temporary:
-            pictures[0].save(temporary, format=MOVIES[suffix], **options)
-        return len(pictures)
-
     def show(self) -> None:
         """Shows the window until the user closes it."""
         interactor = self._plotter.iren
@@ -231,7 +174,6 @@ class Window:
         if self.scene.flat:
             interactor.enable_2d_style()
         interactor.add_observer("TimerEvent", lambda *_: self._tick())
-        interactor.add_observer("MouseMoveEvent", lambda *_: self._hover())
         interactor.create_timer(_TICK, repeating=True)
         self._plotter.show(auto_close=True)
 
@@ -246,7 +188,6 @@ class Window:
             self._plotter.render()
 
     def _furnish(self) -> None:
-        """Adds titles, sliders, texts and keys."""
         plotter = self._plotter
         for number, title in enumerate(self.scene.panels):
             plotter.subplot(0, number)
@@ -261,7 +202,7 @@ class Window:
                 "", position=(x, y), viewport=True, font_size=_FONT, color=_INK, name=name, font="arial"
             )
 
-        self._texts = {"caption": text("caption", _INDENT, _CAPTION), "told": text("told", _INDENT, _TOLD)}
+        self._texts = {"caption": text("caption", _INDENT, _CAPTION), "keys": text("keys", _INDENT, _KEYS)}
         for name, slider in self.sliders.items():
             label = text(f"slider {name}", 0.0, _LABELS)
             widget = plotter.add_slider_widget(
@@ -290,8 +231,6 @@ class Window:
             "Left": lambda: self._move(self._main(), -1),
             "Right": lambda: self._move(self._main(), 1),
         }
-        if self.scene.room:
-            self._keys["b"] = lambda: self.outside(not self.state.outside)
         for number, view in enumerate(self.scene.views, 1):
             self._keys[str(number)] = lambda view=view: self.choose(view)
         # The default keys of the plotter and VTK would switch to stereo and wireframe.
@@ -302,20 +241,12 @@ class Window:
             plotter.add_key_event(key, lambda key=key: self.press(key))
 
     def _shows(self, name: str) -> bool:
-        """Returns whether a slider has an effect in the current view."""
         views = self.sliders[name].views
         return not views or self.state.view in views
 
     def _player(self) -> str | None:
-        """Name of the slider that playing moves in this view; None if the camera turns."""
         name = self.scene.plays
         return name if name is not None and self._shows(name) else None
-
-    def _tell(self) -> str:
-        told = self.scene.describe(self._hit, self.state) if self._hit is not None else ""
-        # Keys have no effect in a picture or a movie.
-        self._texts["told"].SetInput(told or ("" if self._plotter.off_screen else self.help()))
-        return told
 
     def help(self) -> str:
         """One line about the keys that have an effect in this view."""
@@ -327,14 +258,12 @@ class Window:
             "- +": "error" if "error" in self.sliders else None,
             "T": "tone",
             f"1 to {views}": "view" if views > 1 else None,
-            "B": "walls from outside" if self.scene.room else None,
             "R": "first camera",
             "Q": "closes",
         }
         return "keys:   " + "   ".join(f"{key} {what}" for key, what in does.items() if what)
 
     def _lay_out(self) -> None:
-        """Places the sliders of the view side by side, with their values."""
         shown = [name for name in self.sliders if self._shows(name)]
         cell = 1.0 / max(len(shown), _LEAST_CELLS)
         for name, slider in self.sliders.items():
@@ -369,30 +298,6 @@ class Window:
             self.advance(now - self._last)
             self._last = now
             self._plotter.render()
-
-    def _hover(self) -> None:
-        before = self._texts["told"].GetInput()
-        if self.tell(*self._plotter.iren.interactor.GetEventPosition()) != before:
-            self._plotter.render()
-
-    def _count(self, frames: int | None) -> int:
-        """Returns the number of pictures of a movie; `frames` if given."""
-        name = self._player()
-        slider = None if name is None else self.sliders[name]
-        return frames or (round(slider.high - slider.low) + 1 if slider is not None and slider.whole else _FRAMES)
-
-    def _played_once(self, count: int) -> Iterator[np.ndarray]:
-        name = self._player()
-        if name is None:
-            for _ in range(count):
-                yield self.picture()
-                self.turn(360.0 / count)
-            return
-        slider = self.sliders[name]
-        ends = slider.high - slider.low
-        for number in range(count):
-            self.set(name, slider.low + ends * number / (count if slider.wraps else max(count - 1, 1)))
-            yield self.picture()
 
     def look(self) -> None:
         """Places the camera so that it sees the whole scene."""

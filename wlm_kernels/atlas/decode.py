@@ -121,7 +121,7 @@ def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None
 
 @wp.func
 def _in_block(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
-    """Returns the same as `axis_at`, for a rectangle of a single block: the first block of `entry`."""
+    """Returns the texels and weight at `place` (0 to 1) along one axis of the 4 x 4 block with which `entry` begins."""
     return axis_at(entry - (entry & wp.uint16(_SIDE_MASK)) + wp.uint16(first_block_code), place, first_block_code)
 
 

@@ -263,7 +263,7 @@ def _join(
     # out:
     joined: wp.array1d[int],
 ):
-    """Finds for one node per thread the group that it joins; see `join`."""
+    """Finds for one node per thread the least rank of a group whose representative is alike; H if none of H is."""
     i = offset + wp.tid()
     a = nodes[i]
     margin = rule.level + _MARGIN

@@ -1,7 +1,7 @@
-"""Draws random points on a mesh, at which the textures of a cascade are tuned (lightmap-uv-clustering-cascade,
-section 3.3.3).
+"""Random points on a mesh, at which the textures of a cascade are tuned, and the gradient of the loss there
+(lightmap-uv-clustering-cascade, section 3.3.3).
 
-`tests/kernels/test_surface.py` tests their distribution.
+`tests/kernels/test_surface.py` tests the points' distribution, `tests/atlas/test_cascade.py` the gradient.
 """
 
 import warp as wp
@@ -53,6 +53,49 @@ def _surface_points(
     triangle[count + i] = t
     barycentric[i] = b
     barycentric[count + i] = partner
+
+
+@wp.func
+def _difference(value: wp.array3d[float], target: wp.array3d[float], y: int, x: int, c: int) -> float:
+    d = value[y, x, c] - target[y, x, c]
+    return wp.where(wp.isnan(d), 0.0, d)
+
+
+@wp.kernel
+def _loss_gradient(
+    # in:
+    value: wp.array3d[float],
+    target: wp.array3d[float],
+    weight: float,
+    across: int,
+    # out:
+    grad: wp.array3d[float],
+):
+    y, x, c = wp.tid()
+    d = _difference(value, target, y, x, c)
+    # `wp.sign(0)` is 1, where the L1 has the gradient 0.
+    g = wp.where(d == 0.0, 0.0, wp.sign(d))
+    for k in range(2 * (1 + across)):
+        row = y + wp.where(k == 0, 1, wp.where(k == 1, -1, 0))
+        column = x + wp.where(k == 2, 1, wp.where(k == 3, -1, 0))
+        if row >= 0 and row < value.shape[0] and column >= 0 and column < value.shape[1]:
+            change = d - _difference(value, target, row, column, c)
+            g += weight * wp.where(change == 0.0, 0.0, wp.sign(change))
+    grad[y, x, c] = g
+
+
+def loss_gradient(value, target, weight: float, across: bool, grad) -> None:
+    """Computes the gradient, by an image, of the L1 of its difference to a target plus `weight` times the L1 of the
+    changes of this difference from pixel to pixel.
+
+    Args:
+        value, target: float [H, W, 3]; the difference is 0 where one of them is NaN.
+        weight: Weight of the changes.
+        across: Whether changes between horizontal neighbours count, besides those between vertical neighbours.
+        grad: float [H, W, 3], written.
+    """
+    inputs = [value, target, weight, int(across)]
+    wp.launch(_loss_gradient, value.shape, inputs=inputs, outputs=[grad], device=value.device)
 
 
 def surface_points(area, corner, distance: float, seed: int, step, triangle, barycentric) -> None:

@@ -126,7 +126,7 @@ class FluidKernels:
 
 @functools.cache
 def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool]) -> FluidKernels:
-    """Builds (once) the kernels that read and set the fluid; the arguments are those of `memory_functions`."""
+    """Builds (once) the kernels that read and set the fluid's density and velocity; `walls`: axes with walls."""
     memory = memory_functions(lattice_name, storage, walls)
     gather, moments, load, store = memory.gather, memory.moments, memory.load, memory.store
     stored = STORAGES[storage][0]

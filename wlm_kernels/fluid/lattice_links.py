@@ -90,7 +90,7 @@ def _beyond(x: int, n: int, bounded: int) -> bool:
 
 @functools.cache
 def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
-    """Builds (once) the kernels for a lattice and a storage type; `balance` tells whether an outlet conserves mass."""
+    """Builds (once) the kernels that set populations at boundaries and sum forces; `balance`: outlets conserve mass."""
     memory = memory_functions(lattice_name, storage, (False, False, False))
     load, store = memory.load, memory.store
     stored = STORAGES[storage][0]

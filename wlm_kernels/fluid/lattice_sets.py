@@ -141,7 +141,7 @@ def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
 
 @wp.func
 def owned(n: wp.vec3i, bounded: wp.vec3i, walled: wp.vec3i, p: wp.vec3i) -> bool:
-    """Tests whether a population that leaves a cell towards cell p is stored; if not, `lattice_links` writes there."""
+    """Tests whether a population that leaves a cell towards cell p is stored; else a face's boundary writes there."""
     return crosses(n, walled, p) or not crosses(n, bounded, p)
 
 

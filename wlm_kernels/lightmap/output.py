@@ -2,8 +2,6 @@
 
 8-bit tiles are uint32 [n, 128 * 128], RGBA with R in the lowest byte. Each tile has its own bound, the colour of byte
 255: radiance is (byte / 255 * bound) ** gamma.
-
-`wlm.lightmap.decode.SheetDecoder.tiles_8bit` computes the same on the host.
 """
 
 import warp as wp

@@ -66,7 +66,7 @@ class StepKernels:
 
     def load(self, device: str) -> None:
         """Compiles the training step for a device, which would otherwise happen at the first launch."""
-        self._step.module.load(wp.get_device(device))
+        wp.load_module(self._step.module, device, block_dim=BLOCK)
 
     def launch(
         self,

@@ -57,7 +57,7 @@ class _Kernels:
 
 @functools.cache
 def sum_kernels(latent: int) -> _Kernels:
-    """Builds (once) the kernels of `sum` and of its gradients for latent vectors of length `latent`."""
+    """Builds (once) the kernels that sum Gaussians at points, and its gradients, for latent vectors of one length."""
     fn = functions(latent)
     vec_latent, vec_sums = fn.vec_latent, fn.vec_sums
     add, accumulate, chain, slope = fn.add, fn.accumulate, fn.chain, fn.slope

@@ -173,7 +173,7 @@ _vec10 = wp.types.vector(LATENT, float)
 
 @functools.cache
 def functions(latent: int) -> GaussianFunctions:
-    """Builds (once) the functions for latent vectors of length `latent`."""
+    """Builds (once) the `wp.func`s for sums of Gaussians with latent vectors of this length, and for gradients."""
     vec_latent = wp.types.vector(latent, float)
     vec_sums = wp.types.vector(SHAPE_NUMBERS + latent, float)
 

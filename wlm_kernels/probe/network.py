@@ -44,8 +44,8 @@ def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
 
 
 def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
-    """Returns the CUDA code with which a function begins that evaluates the network for a block of probes
-    (`native/layers.cuh`)."""
+    """Returns the CUDA code of the network's layers for a block of probes (`native/layers.cuh`), with sizes as
+    constants; kernels append their own code."""
     sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
     return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
 
@@ -68,8 +68,8 @@ class NetworkKernels:
         return CPU_LANES if self.device_kind == "cpu" else probes // self.probes
 
     def load(self, device) -> None:
-        """Compiles the kernels for a device now."""
-        self._kernel.module.load(wp.get_device(device))
+        """Compiles the kernel for a device, which would otherwise happen at the first launch."""
+        wp.load_module(self._kernel.module, device, block_dim=THREADS)
 
     def launch(self, groups, f, target, weight, net, grad_f, partial, loss, base=0, count=None) -> None:
         """Computes the loss, the sum of weight * error^2 over all numbers of all probes, and its gradients.

@@ -157,9 +157,17 @@ class StepKernels:
     _update: Any
 
     def load(self, device) -> None:
-        """Compiles the kernels for a device now."""
-        for kernel in (self._shapes, self._features, self._collect, self._update, _touch):
-            kernel.module.load(wp.get_device(device))
+        """Compiles the kernels for a device, which would otherwise happen at their first launches."""
+        # A module is compiled anew for each size of blocks that is launched.
+        blocks = {
+            self._shapes: None,
+            self._features: GROUP,
+            self._collect: _COLLECTORS,
+            self._update: None,
+            _touch: None,
+        }
+        for kernel, threads in blocks.items():
+            wp.load_module(kernel.module, device, block_dim=threads)
 
     def shapes(self, rows, bounds, quantised, levels, cut, sphere, used, shapes) -> None:
         """Rounds the Gaussians' parameters as a model file stores them, and prepares the Gaussians for evaluation.
@@ -387,7 +395,7 @@ def _block_sum(vec_sums, numbers: int):
 
 @functools.cache
 def update_kernel(latent: int):
-    """Builds (once) the kernel of `StepKernels.update` for latent vectors of length `latent`."""
+    """Builds (once) the kernel for an Adam step of Gaussians and network, for latent vectors of length `latent`."""
     fn = functions(latent)
     vec_sums, chain = fn.vec_sums, fn.chain
     channels = LATENT + latent

@@ -160,7 +160,7 @@ def centre(frame: Frame, row: int, column: int) -> wp.vec3d:
 
 @wp.func
 def functions(k: Corners, frame: Frame, sign: wp.float64) -> Edges:
-    """Computes edge functions in float64. Products of float32 numbers are exact, so a coefficient is rounded once."""
+    """Returns a triangle's edge functions times `sign`, in float64; exact products: a coefficient is rounded once."""
     out = Edges()
     n0 = sign * wp.cross(k.b, k.c)
     n1 = sign * wp.cross(k.c, k.a)

@@ -440,7 +440,7 @@ def nodes_along(shape: Sequence[int], step: float) -> tuple[int, ...]:
 
 @functools.cache
 def occupied_kernel(dtype: Any) -> wp.Kernel:
-    """Builds (once) the first kernel of `occupied`, for densities of type `wp.float32` or `wp.float16`."""
+    """Builds (once) the kernel that says which runs of 8 voxels along z, and a voxel on either side, hold any smoke."""
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def rows(

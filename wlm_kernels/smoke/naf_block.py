@@ -66,7 +66,7 @@ class NafKernels:
 
 @functools.cache
 def kernels(channels: int, half: bool, cuda: bool) -> NafKernels:
-    """Builds (once) the kernels for pixels with `channels` channels of half floats or float32, for a GPU or a CPU."""
+    """Builds (once) the kernels of NAF blocks, for pixels of `channels` half floats or float32, on a GPU or a CPU."""
     number: Any = wp.float16 if half else wp.float32
     count = lanes(channels, cuda)
     each = -(-channels // count)

@@ -264,7 +264,7 @@ def depths(density, toward, step: float, nodes) -> None:
 
 
 def depths_backward(toward, step: float, grad_nodes, grad_density) -> None:
-    """Computes the adjoint of `depths`.
+    """Computes the gradient of the density from that of the optical depths towards lights, the result of `depths`.
 
     Args:
         toward, step: Arguments of `depths`.

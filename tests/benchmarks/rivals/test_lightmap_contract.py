@@ -11,15 +11,11 @@ from wlm.errors import WlmError
 
 # One of each kind with a package that it needs; other names differ in a number.
 PACKAGES = {
-    "bc6h": "ispc_texcomp",
-    "bc6h-rdo-1": "imagecodecs",
-    "bc7": "imagecodecs",
-    "bc7-rdo-2": "ispc_texcomp",
+    "bc6h": "imagecodecs",
+    "bc7": "ispc_texcomp",
     "astc4": "astc_encoder",
     "astc12": "astc_encoder",
-    "8bit": "imagecodecs",
     "pca-bc4-4": "imagecodecs",
-    "pca-0.04": "imagecodecs",
     "av1-85": "imagecodecs",
 }
 

@@ -6,12 +6,12 @@ from builders.checks import psnr
 from builders.lightmaps import smooth_light
 
 from benchmarks.rivals.lightmap import RIVALS
-from benchmarks.rivals.lightmap_pca import encode_pca, encode_pca_bc4
+from benchmarks.rivals.lightmap_pca import encode_pca_bc4
 from benchmarks.rivals.lightmap_video import encode_av1, fill_smoothly
 from wlm.errors import WlmError
 
 # One of each kind; the rest differ in a number.
-KINDS = ("pca-bc4-4", "pca-0.04", "av1-85")
+KINDS = ("pca-bc4-4", "av1-85")
 
 
 def day(height=72, width=140, hours=5, seed=0) -> np.ndarray:
@@ -42,16 +42,11 @@ def test_sizes(name, shape):
     np.testing.assert_allclose(decoded, frames, atol=0.05 * frames.max())
 
 
-def test_pca_of_three_lights_needs_three_components():
-    """In codes lights don't add up: one light in two strengths is one component, and the levels are its own."""
+def test_one_light_in_three_strengths_is_one_component():
     light = smooth_light(64, 64)
     frames = np.stack([light, 0.5 * light, 0.1 * light])
-    mask = np.ones((64, 64), bool)
-    rival = encode_pca(frames, mask, step=0.02)
-    # A byte a texel; then mean and axis of 9 halves, two floats a map, and 12 bytes of ranges.
-    assert rival.bytes == 64 * 64 + 18 + 18 + 8 + 12
-    assert psnr(frames, rival.decoded) > 45.0
-    blocks = encode_pca_bc4(frames, mask, components=1)
+    blocks = encode_pca_bc4(frames, np.ones((64, 64), bool), components=1)
+    # Half a byte a texel; then mean and axis of 9 halves, two floats a map, and 12 bytes of ranges.
     assert blocks.bytes == 64 * 64 // 2 + 18 + 18 + 8 + 12
     assert psnr(frames, blocks.decoded) > 42.0
 
@@ -72,11 +67,9 @@ def test_settings_are_checked():
     frames, mask = day(8, 8), np.ones((8, 8), bool)
     for call, words in (
         (lambda: encode_pca_bc4(frames, mask, 0), "at least 1 component, got 0"),
-        (lambda: encode_pca(frames, mask, 0.0), "step above 0, got 0"),
-        (lambda: encode_pca(frames, mask, np.nan), "step above 0, got nan"),
         (lambda: encode_av1(frames, mask, 101), "quality from 0 to 100, got 101"),
         (lambda: encode_av1(frames[..., :2], mask), r"lightmaps \[..., H, W, 3\]"),
-        (lambda: encode_pca(frames, mask[:4]), "mask"),
+        (lambda: encode_pca_bc4(frames, mask[:4]), "mask"),
     ):
         with pytest.raises(WlmError, match=words):
             call()

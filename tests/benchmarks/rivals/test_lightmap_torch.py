@@ -59,7 +59,7 @@ def put_into_trainer(fit: PlainFit, trainer: Trainer) -> None:
 
 def test_what_it_decodes_to_is_what_the_product_decodes():
     """Sampling, wrapping at midnight, levels, network and scales, against the float64 decode of the same parameters."""
-    whole, profile = moving_light(128, 256), tiny_profile(gelu="exact")
+    whole, profile = moving_light(128, 256), tiny_profile()
     lightmaps = whole.light
     fit = plain_fit(lightmaps, profile)
     for _ in range(profile.steps):

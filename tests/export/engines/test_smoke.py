@@ -45,9 +45,8 @@ def pages_of(folder):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("moving", [False, True])
-def test_a_folder_has_what_its_index_names(engine, moving, frames, tmp_path):
-    book = random_book(frames, moving=moving)
+def test_a_folder_has_what_its_index_names(engine, frames, tmp_path):
+    book = random_book(frames)
     paths = export_smoke(book, tmp_path / "out", engine, name="the jet")
     assert {path.name for path in paths} == set(os.listdir(tmp_path / "out")) and len(paths) <= 12
     assert paths[-1].name == "bundle.json"
@@ -55,11 +54,11 @@ def test_a_folder_has_what_its_index_names(engine, moving, frames, tmp_path):
     assert set(info["textures"]) == set(book.pages) and info["shader"] in {path.name for path in paths}
     assert (info["frames"], info["rate"], info["levels"], info["clipped"]) == (5, 10.0, 2, 0)
     assert info["frame_size"] == [16, 12] and info["extent"] == pytest.approx([2.0 * 16 / 12, 2.0])
-    assert info["motion_scale"] == book.scale and info["channels"]["second"][-1] == "emission"
+    assert info["channels"]["second"][-1] == "emission"
     texts = {path.name: path.read_text() for path in paths if path.suffix in TEXTS}
     assert not re.search(r"@[A-Z]+@", "".join(texts.values()))
     assert 5 <= len(texts["README.md"].splitlines()) <= 20
-    assert ("motion of at most" in texts["README.md"]) == moving and "5 frames at 10" in texts["README.md"]
+    assert "5 frames at 10" in texts["README.md"]
     for name, page in pages_of(tmp_path / "out").items():
         np.testing.assert_allclose(page[..., :3] / 255.0, book.pages[name[10:-4]][..., :3], atol=0.51 / 255)
     (finding,) = inspect(tmp_path / "out")
@@ -104,10 +103,9 @@ def read_texels(path):
 TIMES = (0.0, 1.5, 3.25, 4.9)
 
 
-@pytest.mark.parametrize("moving", [False, True])
-def test_godots_billboard_shows_the_smoke(moving, frames, tmp_path):
+def test_godots_billboard_shows_the_smoke(frames, tmp_path):
     """Run as GLSL: what fragment() and, of one light, light() write, put together as Godot does."""
-    book = random_book(frames, moving=moving)
+    book = random_book(frames)
     export_smoke(book, tmp_path, "godot")
     text = as_glsl((tmp_path / "smoke.gdshader").read_text())
     main = f"""UV = (vec2(pixel) + 0.5) / vec2(16.0, 12.0); fragment();
@@ -131,12 +129,12 @@ def test_godots_billboard_faces_the_viewer(frames, tmp_path):
 
 def test_names_of_godots_shader_have_one_meaning(frames, tmp_path):
     """GLSL lets a parameter or a local hide a uniform; Godot's language doesn't."""
-    export_smoke(random_book(frames, moving=True), tmp_path, "godot")
+    export_smoke(random_book(frames), tmp_path, "godot")
     text = re.sub(r"//.*", "", (tmp_path / "smoke.gdshader").read_text())
     outer = set(re.findall(r"^(?:uniform|varying) \w+ (\w+)", text, re.MULTILINE))
     within = re.sub(r"^(uniform|varying).*$", "", text, flags=re.MULTILINE)
     inner = set(re.findall(r"\b(?:float|vec[234]|int|bool) (\w+)\b(?!\()", within))
-    assert len(outer) == 7 and {"frame", "place", "mip"} <= inner and not outer & inner
+    assert len(outer) == 6 and {"frame", "place", "mip"} <= inner and not outer & inner
 
 
 def test_godots_script_and_imports_parse(frames, tmp_path):
@@ -168,13 +166,11 @@ def unity_pass(folder):
     return text.replace('#include "WlmSmoke.hlsl"', "\n" + (folder / "WlmSmoke.hlsl").read_text())
 
 
-@pytest.mark.parametrize("moving", [False, True])
-def test_unitys_billboard_shows_the_smoke(moving, frames, tmp_path):
+def test_unitys_billboard_shows_the_smoke(frames, tmp_path):
     """One light in two halves, a black one, and one that is left out by its irradiance."""
-    book = random_book(frames, moving=moving)
+    book = random_book(frames)
     export_smoke(book, tmp_path, "unity")
     text = unity_pass(tmp_path)
-    assert ("wlm_smoke_motion_map (" in (tmp_path / "WlmSmoke.shader").read_text()) == moving
     # From the view's axes to the world's.
     toward = f"float4({TOWARD[2]}, {TOWARD[1]}, {-TOWARD[0]}, 0)"
     half = f"float4({', '.join(str(0.5 * each) for each in IRRADIANCE)}, 0)"
@@ -197,7 +193,7 @@ def test_unitys_billboard_shows_the_smoke(moving, frames, tmp_path):
 def test_unitys_stages_compile(frames, tmp_path):
     if shutil.which("glslangValidator") is None:
         pytest.skip("no glslangValidator: install glslang-tools")
-    export_smoke(random_book(frames, moving=True), tmp_path, "unity")
+    export_smoke(random_book(frames), tmp_path, "unity")
     named = "cbuffer unity { float4x4 unity_ObjectToWorld, UNITY_MATRIX_V, UNITY_MATRIX_P; };\n"
     (tmp_path / "shader.hlsl").write_text(named + unity_pass(tmp_path))
     for stage in ("vert", "frag"):
@@ -211,10 +207,9 @@ def test_unitys_component_parses(frames, tmp_path):
     assert_csharp_parses(tmp_path / "WlmSmoke.cs")
 
 
-@pytest.mark.parametrize("moving", [False, True])
-def test_unreals_node_shows_the_smoke(moving, frames, tmp_path, monkeypatch):
+def test_unreals_node_shows_the_smoke(frames, tmp_path, monkeypatch):
     """Also after the last frame, when it begins again."""
-    book = random_book(frames, moving=moving)
+    book = random_book(frames)
     export_smoke(book, tmp_path, "unreal", name="a b")
     script = Script(tmp_path / "wlm_smoke.py", monkeypatch)
     assert 'PLACE = "/Game/Wlm/a_b"' in (tmp_path / "wlm_smoke.py").read_text()

@@ -340,11 +340,10 @@ def opened_book(tmp_path, browser, serve):
     assert not errors
 
 
-@pytest.mark.parametrize("moving", [False, True])
-def test_three_shows_what_shade_gives(moving, opened_book):
+def test_three_shows_what_shade_gives(opened_book):
     """At frames, between them and, where it doesn't begin again, after the last; over black and over light."""
     frames = random_frames()
-    book = random_book(frames, moving=moving)
+    book = random_book(frames)
     drawn = opened_book(book)
     for seconds, loop in ((0.0, True), (0.15, True), (0.825, True), (0.4, False), (0.9, False)):
         frame = seconds * book.rate

@@ -11,7 +11,6 @@ from builders.atlas_meshes import charts
 from builders.atlas_models import KINDS, MIXED, off_borders
 from builders.atlas_models import random_model as random_atlas
 from builders.exported import read_export
-from builders.metal import run_metal
 from builders.probe_models import random_model as random_probes
 from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, run_wgsl
 from builders.shader_subjects import POINTS, Subject, points_of
@@ -262,8 +261,6 @@ def shown(subject: Subject, language: str, exact: bool, folder) -> np.ndarray:
         head = "".join(f"#define {name}\n" for name in defined) + subject.as_textures
         return run_glsl(head + text, "light = shown(pixel);", size, bound, language, uniforms, subject.version)
     text = translate(text, language, defined)
-    if language == "msl":
-        return run_metal(text, "shown(pixel)", size, subject.bound, folder)
     if language == "wgsl":
         return run_wgsl(text, "shown(pixel)", size, subject.bound)
     return run_hlsl(text, "shown(pixel)", size, subject.bound, folder)
@@ -282,29 +279,6 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
     if subject.filtered is not None and (not name.startswith("atlas cascade") or language.startswith("glsl")):
         found = shown(subject, language, False, tmp_path)[..., :channels]
         np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.filtered)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "lightmap",
-        "atlas cascade",
-        "atlas tiles mixed",
-        "scene",
-        "smoke unity",
-        "smoke billboard",
-        "volume",
-        "probes",
-        "components",
-    ],
-)
-def test_metal_as_the_cpp_that_it_is(name, tmp_path):
-    subject = SUBJECTS[name](tmp_path)
-    channels = subject.expected.shape[-1]
-    found = shown(subject, "msl", False, tmp_path)[..., :channels]
-    # Filters mix in floats here.
-    np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.tolerance)
 
 
 def test_heads_state_language_and_macros():
@@ -327,4 +301,4 @@ def test_what_is_no_shader_of_ours():
     ):
         with pytest.raises(ValueError, match=words):
             translate(text, "wgsl")
-    assert set(LANGUAGES) == {*HEADS, "hlsl", "msl", "wgsl"}
+    assert set(LANGUAGES) == {*HEADS, "hlsl", "wgsl"}

@@ -139,16 +139,16 @@ def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np
 
 
 def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
-    """Returns for each triangle the index in `SIZES` of the smallest size not below its longest edge in texels (eq. 1),
-    int32 [F]."""
+    """Returns for each triangle the index in `SIZES` of its patch's size, int32 [F]: the smallest not below its longest
+    edge in texels (eq. 1), at most `largest`."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
 
 
 def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None) -> list[tuple[int, np.ndarray]]:
-    """Returns for each group of several nodes its representative and all its nodes. Where nodes have equally many
-    edges, the one with the lowest triangle number in `number`, int [M], is chosen."""
+    """Forms groups of alike triangles; returns the representative and all members of each group of several. Of
+    triangles with equally many edges to alike ones, that with the least `number`, int [M], becomes representative."""
     count = len(number)
     left = np.arange(count)
     drawn = np.random.default_rng(0).permutation(count)  # the order in which nodes get into samples
@@ -179,8 +179,8 @@ def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None
 
 
 def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Meter, done: int) -> np.ndarray:
-    """Finds for each of N nodes the index of the first representative in `heads` that it has an edge to, int [N];
-    `len(heads)` where it has none."""
+    """Finds for each of N triangles the index in `heads` of the first representative whose light is alike, int [N];
+    `len(heads)` where none is."""
     device, by_mean = graph.patches.device, np.argsort(heads, kind="stable")
 
     def on_device(values: np.ndarray) -> wp.array:
@@ -199,7 +199,7 @@ def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Me
 
 
 def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
-    """Returns the edges between M nodes, uint8 [M, M], 1 where two are alike."""
+    """Compares the light of all pairs of M triangles: uint8 [M, M], 1 where two are alike, which is an edge."""
     count, device = graph.patches.shape[0], graph.patches.device
     edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     piece = max(_PAIRS_AT_ONCE // max(count, 1), 1)
@@ -213,7 +213,7 @@ def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
 
 
 def _greedy(edge: np.ndarray, number: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Yields each representative with the members of its group, for groups of several nodes (section 3.2.2)."""
+    """Yields the representative (the triangle with most edges) and the sorted members of each group of several."""
     degree = edge.sum(1, dtype=np.int64)
     remains = np.ones(len(number), bool)
     # Among equals the lowest number comes first.

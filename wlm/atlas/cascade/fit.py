@@ -37,7 +37,6 @@ from wlm.atlas.data import LightmappedScene, Sheet
 from wlm.atlas.model import LUT_STEPS, AtlasModel, Profile, SheetPlace, snapped
 from wlm.atlas.resize import resized
 from wlm.atlas.stages import Stages, one_thread
-from wlm.atlas.views import corner_weights
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX
@@ -47,7 +46,8 @@ from wlm.ops.views import DISTANCE, ZOOM, normalised, sphere_views
 from wlm.system import Meter, OnProgress
 from wlm.texels import fill_gaps
 from wlm_kernels.atlas.patches import ORDERS
-from wlm_kernels.atlas.surface import surface_points
+from wlm_kernels.atlas.surface import loss_gradient, surface_points
+from wlm_kernels.raster.gradient import interpolate
 from wlm_kernels.raster.rasterize import Rasterizer
 
 _CHUNK = {"cpu": 5, "cuda": 100}  # steps between two progress reports
@@ -235,7 +235,7 @@ class _Step:
         seed: int,
         device: str,
     ) -> None:
-        self._gradient = profile.gradient
+        self._weight = profile.gradient
         # A black lightmap has no mean to divide by, and needs none.
         self._unit = float(sheet.lightmap[sheet.mask].mean(dtype=np.float64)) or 1.0
         self._colour = torch.tensor(textures.colour / np.float32(self._unit), device=device).requires_grad_()
@@ -253,33 +253,37 @@ class _Step:
         self._adam = torch.optim.Adam(groups, capturable=device != "cpu", fused=True)
         self._image = torch.tensor(sheet.lightmap / np.float32(self._unit), device=device)
         self._step = torch.zeros(1, dtype=torch.int32, device=device)
-        # An inactive triangle hides what is behind it; NaN excludes it from the loss.
-        active = sheet.active[:, None, None]
+        # An inactive triangle hides what is behind it; NaN excludes it from the loss, as does one more triangle, which
+        # stands for "none".
+        active, nothing = sheet.active[:, None, None], np.full((1, 3, 2), np.nan)
         self._corners = [
-            torch.tensor(np.where(active, each, np.nan), dtype=torch.float32, device=device)
+            wp.array(
+                np.concatenate([np.where(active, each, np.nan), nothing], dtype=np.float32).reshape(-1, 2),
+                device=device,
+            )
             for each in (sheet.uv[sheet.triangle], uv)
         ]
+        self._rows = wp.array(np.arange(3 * len(uv) + 3).reshape(-1, 3), dtype=int, device=device)
         kind = _Views if profile.space == "views" else _Surface
         self.points = kind(sheet, profile, self._step, seed, device)
+        self._triangle = torch.empty_like(self.points.triangle)
+        self._uv, self._new_uv = (torch.empty_like(self.points.barycentric) for _ in range(2))
+        self._gradient = self._uv.new_empty(*self._triangle.shape, 3)
 
     def __call__(self) -> None:
         self.points.draw()
-        shown = (self.points.triangle >= 0)[:, None]
-        triangle, weight = self.points.triangle.clamp(min=0).long(), corner_weights(self.points.barycentric)
-        # Points without a triangle are NaN.
-        old, new = (
-            torch.where(shown, (corner[triangle] * weight[..., None]).sum(1), torch.nan) for corner in self._corners
-        )
+        torch.remainder(self.points.triangle, len(self._rows), out=self._triangle)
+        points = interop.to_warp(self._triangle), interop.to_warp(self.points.barycentric, wp.vec2)
+        for corners, uv in zip(self._corners, (self._uv, self._new_uv), strict=True):
+            interpolate(corners, self._rows, *points, interop.to_warp(uv))
         if "lut" in self._tuned:
-            colour = texture(self._colour, texture(self._lut, new), boundary="mirror")
+            colour = texture(self._colour, texture(self._lut, self._new_uv), boundary="mirror")
         else:
-            colour = texture(self._colour, new)
-        difference = (colour - texture(self._image, old)).nan_to_num()
+            colour = texture(self._colour, self._new_uv)
+        images = (colour.detach(), texture(self._image, self._uv))
+        loss_gradient(*map(interop.to_warp, images), self._weight, self.points.across, interop.to_warp(self._gradient))
         self._adam.zero_grad(set_to_none=False)
-        loss = difference.abs().sum()
-        for pairs in self.points.pairs(difference):
-            loss = loss + self._gradient * pairs.abs().sum()
-        loss.backward()
+        colour.backward(self._gradient)
         for rate, now in zip(self._rate, self._rates.index_select(0, self._step)[0], strict=True):
             rate.copy_(now)
         self._adam.step()
@@ -332,9 +336,12 @@ class _Views:
     """Supplies the points of each step for the space "views": the pixels of one random view.
 
     Attributes:
-        triangle, barycentric: int32 [N], the triangle at each point, -1 for none; float32 [N, 2], the weights of its
-            corners 0 and 1.
+        triangle, barycentric: int32 [H, W], the triangle at each point, -1 for none; float32 [H, W, 2], the weights of
+            its corners 0 and 1.
+        across: Whether horizontal neighbours are compared too, besides vertical ones.
     """
+
+    across = True
 
     def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
         self._side = profile.resolution
@@ -346,8 +353,7 @@ class _Views:
         self._clip_array = interop.to_warp(self._clip)
         self._rasterizer = Rasterizer(wp.array(sheet.triangle, dtype=int, device=device), self._side, self._side)
         raster = self._rasterizer.raster
-        self.triangle = wp.to_torch(raster.triangle).flatten()
-        self.barycentric = wp.to_torch(raster.barycentric).reshape(-1, 2)
+        self.triangle, self.barycentric = wp.to_torch(raster.triangle), wp.to_torch(raster.barycentric)
 
     def draw(self) -> None:
         axes = self._axes.index_select(0, self._step)[0]
@@ -358,15 +364,12 @@ class _Views:
         self._clip.copy_(torch.stack([ZOOM * x, ZOOM * y, w - 1.0, w], 1))
         self._rasterizer.run(self._clip_array)
 
-    def pairs(self, values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns the differences between neighbours, of values [N, 3]: the image's gradient (section 3.3.3)."""
-        image = values.unflatten(0, (self._side, self._side))
-        return image.diff(dim=0), image.diff(dim=1)
-
 
 class _Surface:
     """Supplies the points of each step for the space "uv": new pairs of random points on the mesh, with the attributes
-    of `_Views`; point i and point i + N / 2 are a pair."""
+    of `_Views`; H is 2, and the points of a column are a pair."""
+
+    across = False
 
     def __init__(self, sheet: Sheet, profile: Profile, step: torch.Tensor, seed: int, device: str) -> None:
         pairs = max(1, profile.resolution**2 // (2 * _PIXELS_PER_POINT))
@@ -374,23 +377,17 @@ class _Surface:
         normal = np.cross(position[:, 1] - position[:, 0], position[:, 2] - position[:, 0])
         area = np.where(sheet.active, np.linalg.norm(normal, axis=1), 0.0)
         texels = (sheet.uv * sheet.mask.shape[::-1])[sheet.triangle]
-        self.triangle = torch.empty(2 * pairs, dtype=torch.int32, device=device)
-        self.barycentric = torch.empty((2 * pairs, 2), device=device)
+        self.triangle = torch.empty(2, pairs, dtype=torch.int32, device=device)
+        self.barycentric = torch.empty(2, pairs, 2, device=device)
         self._inputs = (
             wp.array(np.cumsum(area), dtype=wp.float64, device=device),
             wp.array(texels.astype(np.float32), dtype=wp.vec2, device=device),
             1.0,
             int(seed) % (1 << 30),
             interop.to_warp(step),
-            interop.to_warp(self.triangle),
-            interop.to_warp(self.barycentric, wp.vec2),
+            interop.to_warp(self.triangle.flatten()),
+            interop.to_warp(self.barycentric.flatten(0, 1), wp.vec2),
         )
 
     def draw(self) -> None:
         surface_points(*self._inputs)
-
-    @staticmethod
-    def pairs(values: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Returns the differences within the pairs, of values [N, 3]."""
-        first, second = values.chunk(2)
-        return (first - second,)

@@ -250,7 +250,7 @@ def _place_inactive(corner: np.ndarray, numbers: np.ndarray, active: np.ndarray)
 
 
 def _thickened(points: np.ndarray, height: float) -> np.ndarray:
-    """Puts right triangles around thin triangles [N, 3, 2]: one leg is `height` long, the other at least as long."""
+    """Replaces thin triangles [N, 3, 2] by right ones on their longest edges, whose other leg is `height` long."""
     out = np.empty_like(points)
     for i, corner in enumerate(points):
         ends = [(corner[k], corner[(k + 1) % 3]) for k in range(3)]

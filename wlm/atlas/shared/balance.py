@@ -57,8 +57,8 @@ def tile_shares(
     seed: int,
     device: str,
 ) -> ViewShares:
-    """Renders the same views as `scene_weights` and counts the pixels that show each tile. `grids` has the rows and
-    columns of tiles of each sheet."""
+    """Renders random views (those of the first weights); returns the fraction of each view's pixels that shows each
+    tile, and each view's assumed error. `grids` has the rows and columns of tiles of each sheet."""
     first = np.cumsum([0, *(rows * columns for rows, columns in grids)])
     row = np.full(first[-1], -1)
     of = np.flatnonzero(tiles.plane < len(scene.sheets))

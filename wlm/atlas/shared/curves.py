@@ -190,7 +190,7 @@ def _curves(
     meter: Meter,
     done: int,
 ) -> dict[str, np.ndarray]:
-    """Returns each tile's mixture and errors, as `number` and `error` of `Candidate`, for the tiles `members`."""
+    """Returns for the T tiles `members` their mixtures, int [T], and errors for each choice, [choices, T], by name."""
     device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
     mixtures = mixtures.to(device)
     factor, offset = mixtures.factor, mixtures.offset

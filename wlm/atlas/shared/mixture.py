@@ -47,7 +47,7 @@ class Mixtures:
         return Mixtures(*(getattr(self, each.name).to(device) for each in fields(self)))
 
     def factors(self, number: int) -> np.ndarray:
-        """Returns the constant of a mixture, which subtracts the offsets, and its factors: float64 [1 + K, M, 3]."""
+        """Returns a mixture's light if all components are 0, then its factors by component: float64 [1 + K, M, 3]."""
         factor, offset = (each[number].cpu().numpy().astype(np.float64) for each in (self.factor, self.offset))
         constant = -np.einsum("mkc,kc->mc", factor, offset)
         return np.concatenate([constant[None], factor.transpose(1, 0, 2)])

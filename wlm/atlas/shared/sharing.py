@@ -111,8 +111,8 @@ class Cut:
     bits: float
 
     def room(self, numbers: int) -> float:
-        """Returns the bits that remain for tiles and factors beside the table of sheets and T_c, which has this many
-        integers per entry."""
+        """Returns the bits of the budget that remain for tiles and factors beside the table of sheets and T_c, if an
+        entry of T_c has `numbers` integers."""
         return self.bits - len(self.planes) * SHEET_BITS - math.prod(self.shape) * numbers // 2 * LUT_BITS
 
 
@@ -231,7 +231,7 @@ def _hopeless(
     seed: int,
     stages: Stages,
 ) -> bool:
-    """Tests on a sample of tiles whether separate tiles have far more error than shared tiles of as many bits."""
+    """Tests on random tiles whether tiles of their own for each state have far more error than shared ones."""
     given, count = together.given, len(factor)
     few = np.sort(np.random.default_rng(seed).choice(count, max(count // _SAMPLE, _SAMPLES), replace=False))
     cost = costs(together.tried)
@@ -247,7 +247,7 @@ def _hopeless(
 
 
 def _allocated(cut: Cut, tried: list[Candidate], factor: np.ndarray, numbers: int, profile: Profile) -> Fitted:
-    """Allocates the tiles, whose errors are multiplied by `factor` [T]; with long entries of T_c if there are pages."""
+    """Chooses sizes and places of T tiles, with errors times `factor` [T]; several pages need longer T_c entries."""
     tried = [replace(each, error=each.error * factor) for each in tried]
     given = allocated(tried, cut.room(numbers), profile)
     if numbers == SHORT_ENTRY and given.page.any():
@@ -257,7 +257,7 @@ def _allocated(cut: Cut, tried: list[Candidate], factor: np.ndarray, numbers: in
 
 
 def _cut(planes: list[Plane], units: list[np.ndarray], bits: float, tile: int, device: str) -> Cut:
-    """Places all planes in T_c, and cuts their light into tiles, after division by the unit of each state."""
+    """Places all planes in T_c and cuts their light, divided by each state's unit, into tiles; returns it all."""
     total, grid = sum(float(plane.weight.sum()) for plane in planes), []
     texels, weights, numbers, owner = [], [], [], []
     for number, (plane, unit) in enumerate(zip(planes, units, strict=True)):

@@ -87,7 +87,7 @@ def scene_weights(
 
 
 class Detail:
-    """The variation of a scene's light, stored on a device."""
+    """How much a scene's light varies at each texel of its sheets, mean over states scaled to vary equally."""
 
     def __init__(self, scene: LightmappedScene, varies: Sequence[np.ndarray], device: str) -> None:
         masks = [sheet.mask for sheet in scene.sheets]

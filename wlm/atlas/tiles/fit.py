@@ -151,7 +151,7 @@ def composed_model(
 
 
 def least_gain(sheet: Sheet) -> float:
-    """Returns the squared error that each bit must save to be worth storing."""
+    """Returns the least squared error that a bit must save to be spent, in proportion to the light's range squared."""
     return float(np.ptp(sheet.lightmap[sheet.mask])) ** 2 * _LEAST_GAIN / sheet.mask.size
 
 

@@ -57,7 +57,6 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
 
 def _write_textures(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes the textures as DDS files and returns their entries for the index."""
     ending, entries = ".bytes" if engine == "unity" else None, {}
     for name, texture in bundle.textures.items():
         if texture.fmt not in DXGI_FORMATS:

@@ -59,10 +59,8 @@ def _facts(bundle: Bundle) -> dict[str, str]:
     book = bundle.document
     width, height = book["frame_size"]
     cells = f"{book['rows']} x {book['columns']} cells of {width} x {height} pixels, padded by {book['padding']}"
-    scale = book.get("motion_scale")
-    moving = "" if scale is None else f", motion of at most {scale:.4g} of a frame"
     facts = f"{book['frames']} frames at {book['rate']:.4g} a second, in {cells};\n"
-    facts += f"light is multiplied by {book['gain']:.4g}{moving}."
+    facts += f"light is multiplied by {book['gain']:.4g}."
     mips = f"The shader reads the textures' mips down to level {book['levels']}." if book["levels"] else _NO_MIPS
     return {"NAME": bundle.name, "FACTS": facts, "MIPS": mips}
 
@@ -93,8 +91,7 @@ def _godot(bundle: Bundle) -> dict[str, str]:
 
 
 def _unity(bundle: Bundle) -> dict[str, str]:
-    motion = 'wlm_smoke_motion_map ("Motion", 2D) = "gray" {}' if "motion" in bundle.textures else ""
-    parts = {"NAME": label(bundle.name), "SIZE": _size(bundle), "MOTION": motion}
+    parts = {"NAME": label(bundle.name), "SIZE": _size(bundle)}
     return {
         "WlmSmoke.hlsl": translate(bundle.shader, "hlsl"),
         "WlmSmoke.shader": filled("unity_smoke.shader", **parts),

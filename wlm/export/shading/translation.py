@@ -5,19 +5,18 @@ from typing import Any
 
 from wlm.errors import WlmError
 from wlm.export.shading.hlsl import HlslWriter
-from wlm.export.shading.metal import MetalWriter
 from wlm.export.shading.source import read_words
 from wlm.export.shading.tree import read_shader
 from wlm.export.shading.wgsl import WgslWriter
 
-LANGUAGES = ("glsl", "glsl-es", "hlsl", "msl", "wgsl")
+LANGUAGES = ("glsl", "glsl-es", "hlsl", "wgsl")
 """Languages in which shaders are exported."""
 
-ENDINGS = {"glsl": ".glsl", "glsl-es": ".glsl", "hlsl": ".hlsl", "msl": ".metal", "wgsl": ".wgsl"}
+ENDINGS = {"glsl": ".glsl", "glsl-es": ".glsl", "hlsl": ".hlsl", "wgsl": ".wgsl"}
 """Endings of shader files by language."""
 
-_WRITERS: dict[str, Any] = {"hlsl": HlslWriter, "msl": MetalWriter, "wgsl": WgslWriter}
-_VERSIONS = {"hlsl": "HLSL, shader model 5 and later", "msl": "Metal 2 and later", "wgsl": "WGSL"}
+_WRITERS: dict[str, Any] = {"hlsl": HlslWriter, "wgsl": WgslWriter}
+_VERSIONS = {"hlsl": "HLSL, shader model 5 and later", "wgsl": "WGSL"}
 _PRECISIONS = "".join(
     f"precision highp {kind};\n" for kind in ("float", "int", "sampler2D", "usampler2D", "sampler2DArray")
 )

@@ -64,11 +64,11 @@ class Writer(ABC):
         return "\n".join([*self.head(), *lines, *self.foot()]) + "\n"
 
     def head(self) -> list[str]:
-        """Returns the lines before the first declaration."""
+        """Returns the lines before the first declaration: none, unless a subclass overrides this."""
         return []
 
     def foot(self) -> list[str]:
-        """Returns the lines after the last declaration."""
+        """Returns the lines after the last declaration: none, unless a subclass overrides this."""
         return []
 
     @abstractmethod
@@ -159,7 +159,7 @@ class Writer(ABC):
         return node.text
 
     def inside(self, node: Node) -> str:
-        """Returns the text of an operand, in brackets if its own operator binds less strongly than the outer one."""
+        """Returns the text of an operand, in brackets if it is itself a unary, binary, ?:, assignment or ++."""
         text = self.write(node)
         return f"({text})" if node.kind in ("binary", "choice", "assign", "unary", "step") else text
 

@@ -35,19 +35,8 @@ class DeviceTiles(ABC):
         return places, np.ascontiguousarray(rows)
 
     @abstractmethod
-    def bounds(self, time: float) -> np.ndarray:
-        """Returns an upper bound of each tile's colour at one time, in gamma space, float32 [n].
-
-        Between two stored times it is the larger of the bounds at these two times.
-        """
-
-    @abstractmethod
     def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
         """Decodes tiles to radiance, float32 [k, 128, 128, 3]; `rows` [k] indexes `numbers`; gaps are not filled."""
-
-    @abstractmethod
-    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
-        """Decodes tiles to RGBA, uint8 [k, 128, 128, 4]: radiance = (byte / 255 * bound) ** gamma; alpha is 255."""
 
 
 class Encoding(ABC):
@@ -62,7 +51,7 @@ class Encoding(ABC):
     codes: ClassVar[tuple[int, ...]]
 
     def packed_size(self, sheet: SheetModel, number: int) -> int:
-        """Returns the number of bytes that `pack` gives for a tile."""
+        """Returns the number of bytes that `pack` gives for a tile: 0, unless a subclass overrides both."""
         return 0
 
     def pack(self, sheet: SheetModel, number: int) -> list[bytes]:

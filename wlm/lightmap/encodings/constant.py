@@ -18,25 +18,14 @@ class ConstantTiles(DeviceTiles):
         """Takes the colours of the sheet's constant tiles."""
         super().__init__(sheet.numbers(TileKind.CONSTANT))
         self._axis, self._colours = sheet.axis, sheet.constant.astype(np.float32)
-        self._exponent = 1.0 / sheet.profile.gamma
 
     def colours(self, time: float) -> np.ndarray:
         """Returns the linear radiance of all tiles, float32 [n, 3]."""
         before, after, share = self._axis.neighbours(time)
         return (1.0 - share) * self._colours[:, before] + share * self._colours[:, after]
 
-    def bounds(self, time: float) -> np.ndarray:
-        return (self.colours(time) ** self._exponent).max(1).astype(np.float32)
-
     def radiance(self, rows: np.ndarray, time: float) -> np.ndarray:
         return np.broadcast_to(self.colours(time)[rows, None, None], (len(rows), TILE, TILE, 3))
-
-    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
-        bounds = self.bounds(time)[rows]
-        share = self.colours(time)[rows] ** self._exponent / np.where(bounds > 0, bounds, 1.0)[:, None]
-        out = np.full((len(rows), TILE, TILE, 4), 255, np.uint8)
-        out[..., :3] = np.floor(share * 255.0 + 0.5).astype(np.uint8)[:, None, None]
-        return out
 
 
 class Constant(Encoding):

@@ -15,15 +15,13 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from scipy.ndimage import binary_dilation
 
 from wlm.bundle import Texture
 from wlm.errors import WlmError
 from wlm.formats import bc7
 from wlm.formats.bc7 import BLOCK_BYTES
-from wlm.formats.block_reuse import by_block, reuse_blocks
 from wlm.formats.folder import rounded
-from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, rgba, side_by_side
+from wlm.lightmap.encodings.base import DeviceTiles, Encoding, side_by_side
 from wlm.lightmap.encodings.maps import tile_bytes
 from wlm.lightmap.model import BLOCKS, SheetModel
 from wlm.lightmap.profile import Profile
@@ -36,12 +34,6 @@ EXTRA = "frames"
 
 _ENCODER = "ispc_texcomp"
 _RANGE_BYTES = 2 * 3 * 2  # two half floats for each channel of a frame
-
-# Rate-distortion optimisation: the root mean square error of a block's visible texels may grow by 0.2 levels of 255, in
-# squares. Blocks that repeat make the file smaller.
-_LOSS = (0.2 / 255.0) ** 2
-_RING_WEIGHT = 0.25  # only some bilinear reads reach the texels next to a chart
-_WINDOW = 1024  # blocks back that a block may repeat: the blocks of one tile
 
 _BLACK = np.zeros(BLOCK_BYTES, np.uint8)
 _BLACK[0] = 1 << 6  # a block of mode 6 whose other bits are 0
@@ -119,14 +111,6 @@ def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> 
     span = np.where(greatest > least, greatest - least, np.float32(1.0))
     levels = np.clip((colour - least) / span, 0.0, 1.0).reshape(-1, TILE, 3)
     blocks = bc7.encode_image((levels * 255.0 + 0.5).astype(np.uint8), EXTRA)
-    ring = binary_dilation(valid, np.ones((3, 3), bool))
-    weight = np.where(valid, 1.0, np.where(ring, _RING_WEIGHT, 0.0)).astype(np.float32)
-    weight = np.tile(np.repeat(weight[..., None], 3, axis=2), (len(colour), 1, 1))
-    decoded = bc7.decode_image(blocks)[..., :3] / np.float32(255.0)
-    kept = np.tile(needed, (len(colour), 1))
-    images = decoded, levels, weight, weight * np.float32(_LOSS)
-    values = (by_block(image)[kept.ravel()] for image in images)
-    blocks[kept] = reuse_blocks(blocks[kept], *values, _WINDOW)
     return clear_unneeded(blocks.reshape(len(colour), BLOCKS, BLOCKS, -1), needed), ranges
 
 
@@ -164,6 +148,8 @@ class FrameTiles(DeviceTiles):
         self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
 
     def bounds(self, time: float) -> np.ndarray:
+        """Returns an upper bound of each tile's colour at a time, in gamma space, float32 [n]; between two stored times
+        the larger of their bounds."""
         before, after, share = self._axis.neighbours(time)
         return self._greatest[:, before] if share == 0 else self._greatest[:, [before, after]].max(1)
 
@@ -182,12 +168,6 @@ class FrameTiles(DeviceTiles):
         out = wp.empty((len(rows), TILE, TILE), dtype=wp.vec3, device=self._device)
         self.decode(time, wp.array(rows, dtype=int, device=self._device), out)
         return out.numpy()
-
-    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
-        out = wp.empty((len(rows), TILE, TILE), dtype=wp.uint32, device=self._device)
-        inverse = wp.array(inverse_of(self.bounds(time)), dtype=float, device=self._device)
-        self.decode(time, wp.array(rows, dtype=int, device=self._device), out, inverse)
-        return rgba(out)
 
 
 class Frames(Encoding):

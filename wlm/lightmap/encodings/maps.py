@@ -18,7 +18,7 @@ from wlm.bundle import Texture
 from wlm.errors import WlmError
 from wlm.formats.bc7 import BLOCK_BYTES, pack_mode6, unpack_mode6
 from wlm.formats.folder import rounded
-from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, rgba, side_by_side
+from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, side_by_side
 from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import SheetModel, decode_scale
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
@@ -118,7 +118,6 @@ def clear_unread(parts: Mapping[str, np.ndarray], used: np.ndarray, reads: Reads
 
 
 def _by_block(texels: np.ndarray) -> np.ndarray:
-    """Rearranges texels [4 h, 4 w] into 4x4 blocks, [h w, 16]."""
     h, w = texels.shape
     return texels.reshape(h // 4, 4, w // 4, 4).swapaxes(1, 2).reshape(-1, 16)
 
@@ -147,7 +146,6 @@ def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: b
 
 
 def _unpacked(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Splits BC7 mode 6 blocks, uint8 [n, 16], into endpoints, uint8 [n, 2, 4], and texel indices [n, 16]."""
     try:
         return unpack_mode6(blocks)
     except WlmError as error:
@@ -166,7 +164,6 @@ def _split_blocks(blocks: np.ndarray) -> list[np.ndarray]:
 
 
 def _join_blocks(data: np.ndarray) -> np.ndarray:
-    """Inverts `_split_blocks`: converts its bytes, uint8 [16 n], to BC7 blocks, uint8 [n, 16]."""
     ends, indices = data.reshape(2, -1, 8)
     if (ends[:, 1:] > 127).any():
         raise ValueError("expected endpoints of 7 bits, found larger values")
@@ -215,7 +212,6 @@ def unpack_network(data: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
 
 
 def _layers(net: np.ndarray, inputs: int, hidden: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Splits a network into the weights [inputs, units] and biases [units] of each layer."""
     split = (inputs + hidden + 2) * hidden
     rows, output = net[:split].reshape(-1, hidden), net[split:].reshape(-1, 3)
     return [(rows[:inputs], rows[inputs]), (rows[inputs + 1 : -1], rows[-1]), (output[:-1], output[-1])]
@@ -227,7 +223,6 @@ def _apart(halves: np.ndarray) -> np.ndarray:
 
 
 def _together(data: np.ndarray) -> np.ndarray:
-    """Inverts `_apart`: converts its bytes to half floats."""
     return np.ascontiguousarray(data.reshape(2, -1).T).view("<f2").ravel()
 
 
@@ -281,11 +276,13 @@ class MapTiles(DeviceTiles):
         self.device_bytes = sum(array.capacity for array in (*maps.values(), hidden, output))
 
     def bounds(self, time: float) -> np.ndarray:
+        """Returns an upper bound of each tile's colour at a time, in gamma space, float32 [n]; between two stored times
+        the larger of their bounds."""
         before, after, share = self._axis.neighbours(time)
         return self._peak[:, before] if share == 0 else np.maximum(self._peak[:, before], self._peak[:, after])
 
     def state(self, time: float, state: decode_kernels.TimeState | None = None) -> decode_kernels.TimeState:
-        """Returns what the decode kernels need for one time; it overwrites `state`, or allocates it if it is None."""
+        """Returns a time's position, encoding and tile scales for the decode kernels, in `state` unless it is None."""
         before, after, share = self._axis.neighbours(time)
         if state is None:
             state = decode_kernels.TimeState()
@@ -321,15 +318,6 @@ class MapTiles(DeviceTiles):
         if len(reads) == 1:
             return self._decoded(rows, reads[0][0], 0).numpy()
         return sum(np.float32(share) * self._decoded(rows, stamp, 0).numpy() for stamp, share in reads)
-
-    def colour_bytes(self, rows: np.ndarray, time: float) -> np.ndarray:
-        if len(self._axis.reads(time)) == 1:
-            return rgba(self._decoded(rows, time, 1))
-        factor = inverse_of(self.bounds(time)[rows])[:, None, None, None]
-        colour = self.radiance(rows, time) ** (1.0 / self.model.profile.gamma) * factor
-        out = np.full((len(rows), TILE, TILE, 4), 255, np.uint8)
-        out[..., :3] = np.clip(colour, 0.0, 1.0) * 255.0 + 0.5
-        return out
 
 
 # ---- textures, networks and tables of the shader ----
@@ -379,7 +367,7 @@ def network_starts(sheet: SheetModel) -> np.ndarray:
 
 
 def image_rows(sheet: SheetModel) -> np.ndarray:
-    """Returns the image of each tile with maps in the textures, where dynamic tiles come first, int [N_m]."""
+    """Returns for each tile with maps the index of its image in the textures, dynamic tiles first, int [N_m]."""
     static = sheet.kind[sheet.mapped] == TileKind.STATIC
     rows = np.empty(len(static), int)
     rows[np.argsort(static, kind="stable")] = np.arange(len(static))

@@ -93,7 +93,7 @@ def tetrahedra_of(count: np.ndarray) -> np.ndarray:
 
 
 def tree_of(low: np.ndarray, size: float, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the tree of planes over the tetrahedra of `tetrahedra_of`.
+    """Makes Godot's BSP tree, whose planes lead to the tetrahedron of a point: five in each cell of a lattice.
 
     Args:
         low, size, count: Attributes of the `Lattice`.

@@ -153,7 +153,7 @@ class _Search:
         return self._rounded(_Steps(*(self._natural() * _FINEST)))[0]
 
     def _natural(self) -> np.ndarray:
-        """Returns the fields of `_Steps`, float64 [8], with which all groups of numbers add about the same error."""
+        """Returns a rounding step for each of eight groups of numbers, float64 [8], that give about equal errors."""
         rows, (first, second, third) = self._rows, self._layers
         latents = first[: len(self._of_latent)]
         slender = np.expm1(np.ptp(rows[:, STORED_SCALE], axis=1))
@@ -243,13 +243,13 @@ def _fitted(square: np.ndarray, right: np.ndarray, before: np.ndarray, share: fl
 
 
 def _feed(square: np.ndarray, share: float) -> np.ndarray:
-    """Returns the upper Cholesky factor of the inverse of a matrix plus a ridge, with which `_fed` corrects rows."""
+    """Returns the upper Cholesky factor of the inverse of a symmetric matrix plus `share` of a ridge, [I, I]."""
     inverse = linalg.inv(square + _ridge(square, share) * np.eye(len(square)))
     return linalg.cholesky(0.5 * (inverse + inverse.T))
 
 
 def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
-    """Rounds numbers [I, O] row by row to integers of at most `most`; later rows compensate for the rounding error."""
+    """Divides numbers [I, O] by steps and rounds them to -most to most, row by row; later rows make up for errors."""
     numbers, whole = numbers.copy(), np.empty_like(numbers)
     for row in range(len(numbers)):
         whole[row] = np.clip(np.rint(numbers[row] / step[row]), -most, most)

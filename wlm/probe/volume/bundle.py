@@ -65,7 +65,7 @@ def volume_bundle(volume: Volume) -> Bundle:
 
 
 def _reference(volume: Volume) -> dict[str, np.ndarray]:
-    """Returns points at all distances around the viewer, and the light that the volume has at them."""
+    """Returns random points around the viewer and positions of probes, and the volume's light and weight at them."""
     random = np.random.default_rng(0)
     reach = np.repeat(np.array(volume.sizes) * volume.side / 2, _REFERENCES // len(volume.sizes))
     near = volume.viewpoint + random.uniform(-1.1, 1.1, (len(reach), 3)) * reach[:, None]

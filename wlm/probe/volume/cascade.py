@@ -88,7 +88,7 @@ class Reading:
 
 
 class State(NamedTuple):
-    """Copies of device arrays (see `wlm_kernels.probe.volume`); `bases` are block coordinates minus `index.start`."""
+    """Copies in host memory of the arrays from which a shader reads a volume: light, page table, bases and views."""
 
     pool: np.ndarray
     pages: np.ndarray
@@ -270,7 +270,7 @@ class Volume:
         return FrameStats(entered, queued, dropped, updated, cached, left, probes, time.perf_counter() - start)
 
     def _work(self) -> None:
-        """Runs the part of a frame that a CUDA graph contains."""
+        """Chooses missing blocks, finds and weights the probes near them, and writes the blocks' light to the pool."""
         work, windows = self._frame_work, self._windows
         frame_kernels.select(self._index, windows, self._pool_rows, self.side, work)
         if self.index.count == 0 or (self.device == "cpu" and not (work.taken.numpy() >= 0).any()):

@@ -21,8 +21,7 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import write_exr
 from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
-from wlm.smoke.data import Frames, read_shaded, spread
-from wlm.smoke.flipbook.motion import ZERO, encoded, frames_motion, mip_levels, scale_of
+from wlm.smoke.data import read_shaded, spread
 from wlm.smoke.flipbook.reading import NOTE, suffix_of
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.scene import Looks
@@ -76,18 +75,16 @@ def read_shots(
 
 @dataclass(frozen=True, eq=False)
 class Book:
-    """A flip book: two textures of six-way lightmaps and optionally one of motion vectors, with a cell per frame.
+    """A flip book: two textures of six-way lightmaps, with a cell per frame.
 
     Attributes:
         first, second: The lightmaps, float32 [rows * (H + 2 padding), columns * (W + 2 padding), 3 or 4].
-        motion: Motion vectors, float32 [..., 3] of the same size, see `wlm.smoke.flipbook.motion`; None: no motion.
         layout: Name of the order of the channels, one of `wlm.smoke.camera.LAYOUTS`.
         rows, columns, count: Number of rows of cells, of columns of cells, and of frames.
         size: Height and width of a frame in pixels, without padding.
         padding: Width in pixels of the border around each frame.
         gain: Factor by which light is multiplied in the textures.
         hot: Whether a texture has a channel for emission.
-        scale: Largest motion that the texture can store, as a share of a frame's size; None: no motion.
         rate: Frames per second.
         extent: Height in world units of the region that a frame shows.
         ramp: Colour of the emission; None: grey.
@@ -95,7 +92,6 @@ class Book:
 
     first: np.ndarray
     second: np.ndarray
-    motion: np.ndarray | None
     layout: str
     rows: int
     columns: int
@@ -104,7 +100,6 @@ class Book:
     padding: int
     gain: float
     hot: bool
-    scale: float | None
     rate: float
     extent: float
     ramp: Ramp | None
@@ -112,15 +107,13 @@ class Book:
     @property
     def pages(self) -> dict[str, np.ndarray]:
         """Textures by name."""
-        pages = {"first": self.first, "second": self.second, "motion": self.motion}
-        return {name: page for name, page in pages.items() if page is not None}
+        return {"first": self.first, "second": self.second}
 
     @property
     def channels(self) -> dict[str, tuple[str, ...]]:
         """Content of the channels of each texture, such as "right" or "alpha"."""
-        first, second = LAYOUTS[self.layout]
-        named = {"first": first, "second": second, "motion": ("right", "up")}
-        return {name: named[name][: page.shape[2]] for name, page in self.pages.items()}
+        pages = zip(self.pages.items(), LAYOUTS[self.layout], strict=True)
+        return {name: contents[: page.shape[2]] for (name, page), contents in pages}
 
     @property
     def levels(self) -> int:
@@ -135,9 +128,7 @@ def pack_book(
     columns: int | None = None,
     gain: float | None = None,
     padding: int = 0,
-    air: Frames | None = None,
     rate: float | None = None,
-    progress: OnProgress | None = None,
 ) -> Book:
     """Packs frames into the textures of a flip book.
 
@@ -150,13 +141,10 @@ def pack_book(
         columns: Largest number of columns; None: such that the texture is nearest to a square.
         gain: Factor of the light; None: the largest with which no light is above 1.
         padding: Pixels around each frame that repeat its border, so that filters and mips do not mix frames.
-        air: Frames with velocities, from `wlm.smoke.flipbook.motion.open_motion`, for motion vectors; None: no motion.
         rate: Frames per second; None: that of the scene, or `RATE`.
-        progress: Called after the motion of each frame has been computed.
 
     Raises:
         ValueError: The frames have several sizes, the layout is unknown, or a number is out of its range.
-        WlmError: As for `frames_motion`.
     """
     frames = [shot.six for shot in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
@@ -175,16 +163,10 @@ def pack_book(
     for names in _channels(frames, layout):
         planes = [[np.broadcast_to(_plane(frame, name, gain), size) for name in names] for frame in frames]
         pages.append(lay_out(np.moveaxis(np.array(planes, np.float32), 1, -1), rows, columns, padding))
-    scale, motion = None, None
-    if air is not None:
-        moved = frames_motion(air, [shot.number for shot in shots], frames, progress)
-        scale = scale_of(moved)
-        motion = lay_out(encoded(moved, scale), rows, columns, padding, ZERO)
     looks, camera = shots[0].looks, frames[0].camera
     return Book(
         first=pages[0],
         second=pages[1],
-        motion=motion,
         layout=layout,
         rows=rows,
         columns=columns,
@@ -193,7 +175,6 @@ def pack_book(
         padding=padding,
         gain=gain,
         hot=any(frame.emission is not None for frame in frames),
-        scale=scale,
         rate=_rate(shots) if rate is None else rate,
         extent=1.0 if camera is None else camera.extent,
         ramp=None if looks is None else looks.ramp,
@@ -201,7 +182,6 @@ def pack_book(
 
 
 def _rate(shots: Sequence[Shot]) -> float:
-    """Returns the frames per second, from the times of the first and the last frame, or `RATE` without a scene."""
     first, last = shots[0].looks, shots[-1].looks
     if first is None or last is None or not last.time > first.time:
         return RATE
@@ -230,18 +210,45 @@ def _plane(frame: SixWay, name: str, gain: float) -> np.ndarray | float:
     return gain * frame[name].cpu().numpy()
 
 
-def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int, empty: float = 0.0) -> np.ndarray:
-    """Lays pictures [N, H, W, C] out in cells with borders of `padding` pixels; cells without picture are `empty`."""
+def lay_out(frames: np.ndarray, rows: int, columns: int, padding: int) -> np.ndarray:
+    """Lays pictures [N, H, W, C] out in cells with borders of `padding` pixels; cells without picture are 0."""
     _count, height, width, channels = frames.shape
-    page = np.full((rows, height + 2 * padding, columns, width + 2 * padding, channels), empty, np.float32)
+    page = np.zeros((rows, height + 2 * padding, columns, width + 2 * padding, channels), np.float32)
     around = [(0, 0), (padding, padding), (padding, padding), (0, 0)]
     for i, cell in enumerate(np.pad(frames, around, mode="edge")):
         page[i // columns, :, i % columns] = cell
     return page.reshape(rows * page.shape[1], columns * page.shape[3], channels)
 
 
+def mip_padding(height: int, width: int, levels: int) -> int:
+    """Returns the least padding in pixels with which `levels` mip levels do not mix neighbouring frames.
+
+    A texel of the coarsest level must not span two cells, and the half texel that a filter reads beyond a frame's edge
+    must be within its padding.
+
+    Raises:
+        WlmError: No padding makes both sides of a cell multiples of a texel of the coarsest level.
+    """
+    part = 2**levels
+    for padding in range(part // 2, part // 2 + part):
+        if (height + 2 * padding) % part == 0 == (width + 2 * padding) % part:
+            return padding
+    raise WlmError(
+        f"mips: {levels} levels need cells with sides of a multiple of {part} pixels, which no padding gives for frames"
+        f" of {width} x {height} pixels: use fewer levels"
+    )
+
+
+def mip_levels(height: int, width: int, padding: int) -> int:
+    """Returns the index of the coarsest mip level that does not mix neighbouring padded frames; 0: no mips."""
+    level = 0
+    while 2**level <= padding and not any((n + 2 * padding) % 2 ** (level + 1) for n in (height, width)):
+        level += 1
+    return level
+
+
 def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, tuple[str, ...]], int]:
-    """Writes the textures of a flip book to files NAME_1, NAME_2 and, with motion, NAME_motion, each atomically.
+    """Writes the textures of a flip book to files NAME_1 and NAME_2, each atomically.
 
     Args:
         book: The flip book.
@@ -254,8 +261,7 @@ def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, t
         WlmError: The suffix is wrong, a number is not finite, or a file cannot be written.
     """
     output = Path(output)
-    endings = {"first": "1", "second": "2", "motion": "motion"}
-    paths = {name: output.with_name(f"{output.stem}_{endings[name]}{output.suffix}") for name in book.pages}
+    paths = {name: output.with_name(f"{output.stem}_{i}{output.suffix}") for i, name in enumerate(book.pages, 1)}
     facts = {"layout": book.layout, "rows": book.rows, "columns": book.columns, "frames": book.count}
     text = json.dumps(facts | {"padding": book.padding, "gain": book.gain}, separators=(",", ":"))
     clipped = sum(_write_page(path, book.pages[name], text) for name, path in paths.items())
@@ -263,7 +269,7 @@ def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, t
 
 
 def _write_page(path: Path, page: np.ndarray, text: str) -> int:
-    """Writes a texture [H, W, 3 or 4] with the `text` of `NOTE`, and returns the number of clipped values."""
+    """Writes a texture [H, W, 3 or 4] with its description `text` as an image; returns how many values are clipped."""
     if not np.isfinite(page).all():
         raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
     if suffix_of(path) == ".exr":

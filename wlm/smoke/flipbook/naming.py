@@ -57,8 +57,8 @@ def layout_name(layout: Layout) -> str:
 
 
 def second_names(first: str, back: bool = False) -> list[tuple[str, str]]:
-    """Returns the names that the second texture may have beside a first one, each with a layout, "" for any; `back`:
-    the names that the first may have beside a second one."""
+    """Returns the names that a flip book's second texture may have if the first is named `first`, each with its layout,
+    "" for any; with `back` the names of the first texture, given that of the second."""
     found = []
     for one, other, layout in PAIRS:
         if back:

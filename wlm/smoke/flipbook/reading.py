@@ -316,7 +316,7 @@ def _straight(
     said: list[str],
     notes: list[str],
 ) -> bool:
-    """Finds whether alpha is straight, and says so; notes a contradiction to what is given."""
+    """Returns whether alpha is straight: as `given`, else by its light, else false; adds lines on this and doubts."""
     seen = _is_straight(maps, alpha)
     kinds = {True: "straight", False: "premultiplied"}
     if given is None:
@@ -348,7 +348,7 @@ def _is_straight(maps: torch.Tensor, alpha: torch.Tensor) -> bool | None:
 
 
 def _stated(entry: bytes | str, path: Path) -> dict[str, Any]:
-    """Returns what `write_book` wrote as a texture's entry, or `wlm.export` beside it; empty for other files."""
+    """Parses the description that wlm wrote into a texture (`entry`) or beside it; an empty dict for other files."""
     try:
         found = json.loads(entry or b"{}")
         index = path.with_name("bundle.json")

@@ -5,7 +5,6 @@ import math
 from wlm.bundle import sampler
 from wlm.smoke.camera import ALPHA, EMISSION, LAYOUTS
 from wlm.smoke.flipbook.book import Book
-from wlm.smoke.flipbook.motion import ZERO
 from wlm.smoke.shading import Ramp
 
 _TEXT = """\
@@ -57,34 +56,6 @@ float wlm_smoke_level(float texels)
 }}
 """
 
-_MOTION = """
-// Between two frames, at a share of 0 to 1 of the interval, both textures are read twice and mixed:
-//
-//     vec2 way = wlm_smoke_motion(texture(motion, wlm_smoke_uv(place, frame)));
-//     way = wlm_smoke_motion(texture(motion, wlm_smoke_uv(wlm_smoke_before(place, way, share), frame)));
-//     first = mix(texture(first, wlm_smoke_uv(wlm_smoke_before(place, way, share), frame)),
-//                 texture(first, wlm_smoke_uv(wlm_smoke_after(place, way, share), frame + 1.0)), share)
-//
-// Returns the motion on the billboard from a frame to the next, from a texel of the motion texture, which is linear.
-vec2 wlm_smoke_motion(vec4 texel)
-{{
-    vec2 way = texel.xy - vec2({zero}, {zero});
-    return vec2(way.x * {reach}, way.y * -{reach});
-}}
-
-// Returns the place in the earlier frame of the smoke that is now at a place.
-vec2 wlm_smoke_before(vec2 place, vec2 motion, float share)
-{{
-    return clamp(place - motion * share, vec2(0.0, 0.0), vec2(1.0, 1.0));
-}}
-
-// Returns the place in the later frame of the smoke that is now at a place.
-vec2 wlm_smoke_after(vec2 place, vec2 motion, float share)
-{{
-    return clamp(place + motion * (1.0 - share), vec2(0.0, 0.0), vec2(1.0, 1.0));
-}}
-"""
-
 
 def smoke_shader(book: Book) -> str:
     """Returns the shader code of functions that read a flip book's textures."""
@@ -95,7 +66,7 @@ def smoke_shader(book: Book) -> str:
     }
     height, width = (n + 2 * book.padding for n in book.size)
     alpha, emission = places.pop(ALPHA), places.pop(EMISSION)
-    text = _TEXT.format(
+    return _TEXT.format(
         layout=book.layout,
         rows=book.rows,
         columns=book.columns,
@@ -111,9 +82,6 @@ def smoke_shader(book: Book) -> str:
         emission=f"{emission} * {_number(1.0 / book.gain)}" if book.hot else "0.0",
         **places,
     )
-    if book.scale is not None:
-        text += _MOTION.format(zero=_number(ZERO), reach=_number(2.0 * book.scale))
-    return text
 
 
 _READ = """
@@ -124,7 +92,8 @@ void wlm_smoke_texels(vec2 place, float time, float texels, out vec4 first, out 
     float frame = clamp(floor(time), 0.0, {last:.1f});
     float share = clamp(time - frame, 0.0, 1.0);
     float mip = wlm_smoke_level(texels);
-{between}
+    vec2 early = wlm_smoke_uv(place, frame);
+    vec2 late = wlm_smoke_uv(place, frame + 1.0);
     first = mix(textureLod(WLM_SMOKE_FIRST_MAP, early, mip), textureLod(WLM_SMOKE_FIRST_MAP, late, mip), share);
     second = mix(textureLod(WLM_SMOKE_SECOND_MAP, early, mip), textureLod(WLM_SMOKE_SECOND_MAP, late, mip), share);
 }}
@@ -164,28 +133,15 @@ vec4 wlm_smoke_pixel(vec2 place, float time, float texels, vec3 toward, vec3 irr
 }}
 """
 
-_FADE = """\
-    vec2 early = wlm_smoke_uv(place, frame);
-    vec2 late = wlm_smoke_uv(place, frame + 1.0);"""
-# Motion of the smoke that is at a pixel at this time, which was elsewhere in the first frame.
-_MOVE = """\
-    vec4 here = textureLod(WLM_SMOKE_MOTION_MAP, wlm_smoke_uv(place, frame), mip);
-    vec2 start = wlm_smoke_before(place, wlm_smoke_motion(here), share);
-    vec4 there = textureLod(WLM_SMOKE_MOTION_MAP, wlm_smoke_uv(start, frame), mip);
-    vec2 way = wlm_smoke_motion(there);
-    vec2 early = wlm_smoke_uv(wlm_smoke_before(place, way, share), frame);
-    vec2 late = wlm_smoke_uv(wlm_smoke_after(place, way, share), frame + 1.0);"""
-
 
 def billboard_shader(book: Book) -> str:
     """Returns the code of a shader that plays and lights a flip book on a billboard.
 
-    Its textures are `wlm_smoke_first_map`, `wlm_smoke_second_map` and, with motion, `wlm_smoke_motion_map`.
+    Its textures are `wlm_smoke_first_map` and `wlm_smoke_second_map`.
     """
     textures = "\n".join(sampler(f"wlm_smoke_{name}_map", "sampler2D") for name in book.pages)
     text = _READ.format(
         last=book.count - 1,
-        between=_FADE if book.motion is None else _MOVE,
         share=f"{0.25 / math.pi:.9g}",
         glow=_glow(book.ramp) if book.hot else "    return vec3(0.0, 0.0, 0.0);",
     )

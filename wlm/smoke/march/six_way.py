@@ -98,7 +98,7 @@ def bake_coarse(volume: DensityVolume, camera: Camera, march: March = March()) -
 
 
 def coarse_march(volume: DensityVolume, seed: int = 0) -> March:
-    """Returns settings of a march in steps of 1/130 of the smoke's longest edge, with a seed for its jitter."""
+    """Returns settings of a march in steps of 1/130 of the smoke's longest edge (or a minimum), with a jitter seed."""
     return March(max(max(volume.shape) / _STEPS, LEAST_STEP), seed=seed)
 
 

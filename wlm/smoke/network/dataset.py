@@ -164,7 +164,7 @@ class _Maker:
         return Pool(*(torch.cat([getattr(pool, field.name) for pool in pools]) for field in fields(Pool)))
 
     def _sequence(self, number: int) -> tuple[Pool, int, int]:
-        """Returns the samples of a sequence, and how many unstable scenes and almost empty samples were left out."""
+        """Simulates a random scene; returns its samples, and how many unstable scenes and empty samples it left out."""
         for attempt in range(ATTEMPTS):
             index = number * ATTEMPTS + attempt
             settings = self._sequence_settings(index)

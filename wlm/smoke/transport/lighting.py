@@ -185,7 +185,7 @@ def light_in(
     lights: Sequence[AnyLight],
     visit: Callable[[int, Depths], None] | None = None,
 ) -> LitSmoke:
-    """Does the work of `light_smoke` in a prepared march; calls `visit` with each light's index and optical depths."""
+    """Computes light scattered once from each light, in a prepared march; `visit` gets each light's optical depths."""
     planes = torch.zeros(2, len(lights), camera.height, camera.width, device=volume.device)
     for n, light in enumerate(lights):
         place, _, radius = in_voxels(light, volume)

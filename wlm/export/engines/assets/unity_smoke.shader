@@ -5,7 +5,6 @@ Shader "Wlm/Smoke/@NAME@"
     {
         wlm_smoke_first_map ("First", 2D) = "black" {}
         wlm_smoke_second_map ("Second", 2D) = "black" {}
-        @MOTION@
         _WlmFrame ("Frame", Float) = 0
         _WlmSky ("Sky", Color) = (0, 0, 0, 1)
     }

@@ -1,4 +1,4 @@
-// Describes the texel under the pointer in the panel, as `wlm view` does.
+// Describes the texel under the pointer in the panel.
 
 const PLACES = `${HEAD}
 in vec2 v_uv;
