@@ -3,15 +3,16 @@
 import inspect
 import math
 import re
+import runpy
 import subprocess
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from builders.operation_cases import CASES, FIRST, Case, normal
 from kernels.compare import close
 
 from wlm import ops
@@ -21,172 +22,6 @@ from wlm.ops import plain
 EXACT = {"value": 1e-5, "gradient": 1e-4, "slope": 1e-3}
 
 
-@dataclass
-class Case:
-    """Arguments of an operation.
-
-    Attributes:
-        op: Its name in `wlm.ops` and in `plain`.
-        leaves: Tensors with a gradient, by argument.
-        constants: Other tensors, by argument.
-        options: Other arguments.
-        sizes: Of the step for differences, by leaf, where 1e-2 isn't right; 0: the gradient isn't the slope.
-    """
-
-    op: str
-    leaves: dict[str, np.ndarray]
-    constants: dict[str, np.ndarray] = field(default_factory=dict)
-    options: dict[str, Any] = field(default_factory=dict)
-    sizes: dict[str, float] = field(default_factory=dict)
-
-    def tensors(self, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
-        """All tensors, of one float type; the leaves require a gradient."""
-        tensors = {name: torch.tensor(values, device=device) for name, values in (self.leaves | self.constants).items()}
-        tensors = {name: t.to(dtype) if t.is_floating_point() else t for name, t in tensors.items()}
-        return {name: t.requires_grad_(name in self.leaves) for name, t in tensors.items()}
-
-    def call(self, module: Any, tensors: dict[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """The results."""
-        results = getattr(module, self.op)(**tensors, **self.options)
-        return results if isinstance(results, tuple) else (results,)
-
-
-def _points(count: int, *cells: int, seed: int = 1, outside: float = 0.0) -> np.ndarray:
-    """Points between cell centres, none within a tenth of a cell of one: there a slope changes."""
-    random = np.random.default_rng(seed)
-    size = np.array(cells)
-    low, high = (-outside * size).astype(int) - 1, ((1.0 + outside) * size).astype(int)
-    cell = random.integers(low, high, (count, len(cells)))
-    return ((cell + 0.5 + random.uniform(0.1, 0.9, cell.shape)) / size).astype(np.float32)
-
-
-def _normal(*shape: int, seed: int = 2) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
-
-
-def _uniform(low: float, high: float, *shape: int, seed: int = 3) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(low, high, shape).astype(np.float32)
-
-
-def _layers(count: int, layers: int) -> np.ndarray:
-    return np.random.default_rng(4).integers(0, layers, count)
-
-
-def _units(*shape: int, seed: int = 5) -> np.ndarray:
-    d = _normal(*shape, 3, seed=seed)
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
-
-
-def _network(inputs: int, width: int, outputs: int, *networks: int) -> dict[str, np.ndarray]:
-    return {
-        "x": _normal(*networks, 37, inputs),
-        "hidden": _normal(*networks, inputs + width + 2, width, seed=6) / width**0.5,
-        "output": _normal(*networks, width + 1, outputs, seed=7) / width**0.5,
-    }
-
-
-def _gaussians(count: int, latent: int) -> np.ndarray:
-    rows = _normal(count, 10 + latent)
-    rows[:, :3] = _uniform(0.0, 1.0, count, 3)
-    rows[:, 3:6] = -2.0 + 0.5 * rows[:, 3:6]
-    return rows
-
-
-def _rays(count: int, middle: tuple[float, ...], radius: float, distance: float) -> dict[str, np.ndarray]:
-    """Rays that begin `distance` before random points round the middle."""
-    direction = _units(count)
-    origin = np.array(middle, np.float32) + radius * _normal(count, 3) - distance * direction
-    return {"origin": origin, "direction": direction}
-
-
-def _smoke(density: np.ndarray, lights: int = 2, emitting: bool = True, distance: float = 12.0, **options) -> Case:
-    """A march through a grid."""
-    middle = tuple(n / 2 for n in density.shape)
-    leaves, constants = {"density": density}, _rays(40, middle, 2.0, distance)
-    if lights:
-        leaves["colour"], constants["toward"] = _uniform(0.2, 1.0, lights, 3), _units(lights, seed=8)
-    if emitting:
-        leaves["emission"] = _uniform(0.0, 1.0, *density.shape, 3)
-    # Opaque smoke hardly answers to a small step, and thin smoke must stay above 0.
-    size = 0.5 if density.max() > 10.0 else min(1e-2, 0.6 * float(density.min()))
-    return Case("march", leaves, constants, options, {"density": size})
-
-
-_BLOCKS = {"endpoints": _uniform(0.1, 0.9, 2, 3, 2, 4), "weights": _uniform(0.1, 0.9, 8, 12)}
-_BEYOND = {"endpoints": _uniform(-0.3, 1.3, 2, 3, 2, 4), "weights": _uniform(-0.3, 1.3, 8, 12)}
-_STRAIGHT = {"endpoints": 0.0, "weights": 0.0, "uv": 1e-3}
-_THIN = _uniform(0.05, 0.3, 6, 7, 8)
-_THIRDS = {"xy": _normal(4, 5, 3), "xz": _normal(6, 5, 3, seed=9), "yz": _normal(6, 4, 3, seed=10)}
-_IN_CELLS = {"points": 5e-3}
-_SPACE = {"points": _points(60, 60, 60, 60)}
-
-CASES = {
-    "bc7_map": Case("bc7_map", {**_BLOCKS, "uv": _points(50, 12, 8)}, sizes={"uv": 5e-3}),
-    "bc7_map-beyond": Case("bc7_map", {**_BEYOND, "uv": _points(50, 12, 8, outside=0.5)}, sizes=_STRAIGHT),
-    "bc7_map-quantised": Case(
-        "bc7_map", {**_BEYOND, "uv": _points(50, 12, 8)}, options={"quantised": True}, sizes=_STRAIGHT
-    ),
-    "bc7_map-layers": Case(
-        "bc7_map",
-        {
-            "endpoints": _uniform(0.1, 0.9, 3, 1, 2, 2, 4),
-            "weights": _uniform(0.1, 0.9, 3, 4, 8),
-            "uv": _points(50, 8, 4),
-        },
-        {"layer": _layers(50, 3)},
-        sizes={"uv": 5e-3},
-    ),
-    "bc7_texels": Case("bc7_texels", _BLOCKS),
-    "plane": Case("plane", {"values": _normal(5, 7, 3), "points": _points(60, 7, 5, outside=0.5)}, sizes=_IN_CELLS),
-    "plane-periodic-layers": Case(
-        "plane",
-        {"values": _normal(3, 5, 7, 2), "points": _points(60, 7, 5, outside=1.5)},
-        {"layer": _layers(60, 3).astype(np.int32)},
-        {"periodic": True},
-        _IN_CELLS,
-    ),
-    "plane-one-cell": Case("plane", {"values": _normal(1, 1, 17), "points": _points(9, 1, 1)}, sizes=_IN_CELLS),
-    "volume": Case(
-        "volume", {"values": _normal(4, 5, 7, 3), "points": _points(60, 7, 5, 4, outside=0.5)}, sizes=_IN_CELLS
-    ),
-    "volume-periodic-layers": Case(
-        "volume",
-        {"values": _normal(3, 4, 1, 6, 2), "points": _points(60, 6, 1, 4, outside=1.5)},
-        {"layer": _layers(60, 3)},
-        {"periodic": True},
-        _IN_CELLS,
-    ),
-    "triplane": Case("triplane", _THIRDS | _SPACE, sizes={"points": 1e-4}),
-    "triplane-product": Case("triplane", _THIRDS | _SPACE, {}, {"reduce": "product"}, {"points": 1e-4}),
-    "triplane-concatenate": Case("triplane", _THIRDS | _SPACE, {}, {"reduce": "concatenate"}, {"points": 1e-4}),
-    **{f"mlp-{width}": Case("mlp", _network(16, width, 3, 3)) for width in (8, 16, 17, 32, 64)},
-    "mlp-tanh": Case("mlp", _network(5, 16, 4, 2), options={"gelu": "tanh"}),
-    "mlp-fast": Case("mlp", _network(5, 17, 1), options={"gelu": "fast"}),
-    "gaussian_sum": Case(
-        "gaussian_sum", {"rows": _gaussians(24, 5), "points": _uniform(0.0, 1.0, 80, 3)}, options={"cut": 6.0}
-    ),
-    "gaussian_sum-sphere": Case(
-        "gaussian_sum",
-        {"rows": _gaussians(9, 17), "points": _uniform(0.0, 1.0, 80, 3)},
-        options={"support": "sphere"},
-        sizes={"rows": 0.0, "points": 0.0},  # what is reached changes at a step
-    ),
-    "gaussian_sum-lists": Case(
-        "gaussian_sum",
-        {"rows": _gaussians(300, 1), "points": _uniform(0.0, 1.0, 500, 3)},
-        sizes={"rows": 0.0, "points": 0.0},
-    ),
-    "march": _smoke(_THIN, step=0.8, g=0.4),
-    "march-inside": _smoke(_THIN, distance=1.0, step=2.5, g=-0.6),
-    "march-transmittance": _smoke(_THIN, lights=0, emitting=False),
-    "march-emission": _smoke(_THIN, lights=0),
-    "march-thin": _smoke(0.12 * _THIN, lights=0),
-    "march-light": _smoke(_THIN, lights=1, emitting=False),
-    "march-opaque": _smoke(300.0 * _THIN, step=0.8),
-    "march-no-smoke": _smoke(0.0 * _THIN),
-    "march-one-voxel": _smoke(_uniform(0.5, 1.0, 1, 1, 1), step=0.3),
-}
-FIRST = {case.op: name for name, case in reversed(CASES.items())}  # one of each operation
 # The GPU's tanh instruction is within 2^-11 relative; x (1 - tanh) and x (1 - tanh^2) carry that to the gradients.
 FAST = {"value": 2e-3, "gradient": 5e-3, "slope": 1e-2}
 
@@ -198,7 +33,7 @@ def _tolerances(name: str, device: str) -> dict[str, float]:
 def _results(case: Case, module: Any, tensors: dict[str, torch.Tensor]) -> tuple[list, dict]:
     """The values and, for random adjoints of them, the gradients by leaf."""
     values = case.call(module, tensors)
-    adjoints = [torch.from_numpy(_normal(*value.shape, seed=20 + i)).to(value) for i, value in enumerate(values)]
+    adjoints = [torch.from_numpy(normal(*value.shape, seed=20 + i)).to(value) for i, value in enumerate(values)]
     pairs = [pair for pair in zip(values, adjoints, strict=True) if pair[0].requires_grad]
     torch.autograd.backward(*zip(*pairs, strict=True))
     return [value.detach() for value in values], {name: tensors[name].grad for name in case.leaves}
@@ -228,7 +63,7 @@ def test_against_differences(device: str, name: str):
         size = case.sizes.get(leaf, 1e-2)
         if size == 0.0:
             continue
-        along = torch.from_numpy(np.sign(_normal(*case.leaves[leaf].shape, seed=30))).to(device)
+        along = torch.from_numpy(np.sign(normal(*case.leaves[leaf].shape, seed=30))).to(device)
         # A density mustn't be below 0.
         forward = name == "march-no-smoke" and leaf == "density"
         if forward:
@@ -239,7 +74,7 @@ def test_against_differences(device: str, name: str):
             with torch.no_grad():
                 tensors[leaf] = tensors[leaf] + step * along
                 values = case.call(ops, tensors)
-            adjoints = [torch.from_numpy(_normal(*value.shape, seed=20 + i)) for i, value in enumerate(values)]
+            adjoints = [torch.from_numpy(normal(*value.shape, seed=20 + i)) for i, value in enumerate(values)]
             return sum(float((v.cpu().double() * a).sum()) for v, a in zip(values, adjoints, strict=True))
 
         if forward:
@@ -264,7 +99,7 @@ def test_any_strides(name: str):
     assert all(t.numel() == 1 or not t.is_contiguous() for t in spread.values())
     spread = {leaf: t.requires_grad_(leaf in case.leaves) for leaf, t in spread.items()}
     results = case.call(ops, spread)
-    adjoints = [torch.from_numpy(_normal(*value.shape, seed=20 + i)) for i, value in enumerate(results)]
+    adjoints = [torch.from_numpy(normal(*value.shape, seed=20 + i)) for i, value in enumerate(results)]
     torch.autograd.backward(results, [torch.stack([a, a], -1)[..., 0] for a in adjoints])
     for value, other in zip(values, results, strict=True):
         assert torch.equal(value, other)
@@ -367,7 +202,11 @@ REFUSED = [
     ("march", {"direction": torch.ones(39, 3)}, "direction: expected float32 [40, 3], got"),
     ("march", {"toward": torch.zeros(2, 3)}, "length of toward: expected numbers from 0.999 to 1.001, found 0"),
     ("march", {"toward": None}, "toward, colour: expected both arguments or neither"),
-    ("march", {"origin": torch.zeros(40, 3).requires_grad_()}, "origin: expected a tensor that requires no gradient"),
+    (
+        "march",
+        {"origin": torch.zeros(40, 3).requires_grad_()},
+        "origin: expected an argument that requires no gradient",
+    ),
     ("march", {"emission": torch.zeros(6, 7, 8)}, "emission: expected float32 [6, 7, 8, 3], got"),
     ("march", {"step": 0.0}, "step: expected a number above 0, got 0.0"),
     ("march", {"g": 1.0}, "g: expected a number between -1 and 1, got 1.0"),
@@ -419,7 +258,7 @@ def test_function_transforms_are_refused(transform: str):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("name", [n for n in ops.__all__ if n not in ("plain", "Raster", "bc7_blocks")])
+@pytest.mark.parametrize("name", [n for n in ops.__all__ if n not in ("plain", "funcs", "Raster", "bc7_blocks")])
 def test_twins_take_the_same_arguments(name: str):
     """A reader can put one in the place of the other; culling and what else is drawn are the kernels' alone."""
     own = inspect.signature(getattr(ops, name)).parameters
@@ -538,16 +377,25 @@ def test_same_bits_every_time():
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "ops.md").read_text(encoding="utf-8")
-BLOCKS = dict(re.findall(r"^## (\S+?),?(?: [^\n]*)?\n(?:(?!^## ).)*?```python\n(.*?)```", PAGE, re.S | re.M))
+BLOCKS = {
+    f"{section}-{i}": block
+    for section, text in re.findall(r"^## ([\w]+)[^\n]*\n((?:(?!^## ).)*)", PAGE, re.S | re.M)
+    for i, block in enumerate(re.findall(r"```python\n(.*?)```", text, re.S))
+}
 
 
 @pytest.mark.parametrize("section", BLOCKS)
-def test_block(section: str):
+def test_block(section: str, tmp_path: Path):
     torch.manual_seed(0)
-    exec(compile(BLOCKS[section], f"docs/ops.md, {section}", "exec"), {"__name__": "__main__"})
+    # Warp reads a kernel's lines from its file.
+    path = tmp_path / "block.py"
+    path.write_text(BLOCKS[section], encoding="utf-8")
+    runpy.run_path(str(path), run_name=f"block_{section.replace('-', '_')}")
 
 
 def test_page():
-    assert [*BLOCKS] == ["bc7_map", "plane", "mlp", "gaussian_sum", "rasterize", "march"]
+    kernels = ["Tapes-0", *(f"funcs-{i}" for i in range(4))]
+    torch_alone = [f"{name}-0" for name in ("bc7_map", "plane", "mlp", "gaussian_sum", "rasterize", "march")]
+    assert [*BLOCKS] == kernels + torch_alone
     for target in re.findall(r"\]\(([^)#\s]+)\)", PAGE):
         assert (ROOT / "docs" / target).exists(), target

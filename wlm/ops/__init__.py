@@ -1,8 +1,9 @@
-"""Differentiable torch operations on Warp kernels.
+"""Differentiable operations on Warp kernels, for torch and for Warp.
 
-The functions support autograd, run on the device of their tensors and, on CUDA, queue work on torch's current stream.
-All floats are float32, and there is no second derivative. `plain` implements each of them in a few lines of torch, for
-any float type, as the reference for the kernels. The documentation is docs/ops.md.
+The functions take torch tensors, with autograd, or Warp arrays, whose gradients they record on the active `wp.Tape`.
+They run on the device of their arguments and, on CUDA, queue work on the current stream of torch or of Warp. All floats
+are float32, and there is no second derivative. `plain` implements each of them in a few lines of torch, for any float
+type, as the reference for the kernels. The documentation is docs/ops.md.
 
     bc7_map, bc7_texels, bc7_blocks     feature maps in BC7 blocks
     plane, triplane, volume             feature grids, sampled linearly
@@ -11,6 +12,7 @@ any float type, as the reference for the kernels. The documentation is docs/ops.
     rasterize, rasterize_uv             triangles to pixels
     interpolate, texture                attributes and texture values per pixel
     march                               light through a density grid
+    funcs                               functions for your own kernels
 """
 
 from wlm._facade import facade
@@ -20,6 +22,7 @@ _PLACES = {
     "bc7_blocks": "wlm.ops.blocks",
     "bc7_map": "wlm.ops.blocks",
     "bc7_texels": "wlm.ops.blocks",
+    "funcs": "wlm.ops.funcs",
     "gaussian_sum": "wlm.ops.gaussians",
     "interpolate": "wlm.ops.raster",
     "march": "wlm.ops.marching",

@@ -14,10 +14,12 @@ from torch.autograd.function import once_differentiable
 from wlm.formats.bc7 import pack_mode6
 from wlm.interop import to_warp
 from wlm.ops.sampling import sample
+from wlm.ops.tapes import takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.lightmap import blocks
 
 
+@takes_arrays("endpoints", "weights", "uv")
 def bc7_map(
     endpoints: torch.Tensor,
     weights: torch.Tensor,
@@ -51,6 +53,7 @@ def bc7_map(
     return sample(texels, uv, layer, axes=2, names=("weights", "uv"))
 
 
+@takes_arrays("endpoints", "weights")
 def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: bool = False) -> torch.Tensor:
     """Decodes whole maps; the reference is `plain.bc7_texels`. Gradients are bitwise reproducible.
 
@@ -71,6 +74,7 @@ def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: boo
     return texels.reshape(*weights.shape, 4)
 
 
+@takes_arrays()
 def bc7_blocks(endpoints: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
     """Packs maps into BC7 blocks, which decode to the result of `bc7_texels` with `quantised`; has no gradient.
 
@@ -82,7 +86,7 @@ def bc7_blocks(endpoints: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
         uint8 [H/4, W/4, 16] or [L, H/4, W/4, 16], BC7 blocks of mode 6.
 
     Raises:
-        ValueError: See `bc7_map`.
+        ValueError: See `bc7_map`; or an array requires a gradient while a tape is active.
     """
     _check(endpoints, weights)
     *layers, height, width = weights.shape

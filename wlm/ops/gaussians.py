@@ -7,6 +7,7 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from wlm.interop import to_warp
+from wlm.ops.tapes import takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.probe import cubes as cubes_kernels
 from wlm_kernels.probe import gaussian_sum as kernels
@@ -16,6 +17,7 @@ PAIRS_FOR_LISTS = 2**17
 """Number of Gaussian-point pairs above which points only evaluate the Gaussians listed for their grid cell."""
 
 
+@takes_arrays("rows", "points")
 def gaussian_sum(
     rows: torch.Tensor, points: torch.Tensor, *, cut: float = 3.0, support: str = "ellipsoid"
 ) -> torch.Tensor:

@@ -8,6 +8,7 @@ from torch.autograd.function import once_differentiable
 
 from wlm.interop import to_warp
 from wlm.ops.plain import henyey_greenstein
+from wlm.ops.tapes import NoGradientError, takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream, optional_array, zeros_for
 from wlm_kernels.smoke import single_scatter
 from wlm_kernels.smoke.march import nodes_along
@@ -15,6 +16,7 @@ from wlm_kernels.smoke.march import nodes_along
 _UNIT = (0.999, 1.001)  # accepted range of a direction's length
 
 
+@takes_arrays("density", "colour", "emission")
 def march(
     density: torch.Tensor,
     origin: torch.Tensor,
@@ -82,7 +84,7 @@ def march(
     check("direction", direction, tuple(origin.shape), device)
     for name, tensor in {"origin": origin, "direction": direction, "toward": toward}.items():
         if tensor.requires_grad:
-            raise ValueError(f"{name}: expected a tensor that requires no gradient; march has none for it")
+            raise NoGradientError(name, "march")
     lengths = {"length of direction": direction.norm(dim=-1), "length of toward": toward.norm(dim=-1)}
     check_finite(
         {"density": (0.0, math.inf), **dict.fromkeys(lengths, _UNIT)},

@@ -4,6 +4,7 @@ import torch
 from torch.autograd.function import once_differentiable
 
 from wlm.interop import to_warp
+from wlm.ops.tapes import takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.mlp import GELUS, MlpKernels, kernels
 
@@ -11,6 +12,7 @@ WIDEST = 64
 """Largest width of a hidden layer: a thread stores a layer in registers, and a wider one would spill."""
 
 
+@takes_arrays("x", "hidden", "output")
 def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: str = "exact") -> torch.Tensor:
     """Evaluates networks with two hidden layers of H units and GELU activations; the reference is `plain.mlp`.
 

@@ -12,6 +12,7 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from wlm.interop import to_warp, torch_memory
+from wlm.ops.tapes import NoGradientError, takes_arrays
 from wlm.ops.tensors import check, check_index, dense, on_stream, optional_array, zeros_for
 from wlm_kernels.raster import gradient as raster_gradient
 from wlm_kernels.raster import rasterize as kernels
@@ -42,6 +43,7 @@ class Raster:
     count: int | None = None
 
 
+@takes_arrays("clip")
 def rasterize(
     clip: torch.Tensor,
     triangle: torch.Tensor,
@@ -73,6 +75,7 @@ def rasterize(
     return _rasterize(clip, triangle, height, width, "clip", cull, derivative, coverage)
 
 
+@takes_arrays("uv")
 def rasterize_uv(
     uv: torch.Tensor,
     triangle: torch.Tensor,
@@ -99,6 +102,7 @@ def rasterize_uv(
     return _rasterize(uv, triangle, height, width, "uv", cull, derivative, coverage)
 
 
+@takes_arrays("attribute", "raster.barycentric")
 def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster) -> torch.Tensor:
     """Interpolates vertex attributes at the visible point of each pixel; the result is 0 in uncovered pixels.
 
@@ -122,6 +126,7 @@ def interpolate(attribute: torch.Tensor, triangle: torch.Tensor, raster: Raster)
     return _Interpolate.apply(attribute, triangle, raster.triangle, raster.barycentric)
 
 
+@takes_arrays("image", "uv")
 def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", boundary: str = "clamp") -> torch.Tensor:
     """Samples a texture at any coordinates, with the given filter and addressing.
 
@@ -139,13 +144,16 @@ def texture(image: torch.Tensor, uv: torch.Tensor, *, filter: str = "linear", bo
         float [..., C].
 
     Raises:
-        ValueError: No such filter or boundary, or a tensor's shape, type or device doesn't fit.
+        ValueError: No such filter or boundary, a tensor's shape, type or device doesn't fit, or `uv` requires a
+            gradient with the filter "nearest".
     """
     texture_kernels.codes(filter, boundary)
     check("image", image, (None, None, None))
     if 0 in image.shape:
         raise ValueError(f"image: expected at least one texel and one channel, got {tuple(image.shape)}")
     check("uv", uv, (..., 2), image.device)
+    if filter == "nearest" and uv.requires_grad:
+        raise NoGradientError("uv", "the filter nearest")
     texels = _Texture.apply(image, uv.reshape(-1, 2), filter, boundary)
     return texels.reshape(*uv.shape[:-1], image.shape[2])
 

@@ -11,12 +11,14 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from wlm.interop import to_warp
+from wlm.ops.tapes import takes_arrays
 from wlm.ops.tensors import check, check_finite, check_index, on_stream, optional_array, zeros_for
 from wlm_kernels import interpolate
 
 REDUCTIONS = ("sum", "product", "concatenate")
 
 
+@takes_arrays("values", "points")
 def plane(
     values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
 ) -> torch.Tensor:
@@ -39,6 +41,7 @@ def plane(
     return sample(values, points, layer, periodic, axes=2)
 
 
+@takes_arrays("values", "points")
 def volume(
     values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
 ) -> torch.Tensor:
@@ -59,6 +62,7 @@ def volume(
     return sample(values, points, layer, periodic, axes=3)
 
 
+@takes_arrays("xy", "xz", "yz", "points")
 def triplane(
     xy: torch.Tensor, xz: torch.Tensor, yz: torch.Tensor, points: torch.Tensor, *, reduce: str = "sum"
 ) -> torch.Tensor:
