@@ -74,9 +74,9 @@ class Pieces(Sequence[bytes]):
     reach. A file that is replaced as `wlm.formats.atomic` does it remains readable.
     """
 
-    def __init__(self, file: OpenFile, start: int, index: np.ndarray) -> None:
-        """Takes the open file, the first byte of the part in it, and the content of `NAME.pieces`, uint32 [n, 5]."""
-        self._file = file
+    def __init__(self, path: str, file: OpenFile, start: int, index: np.ndarray) -> None:
+        """Takes the file, the first byte of the part in it, and the content of `NAME.pieces`, uint32 [n, 5]."""
+        self.path, self._file = path, file
         self.sizes = index[:, 0].astype(np.int64)
         """int64 [n], bytes of each piece."""
         self.digests = [words.tobytes() for words in index[:, 1:]]
@@ -103,6 +103,10 @@ class Pieces(Sequence[bytes]):
             raise ValueError("the file is damaged here: the bytes do not match their digest")
         return data
 
+    def close(self) -> None:
+        """Closes the file, for all its split parts; it is also closed with the last reference to them."""
+        self._file.close()
+
 
 @dataclass(frozen=True)
 class Artifact:
@@ -114,12 +118,10 @@ class Artifact:
         settings: Settings of the fit; for a compact artifact only `name`, the file's name without its ending.
         source: Hash of the input, as given by the writer; empty for a compact artifact.
         tensors: The parts that are not split by name, as read-only views of the bytes read.
-        pieces: The split parts by name.
+        pieces: The split parts by name; those of a file are `Pieces`.
         parts: Sizes of the parts by name, in bytes; those of split parts include their sizes and digests.
         file_bytes: Size of the file.
         header_bytes: Size of everything before the parts: the length, the header and its padding.
-        path: The file; empty for content that is in memory.
-        file: The open file, if it has split parts; it is closed with its last reference, or by `file.close()`.
     """
 
     system: str
@@ -131,8 +133,6 @@ class Artifact:
     parts: dict[str, int] = field(default_factory=dict)
     file_bytes: int = 0
     header_bytes: int = 0
-    path: str = ""
-    file: OpenFile | None = None
 
     @classmethod
     def of_parts(cls, system: str, settings: Mapping[str, Any], parts: Mapping[str, Content], source: str) -> "Artifact":
@@ -287,15 +287,15 @@ def _read(path: str | os.PathLike[str], file: BinaryIO, system: str | None) -> A
     indices = {name: tensors.pop(f"{name}{_PIECES}") for name in split}
     for name, own in indices.items():
         _check_pieces(f"{path}: part {one_line(name, 60)}", entries[name], own, end - start)
-    opened = OpenFile(file) if split else None
-    pieces = {} if opened is None else {n: Pieces(opened, start + entries[n][2], own) for n, own in indices.items()}
+    pieces = {}
+    if split:
+        opened = OpenFile(file)
+        pieces = {n: Pieces(f"{path}", opened, start + entries[n][2], own) for n, own in indices.items()}
     settings = _parse_json(path, settings_text.translate(_EXCHANGED_QUOTES), "settings")
     parts = {name: last - first for name, (_, _, first, last) in entries.items()}
     for name in split:
         parts[name] += parts.pop(f"{name}{_PIECES}")
-    return Artifact(
-        found_system, version, settings, source, tensors, pieces, parts, size, start, os.fspath(path), opened
-    )
+    return Artifact(found_system, version, settings, source, tensors, pieces, parts, size, start)
 
 
 def _index_of(pieces: Sequence[bytes]) -> np.ndarray:
@@ -332,7 +332,7 @@ def _compact(path: str | os.PathLike[str], content: bytes, system: str | None) -
     _check_system(path, found, system)
     parts = {name: array.nbytes for name, array in tensors.items()}
     settings = {"name": Path(path).stem}
-    return Artifact(found, version, settings, "", tensors, {}, parts, len(content), start, os.fspath(path))
+    return Artifact(found, version, settings, "", tensors, {}, parts, len(content), start)
 
 
 def _check_system(path: str | os.PathLike[str], found: str, expected: str | None) -> None:

@@ -134,9 +134,9 @@ def decode(artifact: Artifact) -> LightmapModel:
             plain = check_parts(arrays, {name: part for name, part in table.items() if name not in PACKED})
             if (plain["ranges"][:, :, 0] > plain["ranges"][:, :, 1]).any():
                 raise ValueError("part ranges: expected the least colour of a frame not to exceed its greatest colour")
-        where = f"{artifact.path}: sheet {item.name}".removeprefix(": ")
+        where = f"{tiles.path}: " if isinstance(tiles, Pieces) else ""
         models[sheet] = SheetModel.of_file(
-            StoredTiles(where, numbers, tiles, masks[key], artifact.file),
+            StoredTiles(f"{where}sheet {item.name}", numbers, tiles, masks[key]),
             name=item.name,
             width=item.size[0],
             height=item.size[1],

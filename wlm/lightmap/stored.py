@@ -11,7 +11,7 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.formats import zstd
-from wlm.formats.reading import OpenFile
+from wlm.formats.artifact import Pieces
 from wlm.lightmap.encodings import encoding_of
 from wlm.lightmap.model import PACKED, PACKED_KINDS, SheetModel, part_table
 from wlm.workers import each
@@ -50,14 +50,12 @@ class StoredTiles:
         numbers: int [n], numbers of the packed tiles, rising.
         pieces: A zstd frame for each of them.
         mask: The mask of the sheet.
-        file: The file of the pieces; None if they are in memory.
     """
 
     where: str
     numbers: np.ndarray
     pieces: Sequence[bytes]
     mask: PackedMask
-    file: OpenFile | None = None
 
     def read(self, sheet: SheetModel) -> dict[str, np.ndarray]:
         """Reads and unpacks the tiles of a sheet, which may have some of the file's tiles.
@@ -87,6 +85,6 @@ class StoredTiles:
         return arrays
 
     def close(self) -> None:
-        """Closes the file."""
-        if self.file is not None:
-            self.file.close()
+        """Closes the file, if the pieces are in one."""
+        if isinstance(self.pieces, Pieces):
+            self.pieces.close()
