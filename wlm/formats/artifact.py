@@ -135,7 +135,9 @@ class Artifact:
     header_bytes: int = 0
 
     @classmethod
-    def of_parts(cls, system: str, settings: Mapping[str, Any], parts: Mapping[str, Content], source: str) -> "Artifact":
+    def of_parts(
+        cls, system: str, settings: Mapping[str, Any], parts: Mapping[str, Content], source: str
+    ) -> "Artifact":
         """Returns what reading would return of an artifact with this content, without a file."""
         tensors = {name: part for name, part in parts.items() if not isinstance(part, Sequence)}
         pieces = {name: part for name, part in parts.items() if isinstance(part, Sequence)}

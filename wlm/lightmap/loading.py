@@ -95,9 +95,7 @@ class TileLoader:
             The number of requests that were dropped.
         """
         with self._change:
-            dropped = [
-                tile for tile in self._waiting if sheet in (None, tile[0]) and number in (None, tile[1])
-            ]
+            dropped = [tile for tile in self._waiting if sheet in (None, tile[0]) and number in (None, tile[1])]
             for tile in dropped:
                 del self._waiting[tile]
             return len(dropped)

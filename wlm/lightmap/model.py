@@ -205,7 +205,9 @@ class SheetModel:
         """
         chosen, part = np.asarray(numbers, np.int64).reshape(-1), copy(self)
         if chosen.size and not 0 <= chosen.min() <= chosen.max() < len(self.kind):
-            raise WlmError(f"{self.name}: tiles: expected 0 to {len(self.kind) - 1}, got {chosen.min()}, {chosen.max()}")
+            raise WlmError(
+                f"{self.name}: tiles: expected 0 to {len(self.kind) - 1}, got {chosen.min()}, {chosen.max()}"
+            )
         part.kind = np.zeros_like(self.kind)
         part.kind[chosen] = self.kind[chosen]
         for name, kinds in _KINDS.items():
