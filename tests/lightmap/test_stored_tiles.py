@@ -93,7 +93,9 @@ def test_tiles_are_chosen_by_sheet(tmp_path, reads):
     sheet = next(iter(model.sheets))
     decoder = model.decoder(tiles={sheet: np.flatnonzero(model.sheets[sheet].kind)})
     assert decoder.sheets[sheet].frame(0.0).any()
-    assert not any(own.model.kind.any() for other, own in decoder.sheets.items() if other != sheet)
+    assert list(decoder.sheets) == [sheet] and decoder.light is decoder.sheets[sheet]
+    other = next(other for other in model.sheets if (other.atlas, other.layer) != (sheet.atlas, sheet.layer))
+    assert "expected one of the decoder's sheets" in error_of(decoder.frame, 0.0, other.layer, other.atlas)
     assert "expected the tiles by sheet" in error_of(model.decoder, tiles=[0])
     assert "expected a sheet of the model" in error_of(model.decoder, tiles={LIGHT: [0]})
     assert "tiles: expected 0 to " in error_of(model.decoder, tiles={sheet: [99]})

@@ -79,8 +79,8 @@ class Pieces(Sequence[bytes]):
         self.path, self._file = path, file
         self.sizes = index[:, 0].astype(np.int64)
         """int64 [n], bytes of each piece."""
-        self.digests = [words.tobytes() for words in index[:, 1:]]
-        """BLAKE2b-128 of each piece."""
+        self.index = index
+        """uint32 [n, 5], size and BLAKE2b-128 of each piece."""
         self._starts = start + np.cumsum(self.sizes) - self.sizes
 
     def __len__(self) -> int:
@@ -99,7 +99,7 @@ class Pieces(Sequence[bytes]):
         if isinstance(place, slice):
             return [self[number] for number in range(*place.indices(len(self)))]
         data = self._file.read(int(self._starts[place]), int(self.sizes[place]))
-        if _digest_of(data) != self.digests[place]:
+        if _digest_of(data) != self.index[place, 1:].tobytes():
             raise ValueError("the file is damaged here: the bytes do not match their digest")
         return data
 
@@ -303,10 +303,8 @@ def _read(path: str | os.PathLike[str], file: BinaryIO, system: str | None) -> A
 def _index_of(pieces: Sequence[bytes]) -> np.ndarray:
     """Returns the sizes and digests of pieces, uint32 [n, 5]."""
     if isinstance(pieces, Pieces):
-        rows = zip(pieces.sizes.tolist(), pieces.digests, strict=True)
-    else:
-        rows = ((len(piece), _digest_of(piece)) for piece in pieces)
-    content = b"".join(struct.pack("<I", size) + digest for size, digest in rows)
+        return pieces.index
+    content = b"".join(struct.pack("<I", len(piece)) + _digest_of(piece) for piece in pieces)
     return np.frombuffer(content, _WORDS).reshape(-1, 1 + _DIGEST_BYTES // _WORDS.itemsize)
 
 

@@ -22,7 +22,7 @@ from wlm.formats.artifact import Artifact, Content, Pieces
 from wlm.formats.limits import check_growth
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.encodings import encoding_of
-from wlm.lightmap.model import PACKED, PACKED_KINDS, LightmapModel, SheetModel, part_table
+from wlm.lightmap.model import PACKED, PACKED_KINDS, LightmapModel, SheetModel, part_table, tiles_of
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.sheet import MOST_NAME, MOST_SHEETS, WIDTH, Sheet, check_sheets
 from wlm.lightmap.stored import PackedMask, StoredTiles
@@ -124,17 +124,19 @@ def decode(artifact: Artifact) -> LightmapModel:
             arrays = {name: part for name, part in own.items() if isinstance(part, np.ndarray)}
             if isinstance(tiles, np.ndarray) or len(arrays) < len(own):
                 raise ValueError("expected the tiles alone as a split part, found others")
+            where = f"{tiles.path}: " if isinstance(tiles, Pieces) else ""
             if key not in masks:
-                masks[key] = _mask(arrays, *sizes[number])
+                frame = check_part(arrays, "mask", _BYTES).tobytes() if "mask" in arrays else None
+                masks[key] = PackedMask(f"{where}sheet {item.name}", sizes[number], frame)
+                masks[key].check()
             kind = arrays.pop("kind")
-            numbers = np.flatnonzero(np.isin(kind, PACKED_KINDS))
+            numbers = tiles_of(kind, PACKED_KINDS)
             if len(tiles) != len(numbers):
                 raise ValueError(f"part tiles: expected a piece for each of {len(numbers)} tiles, found {len(tiles)}")
             arrays.pop("mask", None)
             plain = check_parts(arrays, {name: part for name, part in table.items() if name not in PACKED})
             if (plain["ranges"][:, :, 0] > plain["ranges"][:, :, 1]).any():
                 raise ValueError("part ranges: expected the least colour of a frame not to exceed its greatest colour")
-        where = f"{tiles.path}: " if isinstance(tiles, Pieces) else ""
         models[sheet] = SheetModel.of_file(
             StoredTiles(f"{where}sheet {item.name}", numbers, tiles, masks[key]),
             name=item.name,
@@ -224,14 +226,6 @@ def _shortened(times: np.ndarray) -> np.ndarray:
     short = times.astype(np.float32)
     distinct = len(times) < 2 or np.all(np.diff(short) > 0)
     return short if distinct and np.allclose(short, times, rtol=_ROUNDING, atol=0) else times
-
-
-def _mask(tensors: Mapping[str, np.ndarray], height: int, width: int) -> PackedMask:
-    """Reads the mask from the parts; if the file has none, all texels are valid."""
-    if "mask" not in tensors:
-        return PackedMask((height, width), None)
-    frame = check_part(tensors, "mask", _BYTES).tobytes()
-    return PackedMask((height, width), zstd.decompress(frame, -(-height * width // 8), "part mask"))
 
 
 def _check_times(times: list[float], period: float | None) -> None:

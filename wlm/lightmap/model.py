@@ -15,7 +15,7 @@ file the arrays that hold maps, networks and frames are read when they are first
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Self
@@ -89,6 +89,13 @@ def decode_scale(codes: np.ndarray, gamma: float) -> np.ndarray:
     return np.where(codes > 0, value, 0.0).astype(np.float32)
 
 
+def tiles_of(kind: np.ndarray, kinds: Iterable[TileKind]) -> np.ndarray:
+    """Returns the numbers of the tiles of some kinds, rising, int [n]; `kind` is uint8 [tiles]."""
+    chosen = np.zeros(256, bool)
+    chosen[list(kinds)] = True
+    return np.flatnonzero(chosen[kind])
+
+
 def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part]:
     """Returns the types and shapes of the arrays of a sheet.
 
@@ -100,8 +107,7 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
         kind: uint8 [tiles], `TileKind` of each tile of the grid.
         times: T, the number of stored times.
     """
-    counted = TileKind.DYNAMIC, TileKind.STATIC, TileKind.CONSTANT, TileKind.FRAMES
-    dynamic, static, constant, framed = (int((kind == value).sum()) for value in counted)
+    _, constant, static, dynamic, framed = np.bincount(kind, minlength=len(TileKind)).tolist()
     mapped, r = dynamic + static, profile.uvt_resolution // 4
     plane = Part(np.uint8, (dynamic, profile.plane_rows, profile.plane_columns, 2))
     parameters, static_parameters = (mlp.parameter_count(profile.inputs(t), profile.hidden) for t in (True, False))
@@ -210,9 +216,10 @@ class SheetModel:
             )
         part.kind = np.zeros_like(self.kind)
         part.kind[chosen] = self.kind[chosen]
+        rows = {kinds: part.kind[self.numbers(*kinds)] > 0 for kinds in set(_KINDS.values())}
         for name, kinds in _KINDS.items():
             if name not in PACKED or self.pieces is None:
-                setattr(part, name, getattr(self, name)[part.kind[self.numbers(*kinds)] > 0])
+                setattr(part, name, getattr(self, name)[rows[kinds]])
         if self.pieces is not None:
             vars(part).update(vars(self)["_tiles"].read(part))
         return part
@@ -276,7 +283,7 @@ class SheetModel:
 
     def numbers(self, *kinds: TileKind) -> np.ndarray:
         """Returns the numbers of the tiles of these kinds, rising, int [n]."""
-        return np.flatnonzero(np.isin(self.kind, kinds))
+        return tiles_of(self.kind, kinds)
 
     def row(self, number: int) -> int:
         """Returns the index of tile `number` among the tiles of its own kind."""

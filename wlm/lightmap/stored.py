@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -24,21 +25,36 @@ class PackedMask:
     """The mask of an atlas, which is unpacked at its first use: at 4096 x 4096 texels that takes as long as some tiles.
 
     Attributes:
+        where: The file and the sheet, for messages.
         shape: Height and width in texels.
-        bits: A bit for each texel, row-major, the first in the highest bit of the first byte; None: all are valid.
+        frame: A zstd frame of a bit for each texel, row-major, the first in the highest bit of the first byte; None:
+            all are valid.
     """
 
+    where: str
     shape: tuple[int, int]
-    bits: bytes | None
+    frame: bytes | None
+
+    def check(self) -> None:
+        """Checks that the frame states the right size.
+
+        Raises:
+            ValueError: It does not.
+        """
+        if self.frame is not None:
+            zstd.check_frame(self.frame, -(-math.prod(self.shape) // 8), "part mask")
 
     @cached_property
     def texels(self) -> np.ndarray:
-        """Which texels are valid, bool [H, W]."""
-        if self.bits is None:
+        """Which texels are valid, bool [H, W]; a `WlmError` if the frame is none."""
+        if self.frame is None:
             return np.ones(self.shape, bool)
-        height, width = self.shape
-        bits = np.unpackbits(np.frombuffer(self.bits, np.uint8), count=height * width)
-        return bits.view(bool).reshape(self.shape)
+        count = math.prod(self.shape)
+        try:
+            data = zstd.decompress(self.frame, -(-count // 8), "part mask")
+        except ValueError as error:
+            raise WlmError(f"{self.where}: {error}") from error
+        return np.unpackbits(np.frombuffer(data, np.uint8), count=count).view(bool).reshape(self.shape)
 
 
 @dataclass(frozen=True, eq=False)
