@@ -6,7 +6,6 @@ six with profile M. The file is in the cache of the operating system: a disk add
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -18,6 +17,7 @@ from unittest import mock
 
 import numpy as np
 
+from benchmarks import tile_by_tile
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note, demo_data
 from wlm.formats import zstd
@@ -61,8 +61,10 @@ def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
         figures = _one_tile(path, device)
         bench.note("decoding a sheet tile by tile")
         tiles = _QUICK_TILES if quick else _SIDE * _SIDE
-        command = [sys.executable, "-m", "benchmarks.lightmap_file", str(path), device, str(tiles)]
-        told = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+        # By its path: the package of the benchmarks imports torch.
+        command = [sys.executable, "-P", tile_by_tile.__file__, str(path), device, str(tiles)]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(place or os.getcwd() for place in sys.path)}
+        told = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout
     notes = (
         f"medians; a stored hour; memory of the process that decodes {tiles} tiles of a sheet at 26 hours one by one"
     )
@@ -129,26 +131,3 @@ def _one_tile(path: Path, device: str) -> dict[str, float]:
     # The first call compiles or loads the kernels.
     times = {"open_ms": opened[1:], "open_tile_ms": decoded[1:], "load_ms": loaded}
     return {"read_bytes": index + sum(sizes)} | {name: 1e3 * float(np.median(own)) for name, own in times.items()}
-
-
-def _tile_by_tile(path: Path, device: str, count: int) -> dict[str, float]:
-    """Decodes tiles of the first sheet one by one, at all times, and measures the peak memory of this process."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    model = load_model(path)
-    start = time.perf_counter()
-    for number in range(count):
-        decoder = model.decoder(device, tiles={next(iter(model.sheets)): [number]}).light
-        for hour in model.times.tolist():
-            decoder.tiles([number], hour)
-    seconds = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {
-        "memory": peak / 1024,
-        "memory_before": before / 1024,
-        "decode_ms": 1e3 * seconds / (count * len(model.times)),
-        "tiles_timed": count,
-    }
-
-
-if __name__ == "__main__":
-    print(json.dumps(_tile_by_tile(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]))))
