@@ -209,6 +209,8 @@ class SheetModel:
         Raises:
             WlmError: A number is not one of the grid, or a tile of the file is damaged.
         """
+        # In this order, since another thread may read all tiles meanwhile.
+        stored = None if self.pieces is None else vars(self)["_tiles"]
         chosen, part = np.asarray(numbers, np.int64).reshape(-1), copy(self)
         if chosen.size and not 0 <= chosen.min() <= chosen.max() < len(self.kind):
             raise WlmError(
@@ -218,19 +220,21 @@ class SheetModel:
         part.kind[chosen] = self.kind[chosen]
         rows = {kinds: part.kind[self.numbers(*kinds)] > 0 for kinds in set(_KINDS.values())}
         for name, kinds in _KINDS.items():
-            if name not in PACKED or self.pieces is None:
+            if name not in PACKED or stored is None:
                 setattr(part, name, getattr(self, name)[rows[kinds]])
-        if self.pieces is not None:
-            vars(part).update(vars(self)["_tiles"].read(part))
+        if stored is not None:
+            vars(part).update(stored.read(part))
         return part
 
     def check(self) -> None:
-        """Reads and checks all tiles of a sheet of a file, some at a time, and keeps none.
+        """Reads and checks the mask and all tiles of a sheet of a file, some at a time, and keeps none.
 
         Raises:
-            WlmError: A tile is damaged.
+            WlmError: The mask or a tile is damaged.
         """
         numbers = self.numbers(*PACKED_KINDS)
+        if "_tiles" in vars(self):
+            vars(self)["_tiles"].mask.bits()
         if self.pieces is not None:
             for start in range(0, len(numbers), _CHECKED):
                 self.only(numbers[start : start + _CHECKED])

@@ -44,17 +44,25 @@ class PackedMask:
         if self.frame is not None:
             zstd.check_frame(self.frame, -(-math.prod(self.shape) // 8), "part mask")
 
-    @cached_property
-    def texels(self) -> np.ndarray:
-        """Which texels are valid, bool [H, W]; a `WlmError` if the frame is none."""
-        if self.frame is None:
-            return np.ones(self.shape, bool)
-        count = math.prod(self.shape)
+    def bits(self) -> np.ndarray | None:
+        """Unpacks the frame, uint8 [bytes]; None if all texels are valid.
+
+        Raises:
+            WlmError: The frame is damaged.
+        """
         try:
-            data = zstd.decompress(self.frame, -(-count // 8), "part mask")
+            size = -(-math.prod(self.shape) // 8)
+            data = None if self.frame is None else zstd.decompress(self.frame, size, "part mask")
         except ValueError as error:
             raise WlmError(f"{self.where}: {error}") from error
-        return np.unpackbits(np.frombuffer(data, np.uint8), count=count).view(bool).reshape(self.shape)
+        return None if data is None else np.frombuffer(data, np.uint8)
+
+    @cached_property
+    def texels(self) -> np.ndarray:
+        """Which texels are valid, bool [H, W]; for errors see `bits`."""
+        if (bits := self.bits()) is None:
+            return np.ones(self.shape, bool)
+        return np.unpackbits(bits, count=math.prod(self.shape)).view(bool).reshape(self.shape)
 
 
 @dataclass(frozen=True, eq=False)
