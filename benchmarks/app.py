@@ -85,6 +85,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "Measure lightmaps over time: PSNR, bits per texel and decode time of profiles and their rivals.",
         ("rivals_only", "rival_names", "quick", "profiles", "rivals", "device", "set_path"),
     ),
+    "lightmap-file": (
+        "Measure a lightmap file of 200 MB that is read tile by tile: times, bytes read and memory.",
+        ("quick", "device"),
+    ),
     "lightmap-ablation": (
         "Measure lightmaps over time: other feature maps of equal size, or no simulation of block compression.",
         ("quick", "device", "set_path", "steps", "only"),

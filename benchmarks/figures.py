@@ -93,6 +93,9 @@ _TABLES: dict[str, dict[str, Figure]] = {
     "Time": {
         "encode_seconds": Figure("encode", "s", ".3g"),
         "load_ms": Figure("load a tile", "ms", ".2g"),
+        "open_ms": Figure("open the file", "ms", ".3g"),
+        "open_tile_ms": Figure("open it and decode a tile", "ms", ".3g"),
+        "read_bytes": Figure("read for that", "bytes", _WHOLE),
         "decode_ms": Figure("decode time", "ms", ".3g"),
         "time_ms": Figure("time", "ms", ".3g"),
         "replay_ms": Figure("replayed", "ms", ".3g"),
@@ -139,6 +142,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "blocks": Figure("blocks", form=".3g"),
         "probes_decoded": Figure("probes decoded", form=".3g"),
         "memory": Figure("memory", "MiB", ".1f"),
+        "memory_before": Figure("of it before the file is opened", "MiB", ".1f"),
     },
     "Settings": {
         "steps": Figure("steps", form=_WHOLE),

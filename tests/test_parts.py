@@ -172,7 +172,8 @@ def test_settings_out_of_range_are_one_line(name, settings, words, path):
 def test_a_few_bytes_that_claim_a_large_lightmap(path):
     """The file has only empty tiles, and the largest accepted one takes no memory for them."""
     kept = written(path, "lightmap")
-    parts = {name: GONE for name in read_artifact(path).tensors if name not in ("0.kind", "times")}
+    artifact = read_artifact(path)
+    parts = {name: GONE for name in (*artifact.tensors, *artifact.pieces) if name not in ("0.kind", "times")}
     rewrite(path, _sized(32768, 32768), parts | {"0.kind": np.zeros(65536, np.uint8)})
     refused(kept, path, "at most 268435456 texels in all sheets together, found 1073741824")
     rewrite(path, _sized(16384, 16384), {"0.kind": np.zeros(16384, np.uint8)})
@@ -183,9 +184,9 @@ def test_a_few_bytes_that_claim_a_large_lightmap(path):
 def test_a_few_bytes_that_claim_many_frames(path):
     kept = written(path, "lightmap-frames")
     kind, times = np.full(16384, 4, np.uint8), np.arange(8, dtype=np.float64)
-    ranges, sizes = np.zeros((16384, 8, 2, 3), np.float16), np.zeros(16384, np.uint32)
-    parts = {"0.kind": kind, "times": times, "0.mask": GONE, "0.ranges": ranges, "0.tile_sizes": sizes}
-    rewrite(path, _sized(16384, 16384), parts | {"0.tiles": np.zeros(0, np.uint8)})
+    ranges, tiles = np.zeros((16384, 8, 2, 3), np.float16), [b""] * 16384
+    parts = {"0.kind": kind, "times": times, "0.mask": GONE, "0.ranges": ranges, "0.tiles": tiles}
+    rewrite(path, _sized(16384, 16384), parts)
     refused(kept, path, "the file: expected at most 256 times its")
 
 

@@ -26,7 +26,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 
 from wlm.config import check_settings, load_settings, profile_path
 from wlm.errors import WlmError
-from wlm.formats.artifact import FORMAT_VERSION, Artifact, encode_artifact, read_artifact, write_artifact
+from wlm.formats.artifact import Artifact, Content, encode_artifact, read_artifact, write_artifact
 
 if TYPE_CHECKING:
     from wlm.bundle import Bundle
@@ -211,8 +211,9 @@ class Model:
             settings, parts, source = self._encoded()
         except WlmError as error:
             raise WlmError(f"{path}: {error}") from error
-        content = Artifact(self.SYSTEM, FORMAT_VERSION, settings, source, parts, {}, 0, 0)
-        decode(f"{path}: not written", content, _module(self.SYSTEM, "codec").decode)
+        make = _module(self.SYSTEM, "codec").decode
+        content = Artifact.of_parts(self.SYSTEM, settings, parts, source)
+        decode(f"{path}: not written", content, lambda content: make(content).check())
         return write_artifact(path, self.SYSTEM, settings, parts, source)
 
     def file_bytes(self) -> int:
@@ -239,12 +240,23 @@ class Model:
         """
         return _module(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
-    def _encoded(self) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
+    def check(self) -> None:
+        """Reads and checks what `wlm.load` has left in the file, which only lightmaps do.
+
+        Raises:
+            WlmError: A part of the file is damaged.
+        """
+        return
+
+    def _encoded(self) -> tuple[dict[str, Any], dict[str, Content], str]:
         return _module(self.SYSTEM, "codec").encode(self)
 
 
 def load(path: str | os.PathLike[str], system: str | None = None) -> Any:
     """Reads a model of any system from a file; with `system`, a model of another system is an error.
+
+    Of a lightmap only the index is read: the maps, networks and frames of a tile are read when they are first used, and
+    checked then (`wlm.lightmap.LightmapModel`). The models of other systems are read and checked whole.
 
     Raises:
         WlmError: One line: the file is no model, is cut short or damaged, is of another system or version, or has

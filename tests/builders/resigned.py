@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -35,10 +36,10 @@ def rewrite(
     settings: Mapping[str, Any] | None = None,
     tensors: Mapping[str, np.ndarray | Callable[[np.ndarray], np.ndarray] | object] | None = None,
 ) -> None:
-    """Replaces settings and parts of a file by the real writer."""
+    """Replaces settings and parts of a file by the real writer; a split part is the list of its pieces."""
     artifact = read_artifact(path)
-    contents = []
-    for values, changes in ((artifact.settings, settings or {}), (artifact.tensors, tensors or {})):
+    contents, parts = [], {**artifact.tensors, **{name: list(pieces) for name, pieces in artifact.pieces.items()}}
+    for values, changes in ((artifact.settings, settings or {}), (parts, tensors or {})):
         changed = {name: change(values[name]) if callable(change) else change for name, change in changes.items()}
         contents.append({name: value for name, value in {**values, **changed}.items() if value is not GONE})
     write_artifact(path, artifact.system, *contents, artifact.source)
@@ -53,4 +54,13 @@ def rewrite_number(path: Path, key: str, text: str) -> None:
     content = content.replace(f"'{place}'".encode(), text.rjust(len(place) + 2).encode())
     digest = re.search(rb'"wlm":"[^"]* ([0-9a-f]{32})"', content)[1]
     content = content.replace(digest, b"0" * 32, 1)
-    path.write_bytes(content.replace(b"0" * 32, hashlib.blake2b(content, digest_size=16).hexdigest().encode(), 1))
+    index = content[: index_bytes(content)]
+    path.write_bytes(content.replace(b"0" * 32, hashlib.blake2b(index, digest_size=16).hexdigest().encode(), 1))
+
+
+def index_bytes(content: bytes) -> int:
+    """The size of the index of an artifact by the documented rule: all but its split parts."""
+    start = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:start])
+    entries = {name: entry["data_offsets"][1] for name, entry in header.items() if name != "__metadata__"}
+    return start + max((end for name, end in entries.items() if f"{name}.pieces" not in entries), default=0)

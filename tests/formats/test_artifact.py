@@ -157,14 +157,14 @@ def test_a_changed_payload_or_name_is_told_by_the_digest(artifact):
 
 def test_a_newer_version_and_another_system_are_named(artifact):
     whole = artifact.read_bytes()
-    newer = whole.replace(b'"2 lightmap', b'"3 lightmap')
-    assert _refusal(artifact, newer) == "artifact version 3: expected at most 2; update wlm"
+    newer = whole.replace(b'"3 lightmap', b'"4 lightmap')
+    assert _refusal(artifact, newer) == "artifact version 4: expected at most 3; update wlm"
     # A newer version may well say other things after its number.
     header, payload = _split(whole)
     header["__metadata__"] = {"wlm": "12"}
-    assert "artifact version 12: expected at most 2" in _refusal(artifact, _join(header, payload))
-    older = whole.replace(b'"2 lightmap', b'"1 lightmap')
-    assert _refusal(artifact, older) == "artifact version 1: expected 2; compress the input again"
+    assert "artifact version 12: expected at most 3" in _refusal(artifact, _join(header, payload))
+    older = whole.replace(b'"3 lightmap', b'"2 lightmap')
+    assert _refusal(artifact, older) == "artifact version 2: expected 3; compress the input again"
     line = _refusal(artifact, whole, system="probe")
     assert line == "expected an artifact of probe, found one of lightmap"
 

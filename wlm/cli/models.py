@@ -106,6 +106,7 @@ def describe(
     from wlm.system import load
 
     artifact, model = read_artifact(file, system), load(file, system)
+    model.check()
     shown = {"name": model.name, "system": artifact.system, **facts(model), "source": model.source}
     shown["bytes_on_disk"] = artifact.file_bytes
     if device is not None:

@@ -1,5 +1,6 @@
 """Safe reading of untrusted files: opened once, regular files only, up to a stated size; and references to files."""
 
+import io
 import json
 import os
 import re
@@ -128,6 +129,48 @@ class FileBytes:
     def __getitem__(self, part: slice) -> bytes:
         self._file.seek(part.start)
         return self._file.read(part.stop - part.start)
+
+
+class OpenFile:
+    """A file that stays open, of which any bytes are read when they are needed. Several threads may read at once.
+
+    It is closed by `close`, or with the last reference to it. Reads use `os.pread`, not a mapping: of a file that is
+    cut while it is open a read is an error, where a mapping would end the process.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        """Keeps a file open beyond the end of `open_file`."""
+        self._file: _Handle | None = _Handle(os.dup(file.fileno()), "rb")
+
+    def read(self, start: int, size: int) -> bytes:
+        """Reads `size` bytes from byte `start` on.
+
+        Raises:
+            ValueError: The file was closed or cut short, or cannot be read.
+        """
+        # With its own reference, so that `close` in another thread does not end it during the read.
+        handle, data = self._file, b""
+        if handle is None:
+            raise ValueError("the file was closed")
+        try:
+            while len(data) < size and (more := os.pread(handle.fileno(), size - len(data), start + len(data))):
+                data += more
+        except OSError as error:
+            raise ValueError(f"cannot read: {error.strerror or error}") from error
+        if len(data) < size:
+            raise ValueError(f"the file was cut short: expected {size} bytes, found {len(data)}")
+        return data
+
+    def close(self) -> None:
+        """Closes the file once no thread reads from it; later reads are errors. A second call does nothing."""
+        self._file = None
+
+
+class _Handle(io.FileIO):
+    """A file that is closed with its last reference, without the warning of its base class."""
+
+    def __del__(self) -> None:
+        self.close()
 
 
 @contextmanager

@@ -32,23 +32,35 @@ def compress(*pieces: bytes) -> bytes:
     return frame + packer.flush()
 
 
+def check_frame(frame: bytes, size: int, name: str) -> None:
+    """Checks the size that a frame states, if it states one, without decompressing it; `name` is for messages.
+
+    Raises:
+        ValueError: The data are no frame, or one of another size.
+    """
+    try:
+        stated = zstandard.frame_content_size(frame)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"{name}: {error}") from error
+    if stated not in (size, -1):
+        raise ValueError(f"{name}: expected a frame of {size} decompressed bytes, found {stated}")
+
+
 def decompress(frame: bytes, size: int, name: str) -> bytes:
     """Decompresses data of exactly one frame to `size` bytes, and never allocates more; `name` is for messages.
 
     Raises:
         ValueError: The frame is damaged or has another size.
     """
+    check_frame(frame, size, name)
     try:
-        stated = zstandard.frame_content_size(frame)
-        if stated in (size, -1):  # -1: the frame doesn't state it
-            reader = zstandard.ZstdDecompressor()
-            unpacked = reader.decompress(frame, max_output_size=size, allow_extra_data=False)
-            if len(unpacked) == size:
-                return unpacked
-            stated = len(unpacked)
+        reader = zstandard.ZstdDecompressor()
+        unpacked = reader.decompress(frame, max_output_size=size, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise ValueError(f"{name}: {error}") from error
-    raise ValueError(f"{name}: expected a frame of {size} decompressed bytes, found {stated}")
+    if len(unpacked) != size:
+        raise ValueError(f"{name}: expected a frame of {size} decompressed bytes, found {len(unpacked)}")
+    return unpacked
 
 
 def inflate(data: bytes, size: int, name: str) -> bytes:

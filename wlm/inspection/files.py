@@ -253,6 +253,7 @@ def _mesh(path: Path) -> Finding:
 
 def _model(path: Path) -> Finding:
     model, system = load(path), system_of(path)
+    model.check()
     if system == "smoke":
         return Finding(path, _MODELS[system], command("info", path))
     what = f"{_MODELS[system]}: {model.name}"

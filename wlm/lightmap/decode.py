@@ -1,10 +1,10 @@
 """Decodes lightmaps to arrays in host memory: a tile or a whole map at any time, from the stored bytes alone."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 
 import numpy as np
 
-from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.encodings import ENCODINGS
 from wlm.lightmap.encodings.base import DeviceTiles
@@ -15,6 +15,18 @@ from wlm.texels import near_gaps
 from wlm_kernels.mlp import GELUS
 
 _PIECE = 1024  # tiles that are decoded at once: 192 MiB
+
+
+def device_of(device: str) -> str:
+    """Checks a device as `wlm.interop.check_device` does, but without torch for the CPU, which is always there.
+
+    A program that only decodes on the CPU then takes some 200 MB less memory.
+    """
+    if device == "cpu":
+        return device
+    from wlm.interop import check_device
+
+    return check_device(device)
 
 
 def gelu_of(model: SheetModel, gelu: str | None) -> str:
@@ -34,24 +46,38 @@ class SheetDecoder:
     outside charts, within two texels of one, get the light of the nearest valid texel, so that a map can be filtered.
 
     Attributes:
-        model: The sheet.
+        model: The sheet, or the part of it that was uploaded, whose other tiles are empty.
         device: The device, as `wlm.interop.check_device` returns it.
     """
 
-    def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None) -> None:
+    def __init__(
+        self,
+        model: SheetModel,
+        device: str = "cpu",
+        gelu: str | None = None,
+        tiles: Sequence[int] | np.ndarray | None = None,
+    ) -> None:
         """Uploads a sheet.
 
         Args:
             model: The sheet.
             device: "cpu", "cuda" or "cuda:N".
             gelu: GELU variant to use instead of the one that the model was trained with, for speed; None: the model's.
+            tiles: Numbers of the tiles to upload; of a sheet of a file only these are read. None: all.
+
+        Raises:
+            WlmError: There is no such device, GELU variant or tile, or a tile of the file is damaged.
         """
-        self.model, self.device = model, interop.check_device(device)
-        gelu, self._grid = gelu_of(model, gelu), model.grid
+        self.device, gelu = device_of(device), gelu_of(model, gelu)
+        self.model = model if tiles is None else model.only(tiles)
+        self._grid, self._left_out = model.grid, np.flatnonzero(model.kind != self.model.kind)
         self._tiles: list[DeviceTiles] = [
-            tiles for encoding in ENCODINGS for tiles in encoding.upload(model, self.device, gelu)
+            uploaded for encoding in ENCODINGS for uploaded in encoding.upload(self.model, self.device, gelu)
         ]
-        self._gaps = [tuple(at.T) for at in near_gaps(model.mask)]
+
+    @cached_property
+    def _gaps(self) -> list[tuple[np.ndarray, ...]]:
+        return [tuple(at.T) for at in near_gaps(self.model.mask)]
 
     @property
     def device_bytes(self) -> int:
@@ -59,8 +85,14 @@ class SheetDecoder:
         return sum(tiles.device_bytes for tiles in self._tiles)
 
     def tiles(self, numbers: Sequence[int], time: float) -> np.ndarray:
-        """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; gaps are not filled, empty tiles are 0."""
+        """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; gaps are not filled, empty tiles are 0.
+
+        Raises:
+            WlmError: A tile is not empty but was not uploaded, or there is no such time.
+        """
         self.model.axis.wrap(time)
+        if len(wrong := np.intersect1d(numbers, self._left_out)):
+            raise WlmError(f"{self.model.name}: tile {wrong[0]}: expected one of the decoder's tiles, got another")
         out = np.zeros((len(numbers), TILE, TILE, 3), np.float32)
         for tiles in self._tiles:
             places, rows = tiles.among(numbers)
@@ -69,7 +101,9 @@ class SheetDecoder:
         return out
 
     def frame(self, time: float) -> np.ndarray:
-        """Decodes the map, float32 [H, W, 3]: radiance, or values in [0, 1] if it isn't light; 0 in empty tiles."""
+        """Decodes the map, float32 [H, W, 3]: radiance, or values in [0, 1] if it isn't light; 0 in empty tiles and in
+        tiles that were not uploaded.
+        """
         image = np.zeros((self._grid.height, self._grid.width, 3), np.float32)
         for numbers in self._stored():
             place(image, self.tiles(numbers.tolist(), time), numbers, self._grid)
@@ -89,19 +123,38 @@ class Decoder:
 
     Attributes:
         model: The model.
-        sheets: The decoder of each sheet.
+        sheets: The decoder of each sheet, or of those that were chosen.
     """
 
-    def __init__(self, model: LightmapModel, device: str = "cpu", gelu: str | None = None) -> None:
+    def __init__(
+        self,
+        model: LightmapModel,
+        device: str = "cpu",
+        gelu: str | None = None,
+        tiles: Mapping[Sheet, Sequence[int]] | Sequence[int] | None = None,
+    ) -> None:
         """Uploads a model.
 
         Args:
             model: The model.
             device, gelu: As for `SheetDecoder`.
+            tiles: Numbers of the tiles to upload, by sheet, or of a model with one sheet the numbers alone. Of a file
+                only these are read, and sheets that are not named have no decoder. None: all.
+
+        Raises:
+            WlmError: As for `SheetDecoder`, or there is no such sheet.
         """
         self.model = model
+        chosen: Mapping[Sheet, Sequence[int] | None] = dict.fromkeys(model.sheets)
+        if tiles is not None:
+            if not isinstance(tiles, Mapping) and len(model.sheets) > 1:
+                raise WlmError(f"{model.name}: tiles: expected the tiles by sheet for {len(model.sheets)} sheets")
+            named = tiles if isinstance(tiles, Mapping) else dict.fromkeys(model.sheets, tiles)
+            for sheet in named.keys() - model.sheets.keys():
+                raise WlmError(f"{model.name}: tiles: expected a sheet of the model, got {sheet}")
+            chosen = {sheet: named[sheet] for sheet in model.sheets if sheet in named}
         self.sheets: dict[Sheet, SheetDecoder] = {
-            sheet: SheetDecoder(own, device, gelu) for sheet, own in model.sheets.items()
+            sheet: SheetDecoder(model.sheets[sheet], device, gelu, own) for sheet, own in chosen.items()
         }
 
     @property
@@ -131,6 +184,8 @@ class Decoder:
             The channels, float32 [H, W, C]: linear radiance, or the layer's values; empty tiles have its lowest value.
         """
         sheets = self.model.layer(layer, atlas)
+        if left_out := [sheet for sheet in sheets if sheet not in self.sheets]:
+            raise WlmError(f"{self.model.name}: expected one of the decoder's sheets, got {left_out[0].label}")
         frames = [sheet.to_values(self.sheets[sheet].frame(time)) for sheet in sheets]
         return frames[0] if len(frames) == 1 else np.concatenate(frames, axis=2)
 

@@ -10,14 +10,19 @@ mean and the standard deviation, over all times, of colour / scale. The paper on
 tile whose light hardly varies would then have to output 1 +- 0.001. All three are stored rounded, and the fit
 normalises with the rounded values, so that rounding adds no error.
 
-A `LightmapModel` is a collection of sheets (`wlm.lightmap.sheet`); the arrays of each sheet are a `SheetModel`.
+A `LightmapModel` is a collection of sheets (`wlm.lightmap.sheet`); the arrays of each sheet are a `SheetModel`. Of a
+file the arrays that hold maps, networks and frames are read when they are first used, or for some tiles alone.
 """
 
+import math
+from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
+from wlm.errors import WlmError
 from wlm.formats.bc7 import BLOCK_BYTES
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part
@@ -27,11 +32,35 @@ from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.system import Model
 from wlm_kernels import mlp
 
+if TYPE_CHECKING:
+    from wlm.lightmap.stored import StoredTiles
+
 BLOCKS = TILE // 4
 """Blocks along a side of a tile."""
 
+_CHECKED = 64  # tiles that are unpacked at once to check them
+
 SCALE_SPAN = (-21.0, 16.0)
 """Range of scale codes as log2 of radiance: from small half floats to the largest one."""
+
+
+MAPPED_KINDS = TileKind.STATIC, TileKind.DYNAMIC
+"""The kinds of tiles that have feature maps."""
+
+PACKED_KINDS = *MAPPED_KINDS, TileKind.FRAMES
+"""The kinds of tiles that are packed: each is a piece of the file, which is read alone."""
+
+PACKED = ("uv", "uvt", "ut", "vt", "net", "net_static", "frames")
+"""The arrays of a sheet that are packed by tile."""
+
+_KINDS = {
+    **dict.fromkeys(("uv", "peak", "affine"), MAPPED_KINDS),
+    **dict.fromkeys(("uvt", "ut", "vt", "net", "scale"), (TileKind.DYNAMIC,)),
+    **dict.fromkeys(("net_static", "scale_static"), (TileKind.STATIC,)),
+    "constant": (TileKind.CONSTANT,),
+    **dict.fromkeys(("frames", "ranges"), (TileKind.FRAMES,)),
+}
+"""The kinds of tiles that have a row in each array, by rising number."""
 
 
 def encode_scale(values: np.ndarray, gamma: float, up: bool = False) -> np.ndarray:
@@ -60,6 +89,13 @@ def decode_scale(codes: np.ndarray, gamma: float) -> np.ndarray:
     return np.where(codes > 0, value, 0.0).astype(np.float32)
 
 
+def tiles_of(kind: np.ndarray, kinds: Iterable[TileKind]) -> np.ndarray:
+    """Returns the numbers of the tiles of some kinds, rising, int [n]; `kind` is uint8 [tiles]."""
+    chosen = np.zeros(256, bool)
+    chosen[list(kinds)] = True
+    return np.flatnonzero(chosen[kind])
+
+
 def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part]:
     """Returns the types and shapes of the arrays of a sheet.
 
@@ -71,8 +107,7 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
         kind: uint8 [tiles], `TileKind` of each tile of the grid.
         times: T, the number of stored times.
     """
-    counted = TileKind.DYNAMIC, TileKind.STATIC, TileKind.CONSTANT, TileKind.FRAMES
-    dynamic, static, constant, framed = (int((kind == value).sum()) for value in counted)
+    _, constant, static, dynamic, framed = np.bincount(kind, minlength=len(TileKind)).tolist()
     mapped, r = dynamic + static, profile.uvt_resolution // 4
     plane = Part(np.uint8, (dynamic, profile.plane_rows, profile.plane_columns, 2))
     parameters, static_parameters = (mlp.parameter_count(profile.inputs(t), profile.hidden) for t in (True, False))
@@ -96,6 +131,10 @@ def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part
 @dataclass(eq=False)
 class SheetModel:
     """The arrays of one sheet (up to three channels of a layer). Their types and shapes are in `part_table`.
+
+    The sheets of a file read the mask and the arrays in `PACKED` at their first use: the mask by itself, and all tiles
+    together. `only` reads some of the tiles. Both raise a `WlmError`, which names the tile, if the file is damaged
+    there or was closed. Several threads may read at once.
 
     Attributes:
         name, width, height, times, period: Properties of the input, see `wlm.lightmap.data.SheetFrames`.
@@ -141,10 +180,79 @@ class SheetModel:
     frames: np.ndarray
     ranges: np.ndarray
 
+    @classmethod
+    def of_file(cls, tiles: "StoredTiles", **fields: object) -> Self:
+        """Makes a sheet of a file: the fields are those of the class without the mask and the arrays in `PACKED`."""
+        sheet = cls.__new__(cls)
+        vars(sheet).update(fields, _tiles=tiles)
+        return sheet
+
+    def __getattr__(self, name: str) -> np.ndarray:
+        # Python asks for what is missing: of a sheet of a file the mask and the packed arrays before their first use.
+        tiles = vars(self).get("_tiles")
+        if tiles is None or name not in ("mask", *PACKED):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        vars(self).update({"mask": tiles.mask.texels} if name == "mask" else tiles.read(self))
+        return vars(self)[name]
+
+    @property
+    def pieces(self) -> Sequence[bytes] | None:
+        """The packed tiles as the file has them; None unless the sheet is one of a file whose tiles were not read."""
+        return None if "_tiles" not in vars(self) or "uv" in vars(self) else vars(self)["_tiles"].pieces
+
+    def only(self, numbers: Sequence[int] | np.ndarray) -> "SheetModel":
+        """Returns the sheet with some of its tiles; the others are empty. Of a file only these are read.
+
+        Args:
+            numbers: Numbers of the tiles in the grid, in any order; empty tiles stay empty.
+
+        Raises:
+            WlmError: A number is not one of the grid, or a tile of the file is damaged.
+        """
+        # In this order, since another thread may read all tiles meanwhile.
+        stored = None if self.pieces is None else vars(self)["_tiles"]
+        chosen, part = np.asarray(numbers, np.int64).reshape(-1), copy(self)
+        if chosen.size and not 0 <= chosen.min() <= chosen.max() < len(self.kind):
+            raise WlmError(
+                f"{self.name}: tiles: expected 0 to {len(self.kind) - 1}, got {chosen.min()}, {chosen.max()}"
+            )
+        part.kind = np.zeros_like(self.kind)
+        part.kind[chosen] = self.kind[chosen]
+        rows = {kinds: part.kind[self.numbers(*kinds)] > 0 for kinds in set(_KINDS.values())}
+        for name, kinds in _KINDS.items():
+            if name not in PACKED or stored is None:
+                setattr(part, name, getattr(self, name)[rows[kinds]])
+        if stored is not None:
+            vars(part).update(stored.read(part))
+        return part
+
+    def check(self) -> None:
+        """Reads and checks the mask and all tiles of a sheet of a file, some at a time, and keeps none.
+
+        Raises:
+            WlmError: The mask or a tile is damaged.
+        """
+        numbers = self.numbers(*PACKED_KINDS)
+        if "_tiles" in vars(self):
+            vars(self)["_tiles"].mask.bits()
+        if self.pieces is not None:
+            for start in range(0, len(numbers), _CHECKED):
+                self.only(numbers[start : start + _CHECKED])
+
+    def close(self) -> None:
+        """Closes the file of the sheet, see `LightmapModel.close`."""
+        if "_tiles" in vars(self):
+            vars(self)["_tiles"].close()
+
     @property
     def parts(self) -> dict[str, np.ndarray]:
         """The arrays by name, in the order of `part_table`, and `kind` last."""
         return {name: getattr(self, name) for name in (*part_table(self.profile, self.kind, len(self.times)), "kind")}
+
+    @property
+    def plain(self) -> dict[str, np.ndarray]:
+        """The arrays by name that are not packed by tile, `kind` last."""
+        return {name: getattr(self, name) for name in (*_KINDS, "kind") if name not in PACKED}
 
     @property
     def axis(self) -> TimeAxis:
@@ -159,7 +267,7 @@ class SheetModel:
     @property
     def mapped(self) -> np.ndarray:
         """Numbers of the tiles with feature maps, in the order of `uv`, `peak` and `affine`, int [N_m]."""
-        return self.numbers(TileKind.STATIC, TileKind.DYNAMIC)
+        return self.numbers(*MAPPED_KINDS)
 
     @property
     def scales(self) -> np.ndarray:
@@ -173,11 +281,13 @@ class SheetModel:
     @property
     def memory_bytes(self) -> int:
         """Bytes that the sheet takes on a GPU: maps, networks as half floats, scales, colours and frames."""
-        return sum(value.nbytes for value in self.parts.values())
+        table = part_table(self.profile, self.kind, len(self.times))
+        packed = sum(math.prod(table[name].shape) * np.dtype(table[name].dtype).itemsize for name in PACKED)
+        return packed + sum(value.nbytes for value in self.plain.values())
 
     def numbers(self, *kinds: TileKind) -> np.ndarray:
         """Returns the numbers of the tiles of these kinds, rising, int [n]."""
-        return np.flatnonzero(np.isin(self.kind, kinds))
+        return tiles_of(self.kind, kinds)
 
     def row(self, number: int) -> int:
         """Returns the index of tile `number` among the tiles of its own kind."""
@@ -191,6 +301,9 @@ class SheetModel:
 @dataclass(eq=False)
 class LightmapModel(Model):
     """A compressed lightmap set: a `SheetModel` for each sheet (up to three channels of a layer).
+
+    A model from `wlm.load` keeps its file open and reads tiles when they are needed; a tile whose bytes do not match
+    their digest is a `WlmError` then. `check` reads all. It may be used in a `with` statement, which closes it.
 
     Attributes:
         name: Name of the set.
@@ -227,6 +340,29 @@ class LightmapModel(Model):
     def memory_bytes(self) -> int:
         """Bytes that all sheets together take on a GPU."""
         return sum(own.memory_bytes for own in self.sheets.values())
+
+    def check(self) -> None:
+        """Reads and checks all tiles of the file that the model was loaded from, without keeping them.
+
+        Raises:
+            WlmError: A tile is damaged; the line names its sheet and its number.
+        """
+        for own in self.sheets.values():
+            own.check()
+
+    def close(self) -> None:
+        """Closes the file that the model was loaded from: tiles that were not read before are errors from now on.
+
+        The file is also closed when the model and everything that was made of it are no longer referred to.
+        """
+        for own in self.sheets.values():
+            own.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     def layer(self, name: str | None = None, atlas: str | None = None) -> list[Sheet]:
         """Returns the models of the sheets of one layer of one atlas, see `wlm.lightmap.sheet.layer_sheets`."""

@@ -13,10 +13,9 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import unpack_rgb9e5
-from wlm.lightmap.decode import gelu_of
+from wlm.lightmap.decode import device_of, gelu_of
 from wlm.lightmap.encodings.base import inverse_of, rgba
 from wlm.lightmap.encodings.constant import ConstantTiles
 from wlm.lightmap.encodings.frames import FrameTiles
@@ -89,7 +88,7 @@ class _MapDecoder(RuntimeDecoder):
         shared: bool = False,
     ) -> None:
         """Uploads the tiles of one kind, STATIC or DYNAMIC; for other arguments and errors see `StripDecoder`."""
-        device, self.gelu = interop.check_device(device), gelu_of(model, gelu)
+        device, self.gelu = device_of(device), gelu_of(model, gelu)
         self._tiles = MapTiles(model, kind, device, self.gelu)
         self._states: list[decode_kernels.TimeState | None] = [None, None]
         super().__init__(model, device, shared)
@@ -166,7 +165,7 @@ class MatrixDecoder(_ScratchDecoder):
             WlmError: The device is not a GPU, the networks' hidden width is not a multiple of 16, or the sheet has no
                 dynamic tile.
         """
-        name, hidden = interop.check_device(device), model.profile.hidden
+        name, hidden = device_of(device), model.profile.hidden
         if name == "cpu":
             raise WlmError("device: expected cuda for MatrixDecoder, got cpu")
         if hidden % 16:
@@ -192,7 +191,7 @@ class FrameDecoder(RuntimeDecoder):
 
     def __init__(self, model: SheetModel, device: str = "cpu", shared: bool = False) -> None:
         """Uploads the frames of a sheet and allocates all buffers; for the arguments see `StripDecoder`."""
-        device = interop.check_device(device)
+        device = device_of(device)
         self._tiles = FrameTiles(model, device)
         self._inverse = wp.empty(len(self._tiles.numbers), dtype=float, device=device)
         super().__init__(model, device, shared)
@@ -207,7 +206,7 @@ class FrameDecoder(RuntimeDecoder):
 
 def fast_decoder(model: SheetModel, device: str = "cpu", shared: bool = False) -> StripDecoder | MatrixDecoder:
     """Makes the fastest decoder of dynamic tiles: on CUDA a `MatrixDecoder` if network width and GELU allow it."""
-    device = interop.check_device(device)
+    device = device_of(device)
     tanh = device != "cpu" and model.profile.gelu == "tanh"
     if tanh and model.profile.hidden % 16 == 0:
         return MatrixDecoder(model, device, shared)
@@ -247,7 +246,7 @@ class MapDecoder:
         Raises:
             WlmError: There is no such device, or the map does not have that many mips.
         """
-        self.model, self.device = model, interop.check_device(device)
+        self.model, self.device = model, device_of(device)
         most = max(model.height, model.width).bit_length() - 1
         if mips is not None and not 0 <= mips <= most:
             raise WlmError(f"mips: expected 0 to {most} for a map of {model.width}x{model.height}, got {mips}")

@@ -412,6 +412,8 @@ class Maps(Encoding):
         wide = profile.net_bits == 16
         rest = data[at:]
         net[row] = _together(rest) if wide else unpack_network(rest, profile.inputs(bool(dynamic)), profile.hidden)
+        if not np.isfinite(net[row]).all():
+            raise ValueError("expected finite numbers in the network, found NaN or infinity")
 
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
         kinds = [kind for kind in (TileKind.DYNAMIC, TileKind.STATIC) if (sheet.kind == kind).any()]
