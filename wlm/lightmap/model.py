@@ -18,7 +18,7 @@ import math
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -31,9 +31,6 @@ from wlm.lightmap.sheet import Sheet, first_light, layer_sheets
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.system import Model
 from wlm_kernels import mlp
-
-if TYPE_CHECKING:
-    from wlm.lightmap.stored import StoredTiles
 
 BLOCKS = TILE // 4
 """Blocks along a side of a tile."""
@@ -181,8 +178,9 @@ class SheetModel:
     ranges: np.ndarray
 
     @classmethod
-    def of_file(cls, tiles: "StoredTiles", **fields: object) -> Self:
-        """Makes a sheet of a file: the fields are those of the class without the mask and the arrays in `PACKED`."""
+    def of_file(cls, tiles: object, **fields: object) -> Self:
+        """Makes a sheet of a file from its `wlm.lightmap.stored.StoredTiles` and the fields of the class, without the
+        mask and the arrays in `PACKED`."""
         sheet = cls.__new__(cls)
         vars(sheet).update(fields, _tiles=tiles)
         return sheet
