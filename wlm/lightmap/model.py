@@ -26,6 +26,7 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import BLOCK_BYTES
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part
+from wlm.lightmap.groups import groups_of, times_of
 from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.sheet import Sheet, first_light, layer_sheets
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
@@ -307,7 +308,8 @@ class LightmapModel(Model):
         name: Name of the set.
         source: Hash of the input, see `wlm.lightmap.data.LightmapSet.source`.
         profile: The settings of the fit; each sheet's own settings follow from them (`Profile.for_sheet`).
-        sheets: The sheets, with the same times; those of one atlas and size share the mask.
+        sheets: The sheets, group by group (`wlm.lightmap.groups`), with the same times in a group; those of one atlas
+            and size share the mask.
         warnings: Settings that the fit could not follow, one line each; they are not saved to the file.
     """
 
@@ -325,9 +327,14 @@ class LightmapModel(Model):
         return self.sheets[first_light(self.sheets)]
 
     @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the light groups, one for a model of a set without groups."""
+        return groups_of(self.sheets)
+
+    @property
     def times(self) -> np.ndarray:
-        """float64 [T], the stored times, increasing."""
-        return self.light.times
+        """float64 [T], the stored times of all groups, increasing; see `wlm.lightmap.groups.times_of`."""
+        return times_of(self.sheets)
 
     @property
     def period(self) -> float | None:
@@ -363,5 +370,5 @@ class LightmapModel(Model):
         self.close()
 
     def layer(self, name: str | None = None, atlas: str | None = None) -> list[Sheet]:
-        """Returns the models of the sheets of one layer of one atlas, see `wlm.lightmap.sheet.layer_sheets`."""
+        """Returns the sheets of one layer of one atlas in all groups, see `wlm.lightmap.sheet.layer_sheets`."""
         return layer_sheets(self.name, self.sheets, name, atlas)
