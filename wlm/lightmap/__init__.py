@@ -14,6 +14,7 @@ _PLACES = {
     "compress": "wlm.lightmap.fit",
     "evaluate": "wlm.lightmap.evaluation",
     "from_arrays": "wlm.lightmap.data",
+    "from_groups": "wlm.lightmap.data",
     "from_layers": "wlm.lightmap.data",
     "load": "wlm.lightmap.data",
     "open_checkpoint": "wlm.lightmap.fit",
