@@ -114,10 +114,14 @@ class VirtualTexture:
             border: Texels of a page's border, 1 to 16, for a renderer's filter.
 
         Raises:
-            WlmError: There is no such device, a setting is out of its range, or `budget` or `tiles` is too small.
+            WlmError: There is no such device, a setting is out of its range, `budget` or `tiles` is too small, or the
+                model has several light groups.
         """
         self.device = device_of(device)
         _check(decodes, tolerance, side, border)
+        if len(model.groups) > 1:
+            names = ", ".join(model.groups)
+            raise WlmError(f"{model.name}: expected a model with one light group for a virtual texture, found {names}")
         if gelu is None and self.device != "cpu" and model.light.profile.gelu == "tanh":
             gelu = "fast"
         self.model, self.decodes, self.tolerance = model, decodes, tolerance
