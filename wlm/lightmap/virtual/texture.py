@@ -41,6 +41,7 @@ STRIDE = 8
 _GRID = 2  # samples of a texel of a mip along each axis
 _TURN = 27  # order in which the pixels of a square of STRIDE x STRIDE take turns: any odd number reaches all
 _MOST_DECODES = 1024
+_TABLE_ROW = 1024  # pages in a row of the page table, as a texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,10 @@ class VirtualTexture:
         slots: Number of pages that the physical texture holds.
         decodes: Largest number of pages that are decoded in a frame.
         tolerance: Relative change of light up to which a page is not decoded again.
-        texture: `wp.array` uint32 [slots, side + 2 border, side + 2 border], the physical texture, RGB9E5.
+        texture: `wp.array` uint32 [slots, side + 2 border, side + 2 border], the physical texture, RGB9E5: an array of
+            textures, one layer for each slot.
+        table: `wp.array` int [n * 1024], the page table as a texture whose rows have 1,024 pages; see
+            `wlm.lightmap.virtual.shader` for how shaders read both.
     """
 
     def __init__(
@@ -165,7 +169,7 @@ class VirtualTexture:
             name: getattr(layout, name) for name in ("first", "columns", "levels", "place", "parent", "tiles", "own")
         }
         missing = dict.fromkeys(("slot", "ahead", "seen"), (count, -1))
-        fresh = dict.fromkeys(("need", "area", "table"), (count, 0))
+        fresh = dict.fromkeys(("need", "area"), (count, 0)) | {"table": (-(-count // _TABLE_ROW) * _TABLE_ROW, 0)}
         change = page_changes(layout, self._store.change)
         numbers = {"side": layout.side, "border": layout.border, "periodic": int(self.model.period is not None)}
         self._pages = struct(kernels.Pages, size=sizes, change=change, **fixed, **missing, **fresh, **numbers)
@@ -178,6 +182,7 @@ class VirtualTexture:
         jobs = {"target": (self.decodes, 0), "slot": (self.decodes, -1)}
         self._jobs = struct(page_kernels.Jobs, place=np.zeros((self.decodes, 4), np.int32), **jobs)
         self.texture = wp.zeros((self.slots, edge, edge), dtype=wp.uint32, device=self.device)
+        self.table = self._pages.table
         self._look = kernels.Look(self._frame_work)
         # Slots that were never needed are older than any frame.
         self._frame = kernels.KEEP
@@ -324,7 +329,8 @@ class VirtualTexture:
     def state(self) -> State:
         """Copies the physical texture and the tables from the device to the host."""
         pages, slots = self._pages, self._slots
-        parts = (pages.table, slots.owner, slots.stamp, pages.slot, pages.ahead, pages.parent)
+        count = len(self.layout.parent)
+        parts = (pages.table[:count], slots.owner, slots.stamp, pages.slot, pages.ahead, pages.parent)
         with interop.stream(self.device):
             return State(self.texture.numpy(), *(part.numpy() for part in parts))
 
