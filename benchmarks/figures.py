@@ -79,6 +79,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "transparency_rms": Figure("transparency RMS", form=".3g"),
         "bias": Figure("bias", "%", "+.1f"),
         "rms": Figure("RMS", "%", ".3g"),  # RMS difference over the RMS of the exact values
+        "texel_rms": Figure("RMS of a texel", "%", ".3g"),  # relative to its brightest channel
         "worst_rms": Figure("worst light's RMS", "%", ".3g"),
         "halving_rms": Figure("RMS by halving", "%", ".3g"),
         "finest_rms": Figure("RMS from the finest", "%", ".3g"),

@@ -12,6 +12,10 @@ tolerance; `nearly_current` also counts pages that are one level coarser. `cache
 shows them, with views in which every page is decoded at the frame's time; `view_psnr` compares them with the
 uncompressed lightmaps, and `gain` is its difference to that of the views with every page decoded.
 
+Rows "format" have the error of the physical texture's format beside its rival, 8 bits per channel in gamma space
+relative to the bound of a page. Rows "mips" have the error of the mips, whose texels are means of four samples, against
+means of all texels. Both are of the uncompressed lightmaps; `texel_rms` is relative to a texel's brightest channel.
+
 The large set has four sheets of 4096 x 4096 texels at 26 times, of random maps and networks that change about as much
 in an hour as a real set does. Its sheets are a plain on which the camera walks. Only some of its tiles are on the
 device.
@@ -33,6 +37,7 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
 from wlm.formats.geometry import read_geometry
+from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.fit import compress
 from wlm.lightmap.model import LightmapModel, SheetModel, part_table
@@ -46,13 +51,15 @@ from wlm.texels import exposure, fill_gaps, filmic, to_srgb
 
 _SIZE, _QUICK_SIZE = (720, 1280), (180, 320)
 _WALK, _DAY = 600, 1440
-_QUICK = 20  # a quick run has one of so many frames
-_SCORED = 20  # one of so many frames is scored
+_QUICK = 60  # a quick run has one of so many frames
+_SCORED, _QUICK_SCORED = 20, 4  # one of so many frames is scored
 _WALK_HOURS = (18.83, 19.0)
 _LARGE, _SHEETS, _LARGE_TIMES = 4096, 4, 26
 _LARGE_BUDGET, _LARGE_TILES = 32 << 20, 24 << 20
 _METRES = 128.0  # side of a sheet of the large set
 _ALL = 1 << 40  # bytes: the pages of all levels
+_EVERY = 6  # one of so many times is measured in a quick run
+_GAMMA, _BORDER, _GRID = 2.2, 4, 2  # of colours of 8 bits; of a page; samples of a texel of a mip along each axis
 _WARMUP = 32  # frames, in which modules are loaded and the graph is captured
 _WAIT_CYCLES = 600_000  # of the GPU, about 0.3 ms: longer than the host needs to queue a frame
 
@@ -70,7 +77,8 @@ def run(*, scene_path: str | os.PathLike[str], quick: bool, device: str, progres
         progress: Called with a line before each part of the work.
 
     Returns:
-        Three rows for each of the two sets: a walk, and a day with 8 and with 64 pages per frame.
+        Three rows for each of the two sets: a walk, and a day with 8 and with 64 pages per frame; and the rows of
+        formats and mips.
 
     Raises:
         WlmError: The set, its mesh or the device does not exist.
@@ -83,6 +91,7 @@ def run(*, scene_path: str | os.PathLike[str], quick: bool, device: str, progres
     bench.note("fitting profile M")
     model = compress(lightmaps, "M", device=bench.device, **({"steps": 200} if quick else {}))
     rows = bench.rows(model, _RoomCamera(lightmaps, bench.size, bench.device), {}, lightmaps)
+    rows += bench.format_rows(lightmaps)
     side = 512 if quick else _LARGE
     bench.scene = f"{side} x {side} x {_LARGE_TIMES} x {_SHEETS}"
     bench.note("making its tiles")
@@ -107,6 +116,20 @@ class _RunTime(Bench):
             found.append(self._row(model, camera, limits, lightmaps, path, decodes))
         return found
 
+    def format_rows(self, lightmaps: LightmapSet) -> list[Row]:
+        """Returns the rows of formats and mips, of some of the uncompressed lightmaps."""
+        self.note("formats and mips")
+        sheet, found = lightmaps.light, []
+        frames = sheet.frames[:: _EVERY if self.quick else 1].astype(np.float32)
+        shared = unpack_rgb9e5(pack_rgb9e5(frames))
+        for method, decoded in (("RGB9E5", shared), ("RGBA8", np.stack([_as_bytes(frame) for frame in frames]))):
+            found.append(self.row("format", method, **_differences(decoded, frames, sheet.mask)))
+        for level in (2, 3):
+            exact, covered = _mip(frames, sheet.mask, level, 1 << level)
+            sampled, met = _mip(frames, sheet.mask, level, _GRID)
+            found.append(self.row("mips", f"level {level}", **_differences(sampled, exact, covered & met)))
+        return found
+
     def _row(
         self,
         model: LightmapModel,
@@ -120,6 +143,7 @@ class _RunTime(Bench):
         hours = np.linspace(*_WALK_HOURS, count) if path == "walk" else np.arange(count) * 24.0 / count
         # A third of a turn in a day: the camera is almost still.
         places = np.arange(count) / count * (1.0 if path == "walk" else 1.0 / 3.0)
+        every = _QUICK_SCORED if self.quick else _SCORED
         whole = None
         if lightmaps is not None:
             whole = VirtualTexture(model, self.device, budget=_ALL, decodes=1024, tolerance=1e-6)
@@ -132,7 +156,7 @@ class _RunTime(Bench):
             stages: dict[str, list[float]] = {}
             for frame, (hour, place) in enumerate(zip(hours.tolist(), places.tolist(), strict=True)):
                 view = camera(place)
-                if frame % _SCORED == 1:
+                if frame % every == 1:
                     self._time_stages(texture, hour, view, stages)
                 else:
                     device_ms, host_ms = self._timed(lambda hour=hour, view=view: texture.frame(hour, *view))
@@ -141,7 +165,7 @@ class _RunTime(Bench):
                 report = texture.report()
                 decoded.append(report["decoded"])
                 visible.append(report["visible"])
-                if frame % _SCORED == _SCORED // 2:
+                if frame % every == every // 2:
                     reading = texture.sample(*view)
                     shares.add(reading, texture.tolerance)
                     if whole is not None and lightmaps is not None:
@@ -265,6 +289,47 @@ def _neighbours(times: np.ndarray, hour: float) -> tuple[int, int, float]:
     gap = (times[after % len(times)] - times[before]) % 24.0
     held = gap <= np.median(np.diff(times)) / 4
     return before, after % len(times), 0.0 if held else float((hour - times[before]) % 24.0 / gap)
+
+
+# ---- formats and mips ----
+
+
+def _as_bytes(frame: np.ndarray) -> np.ndarray:
+    """Encodes a lightmap with 8 bits per channel relative to the largest colour of each page, and decodes it."""
+    colour, out = np.maximum(frame, 0.0) ** (1.0 / _GAMMA), np.empty_like(frame)
+    for y in range(0, len(frame), TILE):
+        for x in range(0, frame.shape[1], TILE):
+            page = colour[max(y - _BORDER, 0) : y + TILE + _BORDER, max(x - _BORDER, 0) : x + TILE + _BORDER]
+            bound = max(float(page.max()), 1e-30)
+            part = np.s_[y : y + TILE, x : x + TILE]
+            out[part] = (np.rint(colour[part] / bound * 255.0) / 255.0 * bound) ** _GAMMA
+    return out
+
+
+def _mip(frames: np.ndarray, mask: np.ndarray, level: int, grid: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a mip of lightmaps [T, H, W, 3], means of grid x grid valid samples, and which texels have one."""
+    step, (height, width) = 1 << level, (size >> level << level for size in mask.shape)
+    total, count = 0.0, 0
+    for a in range(grid):
+        for b in range(grid):
+            y, x = a, b
+            if grid < step:
+                y, x = (step * (2 * at + 1) // (2 * grid**2) for at in (a * grid + b, b * grid + grid - 1 - a))
+            part = np.s_[y:height:step, x:width:step]
+            total, count = total + mask[part][..., None] * frames[:, *part], count + mask[part]
+    return total / np.maximum(count, 1)[..., None], count > 0
+
+
+def _differences(decoded: np.ndarray, exact: np.ndarray, mask: np.ndarray) -> dict[str, float]:
+    """Returns the PSNR of lightmaps over the valid texels, relative to their range, and the error of a texel."""
+    found, wanted = decoded[:, mask].astype(np.float64), exact[:, mask].astype(np.float64)
+    error = found - wanted
+    brightest = wanted.max(2, keepdims=True)
+    relative = np.divide(error, brightest, out=np.zeros_like(error), where=brightest > 0)
+    return {
+        "psnr": psnr_from_mse(float(np.square(error).mean()), float(np.ptp(wanted))),
+        "texel_rms": float(np.sqrt(np.square(relative).mean())),
+    }
 
 
 # ---- cameras ----
