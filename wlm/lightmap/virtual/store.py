@@ -105,7 +105,7 @@ class TileStore:
         self._make_tiles()
         self.offsets = self._array(np.array([(0, 0), *OFFSETS], np.int32), wp.vec2i)
         self._read_all(clock)
-        self._changed = False
+        self._used = np.full(len(self.slot), -1)  # last frame in which a page needed each tile
         if not self.complete:
             self._loader = TileLoader(model, _REQUESTS)
 
@@ -291,52 +291,72 @@ class TileStore:
 
     # ---- tiles that are loaded when they are needed ----
 
-    def stream(self, used: np.ndarray, priority: np.ndarray, frame: int) -> None:
+    def ready(self) -> np.ndarray:
+        """Returns which pages can be decoded: all tiles that they read are here, or damaged; int32 [P].
+
+        The page of a damaged tile itself is never decoded, so that the page above it is shown. The page of a whole
+        sheet is always decoded, with coarse texels in place of tiles that are not here.
+        """
+        layout = self._layout
+        missing = np.bincount(layout.reader[self.slot[layout.read] == kernels.WAITING], minlength=len(layout.parent))
+        broken = (layout.own >= 0) & (self.slot[layout.own] == kernels.BROKEN)
+        return ((missing == 0) & ~broken).astype(np.int32)
+
+    def stream(self, seen: np.ndarray, priority: np.ndarray, frame: int) -> bool:
         """Asks the loader for tiles and uploads those that it has loaded, some in each frame.
 
         Args:
-            used: int [N], last frame in which a page needed each tile.
-            priority: int [N], priority of each tile that a page waits for, else 0.
+            seen: int [P], last frame in which each page was needed.
+            priority: int [P], priority of each page that waits for tiles, else 0.
             frame: Number of the frame.
+
+        Returns:
+            Whether `ready` has changed.
         """
         if self._loader is None:
-            return
-        waiting = np.flatnonzero((priority > 0) & (self.slot == kernels.WAITING))
-        order = waiting[np.argsort(-priority[waiting], kind="stable")][:_REQUESTS]
+            return False
+        layout = self._layout
+        self._used[layout.read[seen[layout.reader] > frame - KEEP]] = frame
+        wanted = (priority[layout.reader] > 0) & (self.slot[layout.read] == kernels.WAITING)
+        most = np.zeros(len(self.slot), np.int64)
+        np.maximum.at(most, layout.read[wanted], priority[layout.reader[wanted]])
+        waiting = np.flatnonzero(most)
+        order = waiting[np.argsort(-most[waiting], kind="stable")][:_REQUESTS]
         self._loader.cancel()
         for tile in order.tolist():
-            s = int(np.searchsorted(self._layout.tile_first, tile, side="right")) - 1
-            number = tile - int(self._layout.tile_first[s])
-            self._loader.request(self._layout.sheets[s], number, float(priority[tile]))
+            s = int(np.searchsorted(layout.tile_first, tile, side="right")) - 1
+            number = tile - int(layout.tile_first[s])
+            self._loader.request(layout.sheets[s], number, float(most[tile]))
         taken: dict[int, list[tuple[int, SheetModel]]] = {}
+        changed = False
         for loaded in self._loader.take(_UPLOADS):
-            tile = int(self._layout.tile_first[self._layout.sheets.index(loaded.sheet)]) + loaded.number
+            tile = int(layout.tile_first[layout.sheets.index(loaded.sheet)]) + loaded.number
             if self.slot[tile] != kernels.WAITING:
                 continue
             if loaded.tile is None:
                 self._break(tile, loaded.error or WlmError("a tile could not be read"))
-                self._changed = True
-            elif self._room_for(tile, used, frame):
+                changed = True
+            elif self._room_for(tile, frame):
+                changed = True
                 taken.setdefault(int(self._kind[tile]), []).append((tile, loaded.tile))
         for kind, pairs in taken.items():
             each = [_rows(own, kind) for _, own in pairs]
             rows = {name: np.concatenate([one[name] for one in each]) for name in each[0]}
             self._pools[kind].put(self.slot[[tile for tile, _ in pairs]], rows)
-        if self._changed:
+        if changed:
             self.tiles.slot.assign(self.slot)
-            self._changed = False
+        return changed
 
-    def _room_for(self, tile: int, used: np.ndarray, frame: int) -> bool:
+    def _room_for(self, tile: int, frame: int) -> bool:
         """Gives a tile the slot of the tile that was not needed for the longest time; False if all are needed."""
         pool = self._pools[int(self._kind[tile])]
-        age = np.where(pool.owner >= 0, used[pool.owner], -1)
+        age = np.where(pool.owner >= 0, self._used[pool.owner], -1)
         slot = int(np.argmin(age))
         if age[slot] > frame - KEEP:
             return False  # the tile is asked for again
         if pool.owner[slot] >= 0:
             self.slot[pool.owner[slot]] = kernels.WAITING
-        pool.owner[slot], self.slot[tile], used[tile] = tile, slot, frame
-        self._changed = True
+        pool.owner[slot], self.slot[tile], self._used[tile] = tile, slot, frame
         return True
 
     def wait(self, seconds: float) -> bool:
@@ -429,7 +449,5 @@ def page_changes(layout: Layout, change: np.ndarray) -> np.ndarray:
     Returns:
         float32 [P, T + 1]; a page changes as much as the tile below it that changes most.
     """
-    largest = np.stack(
-        [change[layout.numbers(box, place[0])].max(0) for box, place in zip(layout.inner, layout.place, strict=True)]
-    )
+    largest = np.stack([change[layout.below(page)].max(0) for page in range(len(layout.parent))])
     return np.concatenate([np.zeros((len(largest), 1)), np.cumsum(largest, 1)], 1).astype(np.float32)
