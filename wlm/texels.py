@@ -12,10 +12,11 @@ from wlm.formats.exr import HALF_MAX
 REACH = 2
 """Distance from a chart, in texels, that filters read: 1 for a bilinear read, 2 for one of the half-size mip."""
 
-_OFFSETS = sorted(
+OFFSETS = sorted(
     ((y, x) for y in range(-REACH, REACH + 1) for x in range(-REACH, REACH + 1) if (y, x) != (0, 0)),
     key=lambda at: (at[0] ** 2 + at[1] ** 2, at),
-)  # offsets to a texel's neighbours in search order: the nearest first, then by row
+)
+"""Offsets to a texel's neighbours within `REACH`, in search order: the nearest first, then by row."""
 
 _STRIP = 1024  # rows of a lightmap searched for nearest texels at once
 
@@ -88,14 +89,14 @@ def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         Row and column of each such texel, int [G, 2], in reading order, and row and column of its nearest valid texel.
     """
     height, width = mask.shape
-    found = np.zeros(mask.shape, np.int8)  # 1 + the index in `_OFFSETS`
+    found = np.zeros(mask.shape, np.int8)  # 1 + the index in `OFFSETS`
     if not mask.all():
         padded = np.pad(mask, REACH)
-        for i, (y, x) in enumerate(_OFFSETS):
+        for i, (y, x) in enumerate(OFFSETS):
             valid = padded[REACH + y : REACH + y + height, REACH + x : REACH + x + width]
             found[valid & ~mask & (found == 0)] = i + 1
     target = np.argwhere(found)
-    offsets = np.array(_OFFSETS)[found[found > 0].astype(int) - 1]
+    offsets = np.array(OFFSETS)[found[found > 0].astype(int) - 1]
     return target, target + offsets.reshape(-1, 2)
 
 

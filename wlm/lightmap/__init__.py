@@ -10,6 +10,7 @@ _PLACES = {
     "Profile": "wlm.lightmap.profile",
     "Report": "wlm.lightmap.evaluation",
     "Sheet": "wlm.lightmap.sheet",
+    "VirtualTexture": "wlm.lightmap.virtual.texture",
     "compress": "wlm.lightmap.fit",
     "evaluate": "wlm.lightmap.evaluation",
     "from_arrays": "wlm.lightmap.data",

@@ -13,3 +13,4 @@ from wlm.lightmap.fit import open_checkpoint as open_checkpoint
 from wlm.lightmap.model import LightmapModel as LightmapModel
 from wlm.lightmap.profile import Profile as Profile
 from wlm.lightmap.sheet import Sheet as Sheet
+from wlm.lightmap.virtual.texture import VirtualTexture as VirtualTexture
