@@ -31,11 +31,14 @@ class SumScore(Summary):
         sheet: Label of the sheet, without a group.
         reference: `ORIGINALS` or `BAKE`.
         times: float64 [T], the times that are scored.
+        between_inputs: PSNR of the sum of the originals against the reference, in dB: the noise of the bakes, which no
+            compression can undo. NaN if the reference is that sum itself.
     """
 
     sheet: str
     reference: str
     times: np.ndarray
+    between_inputs: float
 
 
 def score_sums(
@@ -66,7 +69,8 @@ def score_sums(
     for plain in dict.fromkeys(replace(sheet, group=BASE) for sheet in model.sheets if not sheet.linear):
         groups = model.maps(plain)
         first, decoders = next(iter(groups.values())), [SheetDecoder(own, device) for own in groups.values()]
-        references = {} if len(groups) == 1 else {ORIGINALS: sum_of(lightmaps, plain)}
+        together = sum_of(lightmaps, plain)
+        references = {} if len(groups) == 1 else {ORIGINALS: together}
         if (bake := wanted.pop(plain, None)) is not None:
             if bake.mask.shape != (first.height, first.width):
                 height, width = bake.mask.shape
@@ -75,13 +79,17 @@ def score_sums(
         stored = np.any([own.kind != TileKind.EMPTY for own in groups.values()], axis=0)
         mask = first.mask & first.grid.texels_of(stored.reshape(first.grid.rows, first.grid.cols))
         for reference, original in references.items():
-            frames = []
+            frames, inputs = [], []
             for i, time in enumerate(original.times.tolist()):
                 decoded, name = sum(decoder.frame(time) for decoder in decoders), f"{model.name} at {time:g}"
                 inside = mask & original.valid(i)
                 frames.append(evaluate_frame(original.frames[i], decoded, inside, TILE, metrics, name=name))
-            summary = summarise(frames, original.times)
-            scores.append(SumScore(**vars(summary), sheet=plain.label, reference=reference, times=original.times))
+                if reference == BAKE:
+                    expected = _at(together, time)
+                    inputs.append(evaluate_frame(original.frames[i], expected, inside, TILE, ("psnr",), name=name))
+            summary, labels = summarise(frames, original.times), {"sheet": plain.label, "reference": reference}
+            between = summarise(inputs).psnr if inputs else float("nan")
+            scores.append(SumScore(**vars(summary), **labels, times=original.times, between_inputs=between))
     if wanted:
         sheet = next(iter(wanted))
         raise WlmError(f"{all_lights.name}: expected light of the sheets of {model.name}, found {sheet.label}")
@@ -102,9 +110,14 @@ def sum_of(lightmaps: LightmapSet, sheet: Sheet) -> SheetFrames:
         return first
     frames = np.zeros((len(times), *first.frames.shape[1:]), np.float32)
     for own in groups.values():
-        axis = TimeAxis(own.times, own.period, "frames")
         for frame, time in zip(frames, times.tolist(), strict=True):
-            # Between two stored times light is interpolated (eq. 2).
-            before, after, share = axis.neighbours(time)
-            frame += (1.0 - share) * own.frames[before] + (share * own.frames[after] if share else 0.0)
+            frame += _at(own, time)
     return replace(first, name=f"{lightmaps.name} {plain.label}", times=times, frames=frames, covered=None)
+
+
+def _at(lightmaps: SheetFrames, time: float) -> np.ndarray:
+    """Returns the original light at a time, between two stored times interpolated (eq. 2), [H, W, 3]."""
+    before, after, share = TimeAxis(lightmaps.times, lightmaps.period, "frames").neighbours(time)
+    if share == 0.0:
+        return lightmaps.frames[before]
+    return (1.0 - share) * lightmaps.frames[before] + share * lightmaps.frames[after]
