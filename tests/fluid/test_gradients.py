@@ -75,7 +75,7 @@ def _double(tensor: torch.Tensor) -> np.ndarray:
 
 
 def _hold(loss: torch.Tensor, leaves: list[torch.Tensor], twin: Callable[..., float], step: float = 1e-8) -> None:
-    """Compares the value of a loss, and its derivative in a random direction, to which all leaves contribute alike, with
+    """Compares the value of a loss, and its derivative in a random direction to which all leaves contribute alike, with
     those of a twin in float64."""
     loss.backward()
     points, random, ways = [_double(leaf) for leaf in leaves], np.random.default_rng(7), []
@@ -282,7 +282,7 @@ def test_tape(smoky: bool, device: str):
         found = run(**arrays)
     for result, expected in zip(found, results, strict=True):
         torch.testing.assert_close(wp.to_torch(result), expected.detach().view(result.shape))
-    grads = {result: wp.from_torch(2.0 * (k + 1) * wp.to_torch(result)) for k, result in enumerate(found)}
+    grads = {result: wp.from_torch(2.0 * (k + 1) * wp.to_torch(result, requires_grad=False)) for k, result in enumerate(found)}
     tape.backward(grads=grads)
     for name, array in arrays.items():
         expected = tensors[name].grad
