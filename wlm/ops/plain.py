@@ -284,7 +284,7 @@ def _outline(places: Tensor, triangle: Tensor) -> Tensor:
                 shared = other != t and len(rest) == 1 and {u, v} <= {*theirs}
                 if shared and _turn(places, u, v, w) * _turn(places, u, v, rest[0]) < 0:
                     found[t, k] = False
-    return found
+    return found.to(triangle.device)
 
 
 def _turn(places: Tensor, a: int, b: int, c: int) -> float:
