@@ -55,7 +55,7 @@ def _sign(header: Any, body: bytes) -> bytes:
     """An artifact of a header, whatever it says, with the digest that fits it."""
     metadata = header.get("__metadata__") if isinstance(header, dict) else None
     digest, end = "0" * 32, len(body)
-    with suppress(AttributeError, KeyError, TypeError, IndexError):
+    with suppress(AttributeError, KeyError, TypeError, IndexError, ValueError, OverflowError):
         split = [name for name in header if f"{name}.pieces" in header]
         end = min([end, *(int(header[name]["data_offsets"][0]) for name in split)])
     if isinstance(metadata, dict) and isinstance(metadata.get("wlm"), str) and metadata["wlm"].count(" ") == 3:

@@ -154,11 +154,12 @@ def evaluate(
         warnings.append(
             f"{lightmaps.name}: not the input of the file: its source is {model.source}, this is {lightmaps.source}"
         )
-    meter = Meter(progress, "score", len(model.sheets) * len(model.times))
+    meter, done = Meter(progress, "score", sum(len(own.times) for own in model.sheets.values())), 0
     for sheet, own in model.sheets.items():
         chosen = [metric for metric in metrics if not (sheet.linear and metric == "flip")]
         count = 0 if sheet.linear or "seen" not in metrics else views
-        report = _score(own, lightmaps.sheets[sheet], sizes[sheet], device, chosen, count, meter, len(reports))
+        report = _score(own, lightmaps.sheets[sheet], sizes[sheet], device, chosen, count, meter, done)
+        done += len(own.times)
         reports[sheet] = replace(report, max_abs_error=report.max_abs_error * sheet.span)
         warnings += report.warnings
     file_bytes = model.file_bytes() if file_bytes is None else file_bytes
@@ -191,7 +192,7 @@ def _score(
     meter: Meter,
     before: int,
 ) -> SheetReport:
-    """Scores a sheet; `before` is the number of sheets already scored, for the progress."""
+    """Scores a sheet; `before` is the number of lightmaps already scored, for the progress."""
     mask, decoder, peak = scored_mask(model, lightmaps), SheetDecoder(model, device), model.profile.peak
     plain = [metric for metric in metrics if metric != "seen"]
     drawn, warnings = views_of(lightmaps, views, device=device)
@@ -206,7 +207,7 @@ def _score(
         for tile, window in _windows(model) if peak is None else ():
             valid = inside[window]
             lost.add(lightmaps.frames[i][window][valid], decoded[window][valid], _place(tile, stamp))
-        if meter.due(done := before * len(model.times) + i + 1):
+        if meter.due(done := before + i + 1):
             meter.report(done)
     report = _sheet_report(model, lightmaps, size, frames, tally.score())
     return replace(report, warnings=report.warnings + warnings + lost.warnings(model.name, *_LOST))
