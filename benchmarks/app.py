@@ -89,6 +89,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "Measure a lightmap file of 200 MB that is read tile by tile: times, bytes read and memory.",
         ("quick", "device"),
     ),
+    "lightmap-run-time": (
+        "Measure the virtual texture of lightmaps: frames of a walk and a day through a set and a large set.",
+        ("scene_path", "quick", "device"),
+    ),
     "lightmap-ablation": (
         "Measure lightmaps over time: other feature maps of equal size, or no simulation of block compression.",
         ("quick", "device", "set_path", "steps", "only"),

@@ -79,6 +79,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "transparency_rms": Figure("transparency RMS", form=".3g"),
         "bias": Figure("bias", "%", "+.1f"),
         "rms": Figure("RMS", "%", ".3g"),  # RMS difference over the RMS of the exact values
+        "texel_rms": Figure("RMS of a texel", "%", ".3g"),  # relative to its brightest channel
         "worst_rms": Figure("worst light's RMS", "%", ".3g"),
         "halving_rms": Figure("RMS by halving", "%", ".3g"),
         "finest_rms": Figure("RMS from the finest", "%", ".3g"),
@@ -149,6 +150,22 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "probes_decoded": Figure("probes decoded", form=".3g"),
         "memory": Figure("memory", "MiB", ".1f"),
         "memory_before": Figure("of it before the file is opened", "MiB", ".1f"),
+    },
+    "Virtual texture": {  # `benchmarks.lightmap_run_time`
+        "frame_ms": Figure("frame", "ms", ".3f"),
+        "feedback_ms": Figure("of it feedback", "ms", ".3f"),
+        "select_ms": Figure("selection", "ms", ".3f"),
+        "table_ms": Figure("page table", "ms", ".3f"),
+        "host_ms": Figure("on the host", "ms", ".3f"),
+        "pages_visible": Figure("pages in view", form=".3g"),
+        "pages_decoded": Figure("decoded", form=".3g"),
+        "current": Figure("current", "%", ".2f"),
+        "nearly_current": Figure("or a level coarser", "%", ".2f"),
+        "cached_psnr": Figure("PSNR to all decoded", "dB", ".2f"),
+        "texture_memory": Figure("texture", "MiB", ".1f"),
+        "tiles_memory": Figure("tiles", "MiB", ".1f"),
+        "coarse_memory": Figure("coarse texels", "MiB", ".1f"),
+        "memory_full": Figure("all tiles", "MiB", ".1f"),
     },
     "Settings": {
         "steps": Figure("steps", form=_WHOLE),

@@ -64,3 +64,14 @@ def test_a_list_of_groups_is_found(tmp_path):
     assert "0_0.exr is missing" in call("inspect", tmp_path / "lit")
     text = fails("compress", tmp_path / "lit", "--group", "lamp", "-o", tmp_path / "a.wlm")
     assert "--group: expected NAME=PATH" in text
+
+
+def test_evaluate_scores_each_group_and_the_sum(made, tmp_path):
+    folder, _ = made
+    words = ["evaluate", folder / "a.wlm", folder / "sky", "--group", f"lamp={folder / 'lamp.exr'}", "--views", 0]
+    text = call(*words, "--all-lights", folder / "sky", "--json", tmp_path / "a.json")
+    assert "lamp: 0/light RGB" in text and "bake of all lights" in text
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert [sheet["group"] for sheet in report["sheets"]] == ["base", "lamp"]
+    # Without the lamp the bake is not the sum.
+    assert report["sums"][0]["psnr"] > report["sums"][1]["psnr"] + 3.0

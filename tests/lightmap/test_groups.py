@@ -99,10 +99,16 @@ def test_damaged_groups_are_one_line(model, tmp_path):
     refused({}, {"1.times": np.array([6.0, 18.0])}, "sheet 1: part")
 
 
-def test_a_fit_of_sky_sun_and_lamps_adds_up(sets, tmp_path):
+@pytest.fixture(scope="module")
+def fitted(sets):
+    """A set of five groups and a model of it."""
     lit = from_groups(sets, "lit")
+    return lit, wlm.lightmap.compress(lit, tiny_profile(steps=150, samples=256, follow_times=True))
+
+
+def test_a_fit_of_sky_sun_and_lamps_adds_up(fitted, sets, tmp_path):
+    lit, model = fitted
     assert lit.groups == tuple(sets) and lit.period == 24.0 and lit.times.tolist() == [0.0, 5.0, 11.0, 13.5, 20.0]
-    model = wlm.lightmap.compress(lit, tiny_profile(steps=150, samples=256, follow_times=True))
     model.save(tmp_path / "a.wlm")
     back = wlm.load(tmp_path / "a.wlm")
     for sheet, own in model.sheets.items():
@@ -119,6 +125,34 @@ def test_a_fit_of_sky_sun_and_lamps_adds_up(sets, tmp_path):
     together = np.mean(np.square(decoder.frame(11.0) - whole))
     assert abs(10.0 * np.log10(together / sum(own))) < 1.0
     assert psnr(whole, decoder.frame(11.0)) > 25.0
+
+
+def test_the_sum_is_scored_beside_the_groups(fitted, sets):
+    lit, model = fitted
+    # 5 h is 9 of the 15 hours from the sun's last time, 20 h, to its first, 11 h of the next day.
+    sun = sets["sun"].light.frames
+    early = sets["sky"].light.frames[1] + (6.0 * sun[2] + 9.0 * sun[0]) / 15.0
+    noon = sets["sky"].light.frames[2] + sun[0]
+    lamps = sum(sets[f"lamp {i}"].light.frames[0] for i in range(3))
+    bake = from_arrays(np.stack([early, noon]) + lamps, [5.0, 11.0], period=24.0)
+    report = wlm.lightmap.evaluate(model, lit, metrics=("psnr",), all_lights=bake)
+    assert [sheet.group for sheet in report.sheets] == list(lit.groups)
+    originals, baked = report.sums
+    assert (originals.reference, baked.reference) == ("originals of the groups", "bake of all lights")
+    assert originals.times.tolist() == [0.0, 5.0, 11.0, 13.5, 20.0] and baked.times.tolist() == [5.0, 11.0]
+    # The bake has exactly the light of the groups, so its score is that of their errors.
+    np.testing.assert_allclose(baked.psnr_by_time, originals.psnr_by_time[1:3], atol=0.01)
+    assert report.to_json()["sums"][1]["psnr"] == pytest.approx(baked.psnr)
+    decoded = model.decoder().frame(11.0)
+    assert baked.psnr_by_time[1] == pytest.approx(psnr(noon + lamps, decoded), abs=0.01)
+
+    unlit = from_arrays(np.stack([early, noon]), [5.0, 11.0], period=24.0)
+    missed = wlm.lightmap.evaluate(model, lit, metrics=("psnr",), all_lights=unlit).sums[1]
+    assert missed.psnr < baked.psnr - 3.0, "a lamp that the bake lacks"
+    small = from_arrays(np.ones((1, 64, 64, 3)), [0.0])
+    assert "expected lightmaps of 128x128, got 64x64" in error_of(wlm.lightmap.evaluate, model, lit, all_lights=small)
+    layers = from_layers([Layer(np.ones((1, 128, 128, 3)), "other")], [0.0])
+    assert "found 0/other RGB" in error_of(wlm.lightmap.evaluate, model, lit, metrics=("psnr",), all_lights=layers)
 
 
 def test_sets_are_joined_by_the_rules(sets):

@@ -324,6 +324,14 @@ def test_what_is_refused():
     assert "tiles: expected at least" in error_of(VirtualTexture, random_model((3, 3), columns=2), side=64, tiles=10)
 
 
+def test_groups_are_refused():
+    sheet = random_sheet((1, 1))
+    model = LightmapModel("two", "0123456789abcdef", sheet.profile, {LIGHT: sheet, replace(LIGHT, group="lamp"): sheet})
+    assert error_of(VirtualTexture, model) == (
+        "two: expected a model with one light group for a virtual texture, found base, lamp"
+    )
+
+
 def test_tiles_are_loaded_when_they_are_needed(tmp_path, device):
     random_model((3, 2, 4) * 8, columns=6).save(tmp_path / "a.wlm")
     with wlm.load(tmp_path / "a.wlm") as model:

@@ -168,6 +168,10 @@ def evaluate(
     layers: _Layers = None,
     encoding: Encoding = None,
     groups: _Groups = None,
+    all_lights: Annotated[
+        Path | None,
+        typer.Option(metavar="SET", help="A bake of all lights together, to compare the sum of the light groups with."),
+    ] = None,
     device: Device = "cpu",
     trust: Trust = False,
 ) -> None:
@@ -186,10 +190,12 @@ def evaluate(
     device = check_device(device)
     model = load(file, "lightmap")
     lightmaps = _load(set_path, times, mask, period, layers, encoding, groups, trust)
-    note_warnings(lightmaps.warnings)
+    together = None if all_lights is None else _load(all_lights, None, mask, period, layers, encoding, None, trust)
+    note_warnings((*lightmaps.warnings, *(together.warnings if together is not None else ())))
     with running("score") as progress:
         size = file.stat().st_size
-        report = evaluate(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
+        options: dict[str, Any] = {"file_bytes": size, "all_lights": together}
+        report = evaluate(model, lightmaps, views=views, device=device, progress=progress, **options)
     if json_path is not None:
         write_json(json_path, report.to_json())
     _show_report(file, report)
@@ -364,6 +370,12 @@ def _show_report(file: Path, report: "Report") -> None:
         rows.add_row(f"time {stamp:g}", *map(number, values, (".2f", ".4f", ".4f")))
     show(rows)
     _show_where_shown(report)
+    if report.sums:
+        rows = table("sum of the light groups", ["compared with", "times", "PSNR, dB", "SSIM"])
+        for score in report.sums:
+            name = f"{score.reference}: {score.sheet}"
+            rows.add_row(escape(name), str(len(score.times)), number(score.psnr, ".2f"), number(score.ssim, ".4f"))
+        show(rows)
     _note_worst(light)
     note_warnings(report.warnings)
 

@@ -372,3 +372,18 @@ class LightmapModel(Model):
     def layer(self, name: str | None = None, atlas: str | None = None) -> list[Sheet]:
         """Returns the sheets of one layer of one atlas in all groups, see `wlm.lightmap.sheet.layer_sheets`."""
         return layer_sheets(self.name, self.sheets, name, atlas)
+
+    def maps(self, name: str | None = None, atlas: str | None = None) -> dict[str, SheetModel]:
+        """Returns the sheet of each light group of one layer of one atlas, for `wlm.lightmap.runtime.MapDecoder`.
+
+        Args:
+            name, atlas: As for `layer`.
+
+        Raises:
+            WlmError: There is no such layer, or it has more than three channels.
+        """
+        sheets = self.layer(name, atlas)
+        groups = {sheet.group: self.sheets[sheet] for sheet in sheets}
+        if len(groups) < len(sheets):
+            raise WlmError(f"{self.name}: {sheets[0].layer}: expected a layer of up to three channels, found more")
+        return groups

@@ -100,6 +100,22 @@ class Jobs:
     slot: wp.array1d[int]
 
 
+@wp.kernel(enable_backward=False)
+def _put(
+    # in:
+    records: wp.array2d[wp.uint8],
+    slots: wp.array1d[int],
+    parts: wp.array2d[int],
+    # out:
+    memory: wp.array1d[wp.uint8],
+):
+    i, j = wp.tid()
+    part = int(0)
+    while j >= parts[part, 0] + parts[part, 1]:
+        part += 1
+    memory[parts[part, 2] + slots[i] * parts[part, 1] + j - parts[part, 0]] = records[i, j]
+
+
 @wp.func
 def _valid(tiles: Tiles, tile: int, y: int, x: int) -> int:
     mask = tiles.mask[tile]
@@ -270,6 +286,19 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
     return decode_pages
 
 
+def put(records, slots, parts, memory) -> None:
+    """Distributes tiles to the arrays of all tiles, which lie one after another in one memory.
+
+    Args:
+        records: uint8 [n, bytes], the tiles, each with its part of each array one after another.
+        slots: int [n], row of each tile in the arrays.
+        parts: int [arrays, 3], for each array its first byte in a record, its bytes of a tile, and its first byte in
+            the memory.
+        memory: uint8 [bytes], written.
+    """
+    wp.launch(_put, records.shape, inputs=[records, slots, parts], outputs=[memory], device=memory.device)
+
+
 def decode(
     kernel: wp.Kernel, source: tuple[Any, ...], clock, offsets, jobs: Jobs, grid: int, direct: bool, out
 ) -> None:
@@ -288,4 +317,4 @@ def decode(
     """
     inputs = [*source, clock, offsets, jobs, grid, int(direct)]
     dim = (jobs.slot.shape[0], *out.shape[1:])
-    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device)
+    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=128)
