@@ -125,6 +125,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "Measure neural six-way lightmaps: time and error beside marches, flip books and path tracing.",
         ("quick", "device", "networks", "profiles"),
     ),
+    "ops": (
+        "Measure differentiable operations: errors against float64, and times forward and backward beside torch.",
+        ("device", "only"),
+    ),
 }
 # Options with which a run replaces only the rows that it measures in a result file.
 _PARTIAL = ("profiles", "rival_names", "only", "volume_only")
