@@ -282,8 +282,8 @@ def test_tape(smoky: bool, device: str):
         found = run(**arrays)
     for result, expected in zip(found, results, strict=True):
         torch.testing.assert_close(wp.to_torch(result), expected.detach().view(result.shape))
-    grads = {result: wp.from_torch(2.0 * (k + 1) * wp.to_torch(result, requires_grad=False)) for k, result in enumerate(found)}
-    tape.backward(grads=grads)
+    seeds = [2.0 * (k + 1) * wp.to_torch(result, requires_grad=False) for k, result in enumerate(found)]
+    tape.backward(grads=dict(zip(found, map(wp.from_torch, seeds), strict=True)))
     for name, array in arrays.items():
         expected = tensors[name].grad
         difference = (wp.to_torch(array.grad).view(expected.shape) - expected).abs().max()
