@@ -54,6 +54,7 @@ COMMANDS = [
         "smoke-network --device cpu --network young.safetensors --profile paper",
         {"networks": [Path("a/young.safetensors")], "profiles": ["paper"]},
     ),
+    (["ops", "--only", "plane"], "ops --device cpu --only plane", {"only": ["plane"]}),
 ]
 
 
