@@ -54,10 +54,10 @@ def settle(virtual, time, at, most=400):
     raise AssertionError(report)
 
 
-def level_twin(light, valid, level, grid=2):
+def level_twin(light, valid, level):
     """Light and validity of a mip level by its definition: means of samples, gaps filled from the nearest texel."""
     step, (height, width) = 1 << level, valid.shape
-    grid = grid if level else 1
+    grid = min(step, 4)
     shape = -(-height // step), -(-width // step)
     total, count = np.zeros((*shape, 3)), np.zeros(shape)
     for a in range(grid):
@@ -69,7 +69,7 @@ def level_twin(light, valid, level, grid=2):
             used = valid[own] & inside
             total, count = total + used[..., None] * light[own], count + used
     mean, covered = total / np.maximum(count, 1)[..., None], count > 0
-    if grid == 4:
+    if level == 4:
         return mean[nearest_valid(covered)], covered
     filled = mean.copy()
     for y, x in np.argwhere(~covered):
@@ -133,7 +133,7 @@ def test_mips_are_means_of_samples(time, device):
         # Coarse texels are stored at stored times.
         settle(virtual, 13.0, view(own, 4.0))
         noon = SheetDecoder(own, device).frame(13.0).astype(np.float64)
-        assert_near(shown_level(virtual, own, 4), level_twin(noon, valid, 4, 4)[0])
+        assert_near(shown_level(virtual, own, 4), level_twin(noon, valid, 4)[0])
 
 
 def test_values_that_are_not_light_have_their_own_gamma(device):
@@ -322,6 +322,14 @@ def test_what_is_refused():
     assert "side: expected" in error_of(VirtualTexture, model, side=100)
     assert "border: expected" in error_of(VirtualTexture, model, border=0)
     assert "tiles: expected at least" in error_of(VirtualTexture, random_model((3, 3), columns=2), side=64, tiles=10)
+
+
+def test_groups_are_refused():
+    sheet = random_sheet((1, 1))
+    model = LightmapModel("two", "0123456789abcdef", sheet.profile, {LIGHT: sheet, replace(LIGHT, group="lamp"): sheet})
+    assert error_of(VirtualTexture, model) == (
+        "two: expected a model with one light group for a virtual texture, found base, lamp"
+    )
 
 
 def test_tiles_are_loaded_when_they_are_needed(tmp_path, device):

@@ -310,7 +310,8 @@ class LightmapModel(Model):
         profile: The settings of the fit; each sheet's own settings follow from them (`Profile.for_sheet`).
         sheets: The sheets, group by group (`wlm.lightmap.groups`), with the same times in a group; those of one atlas
             and size share the mask.
-        warnings: Settings that the fit could not follow, one line each; they are not saved to the file.
+        warnings: Settings that the fit could not follow, and light that it lost though the PSNR is high, one line each;
+            they are not saved to the file.
     """
 
     SYSTEM: ClassVar[str] = "lightmap"

@@ -1,8 +1,8 @@
 """Decodes pages of a virtual texture: square parts of any mip level, with a border, from tiles of all kinds.
 
 A page is read texel by texel at the coordinates of its sheet, so that its border continues into the neighbouring tiles.
-A texel of level L stands for 2^L x 2^L texels. Its light is the mean of those of 2 x 2 samples of them that are valid:
-each row and each column of an even grid of 4 x 4 has one sample (at level 1 the samples are all texels). A texel
+A texel of level L stands for 2^L x 2^L texels. Its light is the mean of those of 4 x 4 samples of them that are valid:
+up to level 2 the samples are all texels, and then each row and each column of an even grid of 16 x 16 has one. A texel
 without a valid sample, in a gap between charts, takes the light of the nearest one within two texels that has one, as
 `wlm.lightmap.runtime.MapDecoder` does; farther away from charts it is black.
 
@@ -98,6 +98,22 @@ class Jobs:
     place: wp.array1d[wp.vec4i]
     target: wp.array1d[int]
     slot: wp.array1d[int]
+
+
+@wp.kernel(enable_backward=False)
+def _put(
+    # in:
+    records: wp.array2d[wp.uint8],
+    slots: wp.array1d[int],
+    parts: wp.array2d[int],
+    # out:
+    memory: wp.array1d[wp.uint8],
+):
+    i, j = wp.tid()
+    part = int(0)
+    while j >= parts[part, 0] + parts[part, 1]:
+        part += 1
+    memory[parts[part, 2] + slots[i] * parts[part, 1] + j - parts[part, 0]] = records[i, j]
 
 
 @wp.func
@@ -222,9 +238,10 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
             columns = (size[1] + step - 1) // step
             y = wp.clamp(place[2] + i, 0, rows - 1)
             x = wp.clamp(place[3] + j, 0, columns - 1)
-            side = int(1)
-            if level > 0:
-                side = grid
+            depth = level
+            if level >= _LEVEL and direct == 0:
+                depth = level - _LEVEL
+            side = wp.min(1 << depth, grid)
             whole = 2 * side * side
             light = wp.vec3()
             count = int(0)
@@ -239,11 +256,14 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
                         b = sample - a * side
                         ty = yy * step + step * (2 * (a * side + b) + 1) // whole
                         tx = xx * step + step * (2 * (b * side + side - 1 - a) + 1) // whole
+                        if depth < level:  # of a coarse texel that reaches past the map's end, its first texel does not
+                            ty -= ty % 16
+                            tx -= tx % 16
                         if ty < size[0] and tx < size[1]:
                             tile = tiles.first[sheet] + (ty // 128) * tiles.columns[sheet] + tx // 128
                             ty = ty % 128
                             tx = tx % 128
-                            if level >= _LEVEL and direct == 0:
+                            if depth < level:
                                 cell = (ty // 16) * _SIDE + tx // 16
                                 light += _coarse_light(tiles, clock, jobs.target[k], tile, cell)
                                 count += 1
@@ -270,6 +290,19 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
     return decode_pages
 
 
+def put(records, slots, parts, memory) -> None:
+    """Distributes tiles to the arrays of all tiles, which lie one after another in one memory.
+
+    Args:
+        records: uint8 [n, bytes], the tiles, each with its part of each array one after another.
+        slots: int [n], row of each tile in the arrays.
+        parts: int [arrays, 3], for each array its first byte in a record, its bytes of a tile, and its first byte in
+            the memory.
+        memory: uint8 [bytes], written.
+    """
+    wp.launch(_put, records.shape, inputs=[records, slots, parts], outputs=[memory], device=memory.device)
+
+
 def decode(
     kernel: wp.Kernel, source: tuple[Any, ...], clock, offsets, jobs: Jobs, grid: int, direct: bool, out
 ) -> None:
@@ -282,10 +315,10 @@ def decode(
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
         jobs: J squares.
-        grid: Samples of a texel of a mip along each axis.
+        grid: Most samples of a texel of a mip along each axis.
         direct: Whether to decode tiles at every level, instead of reading coarse texels from `COARSE_LEVEL` on.
         out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.
     """
     inputs = [*source, clock, offsets, jobs, grid, int(direct)]
     dim = (jobs.slot.shape[0], *out.shape[1:])
-    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device)
+    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=128)

@@ -7,7 +7,8 @@ change from frame to frame.
 2. `mark` counts for each page the pixels that need it, at every `stride`-th pixel along both axes, shifted from frame
    to frame.
 3. `select` gives each page a priority: its number of pixels, times a factor for a page that is missing, that is to be
-   ready for a coming switch, or whose light has changed. It ranks the pages, and finds a slot of the physical texture
+   ready for a coming switch, or whose light has changed. It ranks the pages, decodes the first ones, up to a number of
+   pages and of samples, and finds a slot of the physical texture
    for each page that is decoded in this frame: the least recently needed one of a group of slots. Each page takes from
    another group, and groups take turns. A slot whose page was needed in the last frames is never given away.
 4. `wlm_kernels.lightmap.pages` decodes the chosen pages into their slots.
@@ -21,11 +22,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.lightmap.pages import CLOCK, Jobs, Tiles
+from wlm_kernels.lightmap.pages import CLOCK, COARSE_LEVEL, Jobs
 from wlm_kernels.shared_exponent import unpack_rgb9e5
 
-GROUP = 64  # slots from which one is chosen
+GROUP = 32  # slots from which one is chosen
 MOST = 4096  # most pages that are ranked
+SAMPLES = 4  # most samples of a texel of all decoded pages together, for each page that a frame may decode
 KEEP = 16  # frames for which a page counts as needed
 VISIBLE, MISSING, STALE, AHEAD, WAITING, DECODED, GATHERED = range(7)
 """Counters of a frame: pages that are needed; pages among them without a slot, whose light has changed, that are not
@@ -37,7 +39,7 @@ any more; and whether to decode pages for a coming switch."""
 
 _VISIBLE, _MISSING, _STALE, _AHEAD, _WAITING, _DECODED, _GATHERED = (wp.constant(i) for i in range(7))
 _FRAME, _ADOPT, _DROP, _PREPARE = (wp.constant(i) for i in range(4))
-_MOST, _KEEP = wp.constant(MOST), wp.constant(KEEP)
+_MOST, _KEEP, _SAMPLES, _COARSE = (wp.constant(i) for i in (MOST, KEEP, SAMPLES, COARSE_LEVEL))
 _FADE = wp.constant(0.75)  # share of its pixels that a page keeps in the next frame
 _IF_MISSING, _IF_AHEAD, _IF_STALE = wp.constant(64.0), wp.constant(32.0), wp.constant(8.0)  # factors of the priority
 _SHARE = wp.constant(2)  # column of a clock, see `pages`
@@ -57,8 +59,7 @@ class Pages:
         place: [P], sheet, level, row and column of each page.
         parent: [P], the page that covers this one in the next coarser level; -1 for the page of a whole sheet, which
             always has a slot.
-        tiles: [P], first and last row, first and last column of the tiles that a page reads; none if last < first.
-        own: [P], the tile below a page of level 0, or -1.
+        ready: [P], whether a page can be decoded: the tiles that it reads are on the device.
         change: [P, T + 1], relative change of a page's light from the first stored time up to each one, summed up over
             time. The last is that of a whole day if the times are periodic.
         slot: [P], slot of the physical texture, or -1.
@@ -77,8 +78,7 @@ class Pages:
     size: wp.array1d[wp.vec2i]
     place: wp.array1d[wp.vec4i]
     parent: wp.array1d[int]
-    tiles: wp.array1d[wp.vec4i]
-    own: wp.array1d[int]
+    ready: wp.array1d[int]
     change: wp.array2d[float]
     slot: wp.array1d[int]
     ahead: wp.array1d[int]
@@ -116,9 +116,10 @@ class Work:
         counters: [7], see `VISIBLE`.
         gathered: [MOST], pages that could be decoded: twice the page, plus the row of the clock.
         priority: [MOST], priority of each gathered page.
+        cost: [MOST], samples of a texel of each gathered page.
         chosen: [B], the gathered pages that are decoded, or -1.
-        asked: [2, N], for each tile the last frame in which a page needed it, and the priority of a tile that a page
-            waits for.
+        asked: [2, P], for each page the last frame in which it was needed, and its priority if it waits for tiles, at
+            least 1, else 0.
     """
 
     clock: wp.array2d[float]
@@ -126,6 +127,7 @@ class Work:
     counters: wp.array1d[int]
     gathered: wp.array1d[int]
     priority: wp.array1d[float]
+    cost: wp.array1d[int]
     chosen: wp.array1d[int]
     asked: wp.array2d[int]
 
@@ -145,8 +147,6 @@ def _look(times: Times, frame: int, adopt: int, drop: int, prepare: int, work: W
         work.counters[i] = 0
     if i < work.chosen.shape[0]:
         work.chosen[i] = -1
-    if i < work.asked.shape[1]:
-        work.asked[1, i] = 0
 
 
 @wp.func
@@ -230,15 +230,16 @@ def _between(pages: Pages, page: int, a: float, b: float) -> float:
 
 
 @wp.func
-def _gather(work: Work, code: int, priority: float):
+def _gather(work: Work, code: int, level: int, priority: float):
     i = wp.atomic_add(work.counters, _GATHERED, 1)
     if i < _MOST:
         work.gathered[i] = code
         work.priority[i] = priority
+        work.cost[i] = wp.where(level < _COARSE, 1 << (2 * wp.min(level, 2)), 1)
 
 
 @wp.kernel(enable_backward=False)
-def _score(tiles: Tiles, pages: Pages, slots: Slots, tolerance: float, work: Work):
+def _score(pages: Pages, slots: Slots, tolerance: float, work: Work):
     p = wp.tid()
     frame = work.state[_FRAME]
     slot = pages.slot[p]
@@ -266,6 +267,7 @@ def _score(tiles: Tiles, pages: Pages, slots: Slots, tolerance: float, work: Wor
     pages.area[p] = area
     if count > 0 or whole:
         pages.seen[p] = frame
+    waits = int(0)
     if frame - pages.seen[p] < _KEEP:
         wp.atomic_add(work.counters, _VISIBLE, 1)
         now = _change_at(pages, p, work.clock, 0)
@@ -286,27 +288,16 @@ def _score(tiles: Tiles, pages: Pages, slots: Slots, tolerance: float, work: Wor
             if _between(pages, p, now, _change_at(pages, p, work.clock, 1)) > tolerance:
                 early = _IF_AHEAD * area
                 wp.atomic_add(work.counters, _AHEAD, 1)
-        ready = int(1)
-        if pages.own[p] >= 0:
-            if tiles.slot[pages.own[p]] == -2:  # damaged: the page is never decoded
-                ready = 0
-        box = pages.tiles[p]
-        sheet = pages.place[p][0]
-        most = int(wp.min(wp.max(priority, early) * 16.0, 1.0e9))
-        for row in range(box[0], box[1] + 1):
-            for column in range(box[2], box[3] + 1):
-                tile = tiles.first[sheet] + row * tiles.columns[sheet] + column
-                work.asked[0, tile] = frame
-                if tiles.slot[tile] == -1 and not whole:
-                    wp.atomic_max(work.asked, 1, tile, most)
-                    ready = 0
-        if ready == 1:
+        if pages.ready[p] == 1:
             if priority > 0.0:
-                _gather(work, 2 * p, priority)
+                _gather(work, 2 * p, pages.place[p][1], priority)
             if early > 0.0:
-                _gather(work, 2 * p + 1, early)
-        elif priority > 0.0:
+                _gather(work, 2 * p + 1, pages.place[p][1], early)
+        elif priority > 0.0 or early > 0.0:
             wp.atomic_add(work.counters, _WAITING, 1)
+            waits = int(wp.min(wp.max(priority, early), 1.0e9)) + 1
+    work.asked[0, p] = pages.seen[p]
+    work.asked[1, p] = waits
 
 
 @wp.kernel(enable_backward=False)
@@ -317,11 +308,14 @@ def _rank(work: Work):
         code = work.gathered[i]
         priority = work.priority[i]
         better = int(0)
+        cost = int(0)
         for j in range(count):
             other = work.priority[j]
             if other > priority or (other == priority and work.gathered[j] < code):
                 better += 1
-        if better < work.chosen.shape[0]:
+                cost += work.cost[j]
+        most = work.chosen.shape[0]
+        if better == 0 or (better < most and cost + work.cost[i] <= _SAMPLES * most):
             work.chosen[better] = code
 
 
@@ -442,7 +436,7 @@ class Look:
     """
 
     def __init__(self, work: Work) -> None:
-        count = max(CLOCK, work.counters.shape[0], work.chosen.shape[0], work.asked.shape[1])
+        count = max(CLOCK, work.counters.shape[0], work.chosen.shape[0])
         self._times = np.zeros((2, CLOCK), np.float32)
         # The launch's argument uses this array's memory: building it from its numbers takes longer than the launch.
         first = [Times.from_buffer(self._times), 0, 0, 0, 0]
@@ -478,16 +472,16 @@ def mark(sheet, uv, derivative, at: tuple[int, int], stride: int, pages: Pages) 
     wp.launch(_mark, dim, inputs=inputs, device=sheet.device)
 
 
-def select(tiles: Tiles, pages: Pages, slots: Slots, tolerance: float, work: Work, jobs: Jobs) -> None:
+def select(pages: Pages, slots: Slots, tolerance: float, work: Work, jobs: Jobs) -> None:
     """Chooses the pages that are decoded in this frame, and writes them to `jobs`.
 
     Args:
-        tiles, pages, slots, work: The state, which is changed.
+        pages, slots, work: The state, which is changed.
         tolerance: Relative change of light up to which a page is not decoded again.
         jobs: As many as `work.chosen`, written.
     """
     device, count = work.clock.device, work.chosen.shape[0]
-    wp.launch(_score, pages.slot.shape, inputs=[tiles, pages, slots, tolerance, work], device=device)
+    wp.launch(_score, pages.slot.shape, inputs=[pages, slots, tolerance, work], device=device)
     wp.launch(_rank, MOST, inputs=[work], device=device)
     size = max(1, min(GROUP, slots.owner.shape[0] // count))
     wp.launch(_allocate, count, inputs=[pages, slots, size, work, jobs], device=device)

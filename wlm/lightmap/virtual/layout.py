@@ -26,8 +26,10 @@ class Layout:
         sheets, models: The sheets, and their models.
         side, border: Texels along a side of a page without its border, and of the border.
         tile_first: int [S + 1], number of the first tile of each sheet, and the number of all tiles.
-        first, columns, levels, place, parent, tiles, own: As in `Pages`.
+        first, columns, levels, place, parent: As in `Pages`.
         inner: int [P, 4], first and last row, first and last column of the tiles below each page without its border.
+        own: int [P], the tile below a page of level 0 that has a parent, else -1.
+        reader, read: int [E] each, a page and a tile that it reads; pages of whole sheets are left out.
     """
 
     sheets: list[Sheet]
@@ -40,9 +42,10 @@ class Layout:
     levels: np.ndarray
     place: np.ndarray
     parent: np.ndarray
-    tiles: np.ndarray
-    own: np.ndarray
     inner: np.ndarray
+    own: np.ndarray
+    reader: np.ndarray
+    read: np.ndarray
 
     @classmethod
     def of(cls, model: LightmapModel, side: int, border: int) -> Layout:
@@ -52,7 +55,9 @@ class Layout:
         grids = [_levels(own, side) for own in models]
         most = max(map(len, grids))
         first, columns = np.zeros((2, len(models), most), np.int32)
-        parts: dict[str, list[np.ndarray]] = {"place": [], "parent": [], "tiles": [], "own": [], "inner": []}
+        parts: dict[str, list[np.ndarray]] = {
+            name: [] for name in ("place", "parent", "inner", "own", "reader", "read")
+        }
         count = 0
         for s, (own, grid) in enumerate(zip(models, grids, strict=True)):
             for level, (rows, across) in enumerate(grid):
@@ -70,12 +75,13 @@ class Layout:
                     if level or whole
                     else tile_first[s] + inner[:, 0] * own.grid.cols + inner[:, 2]
                 )
-                parts["tiles"].append(
-                    _tiles_below(own, level, row, column, side, border + REACH)
-                    if level < COARSE_LEVEL
-                    else np.tile([0, -1, 0, -1], (len(row), 1))
-                )
-        arrays = {name: np.concatenate(part).astype(np.int32) for name, part in parts.items()}
+                if level < COARSE_LEVEL and not whole:
+                    boxes = _tiles_below(own, level, row, column, side, border + REACH)
+                    for page, box in enumerate(boxes, int(first[s, level])):
+                        parts["read"].append(_numbers(box, own.grid.cols) + tile_first[s])
+                        parts["reader"].append(np.full(len(parts["read"][-1]), page))
+        nothing = np.zeros(0, np.int32)
+        arrays = {name: np.concatenate(part or [nothing]).astype(np.int32) for name, part in parts.items()}
         levels = np.array([len(grid) for grid in grids], np.int32)
         return cls(list(model.sheets), models, side, border, tile_first, first, columns, levels, **arrays)
 
@@ -87,13 +93,18 @@ class Layout:
     @property
     def footprint(self) -> int:
         """Largest number of tiles that a page reads, except the pages of whole sheets."""
-        box = self.tiles[self.parent >= 0]
-        return int(((box[:, 1] - box[:, 0] + 1) * (box[:, 3] - box[:, 2] + 1)).max(initial=0))
+        return int(np.bincount(self.reader).max(initial=0))
 
-    def numbers(self, box: np.ndarray, sheet: int) -> np.ndarray:
-        """Returns the tiles of a box, a row of `tiles` or `inner`, of a sheet, int [n]."""
-        rows, columns = np.arange(box[0], box[1] + 1), np.arange(box[2], box[3] + 1)
-        return (self.tile_first[sheet] + rows[:, None] * self.models[sheet].grid.cols + columns).ravel()
+    def below(self, page: int) -> np.ndarray:
+        """Returns the tiles below a page without its border, int [n]."""
+        sheet = self.place[page, 0]
+        return _numbers(self.inner[page], self.models[sheet].grid.cols) + self.tile_first[sheet]
+
+
+def _numbers(box: np.ndarray, columns: int) -> np.ndarray:
+    """Returns the numbers of the tiles in a box of first and last row, first and last column."""
+    row, column = np.arange(box[0], box[1] + 1), np.arange(box[2], box[3] + 1)
+    return (row[:, None] * columns + column).ravel()
 
 
 def _levels(own: SheetModel, side: int) -> list[tuple[int, int]]:

@@ -17,7 +17,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.encodings.frames import bc7_tables
-from wlm.lightmap.loading import Loaded, TileLoader
+from wlm.lightmap.loading import TileLoader
 from wlm.lightmap.model import BLOCKS, PACKED_KINDS, LightmapModel, SheetModel
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.virtual.clock import Clock
@@ -32,37 +32,48 @@ _CHUNK = 64  # tiles that are read at once
 _GRID = 4  # samples of a coarse texel along each axis
 _DARK = 0.01  # of a tile's brightest time: changes of less light than that are not relative to it
 _UPLOADS = 4  # most loaded tiles that are copied to the device in a frame
+_ALIGNED = 64  # bytes; the first of an array in a pool
 _REQUESTS = 64  # most tiles that wait for the loader
 
 
 class _Pool:
-    """Device memory for tiles of one kind, in slots of equal size."""
+    """Device memory for tiles of one kind, in slots.
 
-    def __init__(self, arrays: dict[str, tuple[Any, tuple[int, ...]]], slots: int, device: str) -> None:
-        """Allocates the slots; `arrays` has for each name its type, and its shape, whose first axis is that of one
-        tile's rows."""
+    Attributes:
+        owner: int [slots], the tile in each slot, or -1.
+        arrays: The arrays of the tiles by name: parts of one memory, so that tiles are uploaded with one copy.
+        memory_bytes: Bytes on the device.
+    """
+
+    def __init__(self, shapes: dict[str, tuple[Any, tuple[int, ...]]], slots: int, device: str) -> None:
+        """Allocates the slots; `shapes` has for each array its type, and its shape of one tile, whose first axis is
+        that of the tile's rows."""
         self.owner = np.full(slots, -1)
-        self._bytes = {}
-        self.arrays = {}
-        for name, (dtype, shape) in arrays.items():
-            size = math.prod(shape) * wp.types.type_size_in_bytes(dtype)
-            memory = wp.zeros(max(slots * size, 1), dtype=wp.uint8, device=device)
-            whole = (slots * shape[0], *shape[1:])
-            # One memory with two types: tiles are copied as bytes.
-            self.arrays[name] = wp.array(ptr=memory.ptr, dtype=dtype, shape=whole, device=device, deleter=None)
-            self._bytes[name] = memory, size
+        self._device, self._names = device, list(shapes)
+        sizes = [math.prod(shape) * wp.types.type_size_in_bytes(dtype) for dtype, shape in shapes.values()]
+        starts = np.cumsum([0, *(-(-slots * size // _ALIGNED) * _ALIGNED for size in sizes)])
+        if starts[-1] >= 2**31:
+            raise WlmError(f"tiles: expected less than 2 GiB of tiles of one kind, got {starts[-1]} bytes")
+        self._memory = wp.zeros(int(starts[-1]), dtype=wp.uint8, device=device)
+        self.memory_bytes = self._memory.capacity
+        records = np.cumsum([0, *sizes])[:-1]
+        self._parts = wp.array(np.stack([records, sizes, starts[:-1]], 1).astype(np.int32), dtype=int, device=device)
+        self.arrays = {
+            name: wp.array(
+                ptr=(self._memory.ptr or 0) + int(start),
+                dtype=dtype,
+                shape=(slots * shape[0], *shape[1:]),
+                device=device,
+            )
+            for (name, (dtype, shape)), start in zip(shapes.items(), starts, strict=False)
+        }
 
-    @property
-    def memory_bytes(self) -> int:
-        return sum(memory.capacity for memory, _ in self._bytes.values())
-
-    def put(self, first: int, rows: dict[str, np.ndarray]) -> None:
-        """Copies n tiles, arrays [n, ...], into the slots from `first` on."""
-        for name, values in rows.items():
-            memory, size = self._bytes[name]
-            data = np.ascontiguousarray(values).view(np.uint8).ravel()
-            source = wp.array(data, dtype=wp.uint8, device="cpu", copy=False)
-            wp.copy(memory, source, dest_offset=first * size, count=len(data))
+    def put(self, slots: np.ndarray, rows: dict[str, np.ndarray]) -> None:
+        """Copies n tiles, arrays [n, ...] by name, into slots, int [n]."""
+        parts = [np.ascontiguousarray(rows[name]).view(np.uint8).reshape(len(slots), -1) for name in self._names]
+        records = wp.array(np.concatenate(parts, 1), dtype=wp.uint8, device=self._device)
+        at = wp.array(slots.astype(np.int32), dtype=int, device=self._device)
+        kernels.put(records, at, self._parts, self._memory)
 
 
 class TileStore:
@@ -94,7 +105,7 @@ class TileStore:
         self._make_tiles()
         self.offsets = self._array(np.array([(0, 0), *OFFSETS], np.int32), wp.vec2i)
         self._read_all(clock)
-        self._changed = False
+        self._used = np.full(len(self.slot), -1)  # last frame in which a page needed each tile
         if not self.complete:
             self._loader = TileLoader(model, _REQUESTS)
 
@@ -226,7 +237,7 @@ class TileStore:
         self.slot[gone[gone >= 0]] = kernels.WAITING
         pool.owner[first : first + len(tiles)] = tiles
         self.slot[tiles] = np.arange(first, first + len(tiles))
-        pool.put(first, _rows(part, kind))
+        pool.put(self.slot[tiles], _rows(part, kind))
         return numbers
 
     def _is_good(self, s: int, own: SheetModel, number: int) -> bool:
@@ -280,50 +291,73 @@ class TileStore:
 
     # ---- tiles that are loaded when they are needed ----
 
-    def stream(self, used: np.ndarray, priority: np.ndarray, frame: int) -> None:
+    def ready(self) -> np.ndarray:
+        """Returns which pages can be decoded: all tiles that they read are here, or damaged; int32 [P].
+
+        The page of a damaged tile itself is never decoded, so that the page above it is shown. The page of a whole
+        sheet is always decoded, with coarse texels in place of tiles that are not here.
+        """
+        layout = self._layout
+        missing = np.bincount(layout.reader[self.slot[layout.read] == kernels.WAITING], minlength=len(layout.parent))
+        broken = (layout.own >= 0) & (self.slot[layout.own] == kernels.BROKEN)
+        return ((missing == 0) & ~broken).astype(np.int32)
+
+    def stream(self, seen: np.ndarray, priority: np.ndarray, frame: int) -> bool:
         """Asks the loader for tiles and uploads those that it has loaded, some in each frame.
 
         Args:
-            used: int [N], last frame in which a page needed each tile.
-            priority: int [N], priority of each tile that a page waits for, else 0.
+            seen: int [P], last frame in which each page was needed.
+            priority: int [P], priority of each page that waits for tiles, else 0.
             frame: Number of the frame.
+
+        Returns:
+            Whether `ready` has changed.
         """
         if self._loader is None:
-            return
-        waiting = np.flatnonzero((priority > 0) & (self.slot == kernels.WAITING))
-        order = waiting[np.argsort(-priority[waiting], kind="stable")][:_REQUESTS]
+            return False
+        layout = self._layout
+        self._used[layout.read[seen[layout.reader] > frame - KEEP]] = frame
+        wanted = (priority[layout.reader] > 0) & (self.slot[layout.read] == kernels.WAITING)
+        most = np.zeros(len(self.slot), np.int64)
+        np.maximum.at(most, layout.read[wanted], priority[layout.reader[wanted]])
+        waiting = np.flatnonzero(most)
+        order = waiting[np.argsort(-most[waiting], kind="stable")][:_REQUESTS]
         self._loader.cancel()
         for tile in order.tolist():
-            s = int(np.searchsorted(self._layout.tile_first, tile, side="right")) - 1
-            number = tile - int(self._layout.tile_first[s])
-            self._loader.request(self._layout.sheets[s], number, float(priority[tile]))
+            s = int(np.searchsorted(layout.tile_first, tile, side="right")) - 1
+            number = tile - int(layout.tile_first[s])
+            self._loader.request(layout.sheets[s], number, float(most[tile]))
+        taken: dict[int, list[tuple[int, SheetModel]]] = {}
+        changed = False
         for loaded in self._loader.take(_UPLOADS):
-            self._upload(loaded, used, frame)
-        if self._changed:
+            tile = int(layout.tile_first[layout.sheets.index(loaded.sheet)]) + loaded.number
+            if self.slot[tile] != kernels.WAITING:
+                continue
+            if loaded.tile is None:
+                self._break(tile, loaded.error or WlmError("a tile could not be read"))
+                changed = True
+            elif self._room_for(tile, frame):
+                changed = True
+                taken.setdefault(int(self._kind[tile]), []).append((tile, loaded.tile))
+        for kind, pairs in taken.items():
+            each = [_rows(own, kind) for _, own in pairs]
+            rows = {name: np.concatenate([one[name] for one in each]) for name in each[0]}
+            self._pools[kind].put(self.slot[[tile for tile, _ in pairs]], rows)
+        if changed:
             self.tiles.slot.assign(self.slot)
-            self._changed = False
+        return changed
 
-    def _upload(self, loaded: Loaded, used: np.ndarray, frame: int) -> None:
-        s = self._layout.sheets.index(loaded.sheet)
-        tile = int(self._layout.tile_first[s]) + loaded.number
-        if self.slot[tile] != kernels.WAITING:
-            return
-        if loaded.tile is None:
-            self._break(tile, loaded.error or WlmError("a tile could not be read"))
-            self._changed = True
-            return
-        kind = int(self._kind[tile])
-        pool = self._pools[kind]
-        age = np.where(pool.owner >= 0, used[pool.owner], -1)
+    def _room_for(self, tile: int, frame: int) -> bool:
+        """Gives a tile the slot of the tile that was not needed for the longest time; False if all are needed."""
+        pool = self._pools[int(self._kind[tile])]
+        age = np.where(pool.owner >= 0, self._used[pool.owner], -1)
         slot = int(np.argmin(age))
         if age[slot] > frame - KEEP:
-            return  # all are in use: the tile is asked for again
+            return False  # the tile is asked for again
         if pool.owner[slot] >= 0:
             self.slot[pool.owner[slot]] = kernels.WAITING
-        pool.owner[slot], self.slot[tile] = tile, slot
-        used[tile] = frame
-        pool.put(slot, _rows(loaded.tile, kind))
-        self._changed = True
+        pool.owner[slot], self.slot[tile], self._used[tile] = tile, slot, frame
+        return True
 
     def wait(self, seconds: float) -> bool:
         """Waits until a requested tile is loaded, at most some seconds; returns whether there is one."""
@@ -415,7 +449,5 @@ def page_changes(layout: Layout, change: np.ndarray) -> np.ndarray:
     Returns:
         float32 [P, T + 1]; a page changes as much as the tile below it that changes most.
     """
-    largest = np.stack(
-        [change[layout.numbers(box, place[0])].max(0) for box, place in zip(layout.inner, layout.place, strict=True)]
-    )
+    largest = np.stack([change[layout.below(page)].max(0) for page in range(len(layout.parent))])
     return np.concatenate([np.zeros((len(largest), 1)), np.cumsum(largest, 1)], 1).astype(np.float32)

@@ -38,9 +38,10 @@ TOLERANCE = 0.02
 STRIDE = 8
 """Distance between the pixels that are read in a frame to find the pages that a view needs, a power of two."""
 
-_GRID = 2  # samples of a texel of a mip along each axis
+_GRID = 4  # most samples of a texel of a mip along each axis
 _TURN = 27  # order in which the pixels of a square of STRIDE x STRIDE take turns: any odd number reaches all
 _MOST_DECODES = 1024
+_TABLE_ROW = 1024  # pages in a row of the page table, as a texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,10 @@ class VirtualTexture:
         slots: Number of pages that the physical texture holds.
         decodes: Largest number of pages that are decoded in a frame.
         tolerance: Relative change of light up to which a page is not decoded again.
-        texture: `wp.array` uint32 [slots, side + 2 border, side + 2 border], the physical texture, RGB9E5.
+        texture: `wp.array` uint32 [slots, side + 2 border, side + 2 border], the physical texture, RGB9E5: an array of
+            textures, one layer for each slot.
+        table: `wp.array` int [n * 1024], the page table as a texture whose rows have 1,024 pages; see
+            `wlm.lightmap.virtual.shader` for how shaders read both.
     """
 
     def __init__(
@@ -106,7 +110,8 @@ class VirtualTexture:
             model: The model.
             device: "cpu", "cuda" or "cuda:N".
             budget: Bytes of the physical texture. More than the pages of all levels need is not allocated.
-            decodes: Largest number of pages that are decoded in a frame, 1 to 1024.
+            decodes: Largest number of pages that are decoded in a frame, 1 to 1024. A page of the first mip counts as
+                one, of the next two as four, since their texels are means of 16 samples.
             tolerance: Relative change of a page's light (RMS) up to which it is not decoded again, above 0.
             tiles: Bytes for the tiles on the device. If not all fit, a thread loads those that are needed. None: all.
             gelu: GELU variant of the networks; None: the model's, or on CUDA the instruction for its approximation.
@@ -114,10 +119,14 @@ class VirtualTexture:
             border: Texels of a page's border, 1 to 16, for a renderer's filter.
 
         Raises:
-            WlmError: There is no such device, a setting is out of its range, or `budget` or `tiles` is too small.
+            WlmError: There is no such device, a setting is out of its range, `budget` or `tiles` is too small, or the
+                model has several light groups.
         """
         self.device = device_of(device)
         _check(decodes, tolerance, side, border)
+        if len(model.groups) > 1:
+            names = ", ".join(model.groups)
+            raise WlmError(f"{model.name}: expected a model with one light group for a virtual texture, found {names}")
         if gelu is None and self.device != "cpu" and model.light.profile.gelu == "tanh":
             gelu = "fast"
         self.model, self.decodes, self.tolerance = model, decodes, tolerance
@@ -137,7 +146,10 @@ class VirtualTexture:
             self._make(edge)
             self._fill_whole(whole)
         self._step = interop.StepGraph(self._work, self.device)
-        self._asked: Any = None
+        # The copy of what pages wait for, whether it was queued, and on CUDA the event of its arrival.
+        cuda = self.device != "cpu"
+        self._host = wp.zeros(self._frame_work.asked.shape, dtype=int, device="cpu", pinned=cuda)
+        self._asked, self._arrival = False, wp.Event(self.device) if cuda else None
 
     def _make(self, edge: int) -> None:
         layout, count = self.layout, len(self.layout.parent)
@@ -157,23 +169,30 @@ class VirtualTexture:
             return made
 
         sizes = np.array([(own.height, own.width) for own in layout.models], np.int32)
-        fixed = {
-            name: getattr(layout, name) for name in ("first", "columns", "levels", "place", "parent", "tiles", "own")
-        }
+        fixed = {name: getattr(layout, name) for name in ("first", "columns", "levels", "place", "parent")}
         missing = dict.fromkeys(("slot", "ahead", "seen"), (count, -1))
-        fresh = dict.fromkeys(("need", "area", "table"), (count, 0))
+        fresh = dict.fromkeys(("need", "area"), (count, 0)) | {"table": (-(-count // _TABLE_ROW) * _TABLE_ROW, 0)}
         change = page_changes(layout, self._store.change)
         numbers = {"side": layout.side, "border": layout.border, "periodic": int(self.model.period is not None)}
-        self._pages = struct(kernels.Pages, size=sizes, change=change, **fixed, **missing, **fresh, **numbers)
+        ready = self._store.ready()
+        self._pages = struct(
+            kernels.Pages, size=sizes, change=change, ready=ready, **fixed, **missing, **fresh, **numbers
+        )
         self._slots = struct(kernels.Slots, owner=(self.slots, -1), stamp=(self.slots, -1), mark=(self.slots, 0))
-        most = {"gathered": (kernels.MOST, 0), "priority": (kernels.MOST, 0), "chosen": (self.decodes, -1)}
-        asked = (2, len(self._store.slot), 0)
+        most = {
+            "gathered": (kernels.MOST, 0),
+            "priority": (kernels.MOST, 0),
+            "cost": (kernels.MOST, 0),
+            "chosen": (self.decodes, -1),
+        }
+        asked = (2, count, 0)
         self._frame_work = struct(
             kernels.Work, clock=(2, page_kernels.CLOCK, 0), state=(4, 0), counters=(7, 0), asked=asked, **most
         )
         jobs = {"target": (self.decodes, 0), "slot": (self.decodes, -1)}
         self._jobs = struct(page_kernels.Jobs, place=np.zeros((self.decodes, 4), np.int32), **jobs)
         self.texture = wp.zeros((self.slots, edge, edge), dtype=wp.uint32, device=self.device)
+        self.table = self._pages.table
         self._look = kernels.Look(self._frame_work)
         # Slots that were never needed are older than any frame.
         self._frame = kernels.KEEP
@@ -240,7 +259,7 @@ class VirtualTexture:
             stage()
 
     def _select(self) -> None:
-        kernels.select(self._store.tiles, self._pages, self._slots, self.tolerance, self._frame_work, self._jobs)
+        kernels.select(self._pages, self._slots, self.tolerance, self._frame_work, self._jobs)
 
     def _decode(self) -> None:
         if self.device == "cpu" and not (self._jobs.slot.numpy() >= 0).any():
@@ -271,26 +290,20 @@ class VirtualTexture:
 
     def _load(self) -> None:
         """Passes on what an earlier frame asked for to the loader, if its copy has arrived, and uploads tiles."""
-        if self._store.complete or self._asked is None:
+        if not self._asked or (self._arrival is not None and not self._arrival.is_complete):
             return
-        host, event = self._asked
-        if event is not None and not event.is_complete:
-            return
-        used, priority = host.numpy().copy()
-        self._asked = None
-        self._store.stream(used, priority, self._frame)
+        self._asked = False
+        if self._store.stream(*self._host.numpy(), self._frame):
+            self._pages.ready.assign(self._store.ready())
 
     def _ask(self) -> None:
-        """Starts to copy the tiles that the frame needs to the host, unless an earlier copy is on its way."""
-        if self._store.complete or self._asked is not None:
+        """Starts to copy what the pages need to the host, unless an earlier copy is on its way."""
+        if self._store.complete or self._asked:
             return
-        asked = self._frame_work.asked
-        if self.device == "cpu":
-            self._asked = (wp.clone(asked), None)
-            return
-        host = wp.empty(asked.shape, dtype=int, device="cpu", pinned=True)
-        wp.copy(host, asked)
-        self._asked = (host, wp.get_stream(self.device).record_event())
+        wp.copy(self._host, self._frame_work.asked)
+        if self._arrival is not None:
+            wp.get_stream(self.device).record_event(self._arrival)
+        self._asked = True
 
     # ---- reading ----
 
@@ -320,7 +333,8 @@ class VirtualTexture:
     def state(self) -> State:
         """Copies the physical texture and the tables from the device to the host."""
         pages, slots = self._pages, self._slots
-        parts = (pages.table, slots.owner, slots.stamp, pages.slot, pages.ahead, pages.parent)
+        count = len(self.layout.parent)
+        parts = (pages.table[:count], slots.owner, slots.stamp, pages.slot, pages.ahead, pages.parent)
         with interop.stream(self.device):
             return State(self.texture.numpy(), *(part.numpy() for part in parts))
 
