@@ -53,6 +53,7 @@ COMMANDS = [
         {"profile": "cascade", "only": ["ASTC"], "steps": 9},
     ),
     (["smoke", "--quick"], "smoke --quick --device cpu", {"quick": True}),
+    (["fluid-gradients", "--quick"], "fluid-gradients --quick --device cpu", {"quick": True}),
     (["smoke-orders"], "smoke-orders --device cpu", {"quick": False}),
     (
         ["smoke-network", "--network", "a/young.safetensors", "--profile", "paper"],
