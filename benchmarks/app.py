@@ -117,6 +117,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "Measure smoke: speed of the solver against a memory copy, advection, six-way lightmaps and whole frames.",
         ("quick", "device"),
     ),
+    "fluid-gradients": (
+        "Measure gradients through air and smoke: the time of a step both ways, and memory.",
+        ("quick", "device"),
+    ),
     "smoke-orders": (
         "Measure multiple scattering in smoke: PSNR, FLIP, flicker and time of our method and its rivals.",
         ("quick", "device"),
@@ -124,6 +128,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "smoke-network": (
         "Measure neural six-way lightmaps: time and error beside marches, flip books and path tracing.",
         ("quick", "device", "networks", "profiles"),
+    ),
+    "ops": (
+        "Measure differentiable operations: errors against float64, and times forward and backward beside torch.",
+        ("device", "only"),
     ),
 }
 # Options with which a run replaces only the rows that it measures in a result file.

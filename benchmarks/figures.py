@@ -87,6 +87,8 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "mass_drift": Figure("mass drift", form=".2g"),
         "smoke_gained": Figure("smoke gained", "%", "+.2g"),
         "max_error": Figure("largest error", form=".2g"),
+        "value_error": Figure("error of values", form=".1e"),  # as a share of the largest number, against float64
+        "gradient_error": Figure("of gradients", form=".1e"),
         "error_999": Figure("99.9% within", form=".2g"),  # error of all but 0.1% of the points, against float64
         "flicker": Figure("flicker", "levels", ".3g"),  # levels of 255
         "flicker_ratio": Figure("over the reference's", form=".3f"),
@@ -102,6 +104,10 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "replay_ms": Figure("replayed", "ms", ".3g"),
         "call_ms": Figure("as calls", "ms", ".3g"),
         "step_ms": Figure("a step", "ms", ".3g"),
+        "forward_ms": Figure("forward", "ms", ".3g"),
+        "backward_ms": Figure("backward", "ms", ".3g"),
+        "torch_forward_ms": Figure("torch forward", "ms", ".3g"),
+        "torch_backward_ms": Figure("torch backward", "ms", ".3g"),
         "times_ours": Figure("times ours", form=".3g"),
         "bandwidth": Figure("bandwidth", "GB/s", ".4g"),
         "mlups": Figure("MLUPS"),  # million lattice cells a second

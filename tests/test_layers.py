@@ -12,7 +12,8 @@ BASE = (
 )
 LAYERS = (
     BASE.split(),
-    ["wlm.ops", "wlm.fluid"],
+    ["wlm.ops"],
+    ["wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
     ["wlm.bake"],
     ["wlm.inspection"],

@@ -54,10 +54,10 @@ def settle(virtual, time, at, most=400):
     raise AssertionError(report)
 
 
-def level_twin(light, valid, level, grid=2):
+def level_twin(light, valid, level):
     """Light and validity of a mip level by its definition: means of samples, gaps filled from the nearest texel."""
     step, (height, width) = 1 << level, valid.shape
-    grid = grid if level else 1
+    grid = min(step, 4)
     shape = -(-height // step), -(-width // step)
     total, count = np.zeros((*shape, 3)), np.zeros(shape)
     for a in range(grid):
@@ -69,7 +69,7 @@ def level_twin(light, valid, level, grid=2):
             used = valid[own] & inside
             total, count = total + used[..., None] * light[own], count + used
     mean, covered = total / np.maximum(count, 1)[..., None], count > 0
-    if grid == 4:
+    if level == 4:
         return mean[nearest_valid(covered)], covered
     filled = mean.copy()
     for y, x in np.argwhere(~covered):
@@ -133,7 +133,7 @@ def test_mips_are_means_of_samples(time, device):
         # Coarse texels are stored at stored times.
         settle(virtual, 13.0, view(own, 4.0))
         noon = SheetDecoder(own, device).frame(13.0).astype(np.float64)
-        assert_near(shown_level(virtual, own, 4), level_twin(noon, valid, 4, 4)[0])
+        assert_near(shown_level(virtual, own, 4), level_twin(noon, valid, 4)[0])
 
 
 def test_values_that_are_not_light_have_their_own_gamma(device):

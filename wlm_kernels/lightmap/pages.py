@@ -1,8 +1,8 @@
 """Decodes pages of a virtual texture: square parts of any mip level, with a border, from tiles of all kinds.
 
 A page is read texel by texel at the coordinates of its sheet, so that its border continues into the neighbouring tiles.
-A texel of level L stands for 2^L x 2^L texels. Its light is the mean of those of 2 x 2 samples of them that are valid:
-each row and each column of an even grid of 4 x 4 has one sample (at level 1 the samples are all texels). A texel
+A texel of level L stands for 2^L x 2^L texels. Its light is the mean of those of 4 x 4 samples of them that are valid:
+up to level 2 the samples are all texels, and then each row and each column of an even grid of 16 x 16 has one. A texel
 without a valid sample, in a gap between charts, takes the light of the nearest one within two texels that has one, as
 `wlm.lightmap.runtime.MapDecoder` does; farther away from charts it is black.
 
@@ -238,9 +238,10 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
             columns = (size[1] + step - 1) // step
             y = wp.clamp(place[2] + i, 0, rows - 1)
             x = wp.clamp(place[3] + j, 0, columns - 1)
-            side = int(1)
-            if level > 0:
-                side = grid
+            depth = level
+            if level >= _LEVEL and direct == 0:
+                depth = level - _LEVEL
+            side = wp.min(1 << depth, grid)
             whole = 2 * side * side
             light = wp.vec3()
             count = int(0)
@@ -255,11 +256,14 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
                         b = sample - a * side
                         ty = yy * step + step * (2 * (a * side + b) + 1) // whole
                         tx = xx * step + step * (2 * (b * side + side - 1 - a) + 1) // whole
+                        if depth < level:  # of a coarse texel that reaches past the map's end, its first texel does not
+                            ty -= ty % 16
+                            tx -= tx % 16
                         if ty < size[0] and tx < size[1]:
                             tile = tiles.first[sheet] + (ty // 128) * tiles.columns[sheet] + tx // 128
                             ty = ty % 128
                             tx = tx % 128
-                            if level >= _LEVEL and direct == 0:
+                            if depth < level:
                                 cell = (ty // 16) * _SIDE + tx // 16
                                 light += _coarse_light(tiles, clock, jobs.target[k], tile, cell)
                                 count += 1
@@ -311,7 +315,7 @@ def decode(
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
         jobs: J squares.
-        grid: Samples of a texel of a mip along each axis.
+        grid: Most samples of a texel of a mip along each axis.
         direct: Whether to decode tiles at every level, instead of reading coarse texels from `COARSE_LEVEL` on.
         out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.
     """

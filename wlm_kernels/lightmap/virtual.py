@@ -7,7 +7,8 @@ change from frame to frame.
 2. `mark` counts for each page the pixels that need it, at every `stride`-th pixel along both axes, shifted from frame
    to frame.
 3. `select` gives each page a priority: its number of pixels, times a factor for a page that is missing, that is to be
-   ready for a coming switch, or whose light has changed. It ranks the pages, and finds a slot of the physical texture
+   ready for a coming switch, or whose light has changed. It ranks the pages, decodes the first ones, up to a number of
+   pages and of samples, and finds a slot of the physical texture
    for each page that is decoded in this frame: the least recently needed one of a group of slots. Each page takes from
    another group, and groups take turns. A slot whose page was needed in the last frames is never given away.
 4. `wlm_kernels.lightmap.pages` decodes the chosen pages into their slots.
@@ -21,11 +22,12 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.lightmap.pages import CLOCK, Jobs
+from wlm_kernels.lightmap.pages import CLOCK, COARSE_LEVEL, Jobs
 from wlm_kernels.shared_exponent import unpack_rgb9e5
 
 GROUP = 32  # slots from which one is chosen
 MOST = 4096  # most pages that are ranked
+SAMPLES = 4  # most samples of a texel of all decoded pages together, for each page that a frame may decode
 KEEP = 16  # frames for which a page counts as needed
 VISIBLE, MISSING, STALE, AHEAD, WAITING, DECODED, GATHERED = range(7)
 """Counters of a frame: pages that are needed; pages among them without a slot, whose light has changed, that are not
@@ -37,7 +39,7 @@ any more; and whether to decode pages for a coming switch."""
 
 _VISIBLE, _MISSING, _STALE, _AHEAD, _WAITING, _DECODED, _GATHERED = (wp.constant(i) for i in range(7))
 _FRAME, _ADOPT, _DROP, _PREPARE = (wp.constant(i) for i in range(4))
-_MOST, _KEEP = wp.constant(MOST), wp.constant(KEEP)
+_MOST, _KEEP, _SAMPLES, _COARSE = (wp.constant(i) for i in (MOST, KEEP, SAMPLES, COARSE_LEVEL))
 _FADE = wp.constant(0.75)  # share of its pixels that a page keeps in the next frame
 _IF_MISSING, _IF_AHEAD, _IF_STALE = wp.constant(64.0), wp.constant(32.0), wp.constant(8.0)  # factors of the priority
 _SHARE = wp.constant(2)  # column of a clock, see `pages`
@@ -114,6 +116,7 @@ class Work:
         counters: [7], see `VISIBLE`.
         gathered: [MOST], pages that could be decoded: twice the page, plus the row of the clock.
         priority: [MOST], priority of each gathered page.
+        cost: [MOST], samples of a texel of each gathered page.
         chosen: [B], the gathered pages that are decoded, or -1.
         asked: [2, P], for each page the last frame in which it was needed, and its priority if it waits for tiles, at
             least 1, else 0.
@@ -124,6 +127,7 @@ class Work:
     counters: wp.array1d[int]
     gathered: wp.array1d[int]
     priority: wp.array1d[float]
+    cost: wp.array1d[int]
     chosen: wp.array1d[int]
     asked: wp.array2d[int]
 
@@ -226,11 +230,12 @@ def _between(pages: Pages, page: int, a: float, b: float) -> float:
 
 
 @wp.func
-def _gather(work: Work, code: int, priority: float):
+def _gather(work: Work, code: int, level: int, priority: float):
     i = wp.atomic_add(work.counters, _GATHERED, 1)
     if i < _MOST:
         work.gathered[i] = code
         work.priority[i] = priority
+        work.cost[i] = wp.where(level < _COARSE, 1 << (2 * wp.min(level, 2)), 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -285,9 +290,9 @@ def _score(pages: Pages, slots: Slots, tolerance: float, work: Work):
                 wp.atomic_add(work.counters, _AHEAD, 1)
         if pages.ready[p] == 1:
             if priority > 0.0:
-                _gather(work, 2 * p, priority)
+                _gather(work, 2 * p, pages.place[p][1], priority)
             if early > 0.0:
-                _gather(work, 2 * p + 1, early)
+                _gather(work, 2 * p + 1, pages.place[p][1], early)
         elif priority > 0.0 or early > 0.0:
             wp.atomic_add(work.counters, _WAITING, 1)
             waits = int(wp.min(wp.max(priority, early), 1.0e9)) + 1
@@ -303,11 +308,14 @@ def _rank(work: Work):
         code = work.gathered[i]
         priority = work.priority[i]
         better = int(0)
+        cost = int(0)
         for j in range(count):
             other = work.priority[j]
             if other > priority or (other == priority and work.gathered[j] < code):
                 better += 1
-        if better < work.chosen.shape[0]:
+                cost += work.cost[j]
+        most = work.chosen.shape[0]
+        if better == 0 or (better < most and cost + work.cost[i] <= _SAMPLES * most):
             work.chosen[better] = code
 
 

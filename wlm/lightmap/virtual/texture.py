@@ -38,7 +38,7 @@ TOLERANCE = 0.02
 STRIDE = 8
 """Distance between the pixels that are read in a frame to find the pages that a view needs, a power of two."""
 
-_GRID = 2  # samples of a texel of a mip along each axis
+_GRID = 4  # most samples of a texel of a mip along each axis
 _TURN = 27  # order in which the pixels of a square of STRIDE x STRIDE take turns: any odd number reaches all
 _MOST_DECODES = 1024
 _TABLE_ROW = 1024  # pages in a row of the page table, as a texture
@@ -110,7 +110,8 @@ class VirtualTexture:
             model: The model.
             device: "cpu", "cuda" or "cuda:N".
             budget: Bytes of the physical texture. More than the pages of all levels need is not allocated.
-            decodes: Largest number of pages that are decoded in a frame, 1 to 1024.
+            decodes: Largest number of pages that are decoded in a frame, 1 to 1024. A page of the first mip counts as
+                one, of the next two as four, since their texels are means of 16 samples.
             tolerance: Relative change of a page's light (RMS) up to which it is not decoded again, above 0.
             tiles: Bytes for the tiles on the device. If not all fit, a thread loads those that are needed. None: all.
             gelu: GELU variant of the networks; None: the model's, or on CUDA the instruction for its approximation.
@@ -178,7 +179,12 @@ class VirtualTexture:
             kernels.Pages, size=sizes, change=change, ready=ready, **fixed, **missing, **fresh, **numbers
         )
         self._slots = struct(kernels.Slots, owner=(self.slots, -1), stamp=(self.slots, -1), mark=(self.slots, 0))
-        most = {"gathered": (kernels.MOST, 0), "priority": (kernels.MOST, 0), "chosen": (self.decodes, -1)}
+        most = {
+            "gathered": (kernels.MOST, 0),
+            "priority": (kernels.MOST, 0),
+            "cost": (kernels.MOST, 0),
+            "chosen": (self.decodes, -1),
+        }
         asked = (2, count, 0)
         self._frame_work = struct(
             kernels.Work, clock=(2, page_kernels.CLOCK, 0), state=(4, 0), counters=(7, 0), asked=asked, **most
