@@ -156,14 +156,12 @@ class VirtualTexture:
         self._arrays: list[wp.array] = []
 
         def struct(kind: Any, **contents: Any) -> Any:
-            """Makes a Warp struct of copies of NumPy arrays, of arrays of given shapes filled with a value, and of
-            numbers."""
+            """Makes a Warp struct of arrays, of shapes that a value follows with which they are filled, and of numbers."""
             made = kind()
             for name, content in contents.items():
                 if not isinstance(content, int):
-                    array, dtype = isinstance(content, np.ndarray), kind.vars[name].type.dtype
-                    make = wp.array if array else partial(wp.full, value=content[-1] if not array else 0)
-                    content = make(content if array else content[:-1], dtype=dtype, device=self.device)
+                    values = np.full(content[:-1], content[-1]) if isinstance(content, tuple) else content
+                    content = wp.array(values, dtype=kind.vars[name].type.dtype, device=self.device)
                     self._arrays.append(content)
                 setattr(made, name, content)
             return made
@@ -238,9 +236,9 @@ class VirtualTexture:
             WlmError: The time is not finite.
             ValueError: The shapes do not match.
         """
-        times, state = self._clock.frame(time)
         with interop.stream(self.device):
             points = self._points(sheet, uv, derivatives, 2)
+            times, state = self._clock.frame(time)
             self._load()
             self._frame += 1
             self._look(times, (self._frame, *state))
