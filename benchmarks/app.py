@@ -89,6 +89,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "Measure a lightmap file of 200 MB that is read tile by tile: times, bytes read and memory.",
         ("quick", "device"),
     ),
+    "lightmap-run-time": (
+        "Measure the virtual texture of lightmaps: frames of a walk and a day through a set and a large set.",
+        ("scene_path", "quick", "device"),
+    ),
     "lightmap-ablation": (
         "Measure lightmaps over time: other feature maps of equal size, or no simulation of block compression.",
         ("quick", "device", "set_path", "steps", "only"),
@@ -120,6 +124,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "smoke-network": (
         "Measure neural six-way lightmaps: time and error beside marches, flip books and path tracing.",
         ("quick", "device", "networks", "profiles"),
+    ),
+    "ops": (
+        "Measure differentiable operations: errors against float64, and times forward and backward beside torch.",
+        ("device", "only"),
     ),
 }
 # Options with which a run replaces only the rows that it measures in a result file.

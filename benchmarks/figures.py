@@ -79,6 +79,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "transparency_rms": Figure("transparency RMS", form=".3g"),
         "bias": Figure("bias", "%", "+.1f"),
         "rms": Figure("RMS", "%", ".3g"),  # RMS difference over the RMS of the exact values
+        "texel_rms": Figure("RMS of a texel", "%", ".3g"),  # relative to its brightest channel
         "worst_rms": Figure("worst light's RMS", "%", ".3g"),
         "halving_rms": Figure("RMS by halving", "%", ".3g"),
         "finest_rms": Figure("RMS from the finest", "%", ".3g"),
@@ -86,6 +87,8 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "mass_drift": Figure("mass drift", form=".2g"),
         "smoke_gained": Figure("smoke gained", "%", "+.2g"),
         "max_error": Figure("largest error", form=".2g"),
+        "value_error": Figure("error of values", form=".1e"),  # as a share of the largest number, against float64
+        "gradient_error": Figure("of gradients", form=".1e"),
         "error_999": Figure("99.9% within", form=".2g"),  # error of all but 0.1% of the points, against float64
         "flicker": Figure("flicker", "levels", ".3g"),  # levels of 255
         "flicker_ratio": Figure("over the reference's", form=".3f"),
@@ -101,6 +104,10 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "replay_ms": Figure("replayed", "ms", ".3g"),
         "call_ms": Figure("as calls", "ms", ".3g"),
         "step_ms": Figure("a step", "ms", ".3g"),
+        "forward_ms": Figure("forward", "ms", ".3g"),
+        "backward_ms": Figure("backward", "ms", ".3g"),
+        "torch_forward_ms": Figure("torch forward", "ms", ".3g"),
+        "torch_backward_ms": Figure("torch backward", "ms", ".3g"),
         "times_ours": Figure("times ours", form=".3g"),
         "bandwidth": Figure("bandwidth", "GB/s", ".4g"),
         "mlups": Figure("MLUPS"),  # million lattice cells a second
@@ -143,6 +150,22 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "probes_decoded": Figure("probes decoded", form=".3g"),
         "memory": Figure("memory", "MiB", ".1f"),
         "memory_before": Figure("of it before the file is opened", "MiB", ".1f"),
+    },
+    "Virtual texture": {  # `benchmarks.lightmap_run_time`
+        "frame_ms": Figure("frame", "ms", ".3f"),
+        "feedback_ms": Figure("of it feedback", "ms", ".3f"),
+        "select_ms": Figure("selection", "ms", ".3f"),
+        "table_ms": Figure("page table", "ms", ".3f"),
+        "host_ms": Figure("on the host", "ms", ".3f"),
+        "pages_visible": Figure("pages in view", form=".3g"),
+        "pages_decoded": Figure("decoded", form=".3g"),
+        "current": Figure("current", "%", ".2f"),
+        "nearly_current": Figure("or a level coarser", "%", ".2f"),
+        "cached_psnr": Figure("PSNR to all decoded", "dB", ".2f"),
+        "texture_memory": Figure("texture", "MiB", ".1f"),
+        "tiles_memory": Figure("tiles", "MiB", ".1f"),
+        "coarse_memory": Figure("coarse texels", "MiB", ".1f"),
+        "memory_full": Figure("all tiles", "MiB", ".1f"),
     },
     "Settings": {
         "steps": Figure("steps", form=_WHOLE),

@@ -4,16 +4,21 @@
 """
 
 import json
-import resource
+import re
 import sys
 import time
+from pathlib import Path
 
 from wlm.system import load
 
 
 def peak_memory() -> float:
-    """Returns the largest memory that this process has had so far, in MiB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    """Returns the largest memory that this process has had so far, in MiB.
+
+    `resource.getrusage` would include the memory of the process that started this one.
+    """
+    status = Path("/proc/self/status").read_text()
+    return int(re.search(r"^VmHWM:\s*(\d+) kB$", status, re.MULTILINE)[1]) / 1024
 
 
 def measure(path: str, device: str, count: int) -> dict[str, float]:

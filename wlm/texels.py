@@ -12,10 +12,11 @@ from wlm.formats.exr import HALF_MAX
 REACH = 2
 """Distance from a chart, in texels, that filters read: 1 for a bilinear read, 2 for one of the half-size mip."""
 
-_OFFSETS = sorted(
+OFFSETS = sorted(
     ((y, x) for y in range(-REACH, REACH + 1) for x in range(-REACH, REACH + 1) if (y, x) != (0, 0)),
     key=lambda at: (at[0] ** 2 + at[1] ** 2, at),
-)  # offsets to a texel's neighbours in search order: the nearest first, then by row
+)
+"""Offsets to a texel's neighbours within `REACH`, in search order: the nearest first, then by row."""
 
 _STRIP = 1024  # rows of a lightmap searched for nearest texels at once
 
@@ -88,14 +89,14 @@ def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         Row and column of each such texel, int [G, 2], in reading order, and row and column of its nearest valid texel.
     """
     height, width = mask.shape
-    found = np.zeros(mask.shape, np.int8)  # 1 + the index in `_OFFSETS`
+    found = np.zeros(mask.shape, np.int8)  # 1 + the index in `OFFSETS`
     if not mask.all():
         padded = np.pad(mask, REACH)
-        for i, (y, x) in enumerate(_OFFSETS):
+        for i, (y, x) in enumerate(OFFSETS):
             valid = padded[REACH + y : REACH + y + height, REACH + x : REACH + x + width]
             found[valid & ~mask & (found == 0)] = i + 1
     target = np.argwhere(found)
-    offsets = np.array(_OFFSETS)[found[found > 0].astype(int) - 1]
+    offsets = np.array(OFFSETS)[found[found > 0].astype(int) - 1]
     return target, target + offsets.reshape(-1, 2)
 
 
@@ -154,24 +155,27 @@ def doubts(light: np.ndarray) -> list[str]:
     """
     step = max(1, round((light.size / _SAMPLES) ** 0.5))
     used = light[::step, ::step].reshape(-1, 3)
-    largest = used.max(1)  # NaN where one of the three is
+    red, green, blue = used.T
+    largest = np.maximum(np.maximum(red, green), blue)  # NaN where one of the three is
     with np.errstate(invalid="ignore"):
         chosen = (largest > 0) & (largest < np.inf)
-    used, largest = used[chosen], np.sort(largest[chosen])
-    if not len(used) or used.min() == largest[-1]:
+    largest = largest[chosen]
+    if not len(largest):
         return []
-    brightest, middle = float(largest[-1]), float(largest[len(largest) // 2])
-    found = []
-    if middle > _BRIGHT:
+    found, brightest = [], float(largest.max())
+    if 2 * np.count_nonzero(largest > _BRIGHT) >= len(largest):
         found.append(f"half of the texels exceed {_BRIGHT:,.0f}: are they in lux, or scaled for an encoding?")
     if brightest < _DARK:
         found.append(f"no texel exceeds {_DARK:g}, where half floats lose precision: were they scaled by an exposure?")
-    if brightest == 1.0 and np.count_nonzero(used == 1.0) > _AT_ONE * used.size:
-        found.append("values are clamped at 1: are they screen colours instead of radiance?")
-    if len(used) >= _MANY and brightest <= 1.0:
-        codes = used * _LEVELS
-        if float(np.abs(codes - np.rint(codes)).mean()) < _NEAR_LEVEL:
+    if brightest <= 1.0:
+        lit = used[chosen]
+        if brightest == 1.0 and np.count_nonzero(lit == 1.0) > _AT_ONE * lit.size:
+            found.append("values are clamped at 1: are they screen colours instead of radiance?")
+        codes = lit * _LEVELS
+        if len(lit) >= _MANY and float(np.abs(codes - np.rint(codes)).mean()) < _NEAR_LEVEL:
             found.append("values have 256 levels: were they converted from an 8-bit picture?")
+    if found and used[chosen].min() == brightest:
+        return []  # one value everywhere tells nothing
     return found
 
 

@@ -25,6 +25,7 @@ COMMANDS = [
         "lightmap-ablation --quick --device cpu --set city --steps 20 --only '3D alone'",
         {"only": ["3D alone"], "steps": 20},
     ),
+    (["lightmap-file", "--quick"], "lightmap-file --quick --device cpu", {"quick": True}),
     (
         ["probe", "--no-rivals", "--probes", "a/room.npz", "--key", "sh", "--key", "sh_noon"],
         "probe --no-rivals --device cpu --probes room.npz --key sh --key sh_noon",
@@ -53,6 +54,7 @@ COMMANDS = [
         "smoke-network --device cpu --network young.safetensors --profile paper",
         {"networks": [Path("a/young.safetensors")], "profiles": ["paper"]},
     ),
+    (["ops", "--only", "plane"], "ops --device cpu --only plane", {"only": ["plane"]}),
 ]
 
 

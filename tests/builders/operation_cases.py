@@ -88,14 +88,15 @@ def _rays(count: int, middle: tuple[float, ...], radius: float, distance: float)
 def _smoke(density: np.ndarray, lights: int = 2, emitting: bool = True, distance: float = 12.0, **options) -> Case:
     """A march through a grid."""
     middle = tuple(n / 2 for n in density.shape)
-    leaves, constants = {"density": density}, _rays(40, middle, 2.0, distance)
+    leaves, constants = {"density": density, **_rays(40, middle, 2.0, distance)}, {}
     if lights:
         leaves["colour"], constants["toward"] = uniform(0.2, 1.0, lights, 3), _units(lights, seed=8)
     if emitting:
         leaves["emission"] = uniform(0.0, 1.0, *density.shape, 3)
     # Opaque smoke hardly answers to a small step, and thin smoke must stay above 0.
     size = 0.5 if density.max() > 10.0 else min(1e-2, 0.6 * float(density.min()))
-    return Case("march", leaves, constants, options, {"density": size})
+    # A ray that moves gains or loses a step.
+    return Case("march", leaves, constants, options, {"density": size, "origin": 0.0, "direction": 0.0})
 
 
 _BLOCKS = {"endpoints": uniform(0.1, 0.9, 2, 3, 2, 4), "weights": uniform(0.1, 0.9, 8, 12)}

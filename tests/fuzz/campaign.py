@@ -76,7 +76,7 @@ def campaign(
                 if answer is None:
                     for number, (_, _, end, _) in busy.items():
                         if end <= monotonic():
-                            pool._processes[number].kill()
+                            pool.kill(number)
                     continue
                 number, result = answer
                 name, index, end, prepared = busy.pop(number)

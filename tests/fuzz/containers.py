@@ -55,7 +55,7 @@ def _sign(header: Any, body: bytes) -> bytes:
     """An artifact of a header, whatever it says, with the digest that fits it."""
     metadata = header.get("__metadata__") if isinstance(header, dict) else None
     digest, end = "0" * 32, len(body)
-    with suppress(AttributeError, KeyError, TypeError, IndexError):
+    with suppress(AttributeError, KeyError, TypeError, IndexError, ValueError, OverflowError):
         split = [name for name in header if f"{name}.pieces" in header]
         end = min([end, *(int(header[name]["data_offsets"][0]) for name in split)])
     if isinstance(metadata, dict) and isinstance(metadata.get("wlm"), str) and metadata["wlm"].count(" ") == 3:
@@ -97,10 +97,33 @@ def vary_artifact(draw: Random, data: bytes) -> bytes:
     for name, entry in header.items():
         begin, end = entry["data_offsets"]
         parts[name] = np.frombuffer(body[begin:end], _TYPES[entry["dtype"]]).reshape(entry["shape"])
+    split = [name for name in parts if f"{name}.pieces" in parts]
+    if split and draw.random() < 0.4:
+        name = draw.choice(split)
+        parts[name], parts[f"{name}.pieces"] = _other_pieces(draw, parts[name].tobytes(), parts[f"{name}.pieces"])
     settings = change(json.loads(metadata["settings"].translate(_QUOTES)), parts)
-    for name in [name for name in parts if f"{name}.pieces" in parts] if draw.random() < 0.8 else ():
+    for name in [name for name in split if {name, f"{name}.pieces"} <= parts.keys()] if draw.random() < 0.8 else ():
         parts[f"{name}.pieces"] = _signed_pieces(parts[name].tobytes(), parts[f"{name}.pieces"])
     return _pack_artifact(metadata["wlm"], settings, parts)
+
+
+def _other_pieces(draw: Random, body: bytes, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A part of zstd frames, one of which has other content, is another frame or none, and the index that fits it."""
+    ends = np.cumsum(index[:, 0]).astype(int).tolist()
+    frames = [body[a:b] for a, b in pairwise([0, *ends])]
+    number, what = draw.randrange(len(frames)), draw.randrange(6)
+    content = zstandard.ZstdDecompressor().decompressobj().decompress(frames[number])
+    if what <= 2:
+        frames[number] = zstd.compress(corrupt(draw, content) if what else draw.randbytes(2) * (len(content) // 2))
+    elif what == 3:
+        frames[number] = zstd.compress(bytes(draw.choice((len(content) + 1, 1 << 22))))
+    elif what == 4:
+        frames[number] = draw.choice((b"", frames[0], frames[number] * 2, corrupt(draw, frames[number])))
+    else:
+        frames = draw.choice((frames[:-1], [*frames, frames[0]], frames[::-1]))
+    made = np.frombuffer(b"".join(frames), np.uint8)
+    packed = (struct.pack("<I", len(frame)) + hashlib.blake2b(frame, digest_size=16).digest() for frame in frames)
+    return made, np.frombuffer(b"".join(packed), "<u4").reshape(-1, 5)
 
 
 def _signed_pieces(body: bytes, index: np.ndarray) -> np.ndarray:

@@ -326,6 +326,13 @@ def _lightmap_set(path: Path) -> None:
         assert not sheet.linear or (own.frames <= 1).all(), "levels beyond their range"
 
 
+def _groups() -> Sequence[bytes]:
+    """Light groups of one size, one of them with a mask of its own."""
+    sky = {"name": "sky", "lightmaps": [{"time_hours": 2.5 * i, "file": "a.exr"} for i in range(2)]}
+    lamp = {"name": "lamp", "lightmaps": [{"file": "a.exr"}], "mask": "mask.png"}
+    return (json.dumps({"name": "day", "period_hours": 24, "groups": [sky, lamp]}).encode(),)
+
+
 def _layers() -> Sequence[bytes]:
     """Light of two atlases, directions in a PNG, and a layer of an EXR's rows."""
     files = {
@@ -490,6 +497,7 @@ _ALL = (
     Reader("volume-vdb", "a.vdb", _vdbs, _tiles, _volume, cost=2),
     Reader("lightmap-layers-set", "set.json", _layers, _json, _lightmap_set, _beside(_SET)),
     Reader("lightmap-set", "set.json", corpus("set.json"), _set, _lightmap_set, _beside(_SET)),
+    Reader("lightmap-groups-set", "set.json", _groups, _json, _lightmap_set, _beside(_SET)),
     Reader("smoke-frames", "scene.json", corpus("scene.json"), _json, _frames, _beside(_FRAME)),
     Reader("bench-rows", "a.json", corpus("rows.json"), _json, read_json),
     _settings("yaml-lightmap", lambda: wlm.lightmap.Profile, "lightmap-*"),

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from builders.light_groups import random_groups, sum64
 from builders.lightmap_codes import shares_of
 from builders.synthetic import random_sheet
 
@@ -174,3 +175,38 @@ def test_mips_leave_out_tiles_that_the_file_lacks(device):
     stored[:128, 128:] = False
     # The mean is rounded at each level.
     np.testing.assert_allclose(decoder.numpy(whole)[0, 0], light[stored].mean(0), rtol=0.03)
+
+
+def test_groups_are_added_in_one_texture(device):
+    model = random_groups(np.random.default_rng(6).random((236, 247)) < 0.8)
+    off = dict.fromkeys(model.groups, (0.0, 0.0, 0.0))
+    alone = {group: sum64(model, 9.0, off | {group: (1.0, 1.0, 1.0)}) for group in model.groups}
+    decoder = MapDecoder(model.maps(), device)
+    decoder.set_time(9.0)
+    decoder.decode()
+    # A change of weights needs neither another decode nor another graph.
+    graph = interop.StepGraph(decoder.add, device, warmup=1)
+    for weights in ({}, {"sun": (0.25, 1.5, 0.0), "lamp": (3.0, 1.0, 0.5)}, off):
+        decoder.set_weights(weights)
+        graph()
+        expected = sum(decoder.weights[group] * light for group, light in alone.items())
+        # Half a step of the sum, and of each group at one or two times and mixed.
+        steps = 0.5 * expected.max(2, keepdims=True)
+        steps = steps + sum(1.5 * decoder.weights[group] * alone[group].max(2, keepdims=True) for group in alone)
+        assert (np.abs(decoder.numpy() - expected) <= steps / 256 + 1e-6).all()
+    assert not decoder.numpy().any()
+    with pytest.raises(WlmError, match="expected a group among sky, sun, lamp, unlit, got 'moon'"):
+        decoder.set_weights({"moon": 1.0})
+    other = random_sheet((3,), 1)
+    with pytest.raises(WlmError, match="expected a map of 247x236, got 119x108"):
+        MapDecoder(model.maps() | {"other": other}, device)
+
+
+def test_a_weight_dims_a_model_without_groups(device):
+    decoder = MapDecoder(random_sheet((1, 3, 2, 0)), device, mips=1)
+    decoder.decode()
+    before = decoder.numpy()
+    decoder.set_weights({"base": (0.5, 1.0, 0.0)})
+    decoder.add()
+    step = before.max(2, keepdims=True) / 256
+    assert (np.abs(decoder.numpy() - before * [0.5, 1.0, 0.0]) <= 0.5 * step + 1e-6).all()

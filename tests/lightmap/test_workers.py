@@ -251,7 +251,7 @@ def test_a_mapped_set_is_the_same_set(tmp_path, monkeypatch):
     monkeypatch.setattr(scratch, "IN_MEMORY", 1000)
     times = lightmaps.times
     frames = lightmaps.light.frames
-    mapped = [load(tmp_path / "set", period=24.0), from_arrays(frames[order], times[order], period=24.0)]
+    mapped = [load(tmp_path / "set", period=24.0), from_arrays(frames[order], times[order], None, 24.0, lightmaps.name)]
     for each in mapped:
         assert each.source == lightmaps.source
         assert each.light.frames.base is not None and type(each.light.frames) is np.ndarray

@@ -204,11 +204,17 @@ REFUSED = [
     ("march", {"toward": None}, "toward, colour: expected both arguments or neither"),
     (
         "march",
-        {"origin": torch.zeros(40, 3).requires_grad_()},
-        "origin: expected an argument that requires no gradient",
+        {"toward": torch.zeros(2, 3).requires_grad_()},
+        "toward: expected an argument that requires no gradient",
     ),
     ("march", {"emission": torch.zeros(6, 7, 8)}, "emission: expected float32 [6, 7, 8, 3], got"),
     ("march", {"step": 0.0}, "step: expected a number above 0, got 0.0"),
+    ("march", {"density": torch.zeros(6, 7, 8).half()}, "density: expected float32 [any, any, any], got torch.float16"),
+    (
+        "plane",
+        {"points": torch.zeros(5, 2).bfloat16()},
+        "points: expected float32 [..., 2], got torch.bfloat16 (5, 2): use its float()",
+    ),
     ("march", {"g": 1.0}, "g: expected a number between -1 and 1, got 1.0"),
     (
         "plane",
@@ -256,6 +262,40 @@ def test_function_transforms_are_refused(transform: str):
     ) as error:
         calls[transform]()
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", FIRST.values())
+def test_autocast_changes_nothing(device: str, name: str):
+    """Under autocast an operation still computes in single floats."""
+    case = CASES[name]
+    values = case.call(ops, case.tensors(device))
+    with torch.autocast(torch.device(device).type, torch.bfloat16):
+        others = case.call(ops, case.tensors(device))
+    assert all(map(torch.equal, values, others))
+
+
+def test_rays_of_a_camera(device: str):
+    """Where a ray ends, and a slope along it, by differences: a smooth cloud, and steps that stay as many."""
+    density = torch.tensor(_cloud(), device=device)
+    turn = torch.tensor([0.31, -0.17, 1.0], device=device, dtype=torch.float64)
+    place = torch.tensor([6.3, 5.2, -4.0], device=device, dtype=torch.float64)
+
+    def light(place: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+        direction = torch.nn.functional.normalize(turn, dim=0).float()
+        lights = {"toward": AHEAD[None].to(device), "colour": torch.ones(1, 3, device=device)}
+        radiance, through = ops.march(density, place.float()[None], direction[None], step=0.1, g=0.5, **lights)
+        return radiance.sum() + through.sum()
+
+    for at, step in enumerate((0.02, 0.004)):
+        leaves = [place.clone().requires_grad_(), turn.clone().requires_grad_()]
+        (grad,) = torch.autograd.grad(light(*leaves), leaves[at])
+        for axis in range(3):
+            found = []
+            for sign in (1.0, -1.0):
+                moved = [place.clone(), turn.clone()]
+                moved[at][axis] += sign * step
+                found.append(float(light(*moved)))
+            assert abs((found[0] - found[1]) / (2.0 * step) - float(grad[axis])) <= 0.02 * float(grad.abs().max())
 
 
 @pytest.mark.parametrize("name", [n for n in ops.__all__ if n not in ("plain", "funcs", "Raster", "bc7_blocks")])
@@ -395,7 +435,9 @@ def test_block(section: str, tmp_path: Path):
 
 def test_page():
     kernels = ["Tapes-0", *(f"funcs-{i}" for i in range(4))]
-    torch_alone = [f"{name}-0" for name in ("bc7_map", "plane", "mlp", "gaussian_sum", "rasterize", "march")]
+    torch_alone = [
+        f"{name}-0" for name in ("bc7_map", "plane", "mlp", "gaussian_sum", "rasterize", "antialias", "march")
+    ]
     assert [*BLOCKS] == kernels + torch_alone
     for target in re.findall(r"\]\(([^)#\s]+)\)", PAGE):
         assert (ROOT / "docs" / target).exists(), target

@@ -7,7 +7,6 @@ from kernels.compare import close, exact
 
 from wlm import ops
 from wlm.ops import plain
-from wlm.ops.tensors import check
 
 SIZE = (30, 41)
 
@@ -151,28 +150,3 @@ def test_what_is_refused(device: str):
     ):
         with pytest.raises(ValueError, match=message):
             call()
-
-
-def test_sizes_under_compile():
-    """torch.compile with symbolic sizes accepts a tensor that fits."""
-
-    def checked(tensor: torch.Tensor) -> torch.Tensor:
-        check("tensor", tensor, (None, None, 2))
-        return 2 * tensor
-
-    assert torch.compile(checked, backend="eager", dynamic=True)(torch.ones(8, 8, 2)).sum() == 256
-
-
-@pytest.mark.slow
-def test_compiled():
-    """Under torch.compile a picture and its gradients are those of plain calls."""
-    corners = torch.tensor([[-1.0, -1, 0, 1], [1, -1, 0, 1], [1, 1, 0, 1]], requires_grad=True)
-    attribute, triangle = torch.rand(3, 2, requires_grad=True), torch.tensor([[0, 1, 2]])
-
-    def loss(corners: torch.Tensor, attribute: torch.Tensor) -> torch.Tensor:
-        return ops.interpolate(attribute, triangle, ops.rasterize(corners, triangle, 8, 8)).square().sum()
-
-    found, expected = torch.compile(loss, backend="aot_eager")(corners, attribute), loss(corners, attribute)
-    assert expected > 1.0 and torch.equal(found, expected)
-    gradients = [torch.autograd.grad(each, (corners, attribute)) for each in (found, expected)]
-    assert all(map(torch.equal, *gradients))

@@ -12,7 +12,8 @@ import errno
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,6 +42,7 @@ class Group(TyperGroup):
         try:
             # A returned number is that of an `Exit`, which typer also makes of an interrupt.
             code = super().main(args=args or ["--help"], **extra)
+            sys.stdout.flush()
             sys.exit(exit_code() if code == _INTERRUPTED else code)
         except WlmError as error:
             line = str(error)
@@ -50,8 +52,6 @@ class Group(TyperGroup):
             line = f"{text} (see {_command_path(error)} --help)"
         except OSError as error:
             if error.errno == errno.EPIPE:
-                # Text that Python still buffers for the closed pipe must not fail again at exit.
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 sys.exit(1)
             if error.errno is None:
                 raise
@@ -68,6 +68,39 @@ class Group(TyperGroup):
             line = one_line(str(error))
         sys.stderr.write(f"error: {line}\n")
         sys.exit(BAD_INPUT)
+
+
+_STREAMS = {"stdout": 1, "stderr": 2}
+
+
+class _Stream:
+    """A standard stream. Errors of stdout name it, those of stderr are ignored, as when it is closed."""
+
+    def __init__(self, name: str) -> None:
+        self._name, self._stream = name, getattr(sys, name)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        with self._checked():
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with self._checked():
+            self._stream.flush()
+
+    @contextmanager
+    def _checked(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            # What Python still buffers must not fail again at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), _STREAMS[self._name])
+            if self._name == "stdout":
+                error.filename = self._name
+                raise
 
 
 def _cache_hint(error: OSError) -> str:
@@ -133,14 +166,15 @@ def main() -> None:
 
 
 def _open_streams() -> None:
-    """Opens the null device in place of stdout and stderr if the caller closed them, so that writing to them works."""
-    for number, name in ((1, "stdout"), (2, "stderr")):
+    """Makes stdout and stderr usable: the null device takes the place of one that is closed, and errors name them."""
+    for name, number in _STREAMS.items():
         if getattr(sys, name) is None:
             null = os.open(os.devnull, os.O_WRONLY)
             if null != number:
                 os.dup2(null, number)
                 os.close(null)
             setattr(sys, name, open(number, "w"))  # noqa: SIM115
+        setattr(sys, name, _Stream(name))
 
 
 def run(command: Callable[[], Any]) -> None:

@@ -3,11 +3,12 @@
 import functools
 import json
 import os
+import shutil
 import stat
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 _PLAIN_WIDTH = 10_000  # characters of a line in a file or a pipe, so that no cell of a table wraps
 _PLAIN_REPORTS = 10  # lines of progress in a log
+_NO_RESULTS = {"scene.json", "six.partial"}  # files of a sequence without a frame: the scene, the settings of a run
 _MISSING_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
@@ -178,16 +180,31 @@ def check_output(path: Path, *suffixes: str) -> None:
 def exclusive(command: Callable[..., None]) -> Callable[..., None]:
     """Locks the `output` of a command while it runs, and removes temporary files that killed processes left there.
 
+    A folder that the command makes is removed if the command fails before it has a result.
+
     Raises:
         WlmError: Another process is writing that output.
     """
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
-        with locked(values["output"]):
-            command(**values)
+        output = values["output"]
+        with locked(output):
+            existed = os.path.lexists(output)
+            try:
+                command(**values)
+            except WlmError:
+                if not existed:
+                    _remove_without_result(output)
+                raise
 
     return run
+
+
+def _remove_without_result(folder: Path) -> None:
+    with suppress(OSError):
+        if set(os.listdir(folder)) <= _NO_RESULTS:
+            shutil.rmtree(folder)
 
 
 def quiet_warp() -> None:

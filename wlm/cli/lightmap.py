@@ -38,6 +38,7 @@ from wlm.cli.options import (
     output_option,
 )
 from wlm.cli.settings import with_settings
+from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.lightmap import LightmapModel, LightmapSet, Report
@@ -75,6 +76,16 @@ _Layers = Annotated[
     str | None, typer.Option(metavar="NAMES", help="Layers of the set to read, separated by commas; default all.")
 ]
 
+_Groups = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--group",
+        metavar="NAME=PATH",
+        help="A light group, which is added when the file is decoded: a set, or one lightmap for all times, such as "
+        "that of a lamp. May be repeated; SET is the group base unless it names groups.",
+    ),
+]
+
 # Columns of the scores of a sheet: heading, attribute, format, factor.
 _SCORES = (
     ("PSNR, dB", "psnr", ".2f", 1.0),
@@ -104,6 +115,7 @@ def compress(
     period: _Period = None,
     layers: _Layers = None,
     encoding: Encoding = None,
+    groups: _Groups = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -131,7 +143,7 @@ def compress(
     options |= {"workers": workers, "cluster": cluster}
     data, model, facts = models.fit(
         "lightmap",
-        lambda: _load(set_path, times, mask, period, layers, encoding, trust),
+        lambda: _load(set_path, times, mask, period, layers, encoding, groups, trust),
         output,
         profile,
         settings,
@@ -155,6 +167,11 @@ def evaluate(
     period: _Period = None,
     layers: _Layers = None,
     encoding: Encoding = None,
+    groups: _Groups = None,
+    all_lights: Annotated[
+        Path | None,
+        typer.Option(metavar="SET", help="A bake of all lights together, to compare the sum of the light groups with."),
+    ] = None,
     device: Device = "cpu",
     trust: Trust = False,
 ) -> None:
@@ -172,11 +189,13 @@ def evaluate(
 
     device = check_device(device)
     model = load(file, "lightmap")
-    lightmaps = _load(set_path, times, mask, period, layers, encoding, trust)
-    note_warnings(lightmaps.warnings)
+    lightmaps = _load(set_path, times, mask, period, layers, encoding, groups, trust)
+    together = None if all_lights is None else _load(all_lights, None, mask, period, layers, encoding, None, trust)
+    note_warnings((*lightmaps.warnings, *(together.warnings if together is not None else ())))
     with running("score") as progress:
         size = file.stat().st_size
-        report = evaluate(model, lightmaps, views=views, device=device, progress=progress, file_bytes=size)
+        options: dict[str, Any] = {"file_bytes": size, "all_lights": together}
+        report = evaluate(model, lightmaps, views=views, device=device, progress=progress, **options)
     if json_path is not None:
         write_json(json_path, report.to_json())
     _show_report(file, report)
@@ -192,9 +211,23 @@ def decode(
     atlas: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the atlas; default the first that has the layer.")
     ] = None,
+    weights: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--weight", metavar="GROUP=NUMBER", help="Factor of a light group, 0: off; default 1. May be repeated."
+        ),
+    ] = None,
+    colours: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--colour",
+            metavar="GROUP=R,G,B",
+            help="Factors of red, green and blue of a light group, besides its weight. May be repeated.",
+        ),
+    ] = None,
     device: Device = "cpu",
 ) -> None:
-    """Decode a whole lightmap at one time."""
+    """Decode a whole lightmap at one time: the sum of its light groups."""
     check_output(output, ".exr")
     quiet_warp()
     import numpy as np
@@ -205,8 +238,9 @@ def decode(
     model = load(file, "lightmap")
     sheets = model.layer(layer, atlas)
     decoder = model.decoder(device)
+    decoder.set_weights(_weights(weights, colours))
     frame = decoder.frame(time, layer, atlas)
-    names = [name for sheet in sheets for name in sheet.channels]
+    names = [name for sheet in sheets if sheet.group == sheets[0].group for name in sheet.channels]
     write_planes(output, dict(zip(names, np.moveaxis(frame, 2, 0), strict=True)))
     facts = {"file": output, "time": time, "layer": sheets[0].layer, "atlas": sheets[0].atlas, "channels": names}
     facts |= {"size": f"{frame.shape[1]}x{frame.shape[0]}", "mean": float(frame.mean()), "largest": float(frame.max())}
@@ -231,12 +265,14 @@ def info(
     device: Device = "cpu",
 ) -> None:
     """Show what a file of lightmaps contains, and its memory on a device."""
+    from wlm.lightmap.codec import group_sizes
 
     def facts(model: "LightmapModel") -> dict[str, Any]:
         if not as_json:
             return _facts(model)
         sheets = [vars(sheet) | _sheet(own) for sheet, own in model.sheets.items()]
-        return _facts(model) | {"times": model.times.tolist(), "sheets": sheets}
+        groups = [{"name": name, **sizes} for name, sizes in group_sizes(model).items()]
+        return _facts(model) | {"times": model.times.tolist(), "groups": groups, "sheets": sheets}
 
     model = models.describe(file, "lightmap", device, as_json, facts)
     if not as_json:
@@ -250,6 +286,7 @@ def _load(
     period: float | None,
     layers: str | None,
     encoding: str | None,
+    groups: list[str] | None,
     trust: bool,
 ) -> "LightmapSet":
     from wlm.lightmap import load
@@ -257,7 +294,35 @@ def _load(
 
     stamps = None if times is None else parse_times(times)
     names = None if layers is None else [name.strip() for name in layers.split(",")]
-    return load(path, times=stamps, mask=mask, period=period, trust=trust, layers=names, encoding=encoding)
+    options: dict[str, Any] = {"mask": mask, "period": period, "trust": trust, "encoding": encoding}
+    return load(path, times=stamps, layers=names, groups=_by_group("--group", groups, "PATH"), **options)
+
+
+def _by_group(option: str, given: list[str] | None, value: str) -> dict[str, str]:
+    """Splits the values NAME=VALUE of a repeated option at their first equals sign."""
+    result: dict[str, str] = {}
+    for text in given or ():
+        name, sign, rest = text.partition("=")
+        if not (name and sign and rest) or name in result:
+            raise WlmError(f"{option}: expected NAME={value}, each name once, got {text!r}")
+        result[name] = rest
+    return result
+
+
+def _weights(weights: list[str] | None, colours: list[str] | None) -> dict[str, list[float]]:
+    """Returns the factors of red, green and blue of the groups that the options name."""
+    factors: dict[str, list[float]] = {}
+    for option, given, value, count in (("--weight", weights, "NUMBER", 1), ("--colour", colours, "R,G,B", 3)):
+        for name, text in _by_group(option, given, value).items():
+            try:
+                numbers = [float(part) for part in text.split(",")]
+            except ValueError:
+                numbers = []
+            if len(numbers) != count or not all(number >= 0.0 for number in numbers):
+                raise WlmError(f"{option}: expected {name}={value}, numbers of at least 0, got {text!r}")
+            known = factors.get(name, [1.0] * 3)
+            factors[name] = [factor * numbers[i % count] for i, factor in enumerate(known)]
+    return factors
 
 
 def _facts(model: "LightmapModel") -> dict[str, Any]:
@@ -273,8 +338,13 @@ def _sheet(model: "SheetModel") -> dict[str, Any]:
 
 
 def _show_sheets(model: "LightmapModel") -> None:
-    from wlm.lightmap.codec import sheet_bytes
+    from wlm.lightmap.codec import group_sizes, sheet_bytes
 
+    if len(model.groups) > 1:
+        rows = table("light groups", ["group", "times", "bytes on disk", "GPU bytes"])
+        for name, facts in group_sizes(model).items():
+            rows.add_row(escape(name), str(len(facts["times"])), f"{facts['bytes']:,}", f"{facts['GPU_bytes']:,}")
+        show(rows)
     sizes = sheet_bytes(model)
     columns = ["sheet", "values", "size", "bytes on disk", "GPU bytes", "tiles"]
     rows = table("sheets", columns, text=["values", "tiles"])
@@ -300,6 +370,12 @@ def _show_report(file: Path, report: "Report") -> None:
         rows.add_row(f"time {stamp:g}", *map(number, values, (".2f", ".4f", ".4f")))
     show(rows)
     _show_where_shown(report)
+    if report.sums:
+        rows = table("sum of the light groups", ["compared with", "times", "PSNR, dB", "SSIM"])
+        for score in report.sums:
+            name = f"{score.reference}: {score.sheet}"
+            rows.add_row(escape(name), str(len(score.times)), number(score.psnr, ".2f"), number(score.ssim, ".4f"))
+        show(rows)
     _note_worst(light)
     note_warnings(report.warnings)
 

@@ -184,7 +184,7 @@ def _pixels(path: str | os.PathLike[str], channels: _Channels, names: Sequence[s
             raise WlmError(
                 f"{where}: expected half or float numbers, found {'no pixels' if plane is None else plane.dtype}"
             )
-        plane = _framed(where, part, plane.astype(np.float32, copy=False), notes)
+        plane = _framed(where, part, plane, notes)
         if not index:
             pixels = np.empty((*plane.shape, len(names)), np.float32)
         if plane.shape != pixels.shape[:2]:
@@ -194,7 +194,7 @@ def _pixels(path: str | os.PathLike[str], channels: _Channels, names: Sequence[s
 
 
 def _framed(where: str, part: OpenEXR.Part, plane: np.ndarray, notes: list[str]) -> np.ndarray:
-    """Places the pixels of the data window, float32 [h, w], in the display window, 0 elsewhere: [H, W]."""
+    """Places the pixels of the data window, [h, w], in the display window, 0 elsewhere: [H, W] of the same type."""
     data, display = _window(part, "dataWindow"), _window(part, "displayWindow")
     if plane.shape != (data[3], data[2]):
         raise WlmError(
@@ -205,7 +205,7 @@ def _framed(where: str, part: OpenEXR.Part, plane: np.ndarray, notes: list[str])
     left, top, width, height = display
     x, y = data[0] - left, data[1] - top
     rows, columns = (slice(max(at, 0), max(at + size, 0)) for at, size in ((y, data[3]), (x, data[2])))
-    framed = np.zeros((height, width), np.float32)
+    framed = np.zeros((height, width), plane.dtype)
     inside = plane[max(-y, 0) : max(height - y, 0), max(-x, 0) : max(width - x, 0)]
     if not inside.size:
         raise WlmError(f"{where}: expected a data window that overlaps the display window, found none")

@@ -51,9 +51,9 @@ def to_rec709(pixels: np.ndarray, chromaticities: Sequence[float], where: str, n
     Raises:
         WlmError: The chromaticities are not finite, or do not form a triangle.
     """
-    if np.allclose(chromaticities, REC709, rtol=0, atol=_CLOSE):
+    if _close(chromaticities, REC709):
         return
-    name = next((text for known, text in _NAMES.items() if np.allclose(chromaticities, known, rtol=0, atol=_CLOSE)), "")
+    name = next((text for known, text in _NAMES.items() if _close(chromaticities, known)), "")
     ours = _to_xyz(REC709)
     theirs = _to_xyz(chromaticities)
     if theirs is None or ours is None:
@@ -67,6 +67,10 @@ def to_rec709(pixels: np.ndarray, chromaticities: Sequence[float], where: str, n
     with np.errstate(invalid="ignore", over="ignore"):  # the caller checks the values
         pixels[..., :3] = pixels[..., :3] @ matrix.T
     notes.append(f"converted to Rec. 709 from {name or f'the primaries {_text(chromaticities)}'}")
+
+
+def _close(one: Sequence[float], other: Sequence[float]) -> bool:
+    return all(abs(a - b) <= _CLOSE for a, b in zip(one, other, strict=True))
 
 
 def _to_xyz(chromaticities: Sequence[float]) -> np.ndarray | None:

@@ -6,6 +6,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import IO
 
 _STDERR = 2
 _LOCK = threading.RLock()
@@ -22,7 +23,7 @@ def captured_stderr(chosen: Callable[[bytes], bool]) -> Iterator[list[bytes]]:
         The list of the captured lines, which is filled at the end of the block.
     """
     captured: list[bytes] = []
-    with _LOCK, tempfile.TemporaryFile() as sink:
+    with _LOCK, _sink() as sink:
         sys.stderr.flush()
         saved = os.dup(_STDERR)
         os.dup2(sink.fileno(), _STDERR)
@@ -37,3 +38,8 @@ def captured_stderr(chosen: Callable[[bytes], bool]) -> Iterator[list[bytes]]:
                 else:
                     os.write(saved, line)
             os.close(saved)
+
+
+def _sink() -> IO[bytes]:
+    # Memory where the system can: a file takes longer, and the folder for temporary files may be full.
+    return os.fdopen(os.memfd_create("stderr"), "w+b") if hasattr(os, "memfd_create") else tempfile.TemporaryFile()

@@ -41,7 +41,7 @@ def check_frame(frame: bytes, size: int, name: str) -> None:
     try:
         stated = zstandard.frame_content_size(frame)
     except zstandard.ZstdError as error:
-        raise ValueError(f"{name}: {error}") from error
+        raise ValueError(f"{name}: expected a zstd frame, found other data") from error
     if stated not in (size, -1):
         raise ValueError(f"{name}: expected a frame of {size} decompressed bytes, found {stated}")
 

@@ -259,6 +259,15 @@ def _model(path: Path) -> Finding:
     what = f"{_MODELS[system]}: {model.name}"
     if system == "probe" and not model.has_positions:
         return Finding(path, f"{what}, without positions", command("info", path))
+    if system == "lightmap" and len(model.groups) > 1:
+        # This imports the encodings of tiles.
+        from wlm.lightmap.codec import group_sizes
+
+        sizes = (
+            f"{name} {facts['bytes']:,} bytes at {count_of(facts['times'], 'time')}"
+            for name, facts in group_sizes(model).items()
+        )
+        what = f"{what}; {count_of(model.groups, 'light group')}: {', '.join(sizes)}"
     return Finding(path, what, command("web", path, "-o", "PAGE.html"))
 
 
@@ -267,7 +276,7 @@ def _kind_of_json(path: Path) -> str:
     if isinstance(content, dict):
         if str(content.get("format")) in _EXPORTS:
             return "export"
-        for key, kind in (("sheets", "lights"), ("lightmaps", "set"), ("psnr", "scores")):
+        for key, kind in (("sheets", "lights"), ("lightmaps", "set"), ("groups", "set"), ("psnr", "scores")):
             if key in content:
                 return kind
     # This imports scipy.

@@ -29,6 +29,7 @@ from wlm.inspection.pictures import Picture, picture_of, said, size_of
 from wlm.inspection.sets import UNREADABLE_SET, assumed, inspect_set, named, together
 from wlm.lightmap.hours import hours_of_names
 from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders
+from wlm.lightmap.sheet import BASE
 
 MOST = 256
 """Most findings of `inspect`, and most folders that it visits."""
@@ -208,7 +209,7 @@ def _unity(folder: Path, files: Sequence[Path]) -> _Found:
     if len(states) > 1 and None in hours_of_names([state.name for state in states])[0]:
         times, options = range(len(states)), ["--times", f"0:{len(states)}:1"]
         problems.append(f"the hours of {', '.join(state.name for state in states[:8])} are unknown: change --times")
-    listing = list_set(folder, times)
+    listing = list_set(folder, times)[BASE]
     sizes, words = [], compress_command(folder, *options)
     for atlas in listing.atlases:
         paths = [one[key].path for one in listing.states for key in [(atlas.name, "light")] if key in one]
@@ -346,7 +347,7 @@ def _pictures(folder: Path, files: Sequence[Path]) -> _Found:
             raise WlmError(
                 f"{others[0].name} is no lightmap that can be read: move it away, or list the lightmaps in a {SET_FILE}"
             )
-        problems += assumed(list_set(folder, times))
+        problems += assumed(list_set(folder, times)[BASE])
         words = compress_command(folder, *options)
     except WlmError as error:
         problems.append(said(error, folder))

@@ -10,7 +10,7 @@ from wlm.inspection.pictures import Picture, picture_of, read_lit, said, size_of
 from wlm.lightmap.assumptions import set_lines, size_line
 from wlm.lightmap.layout import PICTURES, odd_layout, spread
 from wlm.lightmap.listing import Listing, count_of, list_set
-from wlm.lightmap.sheet import LIGHT
+from wlm.lightmap.sheet import BASE, LIGHT
 
 UNREADABLE_SET = "a lightmap set that cannot be read"
 
@@ -19,12 +19,19 @@ def inspect_set(path: Path) -> Finding:
     """Describes the lightmap set that a `set.json` lists, and names its missing files."""
     folder = path.parent
     try:
-        listing = list_set(path)
-        files = list(dict.fromkeys(source.path for state in listing.states for source in state.values()))
-        masks = [mask for atlas in listing.atlases if (mask := Path(str(atlas.mask))).suffix]  # the others are words
+        listings = list_set(path)
+        files = list(dict.fromkeys(file for listing in listings.values() for file in listing.files))
+        atlases = [atlas for listing in listings.values() for atlas in listing.atlases]
+        masks = [mask for atlas in atlases if (mask := Path(str(atlas.mask))).suffix]  # the others are words
         if missing := [file.name for file in (*files, *masks) if not file.is_file()]:
             lost = f"{missing[0]} is missing" + f", and {len(missing) - 1} more" * (len(missing) > 1)
             return Finding(folder, f"a set of {count_of(files, 'lightmap')}", problems=(lost,))
+        if [*listings] != [BASE]:
+            names = ", ".join(f"{name} at {count_of(own.states, 'time')}" for name, own in listings.items())
+            what = f"a set of lightmaps in {count_of(listings, 'light group')}: {names}; {size_of(files[0])}"
+            problems = [f"{name}: {line}" for name, own in listings.items() for line in assumed(own)]
+            return Finding(folder, what, compress_command(folder), tuple(problems))
+        listing = listings[BASE]
         what, problems = f"a set of lightmaps at {count_of(listing.states, 'time')}", list[str]()
         if any(key != (LIGHT.atlas, LIGHT.layer) for key in listing.states[0]):
             names = ", ".join(layer.name for layer in listing.layers)
@@ -41,10 +48,11 @@ def inspect_set(path: Path) -> Finding:
 def named(path: Path, files: Sequence[Path]) -> set[Path]:
     """Returns which of `files` a `set.json` names as pictures or masks; none if it cannot be read."""
     try:
-        listing = list_set(path)
+        listings = list_set(path).values()
     except WlmError:
         return set()
-    return {*listing.files, *(Path(str(atlas.mask)) for atlas in listing.atlases)} & set(files)
+    masks = (Path(str(atlas.mask)) for listing in listings for atlas in listing.atlases)
+    return {*masks, *(file for listing in listings for file in listing.files)} & set(files)
 
 
 def assumed(listing: Listing) -> list[str]:

@@ -1,8 +1,9 @@
 """Converts a lightmap model to the named parts of its file, and back.
 
-Parts of sheet k (up to three channels of a layer of an atlas) are called `k.NAME`. All sheets share the part `times`;
-the mask of an atlas is stored with the atlas's first sheet. Each tile (its maps and network, or its BC7 frames) is one
-zstd frame, a piece of the split part `k.tiles`, so that it is read alone (`wlm.formats.artifact`).
+Parts of sheet k (up to three channels of a layer of an atlas) are called `k.NAME`. The part `times` is of the first
+light group, and `k.times` of a further group, whose first sheet is k. The mask of an atlas is stored with the atlas's
+first sheet, for all groups. Each tile (its maps and network, or its BC7 frames) is one zstd frame, a piece of the split
+part `k.tiles`, so that it is read alone (`wlm.formats.artifact`).
 """
 
 import math
@@ -24,7 +25,7 @@ from wlm.formats.parts import Part, check_part, check_parts
 from wlm.lightmap.encodings import encoding_of
 from wlm.lightmap.model import PACKED, PACKED_KINDS, LightmapModel, SheetModel, part_table, tiles_of
 from wlm.lightmap.profile import Profile
-from wlm.lightmap.sheet import MOST_NAME, MOST_SHEETS, WIDTH, Sheet, check_sheets
+from wlm.lightmap.sheet import BASE, MOST_NAME, MOST_SHEETS, WIDTH, Sheet, check_sheets
 from wlm.lightmap.stored import PackedMask, StoredTiles
 from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.system import Header, Name
@@ -44,6 +45,7 @@ class _SheetHeader(Header):
     layer: _Word
     channels: Annotated[list[_Word], Field(min_length=1, max_length=WIDTH)]
     encoding: Literal["radiance", "unit", "signed"]
+    group: _Word = BASE
     size: Annotated[list[int], Field(min_length=2, max_length=2)]
 
 
@@ -61,11 +63,15 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, Content], st
         The settings, the parts by name, and the hash of the input that the model was made from.
     """
     headers: list[dict[str, Any]] = []
-    parts: dict[str, Content] = {"times": _shortened(model.times)}
-    masks = set()
+    parts: dict[str, Content] = {}
+    masks, groups = set(), set[str]()
     for number, (sheet, own) in enumerate(model.sheets.items()):
+        if sheet.group not in groups:
+            parts[f"{number}.times" if groups else "times"] = _shortened(own.times)
+        groups.add(sheet.group)
         headers.append(
-            {
+            ({} if sheet.group == BASE else {"group": sheet.group})
+            | {
                 "name": own.name,
                 "atlas": sheet.atlas,
                 "layer": sheet.layer,
@@ -93,23 +99,27 @@ def decode(artifact: Artifact) -> LightmapModel:
         WlmError, ValueError: A setting or a part is missing or wrong, or they do not fit each other.
     """
     header = check_settings(_Header, artifact.settings, "setting ")
-    sheets = [Sheet(item.atlas, item.layer, tuple(item.channels), item.encoding) for item in header.sheets]
+    sheets = [Sheet(item.atlas, item.layer, tuple(item.channels), item.encoding, item.group) for item in header.sheets]
     if len(set(sheets)) < len(sheets):
         raise ValueError("setting sheets: expected different sheets, found one twice")
     sizes = [(item.size[1], item.size[0]) for item in header.sheets]
     if min(map(min, sizes)) < 1:
         raise ValueError("setting size: expected a width and a height of at least 1 texel for each sheet")
     check_sheets("setting sheets", dict(zip(sheets, sizes, strict=True)))
-    times = check_part(artifact.tensors, "times", _TIMES).astype(np.float64)
-    _check_times(times.tolist(), header.period)
+    times = {sheets[0].group: _read_times(artifact.tensors, header.period)}
     parts = _by_sheet({**artifact.tensors, **artifact.pieces}, len(sheets))
-    tables, unpacked = [], 0
+    tables, profiles, unpacked = [], [], 0
     for number, (sheet, size) in enumerate(zip(sheets, sizes, strict=True)):
         with _named(number):
             count = TileGrid.of(*size).count
             arrays = {name: part for name, part in parts[number].items() if isinstance(part, np.ndarray)}
+            if sheet.group not in times:
+                times[sheet.group] = _read_times(arrays, header.period)
+                del parts[number]["times"]
             kind = check_part(arrays, "kind", Part(np.uint8, (count,), most=max(TileKind)))
-            tables.append(part_table(header.profile.for_sheet(sheet), kind, len(times)))
+            stamps = times[sheet.group]
+            profiles.append(header.profile.for_times(len(stamps)).for_sheet(sheet))
+            tables.append(part_table(profiles[-1], kind, len(stamps)))
         unpacked += sum(math.prod(tables[-1][name].shape) for name in PACKED)
     # Before memory is allocated for any sheet.
     check_growth("the file", sum(map(_bytes_of, (*artifact.tensors.values(), *artifact.pieces.values()))), unpacked)
@@ -142,9 +152,9 @@ def decode(artifact: Artifact) -> LightmapModel:
             name=item.name,
             width=item.size[0],
             height=item.size[1],
-            times=times,
+            times=times[sheet.group],
             period=header.period,
-            profile=header.profile.for_sheet(sheet),
+            profile=profiles[number],
             kind=kind,
             **plain,
         )
@@ -177,6 +187,20 @@ def sheet_bytes(model: LightmapModel) -> dict[Sheet, int]:
         if own:
             sizes[int(number)] += _bytes_of(value)
     return dict(zip(model.sheets, sizes, strict=True))
+
+
+def group_sizes(model: LightmapModel) -> dict[str, dict[str, Any]]:
+    """Returns for each light group its `times`, its `bytes` in the file, and its `GPU_bytes`, by the group's name.
+
+    The mask of an atlas counts for the first group.
+    """
+    sizes = sheet_bytes(model)
+    result: dict[str, dict[str, Any]] = {}
+    for sheet, own in model.sheets.items():
+        facts = result.setdefault(sheet.group, {"times": own.times.tolist(), "bytes": 0, "GPU_bytes": 0})
+        facts["bytes"] += sizes[sheet]
+        facts["GPU_bytes"] += own.memory_bytes
+    return result
 
 
 def tile_sizes(sheet: SheetModel) -> np.ndarray:
@@ -228,9 +252,13 @@ def _shortened(times: np.ndarray) -> np.ndarray:
     return short if distinct and np.allclose(short, times, rtol=_ROUNDING, atol=0) else times
 
 
-def _check_times(times: list[float], period: float | None) -> None:
+def _read_times(arrays: Mapping[str, np.ndarray], period: float | None) -> np.ndarray:
+    """Returns the stored times of a group from the part `times`, float64 [T]."""
+    stamps = check_part(arrays, "times", _TIMES).astype(np.float64)
+    times = stamps.tolist()
     if len(times) < 1 or not math.isfinite(times[-1] - times[0]) or not all(a < b for a, b in pairwise(times)):
         raise ValueError("part times: expected finite times that increase")
     # A file may hold a time that was rounded up to the period.
     if period is not None and not (times[0] >= 0 and times[-1] <= period * (1 + _ROUNDING)):
         raise ValueError(f"part times: expected 0 to the period {period:g}, found {times[0]:g} to {times[-1]:g}")
+    return stamps

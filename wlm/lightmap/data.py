@@ -29,7 +29,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -42,9 +42,21 @@ from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, Budget, check_grow
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
 from wlm.lightmap.assumptions import set_lines, size_line
+from wlm.lightmap.groups import groups_of, times_of
 from wlm.lightmap.layout import odd_layout
-from wlm.lightmap.listing import AtlasInfo, LayerInfo, Listing, Source, is_name, list_set
-from wlm.lightmap.sheet import LIGHT, MOST_NAME, VALUE_RANGES, Sheet, check_sheets, first_light, sheets_of
+from wlm.lightmap.listing import AtlasInfo, LayerInfo, Listing, Source, list_set
+from wlm.lightmap.sheet import (
+    BASE,
+    LIGHT,
+    MOST_NAME,
+    VALUE_RANGES,
+    Sheet,
+    check_sheets,
+    first_light,
+    is_group,
+    is_name,
+    sheets_of,
+)
 from wlm.texels import doubts, repair
 
 _PIECE = 1 << 18  # frames times texels that are filled at once
@@ -92,11 +104,13 @@ class SheetFrames:
 
 @dataclass(frozen=True, eq=False)
 class LightmapSet:
-    """Lightmaps over time: one or more sheets, each up to three channels of a layer of an atlas, at the same times.
+    """Lightmaps over time: one or more sheets, each up to three channels of a layer of an atlas.
+
+    The sheets of a light group (`wlm.lightmap.groups`) have the same times.
 
     Attributes:
         name: Name of the set.
-        sheets: The sheets, atlas by atlas and layer by layer; an ordinary set has one.
+        sheets: The sheets, group by group, atlas by atlas and layer by layer; an ordinary set has one.
     """
 
     name: str
@@ -120,9 +134,14 @@ class LightmapSet:
         return self.sheets.get(sheet, self.light)
 
     @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the light groups, one for a set without groups."""
+        return groups_of(self.sheets)
+
+    @property
     def times(self) -> np.ndarray:
-        """The times of all lightmaps, float64 [T], increasing."""
-        return self.light.times
+        """The times of all groups, float64 [T], increasing; see `wlm.lightmap.groups.times_of`."""
+        return times_of(self.sheets)
 
     @property
     def period(self) -> float | None:
@@ -134,7 +153,8 @@ class LightmapSet:
         """Hash of all sheets and their names: 16 hexadecimal digits of BLAKE2b."""
         digest = hashlib.blake2b(digest_size=8)
         for sheet, own in self.sheets.items():
-            digest.update(repr((sheet, own.source)).encode())
+            group = "" if sheet.group == BASE else sheet.group
+            digest.update((repr((sheet, own.source)) + group).encode())
         return digest.hexdigest()
 
     @property
@@ -170,6 +190,7 @@ def load(
     trust: bool = False,
     layers: Sequence[str] | None = None,
     encoding: str | None = None,
+    groups: Mapping[str, str | os.PathLike[str]] | None = None,
 ) -> LightmapSet:
     """Reads a lightmap set: a `set.json`, a folder that holds one, a plain folder of lightmaps, or folders from Unity.
 
@@ -196,6 +217,8 @@ def load(
         layers: Names of the layers to read; None reads all.
         encoding: How the files store their light, an encoding of `wlm.formats.channels`, if they don't define it
             themselves; a folder may then hold PNG, JPEG, WebP and TGA files. None uses `stored` of the set, if any.
+        groups: Further light groups by name, each a set or one lightmap, which is then the same at all times. The set
+            at `path` is the group "base" unless it names groups. See `wlm.lightmap.groups`.
 
     Returns:
         The set, repaired by the module's rules.
@@ -203,13 +226,26 @@ def load(
     Raises:
         WlmError: The set breaks one of the module's rules; the line names the file and the field.
     """
-    listing = list_set(Path(path), times, layers, trust, encoding)
-    stamps = np.asarray(listing.times, np.float64)
-    given, period = period, listing.period if period is None else period
+    further = {name: Path(own) for name, own in (groups or {}).items()}
+    listings = list_set(Path(path), times, layers, trust, encoding, further)
     # Before any file is read, since a wrong list makes that useless.
-    check_times(str(listing.where), listing.labels, stamps, period)
+    for listing in listings.values():
+        day = listing.period if period is None else period
+        check_times(str(listing.where), listing.labels, np.asarray(listing.times, np.float64), day)
+    sets, made = {}, 0
+    for group, listing in listings.items():
+        sets[group] = _read_set(listing, mask, period, trust, made)
+        made += sum(own.frames.nbytes for own in sets[group].sheets.values())
+    return from_groups(sets, next(iter(sets.values())).name) if [*sets] != [BASE] else sets[BASE]
+
+
+def _read_set(
+    listing: Listing, mask: str | os.PathLike[str] | None, given: float | None, trust: bool, made: int
+) -> LightmapSet:
+    """Reads the pictures of a set without groups; for the options see `load`, `made` is that of `_Reader`."""
+    stamps, period = np.asarray(listing.times, np.float64), listing.period if given is None else given
     lines = [f"{listing.where}: {line}" for line in set_lines(listing, given)]
-    reader = _Reader(listing, np.argsort(stamps, kind="stable"), trust)
+    reader = _Reader(listing, np.argsort(stamps, kind="stable"), trust, made)
     sheets: dict[Sheet, SheetFrames] = {}
     for atlas in listing.atlases:
         valid = mask_from = None
@@ -336,6 +372,65 @@ def from_layers(
     return LightmapSet(name, sheets)
 
 
+def from_groups(sets: Mapping[str, LightmapSet], name: str = "groups") -> LightmapSet:
+    """Makes one set of several over the same UVs, whose light is added at run time.
+
+    The rules are those of `wlm.lightmap.groups`.
+
+    Args:
+        sets: The sets by the name of their group, without groups of their own. The frames are not copied.
+        name: Name of the set, also in messages.
+
+    Returns:
+        The set, with the sheets of one group after another.
+
+    Raises:
+        WlmError: There is no set, a name is wrong, or the sets break one of the rules.
+    """
+    if not sets:
+        raise WlmError(f"{name}: expected at least one group, found none")
+    for group, own in sets.items():
+        if not is_group(group):
+            raise WlmError(f"{name}: expected names of groups of printable characters without '=', got {group!r}")
+        if groups_of(own.sheets) != (BASE,):
+            raise WlmError(f"{name}: group {group}: expected a set without groups, found one with its own")
+    first = next(iter(sets.values()))
+    periods = {own.period: group for group, own in sets.items() if len(own.times) > 1} or {first.period: ""}
+    if len(periods) > 1:
+        found = " and ".join(f"{period or 'none'} in {group}" for period, group in periods.items())
+        raise WlmError(f"{name}: expected one period in all groups with several times, found {found}")
+    period = next(iter(periods))
+    named = {replace(sheet, group=group): own for group, one in sets.items() for sheet, own in one.sheets.items()}
+    check_sheets(name, {sheet: own.mask.shape for sheet, own in named.items()})
+    masks: dict[tuple[str, tuple[int, ...]], tuple[str, np.ndarray]] = {}
+    for sheet, own in named.items():
+        key = sheet.atlas, own.mask.shape
+        if key not in masks or (masks[key][1].all() and not own.mask.all()):
+            masks[key] = sheet.group, own.mask
+    sheets = {}
+    for sheet, own in named.items():
+        source, mask = masks[sheet.atlas, own.mask.shape]
+        if lacking := np.count_nonzero(mask & ~own.mask):
+            raise WlmError(
+                f"{name}: {sheet.label}: its mask lacks {lacking} texels of that of group {source}, whose light is "
+                "therefore unknown: give one mask for all groups"
+            )
+        warnings = own.warnings
+        if not own.frames.any():
+            warnings += (f"{name}: {sheet.label}: no light: all its texels are 0",)
+        sheets[sheet] = replace(
+            own,
+            name=name if sheet == LIGHT else f"{name} {sheet.label}",
+            # The one time of a group that does not change may lie outside the period of the others.
+            times=own.times if period is None else own.times % period,
+            mask=mask,
+            period=period,
+            warnings=warnings,
+            covered=None if own.covered is None else own.covered & mask,
+        )
+    return replace(first, name=name, sheets=sheets)
+
+
 def parse_times(text: str) -> list[float]:
     """Reads a list of times: numbers and `start:stop:step` ranges, separated by commas.
 
@@ -402,10 +497,10 @@ class _Stack:
 class _Reader:
     """Reads the pictures that a `Listing` names, one layer of one atlas at a time."""
 
-    def __init__(self, listing: Listing, order: np.ndarray, trust: bool) -> None:
+    def __init__(self, listing: Listing, order: np.ndarray, trust: bool, made: int) -> None:
         self._listing, self._place, self._trust = listing, np.argsort(order), trust
         self._sizes: dict[Sheet, tuple[int, int]] = {}
-        self._made = 0  # bytes of the sheets that memory was allocated for
+        self._made = made  # bytes of the sheets that memory was allocated for, those of other groups included
         self._held = sum(os.path.getsize(file) for file in set(listing.files) if os.path.exists(file))
         # A file may serve many atlases and layers, each of which reads it whole.
         most = max(FRAMES, PICTURE_GROWTH * self._held)

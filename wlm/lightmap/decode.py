@@ -8,6 +8,7 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.lightmap.encodings import ENCODINGS
 from wlm.lightmap.encodings.base import DeviceTiles
+from wlm.lightmap.groups import Weight, changed_weights
 from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.sheet import Sheet, first_light
 from wlm.lightmap.tiles import TILE, place
@@ -119,11 +120,12 @@ class SheetDecoder:
 
 
 class Decoder:
-    """Decodes all layers and atlases of a model.
+    """Decodes all layers and atlases of a model, and adds its light groups by their weights.
 
     Attributes:
         model: The model.
         sheets: The decoder of each sheet, or of those that were chosen.
+        weights: float32 [3] by group, the factors of red, green and blue; initially 1. Changed by `set_weights`.
     """
 
     def __init__(
@@ -144,7 +146,7 @@ class Decoder:
         Raises:
             WlmError: As for `SheetDecoder`, or there is no such sheet.
         """
-        self.model = model
+        self.model, self.weights = model, {group: np.ones(3, np.float32) for group in model.groups}
         chosen: Mapping[Sheet, Sequence[int] | None] = dict.fromkeys(model.sheets)
         if tiles is not None:
             if not isinstance(tiles, Mapping) and len(model.sheets) > 1:
@@ -172,8 +174,19 @@ class Decoder:
         """Memory that maps, networks and frames take on the device, in bytes."""
         return sum(decoder.device_bytes for decoder in self.sheets.values())
 
+    def set_weights(self, weights: Mapping[str, Weight]) -> None:
+        """Sets the weights of some groups for the following frames; the others keep theirs.
+
+        Args:
+            weights: By group a factor of its light, or one each of red, green and blue, from 0 to 65,504.
+
+        Raises:
+            WlmError: The model has no such group, or a weight is wrong; no weight is changed.
+        """
+        self.weights = changed_weights(self.model.name, self.weights, weights)
+
     def frame(self, time: float, layer: str | None = None, atlas: str | None = None) -> np.ndarray:
-        """Decodes one layer of one atlas at one time.
+        """Decodes one layer of one atlas at one time; of light the weighted sum of the groups.
 
         Args:
             time: In the unit of the set's times, stored or between.
@@ -186,7 +199,13 @@ class Decoder:
         sheets = self.model.layer(layer, atlas)
         if left_out := [sheet for sheet in sheets if sheet not in self.sheets]:
             raise WlmError(f"{self.model.name}: expected one of the decoder's sheets, got {left_out[0].label}")
-        frames = [sheet.to_values(self.sheets[sheet].frame(time)) for sheet in sheets]
+        sums: dict[tuple[str, ...], np.ndarray] = {}
+        for sheet in sheets:
+            weight = np.float32(1.0) if sheet.linear else self.weights[sheet.group]
+            # A group that is switched off is not decoded.
+            light = self.sheets[sheet].frame(time) * weight if weight.any() or sheet.channels not in sums else 0.0
+            sums[sheet.channels] = sums[sheet.channels] + light if sheet.channels in sums else light
+        frames = [sheet.to_values(sums[sheet.channels]) for sheet in sheets if sheet.group == sheets[0].group]
         return frames[0] if len(frames) == 1 else np.concatenate(frames, axis=2)
 
     def frames(self, time: float) -> dict[str, dict[str, np.ndarray]]:

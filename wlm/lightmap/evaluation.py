@@ -17,6 +17,7 @@ from wlm.errors import WlmError
 from wlm.lightmap.codec import part_bytes, sheet_bytes
 from wlm.lightmap.data import LightmapSet, SheetFrames
 from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.group_scores import SumScore, score_sums
 from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.sheet import Sheet, first_light
 from wlm.lightmap.tiles import TILE, TileKind
@@ -73,11 +74,12 @@ class Report(system.Report):
         bpp: Bits in the file per texel and time, all layers together.
         memory_bpp: Bits in the memory of a GPU per texel and time, all layers together.
         parts: Bytes of the file by part, see `wlm.lightmap.codec.part_bytes`.
-        times: float64 [T], the stored times.
+        times: float64 [T], the stored times of the first sheet of light.
         device: Device on which the model was decoded.
         seconds: Wall-clock time to decode and score everything; scoring takes most of it.
         profile: Name of the settings.
-        sheets: The report of each sheet.
+        sheets: The report of each sheet, so also of each light group.
+        sums: Scores of the sums of light groups, see `wlm.lightmap.group_scores.score_sums`; empty without groups.
         warnings: Warnings of all sheets, and one if the file was made from another input.
     """
 
@@ -98,6 +100,7 @@ class Report(system.Report):
     seconds: float
     profile: str
     sheets: dict[Sheet, SheetReport]
+    sums: list[SumScore]
     warnings: list[str]
 
     @property
@@ -120,6 +123,7 @@ def evaluate(
     views: int = VIEWS,
     progress: OnProgress | None = None,
     file_bytes: int | None = None,
+    all_lights: LightmapSet | None = None,
 ) -> Report:
     """Decodes every stored time, and times between them, from the stored bytes and compares them with the input.
 
@@ -134,13 +138,14 @@ def evaluate(
         views: Number of rendered views of the set's mesh, scored with "seen"; 0: none. A set without a mesh has none.
         progress: Called about twice a second.
         file_bytes: Size of the model's file; None: the size that the model would have as a file.
+        all_lights: A bake of all lights together, at any times, to compare the sum of the light groups with.
 
     Returns:
         The report.
 
     Raises:
         WlmError: The set and the model differ in sheets, size or times, no tile of the model has a valid texel, there
-            is no such device, a metric is unknown, or the number of views is negative.
+            is no such device, a metric is unknown, the number of views is negative, or `all_lights` has other sheets.
         ValueError: `file_bytes` is smaller than the model's parts.
     """
     start = time.perf_counter()
@@ -154,11 +159,12 @@ def evaluate(
         warnings.append(
             f"{lightmaps.name}: not the input of the file: its source is {model.source}, this is {lightmaps.source}"
         )
-    meter = Meter(progress, "score", len(model.sheets) * len(model.times))
+    meter, done = Meter(progress, "score", sum(len(own.times) for own in model.sheets.values())), 0
     for sheet, own in model.sheets.items():
         chosen = [metric for metric in metrics if not (sheet.linear and metric == "flip")]
         count = 0 if sheet.linear or "seen" not in metrics else views
-        report = _score(own, lightmaps.sheets[sheet], sizes[sheet], device, chosen, count, meter, len(reports))
+        report = _score(own, lightmaps.sheets[sheet], sizes[sheet], device, chosen, count, meter, done)
+        done += len(own.times)
         reports[sheet] = replace(report, max_abs_error=report.max_abs_error * sheet.span)
         warnings += report.warnings
     file_bytes = model.file_bytes() if file_bytes is None else file_bytes
@@ -172,11 +178,12 @@ def evaluate(
         bpp=8 * file_bytes / texels,
         memory_bpp=8 * model.memory_bytes / texels,
         parts=part_bytes(model, file_bytes),
-        times=model.times,
+        times=model.light.times,
         device=device,
         seconds=time.perf_counter() - start,
         profile=model.profile.name,
         sheets=reports,
+        sums=score_sums(model, lightmaps, all_lights, device, [each for each in metrics if each in ("psnr", "ssim")]),
         warnings=list(dict.fromkeys(warnings)),
     )
 
@@ -191,7 +198,7 @@ def _score(
     meter: Meter,
     before: int,
 ) -> SheetReport:
-    """Scores a sheet; `before` is the number of sheets already scored, for the progress."""
+    """Scores a sheet; `before` is the number of lightmaps already scored, for the progress."""
     mask, decoder, peak = scored_mask(model, lightmaps), SheetDecoder(model, device), model.profile.peak
     plain = [metric for metric in metrics if metric != "seen"]
     drawn, warnings = views_of(lightmaps, views, device=device)
@@ -206,7 +213,7 @@ def _score(
         for tile, window in _windows(model) if peak is None else ():
             valid = inside[window]
             lost.add(lightmaps.frames[i][window][valid], decoded[window][valid], _place(tile, stamp))
-        if meter.due(done := before * len(model.times) + i + 1):
+        if meter.due(done := before + i + 1):
             meter.report(done)
     report = _sheet_report(model, lightmaps, size, frames, tally.score())
     return replace(report, warnings=report.warnings + warnings + lost.warnings(model.name, *_LOST))

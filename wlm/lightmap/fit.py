@@ -101,7 +101,9 @@ def compress(
     for sheet, own in sheets.items():
         own.mask = masks[sheet.atlas, own.mask.shape]
     warnings = tuple(dict.fromkeys(fit.warning for fit in fits.values() if fit.warning))
-    stored = profile.for_times(len(lightmaps.times))
+    counts = {len(own.times) for own in lightmaps.sheets.values()}
+    # Groups with other numbers of times have maps of other sizes.
+    stored = profile.for_times(*counts) if len(counts) == 1 else profile
     return LightmapModel(lightmaps.name, lightmaps.source, stored, sheets, warnings)
 
 

@@ -5,7 +5,7 @@ of atlases and layers; the plain set of one lightmap for each time has one atlas
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Sized
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -21,7 +21,7 @@ from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
 from wlm.formats.reading import named_file, read_json_file
 from wlm.lightmap.hours import DAY, hours_of_names
-from wlm.lightmap.sheet import LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS
+from wlm.lightmap.sheet import BASE, LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS, is_group, is_name
 
 SET_FILE = "set.json"
 
@@ -131,36 +131,81 @@ def list_set(
     layers: Sequence[str] | None = None,
     trust: bool = False,
     stored: str | None = None,
-) -> Listing:
+    groups: Mapping[str, Path] | None = None,
+) -> dict[str, Listing]:
     """Lists the files of a set, by the rules that `wlm.lightmap.load` describes. `stored` is its `encoding`.
+
+    Returns:
+        A listing for each light group; for a set that names none, one of the name `BASE`.
 
     Raises:
         WlmError: The set cannot be read, a field is missing or wrong, a file lies outside the folder, there are too
-            many states, or a state has no picture.
+            many states, a state has no picture, or a group's name is wrong or given twice.
     """
+    found = _listings(path, times, layers, trust, stored is not None)
+    for name, own in (groups or {}).items():
+        if not is_group(name) or name in found:
+            raise WlmError(f"{own}: expected a group's name that is printable, without '=' and not taken, got {name!r}")
+        listings = (
+            [_alone(own)] if _is_lightmap(own) else [*_listings(own, None, layers, trust, stored is not None).values()]
+        )
+        if len(listings) > 1:
+            raise WlmError(f"{own}: group {name}: expected a set without groups, found one with {len(listings)}")
+        found[name] = listings[0]
+    if stored is not None:
+        found = {name: _stored_as(listing, stored) for name, listing in found.items()}
+    if layers is None:
+        return found
+    names = list(dict.fromkeys(layer.name for listing in found.values() for layer in listing.layers))
+    wrong = [repr(name) for name in layers if name not in names] or ([] if layers else ["none"])
+    if wrong:
+        raise WlmError(f"{path}: layers: expected names among {', '.join(names)}, got {wrong[0]}")
+    for name, listing in found.items():
+        found[name] = replace(listing, layers=tuple(layer for layer in listing.layers if layer.name in layers))
+    return {name: listing for name, listing in found.items() if listing.layers}
+
+
+def _stored_as(listing: Listing, stored: str) -> Listing:
+    light = (replace(each, stored=stored) if each.encoding == LIGHT.encoding else each for each in listing.layers)
+    return replace(listing, layers=tuple(light))
+
+
+def _is_lightmap(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in SUFFIXES + LEVEL_SUFFIXES
+
+
+def _alone(file: Path) -> Listing:
+    """Lists one lightmap, which is the same at all times."""
+    return Listing(
+        name=file.stem,
+        where=file,
+        times=[0.0],
+        period=None,
+        layers=(LayerInfo(LIGHT.layer, LIGHT.encoding),),
+        atlases=(AtlasInfo(LIGHT.atlas, None),),
+        states=[{(LIGHT.atlas, LIGHT.layer): Source(file, file.name)}],
+        labels=[file.name],
+    )
+
+
+def _listings(
+    path: Path, times: Sequence[float] | None, layers: Sequence[str] | None, trust: bool, levels: bool
+) -> dict[str, Listing]:
+    """Lists a set by group; `levels` states whether pictures of integers are lightmaps."""
     if path.is_dir() and (path / SET_FILE).is_file():
         path = path / SET_FILE
     if path.is_dir():
         unity = state_folders(path)
-        listing = _list_states(path, times, layers) if unity else _list_folder(path, times, stored is not None)
+        listing = _list_states(path, times, layers) if unity else _list_folder(path, times, levels)
     elif path.is_file():
         if path.suffix.lower() != ".json":
             lone = path.suffix.lower() in SUFFIXES
             found = "one lightmap, which wlm compress takes with its mesh" if lone else "a file of another kind"
             raise WlmError(f"{path}: expected a {SET_FILE} or a folder of lightmaps ({EXPECTED}), found {found}")
-        listing = _parse(path, times, trust)
+        return _parse(path, times, trust)
     else:
         raise WlmError(f"{path}: no such file or folder; expected a {SET_FILE} or a folder of lightmaps ({EXPECTED})")
-    if stored is not None:
-        light = (replace(each, stored=stored) if each.encoding == LIGHT.encoding else each for each in listing.layers)
-        listing = replace(listing, layers=tuple(light))
-    if layers is None:
-        return listing
-    names = [layer.name for layer in listing.layers]
-    wrong = [repr(name) for name in layers if name not in names] or ([] if layers else ["none"])
-    if wrong:
-        raise WlmError(f"{path}: layers: expected names among {', '.join(names)}, got {wrong[0]}")
-    return replace(listing, layers=tuple(layer for layer in listing.layers if layer.name in layers))
+    return {BASE: listing}
 
 
 def natural(name: str) -> list[str | int]:
@@ -168,14 +213,9 @@ def natural(name: str) -> list[str | int]:
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def count_of(items: Sequence[object], noun: str) -> str:
+def count_of(items: Sized, noun: str) -> str:
     """Returns the number of items in words: "1 time", "2 times"."""
     return f"{len(items)} {noun}{'' if len(items) == 1 else 's'}"
-
-
-def is_name(value: object) -> bool:
-    """Returns whether a value can name a layer, an atlas or a channel."""
-    return isinstance(value, str) and bool(value.strip()) and len(value) <= MOST_NAME and value.isprintable()
 
 
 def state_folders(folder: Path) -> list[Path]:
@@ -281,15 +321,39 @@ def _labelled(path: Path, *place: int) -> Source:
     return Source(path, f"{path.parent.name}/{path.name}", *place)
 
 
-def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
+def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> dict[str, Listing]:
     content = read_json_file(path, "the set")
+    if not isinstance(content, dict) or "groups" not in content:
+        return {BASE: _parse_group(path, content, times, trust)}
+    if times is not None:
+        raise WlmError(f"{path}: expected a set without groups for --times, found groups, which state their own times")
+    # A group has the fields of the set and its own.
+    groups = check_settings(_Grouped, content, f"{path}: ", extra="ignore").groups
+    whole = {key: value for key, value in content.items() if key != "groups"}
+    found: dict[str, Listing] = {}
+    for group, own in zip(groups, content["groups"], strict=True):
+        if group.name in found:
+            raise WlmError(f"{path}: groups: expected different names, found {group.name} twice")
+        found[group.name] = _parse_group(path, whole | own | {"name": content.get("name")}, None, trust, group.name)
+    for noun, kind in (("atlas", "atlases"), ("layer", "layers")):
+        used = {item.name for listing in found.values() for item in getattr(listing, kind)}
+        if lone := sorted(content.get(kind, {}).keys() - used):
+            raise WlmError(f"{path}: {noun} {lone[0]}: expected a picture of it in a group, found none")
+    return found
+
+
+def _parse_group(
+    path: Path, content: Any, times: Sequence[float] | None, trust: bool, group: str | None = None
+) -> Listing:
+    """Lists a set without groups, or one group of it: this may lack atlases and layers, and its only time is 0."""
+    where = str(path) if group is None else f"{path}: groups.{group}"
     kind = _Layered if isinstance(content, dict) and "layers" in content else _Plain
-    checked = check_settings(kind, content, f"{path}: ", extra="ignore")
+    checked = check_settings(kind, content, f"{where}: ", extra="ignore")
     found: dict[str, Path] = {}
 
     def file(name: str, place: str) -> Path:
         if name not in found:
-            found[name] = named_file(path, name, f"{path}: {place}", trust)
+            found[name] = named_file(path, name, f"{where}: {place}", trust)
         return found[name]
 
     def atlas(name: str, entry: _Atlas, place: str) -> AtlasInfo:
@@ -317,16 +381,22 @@ def _parse(path: Path, times: Sequence[float] | None, trust: bool) -> Listing:
                     place = f"{label}.files.{own}.{layer}"
                     states[-1][own, layer] = _labelled(file(entry.file, place), entry.slice, entry.slices)
             if not states[-1]:
-                raise WlmError(f"{path}: {label}.files: expected a picture, found none of the atlases and layers")
-        for i, noun, names in ((0, "atlas", checked.atlases), (1, "layer", checked.layers)):
-            if lone := sorted(set(names) - {key[i] for state in states for key in state}):
+                raise WlmError(f"{where}: {label}.files: expected a picture, found none of the atlases and layers")
+        if group is not None:
+            used = {name for state in states for key in state for name in (("atlas", key[0]), ("layer", key[1]))}
+            atlases = tuple(each for each in atlases if ("atlas", each.name) in used)
+            layers = tuple(each for each in layers if ("layer", each.name) in used)
+        for i, noun, names in ((0, "atlas", atlases), (1, "layer", layers)):
+            if lone := sorted({each.name for each in names} - {key[i] for state in states for key in state}):
                 raise WlmError(
                     f"{path}: {noun} {lone[0]}: expected a picture of it in an entry of lightmaps, found none"
                 )
     stamps = [one.time_hours for one in checked.lightmaps] if times is None else times
+    if group is not None and stamps == [None]:
+        stamps = [0.0]
     _check_count(path, states, stamps, "lightmap")
     if None in stamps:
-        raise WlmError(f"{path}: lightmaps.{stamps.index(None)}.time_hours: expected a finite number, found none")
+        raise WlmError(f"{where}: lightmaps.{stamps.index(None)}.time_hours: expected a finite number, found none")
     return Listing(
         name=checked.name or path.resolve().parent.name,
         where=path,
@@ -355,6 +425,12 @@ def _word(value: str) -> str:
 _Text = Annotated[str, AfterValidator(_text)]
 _Word = Annotated[str, AfterValidator(_word)]
 _Texels = Annotated[int, Field(gt=0)] | None
+
+
+def _group(value: str) -> str:
+    if not is_group(value):
+        raise PydanticCustomError("group", f"expected a name of 1 to {MOST_NAME} printable characters without '='")
+    return value
 
 
 class _Part(BaseModel):
@@ -423,6 +499,14 @@ class _LayeredTime(_Time):
 class _Set(_Part):
     name: _Text | None = None
     period_hours: float | None = Field(None, gt=0)
+
+
+class _Group(_Part):
+    name: Annotated[str, AfterValidator(_group)]
+
+
+class _Grouped(_Part):
+    groups: list[_Group] = Field(min_length=1, max_length=MOST_SHEETS)
 
 
 class _Plain(_Set, _Atlas):

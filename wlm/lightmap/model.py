@@ -18,7 +18,7 @@ import math
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -26,14 +26,12 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import BLOCK_BYTES
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part
+from wlm.lightmap.groups import groups_of, times_of
 from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.sheet import Sheet, first_light, layer_sheets
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.system import Model
 from wlm_kernels import mlp
-
-if TYPE_CHECKING:
-    from wlm.lightmap.stored import StoredTiles
 
 BLOCKS = TILE // 4
 """Blocks along a side of a tile."""
@@ -181,8 +179,9 @@ class SheetModel:
     ranges: np.ndarray
 
     @classmethod
-    def of_file(cls, tiles: "StoredTiles", **fields: object) -> Self:
-        """Makes a sheet of a file: the fields are those of the class without the mask and the arrays in `PACKED`."""
+    def of_file(cls, tiles: object, **fields: object) -> Self:
+        """Makes a sheet of a file from its `wlm.lightmap.stored.StoredTiles` and the fields of the class, without the
+        mask and the arrays in `PACKED`."""
         sheet = cls.__new__(cls)
         vars(sheet).update(fields, _tiles=tiles)
         return sheet
@@ -309,7 +308,8 @@ class LightmapModel(Model):
         name: Name of the set.
         source: Hash of the input, see `wlm.lightmap.data.LightmapSet.source`.
         profile: The settings of the fit; each sheet's own settings follow from them (`Profile.for_sheet`).
-        sheets: The sheets, with the same times; those of one atlas and size share the mask.
+        sheets: The sheets, group by group (`wlm.lightmap.groups`), with the same times in a group; those of one atlas
+            and size share the mask.
         warnings: Settings that the fit could not follow, one line each; they are not saved to the file.
     """
 
@@ -327,9 +327,14 @@ class LightmapModel(Model):
         return self.sheets[first_light(self.sheets)]
 
     @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the light groups, one for a model of a set without groups."""
+        return groups_of(self.sheets)
+
+    @property
     def times(self) -> np.ndarray:
-        """float64 [T], the stored times, increasing."""
-        return self.light.times
+        """float64 [T], the stored times of all groups, increasing; see `wlm.lightmap.groups.times_of`."""
+        return times_of(self.sheets)
 
     @property
     def period(self) -> float | None:
@@ -365,5 +370,20 @@ class LightmapModel(Model):
         self.close()
 
     def layer(self, name: str | None = None, atlas: str | None = None) -> list[Sheet]:
-        """Returns the models of the sheets of one layer of one atlas, see `wlm.lightmap.sheet.layer_sheets`."""
+        """Returns the sheets of one layer of one atlas in all groups, see `wlm.lightmap.sheet.layer_sheets`."""
         return layer_sheets(self.name, self.sheets, name, atlas)
+
+    def maps(self, name: str | None = None, atlas: str | None = None) -> dict[str, SheetModel]:
+        """Returns the sheet of each light group of one layer of one atlas, for `wlm.lightmap.runtime.MapDecoder`.
+
+        Args:
+            name, atlas: As for `layer`.
+
+        Raises:
+            WlmError: There is no such layer, or it has more than three channels.
+        """
+        sheets = self.layer(name, atlas)
+        groups = {sheet.group: self.sheets[sheet] for sheet in sheets}
+        if len(groups) < len(sheets):
+            raise WlmError(f"{self.name}: {sheets[0].layer}: expected a layer of up to three channels, found more")
+        return groups

@@ -5,11 +5,12 @@ the tiles of one kind of one sheet, without filling gaps between charts: a `Stri
 for wide networks, an `ExactDecoder` for static tiles, and a `FrameDecoder`.
 
 `MapDecoder` combines them to fill one texture with the whole map: RGB9E5, which needs no bounds, so that a filter may
-read across two tiles. It fills gaps between charts, and its mips average only texels inside charts.
+read across two tiles. It adds light groups, fills gaps between charts, and its mips average only texels inside charts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,9 @@ from wlm.lightmap.encodings.base import inverse_of, rgba
 from wlm.lightmap.encodings.constant import ConstantTiles
 from wlm.lightmap.encodings.frames import FrameTiles
 from wlm.lightmap.encodings.maps import MapTiles
+from wlm.lightmap.groups import Weight, changed_weights
 from wlm.lightmap.model import SheetModel
+from wlm.lightmap.sheet import BASE
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm.texels import near_gaps
 from wlm_kernels.lightmap import decode as decode_kernels
@@ -241,57 +244,91 @@ def runtime_decoders(model: SheetModel, device: str = "cpu", shared: bool = Fals
 
 
 class MapDecoder:
-    """Decodes all tiles of a sheet into one texture and its mips.
+    """Decodes all tiles of a map into one texture and its mips, and adds its light groups by their weights.
+
+    The decoded tiles of each group stay in memory, so that a change of weights alone needs only `add`, no other decode.
+    A group with one stored time, such as a lamp, is decoded once, when the decoder is made.
 
     Attributes:
+        groups: The sheet of each light group by name.
+        weights: float32 [3] by group, the factors of red, green and blue; initially 1. Changed by `set_weights`.
         levels: `wp.array` uint32 [h, w] each, RGB9E5, written by `decode`: the map, then mips of half the size, rounded
             down. A mip texel is the mean of the valid texels that it covers, in tiles that are not empty; texels in
             gaps within `wlm.texels.REACH` of a valid texel have the light of the nearest valid one of the same level.
-        decoders: The decoder of each kind of tile.
+        decoders: The decoder of each kind of tile, group by group.
     """
 
-    def __init__(self, model: SheetModel, device: str = "cpu", mips: int | None = None) -> None:
-        """Uploads a sheet and allocates all buffers; the time is initially the first stored one.
+    def __init__(
+        self, model: SheetModel | Mapping[str, SheetModel], device: str = "cpu", mips: int | None = None
+    ) -> None:
+        """Uploads a map and allocates all buffers; the time is initially the first stored one.
 
         Args:
-            model: The sheet.
+            model: The sheet; or the sheet of each light group, as `LightmapModel.maps` returns them, which share size
+                and mask.
             device: "cpu", "cuda" or "cuda:N".
             mips: Number of mips besides the map itself; None: down to one texel.
 
         Raises:
-            WlmError: There is no such device, or the map does not have that many mips.
+            WlmError: There is no such device, the map does not have that many mips, or the groups differ in size.
         """
-        self.model, self.device = model, device_of(device)
-        most = max(model.height, model.width).bit_length() - 1
+        self.device = device_of(device)
+        self.groups = {BASE: model} if isinstance(model, SheetModel) else dict(model)
+        self._first = first = next(iter(self.groups.values()))
+        for name, own in self.groups.items():
+            if (own.height, own.width) != (first.height, first.width):
+                raise WlmError(f"{name}: expected a map of {first.width}x{first.height}, got {own.width}x{own.height}")
+        most = max(first.height, first.width).bit_length() - 1
         if mips is not None and not 0 <= mips <= most:
-            raise WlmError(f"mips: expected 0 to {most} for a map of {model.width}x{model.height}, got {mips}")
-        self.decoders = runtime_decoders(model, self.device, shared=True)
-        self._corners = [self._places(decoder.numbers) for decoder in self.decoders]
-        self._constant = ConstantTiles(model)
-        self._constant_corners = self._places(self._constant.numbers)
-        self._colours = wp.empty(len(self._constant.numbers), dtype=wp.vec3, device=self.device)
+            raise WlmError(f"mips: expected 0 to {most} for a map of {first.width}x{first.height}, got {mips}")
+        self.decoders: list[RuntimeDecoder] = []
+        self._fill_slots()
         self._allocate(most if mips is None else mips)
-        self.set_time(float(model.times[0]))
+        self.weights = {name: np.ones(3, np.float32) for name in self.groups}
+        self._factors = wp.ones(len(self.groups), dtype=wp.vec3, device=self.device)
+        self.set_time(float(first.times[0]))
+        for decoder in self.decoders:
+            decoder.decode()
+
+    def _fill_slots(self) -> None:
+        """Makes the decoders of all groups, and the table of where the tiles of each are found, see `texture.add`."""
+        stored = np.flatnonzero(np.any([own.kind != TileKind.EMPTY for own in self.groups.values()], axis=0))
+        slots = np.full((len(self._first.kind), len(self.groups)), -1, np.int32)
+        self._constant, made, colours = [], 0, 1
+        for group, own in enumerate(self.groups.values()):
+            for decoder in runtime_decoders(own, self.device, shared=True):
+                self.decoders.append(decoder)
+                slots[decoder.numbers, group] = made + np.arange(len(decoder.numbers))
+                made += len(decoder.numbers)
+            constant = ConstantTiles(own)
+            self._constant.append(constant)
+            slots[constant.numbers, group] = -1 - colours - np.arange(len(constant.numbers))
+            colours += len(constant.numbers)
+        self._decoded = wp.zeros((made, TILE, TILE), dtype=wp.uint32, device=self.device)
+        start = 0
+        for decoder in self.decoders:
+            decoder.out = self._decoded[start : start + len(decoder.numbers)]
+            start += len(decoder.numbers)
+        self._colours = wp.zeros(colours, dtype=wp.vec3, device=self.device)
+        self._slots = wp.array(slots[stored], dtype=int, device=self.device)
+        self._corners = self._vectors(np.array([self._first.grid.origin(n) for n in stored.tolist()]).reshape(-1, 2))
 
     def _allocate(self, mips: int) -> None:
-        self.levels, self._weights, self._gaps = [], [], []
-        weight = self.model.mask.astype(np.float32)
-        # Valid texels of tiles that are not stored would darken mips.
-        for number in self.model.numbers(TileKind.EMPTY):
-            weight[self.model.grid.window(number)] = 0.0
+        self.levels, self._coverage, self._gaps = [], [], []
+        coverage = self._first.mask.astype(np.float32)
+        # Valid texels of tiles that no group stores would darken mips.
+        empty = np.all([own.kind == TileKind.EMPTY for own in self.groups.values()], axis=0)
+        for number in np.flatnonzero(empty).tolist():
+            coverage[self._first.grid.window(number)] = 0.0
         for level in range(mips + 1):
             if level:
-                weight = _halved(weight)
-            self.levels.append(wp.zeros(weight.shape, dtype=wp.uint32, device=self.device))
-            self._weights.append(wp.array(weight, dtype=float, device=self.device))
-            self._gaps.append([self._vectors(at) for at in near_gaps(weight > 0)])
+                coverage = _halved(coverage)
+            self.levels.append(wp.zeros(coverage.shape, dtype=wp.uint32, device=self.device))
+            self._coverage.append(wp.array(coverage, dtype=float, device=self.device))
+            self._gaps.append([self._vectors(at) for at in near_gaps(coverage > 0)])
 
     def _vectors(self, at: np.ndarray) -> wp.array:
         return wp.array(np.ascontiguousarray(at, np.int32), dtype=wp.vec2i, device=self.device)
-
-    def _places(self, numbers: np.ndarray) -> wp.array:
-        grid = self.model.grid
-        return self._vectors(np.array([grid.origin(int(number)) for number in numbers]).reshape(-1, 2))
 
     def set_time(self, time: float) -> None:
         """Sets the time of the following decodes; a CUDA graph captured before must be captured again.
@@ -301,19 +338,36 @@ class MapDecoder:
         """
         for decoder in self.decoders:
             decoder.set_time(time)
-        self._colours.assign(self._constant.colours(time))
+        lacking = np.zeros((1, 3), np.float32)
+        self._colours.assign(
+            np.concatenate([lacking, *(own.colours(time) for own in self._constant)]).astype(np.float32)
+        )
+
+    def set_weights(self, weights: Mapping[str, Weight]) -> None:
+        """Sets the weights of some groups for the following decodes, see `wlm.lightmap.Decoder.set_weights`.
+
+        The weights are an array on the device: a CUDA graph that was captured before uses the new ones.
+        """
+        self.weights = changed_weights(self._first.name, self.weights, weights)
+        self._factors.assign(np.stack(list(self.weights.values())))
 
     def decode(self) -> None:
         """Decodes the map into `levels`; it only launches kernels and allocates nothing: CUDA graphs can capture it."""
-        whole = self.levels[0]
-        for decoder, corners in zip(self.decoders, self._corners, strict=True):
-            decoder.decode()
-            texture.place(decoder.out, corners, whole)
-        if len(self._colours):
-            texture.paint(self._colours, self._constant_corners, TILE, whole)
+        for decoder in self.decoders:
+            if len(decoder.model.times) > 1:
+                decoder.decode()
+        self.add()
+
+    def add(self) -> None:
+        """Adds the groups as they were last decoded into `levels`: all that a change of weights alone needs.
+
+        It only launches kernels, as `decode` does.
+        """
+        if len(self._corners):
+            texture.add(self._decoded, self._colours, self._slots, self._factors, self._corners, self.levels[0])
         for i, (level, (target, source)) in enumerate(zip(self.levels, self._gaps, strict=True)):
             if i:
-                texture.halve(self.levels[i - 1], self._weights[i - 1], level)
+                texture.halve(self.levels[i - 1], self._coverage[i - 1], level)
             if len(target):
                 texture.fill(target, source, level)
 

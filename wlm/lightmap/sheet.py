@@ -2,7 +2,8 @@
 
 An ordinary lightmap over time is one sheet: the channels R, G and B of the layer "light" of the atlas "0". A scene with
 several atlases has a sheet for each; a layer with more than three channels, such as SH coefficients, is split into
-sheets of three.
+sheets of three. Light that is added at run time, such as that of a lamp, is a group of sheets of its own
+(`wlm.lightmap.groups`).
 
 Radiance is stored in gamma space. Directions, ratios of SH coefficients and masks are not light and have no gamma:
 their sheets hold values mapped linearly to levels in [0, 1], so that kernels need no case for negative values and
@@ -12,7 +13,7 @@ interpolating levels interpolates values.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -34,6 +35,9 @@ MOST_NAME = 128
 WIDTH = 3
 """Number of channels that the lightmap of a sheet holds."""
 
+BASE = "base"
+"""Name of the group of the sheets of a set that names no groups."""
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -46,18 +50,21 @@ class Sheet:
         atlas, layer: Names of the atlas and of the layer.
         channels: One to three names of channels.
         encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
+        group: Name of the light group; not in `repr`, of which hashes of sets without groups are made.
     """
 
     atlas: str = "0"
     layer: str = "light"
     channels: tuple[str, ...] = ("R", "G", "B")
     encoding: str = "radiance"
+    group: str = field(default=BASE, repr=False)
 
     @property
     def label(self) -> str:
-        """Name of the sheet in messages, such as `Lightmap-0/dir RGB`."""
+        """Name of the sheet in messages, such as `Lightmap-0/dir RGB`, or `lamp: 0/light RGB` of a named group."""
         joint = "" if all(len(name) == 1 for name in self.channels) else ","
-        return f"{self.atlas}/{self.layer} {joint.join(self.channels)}"
+        group = "" if self.group == BASE else f"{self.group}: "
+        return f"{group}{self.atlas}/{self.layer} {joint.join(self.channels)}"
 
     @property
     def linear(self) -> bool:
@@ -93,6 +100,16 @@ LIGHT = Sheet()
 """The sheet of an ordinary lightmap."""
 
 
+def is_name(value: object) -> bool:
+    """Returns whether a value can name a layer, an atlas or a channel."""
+    return isinstance(value, str) and bool(value.strip()) and len(value) <= MOST_NAME and value.isprintable()
+
+
+def is_group(value: object) -> bool:
+    """Returns whether a value can name a group: as `is_name`, without "=", which ends the name on a command line."""
+    return is_name(value) and "=" not in str(value)
+
+
 def sheets_of(atlas: str, layer: str, channels: tuple[str, ...], encoding: str) -> list[Sheet]:
     """Splits a layer of an atlas into sheets of up to three channels, in the order of the channels."""
     return [Sheet(atlas, layer, channels[first : first + WIDTH], encoding) for first in range(0, len(channels), WIDTH)]
@@ -105,7 +122,7 @@ def first_light(sheets: Iterable[Sheet]) -> Sheet:
 
 
 def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: str | None) -> list[Sheet]:
-    """Returns the sheets of one layer of one atlas.
+    """Returns the sheets of one layer of one atlas, in all groups that have it.
 
     Args:
         where: Name of the collection, for messages.
@@ -132,18 +149,29 @@ def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
 
     Raises:
         WlmError: There is no sheet; there are too many sheets, channels in an atlas, or texels in all sheets together;
-            a channel occurs twice; or sheets of a layer of an atlas differ in size.
+            a channel occurs twice; sheets of a layer of an atlas differ in size; or two groups have a layer that is not
+            light, or that has other channels in each of them.
     """
     if not 1 <= len(sizes) <= MOST_SHEETS:
         raise WlmError(f"{where}: expected 1 to {MOST_SHEETS} sheets of three channels, found {len(sizes)}")
-    channels: dict[str, list[tuple[str, str]]] = {}
+    channels: dict[tuple[str, str], list[tuple[str, str]]] = {}
     found: dict[tuple[str, str], tuple[int, int]] = {}
+    layers: dict[tuple[str, str], dict[str, set[Sheet]]] = {}
     for sheet, size in sizes.items():
         if (known := found.setdefault((sheet.atlas, sheet.layer), size)) != size:
             first, second = (f"{width}x{height}" for height, width in (known, size))
             raise WlmError(f"{where}: {sheet.label} has {second} texels, but others of its layer have {first}")
-        channels.setdefault(sheet.atlas, []).extend((sheet.layer, name) for name in sheet.channels)
-    for atlas, names in channels.items():
+        channels.setdefault((sheet.group, sheet.atlas), []).extend((sheet.layer, name) for name in sheet.channels)
+        groups = layers.setdefault((sheet.atlas, sheet.layer), {})
+        groups.setdefault(sheet.group, set()).add(replace(sheet, group=BASE))
+    for (atlas, layer), groups in layers.items():
+        first, *others = groups.values()
+        if (others and any(sheet.linear for sheet in first)) or any(other != first for other in others):
+            raise WlmError(
+                f"{where}: {atlas}/{layer}: expected light with the same channels in the groups {', '.join(groups)}, "
+                "since groups are added; found other values or channels"
+            )
+    for (_, atlas), names in channels.items():
         if len(set(names)) < len(names):
             raise WlmError(f"{where}: atlas {atlas}: expected every channel once, found one twice")
         if len(names) > MOST_CHANNELS:

@@ -11,6 +11,7 @@ type, as the reference for the kernels. The documentation is docs/ops.md.
     gaussian_sum                        3D Gaussians at any points
     rasterize, rasterize_uv             triangles to pixels
     interpolate, texture                attributes and texture values per pixel
+    antialias                           silhouettes, with gradients for their places
     march                               light through a density grid
     funcs                               functions for your own kernels
 """
@@ -19,6 +20,7 @@ from wlm._facade import facade
 
 _PLACES = {
     "Raster": "wlm.ops.raster",
+    "antialias": "wlm.ops.silhouettes",
     "bc7_blocks": "wlm.ops.blocks",
     "bc7_map": "wlm.ops.blocks",
     "bc7_texels": "wlm.ops.blocks",

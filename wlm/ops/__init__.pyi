@@ -15,3 +15,4 @@ from wlm.ops.raster import texture as texture
 from wlm.ops.sampling import plane as plane
 from wlm.ops.sampling import triplane as triplane
 from wlm.ops.sampling import volume as volume
+from wlm.ops.silhouettes import antialias as antialias

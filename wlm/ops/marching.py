@@ -16,7 +16,7 @@ from wlm_kernels.smoke.march import nodes_along
 _UNIT = (0.999, 1.001)  # accepted range of a direction's length
 
 
-@takes_arrays("density", "colour", "emission")
+@takes_arrays("density", "origin", "direction", "colour", "emission")
 def march(
     density: torch.Tensor,
     origin: torch.Tensor,
@@ -40,13 +40,14 @@ def march(
     density and emission are trilinear between centres, with zero outside the grid. Run time is proportional
     to rays times steps, plus voxels times steps for each light.
 
-    The density, the lights' colours and the emission have gradients, exact for the discretised result. The rays and the
-    directions to the lights have none: to find directions of light, fit the colours of many lights. On CUDA the
-    gradients of a voxel are summed in any order, so their last bits change from run to run.
+    The density, the lights' colours, the emission and the rays have gradients, exact for the discretised result; the
+    number of a ray's steps is constant, and the three numbers of a direction count as independent. The directions to
+    the lights have no gradient: to find directions of light, fit the colours of many lights. On CUDA the gradients of a
+    voxel are summed in any order, so their last bits change from run to run.
 
     Args:
         density: float [X, Y, Z], the extinction coefficient per voxel edge, at least 0.
-        origin: float [..., 3], origins of the rays in voxels, inside or outside the grid.
+        origin: float [..., 3], origins of the rays in voxels, inside or outside the grid; of one camera or of many.
         direction: float [..., 3], of length 1.
         toward: float [L, 3], the directions to the lights, of length 1.
         colour: float [L, 3], the lights' irradiance divided by 4 pi: opaque isotropic smoke fully lit by a light of
@@ -60,9 +61,9 @@ def march(
         background b as radiance + transmittance * b. A ray that misses the grid has radiance 0 and transmittance 1.
 
     Raises:
-        ValueError: A tensor's shape, type or device doesn't fit, only one of `toward` and `colour` is given, an
-            argument that has no gradient requires one, or a number isn't finite or in range. The check of numbers waits
-            for the GPU and is skipped while a CUDA graph is captured.
+        ValueError: A tensor's shape, type or device doesn't fit, only one of `toward` and `colour` is given, `toward`
+            requires a gradient, or a number isn't finite or in range. The check of numbers waits for the GPU and is
+            skipped while a CUDA graph is captured.
     """
     if not (math.isfinite(step) and step > 0.0):
         raise ValueError(f"step: expected a number above 0, got {step}")
@@ -82,10 +83,9 @@ def march(
         check("emission", emission, (*density.shape, 3), device)
     check("origin", origin, (..., 3), device)
     check("direction", direction, tuple(origin.shape), device)
-    for name, tensor in {"origin": origin, "direction": direction, "toward": toward}.items():
-        if tensor.requires_grad:
-            raise NoGradientError(name, "march")
-    lengths = {"length of direction": direction.norm(dim=-1), "length of toward": toward.norm(dim=-1)}
+    if toward.requires_grad:
+        raise NoGradientError("toward", "march")
+    lengths = {"length of direction": direction.detach().norm(dim=-1), "length of toward": toward.norm(dim=-1)}
     check_finite(
         {"density": (0.0, math.inf), **dict.fromkeys(lengths, _UNIT)},
         density=density,
@@ -97,7 +97,9 @@ def march(
     shape = origin.shape[:-1]
     origin, direction = origin.reshape(-1, 3), direction.reshape(-1, 3)
     scattered, emitted, depth = _March.apply(density, emission, toward, origin, direction, float(step))
-    radiance = (scattered * henyey_greenstein(g, direction @ toward.T)) @ colour + emitted
+    # Autocast would multiply in half precision.
+    with torch.autocast(device.type, enabled=False):
+        radiance = (scattered * henyey_greenstein(g, direction @ toward.T)) @ colour + emitted
     return radiance.reshape(*shape, 3), torch.exp(-depth).reshape(shape)
 
 
@@ -135,11 +137,10 @@ class _March(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad_scattered, grad_emitted, grad_depth):
         density, emission, toward, origin, direction, nodes, depth, count = ctx.saved_tensors
-        device = density.device
-        on_density, on_nodes = zeros_for(density), zeros_for(nodes)
-        on_emission = zeros_for(emission) if ctx.needs_input_grad[1] else None
+        device, needed = density.device, ctx.needs_input_grad
+        on_density = on_emission = on_origin = on_direction = None
         with on_stream(device):
-            single_scatter.march_backward(
+            arguments = [
                 to_warp(density),
                 optional_array(emission, 3, wp.vec3, device),
                 to_warp(nodes),
@@ -151,9 +152,20 @@ class _March(torch.autograd.Function):
                 to_warp(grad_scattered),
                 to_warp(dense(grad_emitted), wp.vec3),
                 to_warp(grad_depth),
-                to_warp(on_density),
-                optional_array(on_emission, 3, wp.vec3, device),
-                to_warp(on_nodes),
-            )
-            single_scatter.depths_backward(to_warp(toward, wp.vec3), ctx.step, to_warp(on_nodes), to_warp(on_density))
-        return on_density, on_emission, None, None, None, None
+            ]
+            if needed[0] or needed[1]:
+                on_density, on_nodes = zeros_for(density), zeros_for(nodes)
+                on_emission = zeros_for(emission) if needed[1] else None
+                single_scatter.march_backward(
+                    *arguments,
+                    to_warp(on_density),
+                    optional_array(on_emission, 3, wp.vec3, device),
+                    to_warp(on_nodes),
+                )
+                lights = to_warp(toward, wp.vec3), ctx.step
+                single_scatter.depths_backward(*lights, to_warp(on_nodes), to_warp(on_density))
+            if needed[3] or needed[4]:
+                on_origin, on_direction = torch.empty_like(origin), torch.empty_like(direction)
+                rays = to_warp(on_origin, wp.vec3), to_warp(on_direction, wp.vec3)
+                single_scatter.rays_backward(*arguments, *rays)
+        return on_density, on_emission, None, on_origin, on_direction, None

@@ -5,8 +5,8 @@ written for readability, take more time and memory, and use autograd; in float64
 """
 
 import torch
+from torch.nn.functional import adaptive_avg_pool2d, grid_sample, pad
 from torch.nn.functional import gelu as torch_gelu
-from torch.nn.functional import grid_sample, pad
 
 from wlm.ops.raster import Raster
 
@@ -190,15 +190,27 @@ def rasterize_uv(uv: Tensor, triangle: Tensor, height: int, width: int) -> Raste
     return rasterize(uv, triangle, height, width)
 
 
-def interpolate(attribute: Tensor, triangle: Tensor, raster: Raster) -> Tensor:
-    """Interpolates vertex attributes [V, C] at each pixel's surface point, 0 in uncovered pixels: [H, W, C]."""
+def interpolate(attribute: Tensor, triangle: Tensor, raster: Raster, *, derivatives: bool = False):
+    """Interpolates vertex attributes [V, C] at each pixel's surface point, 0 in uncovered pixels: [H, W, C].
+
+    With `derivatives` it also returns their derivatives to the right and down, [H, W, C, 2], by the chain rule from
+    the raster's derivatives of barycentrics.
+    """
+    at_corners = attribute[triangle[raster.triangle.clamp(min=0)]]
     share = torch.cat([raster.barycentric, 1.0 - raster.barycentric.sum(-1, keepdim=True)], -1)
-    mixed = (share[..., None] * attribute[triangle[raster.triangle.clamp(min=0)]]).sum(-2)
-    return torch.where((raster.triangle >= 0)[..., None], mixed, 0.0)
+    mixed = (share[..., None] * at_corners).sum(-2)
+    values = torch.where((raster.triangle >= 0)[..., None], mixed, 0.0)
+    if not derivatives:
+        return values
+    of_corners = torch.stack([raster.derivative[..., :2], raster.derivative[..., 2:]], -2)  # of weights 0 and 1
+    of_corners = torch.cat([of_corners, -of_corners.sum(-2, keepdim=True)], -2)
+    return values, torch.einsum("hwkc,hwkd->hwcd", at_corners, of_corners)
 
 
-def texture(image: Tensor, uv: Tensor, *, filter: str = "linear", boundary: str = "clamp") -> Tensor:
-    """Samples an image [H, W, C] at uv [..., 2]; returns [..., C]."""
+def texture(image: Tensor, uv: Tensor, *, filter: str = "linear", boundary: str = "clamp", derivatives=None) -> Tensor:
+    """Samples an image [H, W, C] at uv [..., 2]; returns [..., C]. With derivatives [..., 2, 2], from mip levels."""
+    if derivatives is not None:
+        return _between_levels(image, uv, boundary, derivatives)
     padding = "reflection" if boundary == "mirror" else "border"
     if boundary == "wrap":
         # Each side is padded with a texel of the opposite side, and coordinates are rescaled accordingly.
@@ -210,6 +222,75 @@ def texture(image: Tensor, uv: Tensor, *, filter: str = "linear", boundary: str 
     mode = "bilinear" if filter == "linear" else "nearest"
     texels = grid_sample(image.movedim(-1, 0)[None], grid, mode=mode, padding_mode=padding, align_corners=False)
     return texels[0, :, 0].T.reshape(*uv.shape[:-1], -1)
+
+
+def _between_levels(image: Tensor, uv: Tensor, boundary: str, derivatives: Tensor) -> Tensor:
+    """Reads all mip levels; each counts by its distance from the level of the footprint, 0 from a distance of 1 on."""
+    size = torch.tensor([image.shape[1], image.shape[0]], dtype=uv.dtype, device=uv.device)
+    longest = torch.linalg.svdvals(size[:, None] * derivatives)[..., 0]
+    last = max(image.shape[:2]).bit_length() - 1
+    level = torch.log2(longest.clamp(min=1.0)).clamp(max=float(last))[..., None]
+    result = 0.0
+    for at in range(last + 1):
+        result = result + (1.0 - (level - at).abs()).clamp(min=0.0) * texture(image, uv, boundary=boundary)
+        size = [max(n // 2, 1) for n in image.shape[:2]]
+        image = adaptive_avg_pool2d(image.movedim(-1, 0), size).movedim(0, -1)
+    return result
+
+
+def antialias(colour: Tensor, raster: Raster, clip: Tensor, triangle: Tensor) -> Tensor:
+    """Blends neighbouring pixels of colour [H, W, C] at silhouettes; all corners must be in front of the viewer."""
+    height, width = raster.triangle.shape
+    ndc = clip[:, :2] / clip[:, 3:]
+    places = 0.5 * torch.stack([(1.0 + ndc[:, 0]) * width, (1.0 - ndc[:, 1]) * height], 1)  # in pixels
+    outline = _outline(places.detach(), triangle)
+    result = colour
+    for axis in range(2):
+        # Pixels p and their neighbours q: to the right for axis 0, below for axis 1.
+        rows, columns = height - axis, width - 1 + axis
+        first, second = (slice(0, rows), slice(0, columns)), (slice(axis, height), slice(1 - axis, width))
+        (t, z), (other, other_z) = ((raster.triangle[at], raster.depth[at]) for at in (first, second))
+        nearer = torch.where((t < 0) | ((other >= 0) & (other_z < z)), other, t)
+        centre = pixel_centres(height, width).to(places)[first]
+        offset = torch.zeros_like(centre[..., 0])
+        for k in range(3):
+            u, v = (places[triangle[nearer.clamp(min=0)][..., (k + i) % 3]] for i in (1, 2))
+            along, across = (v - u).abs().unbind(-1)
+            dominant = along <= across if axis == 0 else along > across
+            share = (centre - u)[..., 1 - axis] / torch.where(dominant, (v - u)[..., 1 - axis], 1.0)
+            s = (u + share[..., None] * (v - u) - centre)[..., axis]  # the crossing's distance from p
+            crosses = dominant & (share >= 0.0) & (share <= 1.0) & (s >= 0.0) & (s <= 1.0)
+            crosses = crosses & outline[nearer.clamp(min=0), k] & (nearer >= 0) & (t != other)
+            offset = torch.where(crosses, s - 0.5, offset)
+        step = colour[first] - colour[second]
+        change = torch.zeros_like(colour)
+        change[second] = offset.clamp(min=0.0)[..., None] * step
+        result = result + change
+        change = torch.zeros_like(colour)
+        change[first] = (-offset).clamp(min=0.0)[..., None] * step
+        result = result - change
+    return result
+
+
+def _outline(places: Tensor, triangle: Tensor) -> Tensor:
+    """Returns bool [F, 3]: whether no other triangle continues behind the edge opposite each corner, on the screen."""
+    found = torch.ones(triangle.shape, dtype=torch.bool)
+    corners = triangle.tolist()
+    for t, own in enumerate(corners):
+        for k in range(3):
+            u, v, w = own[(k + 1) % 3], own[(k + 2) % 3], own[k]
+            for other, theirs in enumerate(corners):
+                rest = [corner for corner in theirs if corner not in (u, v)]
+                shared = other != t and len(rest) == 1 and {u, v} <= {*theirs}
+                if shared and _turn(places, u, v, w) * _turn(places, u, v, rest[0]) < 0:
+                    found[t, k] = False
+    return found.to(triangle.device)
+
+
+def _turn(places: Tensor, a: int, b: int, c: int) -> float:
+    """Returns twice the signed area of a triangle of three places."""
+    (x, y), (s, t) = (places[b] - places[a]).tolist(), (places[c] - places[a]).tolist()
+    return x * t - y * s
 
 
 # Ray marching through a density grid (neural-six-way-lightmaps, eq. 1 to 3)

@@ -38,9 +38,10 @@ class NoGradientError(WlmError, ValueError):
 def takes_arrays(*differentiable: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Makes an operation on torch tensors take Warp arrays too.
 
-    An array's vectors or matrices are the last axes of its tensor: vec3 [N] is float [N, 3]. The results are arrays of
-    numbers. They require gradients if an argument does while a tape is active; as after a launch, the backward
-    pass sets the gradients of results to zero unless they have `retain_grad`. Work is queued on Warp's current stream.
+    An array's vectors or matrices are the last axes of its tensor: vec3 [N] is float [N, 3]. The results are arrays
+    of numbers, or of vectors where they have five axes. They require gradients if an argument does while a tape is
+    active; as after a launch, the backward pass sets the gradients of results to zero unless they have
+    `retain_grad`. Work is queued on Warp's current stream.
 
     Args:
         differentiable: Names of the arguments that have a gradient, "argument.field" for a field of a dataclass.
@@ -57,8 +58,11 @@ def takes_arrays(*differentiable: str) -> Callable[[Callable[P, R]], Callable[P,
 
         @functools.wraps(operation)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            # The first test is for speed.
-            if (args and isinstance(args[0], torch.Tensor)) or torch.compiler.is_compiling():
+            if torch.compiler.is_compiling():
+                # The compiler ends its graph here and calls the operation as it is, forwards and backwards.
+                return torch.compiler.disable(operation)(*args, **kwargs)
+            # For speed.
+            if args and isinstance(args[0], torch.Tensor):
                 return operation(*args, **kwargs)
             array = next(_arrays((*args, *kwargs.values())), None)
             if array is None:
@@ -108,9 +112,11 @@ def _call(
             return _changed(value, lambda _, v: array_of(v))
         if not isinstance(value, torch.Tensor):
             return value
-        array = to_warp(value)
+        # Warp's arrays have at most four axes.
+        dtype = wp.types.vector(value.shape[-1], float) if value.ndim > 4 else None
+        array = to_warp(value, dtype)
         if value.requires_grad:
-            array.grad = to_warp(torch.zeros_like(value))
+            array.grad = to_warp(torch.zeros_like(value), dtype)
             results.append((array, value))
         return array
 

@@ -22,7 +22,8 @@ def check(name: str, tensor: torch.Tensor, shape: Shape, device: torch.device | 
     """
     _check_tensor(name, tensor, "float32", shape)
     if tensor.dtype != torch.float32 or not _fits(tensor, shape):
-        raise ValueError(f"{name}: expected float32 {_text(shape)}, got {tensor.dtype} {tuple(tensor.shape)}")
+        hint = ": use its float()" if tensor.is_floating_point() and tensor.dtype != torch.float32 else ""
+        raise ValueError(f"{name}: expected float32 {_text(shape)}, got {tensor.dtype} {tuple(tensor.shape)}{hint}")
     _check_device(name, tensor, device)
 
 
@@ -99,7 +100,7 @@ def _check_tensor(name: str, tensor: torch.Tensor, types: str, shape: Shape) -> 
     if tensor.layout != torch.strided:
         raise ValueError(f"{name}: expected a dense tensor, got {tensor.layout}: use its to_dense()")
     # torch's own error for such a call tells nothing to a caller.
-    if not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active():
+    if torch._C._are_functorch_transforms_active():
         raise ValueError("torch.func: wlm.ops supports no grad, jvp, jacrev or vmap of it: use torch.autograd.grad")
 
 
@@ -115,10 +116,7 @@ def _fits(tensor: torch.Tensor, shape: Shape) -> bool:
     if shape[:1] == (...,):
         shape = shape[1:]
         sizes = sizes[max(len(sizes) - len(shape), 0) :]
-    # `want in (None, size)` is false for equal sizes once torch.compile traces it.
-    return len(sizes) == len(shape) and all(
-        want is None or want == size for want, size in zip(shape, sizes, strict=True)
-    )
+    return len(sizes) == len(shape) and all(want in (None, size) for want, size in zip(shape, sizes, strict=True))
 
 
 def _text(shape: Shape) -> str:

@@ -149,6 +149,51 @@ def finish_words(shared: bool) -> Any:
 
 
 @functools.cache
+def texel_network(temporal: bool, hidden: int, gelu: str) -> Any:
+    """Builds (once) the `wp.func` that evaluates the network of tile n at its texel (y, x), for the arguments of
+    `exact_kernels`: network_output(stored, hidden, output, tau, encoding, n, y, x), a vec3. `tau` is the position on
+    the time axis, and `encoding`, vec4, the encoded time."""
+    inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
+    centred = 12 if temporal else 4
+    net = mlp.kernels(inputs, hidden, gelu)
+    vec_in, vec_hidden = net.vec_in, net.vec_hidden
+    first, second, third, act = net.first, net.second, net.third, net.act
+
+    @wp.func
+    def network_output(
+        stored: Stored,
+        hidden: wp.array2d[vec_hidden],
+        output: wp.array2d[wp.vec3],
+        tau: float,
+        encoding: wp.vec4,
+        n: int,
+        y: int,
+        x: int,
+    ) -> wp.vec3:
+        f = vec_in()
+        uv = stored_texel(stored.uv, n, y, x)
+        for c in range(4):
+            f[c] = uv[c]
+        if wp.static(temporal):
+            u = (float(x) + 0.5) / 128.0
+            v = (float(y) + 0.5) / 128.0
+            uvt = stored_volume_at(stored, n, u, v, tau)
+            ut = stored_plane_at(stored.ut, n, u, tau, stored.periodic)
+            vt = stored_plane_at(stored.vt, n, v, tau, stored.periodic)
+            for c in range(4):
+                f[4 + c] = uvt[c]
+                f[12 + c] = encoding[c]
+            for c in range(2):
+                f[8 + c] = ut[c]
+                f[10 + c] = vt[c]
+        for c in range(wp.static(centred)):
+            f[c] = (f[c] + 0.0 - 0.5) * CENTRE
+        return third(output, n, act(second(hidden, n, act(first(hidden, n, f)))))
+
+    return network_output
+
+
+@functools.cache
 def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any, Any]:
     """Builds (once) three kernels that decode whole tiles, one texel per thread.
 
@@ -163,41 +208,8 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any, Any
         [N, I + H + 2] with I inputs; output layers, vec3 [N, H + 1]; `TimeState`; int [N], the index of each tile in
         `TimeState`; and int [n], the tiles to decode. Their output is [n, 128, 128].
     """
-    inputs = TEMPORAL_INPUTS if temporal else STATIC_INPUTS
-    centred = 12 if temporal else 4
-    net = mlp.kernels(inputs, hidden, gelu)
-    vec_in, vec_hidden = net.vec_in, net.vec_hidden
-    first, second, third, act = net.first, net.second, net.third, net.act
-
-    @wp.func
-    def network_output(
-        stored: Stored,
-        hidden: wp.array2d[vec_hidden],
-        output: wp.array2d[wp.vec3],
-        time: TimeState,
-        n: int,
-        y: int,
-        x: int,
-    ) -> wp.vec3:
-        f = vec_in()
-        uv = stored_texel(stored.uv, n, y, x)
-        for c in range(4):
-            f[c] = uv[c]
-        if wp.static(temporal):
-            u = (float(x) + 0.5) / 128.0
-            v = (float(y) + 0.5) / 128.0
-            uvt = stored_volume_at(stored, n, u, v, time.tau)
-            ut = stored_plane_at(stored.ut, n, u, time.tau, stored.periodic)
-            vt = stored_plane_at(stored.vt, n, v, time.tau, stored.periodic)
-            for c in range(4):
-                f[4 + c] = uvt[c]
-                f[12 + c] = time.encoding[c]
-            for c in range(2):
-                f[8 + c] = ut[c]
-                f[10 + c] = vt[c]
-        for c in range(wp.static(centred)):
-            f[c] = (f[c] + 0.0 - 0.5) * CENTRE
-        return third(output, n, act(second(hidden, n, act(first(hidden, n, f)))))
+    net = mlp.kernels(TEMPORAL_INPUTS if temporal else STATIC_INPUTS, hidden, gelu)
+    vec_hidden, network_output = net.vec_hidden, texel_network(temporal, hidden, gelu)
 
     def decode_kernel(dtype: Any, finish: Any) -> wp.Kernel:
         @wp.kernel(module="unique", module_options={"enable_backward": False})
@@ -214,7 +226,8 @@ def exact_kernels(temporal: bool, hidden: int, gelu: str) -> tuple[Any, Any, Any
         ):
             i, y, x = wp.tid()
             n = tiles[i]
-            out[i, y, x] = finish(time, places[n], network_output(stored, hidden, output, time, n, y, x))
+            texel = network_output(stored, hidden, output, time.tau, time.encoding, n, y, x)
+            out[i, y, x] = finish(time, places[n], texel)
 
         return decode
 

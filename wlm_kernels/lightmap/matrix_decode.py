@@ -23,6 +23,7 @@ from wlm_kernels.shared_exponent import pack_rgb9e5
 ROWS = 16
 """Rows of texels in a strip."""
 
+_BOUNDS = (128, 4)  # threads of a block, blocks of a multiprocessor: 128 registers per thread
 _STEP = 16  # size of a matrix product: the hidden width is a multiple of it
 _MAPS = 12  # inputs that come from the maps; the encoded time follows
 _UV_SCALE = np.sqrt(12.0) / 255.0
@@ -163,7 +164,7 @@ def _decode_kernel(width: int, resolution: int, shared: bool, hours: int) -> wp.
         hour: int,
     ) -> vec_result: ...
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options={"enable_backward": False}, launch_bounds=_BOUNDS)
     def decode(
         # in:
         stored: Stored,

@@ -8,24 +8,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def _place(
+def _add(
     # in:
     tiles: wp.array3d[wp.uint32],
-    corners: wp.array1d[wp.vec2i],
-    # out:
-    texture: wp.array2d[wp.uint32],
-):
-    n, i, j = wp.tid()
-    y = corners[n][0] + i
-    x = corners[n][1] + j
-    if y < texture.shape[0] and x < texture.shape[1]:
-        texture[y, x] = tiles[n, i, j]
-
-
-@wp.kernel
-def _paint(
-    # in:
     colours: wp.array1d[wp.vec3],
+    slots: wp.array2d[int],
+    weights: wp.array1d[wp.vec3],
     corners: wp.array1d[wp.vec2i],
     # out:
     texture: wp.array2d[wp.uint32],
@@ -33,8 +21,21 @@ def _paint(
     n, i, j = wp.tid()
     y = corners[n][0] + i
     x = corners[n][1] + j
-    if y < texture.shape[0] and x < texture.shape[1]:
-        texture[y, x] = pack_rgb9e5(colours[n])
+    if y >= texture.shape[0] or x >= texture.shape[1]:
+        return
+    first = slots[n, 0]
+    if slots.shape[1] == 1 and first >= 0 and wp.length_sq(weights[0] - wp.vec3(1.0)) == 0.0:
+        # One group at full weight is not rounded again.
+        texture[y, x] = tiles[first, i, j]
+        return
+    light = wp.vec3()
+    for g in range(slots.shape[1]):
+        slot = slots[n, g]
+        if slot < 0:
+            light += wp.cw_mul(weights[g], colours[-1 - slot])
+        else:
+            light += wp.cw_mul(weights[g], unpack_rgb9e5(tiles[slot, i, j]))
+    texture[y, x] = pack_rgb9e5(light)
 
 
 @wp.kernel
@@ -73,28 +74,19 @@ def _fill(
     texture[target[g][0], target[g][1]] = texture[source[g][0], source[g][1]]
 
 
-def place(tiles, corners, texture) -> None:
-    """Copies decoded tiles into the texture of a lightmap.
+def add(tiles, colours, slots, weights, corners, texture) -> None:
+    """Adds the decoded tiles of G light groups into the texture of a lightmap: weighted sums of linear light.
 
     Args:
-        tiles: uint32 [n, 128, 128], RGB9E5.
+        tiles: uint32 [k, 128, 128], RGB9E5, the tiles of all groups.
+        colours: vec3 [c], radiance of the constant tiles of all groups, 0 at index 0 for tiles that a group lacks.
+        slots: int [n, G], for each tile and group s >= 0 for `tiles[s]`, or s < 0 for `colours[-1 - s]`.
+        weights: vec3 [G], factors of red, green and blue.
         corners: vec2i [n], row and column of each tile's first texel; texels outside the texture are left out.
-        texture: uint32 [H, W], changed.
+        texture: uint32 [H, W], RGB9E5, changed. The sum is rounded once.
     """
-    wp.launch(_place, tiles.shape, inputs=[tiles, corners], outputs=[texture], device=texture.device)
-
-
-def paint(colours, corners, side: int, texture) -> None:
-    """Fills tiles of the texture with one colour each.
-
-    Args:
-        colours: vec3 [n], radiance.
-        corners: vec2i [n], row and column of each tile's first texel; texels outside the texture are left out.
-        side: Texels along a side of a tile.
-        texture: uint32 [H, W], changed.
-    """
-    dim = (len(colours), side, side)
-    wp.launch(_paint, dim, inputs=[colours, corners], outputs=[texture], device=texture.device)
+    dim, inputs = (len(corners), *tiles.shape[1:]), [tiles, colours, slots, weights, corners]
+    wp.launch(_add, dim, inputs=inputs, outputs=[texture], device=texture.device)
 
 
 def halve(fine, weight, coarse) -> None:

@@ -13,14 +13,14 @@ only where its transparency is 0 in float32. `wlm.ops.plain.march` is the same i
 
 Adjoints run from a ray's end to its start, so that the light behind a sample is a running sum. They are added to the
 gradients of the density, the emission and the nodes by atomic additions: on CUDA in any order, so that the last bits
-vary from run to run.
+vary from run to run. The gradients of the rays themselves are a kernel of their own, as few callers need them.
 """
 
 from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.march import absorbed, mean_transparency, node_position, point_on, size_of, steps_along
+from wlm_kernels.smoke.march import absorbed, clip, mean_transparency, node_position, point_on, size_of, steps_along
 
 wp.set_module_options({"enable_backward": False})
 
@@ -67,15 +67,19 @@ def _voxel(density: wp.array3d[Any], p: wp.vec3) -> _Cell:
 
 
 @wp.func
-def _node(nodes: wp.array3d[float], size: wp.vec3, p: wp.vec3) -> _Cell:
+def _among_nodes(nodes: wp.array3d[float], size: wp.vec3, p: wp.vec3) -> wp.vec3:
     n = _counts(nodes)
     first = p + wp.vec3(0.5, 0.5, 0.5)
-    q = wp.vec3(
+    return wp.vec3(
         first[0] * float(n[0] - 1) / (size[0] + 1.0),
         first[1] * float(n[1] - 1) / (size[1] + 1.0),
         first[2] * float(n[2] - 1) / (size[2] + 1.0),
     )
-    return _cell(q, n)
+
+
+@wp.func
+def _node(nodes: wp.array3d[float], size: wp.vec3, p: wp.vec3) -> _Cell:
+    return _cell(_among_nodes(nodes, size, p), _counts(nodes))
 
 
 @wp.func
@@ -111,6 +115,43 @@ def _add(grad: wp.array3d[Any], cell: _Cell, g: Any):
         if w != 0.0:
             i = _corner(cell, corner)
             wp.atomic_add(grad, i[0], i[1], i[2], w * g)
+
+
+@wp.func
+def _steep(q: wp.vec3, counts: wp.vec3i) -> _Cell:
+    """Returns the cell of a point with the derivatives of its weights in place of the weights."""
+    cell = _cell(q, counts)
+    for axis in range(3):
+        i = int(wp.floor(q[axis]))
+        cell.low_weight[axis] = wp.where(i >= 0 and i < counts[axis], -1.0, 0.0)
+        cell.high_weight[axis] = wp.where(i >= -1 and i < counts[axis] - 1, 1.0, 0.0)
+    return cell
+
+
+@wp.func
+def _along(value: float, g: float) -> float:
+    return value * g
+
+
+@wp.func
+def _along(value: wp.vec3, g: wp.vec3) -> float:
+    return wp.dot(value, g)
+
+
+@wp.func
+def _slope(grid: wp.array3d[Any], cell: _Cell, steep: _Cell, g: Any) -> wp.vec3:
+    """Computes the derivative, by the point in units of cells, of g times the value that `_read` returns."""
+    slope = wp.vec3()
+    for axis in range(3):
+        part = cell
+        part.low_weight[axis] = steep.low_weight[axis]
+        part.high_weight[axis] = steep.high_weight[axis]
+        total = float(0.0)
+        for corner in range(8):
+            i = _corner(part, corner)
+            total += _weight(part, corner) * _along(grid[i[0], i[1], i[2]], g)
+        slope[axis] = total
+    return slope
 
 
 @wp.func
@@ -249,6 +290,101 @@ def _march_backward(
         hidden += t * (absorbed(x) * lit + mean_transparency(x) * glow)
 
 
+@wp.kernel
+def _rays_backward(
+    # in:
+    density: wp.array3d[float],
+    emission: wp.array3d[wp.vec3],
+    nodes: wp.array4d[float],
+    origin: wp.array1d[wp.vec3],
+    direction: wp.array1d[wp.vec3],
+    step: float,
+    depth: wp.array1d[float],
+    count: wp.array1d[int],
+    grad_scattered: wp.array2d[float],
+    grad_emitted: wp.array1d[wp.vec3],
+    grad_depth: wp.array1d[float],
+    # out:
+    grad_origin: wp.array1d[wp.vec3],
+    grad_direction: wp.array1d[wp.vec3],
+):
+    """Follows `_march_backward`, and takes the derivative by each sample's place and by the steps' start and length."""
+    i = wp.tid()
+    size = size_of(density)
+    way = direction[i]
+    r = steps_along(size, origin[i], way, step)
+    tau = depth[i]
+    hidden = float(0.0)
+    on_origin = wp.vec3()
+    on_direction = wp.vec3()
+    on_first = float(0.0)
+    on_length = float(0.0)
+    for back in range(count[i]):
+        n = count[i] - 1 - back
+        p = point_on(r, n, 0.5)
+        voxel = _voxel(density, p)
+        steep = _steep(p - wp.vec3(0.5, 0.5, 0.5), _counts(density))
+        sigma = _read(density, voxel)
+        x = sigma * r.length
+        tau -= wp.min(x, _OPAQUE)
+        t = wp.exp(-tau)
+        on_p = wp.vec3()
+        lit = float(0.0)
+        if nodes.shape[0] > 0:
+            node = _node(nodes[0], size, p)
+            steep_node = _steep(_among_nodes(nodes[0], size, p), _counts(nodes[0]))
+            on_q = wp.vec3()
+            for light in range(nodes.shape[0]):
+                share = grad_scattered[i, light] * wp.exp(-_read(nodes[light], node))
+                lit += share
+                on_q += _slope(nodes[light], node, steep_node, -t * absorbed(x) * share)
+            for axis in range(3):
+                on_p[axis] = on_q[axis] * float(_counts(nodes[0])[axis] - 1) / (size[axis] + 1.0)
+        glow = float(0.0)
+        if emission.shape[0] > 0:
+            colour = wp.dot(_read(emission, voxel), grad_emitted[i])
+            glow = r.length * colour
+            reaching = t * mean_transparency(x)
+            on_p += _slope(emission, voxel, steep, reaching * r.length * grad_emitted[i])
+            on_length += reaching * colour
+        on_x = t * (wp.exp(-x) * lit + _share_slope(x) * glow) - hidden + grad_depth[i]
+        on_p += _slope(density, voxel, steep, on_x * r.length)
+        on_length += on_x * sigma
+        hidden += t * (absorbed(x) * lit + mean_transparency(x) * glow)
+        steps = float(n) + 0.5
+        on_origin += on_p
+        on_direction += (r.first + steps * r.length) * on_p
+        along = wp.dot(on_p, way)
+        on_first += along
+        on_length += steps * along
+    if r.count > 0:
+        # The length of a step is (last - first) / count, and the ray begins and ends on a face or at its origin.
+        on_last = on_length / float(r.count)
+        on_first -= on_last
+        span = clip(size, origin[i], way)
+        begun = bool(False)
+        ended = bool(False)
+        for axis in range(3):
+            d = way[axis]
+            if wp.abs(d) > 1.0e-9:
+                low = (-0.5 - origin[i][axis]) / d
+                high = (size[axis] + 0.5 - origin[i][axis]) / d
+                on_axis = float(0.0)
+                on_way = float(0.0)
+                if not begun and span[0] > 0.0 and wp.min(low, high) == span[0]:
+                    begun = True
+                    on_axis -= on_first / d
+                    on_way -= on_first * span[0] / d
+                if not ended and wp.max(low, high) == span[1]:
+                    ended = True
+                    on_axis -= on_last / d
+                    on_way -= on_last * span[1] / d
+                on_origin[axis] = on_origin[axis] + on_axis
+                on_direction[axis] = on_direction[axis] + on_way
+    grad_origin[i] = on_origin
+    grad_direction[i] = on_direction
+
+
 def depths(density, toward, step: float, nodes) -> None:
     """Computes optical depths towards lights at the nodes of a lattice.
 
@@ -323,3 +459,31 @@ def march_backward(
     inputs += [grad_scattered, grad_emitted, grad_depth]
     outputs = [grad_density, grad_emission, grad_nodes]
     wp.launch(_march_backward, origin.shape, inputs=inputs, outputs=outputs, device=density.device)
+
+
+def rays_backward(
+    density,
+    emission,
+    nodes,
+    origin,
+    direction,
+    step: float,
+    depth,
+    count,
+    grad_scattered,
+    grad_emitted,
+    grad_depth,
+    grad_origin,
+    grad_direction,
+) -> None:
+    """Computes the gradients of the rays of `march`; the number of a ray's steps is constant.
+
+    Args:
+        density, emission, nodes, origin, direction, step, depth, count: Arguments and results of `march`.
+        grad_scattered, grad_emitted, grad_depth: Arguments of `march_backward`.
+        grad_origin, grad_direction: vec3 [R], written. The three numbers of a direction count as independent.
+    """
+    inputs = [density, emission, nodes, origin, direction, step * _SLACK, depth, count]
+    inputs += [grad_scattered, grad_emitted, grad_depth]
+    outputs = [grad_origin, grad_direction]
+    wp.launch(_rays_backward, origin.shape, inputs=inputs, outputs=outputs, device=density.device)

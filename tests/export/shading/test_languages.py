@@ -27,7 +27,10 @@ from wlm.atlas.shader import glsl as atlas_glsl
 from wlm.errors import WlmError
 from wlm.export import export
 from wlm.export.shading import LANGUAGES, translate
+from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.virtual.shader import sheet_words, virtual_glsl
+from wlm.lightmap.virtual.texture import VirtualTexture
 from wlm.probe.sphere import irradiance
 from wlm.probe.volume.bundle import volume_bundle
 from wlm.probe.volume.cascade import Volume
@@ -169,6 +172,41 @@ vec4 shown(ivec2 pixel)
     return Subject(volume_glsl(27), main, expected[None], bound, "", 3e-5, as_textures=VOLUME)
 
 
+def virtual(folder) -> Subject:
+    model = random_lightmap((3, 2, 4, 1, 0, 3), columns=3)
+    own, random = model.light, np.random.default_rng(0)
+    y, x = (np.mgrid[:40, :40] + 0.5) / 80
+    zero = np.zeros((40, 40))
+    uv, level = random.uniform(-0.05, 1.05, (90, 2)), random.uniform(-1.0, 7.0, 90)
+    with VirtualTexture(model, side=32, border=2, decodes=16) as texture:
+        for _ in range(80):
+            derivative = np.stack([zero + 2.0 / own.width, zero, zero, zero + 3.0 / own.height], 2)
+            texture.frame(7.5, zero.astype(int), np.stack([x, y], 2), derivative)
+        slope = 2.0**level / own.width
+        derivative = np.stack([0.0 * level, slope, 0.0 * level, 0.0 * level], 1)
+        expected, state = texture.sample(np.zeros(90, int), uv, derivative), texture.state()
+        assert len(set(expected.coarser.tolist())) > 1, "some pages are missing"
+        light, table = unpack_rgb9e5(state.texture).astype(np.float16), texture.table.numpy()
+        words = sheet_words(texture.layout)
+    main = (
+        POINTS
+        + """
+vec4 shown(ivec2 pixel)
+{
+    vec4 at = texelFetch(u_points, pixel, 0);
+    return vec4(wlm_virtual_light(0, at.xy, vec2(0.0, 0.0), vec2(at.z, 0.0)), 1.0);
+}
+"""
+    )
+    bound = {
+        "u_points": points_of(np.column_stack([uv, slope])),
+        "wlm_virtual_pages": np.pad(light, ((0, 0), (0, 0), (0, 0), (0, 1))),
+        "wlm_virtual_table": table.astype(np.uint32).reshape(-1, 1024, 1),
+        "wlm_virtual_sheets": words[..., None],
+    }
+    return Subject(virtual_glsl(), main, expected.light[None], bound, "", 5e-3 * float(light.max()))
+
+
 KINDS_OF_BUFFERS = (("volume", "<u4"), ("pages", "<i4"), ("pool", "<f4"))
 VOLUME = "".join(
     f"uniform {kind} u_{name};\n#define WLM_VOLUME_{name.upper()}(i) {before}texelFetch(u_{name}, ivec2((i) & 1023, "
@@ -235,6 +273,7 @@ SUBJECTS: dict[str, Callable[..., Subject]] = {
     "scene apart": partial(scene, True, False, True),
     **smoke_subjects(),
     "volume": volume,
+    "virtual texture": virtual,
     "probes": probes,
     "components": component_probes,
 }

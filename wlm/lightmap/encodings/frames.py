@@ -121,6 +121,16 @@ def round_half(values: np.ndarray, toward: float) -> np.ndarray:
     return np.where(wrong, np.nextafter(nearest, np.float16(toward)), nearest)
 
 
+def bc7_tables(device: str) -> frame_kernels.Tables:
+    """Uploads the tables of the BC7 format to a device."""
+    tables = frame_kernels.Tables()
+    tables.modes = wp.array(bc7.MODES, dtype=int, device=device)
+    tables.partitions = wp.array(bc7.PARTITIONS, dtype=wp.uint32, device=device)
+    tables.anchors = wp.array(bc7.ANCHORS, dtype=int, device=device)
+    tables.shares = wp.array(bc7.SHARES, dtype=int, device=device)
+    return tables
+
+
 class FrameTiles(DeviceTiles):
     """The tiles of a sheet that are stored as frames, on a device."""
 
@@ -138,12 +148,7 @@ class FrameTiles(DeviceTiles):
         stored.least = wp.array(np.ascontiguousarray(ends[:, 0]), dtype=wp.vec3, device=device)
         stored.span = wp.array(np.ascontiguousarray(ends[:, 1] - ends[:, 0]), dtype=wp.vec3, device=device)
         stored.times, stored.gamma = len(sheet.times), sheet.profile.gamma
-        tables = frame_kernels.Tables()
-        tables.modes = wp.array(bc7.MODES, dtype=int, device=device)
-        tables.partitions = wp.array(bc7.PARTITIONS, dtype=wp.uint32, device=device)
-        tables.anchors = wp.array(bc7.ANCHORS, dtype=int, device=device)
-        tables.shares = wp.array(bc7.SHARES, dtype=int, device=device)
-        stored.tables = tables
+        stored.tables = bc7_tables(device)
         self._stored = stored
         self.device_bytes = sum(array.capacity for array in (stored.blocks, stored.least, stored.span))
 

@@ -9,6 +9,7 @@ import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -247,7 +248,7 @@ def mip_levels(height: int, width: int, padding: int) -> int:
 
 
 def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, tuple[str, ...]], int]:
-    """Writes the textures of a flip book to files NAME_1 and NAME_2, each atomically.
+    """Writes the textures of a flip book to files NAME_1 and NAME_2, atomically: all of them or none.
 
     Args:
         book: The flip book.
@@ -263,22 +264,27 @@ def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, t
     paths = {name: output.with_name(f"{output.stem}_{i}{output.suffix}") for i, name in enumerate(book.pages, 1)}
     facts = {"layout": book.layout, "rows": book.rows, "columns": book.columns, "frames": book.count}
     text = json.dumps(facts | {"padding": book.padding, "gain": book.gain}, separators=(",", ":"))
-    clipped = sum(_write_page(path, book.pages[name], text) for name, path in paths.items())
+    with ExitStack() as files:
+        made = {path: files.enter_context(atomic_path(path)) for path in paths.values()}
+        clipped = sum(_write_page(path, made[path], book.pages[name], text) for name, path in paths.items())
     return {path: book.channels[name] for name, path in paths.items()}, clipped
 
 
-def _write_page(path: Path, page: np.ndarray, text: str) -> int:
-    """Writes a texture [H, W, 3 or 4] with its description `text` as an image; returns how many values are clipped."""
+def _write_page(path: Path, temporary: Path, page: np.ndarray, text: str) -> int:
+    """Writes a texture [H, W, 3 or 4] with its description `text` as an image of the kind of `path` into a temporary
+    file; returns how many values are clipped."""
     if not np.isfinite(page).all():
         raise WlmError(f"{path}: cannot write: expected finite light, found NaN or infinity")
     if suffix_of(path) == ".exr":
-        write_exr(path, page, note=json.loads(text))
+        try:
+            write_exr(temporary, page, note=json.loads(text))
+        except WlmError as error:
+            raise WlmError(str(error).replace(str(temporary), str(path))) from error
         return int((page > 65504.0).sum())
     image = Image.fromarray(np.round(np.clip(page, 0.0, 1.0) * 255.0).astype(np.uint8))
     entry: dict[str, Any] = {"id_section": text.encode()}
     if suffix_of(path) == ".png":
         entry = {"pnginfo": PngInfo()}
         entry["pnginfo"].add_text(NOTE, text)
-    with atomic_path(path) as temporary:
-        image.save(temporary, format=suffix_of(path)[1:].upper(), **entry)
+    image.save(temporary, format=suffix_of(path)[1:].upper(), **entry)
     return int((page > 1.0).sum())

@@ -1,0 +1,453 @@
+"""Measures the virtual texture of lightmaps as a renderer uses it: a walk and a day through a set and a large set.
+
+A row is one path of a camera at 1280 x 720 pixels, with one setting:
+
+- "walk": 600 frames of a walk through the scene while 10 minutes pass, in which a lamp is switched: 10 seconds of a
+  game whose day takes 24 minutes, at 60 frames per second.
+- "day": a whole day, with a frame for every minute, while the camera turns slowly.
+
+`frame_ms` is the time of a frame on the device, without the gaps of the host that queues it: on CUDA a short wait is
+queued first. `current` is the share of pixels that show the page that they need, with its light changed by at most the
+tolerance; `nearly_current` also counts pages that are one level coarser. `cached_psnr` compares views, as a screen
+shows them, with views in which every page is decoded at the frame's time; `view_psnr` compares them with the
+uncompressed lightmaps, and `gain` is its difference to that of the views with every page decoded.
+
+Rows "format" have the error of the physical texture's format beside its rival, 8 bits per channel in gamma space
+relative to the bound of a page. Rows "mips" have the error of the mips, whose texels are means of four samples, against
+means of all texels. Both are of the uncompressed lightmaps; `texel_rms` is relative to a texel's brightest channel.
+
+The large set has four sheets of 4096 x 4096 texels at 26 times, of random maps and networks that change about as much
+in an hour as a real set does. Its sheets are a plain on which the camera walks. Only some of its tiles are on the
+device.
+"""
+
+import os
+import time
+from collections.abc import Callable
+from typing import Any
+from unittest import mock
+
+import numpy as np
+import torch
+import warp as wp
+
+from benchmarks.rows import Row
+from benchmarks.runner import Bench, Note
+from wlm import interop
+from wlm.errors import WlmError
+from wlm.formats.bc7 import pack_mode6
+from wlm.formats.geometry import read_geometry
+from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+from wlm.lightmap.data import LightmapSet, load
+from wlm.lightmap.fit import compress
+from wlm.lightmap.model import LightmapModel, SheetModel, part_table
+from wlm.lightmap.profile import Profile
+from wlm.lightmap.sheet import Sheet
+from wlm.lightmap.tiles import TILE, TileKind
+from wlm.lightmap.virtual.texture import VirtualTexture
+from wlm.metrics import psnr_from_mse
+from wlm.ops import raster
+from wlm.texels import exposure, fill_gaps, filmic, to_srgb
+
+_SIZE, _QUICK_SIZE = (720, 1280), (180, 320)
+_WALK, _DAY = 600, 1440
+_QUICK = 60  # a quick run has one of so many frames
+_SCORED, _QUICK_SCORED = 20, 4  # one of so many frames is scored
+_WALK_HOURS = (18.83, 19.0)
+_LARGE, _SHEETS, _LARGE_TIMES = 4096, 4, 26
+_LARGE_BUDGET, _LARGE_TILES = 32 << 20, 24 << 20
+_METRES = 128.0  # side of a sheet of the large set
+_ALL = 1 << 40  # bytes: the pages of all levels
+_EVERY = 6  # one of so many times is measured in a quick run
+_GAMMA, _BORDER, _GRID = 2.2, 4, 2  # of colours of 8 bits; of a page; samples of a texel of a mip along each axis
+_WARMUP = 32  # frames, in which modules are loaded and the graph is captured
+_WAIT_CYCLES = 600_000  # of the GPU, about 0.3 ms: longer than the host needs to queue a frame
+
+View = tuple[wp.array, wp.array, wp.array]
+Camera = Callable[[float], View]
+
+
+def run(*, scene_path: str | os.PathLike[str], quick: bool, device: str, progress: Note | None = None) -> list[Row]:
+    """Measures the virtual texture on a set with profile M, and on the large set.
+
+    Args:
+        scene_path: A lightmap set that names its mesh.
+        quick: Whether to fit for 200 steps, and to draw few and small frames of a large set of 512 x 512 texels.
+        device: "cpu" or "cuda:0".
+        progress: Called with a line before each part of the work.
+
+    Returns:
+        Three rows for each of the two sets: a walk, and a day with 8 and with 64 pages per frame; and the rows of
+        formats and mips.
+
+    Raises:
+        WlmError: The set, its mesh or the device does not exist.
+    """
+    lightmaps = load(scene_path)
+    bench = _RunTime("lightmap", device, progress, scene=lightmaps.name, clock="frame_ms")
+    if lightmaps.light.mesh is None:
+        raise WlmError(f"{lightmaps.name}: expected a set that names its mesh, for a walk through it")
+    bench.quick, bench.size = quick, _QUICK_SIZE if quick else _SIZE
+    bench.note("fitting profile M")
+    model = compress(lightmaps, "M", device=bench.device, **({"steps": 200} if quick else {}))
+    rows = bench.rows(model, _RoomCamera(lightmaps, bench.size, bench.device), {}, lightmaps)
+    rows += bench.format_rows(lightmaps)
+    side = 512 if quick else _LARGE
+    bench.scene = f"{side} x {side} x {_LARGE_TIMES} x {_SHEETS}"
+    bench.note("making its tiles")
+    large = large_model(side)
+    limits = {"budget": _LARGE_BUDGET, "tiles": _LARGE_TILES}
+    return rows + bench.rows(large, _PlainCamera(side, bench.size, bench.device), limits, None)
+
+
+class _RunTime(Bench):
+    """The benchmark of one set: draws frames with a virtual texture, times and scores them."""
+
+    quick: bool
+    size: tuple[int, int]
+
+    def rows(
+        self, model: LightmapModel, camera: Camera, limits: dict[str, int], lightmaps: LightmapSet | None
+    ) -> list[Row]:
+        """Returns the rows of a walk and of a day."""
+        found = []
+        for path, decodes in (("walk", 8), ("day", 8), ("day", 64)):
+            self.note(f"{path}, {decodes} pages a frame")
+            found.append(self._row(model, camera, limits, lightmaps, path, decodes))
+        return found
+
+    def format_rows(self, lightmaps: LightmapSet) -> list[Row]:
+        """Returns the rows of formats and mips, of some of the uncompressed lightmaps."""
+        self.note("formats and mips")
+        sheet, found = lightmaps.light, []
+        frames = sheet.frames[:: _EVERY if self.quick else 1].astype(np.float32)
+        shared = unpack_rgb9e5(pack_rgb9e5(frames))
+        for method, decoded in (("RGB9E5", shared), ("RGBA8", np.stack([_as_bytes(frame) for frame in frames]))):
+            found.append(self.row("format", method, **_differences(decoded, frames, sheet.mask)))
+        for level in (2, 3):
+            exact, covered = _mip(frames, sheet.mask, level, 1 << level)
+            sampled, met = _mip(frames, sheet.mask, level, _GRID)
+            found.append(self.row("mips", f"level {level}", **_differences(sampled, exact, covered & met)))
+        return found
+
+    def _row(
+        self,
+        model: LightmapModel,
+        camera: Camera,
+        limits: dict[str, int],
+        lightmaps: LightmapSet | None,
+        path: str,
+        decodes: int,
+    ) -> Row:
+        count = (_WALK if path == "walk" else _DAY) // (_QUICK if self.quick else 1)
+        hours = np.linspace(*_WALK_HOURS, count) if path == "walk" else np.arange(count) * 24.0 / count
+        # A third of a turn in a day: the camera is almost still.
+        places = np.arange(count) / count * (1.0 if path == "walk" else 1.0 / 3.0)
+        every = _QUICK_SCORED if self.quick else _SCORED
+        whole = None
+        if lightmaps is not None:
+            whole = VirtualTexture(model, self.device, budget=_ALL, decodes=1024, tolerance=1e-6)
+        with VirtualTexture(model, self.device, decodes=decodes, **limits) as texture:
+            for _ in range(_WARMUP * (1 if self.quick else 8)):
+                texture.frame(float(hours[0]), *camera(float(places[0])))
+                texture.wait(0.1)
+            times, hosts, decoded, visible = [], [], [], []
+            shares, errors = _Shares(), _Errors()
+            stages: dict[str, list[float]] = {}
+            for frame, (hour, place) in enumerate(zip(hours.tolist(), places.tolist(), strict=True)):
+                view = camera(place)
+                if frame % every == 1:
+                    self._time_stages(texture, hour, view, stages)
+                else:
+                    device_ms, host_ms = self._timed(lambda hour=hour, view=view: texture.frame(hour, *view))
+                    times.append(device_ms)
+                    hosts.append(host_ms)
+                report = texture.report()
+                decoded.append(report["decoded"])
+                visible.append(report["visible"])
+                if frame % every == every // 2:
+                    reading = texture.sample(*view)
+                    shares.add(reading, texture.tolerance)
+                    if whole is not None and lightmaps is not None:
+                        errors.add(reading.light, _all_decoded(whole, hour, view), lightmaps, hour, view, self.device)
+            memory = report["memory"]
+        full = {"memory_full": sum(own.memory_bytes for own in model.sheets.values()) / 2**20}
+        parts = {f"{name}_memory": memory[name] / 2**20 for name in ("texture", "tiles", "coarse")}
+        return self.row(
+            "virtual texture",
+            f"{path}, {decodes} pages a frame",
+            f"{count} frames of {self.size[1]}x{self.size[0]} pixels",
+            frame_ms=float(np.mean(times)),
+            frame_ms_p95=float(np.percentile(times, 95)),
+            frame_ms_max=float(np.max(times)),
+            host_ms=float(np.median(hosts)),
+            **{f"{name}_ms": float(np.mean(values)) for name, values in stages.items()},
+            pages_visible=float(np.mean(visible)),
+            pages_decoded=float(np.mean(decoded)),
+            pages_decoded_max=float(np.max(decoded)),
+            memory=sum(memory.values()) / 2**20,
+            **parts,
+            **full,
+            **shares.figures(),
+            **errors.figures(),
+        )
+
+    def _timed(self, call: Callable[[], None]) -> tuple[float, float]:
+        """Returns the milliseconds of a call on the device, and those of the host to queue it."""
+        if self.device == "cpu":
+            start = time.perf_counter()
+            call()
+            duration = 1e3 * (time.perf_counter() - start)
+            return duration, duration
+        with interop.stream(self.device) as stream:
+            begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+            torch.cuda._sleep(_WAIT_CYCLES)
+            begin.record(stream)
+            start = time.perf_counter()
+            call()
+            host = 1e3 * (time.perf_counter() - start)
+            end.record(stream)
+            end.synchronize()
+            return begin.elapsed_time(end), host
+
+    def _time_stages(self, texture: VirtualTexture, hour: float, view: View, times: dict[str, list[float]]) -> None:
+        """Draws a frame stage by stage, and adds the milliseconds of each stage to `times`."""
+
+        def step() -> None:
+            for name, stage in texture.stages.items():
+                times.setdefault(name, []).append(self._timed(stage)[0])
+
+        with mock.patch.object(texture, "_step", lambda: None):
+            times.setdefault("feedback", []).append(self._timed(lambda: texture.frame(hour, *view))[0])
+        with mock.patch.object(texture, "_step", step):
+            texture.frame(hour, *view)
+
+
+def _all_decoded(whole: VirtualTexture, hour: float, view: View) -> np.ndarray:
+    """Returns the light of a view from a texture that has all pages of the view at its time."""
+    for _ in range(64):  # every pixel takes a turn
+        whole.frame(hour, *view)
+    return whole.sample(*view).light
+
+
+class _Shares:
+    """Counts the pixels that show what they need."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(3)
+
+    def add(self, reading: Any, tolerance: float) -> None:
+        lit = reading.coarser >= 0
+        now = lit & (reading.change <= tolerance)
+        self._counts += [lit.sum(), (now & (reading.coarser == 0)).sum(), (now & (reading.coarser <= 1)).sum()]
+
+    def figures(self) -> dict[str, float]:
+        lit, current, nearly = self._counts
+        return {"current": current / lit, "nearly_current": nearly / lit} if lit else {}
+
+
+class _Errors:
+    """Compares views with the uncompressed lightmaps, and with views in which every page is decoded."""
+
+    def __init__(self) -> None:
+        self._sums = np.zeros(3)
+        self._count = 0
+
+    def add(
+        self,
+        light: np.ndarray,
+        whole: np.ndarray,
+        lightmaps: LightmapSet,
+        hour: float,
+        view: View,
+        device: str,
+    ) -> None:
+        """Adds a view: its light, its light with all pages decoded, and the original's at the hour."""
+        sheet = lightmaps.light
+        before, after, share = _neighbours(sheet.times, hour)
+        frame = (1.0 - share) * sheet.frames[before] + share * sheet.frames[after]
+        gain = np.float32(exposure(frame[sheet.mask]))
+        image = torch.tensor(fill_gaps(frame.astype(np.float32), sheet.mask), device=device)
+        original = raster.texture(image, wp.to_torch(view[1])).cpu().numpy()
+        lit = view[0].numpy() >= 0
+        shown = [to_srgb(filmic(np.maximum(each[lit], 0.0) * gain)) for each in (light, whole, original)]
+        pairs = ((0, 2), (1, 2), (0, 1))
+        self._sums += [np.square(shown[a] - shown[b], dtype=np.float64).sum() for a, b in pairs]
+        self._count += shown[0].size
+
+    def figures(self) -> dict[str, float]:
+        if not self._count:
+            return {}
+        own, best, cached = (psnr_from_mse(total / self._count, 1.0) for total in self._sums)
+        return {"view_psnr": own, "gain": own - best, "cached_psnr": cached}
+
+
+def _neighbours(times: np.ndarray, hour: float) -> tuple[int, int, float]:
+    """Returns the stored times around an hour, of a day, and the weight of the later one. A lamp's switch is held."""
+    after = int(np.searchsorted(times, hour, side="right"))
+    before = after - 1
+    gap = (times[after % len(times)] - times[before]) % 24.0
+    held = gap <= np.median(np.diff(times)) / 4
+    return before, after % len(times), 0.0 if held else float((hour - times[before]) % 24.0 / gap)
+
+
+# ---- formats and mips ----
+
+
+def _as_bytes(frame: np.ndarray) -> np.ndarray:
+    """Encodes a lightmap with 8 bits per channel relative to the largest colour of each page, and decodes it."""
+    colour, out = np.maximum(frame, 0.0) ** (1.0 / _GAMMA), np.empty_like(frame)
+    for y in range(0, len(frame), TILE):
+        for x in range(0, frame.shape[1], TILE):
+            page = colour[max(y - _BORDER, 0) : y + TILE + _BORDER, max(x - _BORDER, 0) : x + TILE + _BORDER]
+            bound = max(float(page.max()), 1e-30)
+            part = np.s_[y : y + TILE, x : x + TILE]
+            out[part] = (np.rint(colour[part] / bound * 255.0) / 255.0 * bound) ** _GAMMA
+    return out
+
+
+def _mip(frames: np.ndarray, mask: np.ndarray, level: int, grid: int) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a mip of lightmaps [T, H, W, 3], means of grid x grid valid samples, and which texels have one."""
+    step, (height, width) = 1 << level, (size >> level << level for size in mask.shape)
+    total, count = 0.0, 0
+    for a in range(grid):
+        for b in range(grid):
+            y, x = a, b
+            if grid < step:
+                y, x = (step * (2 * at + 1) // (2 * grid**2) for at in (a * grid + b, b * grid + grid - 1 - a))
+            part = np.s_[y:height:step, x:width:step]
+            total, count = total + mask[part][..., None] * frames[:, *part], count + mask[part]
+    return total / np.maximum(count, 1)[..., None], count > 0
+
+
+def _differences(decoded: np.ndarray, exact: np.ndarray, mask: np.ndarray) -> dict[str, float]:
+    """Returns the PSNR of lightmaps over the valid texels, relative to their range, and the error of a texel."""
+    found, wanted = decoded[:, mask].astype(np.float64), exact[:, mask].astype(np.float64)
+    error = found - wanted
+    brightest = wanted.max(2, keepdims=True)
+    relative = np.divide(error, brightest, out=np.zeros_like(error), where=brightest > 0)
+    return {
+        "psnr": psnr_from_mse(float(np.square(error).mean()), float(np.ptp(wanted))),
+        "texel_rms": float(np.sqrt(np.square(relative).mean())),
+    }
+
+
+# ---- cameras ----
+
+
+def _arrays(sheet: torch.Tensor, uv: torch.Tensor, derivative: torch.Tensor) -> View:
+    sheet, uv, derivative = (each.contiguous() for each in (sheet, uv, derivative))
+    return wp.from_torch(sheet), wp.from_torch(uv, dtype=wp.vec2), wp.from_torch(derivative, dtype=wp.vec4)
+
+
+class _RoomCamera:
+    """Walks in a circle inside the box of a set's mesh and looks outward, slowly from side to side."""
+
+    def __init__(self, lightmaps: LightmapSet, size: tuple[int, int], device: str) -> None:
+        mesh = read_geometry(lightmaps.light.mesh)
+        low, high = mesh.box
+        self._middle, self._half, self._size = (low + high) / 2, (high - low) / 2, size
+        self._position = torch.tensor(mesh.position, dtype=torch.float32, device=device)
+        self._triangle = torch.tensor(mesh.triangle.astype(np.int32), device=device)
+        self._uv = torch.tensor(mesh.uv, dtype=torch.float32, device=device)
+
+    def __call__(self, place: float) -> View:
+        angle = 2.0 * np.pi * place
+        eye = self._middle + self._half * [0.3 * np.cos(angle), 0.1, 0.3 * np.sin(angle)]
+        turn = angle + 0.7 * np.sin(3.0 * angle)
+        forward = np.array([np.cos(turn), -0.15, np.sin(turn)])
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 1.0, 0.0])
+        right /= np.linalg.norm(right)
+        offset = self._position - torch.tensor(eye, dtype=torch.float32, device=self._position.device)
+        height, width = self._size
+        axes = (right, np.cross(right, forward), forward)
+        # No matrix product, which would round equal vertices to different pixels.
+        x, y, w = (sum(offset[:, i] * float(axis[i]) for i in range(3)) for axis in axes)
+        near = 1e-3 * float(self._half.max())
+        clip = torch.stack([x, y * (width / height), w - 2.0 * near, w], 1)
+        drawn = raster.rasterize(clip, self._triangle, height, width, cull=True, derivative=True)
+        uv = raster.interpolate(self._uv, self._triangle, drawn)
+        corner = self._uv[self._triangle[drawn.triangle.clamp(min=0)].long()]
+        edges = (corner[..., :2, :] - corner[..., 2:, :]).movedim(-2, -1)
+        slopes = torch.einsum("hwcb,hwbd->hwcd", edges, drawn.derivative.reshape(height, width, 2, 2))
+        sheet = torch.where(drawn.triangle >= 0, 0, -1).to(torch.int32)
+        return _arrays(sheet, uv, slopes.reshape(height, width, 4))
+
+
+class _PlainCamera:
+    """Walks over a plain of 2 x 2 sheets at eye height, in a circle, and looks ahead."""
+
+    def __init__(self, side: int, size: tuple[int, int], device: str) -> None:
+        self._size, self._device = size, device
+        self._metres = _METRES * side / _LARGE
+
+    def __call__(self, place: float) -> View:
+        height, width = self._size
+        angle = 2.0 * np.pi * place
+        # 600 frames: 10 seconds of a quick run, 40 m.
+        eye, turn = 6.4 * np.array([np.cos(angle), np.sin(angle)]), angle + np.pi / 2
+        column = (torch.arange(width + 1, device=self._device) + 0.5 - width / 2) / (width / 2)
+        row = (torch.arange(height + 1, device=self._device) + 0.5 - height / 2) / (width / 2)
+        down = row[:, None] + 0.2
+        distance = torch.where(down > 0.0, 1.7 / down, torch.inf)
+        ahead, aside = distance, distance * column[None]
+        x = float(eye[0]) + ahead * float(np.cos(turn)) - aside * float(np.sin(turn))
+        y = float(eye[1]) + ahead * float(np.sin(turn)) + aside * float(np.cos(turn))
+        point = torch.stack([x, y.expand_as(x)], 2) / self._metres
+        slopes = torch.stack([point[:-1, 1:] - point[:-1, :-1], point[1:, :-1] - point[:-1, :-1]], 3)
+        point = point[:-1, :-1]
+        inside = (point.abs() < 1.0).all(2) & torch.isfinite(slopes).all((2, 3))
+        number = (point[..., 0] >= 0).to(torch.int32) + 2 * (point[..., 1] >= 0).to(torch.int32)
+        sheet = torch.where(inside, number, -1).to(torch.int32)
+        return _arrays(
+            sheet, torch.where(inside[..., None], point - point.floor(), 0.0), slopes.reshape(height, width, 4)
+        )
+
+
+# ---- the large set ----
+
+
+def large_model(side: int) -> LightmapModel:
+    """Makes a model of four sheets of dynamic tiles with random maps and networks, for profile M at 26 times."""
+    times = np.concatenate([np.arange(24.0), [18.75, 18.0 + 55.0 / 60.0]])
+    times.sort()
+    sheets = {Sheet(atlas=str(number)): _large_sheet(side, times, number) for number in range(_SHEETS)}
+    first = next(iter(sheets.values()))
+    return LightmapModel("large", "0123456789abcdef", first.profile, sheets)
+
+
+def _large_sheet(side: int, times: np.ndarray, seed: int) -> SheetModel:
+    random, profile = np.random.default_rng(seed), Profile.load("M").for_times(len(times))
+    count = (side // TILE) ** 2
+    kind = np.full(count, TileKind.DYNAMIC, np.uint8)
+    table = part_table(profile, kind, len(times))
+    parts: dict[str, np.ndarray] = {name: np.zeros(part.shape, _dtype(part.dtype)) for name, part in table.items()}
+    # Endpoints that lie close together, and the same in all slices: a lightmap is smooth, and changes slowly.
+    parts["uv"] = _blocks(random, parts["uv"].shape[:-1])
+    slices = _blocks(random, (count, 1, *parts["uvt"].shape[2:-1]))
+    parts["uvt"] = np.ascontiguousarray(np.broadcast_to(slices, parts["uvt"].shape))
+    for name in ("ut", "vt"):
+        rows, columns = parts[name].shape[1:3]
+        steps = random.integers(-3, 4, (count, rows, columns, 2)).cumsum(1)
+        parts[name] = np.clip(128 + steps - steps.mean(1, keepdims=True), 0, 255).astype(np.uint8)
+    parts["net"] = (random.standard_normal(parts["net"].shape) * 0.25).astype(np.float16)
+    sun = np.clip(np.sin((times - 6.0) / 12.0 * np.pi), 0.0, None)
+    lamp = (times > 18.8) | (times < 5.5)
+    parts["scale"][:] = (120.0 + 30.0 * sun + 12.0 * lamp)[None, :, None].astype(np.uint8)
+    parts["peak"][:] = 200
+    parts["affine"][:, 0], parts["affine"][:, 1] = 1.0, 0.15
+    mask = np.ones((side, side), bool)
+    return SheetModel("large", side, side, times, 24.0, profile, mask, kind, **parts)
+
+
+def _dtype(dtype: Any) -> Any:
+    return dtype[0] if isinstance(dtype, tuple) else dtype
+
+
+def _blocks(random: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Returns random BC7 blocks of mode 6, uint8 [*shape, 16]; the texels of a block are alike."""
+    middle = random.integers(96, 160, (*shape, 1, 4))
+    ends = np.clip(middle + random.integers(-16, 17, (*shape, 2, 4)), 0, 255)
+    ends = ends & ~1 | random.integers(0, 2, (*shape, 2, 1))
+    return pack_mode6(ends.astype(np.uint8), random.integers(0, 16, (*shape, 16), np.uint8))

@@ -1,0 +1,382 @@
+"""The virtual texture against the decoders of whole maps and a NumPy twin: pages, tables, time, damage and loading."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from builders.checks import error_of
+from builders.synthetic import random_model, random_sheet
+
+import wlm
+from wlm.errors import WlmError
+from wlm.formats.artifact import read_artifact
+from wlm.formats.shared_exponent import unpack_rgb9e5
+from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.sheet import LIGHT, Sheet
+from wlm.lightmap.tiles import TileKind
+from wlm.lightmap.virtual.texture import VirtualTexture
+from wlm.texels import OFFSETS, nearest_valid
+
+KINDS = (3, 4, 2, 1, 0, 3)
+SWITCH = 18.0 + 55.0 / 60.0
+TIMES = (0.0, 7.5, 13.0, 18.75, SWITCH)
+SMALL = {"side": 8, "border": 1}
+
+
+def gappy() -> np.ndarray:
+    """A mask of 236 x 375 texels with gaps inside and between tiles."""
+    mask = np.zeros((236, 375), bool)
+    mask[20:60, 30:128] = mask[100:180, 60:90] = mask[40:200, 126:150] = mask[130:200, 200:340] = True
+    mask[::7, 270:300] = True
+    return mask
+
+
+def view(own, level=0.0, pixels=96, window=(0.0, 0.0, 1.0, 1.0)):
+    """Sheet numbers, texture coordinates and derivatives of an image of a window of a map, drawn at a mip level."""
+    y, x = (np.mgrid[:pixels, :pixels] + 0.5) / pixels
+    left, top, right, bottom = window
+    uv = np.stack([left + x * (right - left), top + y * (bottom - top)], 2).astype(np.float32)
+    derivative = np.zeros((pixels, pixels, 4), np.float32)
+    derivative[..., 0], derivative[..., 3] = 2.0**level / own.width, 2.0**level / own.height
+    return np.zeros((pixels, pixels), np.int32), uv, derivative
+
+
+def settle(virtual, time, at, most=400):
+    """Draws frames until no page is missing or stale."""
+    for _ in range(most):
+        virtual.frame(time, *at)
+        virtual.wait(5.0)
+        report = virtual.report()
+        # A quarter of the pixels takes a turn in 16 frames.
+        if not (report["missing"] + report["stale"] + report["decoded"]) and _ >= 64:
+            return
+    raise AssertionError(report)
+
+
+def level_twin(light, valid, level, grid=2):
+    """Light and validity of a mip level by its definition: means of samples, gaps filled from the nearest texel."""
+    step, (height, width) = 1 << level, valid.shape
+    grid = grid if level else 1
+    shape = -(-height // step), -(-width // step)
+    total, count = np.zeros((*shape, 3)), np.zeros(shape)
+    for a in range(grid):
+        for b in range(grid):
+            y = np.arange(shape[0]) * step + step * (2 * (a * grid + b) + 1) // (2 * grid**2)
+            x = np.arange(shape[1]) * step + step * (2 * (b * grid + grid - 1 - a) + 1) // (2 * grid**2)
+            inside = (y < height)[:, None] & (x < width)[None]
+            own = np.ix_(np.minimum(y, height - 1), np.minimum(x, width - 1))
+            used = valid[own] & inside
+            total, count = total + used[..., None] * light[own], count + used
+    mean, covered = total / np.maximum(count, 1)[..., None], count > 0
+    if grid == 4:
+        return mean[nearest_valid(covered)], covered
+    filled = mean.copy()
+    for y, x in np.argwhere(~covered):
+        for dy, dx in OFFSETS:
+            if 0 <= y + dy < shape[0] and 0 <= x + dx < shape[1] and covered[y + dy, x + dx]:
+                filled[y, x] = mean[y + dy, x + dx]
+                break
+    return filled, covered
+
+
+def stored_texels(own):
+    """The valid texels of tiles that are not empty."""
+    return own.mask & own.grid.texels_of((own.kind != TileKind.EMPTY).reshape(own.grid.rows, own.grid.cols))
+
+
+def shown_level(virtual, own, level, sheet=0):
+    """Puts the decoded pages of a level together, float32 [h, w, 3]; NaN where no page is."""
+    layout, state = virtual.layout, virtual.state()
+    side, border = layout.side, layout.border
+    height, width = -(-own.height // (1 << level)), -(-own.width // (1 << level))
+    image = np.full((-(-height // side) * side, -(-width // side) * side, 3), np.nan, np.float32)
+    for page in np.flatnonzero((layout.place[:, 0] == sheet) & (layout.place[:, 1] == level) & (state.slot >= 0)):
+        _, _, row, column = layout.place[page]
+        inner = state.texture[state.slot[page]][border : border + side, border : border + side]
+        image[row * side : (row + 1) * side, column * side : (column + 1) * side] = unpack_rgb9e5(inner)
+    return image[:height, :width]
+
+
+def assert_near(got, expected, steps=0.51):
+    """Compares RGB9E5 texels with exact values, in steps of the format."""
+    step = expected.max(-1, keepdims=True) / 256 + 1e-6
+    assert (np.abs(got - expected) <= steps * step).all(), np.abs((got - expected) / step).max()
+
+
+def test_pages_of_all_kinds_continue_across_tiles(device):
+    model = random_model(KINDS, columns=3, mask=gappy())
+    own, edge = model.light, 136
+    with VirtualTexture(model, device) as virtual:
+        settle(virtual, 9.0, view(own))
+        expected = level_twin(SheetDecoder(own, device).frame(9.0).astype(np.float64), stored_texels(own), 0)[0]
+        state, layout = virtual.state(), virtual.layout
+        pages = np.flatnonzero((layout.place[:, 1] == 0) & (state.slot >= 0))
+        assert len(pages) == 6
+        for page in pages:
+            row, column = layout.place[page, 2:] * 128 - 4
+            y = np.clip(row + np.arange(edge), 0, own.height - 1)
+            x = np.clip(column + np.arange(edge), 0, own.width - 1)
+            # The other decoder rounds each of the two stored times, too.
+            assert_near(unpack_rgb9e5(state.texture[state.slot[page]]), expected[np.ix_(y, x)])
+
+
+@pytest.mark.parametrize("time", [13.0, 10.1])
+def test_mips_are_means_of_samples(time, device):
+    model = random_model(KINDS, columns=3, mask=gappy())
+    own = model.light
+    valid, light = stored_texels(own), SheetDecoder(own, device).frame(time).astype(np.float64)
+    with VirtualTexture(model, device, **SMALL, decodes=64, tolerance=1e-6) as virtual:
+        for level in range(1, 4):
+            settle(virtual, time, view(own, level))
+            assert_near(shown_level(virtual, own, level), level_twin(light, valid, level)[0])
+        # Coarse texels are stored at stored times.
+        settle(virtual, 13.0, view(own, 4.0))
+        noon = SheetDecoder(own, device).frame(13.0).astype(np.float64)
+        assert_near(shown_level(virtual, own, 4), level_twin(noon, valid, 4, 4)[0])
+
+
+def test_values_that_are_not_light_have_their_own_gamma(device):
+    sheets = {
+        LIGHT: random_sheet((3, 2)),
+        Sheet("0", "dir", encoding="signed"): random_sheet((3, 4), gamma=1.0, seed=1),
+    }
+    model = LightmapModel("two", "0123456789abcdef", sheets[LIGHT].profile, sheets)
+    with VirtualTexture(model, device, **SMALL, decodes=64) as virtual:
+        for s, own in enumerate(sheets.values()):
+            at = view(own, 2.0)
+            settle(virtual, 7.5, (at[0] + s, *at[1:]))
+            twin = level_twin(SheetDecoder(own, device).frame(7.5).astype(np.float64), stored_texels(own), 2)[0]
+            assert_near(shown_level(virtual, own, 2, s), twin)
+    assert virtual.layout.whole.tolist() == [i for i, parent in enumerate(virtual.layout.parent) if parent < 0]
+    assert len(virtual.layout.whole) == 2
+
+
+def read_twin(virtual, own, uv, level):
+    """Reads one level bilinearly at a point, from the finest resident page, in float64."""
+    layout, state = virtual.layout, virtual.state()
+    side, border = layout.side, layout.border
+
+    def page_at(level):
+        at = np.clip(uv, 0.0, 1.0) * [own.width, own.height] / 2.0**level
+        most = np.ceil(np.array([own.width, own.height]) / (side << level)).astype(int) - 1
+        column, row = np.minimum((at // side).astype(int), most)
+        return at, int(layout.first[0, level] + row * layout.columns[0, level] + column)
+
+    at, page = page_at(level)
+    while state.slot[page] < 0:
+        level += 1
+        at, page = page_at(level)
+    x, y = at - layout.place[page, [3, 2]] * side + border - 0.5
+    texels = unpack_rgb9e5(state.texture[state.slot[page]]).astype(np.float64)
+    j, i = int(x), int(y)
+    weight = np.outer([i + 1 - y, y - i], [j + 1 - x, x - j])
+    return (weight[..., None] * texels[i : i + 2, j : j + 2]).sum((0, 1)), level
+
+
+def test_sampling_is_trilinear_and_falls_back_to_coarser_pages(device):
+    model = random_model(KINDS, columns=3)
+    own, random = model.light, np.random.default_rng(0)
+    with VirtualTexture(model, device, **SMALL, decodes=16) as virtual:
+        settle(virtual, 7.5, view(own, 1.5, window=(0.0, 0.0, 0.5, 0.5)))
+        uv = random.uniform(-0.1, 1.1, (200, 2)).astype(np.float32)
+        levels = random.uniform(-1.0, 7.0, 200)
+        derivative = np.zeros((200, 4), np.float32)
+        derivative[:, 1], derivative[:, 2] = 0.5 * 2.0**levels / own.width, 2.0**levels / own.height
+        reading = virtual.sample(np.zeros(200, np.int32), uv, derivative)
+        clamped = np.clip(levels, 0.0, virtual.layout.levels[0] - 1)
+        for i, (point, level) in enumerate(zip(uv.astype(np.float64), clamped, strict=True)):
+            fine, share = int(level), level - int(level)
+            light, found = read_twin(virtual, own, point, fine)
+            if share > 0.0:
+                light = (1.0 - share) * light + share * read_twin(virtual, own, point, fine + 1)[0]
+            np.testing.assert_allclose(reading.light[i], light, rtol=2e-3, atol=2e-3)
+            assert reading.coarser[i] == found - fine
+        assert len(set(reading.coarser.tolist())) > 2, "some pages are there, and some are missing"
+
+
+def test_points_without_light(device):
+    model = random_model((3, 1), columns=2)
+    with VirtualTexture(model, device, **SMALL) as virtual:
+        sheet, uv, derivative = view(model.light)
+        sheet[:] = -1
+        sheet[0, :4] = 0, 0, 0, 7
+        uv[0, 0, 1], uv[0, 1, 0], derivative[0, 2, 3] = np.nan, np.inf, np.nan
+        for _ in range(70):
+            virtual.frame(3.0, sheet, uv, derivative)
+        assert virtual.report()["visible"] == 1, "only the page that always stays"
+        reading = virtual.sample(sheet, uv, derivative)
+        assert not reading.light.any() and (reading.coarser == -1).all() and not reading.change.any()
+        with pytest.raises(ValueError, match="expected 2 equal axes"):
+            virtual.frame(3.0, sheet[:4], uv, derivative)
+        assert "finite" in error_of(virtual.frame, np.nan, sheet, uv, derivative)
+
+
+@pytest.mark.parametrize("kinds", [(1,), (1, 1, 1, 1), (0,), (2,)])
+def test_simple_models(kinds, device):
+    model = random_model(kinds, columns=1 if len(kinds) == 1 else 2)
+    own = model.light
+    with VirtualTexture(model, device, **SMALL, decodes=8) as virtual:
+        at = view(own, 3.0)
+        settle(virtual, 10.0, at)
+        twin = level_twin(SheetDecoder(own, device).frame(10.0).astype(np.float64), stored_texels(own), 3)[0]
+        assert_near(shown_level(virtual, own, 3), twin)
+    with VirtualTexture(model, device) as virtual:
+        assert len(virtual.layout.parent) == (1 if len(kinds) == 1 else 5)
+
+
+def check_tables(virtual):
+    """Checks that slots and pages refer to each other, and that the table has the finest resident page of each page."""
+    state, layout = virtual.state(), virtual.layout
+    held = [(page, slot) for slots in (state.slot, state.ahead) for page, slot in enumerate(slots) if slot >= 0]
+    assert len({slot for _, slot in held}) == len(held) and all(state.owner[slot] == page for page, slot in held)
+    assert np.count_nonzero(state.owner >= 0) == len(held)
+    assert (state.slot[layout.whole] >= 0).all() and (state.stamp[state.owner < 0] == -1).all()
+    for page, entry in enumerate(state.table):
+        shown = page
+        while state.slot[shown] < 0:
+            shown = state.parent[shown]
+        assert entry == 16 * state.slot[shown] + layout.place[shown, 1]
+
+
+@pytest.mark.parametrize("frames", [150, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_random_cameras_and_times_leave_the_tables_consistent(frames, device):
+    model = random_model(KINDS, columns=3, times=TIMES)
+    own, random = model.light, np.random.default_rng(1)
+    with VirtualTexture(model, device, **SMALL, budget=60 * 400, decodes=6) as virtual:
+        size, clock, used = sum(virtual.report()["memory"].values()), 17.9, set()
+        for frame in range(frames):
+            clock = random.uniform(0.0, 24.0) if random.random() < 0.02 else clock + random.uniform(-0.02, 0.06)
+            centre, reach, level = random.uniform(0.0, 1.0, 2), random.uniform(0.0, 0.1), random.uniform(0.0, 6.0)
+            window = (*(centre - reach), *(centre + reach))
+            virtual.frame(clock, *view(own, level, 16, window))
+            if frame % 10 == 0:
+                check_tables(virtual)
+                used |= set(virtual.state().ahead.tolist())
+        assert len(used) > 1, "pages were decoded ahead of the switch"
+        assert sum(virtual.report()["memory"].values()) == size and virtual.report()["slots"] == 60
+        at = view(own, 3.5, window=(0.2, 0.2, 0.5, 0.5))
+        settle(virtual, clock, at)
+        check_tables(virtual)
+        reading = virtual.sample(*at)
+        assert (reading.coarser == 0).all() and reading.change.max() <= virtual.tolerance
+
+
+def test_a_lamp_is_on_in_the_first_frame_after_its_switch(device):
+    model = random_model((3, 2, 4, 3), times=TIMES)
+    own, decoder = model.light, SheetDecoder(model.light, device)
+    at = view(own, 3.0)
+    valid = stored_texels(own)
+
+    def error(time):
+        twin = level_twin(decoder.frame(time).astype(np.float64), valid, 3)[0]
+        return np.abs(shown_level(virtual, own, 3) - twin).max() / twin.max()
+
+    with VirtualTexture(model, device, **SMALL, decodes=2) as virtual:
+        settle(virtual, 18.0, at, 2000)
+        for clock in np.linspace(18.0, 18.8, 400):
+            virtual.frame(clock, *at)
+        assert virtual.report()["ahead"] == 0, "all visible pages are ready"
+        # Within the switch the lamp is still off.
+        virtual.frame(SWITCH - 1e-6, *at)
+        assert error(18.75) < 0.05 < error(SWITCH)
+        virtual.frame(SWITCH, *at)
+        assert error(SWITCH) < 0.01
+        check_tables(virtual)
+        # Back again: what was decoded ahead is dropped, and pages are decoded one after another.
+        virtual.frame(18.8, *at)
+        assert error(SWITCH) < 0.2 and virtual.report()["stale"] > 2
+        virtual.frame(12.0, *at)
+        assert (virtual.state().ahead < 0).all()
+
+
+def test_pages_are_decoded_again_when_their_light_has_changed(device):
+    model = random_model((1, 1, 1, 1))
+    # One tile changes by 10% an hour until 7.5 h, the others are constant.
+    light = model.light.constant
+    light[1:] = light[1:, :1]
+    light[0] = 1.0
+    light[0, 1] = 1.0 / 0.25
+    at = view(model.light, 2.0)
+    with VirtualTexture(model, device, side=32, border=1, decodes=64, tolerance=0.05) as virtual:
+        settle(virtual, 0.0, at)
+        # RMS 1 to 4 by 7.5 h: 75% of the brighter time, 10% an hour.
+        for hour, expected in ((0.4, 0), (0.49, 0), (0.6, 2), (0.7, 0), (1.0, 0), (1.2, 2)):
+            virtual.frame(hour, *at)
+            assert virtual.report()["decoded"] == expected, hour
+        reading = virtual.sample(*at)
+        inside = (at[1] < 0.45).all(2)
+        np.testing.assert_allclose(reading.light[inside], 1.0 + 3.0 * 1.2 / 7.5, rtol=0.01)
+        assert reading.change.max() == 0.0
+
+
+def test_what_is_refused():
+    model = random_model((3, 1), columns=2)
+    whole = 3 * 4 * 136 * 136
+    assert error_of(VirtualTexture, model, budget=whole - 1, decodes=2) == (
+        f"budget: expected at least {whole} bytes, for 1 pages that always stay and the 2 that a frame decodes, got "
+        f"{whole - 1}"
+    )
+    assert "decodes: expected 1 to" in error_of(VirtualTexture, model, decodes=0)
+    assert "tolerance: expected" in error_of(VirtualTexture, model, tolerance=0.0)
+    assert "side: expected" in error_of(VirtualTexture, model, side=100)
+    assert "border: expected" in error_of(VirtualTexture, model, border=0)
+    assert "tiles: expected at least" in error_of(VirtualTexture, random_model((3, 3), columns=2), side=64, tiles=10)
+
+
+def test_groups_are_refused():
+    sheet = random_sheet((1, 1))
+    model = LightmapModel("two", "0123456789abcdef", sheet.profile, {LIGHT: sheet, replace(LIGHT, group="lamp"): sheet})
+    assert error_of(VirtualTexture, model) == (
+        "two: expected a model with one light group for a virtual texture, found base, lamp"
+    )
+
+
+def test_tiles_are_loaded_when_they_are_needed(tmp_path, device):
+    random_model((3, 2, 4) * 8, columns=6).save(tmp_path / "a.wlm")
+    with wlm.load(tmp_path / "a.wlm") as model:
+        own, whole = model.light, sum(VirtualTexture(model, **SMALL).report()["memory"].values())
+        with VirtualTexture(model, device, **SMALL, decodes=64, tiles=450_000) as virtual:
+            assert sum(virtual.report()["memory"].values()) < whole
+            for window in ((0.0, 0.0, 0.3, 1.0), (0.7, 0.0, 1.0, 1.0), (0.0, 0.0, 0.3, 1.0)):
+                at = view(own, 1.0, window=window)
+                settle(virtual, 13.0, at)
+                assert (virtual.sample(*at).coarser == 0).all()
+            twin = level_twin(SheetDecoder(own, device).frame(13.0).astype(np.float64), stored_texels(own), 1)[0]
+            got = shown_level(virtual, own, 1)
+            there = np.isfinite(got).all(2)
+            assert there.mean() > 0.3
+            assert_near(got[there], twin[there])
+            check_tables(virtual)
+            virtual.close()
+
+
+def test_a_damaged_tile_shows_its_parent_page(tmp_path, device):
+    random_model((3, 3, 2, 3), columns=2).save(tmp_path / "a.wlm")
+    content = bytearray((tmp_path / "a.wlm").read_bytes())
+    content[-1 - int(read_artifact(tmp_path / "a.wlm").pieces["0.tiles"].sizes[2:].sum())] ^= 1
+    (tmp_path / "a.wlm").write_bytes(content)
+    with wlm.load(tmp_path / "a.wlm") as model, VirtualTexture(model, device, decodes=4) as virtual:
+        assert len(virtual.warnings) == 1 and "tile 1: " in virtual.warnings[0]
+        assert virtual.warnings[0].endswith("the light around it is shown instead")
+        at = view(model.light)
+        for _ in range(80):
+            virtual.frame(7.5, *at)
+        reading = virtual.sample(*at)
+        damaged = (at[1][..., 0] * model.light.width >= 128) & (at[1][..., 1] * model.light.height < 128)
+        assert (reading.coarser[damaged] == 1).all() and (reading.coarser[~damaged] == 0).all()
+        assert np.isfinite(reading.light).all() and (reading.light[damaged].sum(1) > 0.0).all()
+        assert virtual.report()["warnings"] == virtual.warnings
+        with pytest.raises(WlmError):
+            model.decoder(tiles=[1])
+
+
+def test_changes_are_those_between_stored_times():
+    sheet = random_sheet((1, 1), columns=1, period=None)
+    sheet = replace(
+        sheet, constant=np.array([[[1.0] * 3, [2.0] * 3, [2.0] * 3, [0.0] * 3], [[0.0] * 3] * 4], np.float16)
+    )
+    model = LightmapModel("two", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
+    with VirtualTexture(model) as virtual:
+        np.testing.assert_allclose(virtual._store.change, [[0.5, 0.0, 1.0, 0.0], [0.0] * 4], atol=0.01)
+        np.testing.assert_allclose(virtual._pages.change.numpy()[-1], [0.0, 0.5, 0.5, 1.5, 1.5], atol=0.01)

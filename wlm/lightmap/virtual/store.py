@@ -1,0 +1,453 @@
+"""The tiles of a virtual texture on a device: all of them, or as many as memory is given for, loaded when needed.
+
+All tiles are read once, when the store is made, to decode `COARSE` x `COARSE` texels of each tile at each stored time.
+The coarsest mip levels are read from these texels, and the change of each tile's light between stored times is computed
+from them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from wlm.errors import WlmError
+from wlm.formats.shared_exponent import unpack_rgb9e5
+from wlm.lightmap.encodings.frames import bc7_tables
+from wlm.lightmap.loading import TileLoader
+from wlm.lightmap.model import BLOCKS, PACKED_KINDS, LightmapModel, SheetModel
+from wlm.lightmap.tiles import TILE, TileKind
+from wlm.lightmap.virtual.clock import Clock
+from wlm.lightmap.virtual.layout import Layout
+from wlm.texels import OFFSETS, nearest_valid
+from wlm_kernels.lightmap import decode as decode_kernels
+from wlm_kernels.lightmap import frames as frame_kernels
+from wlm_kernels.lightmap import pages as kernels
+from wlm_kernels.lightmap.virtual import KEEP
+
+_CHUNK = 64  # tiles that are read at once
+_GRID = 4  # samples of a coarse texel along each axis
+_DARK = 0.01  # of a tile's brightest time: changes of less light than that are not relative to it
+_UPLOADS = 4  # most loaded tiles that are copied to the device in a frame
+_ALIGNED = 64  # bytes; the first of an array in a pool
+_REQUESTS = 64  # most tiles that wait for the loader
+
+
+class _Pool:
+    """Device memory for tiles of one kind, in slots.
+
+    Attributes:
+        owner: int [slots], the tile in each slot, or -1.
+        arrays: The arrays of the tiles by name: parts of one memory, so that tiles are uploaded with one copy.
+        memory_bytes: Bytes on the device.
+    """
+
+    def __init__(self, shapes: dict[str, tuple[Any, tuple[int, ...]]], slots: int, device: str) -> None:
+        """Allocates the slots; `shapes` has for each array its type, and its shape of one tile, whose first axis is
+        that of the tile's rows."""
+        self.owner = np.full(slots, -1)
+        self._device, self._names = device, list(shapes)
+        sizes = [math.prod(shape) * wp.types.type_size_in_bytes(dtype) for dtype, shape in shapes.values()]
+        starts = np.cumsum([0, *(-(-slots * size // _ALIGNED) * _ALIGNED for size in sizes)])
+        if starts[-1] >= 2**31:
+            raise WlmError(f"tiles: expected less than 2 GiB of tiles of one kind, got {starts[-1]} bytes")
+        self._memory = wp.zeros(int(starts[-1]), dtype=wp.uint8, device=device)
+        self.memory_bytes = self._memory.capacity
+        records = np.cumsum([0, *sizes])[:-1]
+        self._parts = wp.array(np.stack([records, sizes, starts[:-1]], 1).astype(np.int32), dtype=int, device=device)
+        self.arrays = {
+            name: wp.array(
+                ptr=(self._memory.ptr or 0) + int(start),
+                dtype=dtype,
+                shape=(slots * shape[0], *shape[1:]),
+                device=device,
+            )
+            for (name, (dtype, shape)), start in zip(shapes.items(), starts, strict=False)
+        }
+
+    def put(self, slots: np.ndarray, rows: dict[str, np.ndarray]) -> None:
+        """Copies n tiles, arrays [n, ...] by name, into slots, int [n]."""
+        parts = [np.ascontiguousarray(rows[name]).view(np.uint8).reshape(len(slots), -1) for name in self._names]
+        records = wp.array(np.concatenate(parts, 1), dtype=wp.uint8, device=self._device)
+        at = wp.array(slots.astype(np.int32), dtype=int, device=self._device)
+        kernels.put(records, at, self._parts, self._memory)
+
+
+class TileStore:
+    """The tiles of a model on a device.
+
+    Attributes:
+        tiles: The kernels' description of all tiles.
+        source: The first arguments of the kernel that decodes pages, see `wlm_kernels.lightmap.pages.decode`.
+        kernel: That kernel.
+        change: float32 [N, T], RMS change of each tile's light from each stored time to the next, as a share of the RMS
+            light of the brighter time; 0 for the last time unless the times are periodic.
+        warnings: A line for each damaged tile.
+        complete: Whether all tiles are on the device.
+    """
+
+    def __init__(
+        self, model: LightmapModel, layout: Layout, device: str, gelu: str, room: int | None, clock: Clock
+    ) -> None:
+        """Reads all tiles and uploads as many as fit into `room` bytes; for the errors see `VirtualTexture`."""
+        self._model, self._layout, self._device = model, layout, device
+        self.warnings: list[str] = []
+        self._loader: TileLoader | None = None
+        self.kernel = kernels.page_kernel(layout.models[0].profile.hidden, gelu)
+        self._kind = np.concatenate([own.kind for own in layout.models]).astype(np.int32)
+        self.slot = np.full(len(self._kind), kernels.WAITING, np.int32)
+        self.slot[self._kind == TileKind.EMPTY] = 0
+        self._pools = self._allocate(room)
+        self.complete = all(len(pool.owner) == (self._kind == kind).sum() for kind, pool in self._pools.items())
+        self._make_tiles()
+        self.offsets = self._array(np.array([(0, 0), *OFFSETS], np.int32), wp.vec2i)
+        self._read_all(clock)
+        self._used = np.full(len(self.slot), -1)  # last frame in which a page needed each tile
+        if not self.complete:
+            self._loader = TileLoader(model, _REQUESTS)
+
+    def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._device)
+
+    def _allocate(self, room: int | None) -> dict[int, _Pool]:
+        layout, own = self._layout, self._layout.models[0]
+        shapes, times = _shapes(own), len(own.times)
+        counts = {kind: int((self._kind == kind).sum()) for kind in PACKED_KINDS}
+        size = {
+            kind: sum(math.prod(shape) * wp.types.type_size_in_bytes(dtype) for dtype, shape in of.values())
+            for kind, of in shapes.items()
+        }
+        total = sum(counts[kind] * size[kind] for kind in counts)
+        slots = dict(counts)
+        if room is not None and room < total:
+            least = {kind: min(count, layout.footprint) for kind, count in counts.items()}
+            slots = {kind: max(least[kind], int(count * room / total)) for kind, count in counts.items()}
+            if sum(slots[kind] * size[kind] for kind in slots) > room:
+                needed = sum(least[kind] * size[kind] for kind in least)
+                if needed > room:
+                    raise WlmError(f"tiles: expected at least {needed} bytes for the tiles of a page, got {room}")
+                slots = least
+        pools = {kind: _Pool(shapes[kind], slots[kind], self._device) for kind in PACKED_KINDS}
+        moving, still = (
+            (self._mapped(own, pools[kind].arrays), *(pools[kind].arrays[name] for name in ("hidden", "output")))
+            for kind in (TileKind.DYNAMIC, TileKind.STATIC)
+        )
+        frames = frame_kernels.StoredFrames()
+        for name, array in pools[TileKind.FRAMES].arrays.items():
+            setattr(frames, name, array)
+        frames.tables, frames.times, frames.gamma = bc7_tables(self._device), times, 1.0  # the gamma is the sheet's
+        self._stored = (*moving, *still, frames)
+        return pools
+
+    def _mapped(self, own: SheetModel, arrays: dict[str, wp.array]) -> kernels.Mapped:
+        stored, mapped = decode_kernels.Stored(), kernels.Mapped()
+        stored.slices, stored.periodic = own.profile.uvt_slices, int(own.axis.periodic)
+        for name in ("uv", "uvt", "ut", "vt"):
+            if name in arrays:
+                setattr(stored, name, arrays[name])
+        mapped.stored = stored
+        for name in ("scale", "shift", "spread"):
+            setattr(mapped, name, arrays[name])
+        return mapped
+
+    def _make_tiles(self) -> None:
+        layout, tiles = self._layout, kernels.Tiles()
+        sizes = np.array([(own.height, own.width) for own in layout.models], np.int32)
+        tiles.size = self._array(sizes, wp.vec2i)
+        tiles.first = self._array(layout.tile_first[:-1].astype(np.int32), int)
+        tiles.columns = self._array(np.array([own.grid.cols for own in layout.models], np.int32), int)
+        tiles.gamma = self._array(np.array([own.profile.gamma for own in layout.models], np.float32), float)
+        tiles.kind = self._array(self._kind, int)
+        constant = np.flatnonzero(self._kind == TileKind.CONSTANT)
+        self.slot[constant] = np.arange(len(constant))
+        colours = np.concatenate([own.constant.astype(np.float32) for own in layout.models])
+        tiles.colours = self._array(colours, wp.vec3)
+        masks, bits = zip(*(_masks(own) for own in layout.models), strict=True)
+        starts = np.cumsum([0, *map(len, bits)])
+        mask = [np.where(own >= 0, own + start, own) for own, start in zip(masks, starts, strict=False)]
+        tiles.mask = self._array(np.concatenate(mask).astype(np.int32), int)
+        tiles.bits = self._array(np.concatenate(bits), wp.uint32)
+        shape = (len(self._kind), len(layout.models[0].times), kernels.COARSE**2)
+        tiles.coarse = wp.zeros(shape, dtype=wp.uint32, device=self._device)
+        tiles.slot = self._array(self.slot, int)
+        self.tiles = tiles
+
+    @property
+    def source(self) -> tuple[Any, ...]:
+        return self.tiles, *self._stored
+
+    @property
+    def memory(self) -> dict[str, int]:
+        """Bytes on the device: of the tiles' maps, networks and frames; of coarse texels; of masks; and of the rest."""
+        tiles = self.tiles
+        rest = (tiles.kind, tiles.slot, tiles.mask, tiles.colours)
+        return {
+            "tiles": sum(pool.memory_bytes for pool in self._pools.values()),
+            "coarse": tiles.coarse.capacity,
+            "masks": tiles.bits.capacity,
+            "tables": sum(array.capacity for array in rest),
+        }
+
+    # ---- coarse texels ----
+
+    def _read_all(self, clock: Clock) -> None:
+        layout, times = self._layout, len(clock.axis.times)
+        rows = self._array(np.stack([clock.row(float(time)) for time in clock.axis.times]), float)
+        words = np.zeros((len(self._kind), times, kernels.COARSE, kernels.COARSE), np.uint32)
+        for s, own in enumerate(layout.models):
+            for kind in (TileKind.CONSTANT, *PACKED_KINDS):
+                for numbers in self._chunks(own, kind):
+                    read = self._place(s, own, kind, numbers)
+                    if len(read):
+                        words[layout.tile_first[s] + read] = self._coarse(s, own, read, rows)
+        self.change = np.zeros(words.shape[:2], np.float32)
+        for s, own in enumerate(layout.models):
+            part = slice(layout.tile_first[s], layout.tile_first[s + 1])
+            self._fill(own, words[part], self.slot[part])
+            self.change[part] = _changes(words[part], clock.axis.period is not None)
+        self.tiles.coarse.assign(words.reshape(self.tiles.coarse.shape))
+        self.tiles.slot.assign(self.slot)
+
+    def _chunks(self, own: SheetModel, kind: TileKind) -> Iterator[np.ndarray]:
+        numbers = own.numbers(kind)
+        size = min(_CHUNK, len(self._pools[kind].owner) if kind in self._pools else _CHUNK)
+        for start in range(0, len(numbers), max(size, 1)):
+            yield numbers[start : start + size]
+
+    def _place(self, s: int, own: SheetModel, kind: TileKind, numbers: np.ndarray) -> np.ndarray:
+        """Reads tiles of one kind and puts them on the device; returns the numbers of those that are not damaged."""
+        if kind not in self._pools:
+            return numbers
+        try:
+            part = own.only(numbers)
+        except WlmError:
+            good = [number for number in numbers.tolist() if self._is_good(s, own, number)]
+            numbers = np.array(good, np.int64)
+            part = own.only(numbers)
+        if not len(numbers):
+            return numbers
+        pool, tiles = self._pools[kind], self._layout.tile_first[s] + numbers
+        first = int((pool.owner >= 0).sum())
+        if first + len(tiles) > len(pool.owner):
+            first = 0
+        gone = pool.owner[first : first + len(tiles)]
+        self.slot[gone[gone >= 0]] = kernels.WAITING
+        pool.owner[first : first + len(tiles)] = tiles
+        self.slot[tiles] = np.arange(first, first + len(tiles))
+        pool.put(self.slot[tiles], _rows(part, kind))
+        return numbers
+
+    def _is_good(self, s: int, own: SheetModel, number: int) -> bool:
+        try:
+            own.only([number])
+        except WlmError as error:
+            self._break(int(self._layout.tile_first[s]) + number, error)
+            return False
+        return True
+
+    def _break(self, tile: int, error: WlmError) -> None:
+        if self.slot[tile] != kernels.BROKEN:
+            self.slot[tile] = kernels.BROKEN
+            self.warnings.append(f"{error}; the light around it is shown instead")
+
+    def _coarse(self, s: int, own: SheetModel, numbers: np.ndarray, rows: wp.array) -> np.ndarray:
+        """Decodes coarse texels of n tiles at all T stored times, uint32 [n, T, COARSE, COARSE]."""
+        count, times = len(numbers), rows.shape[0]
+        self.tiles.slot.assign(self.slot)
+        row, column = np.divmod(numbers, own.grid.cols)
+        one = np.full(count, 1)
+        side = kernels.COARSE
+        place = np.stack([s * one, kernels.COARSE_LEVEL * one, side * row, side * column], 1).astype(np.int32)
+        jobs = kernels.Jobs()
+        jobs.place = self._array(place.repeat(times, 0), wp.vec4i)
+        jobs.target = self._array(np.tile(np.arange(times, dtype=np.int32), count), int)
+        jobs.slot = self._array(np.arange(count * times, dtype=np.int32), int)
+        out = wp.zeros((count * times, side, side), dtype=wp.uint32, device=self._device)
+        kernels.decode(self.kernel, self.source, rows, self.offsets[:1], jobs, _GRID, True, out)
+        return out.numpy().reshape(count, times, side, side)
+
+    def _fill(self, own: SheetModel, words: np.ndarray, slot: np.ndarray) -> None:
+        """Gives the coarse texels of a sheet without a valid sample, or in a damaged tile, the nearest one's light."""
+        grid, side, step = own.grid, kernels.COARSE, TILE // kernels.COARSE
+        stored = ((own.kind != TileKind.EMPTY) & (slot != kernels.BROKEN)).reshape(grid.rows, grid.cols)
+        mask = np.zeros((grid.rows * TILE, grid.cols * TILE), bool)
+        mask[: own.height, : own.width] = own.mask
+        mask &= stored.repeat(TILE, 0).repeat(TILE, 1)
+        covered = np.zeros((grid.rows * side, grid.cols * side), bool)
+        for a in range(_GRID):
+            for b in range(_GRID):
+                y, x = (step * (2 * at + 1) // (2 * _GRID**2) for at in (a * _GRID + b, b * _GRID + _GRID - 1 - a))
+                covered |= mask[y::step, x::step]
+        if covered.all() or not covered.any():
+            return
+        image = words.reshape(grid.rows, grid.cols, -1, side, side).transpose(2, 0, 3, 1, 4)
+        image = image.reshape(-1, *covered.shape)
+        rows, columns = nearest_valid(covered)
+        filled = image[:, rows, columns].reshape(len(image), grid.rows, side, grid.cols, side)
+        words[...] = filled.transpose(1, 3, 0, 2, 4).reshape(words.shape)
+
+    # ---- tiles that are loaded when they are needed ----
+
+    def ready(self) -> np.ndarray:
+        """Returns which pages can be decoded: all tiles that they read are here, or damaged; int32 [P].
+
+        The page of a damaged tile itself is never decoded, so that the page above it is shown. The page of a whole
+        sheet is always decoded, with coarse texels in place of tiles that are not here.
+        """
+        layout = self._layout
+        missing = np.bincount(layout.reader[self.slot[layout.read] == kernels.WAITING], minlength=len(layout.parent))
+        broken = (layout.own >= 0) & (self.slot[layout.own] == kernels.BROKEN)
+        return ((missing == 0) & ~broken).astype(np.int32)
+
+    def stream(self, seen: np.ndarray, priority: np.ndarray, frame: int) -> bool:
+        """Asks the loader for tiles and uploads those that it has loaded, some in each frame.
+
+        Args:
+            seen: int [P], last frame in which each page was needed.
+            priority: int [P], priority of each page that waits for tiles, else 0.
+            frame: Number of the frame.
+
+        Returns:
+            Whether `ready` has changed.
+        """
+        if self._loader is None:
+            return False
+        layout = self._layout
+        self._used[layout.read[seen[layout.reader] > frame - KEEP]] = frame
+        wanted = (priority[layout.reader] > 0) & (self.slot[layout.read] == kernels.WAITING)
+        most = np.zeros(len(self.slot), np.int64)
+        np.maximum.at(most, layout.read[wanted], priority[layout.reader[wanted]])
+        waiting = np.flatnonzero(most)
+        order = waiting[np.argsort(-most[waiting], kind="stable")][:_REQUESTS]
+        self._loader.cancel()
+        for tile in order.tolist():
+            s = int(np.searchsorted(layout.tile_first, tile, side="right")) - 1
+            number = tile - int(layout.tile_first[s])
+            self._loader.request(layout.sheets[s], number, float(most[tile]))
+        taken: dict[int, list[tuple[int, SheetModel]]] = {}
+        changed = False
+        for loaded in self._loader.take(_UPLOADS):
+            tile = int(layout.tile_first[layout.sheets.index(loaded.sheet)]) + loaded.number
+            if self.slot[tile] != kernels.WAITING:
+                continue
+            if loaded.tile is None:
+                self._break(tile, loaded.error or WlmError("a tile could not be read"))
+                changed = True
+            elif self._room_for(tile, frame):
+                changed = True
+                taken.setdefault(int(self._kind[tile]), []).append((tile, loaded.tile))
+        for kind, pairs in taken.items():
+            each = [_rows(own, kind) for _, own in pairs]
+            rows = {name: np.concatenate([one[name] for one in each]) for name in each[0]}
+            self._pools[kind].put(self.slot[[tile for tile, _ in pairs]], rows)
+        if changed:
+            self.tiles.slot.assign(self.slot)
+        return changed
+
+    def _room_for(self, tile: int, frame: int) -> bool:
+        """Gives a tile the slot of the tile that was not needed for the longest time; False if all are needed."""
+        pool = self._pools[int(self._kind[tile])]
+        age = np.where(pool.owner >= 0, self._used[pool.owner], -1)
+        slot = int(np.argmin(age))
+        if age[slot] > frame - KEEP:
+            return False  # the tile is asked for again
+        if pool.owner[slot] >= 0:
+            self.slot[pool.owner[slot]] = kernels.WAITING
+        pool.owner[slot], self.slot[tile], self._used[tile] = tile, slot, frame
+        return True
+
+    def wait(self, seconds: float) -> bool:
+        """Waits until a requested tile is loaded, at most some seconds; returns whether there is one."""
+        return self._loader is not None and self._loader.wait(seconds)
+
+    def close(self) -> None:
+        """Ends the loader's thread."""
+        if self._loader is not None:
+            self._loader.close()
+
+
+def _shapes(own: SheetModel) -> dict[int, dict[str, tuple[Any, tuple[int, ...]]]]:
+    """Returns the type and shape of each array of a tile on the device, by kind; the first axis counts its rows."""
+    profile, times = own.profile, len(own.times)
+    h, r = profile.hidden, profile.uvt_resolution // 4
+    plane = (wp.vec2ub, (1, profile.plane_rows, profile.plane_columns))
+
+    def mapped(temporal: bool) -> dict[str, tuple[Any, tuple[int, ...]]]:
+        return {
+            "uv": (wp.uint64, (1, BLOCKS, BLOCKS, 2)),
+            "hidden": (wp.types.vector(h, float), (1, profile.inputs(temporal) + h + 2)),
+            "output": (wp.vec3, (1, h + 1)),
+            "scale": (wp.vec3, (1, times)),
+            "shift": (wp.vec3, (1,)),
+            "spread": (wp.vec3, (1,)),
+        }
+
+    temporal = {"uvt": (wp.uint64, (profile.uvt_slices, r, r, 2)), "ut": plane, "vt": plane}
+    frames = {
+        "blocks": (wp.uint64, (times, BLOCKS, BLOCKS, 2)),
+        "least": (wp.vec3, (times,)),
+        "span": (wp.vec3, (times,)),
+    }
+    return {TileKind.DYNAMIC: mapped(True) | temporal, TileKind.STATIC: mapped(False), TileKind.FRAMES: frames}
+
+
+def _rows(part: SheetModel, kind: int) -> dict[str, np.ndarray]:
+    """Returns the arrays of n tiles of one kind, [n, ...] each, with the bytes that `_shapes` describes."""
+    if kind == TileKind.FRAMES:
+        ends = part.ranges.astype(np.float32)
+        return {"blocks": part.frames, "least": ends[:, :, 0], "span": ends[:, :, 1] - ends[:, :, 0]}
+    dynamic, profile = kind == TileKind.DYNAMIC, part.profile
+    net = (part.net if dynamic else part.net_static).astype(np.float32)
+    split = (profile.inputs(dynamic) + profile.hidden + 2) * profile.hidden
+    affine = part.affine.astype(np.float32)
+    maps = {"uvt": part.uvt, "ut": part.ut, "vt": part.vt} if dynamic else {}
+    return maps | {
+        "uv": part.uv,
+        "hidden": net[:, :split],
+        "output": net[:, split:],
+        "scale": part.scales,
+        "shift": affine[:, 0],
+        "spread": affine[:, 1],
+    }
+
+
+def _masks(own: SheetModel) -> tuple[np.ndarray, np.ndarray]:
+    """Returns for each tile of a sheet its row in the second array, or that all or none of its texels are valid; and
+    the bits of the other tiles, uint32 [M, 128, 4]. Empty tiles have no valid texel."""
+    grid = own.grid
+    mask = np.zeros((grid.rows * TILE, grid.cols * TILE), bool)
+    mask[: own.height, : own.width] = own.mask
+    tiles = mask.reshape(grid.rows, TILE, grid.cols, TILE).swapaxes(1, 2).reshape(-1, TILE, TILE)
+    full, some = tiles.all((1, 2)), tiles.any((1, 2)) & (own.kind != TileKind.EMPTY)
+    partial = some & ~full
+    rows = np.where(some, kernels.FULL, kernels.EMPTY)
+    rows[partial] = np.arange(partial.sum())
+    bits = np.packbits(tiles[partial], axis=2, bitorder="little")
+    return rows, np.ascontiguousarray(bits).view("<u4")
+
+
+def _changes(words: np.ndarray, periodic: bool) -> np.ndarray:
+    """Computes `TileStore.change` of n tiles from their coarse texels, uint32 [n, T, COARSE, COARSE]."""
+    light = unpack_rgb9e5(words).reshape(*words.shape[:2], -1)
+    rms = np.sqrt(np.square(light).mean(2))
+    after = np.roll(light, -1, axis=1)
+    moved = np.sqrt(np.square(after - light).mean(2))
+    least = _DARK * rms.max(1, keepdims=True)
+    scale = np.maximum(np.maximum(rms, np.roll(rms, -1, axis=1)), least)
+    change = np.divide(moved, scale, out=np.zeros_like(moved), where=scale > 0)
+    if not periodic:
+        change[:, -1] = 0.0
+    return change
+
+
+def page_changes(layout: Layout, change: np.ndarray) -> np.ndarray:
+    """Adds up the changes of the pages' light, see `wlm_kernels.lightmap.virtual.Pages`, from `TileStore.change`.
+
+    Returns:
+        float32 [P, T + 1]; a page changes as much as the tile below it that changes most.
+    """
+    largest = np.stack([change[layout.below(page)].max(0) for page in range(len(layout.parent))])
+    return np.concatenate([np.zeros((len(largest), 1)), np.cumsum(largest, 1)], 1).astype(np.float32)

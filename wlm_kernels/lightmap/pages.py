@@ -1,0 +1,320 @@
+"""Decodes pages of a virtual texture: square parts of any mip level, with a border, from tiles of all kinds.
+
+A page is read texel by texel at the coordinates of its sheet, so that its border continues into the neighbouring tiles.
+A texel of level L stands for 2^L x 2^L texels. Its light is the mean of those of 2 x 2 samples of them that are valid:
+each row and each column of an even grid of 4 x 4 has one sample (at level 1 the samples are all texels). A texel
+without a valid sample, in a gap between charts, takes the light of the nearest one within two texels that has one, as
+`wlm.lightmap.runtime.MapDecoder` does; farther away from charts it is black.
+
+From level `COARSE_LEVEL` on, texels are read from a table of `COARSE` x `COARSE` texels of each tile at each time, so
+that a page of a whole map does not need its tiles. This table is itself decoded by the same kernel (`direct`).
+
+Read first: `exact_kernels` in `wlm_kernels/lightmap/decode.py`.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from wlm_kernels import mlp
+from wlm_kernels.lightmap.decode import Stored, texel_network
+from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.frames import StoredFrames, frame_colour, power
+from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
+
+COARSE_LEVEL, COARSE = 4, 8
+"""The finest level that is read from the table of coarse texels, and their number along a side of a tile."""
+
+WAITING, BROKEN = -1, -2
+"""Values of `Tiles.slot`: the tile is not on the device; it is damaged."""
+
+FULL, EMPTY = -1, -2
+"""Values of `Tiles.mask`: all texels are valid; none is."""
+
+BEFORE, AFTER, SHARE, TAU, WEIGHT, FIRST, SECOND, MIX, ENCODING, CLOCK = 0, 1, 2, 3, 5, 7, 9, 11, 13, 21
+"""Columns of a time in a clock, a float array. First the stored times before and after it, and the weight of the later
+one. Then for each of the two times at which networks are evaluated: its position on the time axis, its weight (0: it
+is not evaluated), the two stored times between which tile scales are interpolated, the weight of the later one, and the
+encoded time (four columns). The last is the number of columns."""
+
+_LEVEL, _SIDE = wp.constant(COARSE_LEVEL), wp.constant(COARSE)
+_FULL, _EMPTY = wp.constant(FULL), wp.constant(EMPTY)
+_BEFORE, _AFTER, _SHARE, _TAU, _WEIGHT, _FIRST, _SECOND, _MIX, _ENCODING = (
+    wp.constant(i) for i in (BEFORE, AFTER, SHARE, TAU, WEIGHT, FIRST, SECOND, MIX, ENCODING)
+)
+_CONSTANT, _STATIC, _FRAMES = wp.constant(1), wp.constant(2), wp.constant(4)  # of `wlm.lightmap.tiles.TileKind`
+
+
+@wp.struct
+class Tiles:
+    """The N tiles of all sheets, sheet after sheet and row by row, and the sheets S.
+
+    Attributes:
+        size: [S], height and width of each sheet in texels.
+        first, columns: [S], number of the sheet's first tile, and its tiles in a row.
+        gamma: [S], exponent that converts colours to light.
+        kind: [N], the kind of each tile, see `wlm.lightmap.tiles.TileKind`.
+        slot: [N], row of the tile among the tiles of its kind on the device, or `WAITING` or `BROKEN`.
+        mask: [N], row in `bits`, or `FULL` or `EMPTY`.
+        bits: [M, 128, 4], valid texels of a tile, the first of a word in its lowest bit.
+        coarse: [N, T, COARSE * COARSE], light of each tile at each stored time, RGB9E5.
+        colours: [C, T], light of the constant tiles at each stored time.
+    """
+
+    size: wp.array1d[wp.vec2i]
+    first: wp.array1d[int]
+    columns: wp.array1d[int]
+    gamma: wp.array1d[float]
+    kind: wp.array1d[int]
+    slot: wp.array1d[int]
+    mask: wp.array1d[int]
+    bits: wp.array3d[wp.uint32]
+    coarse: wp.array3d[wp.uint32]
+    colours: wp.array2d[wp.vec3]
+
+
+@wp.struct
+class Mapped:
+    """K tiles with feature maps: their maps, mean colours at T stored times, and the `shift` and `spread` of colours,
+    see `wlm.lightmap.model`."""
+
+    stored: Stored
+    scale: wp.array2d[wp.vec3]  # [K, T]
+    shift: wp.array1d[wp.vec3]  # [K]
+    spread: wp.array1d[wp.vec3]  # [K]
+
+
+@wp.struct
+class Jobs:
+    """Squares to decode.
+
+    Attributes:
+        place: [J], sheet, level, row and column of the first texel, which may lie outside the level.
+        target: [J], row of the clock with the time.
+        slot: [J], index of the square in the output, or -1 for nothing to decode.
+    """
+
+    place: wp.array1d[wp.vec4i]
+    target: wp.array1d[int]
+    slot: wp.array1d[int]
+
+
+@wp.kernel(enable_backward=False)
+def _put(
+    # in:
+    records: wp.array2d[wp.uint8],
+    slots: wp.array1d[int],
+    parts: wp.array2d[int],
+    # out:
+    memory: wp.array1d[wp.uint8],
+):
+    i, j = wp.tid()
+    part = int(0)
+    while j >= parts[part, 0] + parts[part, 1]:
+        part += 1
+    memory[parts[part, 2] + slots[i] * parts[part, 1] + j - parts[part, 0]] = records[i, j]
+
+
+@wp.func
+def _valid(tiles: Tiles, tile: int, y: int, x: int) -> int:
+    mask = tiles.mask[tile]
+    if mask == _FULL:
+        return 1
+    if mask == _EMPTY:
+        return 0
+    return int(wp.rshift(tiles.bits[mask, y, x // 32], wp.uint32(x % 32)) & wp.uint32(1))
+
+
+@wp.func
+def _coarse_light(tiles: Tiles, clock: wp.array2d[float], target: int, tile: int, cell: int) -> wp.vec3:
+    share = clock[target, _SHARE]
+    early = unpack_rgb9e5(tiles.coarse[tile, int(clock[target, _BEFORE]), cell])
+    return (1.0 - share) * early + share * unpack_rgb9e5(tiles.coarse[tile, int(clock[target, _AFTER]), cell])
+
+
+@wp.func
+def _light_of(
+    mapped: Mapped, clock: wp.array2d[float], target: int, r: int, n: int, gamma: float, y: wp.vec3
+) -> wp.vec3:
+    """Converts the output y of the network of the mapped tile n at the time r of a clock's row to light."""
+    share = clock[target, _MIX + r]
+    early = mapped.scale[n, int(clock[target, _FIRST + r])]
+    scale = (1.0 - share) * early + share * mapped.scale[n, int(clock[target, _SECOND + r])]
+    c = wp.cw_mul(mapped.shift[n] + wp.cw_mul(mapped.spread[n], y), scale)
+    return power(wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0)), gamma)
+
+
+@functools.cache
+def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
+    """Builds (once) the kernel that decodes squares of texels, for networks of one hidden width.
+
+    Args:
+        hidden: H, width of the hidden layers.
+        gelu: One of `mlp.GELUS`.
+    """
+    vec_hidden = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu).vec_hidden
+    assert vec_hidden is mlp.kernels(STATIC_INPUTS, hidden, gelu).vec_hidden
+    temporal_network, static_network = (texel_network(temporal, hidden, gelu) for temporal in (True, False))
+
+    @wp.func
+    def texel_light(
+        tiles: Tiles,
+        moving: Mapped,
+        moving_hidden: wp.array2d[vec_hidden],
+        moving_output: wp.array2d[wp.vec3],
+        still: Mapped,
+        still_hidden: wp.array2d[vec_hidden],
+        still_output: wp.array2d[wp.vec3],
+        frames: StoredFrames,
+        clock: wp.array2d[float],
+        target: int,
+        gamma: float,
+        tile: int,
+        y: int,
+        x: int,
+    ) -> wp.vec3:
+        kind = tiles.kind[tile]
+        slot = tiles.slot[tile]
+        light = wp.vec3()
+        if slot < 0:
+            light = _coarse_light(tiles, clock, target, tile, (y // 16) * _SIDE + x // 16)
+        elif kind == _CONSTANT:
+            share = clock[target, _SHARE]
+            early = tiles.colours[slot, int(clock[target, _BEFORE])]
+            light = (1.0 - share) * early + share * tiles.colours[slot, int(clock[target, _AFTER])]
+        elif kind == _FRAMES:
+            share = clock[target, _SHARE]
+            first = slot * frames.times
+            light = (1.0 - share) * power(frame_colour(frames, first + int(clock[target, _BEFORE]), y, x), gamma)
+            if share > 0.0:
+                light += share * power(frame_colour(frames, first + int(clock[target, _AFTER]), y, x), gamma)
+        else:
+            two = int(2)  # a variable keeps the loop rolled
+            for r in range(two):
+                weight = clock[target, _WEIGHT + r]
+                if weight > 0.0:
+                    tau = clock[target, _TAU + r]
+                    at = _ENCODING + 4 * r
+                    encoding = wp.vec4(
+                        clock[target, at], clock[target, at + 1], clock[target, at + 2], clock[target, at + 3]
+                    )
+                    if kind == _STATIC:
+                        out = static_network(still.stored, still_hidden, still_output, tau, encoding, slot, y, x)
+                        light += weight * _light_of(still, clock, target, r, slot, gamma, out)
+                    else:
+                        out = temporal_network(moving.stored, moving_hidden, moving_output, tau, encoding, slot, y, x)
+                        light += weight * _light_of(moving, clock, target, r, slot, gamma, out)
+        return light
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def decode_pages(
+        # in:
+        tiles: Tiles,
+        moving: Mapped,
+        moving_hidden: wp.array2d[vec_hidden],
+        moving_output: wp.array2d[wp.vec3],
+        still: Mapped,
+        still_hidden: wp.array2d[vec_hidden],
+        still_output: wp.array2d[wp.vec3],
+        frames: StoredFrames,
+        clock: wp.array2d[float],
+        offsets: wp.array1d[wp.vec2i],
+        jobs: Jobs,
+        grid: int,
+        direct: int,
+        # out:
+        out: wp.array3d[wp.uint32],
+    ):
+        k, i, j = wp.tid()
+        slot = jobs.slot[k]
+        if slot >= 0:
+            place = jobs.place[k]
+            sheet = place[0]
+            level = place[1]
+            step = 1 << level
+            size = tiles.size[sheet]
+            rows = (size[0] + step - 1) // step
+            columns = (size[1] + step - 1) // step
+            y = wp.clamp(place[2] + i, 0, rows - 1)
+            x = wp.clamp(place[3] + j, 0, columns - 1)
+            side = int(1)
+            if level > 0:
+                side = grid
+            whole = 2 * side * side
+            light = wp.vec3()
+            count = int(0)
+            o = int(0)
+            while o < offsets.shape[0] and count == 0:
+                yy = y + offsets[o][0]
+                xx = x + offsets[o][1]
+                o += 1
+                if yy >= 0 and xx >= 0 and yy < rows and xx < columns:
+                    for sample in range(side * side):
+                        a = sample // side
+                        b = sample - a * side
+                        ty = yy * step + step * (2 * (a * side + b) + 1) // whole
+                        tx = xx * step + step * (2 * (b * side + side - 1 - a) + 1) // whole
+                        if ty < size[0] and tx < size[1]:
+                            tile = tiles.first[sheet] + (ty // 128) * tiles.columns[sheet] + tx // 128
+                            ty = ty % 128
+                            tx = tx % 128
+                            if level >= _LEVEL and direct == 0:
+                                cell = (ty // 16) * _SIDE + tx // 16
+                                light += _coarse_light(tiles, clock, jobs.target[k], tile, cell)
+                                count += 1
+                            elif _valid(tiles, tile, ty, tx) == 1:
+                                light += texel_light(
+                                    tiles,
+                                    moving,
+                                    moving_hidden,
+                                    moving_output,
+                                    still,
+                                    still_hidden,
+                                    still_output,
+                                    frames,
+                                    clock,
+                                    jobs.target[k],
+                                    tiles.gamma[sheet],
+                                    tile,
+                                    ty,
+                                    tx,
+                                )
+                                count += 1
+            out[slot, i, j] = pack_rgb9e5(light / float(wp.max(count, 1)))
+
+    return decode_pages
+
+
+def put(records, slots, parts, memory) -> None:
+    """Distributes tiles to the arrays of all tiles, which lie one after another in one memory.
+
+    Args:
+        records: uint8 [n, bytes], the tiles, each with its part of each array one after another.
+        slots: int [n], row of each tile in the arrays.
+        parts: int [arrays, 3], for each array its first byte in a record, its bytes of a tile, and its first byte in
+            the memory.
+        memory: uint8 [bytes], written.
+    """
+    wp.launch(_put, records.shape, inputs=[records, slots, parts], outputs=[memory], device=memory.device)
+
+
+def decode(
+    kernel: wp.Kernel, source: tuple[Any, ...], clock, offsets, jobs: Jobs, grid: int, direct: bool, out
+) -> None:
+    """Decodes squares of texels with one launch, which a CUDA graph can capture.
+
+    Args:
+        kernel: From `page_kernel`.
+        source: `Tiles`; `Mapped`, hidden and output layers of the dynamic tiles, and the same of the static ones; the
+            tiles stored as frames.
+        clock: float [times, CLOCK], the times.
+        offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
+        jobs: J squares.
+        grid: Samples of a texel of a mip along each axis.
+        direct: Whether to decode tiles at every level, instead of reading coarse texels from `COARSE_LEVEL` on.
+        out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.
+    """
+    inputs = [*source, clock, offsets, jobs, grid, int(direct)]
+    dim = (jobs.slot.shape[0], *out.shape[1:])
+    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=128)
