@@ -164,7 +164,7 @@ class StripDecoder(_OneTimeDecoder):
 
 
 class MatrixDecoder(_MapDecoder):
-    """Fast decoder of dynamic tiles on a GPU's matrix units (tensor cores), in half floats, with GELU "fast".
+    """Fast decoder of dynamic tiles on a GPU's matrix units (tensor cores), in half floats, with GELU by its tanh form.
 
     A decode is one launch, also between two stored times.
     """

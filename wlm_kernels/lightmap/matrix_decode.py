@@ -2,7 +2,8 @@
 
 A launch does everything: a block of threads decodes a strip of a tile, for which it reads F_uvt, F_ut and F_vt at one
 hour, or at two between which it interpolates the radiance. A thread decodes the texels of a column. Activations and
-weights are half floats, and GELU is its tanh approximation with the GPU's tanh instruction.
+weights are half floats. GELU is its tanh form with the GPU's tanh instruction in half of the units, and in the others a
+polynomial.
 
 Read first: `exact_kernels` in `wlm_kernels/lightmap/decode.py`.
 """
