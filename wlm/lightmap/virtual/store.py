@@ -42,7 +42,6 @@ class _Pool:
     Attributes:
         owner: int [slots], the tile in each slot, or -1.
         arrays: The arrays of the tiles by name: parts of one memory, so that tiles are uploaded with one copy.
-        memory_bytes: Bytes on the device.
     """
 
     def __init__(self, shapes: dict[str, tuple[Any, tuple[int, ...]]], slots: int, device: str) -> None:
@@ -50,12 +49,13 @@ class _Pool:
         that of the tile's rows."""
         self.owner = np.full(slots, -1)
         self._device, self._names = device, list(shapes)
+        self._staging: wp.array | None = None
+        self._records: wp.array | None = None
         sizes = [math.prod(shape) * wp.types.type_size_in_bytes(dtype) for dtype, shape in shapes.values()]
         starts = np.cumsum([0, *(-(-slots * size // _ALIGNED) * _ALIGNED for size in sizes)])
         if starts[-1] >= 2**31:
             raise WlmError(f"tiles: expected less than 2 GiB of tiles of one kind, got {starts[-1]} bytes")
         self._memory = wp.zeros(int(starts[-1]), dtype=wp.uint8, device=device)
-        self.memory_bytes = self._memory.capacity
         records = np.cumsum([0, *sizes])[:-1]
         self._parts = wp.array(np.stack([records, sizes, starts[:-1]], 1).astype(np.int32), dtype=int, device=device)
         self.arrays = {
@@ -68,12 +68,37 @@ class _Pool:
             for (name, (dtype, shape)), start in zip(shapes.items(), starts, strict=False)
         }
 
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes on the device."""
+        return self._memory.capacity + (0 if self._staging is None else self._staging.capacity)
+
+    def free_staging(self) -> None:
+        """Frees the memory through which tiles are uploaded, which has the size of the largest upload."""
+        self._staging = self._records = None
+
     def put(self, slots: np.ndarray, rows: dict[str, np.ndarray]) -> None:
         """Copies n tiles, arrays [n, ...] by name, into slots, int [n]."""
         parts = [np.ascontiguousarray(rows[name]).view(np.uint8).reshape(len(slots), -1) for name in self._names]
-        records = wp.array(np.concatenate(parts, 1), dtype=wp.uint8, device=self._device)
         at = wp.array(slots.astype(np.int32), dtype=int, device=self._device)
-        kernels.put(records, at, self._parts, self._memory)
+        kernels.put(self._upload(np.concatenate(parts, 1)), at, self._parts, self._memory)
+
+    def _upload(self, records: np.ndarray) -> wp.array:
+        """Copies records to the device. Host memory that CUDA may read by itself makes no frame wait for the copy."""
+        if self._device == "cpu":
+            return wp.array(records, dtype=wp.uint8, device="cpu", copy=False)
+        if self._staging is None or len(records) > self._staging.shape[0]:
+            shape = (max(len(records), _UPLOADS), records.shape[1])
+            self._staging = wp.empty(shape, dtype=wp.uint8, device="cpu", pinned=True)
+            self._records = wp.empty(shape, dtype=wp.uint8, device=self._device)
+            self._copied = wp.Event(self._device)
+        else:
+            wp.synchronize_event(self._copied)  # that of an earlier frame, which is over
+        count = len(records)
+        self._staging.numpy()[:count] = records
+        wp.copy(self._records, self._staging, count=records.size)
+        wp.get_stream(self._device).record_event(self._copied)
+        return self._records[:count]
 
 
 class TileStore:
@@ -210,6 +235,8 @@ class TileStore:
             self.change[part] = _changes(words[part], clock.axis.period is not None)
         self.tiles.coarse.assign(words.reshape(self.tiles.coarse.shape))
         self.tiles.slot.assign(self.slot)
+        for pool in self._pools.values():
+            pool.free_staging()
 
     def _chunks(self, own: SheetModel, kind: TileKind) -> Iterator[np.ndarray]:
         numbers = own.numbers(kind)
