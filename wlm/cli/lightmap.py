@@ -385,10 +385,13 @@ def _show_report(file: Path, report: "Report") -> None:
     _show_where_shown(report)
     _show_held_out(report)
     if report.sums:
-        rows = table("sum of the light groups", ["compared with", "times", "PSNR, dB", "SSIM"])
+        rows = table(
+            "sum of the light groups", ["compared with", "times", "PSNR, dB", "SSIM", "PSNR of the inputs, dB"]
+        )
         for score in report.sums:
             name = f"{score.reference}: {score.sheet}"
-            rows.add_row(escape(name), str(len(score.times)), number(score.psnr, ".2f"), number(score.ssim, ".4f"))
+            figures = number(score.psnr, ".2f"), number(score.ssim, ".4f"), number(score.between_inputs, ".2f")
+            rows.add_row(escape(name), str(len(score.times)), *figures)
         show(rows)
     _note_worst(light)
     note_warnings(report.warnings)
