@@ -1,8 +1,8 @@
 """Ablation of the feature maps and of the simulation of block compression (neural-dynamic-gi, section 11).
 
 One profile is fitted again and again in plain torch (`benchmarks.rivals.lightmap_torch`), from the same seed and for as
-many steps, each time with other feature maps of about the same size in bytes. Errors are those after quantisation, with
-the network fitted to the quantised maps at the end (section 4). The rows:
+many steps, each time with other feature maps of about the same size in bytes. Errors are those after quantisation;
+unless a row says otherwise, the network is fitted to the quantised maps at the end (section 4). The rows:
 
 - "hybrid": the maps F_uv, F_uvt, F_ut and F_vt over texture coordinates u, v and time t, as in paper and profile.
 - "2D alone": two maps F_uv and no other map. "3D alone": one F_uvt of 48 x 48 x 15 texels (table 6, figure 9).
@@ -10,6 +10,8 @@ the network fitted to the quantised maps at the end (section 4). The rows:
 - "8 channels of F_uv": two maps F_uv in place of F_ut and F_vt (table 8).
 - "no block simulation": the hybrid trained as 8-bit texels, which a BC7 encoder compresses at the end (table 7,
   figure 10).
+- "encoder at the end": the hybrid trained with noise in place of rounding, and compressed after the last step by an
+  encoder of all modes of BC7, as in the paper (section 3.4). The other rows round in training to the levels of mode 6.
 - "kernels": the hybrid fitted by `wlm.lightmap.compress`, as a check of the fit in plain torch.
 
 Only dynamic tiles, whose light changes over time by more than a common factor, are fitted and measured.
@@ -44,6 +46,7 @@ VARIANTS = {
     "tri-plane": Features(uvt=0, channels=6),
     "8 channels of F_uv": Features(uv=2, channels=0),
     "no block simulation": Features(blocks=False),
+    "encoder at the end": Features(encoded=True),
 }
 """The feature maps of each row except the last, at the sizes of profile M."""
 
