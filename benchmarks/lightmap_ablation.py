@@ -11,12 +11,12 @@ unless a row says otherwise, the network is fitted to the quantised maps at the 
 - "no block simulation": the hybrid trained as 8-bit texels, which a BC7 encoder compresses at the end (table 7,
   figure 10).
 - "encoder at the end": the hybrid trained with noise in place of rounding, and compressed after the last step by an
-  encoder of all modes of BC7, as in the paper (section 3.4). The other rows round in training to the levels of mode 6.
+  encoder of all modes of BC7, as in the paper (section 3.4). The others round in training to the levels of mode 6.
 - "kernels": the hybrid fitted by `wlm.lightmap.compress`, as a check of the fit in plain torch.
-- "held out": `compress` without every second time, scored at these times alone, beside the originals of the times around
-  them, interpolated. Times that are close to others, such as those before and after a lamp is switched, are kept.
-  "network": the network evaluates interpolated features instead of mixing radiance; "paper's axis": with the hour as the
-  axis of the features, too.
+- "held out": `compress` without every second time, scored at these times alone, beside the originals of the times
+  around them, interpolated. Times that are close to others, as those before and after a lamp is switched, are kept.
+  "network": the network evaluates interpolated features, in place of a mix of radiance; "paper's axis": the axis of the
+  features is the hour, too.
 
 Only dynamic tiles, whose light changes over time by more than a common factor, are fitted and measured.
 """
