@@ -14,10 +14,13 @@ from wlm.formats.artifact import read_artifact
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.sheet import LIGHT, Sheet
 from wlm.lightmap.tiles import TileKind
+from wlm.lightmap.virtual.clock import Clock
 from wlm.lightmap.virtual.texture import VirtualTexture
 from wlm.texels import OFFSETS, nearest_valid
+from wlm_kernels.lightmap.pages import AFTER, BEFORE, SHARE, WAITING
 
 KINDS = (3, 4, 2, 1, 0, 3)
 SWITCH = 18.0 + 55.0 / 60.0
@@ -400,6 +403,67 @@ def test_a_damaged_tile_shows_its_parent_page(tmp_path, device):
         assert virtual.report()["warnings"] == virtual.warnings
         with pytest.raises(WlmError):
             model.decoder(tiles=[1])
+
+
+def test_a_tile_that_is_damaged_later_is_one_line(tmp_path, device):
+    random_model((3, 2, 4) * 8, columns=6).save(tmp_path / "a.wlm")
+    with wlm.load(tmp_path / "a.wlm") as model:
+        own = model.light
+        with VirtualTexture(model, device, **SMALL, tiles=450_000) as virtual:
+            tile = int(np.flatnonzero(virtual._stores[0].slot == WAITING)[0])
+            sizes = read_artifact(tmp_path / "a.wlm").pieces["0.tiles"].sizes
+            with open(tmp_path / "a.wlm", "r+b") as file:
+                file.seek(-int(sizes[tile:].sum()), 2)
+                file.write(bytes(sizes[tile]))
+            row, column = np.array(divmod(tile, 6)) * 128
+            # Inside the tile, farther from its border than a page reads.
+            window = np.array([column + 32, row + 32, column + 96, row + 96]) / ([own.width, own.height] * 2)
+            at = view(own, 0.0, 32, window)
+            for _ in range(120):
+                virtual.frame(7.5, *at)
+                virtual.wait(1.0)
+            assert len(virtual.warnings) == 1 and f"tile {tile}: " in virtual.warnings[0]
+            reading = virtual.sample(*at)
+            assert (reading.coarser == 1).all() and reading.light.any()
+            check_tables(virtual)
+
+
+def test_a_view_without_pixels(device):
+    model = random_model((1,), columns=1)
+    nothing = np.zeros((0, 0), np.int32), np.zeros((0, 0, 2), np.float32), np.zeros((0, 0, 4), np.float32)
+    with VirtualTexture(model, device, **SMALL) as virtual:
+        virtual.frame(1.0, *nothing)
+        assert virtual.sample(*nothing).light.shape == (0, 0, 3) and virtual.report()["visible"] == 1
+
+
+@pytest.mark.parametrize(
+    ("times", "period", "moves"),
+    [
+        # Each move: a time, the stored times around it, and whether pages are adopted, dropped and prepared.
+        ((0.0, 6.0, 12.0, 18.0, 18.1), 24.0, [(17.5, (2, 3), 1), (18.05, (3, 4), 1), (18.1, (4, 0), "adopt")]),
+        ((0.0, 6.0, 12.0, 18.0, 18.1), 24.0, [(17.5, (2, 3), 1), (3.0, (0, 1), "adopt"), (17.9, (2, 3), 1)]),
+        ((0.0, 6.0, 12.0, 18.0, 18.1), 24.0, [(17.5, (2, 3), 1), (17.0, (2, 3), "drop"), (16.0, (2, 3), 0)]),
+        # Over midnight.
+        ((0.0, 6.0, 12.0, 18.0, 23.9), 24.0, [(23.0, (3, 4), 1), (23.95, (4, 0), 1), (24.01, (0, 1), "adopt")]),
+        (
+            (0.0, 10.0, 10.5, 20.0),
+            None,
+            [(9.9, (0, 1), 1), (10.5, (2, 3), "adopt"), (99.0, (3, 3), 0), (9.0, (0, 1), 0)],
+        ),
+        ((5.0,), 24.0, [(4.0, (0, 0), 0), (6.0, (0, 0), 0)]),
+        ((5.0,), None, [(4.0, (0, 0), 0), (6.0, (0, 0), 0)]),
+        ((5.0, 5.1), None, [(5.05, (0, 1), 0), (5.1, (1, 1), 0)]),
+    ],
+)
+def test_the_clock_passes_switches(times, period, moves):
+    clock = Clock(TimeAxis(np.array(times), period, "frames"))
+    for time, around, wanted in moves:
+        rows, (adopt, drop, prepare) = clock.frame(time)
+        assert (adopt, drop) == (int(wanted == "adopt"), int(wanted == "drop")), time
+        assert wanted in ("adopt", "drop") or prepare == wanted, time
+        assert rows[0, [BEFORE, AFTER]].tolist() == list(around)
+        held = around[0] in clock.switches
+        assert rows[0, SHARE] == (0.0 if held else np.float32(clock.axis.neighbours(time)[2]))
 
 
 def test_changes_are_those_between_stored_times():

@@ -67,7 +67,8 @@ class Pages:
         place: [P], sheet, level, row and column of each page.
         parent: [P], the page that covers this one in the next coarser level; -1 for the page of a whole sheet, which
             always has a slot.
-        ready: [P], whether a page can be decoded: the tiles that it reads are on the device.
+        ready: [P], 1 for a page whose tiles are on the device, 0 for one that waits for tiles, -1 for the page of a
+            damaged tile: the page above is needed in its place.
         change: [P, T + 1], relative change of a page's light from the first stored time up to each one, summed up over
             time. The last is that of a whole day if the times are periodic.
         slot: [P], slot of the physical texture, or -1.
@@ -203,6 +204,14 @@ def _page_at(pages: Pages, sheet: int, level: int, uv: wp.vec2) -> int:
     return pages.first[sheet, level] + row * columns + column
 
 
+@wp.func
+def _need(pages: Pages, sheet: int, level: int, uv: wp.vec2):
+    page = _page_at(pages, sheet, level, uv)
+    if pages.ready[page] < 0:
+        page = pages.parent[page]
+    wp.atomic_add(pages.need, page, 1)
+
+
 @wp.kernel(enable_backward=False)
 def _mark(
     # in:
@@ -227,9 +236,9 @@ def _mark(
                     if s >= 0:
                         level = _level_of(pages, s, derivative[y, x])
                         fine = int(level)
-                        wp.atomic_add(pages.need, _page_at(pages, s, fine, uv[y, x]), 1)
+                        _need(pages, s, fine, uv[y, x])
                         if level > float(fine):
-                            wp.atomic_add(pages.need, _page_at(pages, s, fine + 1, uv[y, x]), 1)
+                            _need(pages, s, fine + 1, uv[y, x])
 
 
 @wp.func

@@ -338,15 +338,15 @@ class TileStore:
     # ---- tiles that are loaded when they are needed ----
 
     def ready(self) -> np.ndarray:
-        """Returns which pages can be decoded: all tiles that they read are here, or damaged; int32 [P].
+        """Returns `Pages.ready` of `wlm_kernels.lightmap.virtual`: whether the tiles of each page are here, int32 [P].
 
-        The page of a damaged tile itself is never decoded, so that the page above it is shown. The page of a whole
-        sheet is always decoded, with coarse texels in place of tiles that are not here.
+        Damaged tiles count as here: pages that read them have coarse texels in their place, but the page of such a tile
+        itself is never decoded. The page of a whole sheet is always decoded, with coarse texels for missing tiles.
         """
         layout = self.layout
         missing = np.bincount(layout.reader[self.slot[layout.read] == kernels.WAITING], minlength=len(layout.parent))
         broken = (layout.own >= 0) & (self.slot[layout.own] == kernels.BROKEN)
-        return ((missing == 0) & ~broken).astype(np.int32)
+        return np.where(broken, -1, missing == 0).astype(np.int32)
 
     def stream(self, seen: np.ndarray, priority: np.ndarray, frame: int) -> bool:
         """Asks the loader for tiles and uploads those that it has loaded, some in each frame.
