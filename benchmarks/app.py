@@ -117,6 +117,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "Measure smoke: speed of the solver against a memory copy, advection, six-way lightmaps and whole frames.",
         ("quick", "device"),
     ),
+    "fluid-gradients": (
+        "Measure gradients through air and smoke: the time of a step both ways, and memory.",
+        ("quick", "device"),
+    ),
     "smoke-orders": (
         "Measure multiple scattering in smoke: PSNR, FLIP, flicker and time of our method and its rivals.",
         ("quick", "device"),

@@ -51,6 +51,7 @@ VIEWS: dict[str, tuple[Sequence[str], dict[str, Any], str, dict[str, float]]] = 
 }
 # Those that demos make themselves.
 DEMOS = {
+    "fluid-control.png": "fluid_control.png",
     "ops-bc7.png": "ops_bc7.png",
     "ops-march.png": "ops_march.png",
     "ops-silhouette.png": "ops_silhouette.png",

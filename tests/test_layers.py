@@ -12,10 +12,12 @@ BASE = (
 )
 LAYERS = (
     BASE.split(),
-    ["wlm.ops", "wlm.fluid"],
+    ["wlm.ops"],
+    ["wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
+    ["wlm.bake"],
     ["wlm.inspection"],
-    ["wlm.bake", "wlm.export", "wlm.view"],
+    ["wlm.export", "wlm.view"],
     ["wlm.cli"],
     ["wlm.__main__"],
     ["benchmarks"],

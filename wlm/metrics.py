@@ -58,7 +58,8 @@ _EXPOSED_LIMIT = 60.0
 
 _BRIGHT = 0.5  # share of the group's maximum above which a point counts as one of its brightest
 _KEPT = 0.5  # share of a point's own light: a bright point below it is lost, and a larger error makes a dim point lost
-_BRIGHTER = 10.0  # multiple of the median above which a bright point hides the errors of the others
+BRIGHTER = 10.0
+"""Multiple of the median of a group of points above which its brightest point hides the errors of the others."""
 
 
 def check_pair(
@@ -356,7 +357,7 @@ class LostLight:
             worst = int(torch.where(lost, light, 0.0).argmax())
             if self.worst is None or light[worst] > self.worst[0]:
                 self.worst = float(light[worst]), float(kept[worst]), where
-        if largest > _BRIGHTER * light.median():
+        if largest > BRIGHTER * light.median():
             lit = light > 0
             off = int(((_largest(decoded - reference) > _KEPT * light) & lit).count_nonzero())
             if 2 * off > int(lit.count_nonzero()):

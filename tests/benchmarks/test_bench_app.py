@@ -25,6 +25,11 @@ COMMANDS = [
         "lightmap-ablation --quick --device cpu --set city --steps 20 --only '3D alone'",
         {"only": ["3D alone"], "steps": 20},
     ),
+    (
+        ["lightmap-run-time", "--set", "a/city", "--quick"],
+        "lightmap-run-time --set city --quick --device cpu",
+        {"scene_path": Path("a/city"), "quick": True},
+    ),
     (["lightmap-file", "--quick"], "lightmap-file --quick --device cpu", {"quick": True}),
     (
         ["probe", "--no-rivals", "--probes", "a/room.npz", "--key", "sh", "--key", "sh_noon"],
@@ -48,6 +53,7 @@ COMMANDS = [
         {"profile": "cascade", "only": ["ASTC"], "steps": 9},
     ),
     (["smoke", "--quick"], "smoke --quick --device cpu", {"quick": True}),
+    (["fluid-gradients", "--quick"], "fluid-gradients --quick --device cpu", {"quick": True}),
     (["smoke-orders"], "smoke-orders --device cpu", {"quick": False}),
     (
         ["smoke-network", "--network", "a/young.safetensors", "--profile", "paper"],

@@ -143,6 +143,18 @@ def test_evaluate_prints_and_writes_the_report(fitted, folder, tmp_path):
     assert not any(title in scores for title in ("beside charts", "tile borders", "views"))
 
 
+def test_times_left_out_of_the_fit_are_scored_apart(folder, profile, tmp_path):
+    path, report = tmp_path / "a.wlm", tmp_path / "r.json"
+    call("compress", folder, "-o", path, "--profile", profile, "--period", 24, "--hold-out", "5,13.5")
+    assert json.loads(call("info", path, "--json"))["times"] == [0.0, 11.0, 20.0]
+    text = call("evaluate", path, folder, "--period", 24, "--json", report)
+    (sheet,) = json.loads(report.read_text())["sheets"]
+    assert sheet["held_out"]["times"] == [5.0, 13.5]
+    shown = text.split("that the file does not store")[1]
+    for name in ("decoded", "mixed"):
+        assert f"{sheet['held_out'][name]['psnr']:.2f}" in shown
+
+
 def test_info_says_what_is_in_the_file(fitted):
     facts = json.loads(call("info", fitted, "--json"))
     assert facts["bytes_on_disk"] == fitted.stat().st_size == sum(facts["parts"].values())
@@ -197,6 +209,10 @@ def test_a_set_that_names_files_elsewhere_needs_trust(folder, fitted, tmp_path):
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--steps", "many"], "--steps"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--seed", "-1"], "--seed"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--times", "noon"], "expected a number or start"),
+        (
+            ["compress", "{set}", "-o", "{tmp}/a.wlm", "--hold-out", "7"],
+            "expected times of the set to leave out, got 7",
+        ),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--profile", "XXL"], "profile 'XXL'"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--profile", "{tmp}/x.yaml"], "x.yaml"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--device", "cuda:9"], "device 'cuda:9'"),

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+from importlib.util import find_spec
 from pathlib import Path
 
 import imagecodecs
@@ -15,7 +16,7 @@ import pytest
 from builders import small_sets
 from builders.contract import FILES
 from builders.godot_bakes import Writer, bake, probes
-from builders.running import call
+from builders.running import call, fails
 from fuzz.readers import _own_lights as own_lights
 from PIL import Image
 from typer.testing import CliRunner
@@ -155,7 +156,7 @@ def kinds() -> dict[str, dict[str, bytes]]:
         | {".npz": small_npz(**{"position": probes(9)[0], "sh_-1 $'": probes(9)[1], "sh-2": probes(9)[1]})},
         "scores": {".json": b'{"psnr": 40.0}'},
         "set": {"set.json": stored["set.json"]},
-        "settings": {".yaml": yaml_scene, " profile.yml": b"steps: 10", " bake.yaml": b"geometry: a.glb"},
+        "settings": {".yaml": yaml_scene, " profile.yml": b"steps: 10", " bake.yaml": b"geometry: mesh.glb"},
         "unity asset": {".asset": stored["probes.asset"]},
         "volume": {f" {name}": stored[name] for name in ("volume.npz", "volume-bricks.npz")}
         | {".nvdb": gzip.decompress(stored["cloud.nvdb.gz"])},
@@ -172,6 +173,9 @@ def run(finding) -> None:
     if finding.command:
         split = ["bash", "-c", f"printf '%s\\0' {finding.command}"]
         words = subprocess.run(split, capture_output=True, check=True).stdout.decode().split("\0")[1:-1]
+        if words[0] == "bake" and find_spec("mitsuba") is None:
+            assert "the extra" in fails(*words[:-1], "BAKED") and "wlm[bake]" in finding.problems[-1]
+            return
         call(*words, *TINY.get(input_system(words[1]) if words[0] == "compress" else words[1], []))
 
 
@@ -185,11 +189,29 @@ def test_every_printed_command_works_as_printed(kind, tmp_path, monkeypatch):
         path.write_bytes(content if isinstance(content, bytes) else b"".join(map(bytes, content)))
         if kind == "set":
             copy(folder, {"a.exr": "light.exr", "b.exr": "light.exr", "mask.png": "mask-grey.png"})
+        if kind == "settings":
+            copy(Path(), {"mesh.glb": "mesh.glb"})
         assert files.kind_of(path) == kind
         (finding,) = inspect(path)
         printed = CliRunner().invoke(app, ["inspect", "--", str(path)]).output.splitlines()[0]
         assert printed.startswith(f"{printable(str(finding.path))}: ") and printed.endswith(finding.command)
         run(finding)
+
+
+def test_a_scene_to_bake_without_lightmap_uvs_gives_probes(tmp_path):
+    (tmp_path / "a.yaml").write_text("geometry: a.gltf\nhours: [6, 18]")
+    copy(tmp_path, {"image.png": "mask-grey.png"})
+    content = json.loads((CORPUS / "mesh.gltf").read_bytes())
+    for mesh in content["meshes"]:
+        for each in mesh["primitives"]:
+            each["attributes"] = {name: at for name, at in each["attributes"].items() if name[:8] != "TEXCOORD"}
+    (tmp_path / "a.gltf").write_text(json.dumps(content))
+    finding = inspect(tmp_path / "a.yaml")[0]
+    assert finding.what == "a scene to bake at 2 hours, a.gltf" and finding.command.startswith("wlm bake probes ")
+    assert "lightmap.unwrap: true creates new UVs" in finding.problems[0]
+    (tmp_path / "a.yaml").write_text("geometry: a.gltf\nlamps: [{material: none}]")
+    finding = inspect(tmp_path / "a.yaml")[0]
+    assert finding.command == "" and "lamps.0.material: expected one of" in finding.problems[0]
 
 
 def copy(folder: Path, names: dict[str, str]) -> None:
@@ -223,6 +245,14 @@ def test_every_command_for_a_folder_works(names, command, tmp_path, monkeypatch)
     )
     for finding in found if command else ():
         run(finding)
+
+
+def test_one_texture_of_a_flip_book_is_no_lightmap(tmp_path):
+    copy(tmp_path, {"x_RLT.exr": "light.exr", "y_BBF.png": "flipbook.png", "rltd.exr": "light.exr"})
+    text = told(tmp_path)
+    half = "by its name half of a flip book of six-way lightmaps of smoke, without"
+    assert f"{half} x_BBF.exr -> \n" in text and f"{half} y_RLT.png or y_TLR.png -> " in text
+    assert "rltd.exr: a lightmap" in text
 
 
 def test_all_folders_that_are_written_are_known():

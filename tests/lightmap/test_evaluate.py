@@ -11,7 +11,7 @@ import wlm
 from wlm.errors import WlmError
 from wlm.lightmap.codec import part_bytes
 from wlm.lightmap.data import from_arrays, load
-from wlm.lightmap.evaluation import bits_per_texel, evaluate, lost_light
+from wlm.lightmap.evaluation import bits_per_texel, evaluate
 from wlm.lightmap.fit import compress
 from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import TILE
@@ -101,8 +101,8 @@ def test_a_set_that_does_not_fit_is_one_line(fitted):
     frames, times, mask = lightmaps.light.frames, lightmaps.times, lightmaps.light.mask
     for other, says in (
         (from_arrays(frames[:, :-1], times, mask[:-1]), "has 228x199 texels, but the file four has 228x200"),
-        (from_arrays(frames[:3], times[:3], mask), "has 3 times, but the file four holds 5"),
-        (from_arrays(frames, times + 0.1, mask), "time 0 is 0.1, but in the file four it is 0"),
+        (from_arrays(frames[:3], times[:3], mask), "expected a lightmap at 13.5, as in the file four, found none"),
+        (from_arrays(frames, times + 0.1, mask), "expected a lightmap at 0, as in the file four, found none"),
         (from_arrays(frames, times, ~mask), "no tile of the file four has a valid texel"),
     ):
         with pytest.raises(WlmError, match=says):
@@ -122,11 +122,58 @@ def test_a_firefly_that_is_lost_is_said():
     frames[2, 60, 60] = 1e4
     lightmaps = from_arrays(frames, plain.times, period=24.0, name="fly")
     model = compress(lightmaps, tiny_profile(steps=60))
-    (line,) = lost_light(model, lightmaps)
+    (line,) = model.warnings
     assert line.startswith("fly: 1 texel among the brightest of their tile lost more than half of the light; the larg")
     assert "of 1e+04 decodes to 0." in line and line.endswith("(tile 0 at 11)")
     assert line in evaluate(model, lightmaps, metrics=("psnr",)).warnings
-    assert lost_light(compress(plain, tiny_profile(steps=60)), plain) == []
+    assert compress(plain, tiny_profile(steps=60)).warnings == ()
+
+
+def test_a_bright_patch_that_hides_the_rest_is_said():
+    """Errors of a tile are relative to its range, which hides that the dim texels are off by half of their light."""
+    plain = moving_light(128, 128)
+    frames = plain.light.frames.copy()
+    frames[:, 20:60, 20:60] = 6e4
+    lightmaps = from_arrays(frames, plain.times, period=24.0, name="patch")
+    model = compress(lightmaps, tiny_profile(steps=60))
+    report = evaluate(model, lightmaps, metrics=("psnr",))
+    (line,) = (line for line in model.warnings if "most of their tile" in line)
+    assert line.startswith("patch: ") and line in report.warnings
+
+
+def test_times_that_the_model_lacks_are_scored_by_themselves(fitted):
+    whole, _, _ = fitted
+    stored = whole.without([5.0, 13.5])
+    light = whole.light
+    assert stored.source == from_arrays(light.frames[[0, 2, 4]], light.times[[0, 2, 4]], light.mask, 24.0).source
+    model = compress(stored, tiny_profile(steps=60))
+    report, alone = evaluate(model, whole, metrics=("psnr",)), evaluate(model, stored, metrics=("psnr",))
+    held, decoder = report.light.held_out, model.decoder()
+    assert report.psnr == alone.psnr and report.warnings == [] and alone.light.held_out is None
+    assert held.times.tolist() == [5.0, 13.5] and report.times.tolist() == [0.0, 11.0, 20.0]
+    for i, (k, before, share) in enumerate(((1, 0, 5.0 / 11.0), (3, 2, 2.5 / 9.0))):
+        mixed = (1.0 - share) * light.frames[before] + share * light.frames[(2, 4)[i]]
+        for scores, frame in ((held.decoded, decoder.frame(light.times[k])), (held.mixed, mixed)):
+            expected = summarise([evaluate_frame(light.frames[k], frame, light.mask, metrics=["psnr"])])
+            assert scores.psnr_by_time[i] == pytest.approx(expected.psnr, rel=1e-6)
+    assert held.mixed.psnr != held.decoded.psnr
+    for times, says in (([7.0], "expected times of the set to leave out, got 7"), (HOURS, "at least one time")):
+        with pytest.raises(WlmError, match=says):
+            whole.without(times)
+
+
+def test_a_texel_of_a_time_that_is_left_out():
+    """A texel that no other time has is not valid in what remains, and light of that time fills no other."""
+    frames = moving_light(128, 128).light.frames
+    mask = np.ones(frames.shape[:3], bool)
+    mask[[0, 2, 3, 4], :10] = False
+    mask[2, 20:30] = mask[3, 40:50] = False
+    whole = from_arrays(frames, HOURS, mask, 24.0)
+    stored = whole.without([HOURS[1]]).light
+    expected = from_arrays(frames[[0, 2, 3, 4]], np.delete(HOURS, 1), mask[[0, 2, 3, 4]], 24.0).light
+    assert not stored.mask[:10].any() and stored.mask[10:].all()
+    np.testing.assert_array_equal(stored.covered, expected.covered)
+    np.testing.assert_array_equal(stored.frames[:, 10:], expected.frames[:, 10:])
 
 
 def test_each_hour_is_scored_on_its_own_texels():

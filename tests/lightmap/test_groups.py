@@ -142,13 +142,14 @@ def test_the_sum_is_scored_beside_the_groups(fitted, sets):
     assert originals.times.tolist() == [0.0, 5.0, 11.0, 13.5, 20.0] and baked.times.tolist() == [5.0, 11.0]
     # The bake has exactly the light of the groups, so its score is that of their errors.
     np.testing.assert_allclose(baked.psnr_by_time, originals.psnr_by_time[1:3], atol=0.01)
+    assert baked.between_inputs > 100.0 and np.isnan(originals.between_inputs)
     assert report.to_json()["sums"][1]["psnr"] == pytest.approx(baked.psnr)
     decoded = model.decoder().frame(11.0)
     assert baked.psnr_by_time[1] == pytest.approx(psnr(noon + lamps, decoded), abs=0.01)
 
     unlit = from_arrays(np.stack([early, noon]), [5.0, 11.0], period=24.0)
     missed = wlm.lightmap.evaluate(model, lit, metrics=("psnr",), all_lights=unlit).sums[1]
-    assert missed.psnr < baked.psnr - 3.0, "a lamp that the bake lacks"
+    assert missed.psnr < baked.psnr - 3.0 and missed.between_inputs < 30.0, "a lamp that the bake lacks"
     small = from_arrays(np.ones((1, 64, 64, 3)), [0.0])
     assert "expected lightmaps of 128x128, got 64x64" in error_of(wlm.lightmap.evaluate, model, lit, all_lights=small)
     layers = from_layers([Layer(np.ones((1, 128, 128, 3)), "other")], [0.0])

@@ -436,7 +436,7 @@ def test_block(section: str, tmp_path: Path):
 def test_page():
     kernels = ["Tapes-0", *(f"funcs-{i}" for i in range(4))]
     torch_alone = [
-        f"{name}-0" for name in ("bc7_map", "plane", "mlp", "gaussian_sum", "rasterize", "antialias", "march")
+        f"{name}-0" for name in ("bc7_map", "plane", "mlp", "gaussian_sum", "rasterize", "antialias", "march", "Air")
     ]
     assert [*BLOCKS] == kernels + torch_alone
     for target in re.findall(r"\]\(([^)#\s]+)\)", PAGE):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from wlm.bake.settings import LightmapSettings
+from wlm.bake.settings import BakeScene, LightmapSettings
 from wlm.errors import WlmError, one_line
 from wlm.formats.gltf import (
     GltfDocument,
@@ -158,6 +158,18 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
             f"float32 rays are too coarse at the farthest coordinate, {reach:.3g}"
         )
     return geometry
+
+
+def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
+    """Checks that the materials named by lamps exist; `path` is the scene file, for the message.
+
+    Raises:
+        WlmError: A material doesn't exist.
+    """
+    names = sorted({each.material.name for each in geometry.surfaces})
+    for i, lamp in enumerate(scene.lamps):
+        if lamp.material is not None and lamp.material not in names:
+            raise WlmError(f"{path}: lamps.{i}.material: expected one of {', '.join(names)}, got {lamp.material!r}")
 
 
 def _surface(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from wlm.bake.backend import start
-from wlm.bake.geometry import Geometry, read_geometry
+from wlm.bake.geometry import Geometry, check_lamps, read_geometry
 from wlm.bake.texels import Texels, place_texels
 from wlm.bake.work import Task, each_hour, noise_share
 from wlm.errors import WlmError, one_line
@@ -91,7 +91,7 @@ def bake_lightmaps(
     denoise = need("pyoidn", "bake").denoise if scene.denoise else None
     # Both modules can only be imported after Mitsuba's variant is set.
     from wlm.bake.paths import irradiance
-    from wlm.bake.world import check_lamps, make_hour
+    from wlm.bake.world import make_hour
 
     geometry = read_geometry(task.geometry, scene.lightmap, task.trust)
     check_lamps(task.path, scene, geometry)

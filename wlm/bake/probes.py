@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from wlm.bake.backend import start
-from wlm.bake.geometry import Geometry, read_geometry
+from wlm.bake.geometry import Geometry, check_lamps, read_geometry
 from wlm.bake.settings import ProbeSettings
 from wlm.bake.work import Task, each_hour, noise_share
 from wlm.errors import WlmError
@@ -83,7 +83,7 @@ def bake_probes(
     start(device)
     # Both modules can only be imported after Mitsuba's variant is set.
     from wlm.bake.paths import harmonics
-    from wlm.bake.world import check_lamps, make_hour
+    from wlm.bake.world import make_hour
 
     geometry = read_geometry(task.geometry, None, task.trust)
     check_lamps(task.path, scene, geometry)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from wlm.bake.daylight import sun_direction
 from wlm.bake.geometry import Geometry, Surface
 from wlm.bake.paths import SUN_ANGLE, Sun, Tracing
 from wlm.bake.settings import BakeScene, Daylight
-from wlm.errors import WlmError
 
 with suppress(ImportError):  # `wlm.bake.backend.start`, which runs first, reports a missing package
     import drjit as dr
@@ -22,18 +20,6 @@ with suppress(ImportError):  # `wlm.bake.backend.start`, which runs first, repor
 _SKY_ROWS = 128
 _DISC_SAMPLES = 1 << 12
 _DAY = 24.0
-
-
-def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
-    """Checks that the materials named by lamps exist; `path` is the scene file, for the message.
-
-    Raises:
-        WlmError: A material doesn't exist.
-    """
-    names = sorted({each.material.name for each in geometry.surfaces})
-    for i, lamp in enumerate(scene.lamps):
-        if lamp.material is not None and lamp.material not in names:
-            raise WlmError(f"{path}: lamps.{i}.material: expected one of {', '.join(names)}, got {lamp.material!r}")
 
 
 def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, hour: float) -> tuple[Any, Tracing]:

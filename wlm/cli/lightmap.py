@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from wlm.lightmap import LightmapModel, LightmapSet, Report
     from wlm.lightmap.evaluation import SheetReport
     from wlm.lightmap.model import SheetModel
+    from wlm.metrics import Summary
 
 _Set = Annotated[
     Path,
@@ -116,6 +117,13 @@ def compress(
     layers: _Layers = None,
     encoding: Encoding = None,
     groups: _Groups = None,
+    hold_out: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIMES",
+            help="Times of the set to leave out of the fit, such as 1:24:2; `wlm evaluate` scores them by themselves.",
+        ),
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -141,20 +149,25 @@ def compress(
     """
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
     options |= {"workers": workers, "cluster": cluster}
-    data, model, facts = models.fit(
+
+    def read() -> "LightmapSet":
+        from wlm.lightmap.data import parse_times
+
+        left_out = None if hold_out is None else parse_times(hold_out)
+        lightmaps = _load(set_path, times, mask, period, layers, encoding, groups, trust)
+        return lightmaps if left_out is None else lightmaps.without(left_out)
+
+    _, model, facts = models.fit(
         "lightmap",
-        lambda: _load(set_path, times, mask, period, layers, encoding, groups, trust),
+        read,
         output,
         profile,
         settings,
         **options,
     )
-    from wlm.lightmap.evaluation import lost_light
-
     show_facts(model.name, facts | _facts(model))
     _show_sheets(model)
-    # The device of a cluster is not on this machine.
-    note_warnings((*model.warnings, *lost_light(model, data, "cpu" if cluster is not None else device)))
+    note_warnings(model.warnings)
 
 
 def evaluate(
@@ -370,18 +383,34 @@ def _show_report(file: Path, report: "Report") -> None:
         rows.add_row(f"time {stamp:g}", *map(number, values, (".2f", ".4f", ".4f")))
     show(rows)
     _show_where_shown(report)
+    _show_held_out(report)
     if report.sums:
-        rows = table("sum of the light groups", ["compared with", "times", "PSNR, dB", "SSIM"])
+        rows = table(
+            "sum of the light groups", ["compared with", "times", "PSNR, dB", "SSIM", "PSNR of the inputs, dB"]
+        )
         for score in report.sums:
             name = f"{score.reference}: {score.sheet}"
-            rows.add_row(escape(name), str(len(score.times)), number(score.psnr, ".2f"), number(score.ssim, ".4f"))
+            figures = number(score.psnr, ".2f"), number(score.ssim, ".4f"), number(score.between_inputs, ".2f")
+            rows.add_row(escape(name), str(len(score.times)), *figures)
         show(rows)
     _note_worst(light)
     note_warnings(report.warnings)
 
 
-def _cells(report: "Report | SheetReport", columns: Any) -> list[str]:
+def _cells(report: "Report | Summary", columns: Any) -> list[str]:
     return [number(factor * getattr(report, name), form) for _, name, form, factor in columns]
+
+
+def _show_held_out(report: "Report") -> None:
+    """Prints the scores at times that the file does not store, and of the originals around them, interpolated."""
+    held = {escape(sheet.label): own.held_out for sheet, own in report.sheets.items() if own.held_out is not None}
+    if held:
+        columns = ["times", *(heading for heading, *_ in _SCORES)]
+        rows = table("times of the set that the file does not store", ["", *columns])
+        for name, scores in held.items():
+            for what, own in (("decoded", scores.decoded), ("originals at stored times, interpolated", scores.mixed)):
+                rows.add_row(f"{name}: {what}", str(len(scores.times)), *_cells(own, _SCORES))
+        show(rows)
 
 
 def _show_where_shown(report: "Report") -> None:

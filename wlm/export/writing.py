@@ -35,7 +35,10 @@ _KITS = {
     "probe": "wlm.probe.engines.{engine}",
     "smoke": "wlm.export.engines.smoke",
 }
-"""Module of each system, whose function `write_kit` writes a bundle for an engine; probes have one per engine."""
+"""Module of each system, whose function `write_kit` writes a bundle for an engine; probes have one per engine.
+
+That of a system with collections has a function `write_collection`, which writes what the kits of the parts share.
+"""
 
 
 def export(
@@ -128,6 +131,7 @@ def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: 
     parts = {name: part for name, part in bundle.parts.items() if "values" not in part.document}
     if not parts:
         raise WlmError(f"{bundle.name}: cannot export for {engine}: expected a layer of light, found only others")
+    import_module(_KITS[bundle.system].format(engine=engine)).write_collection(bundle, folder, engine)
     for name, part in parts.items():
         (folder / name).mkdir()
         _write_kit(part, folder / name, engine, device, options)

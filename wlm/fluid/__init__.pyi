@@ -1,5 +1,8 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
 from wlm.fluid.faces import FACES as FACES
+from wlm.fluid.gradients import DifferentiableLattice as DifferentiableLattice
+from wlm.fluid.gradients import DifferentiableSolver as DifferentiableSolver
+from wlm.fluid.gradients import SmokeState as SmokeState
 from wlm.fluid.lattice import Domain as Domain
 from wlm.fluid.lattice import Lattice as Lattice
 from wlm.fluid.obstacles import Mesh as Mesh

@@ -96,16 +96,24 @@ def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
     return tuple(zip(ends[::2], ends[1::2], strict=True))
 
 
+def inlet_rows(faces: Mapping[str, Face]) -> np.ndarray:
+    """Returns int32, for each cell of each face in the order of `FACES`: its number among the inlets' cells, or -1."""
+    opened = [(faces[name].kind == INLET).ravel() for name in FACES if name in faces]
+    inlet = np.concatenate([np.zeros(0, bool), *opened])
+    return np.where(inlet, np.cumsum(inlet) - 1, -1).astype(np.int32)
+
+
 def face_links(
     shape: tuple[int, int, int], lattice: VelocitySet, faces: Mapping[str, Face]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Lists the links of the faces: the populations that a boundary condition sends into the box.
 
     Axes with walls at rest at both ends have none. Links are sorted by direction, then by cell. The links of solid
     cells are included; the kernels skip them.
 
     Returns:
-        `cell` int32 [L], `code` uint8 [L] and `term` float32 [L] of `wlm_kernels.fluid.lattice_links.Links`.
+        `cell` int32 [L], `code` uint8 [L] and `term` float32 [L] of `wlm_kernels.fluid.lattice_links.Links`; and
+        int32 [L], the cell of a face that decides, numbered through all faces in the order of `FACES`.
     """
     bounded = bounded_axes(faces)
     closed = np.array(walled_axes(faces))
@@ -121,6 +129,7 @@ def face_links(
         walled = (((source < 0) | (source >= np.array(shape))) & closed).any(1)
         rank = np.full(len(cells), 255)
         kind, velocity, excess = np.zeros(len(cells), np.uint8), np.zeros((len(cells), 3)), np.zeros(len(cells))
+        decides, before = np.zeros(len(cells), np.int32), 0
         for number, name in enumerate(FACES):
             axis, high = divmod(number, 2)
             if name not in faces:
@@ -132,9 +141,11 @@ def face_links(
             at = first[wins], second[wins]
             rank[wins], kind[wins], velocity[wins] = face.rank[at], face.kind[at], face.velocity[at]
             excess[wins] = face.excess
+            decides[wins] = before + at[0] * face.kind.shape[1] + at[1]
+            before += face.kind.size
         linked = (rank < 255) & ~walled
         momentum = 6.0 * lattice.w[q] * (velocity @ np.array(lattice.c[q], float))
         term = np.where((kind == BOUNCE) | (kind == INLET), momentum, excess)
-        links.append((cells[linked], (q + 32 * kind)[linked], term[linked]))
-    columns = zip(*links, strict=True)
-    return tuple(np.concatenate(c).astype(t) for c, t in zip(columns, (np.int32, np.uint8, np.float32), strict=True))
+        links.append((cells[linked], (q + 32 * kind)[linked], term[linked], decides[linked]))
+    types = np.int32, np.uint8, np.float32, np.int32
+    return tuple(np.concatenate(c).astype(t) for c, t in zip(zip(*links, strict=True), types, strict=True))

@@ -13,14 +13,14 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from wlm.errors import WlmError
-from wlm.fluid.faces import Face, bounded_axes, face_links, make_face, walled_axes
+from wlm.fluid.faces import Face, bounded_axes, face_links, inlet_rows, make_face, walled_axes
 from wlm.formats.parts import Part, check_parts
 from wlm.interop import free_memory, no_collection
 from wlm_kernels.fluid import lattice_links
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
-from wlm_kernels.fluid.lattice_fields import fluid_kernels
+from wlm_kernels.fluid.lattice_fields import FluidKernels, fluid_kernels
 from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
-from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, tables
+from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, Tables, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
 BODIES = 256
@@ -82,6 +82,55 @@ def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp
             f"{name}: {cells} cells need {needed / 2**30:.1f} GiB on {device}: expected at most the"
             f" {free / 2**30:.1f} GiB that are free: use {remedy}"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """The settings of a lattice of N cells, with copies of its L links, solids and force, for `wlm.fluid.gradients`.
+
+    Attributes:
+        shape: Cells along x, y and z.
+        spec: The settings for which the kernel of a step is specialised.
+        tables: The velocity set.
+        bounded: 1 for each axis that is not periodic, else 0.
+        tau, eddy: Relaxation time, and factor of the eddy viscosity.
+        ramp: Number of steps in which inlets rise to their velocity.
+        links: The links of faces and solids.
+        inlet: int [L], the cell of an inlet that decides a link, numbered in the order of `FACES`, or -1.
+        inlets: Number of cells of inlets.
+        outlets: Whether there are outlets.
+        link_kernels, fluid_kernels: Kernels for the lattice's velocity set.
+        solid: uint8 [N], number of the body of each cell; [0] without solids.
+        bodies: vec3 [256], velocity of each body.
+        forces: vec3 [N], the force; [0] without.
+    """
+
+    shape: tuple[int, int, int]
+    spec: Spec
+    tables: Tables
+    bounded: wp.vec3i
+    tau: float
+    eddy: float
+    ramp: int
+    links: lattice_links.Links
+    inlet: wp.array
+    inlets: int
+    outlets: bool
+    link_kernels: lattice_links.LinkKernels
+    fluid_kernels: FluidKernels
+    solid: wp.array
+    bodies: wp.array
+    forces: wp.array
+
+
+def blown_up(key: int, shape: tuple[int, int, int]) -> WlmError:
+    """Returns the error of a flow that blew up; `key` is that of `wlm_kernels.fluid.lattice.trouble_of`."""
+    step, cell, cause = trouble_of(key)
+    indices = tuple(int(a) for a in np.unravel_index(cell, shape))
+    return WlmError(
+        f"lattice: blew up in step {step} at cell {indices}: {cause}; expected speeds below {MAX_SPEED} and a"
+        f" viscosity at which the operator is stable: use a shorter step, a larger viscosity or smagorinsky=0.17"
+    )
 
 
 class Lattice:
@@ -317,12 +366,7 @@ class Lattice:
         key = int(self._trouble.numpy()[0])
         if key == QUIET:
             return
-        step, cell, cause = trouble_of(key)
-        indices = tuple(int(a) for a in np.unravel_index(cell, self.shape))
-        raise WlmError(
-            f"lattice: blew up in step {step} at cell {indices}: {cause}; expected speeds below {MAX_SPEED} and a"
-            f" viscosity at which the operator is stable: use a shorter step, a larger viscosity or smagorinsky=0.17"
-        )
+        raise blown_up(key, self.shape)
 
     # Results.
 
@@ -406,6 +450,42 @@ class Lattice:
         spare.zero_()
         self._find_links()
 
+    def setup(self) -> Setup:
+        """Returns the settings with copies of the links, solids and force, which no later change affects."""
+        self._prepare()
+        links = lattice_links.Links()
+        links.faces = self._links.faces
+        for name in ("cell", "code", "term", "value", "used"):
+            setattr(links, name, wp.clone(getattr(self._links, name)))
+        inlet = np.full(links.cell.shape[0], -1, np.int32)
+        rows = inlet_rows(self._faces)
+        inlet[: links.faces] = rows[self._decides] if len(rows) else -1
+        inlet[links.code.numpy() >> 5 != INLET] = -1
+        kinds = {int(kind) for face in self._faces.values() for kind in np.unique(face.kind)}
+        return Setup(
+            shape=self.shape,
+            spec=self._spec,
+            tables=self._tables,
+            bounded=self._bounded,
+            tau=self._tau,
+            eddy=self._eddy,
+            ramp=round(1.0 / self._rise),
+            links=links,
+            inlet=wp.array(inlet, dtype=int, device=self.device),
+            inlets=int(rows.max(initial=-1)) + 1,
+            outlets=bool(kinds & {OUTLET, PRESSURE}),
+            link_kernels=self._link_kernels,
+            fluid_kernels=self._fluid_kernels,
+            solid=wp.clone(self._solid),
+            bodies=wp.clone(self._velocity),
+            forces=wp.clone(self._forces),
+        )
+
+    def populations(self) -> wp.array:
+        """Returns a copy of the populations as the lattice stores them, [Q, X, Y, Z], see `state`."""
+        self._prepare()
+        return wp.clone(self._buffers[0]).reshape((len(self._set.c), *self.shape))
+
     # Checked arguments.
 
     def _vectors(self, name: str, value: ArrayLike) -> wp.array:
@@ -457,7 +537,7 @@ class Lattice:
         sets = self._spec.lattice, self._spec.storage
         self._link_kernels = lattice_links.link_kernels(*sets, OUTLET in kinds)
         self._fluid_kernels = fluid_kernels(*sets, walls)
-        columns = face_links(self.shape, self._set, self._faces)
+        *columns, self._decides = face_links(self.shape, self._set, self._faces)
         self._links = self._make_links(columns, len(columns[0]))
         self._find_links()
 

@@ -69,6 +69,15 @@ class Source:
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}: expected a finite number of at least 0, got {value}")
 
+    def region(self, refinement: int) -> tuple[int, list[float], list[float]]:
+        """Returns the shape's code in `advection_sources`, and centre and size in cells of smoke."""
+        shape = advection_sources.BOX if self.shape == "box" else advection_sources.SPHERE
+        return shape, [refinement * v for v in self.centre], [refinement * v for v in self.size]
+
+    def steps(self, substeps: int) -> float:
+        """Returns the factor of density and temperature in a step of the solver."""
+        return 1.0 if self.fixed else float(substeps)
+
 
 @dataclass(frozen=True)
 class Buoyancy:
@@ -89,6 +98,45 @@ class Buoyancy:
             raise ValueError("buoyancy: expected finite numbers, got NaN or infinity")
         if len(self.up) != 3 or abs(math.hypot(*self.up) - 1.0) > 1e-4:
             raise ValueError(f"up: expected a vector of length 1, got {self.up}")
+
+    @property
+    def by_density(self) -> list[float]:
+        """The acceleration at density 1 and temperature 0, (3,)."""
+        return [-self.weight * a for a in self.up]
+
+    @property
+    def by_temperature(self) -> list[float]:
+        """The acceleration at temperature 1 and density 0, (3,)."""
+        return [self.lift * a for a in self.up]
+
+
+@dataclass(frozen=True, eq=False)
+class SmokeSetup:
+    """The settings of a solver, with a copy of its obstacles, for `wlm.fluid.gradients`.
+
+    Attributes:
+        shape: Cells of smoke along x, y and z.
+        box: The domain.
+        walls: uint8 [cells of the lattice], marks of solids; [0] without obstacles.
+        scheme, storage, substeps, sources, buoyancy: As for `Solver`.
+        temperature: Whether the smoke has a temperature.
+        decay: Factors of density and temperature per step.
+        bricks: Whether only bricks with smoke are computed.
+        moves: Whether an obstacle moves.
+    """
+
+    shape: tuple[int, int, int]
+    box: advection_places.Box
+    walls: wp.array
+    scheme: str
+    storage: str
+    substeps: int
+    sources: tuple[Source, ...]
+    buoyancy: Buoyancy | None
+    temperature: bool
+    decay: tuple[float, float]
+    bricks: bool
+    moves: bool
 
 
 def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
@@ -313,6 +361,24 @@ class Solver:
             emission=emission,
         )
 
+    def setup(self) -> SmokeSetup:
+        """Places the obstacles as the next step would, and returns the settings with a copy of their cells."""
+        self._place_obstacles()
+        return SmokeSetup(
+            shape=self.shape,
+            box=self._box,
+            walls=wp.clone(self._walls[0]),
+            scheme=self.scheme,
+            storage=self._settings["storage"],
+            substeps=self.substeps,
+            sources=self.sources,
+            buoyancy=self.buoyancy,
+            temperature=self.temperature is not None,
+            decay=self._decay,
+            bricks=self._bricks is not DENSE,
+            moves=any(obstacle.path.moves for obstacle in self.obstacles),
+        )
+
     # Checkpoints.
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -419,20 +485,16 @@ class Solver:
             for fields in self._fields:
                 advection_sources.empty_retired(box, bricks, fields)
         if self.buoyancy is not None:
-            by_density = [-self.buoyancy.weight * a for a in self.buoyancy.up]
-            by_temperature = [self.buoyancy.lift * a for a in self.buoyancy.up]
-            force = self._force.flatten()
-            advection_sources.buoyancy(box, walls, self._fields[0], by_density, by_temperature, force, bricks)
+            by = self.buoyancy.by_density, self.buoyancy.by_temperature
+            advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)
         self._carry()
         for source in self.sources:
-            shape = advection_sources.BOX if source.shape == "box" else advection_sources.SPHERE
-            steps = 1.0 if source.fixed else float(self.substeps)
-            centre, size = ([box.refinement * v for v in lengths] for lengths in (source.centre, source.size))
+            steps = source.steps(self.substeps)
             value = (steps * source.density, steps * source.temperature)
-            where = [box, walls, shape, centre, size, value]
+            where = [box, walls, *source.region(box.refinement), value]
             advection_sources.add_source(*where, self._fields[0], fixed=source.fixed, bricks=bricks)
 
     def _carry(self) -> None:

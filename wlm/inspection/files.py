@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -316,7 +317,7 @@ def _settings(path: Path) -> Finding:
         what = f"a scene of smoke: {count_of(range(scene.frames), 'frame')} at {scene.rate:g} a second"
         return Finding(path, what, command("smoke", "simulate", path, "-o", "DIR"))
     if "geometry" in values:
-        return Finding(path, "a scene for wlm bake lightmaps and wlm bake probes")
+        return _bake_scene(path)
     fitting, faults = [], {}
     for system in _MODELS:
         profile = import_module(f"wlm.{system}").Profile
@@ -329,6 +330,26 @@ def _settings(path: Path) -> Finding:
         use = "wlm smoke train" if fitting == ["smoke"] else "--profile of wlm compress"
         return Finding(path, f"settings of {' or '.join(fitting)}, for {use}")
     return Finding(path, "YAML, neither a scene nor settings", problems=tuple(f"{s}: {f}" for s, f in faults.items()))
+
+
+def _bake_scene(path: Path) -> Finding:
+    from wlm.bake.geometry import check_lamps, read_geometry
+    from wlm.bake.work import open_task
+
+    task = open_task(path)
+    what = f"a scene to bake at {count_of(task.scene.hours, 'hour')}, {task.geometry.name}"
+    use, problems = ("lightmaps", path, "-o", "DIR"), list[str]()
+    geometry, settings = read_geometry(task.geometry, None), task.scene.lightmap
+    check_lamps(path, task.scene, geometry)
+    if not settings.unwrap:
+        try:
+            read_geometry(task.geometry, settings)
+        except WlmError as error:
+            problems.append(said(error, path))
+            use = ("probes", path, "-o", "OUT.npz")
+    if find_spec("mitsuba") is None:
+        problems.append("wlm bake needs Mitsuba: pip install 'wlm[bake]'")
+    return Finding(path, what, command("bake", *use), tuple(problems))
 
 
 def _checkpoint(path: Path) -> Finding:

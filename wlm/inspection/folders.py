@@ -25,7 +25,7 @@ from wlm.inspection.files import (
     scene_command,
 )
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
-from wlm.inspection.pictures import Picture, picture_of, said, size_of
+from wlm.inspection.pictures import Picture, half_of, picture_of, said, size_of
 from wlm.inspection.sets import UNREADABLE_SET, assumed, inspect_set, named, together
 from wlm.lightmap.hours import hours_of_names
 from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders
@@ -288,13 +288,14 @@ def _flip_books(folder: Path, files: Sequence[Path]) -> _Found:
 
 
 def _light(files: Sequence[Path]) -> dict[Path, Picture]:
-    """Returns the headers of all readable pictures of light among the files, except reflection probes."""
+    """Returns the headers of all readable pictures of light among the files, except reflection probes and halves of
+    flip books."""
     found = {}
     for file in files:
         if file.suffix.lower() in SUFFIXES:
             with suppress(WlmError):  # an unreadable file is described by itself
                 picture = picture_of(file)
-                if picture is not None and not picture.is_cube and picture.is_light:
+                if picture is not None and not picture.is_cube and picture.is_light and not half_of(file):
                     found[file] = picture
     return found
 

@@ -65,7 +65,10 @@ _VALUES = (
     "colour * (values[1] - values[0]); gamma is 1."
 )
 
-_SHEETS = "Each part is a sheet: up to three channels of a layer of an atlas, in the order of red, green and blue."
+_SHEETS = (
+    "Each part is a sheet: up to three channels of a layer of an atlas, in the order of red, green and blue. Light of "
+    "sheets that differ only in their group is added, weighted; each group has its own times."
+)
 
 
 def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
@@ -90,6 +93,7 @@ def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
         name = f"{model.name} {sheet.label.replace('/', ' ')}"
         parts[part] = sheet_bundle(sheet, own, name, model.source, device)
         named = {"atlas": sheet.atlas, "layer": sheet.layer, "channels": list(sheet.channels)}
+        named["group"] = sheet.group
         sheets.append({"part": part} | named | {"encoding": sheet.encoding, "width": own.width, "height": own.height})
     document = {"about": _SHEETS, "times": model.times.tolist(), "period": model.period, "sheets": sheets}
     return Bundle("lightmap", model.name, "", document | {"source": model.source}, parts=parts)

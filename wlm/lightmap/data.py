@@ -60,6 +60,7 @@ from wlm.lightmap.sheet import (
 from wlm.texels import doubts, repair
 
 _PIECE = 1 << 18  # frames times texels that are filled at once
+_TIME_TOLERANCE = 1e-6
 _READERS = 2  # decompression releases Python's lock; more threads than this only compete for the disk
 _LIGHT_CHANNELS = ("R", "G", "B")
 _ALPHA = "A"
@@ -100,6 +101,24 @@ class SheetFrames:
     def valid(self, index: int) -> np.ndarray:
         """Returns which texels are valid in the frame with this index, bool [H, W]."""
         return self.mask if self.covered is None else self.covered[index]
+
+    def select(self, indices: Sequence[int] | np.ndarray) -> "SheetFrames":
+        """Returns the lightmaps with these indices, which are copied, as if the set had no others."""
+        chosen = np.unique(np.asarray(indices, np.int64))
+        frames, times = room((len(chosen), *self.frames.shape[1:]), np.float32, self.name), self.times[chosen]
+        for frame, index in zip(frames, chosen, strict=True):
+            frame[...] = self.frames[index]
+        mask, covered = self.mask, None
+        if self.covered is not None:
+            covered = self.covered[chosen]
+            mask = covered.any(0)
+            if not mask.any():
+                raise WlmError(f"{self.name}: expected a valid texel at the times that are kept, found none")
+            covered = None if (covered == mask).all() else covered
+        if covered is not None:
+            _fill_in_time(frames, covered, times, self.period)
+        source = _hash(frames, times, mask if covered is None else covered)
+        return replace(self, times=times, frames=frames, mask=mask, covered=covered, source=source)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +175,23 @@ class LightmapSet:
             group = "" if sheet.group == BASE else sheet.group
             digest.update((repr((sheet, own.source)) + group).encode())
         return digest.hexdigest()
+
+    def without(self, times: Sequence[float]) -> "LightmapSet":
+        """Returns the set without some times, so that a fit can be scored at times that it has not seen.
+
+        Raises:
+            WlmError: No sheet has one of the times, or a sheet would have no time left.
+        """
+        sheets = {}
+        for sheet, own in self.sheets.items():
+            kept = np.setdiff1d(np.arange(len(own.times)), at_times(own.times, np.asarray(times, np.float64)))
+            if not len(kept):
+                raise WlmError(f"{own.name}: expected at least one time to be kept, got all of them to leave out")
+            sheets[sheet] = own if len(kept) == len(own.times) else own.select(kept)
+        for time in times:
+            if (at_times(self.times, np.array([time])) < 0).all():
+                raise WlmError(f"{self.name}: expected times of the set to leave out, got {time:g}")
+        return LightmapSet(self.name, sheets)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -429,6 +465,15 @@ def from_groups(sets: Mapping[str, LightmapSet], name: str = "groups") -> Lightm
             covered=None if own.covered is None else own.covered & mask,
         )
     return replace(first, name=name, sheets=sheets)
+
+
+def at_times(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Returns for each time of `wanted` its index in `times`, -1 if it is not there, int [K].
+
+    Times that differ by a millionth count as equal: a file stores them as float32 if that keeps them distinct.
+    """
+    close = np.isclose(np.asarray(wanted)[:, None], times[None], rtol=_TIME_TOLERANCE, atol=_TIME_TOLERANCE)
+    return np.where(close.any(1), close.argmax(1), -1)
 
 
 def parse_times(text: str) -> list[float]:

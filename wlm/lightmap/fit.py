@@ -15,6 +15,7 @@ from wlm.lightmap.data import LightmapSet, SheetFrames
 from wlm.lightmap.dispatch import Batch, Dispatch, Parts, start_workers, worker_devices
 from wlm.lightmap.encodings.frames import choose_frames, encode_frames, missing_encoder, needed_blocks
 from wlm.lightmap.encodings.maps import Reads, check_packable, clear_unread
+from wlm.lightmap.evaluation import lost_light
 from wlm.lightmap.model import LightmapModel, SheetModel, decode_scale, encode_scale, part_table
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, check_index, classify, cut, split, valid_texels
@@ -65,7 +66,8 @@ def compress(
         settings: Values that replace fields of the profile, such as `steps=500`.
 
     Returns:
-        The model; its `warnings` name the settings that could not be followed.
+        The model; its `warnings` name the settings that could not be followed, and light that was lost although the
+        PSNR is high, see `wlm.lightmap.evaluation.lost_light`.
 
     Raises:
         WlmError: There is no such profile, setting, device, tile or cluster; the checkpoint is of another fit; the fit
@@ -104,7 +106,10 @@ def compress(
     counts = {len(own.times) for own in lightmaps.sheets.values()}
     # Groups with other numbers of times have maps of other sizes.
     stored = profile.for_times(*counts) if len(counts) == 1 else profile
-    return LightmapModel(lightmaps.name, lightmaps.source, stored, sheets, warnings)
+    model = LightmapModel(lightmaps.name, lightmaps.source, stored, sheets, warnings)
+    # The device of a cluster is not on this machine.
+    model.warnings += tuple(lost_light(model, lightmaps, "cpu" if cluster is not None else device))
+    return model
 
 
 def open_checkpoint(

@@ -4,7 +4,7 @@ The sum is compared with the sum of the originals, whose error is that of the gr
 lights together, whose error also has the noise of both bakes, and any light that is in one of them only.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, SheetFrames
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.groups import times_of
-from wlm.lightmap.model import LightmapModel, SheetModel
+from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.sheet import BASE, Sheet
 from wlm.lightmap.tiles import TILE, TileKind
@@ -31,11 +31,14 @@ class SumScore(Summary):
         sheet: Label of the sheet, without a group.
         reference: `ORIGINALS` or `BAKE`.
         times: float64 [T], the times that are scored.
+        between_inputs: PSNR of the sum of the originals against the reference, in dB: the noise of the bakes, which no
+            compression can undo. NaN if the reference is that sum itself.
     """
 
     sheet: str
     reference: str
     times: np.ndarray
+    between_inputs: float
 
 
 def score_sums(
@@ -64,38 +67,52 @@ def score_sums(
     scores: list[SumScore] = []
     wanted = {} if all_lights is None else dict(all_lights.sheets)
     for plain in dict.fromkeys(replace(sheet, group=BASE) for sheet in model.sheets if not sheet.linear):
-        groups = {sheet: own for sheet, own in model.sheets.items() if replace(sheet, group=BASE) == plain}
-        decoders = [SheetDecoder(own, device) for own in groups.values()]
-        references: dict[str, list[SheetFrames]] = {}
-        if len(groups) > 1:
-            references[ORIGINALS] = [lightmaps.sheets[sheet] for sheet in groups]
+        groups = model.maps(plain)
+        first, decoders = next(iter(groups.values())), [SheetDecoder(own, device) for own in groups.values()]
+        together = sum_of(lightmaps, plain)
+        references = {} if len(groups) == 1 else {ORIGINALS: together}
         if (bake := wanted.pop(plain, None)) is not None:
-            first = next(iter(groups.values()))
             if bake.mask.shape != (first.height, first.width):
                 height, width = bake.mask.shape
                 raise WlmError(f"{bake.name}: expected lightmaps of {first.width}x{first.height}, got {width}x{height}")
-            references[BAKE] = [bake]
-        for reference, originals in references.items():
-            times = times_of(dict(zip(groups, originals, strict=False)))
-            frames = []
-            for time in times.tolist():
-                decoded = sum(decoder.frame(time) for decoder in decoders)
-                expected = sum(_at(own, time) for own in originals)
-                mask = _scored(groups) & originals[0].mask
-                frames.append(evaluate_frame(expected, decoded, mask, TILE, metrics, name=f"{model.name} at {time:g}"))
-            summary = summarise(frames, times)
-            scores.append(SumScore(**vars(summary), sheet=plain.label, reference=reference, times=times))
+            references[BAKE] = bake
+        stored = np.any([own.kind != TileKind.EMPTY for own in groups.values()], axis=0)
+        mask = first.mask & first.grid.texels_of(stored.reshape(first.grid.rows, first.grid.cols))
+        for reference, original in references.items():
+            frames, inputs = [], []
+            for i, time in enumerate(original.times.tolist()):
+                decoded, name = sum(decoder.frame(time) for decoder in decoders), f"{model.name} at {time:g}"
+                inside = mask & original.valid(i)
+                frames.append(evaluate_frame(original.frames[i], decoded, inside, TILE, metrics, name=name))
+                if reference == BAKE:
+                    expected = _at(together, time)
+                    inputs.append(evaluate_frame(original.frames[i], expected, inside, TILE, ("psnr",), name=name))
+            summary, labels = summarise(frames, original.times), {"sheet": plain.label, "reference": reference}
+            between = summarise(inputs).psnr if inputs else float("nan")
+            scores.append(SumScore(**vars(summary), **labels, times=original.times, between_inputs=between))
     if wanted:
         sheet = next(iter(wanted))
         raise WlmError(f"{all_lights.name}: expected light of the sheets of {model.name}, found {sheet.label}")
     return scores
 
 
-def _scored(groups: Mapping[Sheet, SheetModel]) -> np.ndarray:
-    """Returns the valid texels in tiles that some group stores, bool [H, W]."""
-    own = next(iter(groups.values()))
-    stored = np.any([each.kind != TileKind.EMPTY for each in groups.values()], axis=0)
-    return own.mask & own.grid.texels_of(stored.reshape(own.grid.rows, own.grid.cols))
+def sum_of(lightmaps: LightmapSet, sheet: Sheet) -> SheetFrames:
+    """Returns the sum of the light groups of an input as one sheet, at the times of all of them.
+
+    Args:
+        lightmaps: The input.
+        sheet: The sheet of any of its groups.
+    """
+    plain = replace(sheet, group=BASE)
+    groups = {one: own for one, own in lightmaps.sheets.items() if replace(one, group=BASE) == plain}
+    first, times = next(iter(groups.values())), times_of(groups)
+    if len(groups) == 1:
+        return first
+    frames = np.zeros((len(times), *first.frames.shape[1:]), np.float32)
+    for own in groups.values():
+        for frame, time in zip(frames, times.tolist(), strict=True):
+            frame += _at(own, time)
+    return replace(first, name=f"{lightmaps.name} {plain.label}", times=times, frames=frames, covered=None)
 
 
 def _at(lightmaps: SheetFrames, time: float) -> np.ndarray:

@@ -17,7 +17,7 @@ file the arrays that hold maps, networks and frames are read when they are first
 import math
 from collections.abc import Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
@@ -28,7 +28,7 @@ from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part
 from wlm.lightmap.groups import groups_of, times_of
 from wlm.lightmap.profile import Profile, TimeAxis
-from wlm.lightmap.sheet import Sheet, first_light, layer_sheets
+from wlm.lightmap.sheet import BASE, Sheet, first_light, layer_sheets
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.system import Model
 from wlm_kernels import mlp
@@ -310,7 +310,8 @@ class LightmapModel(Model):
         profile: The settings of the fit; each sheet's own settings follow from them (`Profile.for_sheet`).
         sheets: The sheets, group by group (`wlm.lightmap.groups`), with the same times in a group; those of one atlas
             and size share the mask.
-        warnings: Settings that the fit could not follow, one line each; they are not saved to the file.
+        warnings: Settings that the fit could not follow, and light that it lost though the PSNR is high, one line each;
+            they are not saved to the file.
     """
 
     SYSTEM: ClassVar[str] = "lightmap"
@@ -373,17 +374,17 @@ class LightmapModel(Model):
         """Returns the sheets of one layer of one atlas in all groups, see `wlm.lightmap.sheet.layer_sheets`."""
         return layer_sheets(self.name, self.sheets, name, atlas)
 
-    def maps(self, name: str | None = None, atlas: str | None = None) -> dict[str, SheetModel]:
-        """Returns the sheet of each light group of one layer of one atlas, for `wlm.lightmap.runtime.MapDecoder`.
+    def maps(self, sheet: Sheet | None = None) -> dict[str, SheetModel]:
+        """Returns a sheet in all light groups that have it, by group, for `wlm.lightmap.runtime.MapDecoder`.
 
         Args:
-            name, atlas: As for `layer`.
+            sheet: The sheet of any of the groups; None: the first sheet of radiance.
 
         Raises:
-            WlmError: There is no such layer, or it has more than three channels.
+            WlmError: The model has no such sheet.
         """
-        sheets = self.layer(name, atlas)
-        groups = {sheet.group: self.sheets[sheet] for sheet in sheets}
-        if len(groups) < len(sheets):
-            raise WlmError(f"{self.name}: {sheets[0].layer}: expected a layer of up to three channels, found more")
-        return groups
+        wanted = replace(sheet or first_light(self.sheets), group=BASE)
+        found = {one.group: own for one, own in self.sheets.items() if replace(one, group=BASE) == wanted}
+        if not found:
+            raise WlmError(f"{self.name}: expected a sheet of the model, got {wanted.label}")
+        return found

@@ -26,7 +26,7 @@ a velocity that is not a number  the trace reads some cell of the grid, never me
 more than half floats can hold   clamped to 65504
 ===============================  =====================================================================
 
-A trace shorter than a coarse cell cannot jump over a wall. There are no gradients.
+A trace shorter than a coarse cell cannot jump over a wall. The gradients are those of `advection_adjoint`.
 """
 
 import functools

@@ -41,6 +41,18 @@ def _mark_busy(box: Box, p: wp.vec3i, value: float, bricks: Bricks):
         bricks.busy[index_of(box.bricks, wp.vec3i(p[0] // _BRICK, p[1] // _BRICK, p[2] // _BRICK))] = 1
 
 
+@wp.func
+def within(box: Box, walls: wp.array1d[wp.uint8], shape: int, centre: wp.vec3, size: wp.vec3, p: wp.vec3i) -> bool:
+    """Tests whether a source emits smoke in a fine cell: its centre is in the region, and it is not solid."""
+    if is_solid(box, walls, p):
+        return False
+    x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
+    away = wp.abs(wp.cw_div(x - centre, size))
+    if shape == _SPHERE:
+        return wp.dot(away, away) <= 1.0
+    return away[0] <= 1.0 and away[1] <= 1.0 and away[2] <= 1.0
+
+
 @functools.cache
 def source_kernels(stored: type) -> dict[str, wp.Kernel]:
     """Builds (once) the kernels for smoke stored as `wp.float32` or `wp.float16`, by their names: "source" has a thread
@@ -71,14 +83,7 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         fields: fields_type,
     ):
         p = low + cell_of(cells, wp.tid())
-        if is_solid(box, walls, p):
-            return
-        x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
-        away = wp.abs(wp.cw_div(x - centre, size))
-        within = away[0] <= 1.0 and away[1] <= 1.0 and away[2] <= 1.0
-        if shape == _SPHERE:
-            within = wp.dot(away, away) <= 1.0
-        if not within:
+        if not within(box, walls, shape, centre, size, p):
             return
         i = index_of(box.n, p)
         smoke = in_range(wp.max(kept * float(fields.density[i]) + value[0], 0.0))
@@ -106,8 +111,8 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         coarse = cell_of(box.coarse, i)
         r = box.refinement
         for k in range(r * r * r):
-            within = cell_of(wp.vec3i(r, r, r), k)
-            p = wp.vec3i(coarse[0] * r + within[0], coarse[1] * r + within[1], coarse[2] * r + within[2])
+            inner = cell_of(wp.vec3i(r, r, r), k)
+            p = wp.vec3i(coarse[0] * r + inner[0], coarse[1] * r + inner[1], coarse[2] * r + inner[2])
             smoke = float(0.0)
             heat = float(0.0)
             count = float(0.0)
@@ -188,8 +193,7 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         i = wp.tid()
         for k in range(i // _BRICK_CELLS, bricks.retired_count[0], bricks.workers):
             b = cell_of(box.bricks, bricks.retired[k])
-            within = cell_of(wp.vec3i(_BRICK, _BRICK, _BRICK), i % _BRICK_CELLS)
-            p = _BRICK * b + within
+            p = _BRICK * b + cell_of(wp.vec3i(_BRICK, _BRICK, _BRICK), i % _BRICK_CELLS)
             if p[0] < box.n[0] and p[1] < box.n[1] and p[2] < box.n[2]:
                 at = index_of(box.n, p)
                 fields.density[at] = stored(0.0)
@@ -202,6 +206,14 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
 def _launch(name: str, size: int, inputs: list, output, fields: Fields) -> None:
     kernel = source_kernels(fields.density.dtype)[name]
     wp.launch(kernel, size, inputs=inputs, outputs=[output], device=fields.density.device)
+
+
+def region_of(box: Box, centre: Sequence[float], size: Sequence[float]) -> tuple[wp.vec3i, wp.vec3i, int]:
+    """Returns the lowest fine cell of the box around a source, the cells of this box along each axis, and in all."""
+    low = [max(0, int(c - h)) for c, h in zip(centre, size, strict=True)]
+    high = [min(n, int(max(c + h + 1.0, 0.0))) for c, h, n in zip(centre, size, box.n, strict=True)]
+    cells = [max(0, b - a) for a, b in zip(low, high, strict=True)]
+    return wp.vec3i(*low), wp.vec3i(*cells), cells[0] * cells[1] * cells[2]
 
 
 def add_source(
@@ -230,13 +242,10 @@ def add_source(
         fixed: Whether the values are set instead of added.
         bricks: Bricks that receive smoke are marked as busy.
     """
-    low = [max(0, int(c - h)) for c, h in zip(centre, size, strict=True)]
-    high = [min(n, int(max(c + h + 1.0, 0.0))) for c, h, n in zip(centre, size, box.n, strict=True)]
-    cells = [max(0, b - a) for a, b in zip(low, high, strict=True)]
-    total = cells[0] * cells[1] * cells[2]
+    low, cells, total = region_of(box, centre, size)
     if total > 0:
         region = [wp.vec3(*centre), wp.vec3(*size), wp.vec2(*value), 0.0 if fixed else 1.0]
-        inputs = [box, walls, shape, *region, wp.vec3i(*low), wp.vec3i(*cells), bricks]
+        inputs = [box, walls, shape, *region, low, cells, bricks]
         _launch("source", total, inputs, fields.arrays, fields)
 
 

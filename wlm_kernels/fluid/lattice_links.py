@@ -44,7 +44,7 @@ BLOCK = 256
 
 # An outlet of fixed density reflects all sound. Relaxed at this rate per crossing of the domain (0.25 to 0.6 in the
 # literature, Poinsot and Lele 1992), it transmits most of the sound and still keeps the mean density.
-_HOLD = wp.constant(0.3)
+HOLD = wp.constant(0.3)
 
 
 @wp.struct
@@ -88,6 +88,19 @@ def _beyond(x: int, n: int, bounded: int) -> bool:
     return bounded != 0 and (x < 0 or x >= n)
 
 
+@wp.func
+def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
+    """Returns the cell and the velocity of the population that a slip wall reflects into population q of cell i."""
+    p = cell_of(n, i)
+    c = t.c[q]
+    x = _beyond(p[0] - c[0], n[0], bounded[0])
+    y = _beyond(p[1] - c[1], n[1], bounded[1])
+    z = _beyond(p[2] - c[2], n[2], bounded[2])
+    along = wp.vec3i(wp.where(x, 0, c[0]), wp.where(y, 0, c[1]), wp.where(z, 0, c[2]))
+    turned = wp.vec3i(wp.where(x, -c[0], c[0]), wp.where(y, -c[1], c[1]), wp.where(z, -c[2], c[2]))
+    return index_of(n, wrapped(n, p - along)), turned
+
+
 @functools.cache
 def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
     """Builds (once) the kernels that set populations at boundaries and sum forces; `balance`: outlets conserve mass."""
@@ -95,18 +108,6 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
     load, store = memory.load, memory.store
     stored = STORAGES[storage][0]
     options = {"enable_backward": False}
-
-    @wp.func
-    def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
-        """Returns the cell and the velocity of the population that a slip wall reflects into population q of cell i."""
-        p = cell_of(n, i)
-        c = t.c[q]
-        x = _beyond(p[0] - c[0], n[0], bounded[0])
-        y = _beyond(p[1] - c[1], n[1], bounded[1])
-        z = _beyond(p[2] - c[2], n[2], bounded[2])
-        along = wp.vec3i(wp.where(x, 0, c[0]), wp.where(y, 0, c[1]), wp.where(z, 0, c[2]))
-        turned = wp.vec3i(wp.where(x, -c[0], c[0]), wp.where(y, -c[1], c[1]), wp.where(z, -c[2], c[2]))
-        return index_of(n, wrapped(n, p - along)), turned
 
     @wp.func
     def outflow(
@@ -125,10 +126,10 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
             if bounded[a] != 0:
                 if source[a] < 0:
                     u[a] = wp.min(u[a], 0.0)
-                    hold = wp.min(hold, _HOLD / float(n[a]))
+                    hold = wp.min(hold, HOLD / float(n[a]))
                 if source[a] >= n[a]:
                     u[a] = wp.max(u[a], 0.0)
-                    hold = wp.min(hold, _HOLD / float(n[a]))
+                    hold = wp.min(hold, HOLD / float(n[a]))
         if kind != _OUTLET:
             drho += hold * (term - drho)
         return equilibrium(t.w[q], t.c[q], drho, u)

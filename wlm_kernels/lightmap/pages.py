@@ -1,8 +1,8 @@
 """Decodes pages of a virtual texture: square parts of any mip level, with a border, from tiles of all kinds.
 
 A page is read texel by texel at the coordinates of its sheet, so that its border continues into the neighbouring tiles.
-A texel of level L stands for 2^L x 2^L texels. Its light is the mean of those of 2 x 2 samples of them that are valid:
-each row and each column of an even grid of 4 x 4 has one sample (at level 1 the samples are all texels). A texel
+A texel of level L stands for 2^L x 2^L texels. Its light is the mean of those of 4 x 4 samples of them that are valid:
+up to level 2 the samples are all texels, and then each row and each column of an even grid of 16 x 16 has one. A texel
 without a valid sample, in a gap between charts, takes the light of the nearest one within two texels that has one, as
 `wlm.lightmap.runtime.MapDecoder` does; farther away from charts it is black.
 
@@ -48,9 +48,10 @@ _CONSTANT, _STATIC, _FRAMES = wp.constant(1), wp.constant(2), wp.constant(4)  # 
 
 @wp.struct
 class Tiles:
-    """The N tiles of all sheets, sheet after sheet and row by row, and the sheets S.
+    """The N tiles of the S sheets of one light group, sheet after sheet and row by row.
 
     Attributes:
+        sheet: Number of the group's first sheet among the sheets of all groups.
         size: [S], height and width of each sheet in texels.
         first, columns: [S], number of the sheet's first tile, and its tiles in a row.
         gamma: [S], exponent that converts colours to light.
@@ -62,6 +63,7 @@ class Tiles:
         colours: [C, T], light of the constant tiles at each stored time.
     """
 
+    sheet: int
     size: wp.array1d[wp.vec2i]
     first: wp.array1d[int]
     columns: wp.array1d[int]
@@ -228,9 +230,9 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
     ):
         k, i, j = wp.tid()
         slot = jobs.slot[k]
-        if slot >= 0:
+        sheet = jobs.place[k][0] - tiles.sheet
+        if slot >= 0 and sheet >= 0 and sheet < tiles.size.shape[0]:
             place = jobs.place[k]
-            sheet = place[0]
             level = place[1]
             step = 1 << level
             size = tiles.size[sheet]
@@ -238,9 +240,10 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
             columns = (size[1] + step - 1) // step
             y = wp.clamp(place[2] + i, 0, rows - 1)
             x = wp.clamp(place[3] + j, 0, columns - 1)
-            side = int(1)
-            if level > 0:
-                side = grid
+            depth = level
+            if level >= _LEVEL and direct == 0:
+                depth = level - _LEVEL
+            side = wp.min(1 << depth, grid)
             whole = 2 * side * side
             light = wp.vec3()
             count = int(0)
@@ -255,11 +258,14 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
                         b = sample - a * side
                         ty = yy * step + step * (2 * (a * side + b) + 1) // whole
                         tx = xx * step + step * (2 * (b * side + side - 1 - a) + 1) // whole
+                        if depth < level:  # of a coarse texel that reaches past the map's end, its first texel does not
+                            ty -= ty % 16
+                            tx -= tx % 16
                         if ty < size[0] and tx < size[1]:
                             tile = tiles.first[sheet] + (ty // 128) * tiles.columns[sheet] + tx // 128
                             ty = ty % 128
                             tx = tx % 128
-                            if level >= _LEVEL and direct == 0:
+                            if depth < level:
                                 cell = (ty // 16) * _SIDE + tx // 16
                                 light += _coarse_light(tiles, clock, jobs.target[k], tile, cell)
                                 count += 1
@@ -302,7 +308,7 @@ def put(records, slots, parts, memory) -> None:
 def decode(
     kernel: wp.Kernel, source: tuple[Any, ...], clock, offsets, jobs: Jobs, grid: int, direct: bool, out
 ) -> None:
-    """Decodes squares of texels with one launch, which a CUDA graph can capture.
+    """Decodes squares of texels of one light group with one launch, which a CUDA graph can capture.
 
     Args:
         kernel: From `page_kernel`.
@@ -310,8 +316,8 @@ def decode(
             tiles stored as frames.
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
-        jobs: J squares.
-        grid: Samples of a texel of a mip along each axis.
+        jobs: J squares; those of other groups are left as they are.
+        grid: Most samples of a texel of a mip along each axis.
         direct: Whether to decode tiles at every level, instead of reading coarse texels from `COARSE_LEVEL` on.
         out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.
     """

@@ -15,6 +15,7 @@ from builders.atlas_models import random_model as random_atlas
 from builders.checks import error_of
 from builders.engine_scripts import Script, assert_csharp_parses, assert_gdscript_parses, node_gives, pixels_of
 from builders.layered_sets import random_layers
+from builders.light_groups import random_groups
 from builders.shader_runs import run_glsl, run_hlsl
 from builders.synthetic import random_model as random_lightmap
 
@@ -422,3 +423,16 @@ def test_what_unreal_does_not_import(tmp_path, monkeypatch):
     assert re.search(r"cannot export for unreal: uv: expected at most 127 texels along a side, found \d+x\d+", line)
     assert not (tmp_path / "deep").exists()
     assert asset_name("a b/ç.1") == "a_b___1"
+
+
+def test_light_groups_are_added_by_three_alone(tmp_path):
+    model = random_groups()
+    paths = export(model, tmp_path / "three", "three")
+    assert {"groups.js", "README.md"} <= {path.name for path in paths}
+    assert "from './sheet_00/lightmap.js'" in (tmp_path / "three" / "groups.js").read_text()
+    for engine in set(ENGINES) - {"three"}:
+        assert "does not add light groups" in error_of(export, model, tmp_path / engine, engine)
+        assert not (tmp_path / engine).exists()
+    export(model, tmp_path / "raw")
+    sheets = json.loads((tmp_path / "raw" / "bundle.json").read_text())["sheets"]
+    assert [sheet["group"] for sheet in sheets] == list(model.groups)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from builders import atlas_meshes, atlas_models, probe_models, probe_sets, rooms, small_sets
+from builders.light_groups import random_groups
 from builders.synthetic import random_model
 from PIL import Image
 
@@ -437,3 +438,31 @@ def test_a_damaged_page_says_so(model, tmp_path, show):
     page = show(tmp_path / "page.html")
     assert "damaged" in page.locator("#message").inner_text()
     show.errors.clear()  # the page also throws it, for the console
+
+
+def test_light_groups_are_added_by_their_sliders(tmp_path, show):
+    model = random_groups(np.random.default_rng(6).random((236, 247)) < 0.8)
+    model.save(tmp_path / "groups.wlm")
+    write_page(tmp_path / "page.html", [tmp_path / "groups.wlm"])
+    page = show(tmp_path / "page.html")
+    decoder = model.decoder()
+
+    def check(time: float) -> None:
+        expected = decoder.frame(time)
+        seen = numbers(page, f"kind.read({time})").reshape(*expected.shape[:2], 4)[..., :3]
+        # Each of the four additions rounds to half floats, and so did each map.
+        assert np.abs(seen - expected).max() < 5 * 2**-11 * expected.max() + 2 / 255 * 0.1
+
+    for time in (13.0, 3.0):
+        check(time)
+    before = picture(page)
+    decodes = "wlm.then(({kind}) => kind.groups.map((group) => group.maps.map((map) => map.key)).join(' '))"
+    maps = page.evaluate(decodes)
+    page.get_by_label("lamp", exact=True).evaluate("(input) => { input.value = 0; input.oninput(); }")
+    page.get_by_label("colour of sun").evaluate("(input) => { input.value = '#ff0080'; input.oninput(); }")
+    decoder.set_weights({"lamp": 0.0, "sun": (1.0, 0.0, ((128 / 255 + 0.055) / 1.055) ** 2.4)})
+    assert np.abs(picture(page) - before).max() > 20, "in the next picture"
+    check(3.0)
+    assert page.evaluate(decodes) == maps, "nothing is decoded again"
+    assert "off" in page.locator("#panel label:has-text('lamp') output").inner_text()
+    page.close()

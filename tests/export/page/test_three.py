@@ -10,6 +10,7 @@ import pytest
 from builders.atlas_meshes import charts
 from builders.atlas_models import KINDS, MIXED
 from builders.atlas_models import random_model as random_atlas
+from builders.light_groups import random_groups
 from builders.probe_models import whole_model as random_model
 from builders.scene_folders import expected_picture, scene_folder
 from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames, shown
@@ -143,6 +144,9 @@ window.ready = true;
 _LIGHTMAP = """import { loadLightmap } from './lightmap.js';
 export const load = (renderer, THREE) => loadLightmap(new URL('bundle.json', import.meta.url), renderer, THREE);
 """
+_GROUPS = """import { loadGroups } from './groups.js';
+export const load = (renderer, THREE) => loadGroups(new URL('bundle.json', import.meta.url), renderer, THREE);
+"""
 _ATLAS = """import { loadAtlas } from './atlas.js';
 export const load = (renderer, THREE) => loadAtlas(new URL('bundle.json', import.meta.url), THREE);
 """
@@ -189,6 +193,23 @@ def test_three_shows_the_light_of_any_hour(kinds, interpolation, tmp_path, brows
         expected = filtered(decoder.frame(time))
         # Maps of half floats, between which SwiftShader's filter mixes in floats.
         np.testing.assert_allclose(drawn(page, name), expected, rtol=0, atol=expected.max() / 255)
+    assert not errors
+    page.close()
+
+
+def test_three_adds_light_groups(tmp_path, browser, serve):
+    model = random_groups()
+    export(model, tmp_path, "three")
+    page, errors = opened(browser, tmp_path, serve, _GROUPS)
+    decoder = model.decoder()
+    assert page.evaluate("light.groups") == list(model.groups)
+    for time, weights in ((0.0, {}), (9.1, {"lamp": 0.0, "sun": [1.0, 0.5, 0.25]}), (21.7, {"lamp": 2.0})):
+        page.evaluate(f"light.setTime({time})")
+        for name, weight in weights.items():
+            page.evaluate(f"light.setWeight('{name}', {weight})")
+        decoder.set_weights(weights)
+        expected = filtered(decoder.frame(time))
+        np.testing.assert_allclose(drawn(page, "Basic"), expected, rtol=0, atol=expected.max() / 255)
     assert not errors
     page.close()
 

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from wlm.bundle import Bundle
+from wlm.errors import WlmError
 from wlm.export.engines.kit import (
     README_FILE,
     asset_name,
@@ -54,6 +55,24 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
     texts = _TEXTS[engine](bundle)
     write_texts(folder, texts)
     return {"shader": next(iter(texts)), "textures": textures, "buffers": buffers}
+
+
+def write_collection(bundle: Bundle, folder: Path, engine: str) -> None:
+    """Writes what the kits of a collection's parts need together: the script that adds the light groups.
+
+    Raises:
+        WlmError: The collection has several light groups, and the engine's kit does not add them.
+    """
+    if len({sheet["group"] for sheet in bundle.document["sheets"]}) == 1:
+        return
+    if engine != "three":
+        raise WlmError(
+            f"{bundle.name}: the kit for {engine} does not add light groups: export for three, or without an engine, "
+            "which writes a shader and textures for each group"
+        )
+    part = next(name for name, each in bundle.parts.items() if "values" not in each.document)
+    script = filled("three_groups.js", PART=part)
+    write_texts(folder, {"groups.js": script, README_FILE: filled("three_groups.md", NAME=bundle.name)})
 
 
 def _three(bundle: Bundle) -> dict[str, str]:

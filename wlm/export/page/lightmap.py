@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.export.engines.kit import filled
 from wlm.export.page.html import Page, pack_triangles
@@ -19,8 +21,10 @@ from wlm.lightmap.bundle import sheet_bundle
 from wlm.lightmap.data import SheetFrames, load
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
+from wlm.lightmap.group_scores import sum_of
+from wlm.lightmap.groups import times_of
 from wlm.lightmap.model import SheetModel
-from wlm.lightmap.sheet import LIGHT, first_light
+from wlm.lightmap.sheet import BASE, LIGHT, first_light
 from wlm.system import Meter, OnProgress
 from wlm.system import load as load_model
 from wlm.texels import exposure, fill_gaps
@@ -40,63 +44,87 @@ def lightmap_page(
     up: Literal["y", "z"] = "y",
     progress: OnProgress | None = None,
 ) -> Page:
-    """Makes the HTML page of a lightmap model's first layer of light; for the arguments see `make_page`.
+    """Makes the HTML page of a lightmap model's first layer of light, the sum of its light groups, each with a slider.
+
+    For the arguments see `make_page`; `original` is a set with the same groups, or a bake of all lights together.
 
     Raises:
         WlmError: The mesh or the original lightmap set cannot be read, or the set has another size.
     """
     whole, file_bytes = load_model(paths[0], "lightmap"), paths[0].stat().st_size
-    sheet, others = first_light(whole.sheets), len(whole.sheets) - 1
-    model = whole.sheets[sheet]
-    bundle = sheet_bundle(sheet, model, whole.name, whole.source)
-    textures = {name: texture for name, texture in bundle.textures.items() if name != "valid"}
-    described = {name: bundle.document[name] for name in _DESCRIBED}
-    described["textures"] = {
-        name: {"size": [each.width, each.height], "layers": each.layers} for name, each in textures.items()
-    }
-    networks = bundle.buffers.get("networks", np.zeros((0, 4), np.float32))
-    arrays: dict[str, np.ndarray] = {"networks": networks, "valid": np.packbits(bundle.textures["valid"].data > 0)}
-    arrays |= {f"tiles_{name}": texture.data for name, texture in textures.items()}
-    times = model.times
+    sheet = first_light(whole.sheets)
+    groups = whole.maps(sheet)
+    others, model = len(whole.sheets) - len(groups), groups[sheet.group]
+    described, arrays = [], dict[str, np.ndarray]()
+    for number, (name, own) in enumerate(groups.items()):
+        bundle = sheet_bundle(replace(sheet, group=name), own, whole.name, whole.source)
+        described.append({"name": name, "shader": bundle.shader, "lightmap": _described(bundle)})
+        textures = {key: texture for key, texture in bundle.textures.items() if key != "valid"}
+        arrays |= {f"{number}_{key}": texture.data for key, texture in textures.items()}
+        arrays[f"{number}_networks"] = bundle.buffers.get("networks", np.zeros((0, 4), np.float32))
+    arrays["valid"] = np.packbits(model.mask)
+    decoders = [SheetDecoder(own) for own in groups.values()]
+
+    def decode(time: float) -> np.ndarray:
+        return sum(decoder.frame(time) for decoder in decoders)
+
+    times = times_of({replace(sheet, group=name): own for name, own in groups.items()})
     time = float(times[len(times) // 2])
     reference: dict[str, Any] | None = None
     if original is not None:
-        reference, originals = _originals(model, load(original).find(sheet), original, hours, progress)
+        given = load(original)
+        light = given.find(sheet) if len(given.groups) == 1 else sum_of(given, sheet)
+        reference, originals = _originals(model, light, decode, original, hours, progress)
         arrays |= originals
         # The page starts at an hour with an original.
         time = min(reference["times"], key=lambda stored: abs(stored - time))
     manifest: dict[str, Any] = {
         "width": model.width,
         "height": model.height,
-        "shader": bundle.shader,
-        "exposure": exposure(SheetDecoder(model).frame(time)),
+        "exposure": exposure(decode(time)),
         "time": time,
-        "lightmap": described,
+        "times": times.tolist(),
+        "period": model.period,
+        "groups": described,
     }
     if mesh is not None:
         triangles, box = pack_triangles(read_geometry(mesh), up)
         arrays |= triangles
         manifest |= box
-    kinds = ", ".join(f"{count} {kind}" for kind, count in count_kinds(model).items() if count)
+    counts = [count_kinds(own) for own in groups.values()]
+    kinds = {kind: sum(count[kind] for count in counts) for kind in counts[0]}
     figures = [
         ("file", f"{file_bytes:,} bytes"),
         ("bits per texel and hour", f"{file_bytes * 8 / (model.width * model.height * len(times)):.3f}"),
         ("lightmaps", f"{model.width} × {model.height}, {len(times)} {'hour' if len(times) == 1 else 'hours'}"),
-        ("tiles", kinds),
+        ("tiles", ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)),
         ("profile", model.profile.name),
     ]
+    if len(groups) > 1:
+        figures.append(("light groups", str(len(groups))))
     if reference is not None:
         manifest["reference"] = reference
     note = "Lightmaps over time, decoded on this GPU."
-    if sheet != LIGHT or others:
+    if replace(sheet, group=BASE) != LIGHT or others:
         rest = f", without the file's {others} other sheet{'' if others == 1 else 's'}" if others else ""
-        note += f" Shown is {sheet.label}{rest}."
+        note += f" Shown is {replace(sheet, group=BASE).label}{rest}."
     return Page("lightmap", whole.name, note, figures, manifest, arrays, [filled("lightmap_table.js").rstrip("\n")])
+
+
+def _described(bundle: Bundle) -> dict[str, Any]:
+    """Returns what the script needs to know of the bundle of a light group."""
+    textures = {
+        name: {"size": [each.width, each.height], "layers": each.layers}
+        for name, each in bundle.textures.items()
+        if name != "valid"
+    }
+    return {name: bundle.document[name] for name in _DESCRIBED} | {"textures": textures}
 
 
 def _originals(
     model: SheetModel,
     lightmaps: SheetFrames,
+    decode: Callable[[float], np.ndarray],
     path: str | os.PathLike[str],
     hours: int,
     progress: OnProgress | None,
@@ -113,10 +141,10 @@ def _originals(
     arrays = {f"original_{i}": pack_rgb9e5(frame) for i, frame in enumerate(frames)}
     # Texels outside of the mask were not compressed and have no error.
     arrays["mask"] = lightmaps.mask.astype(np.uint8) * 255
-    times, decoder, scores = lightmaps.times[chosen].tolist(), SheetDecoder(model), []
+    times, scores = lightmaps.times[chosen].tolist(), list[float]()
     meter = Meter(progress, "score", len(times))
     for number, time in zip(chosen.tolist(), times, strict=True):
-        scores.append(psnr_of(model, lightmaps, number, decoder.frame(time)))
+        scores.append(psnr_of(model, lightmaps, number, decode(time)))
         if meter.due(len(scores)):
             meter.report(len(scores))
     return {"times": times, "psnr": [None if math.isnan(score) else score for score in scores]}, arrays

@@ -22,10 +22,10 @@ function wlmPlace(lightmap, time) {
 }
 
 // The times to decode for a given time, each with its weight in linear light: one or two stored times; if the networks
-// interpolate, the time itself.
+// interpolate, the time itself. The light of a single stored time is the same at all times.
 function wlmReads(lightmap, time) {
   const now = wlmPlace(lightmap, time);
-  if (lightmap.interpolation === 'network') return [{...now, key: time, weight: 1}];
+  if (lightmap.interpolation === 'network' && lightmap.times.length > 1) return [{...now, key: time, weight: 1}];
   const stored = (k, weight) => ({before: k, after: k, share: 0, tau: lightmap.tau[k], key: k, weight});
   return [stored(now.before, 1 - now.share), stored(now.after, now.share)].filter((read) => read.weight > 0);
 }

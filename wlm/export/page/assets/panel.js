@@ -56,11 +56,18 @@ class Panel {
   }
 
   // Adds a slider; returns a function that sets it and calls `changed`. `keys` move it by `by` or to the result of `next`.
-  slider(name, {min, max, step, value, text, changed, keys = [], by = step, next = (now, sign) => now + sign * by, told}) {
+  // With `tint` there is a colour beside it, which this gets as three numbers from 0 to 1.
+  slider(name, {min, max, step, value, text, changed, keys = [], by = step, next = (now, sign) => now + sign * by, told, tint}) {
     const label = this.#add(this.controls, 'label');
     this.#add(label, 'span').textContent = name;
     const input = Object.assign(this.#add(label, 'input'), {type: 'range', min, max, step, value});
     input.setAttribute('aria-label', name);
+    if (tint) {
+      label.className = 'tinted';
+      const colour = Object.assign(this.#add(label, 'input'), {type: 'color', value: '#ffffff'});
+      colour.setAttribute('aria-label', `colour of ${name}`);
+      colour.oninput = () => tint([1, 3, 5].map((at) => parseInt(colour.value.slice(at, at + 2), 16) / 255));
+    }
     const output = this.#add(label, 'output');
     const show = () => {
       output.textContent = text(Number(input.value));

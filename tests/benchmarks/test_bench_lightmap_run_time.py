@@ -1,0 +1,98 @@
+"""The benchmark of the virtual texture: its cameras, its large set, its mips, and rows that are of what they name."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from builders.bench_rows import check_outputs, keys
+from builders.gltf_scene import box
+from builders.small_sets import moving_light, tiny_profile
+
+from benchmarks import Panel
+from benchmarks import lightmap_run_time as bench
+from wlm.formats.geometry import Geometry
+from wlm.lightmap.fit import compress
+from wlm.lightmap.tiles import TileKind
+
+SIZE = (24, 40)
+
+
+@pytest.fixture(scope="module")
+def patch():
+    with pytest.MonkeyPatch.context() as context:
+        yield context
+
+
+@pytest.fixture(scope="module")
+def room(patch):
+    """A set of one tile, in a room."""
+    position, triangle, uv = (np.asarray(part) for part in box((0, 0, 0), (6, 3, 5), inward=True))
+    patch.setattr(bench, "read_geometry", lambda path: Geometry(position.astype(np.float32), triangle, uv))
+    return moving_light(hours=(0.0, 12.0, 18.45, 18.55))
+
+
+@pytest.mark.parametrize("kind", ["room", "plain"])
+def test_derivatives_are_differences_of_neighbours(kind, room):
+    camera = bench._RoomCamera(room, SIZE, "cpu") if kind == "room" else bench._PlainCamera(512, SIZE, "cpu")
+    sheet, uv, slope = (array.numpy() for array in camera(0.1))
+    assert sheet.max() == (0 if kind == "room" else 3) and (sheet >= 0).mean() > 0.5
+    inside = sheet >= 0
+    for axis, own in ((1, (0, 2)), (0, (1, 3))):
+        step = np.diff(uv, axis=axis)
+        first = np.s_[:, :-1] if axis else np.s_[:-1]
+        near = inside[first] & (np.abs(step) < 0.05).all(2)
+        error = np.abs(step - slope[first][..., own])[near]
+        # A step is the mean slope of both pixels, and a few steps cross an edge.
+        assert np.median(error) < 0.2 * np.median(np.abs(step[near])) + 1e-4
+
+
+def test_the_large_set_changes_as_a_real_one():
+    model = bench.large_model(256)
+    assert len(model.sheets) == 4 and len(model.times) == 26 and model.period == 24.0
+    assert all((own.kind == TileKind.DYNAMIC).all() and own.grid.count == 4 for own in model.sheets.values())
+    light = model.decoder(tiles={sheet: [0] for sheet in model.sheets}).light
+    noon, later, night = (light.tiles([0], hour) for hour in (12.0, 13.0, 2.0))
+    assert np.isfinite(noon).all() and noon.std() > 0.0
+    assert 0.005 < np.abs(later - noon).mean() / noon.mean() < 0.2 < np.abs(night - noon).mean() / noon.mean()
+
+
+def test_mips_and_formats():
+    random = np.random.default_rng(0)
+    frames, mask = random.uniform(0.0, 2.0, (2, 40, 24, 3)).astype(np.float32), random.random((40, 24)) < 0.7
+    mean, covered = bench._mip(frames, mask, 2, 4)
+    blocks = np.where(mask[..., None], frames, np.nan).reshape(2, 10, 4, 6, 4, 3)
+    np.testing.assert_allclose(mean[:, covered], np.nanmean(blocks, (2, 4))[:, covered], rtol=1e-5)
+    sampled, met = bench._mip(frames, mask, 3, 4)
+    assert sampled.shape == (2, 5, 3, 3) and met.all() and np.abs(sampled - 1.0).max() < 0.7
+    error = bench._differences(np.stack([bench._as_bytes(frame) for frame in frames]), frames, mask)
+    assert 45.0 < error["psnr"] < 60.0
+
+
+@pytest.fixture(scope="module")
+def rows(room, patch):
+    patch.setattr(bench, "_QUICK", 120)
+    run = bench._RunTime("lightmap", "cpu", None, scene="room", clock="frame_ms")
+    run.quick, run.size = True, SIZE
+    model = compress(room, tiny_profile())
+    return [*run.rows(model, bench._RoomCamera(room, SIZE, "cpu"), {}, room), *run.format_rows(room)]
+
+
+def test_every_row_has_its_figures(rows, tmp_path):
+    check_outputs(rows, tmp_path, [Panel("texel_rms")], rows[3:])
+    paths = ["walk, 8 pages a frame", "day, 8 pages a frame", "day, 64 pages a frame"]
+    assert keys(rows) == [
+        *(("virtual texture", path) for path in paths),
+        *(("format", name) for name in ("RGB9E5", "RGBA8")),
+        *(("mips", f"level {level}") for level in (3, 4)),
+    ]
+    for row in rows[:3]:
+        assert 0.0 < row["current"] <= row["nearly_current"] <= 1.0 and row["cached_psnr"] > 30.0
+        assert row["frame_ms"] <= row["frame_ms_max"] and row["pages_decoded"] <= row["pages_decoded_max"]
+    assert rows[2]["current"] == 1.0 and abs(rows[2]["gain"]) < 0.3
+    assert rows[3]["texel_rms"] < 0.002 < rows[4]["texel_rms"]
+
+
+def test_a_set_without_a_mesh_is_refused(monkeypatch):
+    monkeypatch.setattr(bench, "load", lambda path: SimpleNamespace(name="set", light=SimpleNamespace(mesh=None)))
+    with pytest.raises(bench.WlmError, match="set: expected a set that names its mesh"):
+        bench.run(scene_path="a", quick=True, device="cpu")

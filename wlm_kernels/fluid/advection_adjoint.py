@@ -1,0 +1,472 @@
+"""The backward pass of the advection of smoke, of its sources and of buoyancy: gradients to smoke and to velocities.
+
+Read `advection` and `advection_sources` first. Every gradient is that of the discretised step, so the cases of the
+forward pass are decided as there, and each is differentiated as it is computed:
+
+- A trace is differentiated through both of its velocity reads. Along an axis on which it is clamped to a face its
+  gradient is 0; where it is cut by a solid, the fraction of its length that remains is constant.
+- Where MacCormack's limiter clamps a value, the gradient goes to the cell with the smallest or largest of the eight
+  values alone, the first of equal ones, and none to the prediction, the correction or the velocity. Where smoke is
+  uniform, rounding decides whether a value is clamped.
+- Clean air from beyond an open face has no gradient, and neither have solid cells.
+
+Values are float32. Gradients of neighbouring cells are summed in any order on CUDA.
+"""
+
+from collections.abc import Sequence
+
+import warp as wp
+
+from wlm_kernels.fluid.advection import Fields, fields_struct
+from wlm_kernels.fluid.advection_places import (
+    FREE,
+    REACH,
+    SOLID,
+    Box,
+    Stencil,
+    beyond_open_face,
+    clip_at_solid,
+    corner,
+    evaluate,
+    fetch,
+    in_domain,
+    into_domain,
+    is_solid,
+    side_of,
+    stencil,
+    wall_at,
+)
+from wlm_kernels.fluid.advection_sources import region_of, within
+from wlm_kernels.fluid.lattice_sets import cell_of, index_of
+
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})
+
+_REACH = wp.constant(REACH)
+_FieldArrays = fields_struct(wp.float32)
+
+
+@wp.struct
+class Trace:
+    """A trace from a cell back in time, with what its gradient needs.
+
+    Attributes:
+        start, middle: The velocities that it reads at the cell and at its midpoint.
+        passes: The derivative of the position of `middle` by that of the midpoint, along each axis: 0 or 1.
+        end: Its end, within the domain.
+        stays: The derivative of `end` by the unclamped and uncut end, along each axis.
+        left: Whether it left the domain through an open face.
+        beside: Whether its end is beside a solid.
+    """
+
+    start: Stencil
+    middle: Stencil
+    passes: wp.vec3
+    end: wp.vec3
+    stays: wp.vec3
+    left: bool
+    beside: bool
+
+
+@wp.func
+def _kept_axes(box: Box, x: wp.vec3) -> wp.vec3:
+    """Returns 0 for each axis along which `into_domain` clamps a point, else 1."""
+    kept = wp.vec3(1.0, 1.0, 1.0)
+    for a in range(3):
+        if box.periodic[a] == 0 and (x[a] < 0.0 or x[a] > float(box.n[a])):
+            kept[a] = 0.0
+    return kept
+
+
+@wp.func
+def _trace(box: Box, u: wp.array1d[wp.vec3], walls: wp.array1d[wp.uint8], x: wp.vec3, dt: float) -> Trace:
+    out = Trace()
+    fine = dt * float(box.refinement)
+    out.start = stencil(box.coarse, box.periodic, box.voxel * x)
+    around = fetch(u, out.start)
+    v = evaluate(around, out.start.f)
+    half = out.start.f - 0.5 * dt * v
+    w = wp.vec3()
+    if wp.min(half) >= -_REACH and wp.max(half) <= 1.0 + _REACH:
+        out.middle = out.start
+        out.middle.f = half
+        out.passes = wp.vec3(1.0, 1.0, 1.0)
+        w = evaluate(around, half)
+    else:
+        middle = x - 0.5 * fine * v
+        out.passes = _kept_axes(box, middle)
+        out.middle = stencil(box.coarse, box.periodic, box.voxel * into_domain(box, middle))
+        w = evaluate(fetch(u, out.middle), out.middle.f)
+    end = x - fine * w
+    out.end = end
+    out.stays = wp.vec3(1.0, 1.0, 1.0)
+    if not in_domain(box, end):
+        out.end = into_domain(box, end)
+        out.stays = _kept_axes(box, end)
+        out.left = beyond_open_face(box, end)
+    if walls.shape[0] > 0:
+        away = end - x
+        near = wp.max(wp.abs(away)) <= 0.5 * float(box.refinement)
+        if wall_at(box, walls, x) != FREE or not near:
+            wall = wall_at(box, walls, out.end)
+            out.beside = wall != FREE
+            if wall == SOLID:
+                cut = clip_at_solid(box, walls, x, end)
+                fraction = wp.dot(cut - x, away) / wp.max(wp.dot(away, away), 1.0e-20)
+                out.end = into_domain(box, cut)
+                out.stays = fraction * _kept_axes(box, cut)
+                out.left = beyond_open_face(box, cut)
+    return out
+
+
+@wp.func
+def _slope(f: wp.vec3, k: int) -> wp.vec3:
+    """Returns the derivatives of the trilinear weight of the cell k of eight by the fractions between them."""
+    side = side_of(k)
+    w = wp.vec3()
+    sign = wp.vec3()
+    for a in range(3):
+        w[a] = wp.where(side[a] == 0, 1.0 - f[a], f[a])
+        sign[a] = wp.where(side[a] == 0, -1.0, 1.0)
+    return wp.vec3(sign[0] * w[1] * w[2], w[0] * sign[1] * w[2], w[0] * w[1] * sign[2])
+
+
+@wp.func
+def _velocity_backward(
+    box: Box, u: wp.array1d[wp.vec3], trace: Trace, dt: float, on_end: wp.vec3, on_u: wp.array1d[wp.vec3]
+):
+    """Adds the gradients to the velocities that a trace reads."""
+    on_w = -dt * float(box.refinement) * wp.cw_mul(trace.stays, on_end)
+    on_half = wp.vec3()
+    for k in range(8):
+        i, _weight = corner(trace.middle, k)
+        on_half += wp.dot(u[i], on_w) * _slope(trace.middle.f, k)
+    on_v = -0.5 * dt * wp.cw_mul(trace.passes, on_half)
+    # Most traces read the same eight velocities twice.
+    same = trace.middle.base == trace.start.base and trace.middle.step == trace.start.step
+    for k in range(8):
+        i, first = corner(trace.start, k)
+        j, second = corner(trace.middle, k)
+        if same:
+            wp.atomic_add(on_u, i, first * on_v + second * on_w)
+        else:
+            wp.atomic_add(on_u, i, first * on_v)
+            wp.atomic_add(on_u, j, second * on_w)
+
+
+@wp.func
+def _read_backward(
+    box: Box,
+    walls: wp.array1d[wp.uint8],
+    field: wp.array1d[float],
+    trace: Trace,
+    g: float,
+    on_field: wp.array1d[float],
+) -> wp.vec3:
+    """Adds the gradients to the eight values that a trace's end reads; returns that to its position."""
+    at = stencil(box.n, box.periodic, trace.end)
+    weight = float(1.0)
+    mean = float(0.0)
+    if trace.beside:
+        weight = float(0.0)
+        for k in range(8):
+            i, w = corner(at, k)
+            if not is_solid(box, walls, cell_of(box.n, i)):
+                weight += w
+                mean += w * field[i]
+        if weight < 1.0e-6:
+            return wp.vec3()
+        mean /= weight
+    on_end = wp.vec3()
+    for k in range(8):
+        i, w = corner(at, k)
+        counts = bool(True)
+        if trace.beside:
+            counts = not is_solid(box, walls, cell_of(box.n, i))
+        if counts:
+            wp.atomic_add(on_field, i, g * w / weight)
+            on_end += (field[i] - mean) * _slope(at.f, k)
+    return g / weight * on_end
+
+
+@wp.func
+def _interpolate(field: wp.array1d[float], at: Stencil) -> float:
+    i00 = at.base
+    i01 = at.base + at.step[1]
+    i10 = at.base + at.step[0]
+    i11 = i10 + at.step[1]
+    a = wp.lerp(field[i00], field[i00 + at.step[2]], at.f[2])
+    b = wp.lerp(field[i01], field[i01 + at.step[2]], at.f[2])
+    c = wp.lerp(field[i10], field[i10 + at.step[2]], at.f[2])
+    d = wp.lerp(field[i11], field[i11 + at.step[2]], at.f[2])
+    return wp.lerp(wp.lerp(a, b, at.f[1]), wp.lerp(c, d, at.f[1]), at.f[0])
+
+
+@wp.func
+def _corrected_backward(
+    box: Box,
+    walls: wp.array1d[wp.uint8],
+    field: wp.array1d[float],
+    predicted: wp.array1d[float],
+    i: int,
+    origin: Stencil,
+    target: Trace,
+    g: float,
+    on_field: wp.array1d[float],
+    on_predicted: wp.array1d[float],
+) -> wp.vec3:
+    """Adds the gradients of the correction in cell i; returns that to the end of the trace forwards in time."""
+    least = float(field[origin.base])
+    most = float(least)
+    i_least = int(origin.base)
+    i_most = int(origin.base)
+    for k in range(1, 8):
+        j = origin.base + wp.dot(side_of(k), origin.step)
+        if field[j] < least:
+            least = field[j]
+            i_least = j
+        if field[j] > most:
+            most = field[j]
+            i_most = j
+    value = predicted[i] + 0.5 * (field[i] - _interpolate(predicted, stencil(box.n, box.periodic, target.end)))
+    if value < least:
+        wp.atomic_add(on_field, i_least, g)
+        return wp.vec3()
+    if value > most:
+        wp.atomic_add(on_field, i_most, g)
+        return wp.vec3()
+    wp.atomic_add(on_predicted, i, g)
+    wp.atomic_add(on_field, i, 0.5 * g)
+    return _read_backward(box, walls, predicted, target, -0.5 * g, on_predicted)
+
+
+@wp.func
+def _centre(p: wp.vec3i) -> wp.vec3:
+    return wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
+
+
+@wp.kernel
+def _carry(
+    # in:
+    box: Box,
+    u: wp.array1d[wp.vec3],
+    walls: wp.array1d[wp.uint8],
+    fields: _FieldArrays,
+    dt: float,
+    decay: wp.vec2,
+    on_out: _FieldArrays,
+    # in, out:
+    on_fields: _FieldArrays,
+    on_u: wp.array1d[wp.vec3],
+):
+    i = wp.tid()
+    hot = fields.temperature.shape[0] > 0
+    smoke = decay[0] * on_out.density[i]
+    heat = float(0.0)
+    if hot:
+        heat = decay[1] * on_out.temperature[i]
+    if smoke == 0.0 and heat == 0.0:
+        return
+    p = cell_of(box.n, i)
+    if is_solid(box, walls, p):
+        return
+    trace = _trace(box, u, walls, _centre(p), dt)
+    if trace.left:
+        return
+    on_end = _read_backward(box, walls, fields.density, trace, smoke, on_fields.density)
+    if hot:
+        on_end += _read_backward(box, walls, fields.temperature, trace, heat, on_fields.temperature)
+    _velocity_backward(box, u, trace, dt, on_end, on_u)
+
+
+@wp.kernel
+def _correct(
+    # in:
+    box: Box,
+    u: wp.array1d[wp.vec3],
+    walls: wp.array1d[wp.uint8],
+    fields: _FieldArrays,
+    predicted: _FieldArrays,
+    dt: float,
+    decay: wp.vec2,
+    on_out: _FieldArrays,
+    # in, out:
+    on_fields: _FieldArrays,
+    on_predicted: _FieldArrays,
+    on_u: wp.array1d[wp.vec3],
+):
+    i = wp.tid()
+    hot = fields.temperature.shape[0] > 0
+    smoke = decay[0] * on_out.density[i]
+    heat = float(0.0)
+    if hot:
+        heat = decay[1] * on_out.temperature[i]
+    if smoke == 0.0 and heat == 0.0:
+        return
+    p = cell_of(box.n, i)
+    if is_solid(box, walls, p):
+        return
+    source = _trace(box, u, walls, _centre(p), dt)
+    target = _trace(box, u, walls, _centre(p), -dt)
+    if source.left or target.left or source.beside or target.beside:
+        wp.atomic_add(on_predicted.density, i, smoke)
+        if hot:
+            wp.atomic_add(on_predicted.temperature, i, heat)
+        return
+    at = stencil(box.n, box.periodic, source.end)
+    on_end = _corrected_backward(
+        box,
+        walls,
+        fields.density,
+        predicted.density,
+        i,
+        at,
+        target,
+        smoke,
+        on_fields.density,
+        on_predicted.density,
+    )
+    if hot:
+        on_end += _corrected_backward(
+            box,
+            walls,
+            fields.temperature,
+            predicted.temperature,
+            i,
+            at,
+            target,
+            heat,
+            on_fields.temperature,
+            on_predicted.temperature,
+        )
+    _velocity_backward(box, u, target, -dt, on_end, on_u)
+
+
+@wp.kernel
+def _source(
+    # in:
+    box: Box,
+    walls: wp.array1d[wp.uint8],
+    shape: int,
+    centre: wp.vec3,
+    size: wp.vec3,
+    kept: float,
+    low: wp.vec3i,
+    cells: wp.vec3i,
+    number: int,
+    # in, out:
+    on_fields: _FieldArrays,
+    on_values: wp.array1d[wp.vec2],
+):
+    p = low + cell_of(cells, wp.tid())
+    if not within(box, walls, shape, centre, size, p):
+        return
+    i = index_of(box.n, p)
+    on_both = wp.vec2(on_fields.density[i], 0.0)
+    on_fields.density[i] = kept * on_both[0]
+    if on_fields.temperature.shape[0] > 0:
+        on_both[1] = on_fields.temperature[i]
+        on_fields.temperature[i] = kept * on_both[1]
+    wp.atomic_add(on_values, number, on_both)
+
+
+@wp.kernel
+def _lift(
+    # in:
+    box: Box,
+    walls: wp.array1d[wp.uint8],
+    by_density: wp.vec3,
+    by_temperature: wp.vec3,
+    on_force: wp.array1d[wp.vec3],
+    # in, out:
+    on_fields: _FieldArrays,
+):
+    i = wp.tid()
+    p = cell_of(box.n, i)
+    if is_solid(box, walls, p):
+        return
+    r = box.refinement
+    g = on_force[index_of(box.coarse, wp.vec3i(p[0] // r, p[1] // r, p[2] // r))]
+    volume = box.voxel * box.voxel * box.voxel
+    on_fields.density[i] += volume * wp.dot(by_density, g)
+    if on_fields.temperature.shape[0] > 0:
+        on_fields.temperature[i] += volume * wp.dot(by_temperature, g)
+
+
+def advect_backward(
+    box: Box,
+    velocity: wp.array,
+    walls: wp.array,
+    fields: Fields,
+    on_out: Fields,
+    on_fields: Fields,
+    on_velocity: wp.array,
+    dt: float,
+    decay: tuple[float, float] = (1.0, 1.0),
+    predicted: Fields | None = None,
+    on_predicted: Fields | None = None,
+) -> None:
+    """Adds the gradients of `advection.advect`, or with `predicted` and `on_predicted` those of its second half.
+
+    Args:
+        box, velocity, walls, fields, dt, decay, predicted: As for `advect`, in float32.
+        on_out: Gradients to its result.
+        on_fields: Gradients to `fields`, added to.
+        on_velocity: vec3 [coarse cells], the gradient to `velocity`, added to.
+        on_predicted: Gradients to `predicted`, added to.
+    """
+    cells, device = fields.density.shape[0], fields.density.device
+    settings = [float(dt), wp.vec2(*decay), on_out.arrays]
+    if predicted is None or on_predicted is None:
+        inputs, outputs = [box, velocity, walls, fields.arrays, *settings], [on_fields.arrays, on_velocity]
+        wp.launch(_carry, cells, inputs=inputs, outputs=outputs, device=device)
+    else:
+        inputs = [box, velocity, walls, fields.arrays, predicted.arrays, *settings]
+        outputs = [on_fields.arrays, on_predicted.arrays, on_velocity]
+        wp.launch(_correct, cells, inputs=inputs, outputs=outputs, device=device)
+
+
+def source_backward(
+    box: Box,
+    walls: wp.array,
+    shape: int,
+    centre: Sequence[float],
+    size: Sequence[float],
+    number: int,
+    on_fields: Fields,
+    on_values: wp.array,
+    *,
+    fixed: bool,
+) -> None:
+    """Computes the gradients of `advection_sources.add_source` for values of at least 0, so that nothing is clamped.
+
+    Args:
+        box, walls, shape, centre, size, fixed: As for `add_source`.
+        number: Number of the source.
+        on_fields: Gradients to the fields after it, overwritten by those to the fields before it.
+        on_values: vec2 [S], the gradients to the density and the temperature that each source adds or sets; that of
+            this source is added to.
+    """
+    low, cells, total = region_of(box, centre, size)
+    if total > 0:
+        inputs = [box, walls, shape, wp.vec3(*centre), wp.vec3(*size), 0.0 if fixed else 1.0, low, cells, number]
+        wp.launch(_source, total, inputs=inputs, outputs=[on_fields.arrays, on_values], device=on_values.device)
+
+
+def buoyancy_backward(
+    box: Box,
+    walls: wp.array,
+    by_density: Sequence[float],
+    by_temperature: Sequence[float],
+    on_force: wp.array,
+    on_fields: Fields,
+) -> None:
+    """Adds the gradients of `advection_sources.buoyancy` to those of the fields.
+
+    Args:
+        box, walls, by_density, by_temperature: As for `buoyancy`.
+        on_force: vec3 [coarse cells], the gradient to its result.
+        on_fields: Gradients to the fields, added to.
+    """
+    inputs = [box, walls, wp.vec3(*by_density), wp.vec3(*by_temperature), on_force]
+    cells, device = on_fields.density.shape[0], on_force.device
+    wp.launch(_lift, cells, inputs=inputs, outputs=[on_fields.arrays], device=device)
