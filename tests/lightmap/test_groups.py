@@ -12,7 +12,7 @@ from builders.small_sets import moving_light, tiny_profile, write_set
 import wlm
 from wlm.formats.artifact import read_artifact
 from wlm.formats.exr import write_exr
-from wlm.lightmap import Layer, from_arrays, from_groups, from_layers, load
+from wlm.lightmap import Layer, from_arrays, from_groups, from_layers, load, reading
 from wlm.lightmap.codec import group_sizes
 from wlm.lightmap.sheet import BASE
 
@@ -227,6 +227,15 @@ def test_wrong_lists_of_groups_are_one_line(changes, words, sets, tmp_path):
     path = write_groups(tmp_path / "lit", sets, **changes)
     text = error_of(load, path)
     assert text.startswith(str(path)) and words in text
+
+
+def test_groups_are_bounded_together(sets, tmp_path, monkeypatch):
+    path = write_groups(tmp_path / "lit", {"sky": sets["sky"], "lamp": sets["lamp 0"]})
+    monkeypatch.setattr(reading, "PICTURE_GROWTH", 0)
+    # Each alone is within the bound.
+    monkeypatch.setattr(reading, "FRAMES", sets["sky"].light.frames.nbytes)
+    assert "set.json: lightmaps: expected at most" in error_of(load, path)
+    assert load(path, trust=True).groups == ("sky", "lamp")
 
 
 def test_a_group_of_a_layered_set_may_lack_atlases(tmp_path):
