@@ -1,8 +1,11 @@
 """Gradients through air and smoke against finite differences in float64, in torch and on tapes; stored states."""
 
+import importlib.util
 import math
+import sys
 import weakref
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from wlm.fluid.lattice import Lattice
 from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
 from wlm_kernels.fluid.lattice_sets import LATTICES
 
+ROOT = Path(__file__).resolve().parents[2]
 STEPS = 20
 VISCOSITY = 0.02
 TOLERANCE = 1e-3  # of a derivative
@@ -347,6 +351,23 @@ def test_reversal(steps: int, most: int, sweeps: int):
     assert reversal.run(stored, steps, most, advance).number == steps
     assert reversal.reverse(stored, steps, most, advance, backward, steps) == 0
     assert len(stored) == 1 and computed.max() <= sweeps
+
+
+def test_control(device: str, monkeypatch):
+    """The demo's scene, for fewer steps: the smoke of other sources in another wind is found again."""
+    spec = importlib.util.spec_from_file_location("fluid_control", ROOT / "demos" / "fluid_control.py")
+    demo = importlib.util.module_from_spec(spec)
+    # Its dataclass looks there for the names of types.
+    monkeypatch.setitem(sys.modules, "fluid_control", demo)
+    spec.loader.exec_module(demo)
+    model, steps = demo.scene(device), 8
+    strength = torch.full((steps, demo.NOZZLES), -4.0, device=device)
+    strength[2:5, 3:6] = 2.0
+    inlet, sources = demo.Unknowns(strength, torch.ones(demo.KNOTS, device=device)).controls()
+    target = model.advance(model.state(), steps, inlet=inlet, sources=sources).density
+    first, last, errors = demo.find(model, target, steps, 6)
+    assert errors[-1] < 0.25 * errors[0]
+    assert (last - target).square().sum() < 0.25 * (first - target).square().sum()
 
 
 def test_refusals():

@@ -435,13 +435,14 @@ class _Smoke:
         forces = self._buoyancy(tuple(smoke))
         *_, f = self._moved(work, step, f, controls[0], forces)
         (density, heat), _ = self.solver._advect(self._velocity(f, forces), tuple(smoke))
+        fields = _fields((density, heat))
         for number, source in enumerate(self.setup.sources):
             values = (source.density, source.temperature)
             if self.values is not None:
                 values = self.values[step if len(self.values) > 1 else 0][number]
             scale = source.steps(self.setup.substeps)
             where = [self.setup.box, self.setup.walls, *source.region(self.setup.box.refinement)]
-            value, fields = (scale * values[0], scale * values[1]), _fields((density, heat))
+            value = scale * values[0], scale * values[1]
             advection_sources.add_source(*where, value, fields, fixed=source.fixed)
         return f, density, heat
 
@@ -455,14 +456,15 @@ class _Smoke:
         forces = self._buoyancy(smoke)
         before = self._moved(work, step, f, controls[0], forces)
         u = self._velocity(before[-1], forces)
-        on_values = _at(on_controls[1], step)
-        for number, source in reversed(list(enumerate(setup.sources))):
-            on_value = on_f.new_zeros(1, 2)
-            where = [setup.box, setup.walls, *source.region(setup.box.refinement)]
-            fields, into = _fields(on_smoke), _flat(on_value, wp.vec2)
-            advection_adjoint.source_backward(*where, fields, into, fixed=source.fixed)
-            if on_values is not None:
-                on_values[number] += source.steps(setup.substeps) * on_value[0]
+        if setup.sources:
+            on_values = on_f.new_zeros(len(setup.sources), 2)
+            fields, into = _fields(on_smoke), _flat(on_values, wp.vec2)
+            for number, source in reversed(list(enumerate(setup.sources))):
+                where = [setup.box, setup.walls, *source.region(setup.box.refinement), number]
+                advection_adjoint.source_backward(*where, fields, into, fixed=source.fixed)
+            if on_controls[1] is not None:
+                scales = [source.steps(setup.substeps) for source in setup.sources]
+                _at(on_controls[1], step).add_(on_values * on_values.new_tensor(scales)[:, None])
         on_u = torch.zeros(air._cells, 3, device=air.device)
         predicted = self.solver._advect(u, smoke)[1] if setup.scheme == "maccormack" else None
         on_smoke = self.solver._advect_backward(u, smoke, predicted, on_smoke, _flat(on_u, wp.vec3))
