@@ -50,7 +50,13 @@ VIEWS: dict[str, tuple[Sequence[str], dict[str, Any], str, dict[str, float]]] = 
     "smoke.png": ([f"smoke/plume_{angle:02}.exr" for angle in (0, 30, 60, 90)], {}, "light", {"turn": 60.0}),
 }
 # Those that demos make themselves.
-DEMOS = {"ops-bc7.png": "ops_bc7.png", "ops-march.png": "ops_march.png", "smoke-light.png": "smoke/smoke_light.png"}
+DEMOS = {
+    "fluid-control.png": "fluid_control.png",
+    "ops-bc7.png": "ops_bc7.png",
+    "ops-march.png": "ops_march.png",
+    "ops-silhouette.png": "ops_silhouette.png",
+    "smoke-light.png": "smoke/smoke_light.png",
+}
 
 
 class Browser:

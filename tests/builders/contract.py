@@ -56,6 +56,12 @@ class Subject:
         return fit.open_checkpoint(output, data, self.profile, resume=resume, **options)
 
 
+def _groups(model: Any) -> dict[str, np.ndarray]:
+    decoder = model.decoder()
+    decoder.set_weights({"lamp": (0.5, 2.0, 0.0)})
+    return {"frame": decoder.frame(18.5)[6:10, 98:142]}
+
+
 def _layers(model: Any) -> dict[str, np.ndarray]:
     return {
         f"{atlas}_{layer}": values[:24:2, :24:2]
@@ -103,6 +109,7 @@ SUBJECTS: dict[str, Callable[[], Subject]] = {
         {"metrics": ("psnr", "seen")},
     ),
     "lightmap-layers": lambda: Subject("lightmap", "lightmap-layers", _layers),
+    "lightmap-groups": lambda: Subject("lightmap", "lightmap-groups", _groups),
     "probe": lambda: Subject("probe", "probe", _probes, _room, wlm.probe.Profile(**_GAUSSIANS)),
     "probe-pca": lambda: Subject("probe", "probe-pca", _probes, _room, "pca", options={"positions": True}),
     **{f"atlas-{kind}": lambda kind=kind: _atlas(kind) for kind in ("tiles", "cascade", "bc6h", "plain")},

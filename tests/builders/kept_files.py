@@ -15,6 +15,7 @@ import torch
 from builders import atlas_models, smoke_samples, synthetic
 from builders.atlas_meshes import sheet
 from builders.layered_sets import random_layers
+from builders.light_groups import few_texels
 from builders.probe_sets import synthetic as synthetic_probes
 from builders.small_sets import moving_light, tiny_profile
 
@@ -63,6 +64,11 @@ def _frames() -> Kept:
 def _layers() -> Kept:
     ranges = {"0.kind": (0, 7), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
     return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing"}, ranges)
+
+
+def _groups() -> Kept:
+    ranges = {"0.kind": (0, 7), "1.times": (0, 24.5), "0.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
+    return Kept(_written(few_texels().save), wlm.load, {"0.mask": "missing"}, ranges)
 
 
 def _atlas(kind: str, colour: str) -> Kept:
@@ -173,6 +179,7 @@ KEPT: dict[str, Callable[[], Kept]] = {
         "lightmap": _lightmap,
         "lightmap-frames": _frames,
         "lightmap-layers": _layers,
+        "lightmap-groups": _groups,
         "atlas-tiles": lambda: _atlas("tiles", "half"),
         "atlas-cascade": lambda: _atlas("cascade", "half"),
         "atlas-bc6h": lambda: _atlas("plain with uv", "bc6h"),

@@ -12,3 +12,9 @@
 A case depends on its reader's name and its index alone. It must be accepted, or be refused with one `WlmError` of one
 line; an accepted one must be what docs/formats.md says. Anything else is a failure.
 """
+
+import sys
+from pathlib import Path
+
+# Modules here import `builders`, which pytest finds by itself; `python -m tests.fuzz` and its processes do not.
+sys.path.append(str(Path(__file__).resolve().parents[1]))

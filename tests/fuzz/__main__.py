@@ -34,7 +34,6 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the counts there")
     parser.add_argument("--corpus", action="store_true", help="make the corpus again")
     words = parser.parse_args()
-    sys.path.append(str(ROOT / "tests"))
     os.environ.setdefault("WARP_CACHE_PATH", str(ROOT / ".cache" / "warp"))
     if words.corpus:
         import_module("tests.fuzz.corpus").write_corpus(Path(__file__).parent / "corpus")

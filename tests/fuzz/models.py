@@ -265,7 +265,7 @@ class _diverging:
         return isinstance(error, WlmError) and "diverged" in str(error)
 
 
-_LIGHTMAPS = ("lightmap.wlm", "lightmap-frames.wlm", "lightmap-layers.wlm")
+_LIGHTMAPS = ("lightmap.wlm", "lightmap-frames.wlm", "lightmap-layers.wlm", "lightmap-groups.wlm")
 _ATLASES = ("tiles", "mixed", "cascade", "bc6h", "plain", "shared", "separate")
 READERS = (
     Reader("lightmap", "a.wlm", stored(*_LIGHTMAPS), vary_artifact, _lightmap),

@@ -5,7 +5,6 @@ import os
 import resource
 import shutil
 import signal
-import sys
 import tempfile
 import traceback
 import unicodedata
@@ -133,7 +132,6 @@ class Alone(Bench):
         cache = os.environ.get("WARP_CACHE_PATH", str(ROOT / ".cache" / "warp"))
         # Two that compile one kernel at once would race for its files.
         os.environ["WARP_CACHE_PATH"] = f"{cache}-{number}" if number else cache
-        sys.path.append(str(ROOT / "tests"))
         warnings.simplefilter("ignore")
         super().__init__(own, *arguments)
 

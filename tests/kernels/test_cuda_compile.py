@@ -109,7 +109,7 @@ FACTORIES = [
     *_cases("step", lambda *of: lightmap_step.step_kernels(*of, "cuda"), [], BOTH, WIDTHS, ("tanh", "exact")),
     *_cases("exact_decode", lambda *of: list(lightmap_decode.exact_kernels(*of, "tanh")), [], BOTH, WIDTHS),
     *_cases("strip_decode", lambda *of: lightmap_decode.strip_kernels(of[0], "fast", of[1]), [], WIDTHS, BOTH),
-    *_cases("matrix_decode", matrix_decode.matrix_kernels, [(64, True)], (16, 32, 48, 64), BOTH),
+    *_cases("matrix_decode", matrix_decode.matrix_kernels, [(16, 32, True)], (16, 48, 64), (4, 32, 40), BOTH),
     *_cases("frames", lambda: list(FRAMES), []),
     *_cases("pages", lambda *of: [pages.page_kernel(*of)], [], (8, 16, 64), ("fast", "exact")),
     *_cases("gaussian_step", lambda latent: probe_step.step_kernels(latent, "cuda"), [], LATENTS),

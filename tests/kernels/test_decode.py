@@ -16,6 +16,7 @@ from wlm.lightmap.exact import decode_tile64
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileKind
+from wlm_kernels.lightmap.matrix_decode import pack_networks
 
 KINDS = (3, 2, 3, 1)  # dynamic, static, dynamic, constant
 STORED, BETWEEN = (0.0, 13.0), (3.3, 21.7)  # 21.7 lies between the last stored time and the next day's first
@@ -58,6 +59,40 @@ def _hold_strip(model: SheetModel, device: str, times: tuple[float, ...]) -> Non
             continue
         assert off.max() <= 1
         assert (off == 0).mean() >= 0.99, f"{(off == 0).mean():.4f} of the codes are equal"
+
+
+@pytest.mark.parametrize("width", [16, 48])
+def test_networks_packed_for_matrix_units(width: int):
+    """The words that each lane of a warp multiplies, in the order of the PTX instruction's fragments."""
+    random = np.random.default_rng(width)
+    hidden = random.standard_normal((2, 18 + width, width)).astype(np.float16).astype(np.float32)
+    output = random.standard_normal((2, width + 1, 3)).astype(np.float16).astype(np.float32)
+    words = pack_networks(hidden, output)[1]
+    place = 0
+
+    def layer(inputs: int, units: int) -> np.ndarray:
+        nonlocal place
+        weights = np.empty((inputs, units))
+        for k in range(inputs // 16):
+            for i in range(units // 8):
+                for lane in range(32):
+                    g, q = lane // 4, lane % 4
+                    for row in (2 * q, 2 * q + 8):
+                        weights[16 * k + row : 16 * k + row + 2, 8 * i + g] = words[place : place + 1].view(np.float16)
+                        place += 1
+        return weights
+
+    first, second, one, other = layer(16, width), layer(width, width), layer(width, 8), layer(width, 8)
+    scale = (np.sqrt(2.0 / np.pi) * 0.044715) ** (1 / 3)
+    first[:4] /= np.sqrt(12.0) / 255.0
+    np.testing.assert_allclose(first[:12] / scale, hidden[1, :12], rtol=1e-3, atol=3e-5)
+    assert (first[12:] == 0).all()
+    np.testing.assert_allclose(2.0 * second, hidden[1, 17:-1], atol=1e-6)
+    np.testing.assert_allclose(2.0 * scale * one[:, :3], output[1, :-1], rtol=1e-3)
+    assert (one[:, 3:] == 0).all() and np.array_equal(np.roll(one, 4, axis=1), other)
+    bias = words[place : place + width // 2].view(np.float16)
+    np.testing.assert_allclose(bias / scale, hidden[1, -1], rtol=1e-3, atol=1e-6)
+    assert words[place + width // 2 :].view(np.float32).tolist() == [*output[1, -1].tolist(), 0.0]
 
 
 def _stored(fit, case: Case) -> SheetModel:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from builders.checks import error_of
+from builders.light_groups import DARK, random_groups
 from builders.synthetic import random_model, random_sheet
 
 import wlm
@@ -13,15 +14,18 @@ from wlm.formats.artifact import read_artifact
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.sheet import LIGHT, Sheet
 from wlm.lightmap.tiles import TileKind
+from wlm.lightmap.virtual.clock import Clock
 from wlm.lightmap.virtual.texture import VirtualTexture
 from wlm.texels import OFFSETS, nearest_valid
+from wlm_kernels.lightmap.pages import AFTER, BEFORE, SHARE, WAITING
 
 KINDS = (3, 4, 2, 1, 0, 3)
 SWITCH = 18.0 + 55.0 / 60.0
 TIMES = (0.0, 7.5, 13.0, 18.75, SWITCH)
-SMALL = {"side": 8, "border": 1}
+SMALL = {"side": 8, "border": 1, "gelu": "tanh"}
 
 
 def gappy() -> np.ndarray:
@@ -107,7 +111,7 @@ def assert_near(got, expected, steps=0.51):
 def test_pages_of_all_kinds_continue_across_tiles(device):
     model = random_model(KINDS, columns=3, mask=gappy())
     own, edge = model.light, 136
-    with VirtualTexture(model, device) as virtual:
+    with VirtualTexture(model, device, gelu="tanh") as virtual:
         settle(virtual, 9.0, view(own))
         expected = level_twin(SheetDecoder(own, device).frame(9.0).astype(np.float64), stored_texels(own), 0)[0]
         state, layout = virtual.state(), virtual.layout
@@ -324,11 +328,41 @@ def test_what_is_refused():
     assert "tiles: expected at least" in error_of(VirtualTexture, random_model((3, 3), columns=2), side=64, tiles=10)
 
 
-def test_groups_are_refused():
-    sheet = random_sheet((1, 1))
-    model = LightmapModel("two", "0123456789abcdef", sheet.profile, {LIGHT: sheet, replace(LIGHT, group="lamp"): sheet})
-    assert error_of(VirtualTexture, model) == (
-        "two: expected a model with one light group for a virtual texture, found base, lamp"
+def test_groups_are_added_by_their_weights(device):
+    model = random_groups()
+    weights = {"sky": (1.0, 1.0, 1.0), "sun": (0.25, 1.5, 0.0), "lamp": (0.0, 0.0, 0.0), DARK: (1.0, 1.0, 1.0)}
+    at = view(model.light, 3.0, 32)
+
+    def expected(hour):
+        own = model.light
+        total = np.zeros((-(-own.height // 8), -(-own.width // 8), 3))
+        for sheet, own in model.sheets.items():
+            light = SheetDecoder(own, device).frame(hour).astype(np.float64)
+            total += np.array(weights[sheet.group]) * level_twin(light, stored_texels(own), 3)[0]
+        centre = (np.stack(np.mgrid[: total.shape[0], : total.shape[1]][::-1], 2) + 0.5) * 8.0
+        return total, (centre / [own.width, own.height]).astype(np.float32)
+
+    with VirtualTexture(model, device, **SMALL, decodes=32) as virtual:
+        virtual.set_weights(weights)
+        settle(virtual, 9.0, at)
+        for hour in (9.0, 15.0):
+            virtual.set_weights({"lamp": (2.0, 1.0, 0.5)} if hour == 9.0 else {"lamp": 0.0})
+            weights["lamp"] = tuple(virtual.weights["lamp"].tolist())
+            if hour != 9.0:
+                settle(virtual, hour, at)
+            # The lamp is there without a further frame.
+            total, uv = expected(hour)
+            derivative = np.zeros((*uv.shape[:2], 4), np.float32)
+            derivative[..., 0], derivative[..., 3] = 8.0 / model.light.width, 8.0 / model.light.height
+            reading = virtual.sample(np.zeros(uv.shape[:2], np.int32), uv, derivative)
+            assert (reading.coarser == 0).all() and reading.change.max() <= virtual.tolerance
+            # The last texel of a row reaches past the map's end: its centre is clamped.
+            assert_near(reading.light[:-1, :-1], total[:-1, :-1], 4.0)
+        check_tables(virtual)
+        assert "expected a group among sky, sun, lamp" in error_of(virtual.set_weights, {"moon": 1.0})
+    sheets = {replace(LIGHT, group=str(i)): model.light for i in range(9)}
+    assert error_of(VirtualTexture, LightmapModel("nine", "0" * 16, model.profile, sheets)) == (
+        "nine: expected at most 8 light groups, got 9"
     )
 
 
@@ -371,6 +405,67 @@ def test_a_damaged_tile_shows_its_parent_page(tmp_path, device):
             model.decoder(tiles=[1])
 
 
+def test_a_tile_that_is_damaged_later_is_one_line(tmp_path, device):
+    random_model((3, 2, 4) * 8, columns=6).save(tmp_path / "a.wlm")
+    with wlm.load(tmp_path / "a.wlm") as model:
+        own = model.light
+        with VirtualTexture(model, device, **SMALL, tiles=450_000) as virtual:
+            tile = int(np.flatnonzero(virtual._stores[0].slot == WAITING)[0])
+            sizes = read_artifact(tmp_path / "a.wlm").pieces["0.tiles"].sizes
+            with open(tmp_path / "a.wlm", "r+b") as file:
+                file.seek(-int(sizes[tile:].sum()), 2)
+                file.write(bytes(sizes[tile]))
+            row, column = np.array(divmod(tile, 6)) * 128
+            # Inside the tile, farther from its border than a page reads.
+            window = np.array([column + 32, row + 32, column + 96, row + 96]) / ([own.width, own.height] * 2)
+            at = view(own, 0.0, 32, window)
+            for _ in range(120):
+                virtual.frame(7.5, *at)
+                virtual.wait(1.0)
+            assert len(virtual.warnings) == 1 and f"tile {tile}: " in virtual.warnings[0]
+            reading = virtual.sample(*at)
+            assert (reading.coarser == 1).all() and reading.light.any()
+            check_tables(virtual)
+
+
+def test_a_view_without_pixels(device):
+    model = random_model((1,), columns=1)
+    nothing = np.zeros((0, 0), np.int32), np.zeros((0, 0, 2), np.float32), np.zeros((0, 0, 4), np.float32)
+    with VirtualTexture(model, device, **SMALL) as virtual:
+        virtual.frame(1.0, *nothing)
+        assert virtual.sample(*nothing).light.shape == (0, 0, 3) and virtual.report()["visible"] == 1
+
+
+@pytest.mark.parametrize(
+    ("times", "period", "moves"),
+    [
+        # Each move: a time, the stored times around it, and whether pages are adopted, dropped and prepared.
+        ((0.0, 6.0, 12.0, 18.0, 18.1), 24.0, [(17.5, (2, 3), 1), (18.05, (3, 4), 1), (18.1, (4, 0), "adopt")]),
+        ((0.0, 6.0, 12.0, 18.0, 18.1), 24.0, [(17.5, (2, 3), 1), (3.0, (0, 1), "adopt"), (17.9, (2, 3), 1)]),
+        ((0.0, 6.0, 12.0, 18.0, 18.1), 24.0, [(17.5, (2, 3), 1), (17.0, (2, 3), "drop"), (16.0, (2, 3), 0)]),
+        # Over midnight.
+        ((0.0, 6.0, 12.0, 18.0, 23.9), 24.0, [(23.0, (3, 4), 1), (23.95, (4, 0), 1), (24.01, (0, 1), "adopt")]),
+        (
+            (0.0, 10.0, 10.5, 20.0),
+            None,
+            [(9.9, (0, 1), 1), (10.5, (2, 3), "adopt"), (99.0, (3, 3), 0), (9.0, (0, 1), 0)],
+        ),
+        ((5.0,), 24.0, [(4.0, (0, 0), 0), (6.0, (0, 0), 0)]),
+        ((5.0,), None, [(4.0, (0, 0), 0), (6.0, (0, 0), 0)]),
+        ((5.0, 5.1), None, [(5.05, (0, 1), 0), (5.1, (1, 1), 0)]),
+    ],
+)
+def test_the_clock_passes_switches(times, period, moves):
+    clock = Clock(TimeAxis(np.array(times), period, "frames"))
+    for time, around, wanted in moves:
+        rows, (adopt, drop, prepare) = clock.frame(time)
+        assert (adopt, drop) == (int(wanted == "adopt"), int(wanted == "drop")), time
+        assert wanted in ("adopt", "drop") or prepare == wanted, time
+        assert rows[0, [BEFORE, AFTER]].tolist() == list(around)
+        held = around[0] in clock.switches
+        assert rows[0, SHARE] == (0.0 if held else np.float32(clock.axis.neighbours(time)[2]))
+
+
 def test_changes_are_those_between_stored_times():
     sheet = random_sheet((1, 1), columns=1, period=None)
     sheet = replace(
@@ -378,5 +473,5 @@ def test_changes_are_those_between_stored_times():
     )
     model = LightmapModel("two", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
     with VirtualTexture(model) as virtual:
-        np.testing.assert_allclose(virtual._store.change, [[0.5, 0.0, 1.0, 0.0], [0.0] * 4], atol=0.01)
+        np.testing.assert_allclose(virtual._stores[0].change, [[0.5, 0.0, 1.0, 0.0], [0.0] * 4], atol=0.01)
         np.testing.assert_allclose(virtual._pages.change.numpy()[-1], [0.0, 0.5, 0.5, 1.5, 1.5], atol=0.01)

@@ -183,9 +183,9 @@ class DifferentiableLattice:
     def _collide(self, work: "_Work", f: wp.array, done: int, forces: wp.array, out: wp.array) -> None:
         setup = self._setup
         spec = replace(setup.spec, forced=forces.shape[0] > 0)
-        work.clock.fill_(done)
+        work.done.fill_(done)
         inputs = [wp.vec3i(*setup.shape), f, setup.solid, setup.tau, setup.eddy, forces, 0]
-        outputs = [to_warp(work.clock), to_warp(work.trouble), work.sums, out]
+        outputs = [work.clock, work.trouble, work.sums, out]
         wp.launch(step_kernel(spec), self._cells, inputs=inputs, outputs=outputs, device=f.device)
 
     def _advance(
@@ -201,7 +201,7 @@ class DifferentiableLattice:
         self._collide(work, self._populations(f), done, forces, left)
         where = [setup.tables, wp.vec3i(*setup.shape), setup.bounded, 0, work.links, setup.solid]
         rise = 1.0 / max(setup.ramp, 1)
-        lattice_links.apply(setup.link_kernels, *where, to_warp(work.clock), rise, left, work.sums)
+        lattice_links.apply(setup.link_kernels, *where, work.clock, rise, left, work.sums)
         return out
 
     def _reverse(
@@ -306,7 +306,7 @@ class DifferentiableSolver:
             tail = (len(self._setup.sources), 2)
             check("sources", sources, (steps, *tail) if sources.ndim == 3 else tail, self.air.device)
             check_finite({"sources": (0.0, math.inf)}, sources=sources)
-            sources = sources.reshape(-1, *tail)
+            sources = sources if sources.ndim == 3 else sources[None]
         controls = self.air._inlet(inlet, steps), sources
         machine = _Smoke(self, self._solver.steps if begin is None else begin, controls[1])
         f, density, heat = _Steps.apply(machine, *_counts(steps, states), 3, state.populations, *smoke, *controls)
@@ -386,13 +386,15 @@ class _Work:
 
     Attributes:
         clock, trouble, sums: See `wlm_kernels.fluid.lattice.step_kernel`.
+        done, first_trouble: `clock` and `trouble` as tensors.
         links: The lattice's links with terms and values of this call.
     """
 
     def __init__(self, air: DifferentiableLattice) -> None:
         links, device = air._setup.links, air.device
-        self.clock = torch.zeros(2, dtype=torch.int32, device=device)
-        self.trouble = torch.full((1,), QUIET, dtype=torch.int64, device=device)
+        self.done = torch.zeros(2, dtype=torch.int32, device=device)
+        self.first_trouble = torch.full((1,), QUIET, dtype=torch.int64, device=device)
+        self.clock, self.trouble = to_warp(self.done), to_warp(self.first_trouble)
         self.sums = to_warp(torch.zeros(2, dtype=torch.float64, device=device))
         self.links = lattice_links.Links()
         self.links.cell, self.links.code, self.links.term = links.cell, links.code, links.term
@@ -435,13 +437,14 @@ class _Smoke:
         forces = self._buoyancy(tuple(smoke))
         *_, f = self._moved(work, step, f, controls[0], forces)
         (density, heat), _ = self.solver._advect(self._velocity(f, forces), tuple(smoke))
+        fields = _fields((density, heat))
         for number, source in enumerate(self.setup.sources):
             values = (source.density, source.temperature)
             if self.values is not None:
                 values = self.values[step if len(self.values) > 1 else 0][number]
             scale = source.steps(self.setup.substeps)
             where = [self.setup.box, self.setup.walls, *source.region(self.setup.box.refinement)]
-            value, fields = (scale * values[0], scale * values[1]), _fields((density, heat))
+            value = scale * values[0], scale * values[1]
             advection_sources.add_source(*where, value, fields, fixed=source.fixed)
         return f, density, heat
 
@@ -455,14 +458,15 @@ class _Smoke:
         forces = self._buoyancy(smoke)
         before = self._moved(work, step, f, controls[0], forces)
         u = self._velocity(before[-1], forces)
-        on_values = _at(on_controls[1], step)
-        for number, source in reversed(list(enumerate(setup.sources))):
-            on_value = on_f.new_zeros(1, 2)
-            where = [setup.box, setup.walls, *source.region(setup.box.refinement)]
-            fields, into = _fields(on_smoke), _flat(on_value, wp.vec2)
-            advection_adjoint.source_backward(*where, fields, into, fixed=source.fixed)
-            if on_values is not None:
-                on_values[number] += source.steps(setup.substeps) * on_value[0]
+        if setup.sources:
+            on_values = on_f.new_zeros(len(setup.sources), 2)
+            fields, into = _fields(on_smoke), _flat(on_values, wp.vec2)
+            for number, source in reversed(list(enumerate(setup.sources))):
+                where = [setup.box, setup.walls, *source.region(setup.box.refinement), number]
+                advection_adjoint.source_backward(*where, fields, into, fixed=source.fixed)
+            if on_controls[1] is not None:
+                scales = [source.steps(setup.substeps) for source in setup.sources]
+                _at(on_controls[1], step).add_(on_values * on_values.new_tensor(scales)[:, None])
         on_u = torch.zeros(air._cells, 3, device=air.device)
         predicted = self.solver._advect(u, smoke)[1] if setup.scheme == "maccormack" else None
         on_smoke = self.solver._advect_backward(u, smoke, predicted, on_smoke, _flat(on_u, wp.vec3))
@@ -641,7 +645,7 @@ def _counts(steps: int, states: int) -> tuple[int, int]:
 
 
 def _check_trouble(air: DifferentiableLattice, work: _Work) -> None:
-    if work.trouble.is_cuda and torch.cuda.is_current_stream_capturing():
+    if work.first_trouble.is_cuda and torch.cuda.is_current_stream_capturing():
         return
-    if (key := int(work.trouble)) != QUIET:
+    if (key := int(work.first_trouble)) != QUIET:
         raise blown_up(key, air._setup.shape)

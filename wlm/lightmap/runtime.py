@@ -11,6 +11,7 @@ read across two tiles. It adds light groups, fills gaps between charts, and its 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -96,12 +97,19 @@ class _MapDecoder(RuntimeDecoder):
         self._tiles = MapTiles(model, kind, device, self.gelu)
         self._states: list[decode_kernels.TimeState | None] = [None, None]
         super().__init__(model, device, shared)
-        self._early, self._late = self._empty(), self._empty()
 
     def set_time(self, time: float) -> None:
         self._time, self._reads = time, self.model.axis.reads(time)
         for i, (stamp, _) in enumerate(self._reads):
             self._states[i] = self._tiles.state(stamp, self._states[i])
+
+
+class _OneTimeDecoder(_MapDecoder):
+    """Base class of decoders whose kernels decode one time: between two, a last kernel interpolates their results."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._early, self._late = self._empty(), self._empty()
 
     def decode(self) -> None:
         early, late = self._states
@@ -122,15 +130,7 @@ class _MapDecoder(RuntimeDecoder):
         raise NotImplementedError
 
 
-class _ScratchDecoder(_MapDecoder):
-    """Base class of decoders of dynamic tiles whose kernels keep intermediate results of a time in buffers."""
-
-    def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
-        tiles = self._tiles
-        self._kernels.decode(*tiles.arguments, state, *self._scratch, tiles.places, self._rows, out)
-
-
-class StripDecoder(_ScratchDecoder):
+class StripDecoder(_OneTimeDecoder):
     """Fast decoder of dynamic tiles: one thread decodes four texels (neural-dynamic-gi, section 3.5).
 
     Attributes:
@@ -158,9 +158,16 @@ class StripDecoder(_ScratchDecoder):
             wp.empty((n, TILE), dtype=wp.vec2, device=self.device),
         )
 
+    def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
+        tiles = self._tiles
+        self._kernels.decode(*tiles.arguments, state, *self._scratch, tiles.places, self._rows, out)
 
-class MatrixDecoder(_ScratchDecoder):
-    """Fast decoder of dynamic tiles on a GPU's matrix units (tensor cores), in half floats, with GELU "fast"."""
+
+class MatrixDecoder(_MapDecoder):
+    """Fast decoder of dynamic tiles on a GPU's matrix units (tensor cores), in half floats, with GELU by its tanh form.
+
+    A decode is one launch, also between two stored times.
+    """
 
     def __init__(self, model: SheetModel, device: str = "cuda", shared: bool = False) -> None:
         """Uploads the dynamic tiles of a sheet; for the arguments see `StripDecoder`.
@@ -169,21 +176,28 @@ class MatrixDecoder(_ScratchDecoder):
             WlmError: The device is not a GPU, the networks' hidden width is not a multiple of 16, or the sheet has no
                 dynamic tile.
         """
-        name, hidden = device_of(device), model.profile.hidden
+        name, profile = device_of(device), model.profile
         if name == "cpu":
             raise WlmError("device: expected cuda for MatrixDecoder, got cpu")
-        if hidden % 16:
-            raise WlmError(f"model: expected networks whose hidden width is a multiple of 16, got {hidden}")
+        if profile.hidden % 16:
+            raise WlmError(f"model: expected networks whose hidden width is a multiple of 16, got {profile.hidden}")
         super().__init__(model, name, "fast", TileKind.DYNAMIC, shared)
-        n, resolution = len(self.numbers), model.profile.uvt_resolution
-        self._kernels = matrix_decode.matrix_kernels(hidden, shared)
-        self._scratch = (
-            wp.empty((n, resolution, resolution), dtype=wp.vec4, device=self.device),
-            *(wp.empty((n, TILE), dtype=wp.vec2, device=self.device) for _ in range(2)),
+        self._kernels = matrix_decode.matrix_kernels(profile.hidden, profile.uvt_resolution, shared)
+        _, hidden, output_layers = self._tiles.arguments
+        n = len(self.numbers)
+        packed = matrix_decode.pack_networks(
+            hidden.numpy().reshape(n, -1, profile.hidden), output_layers.numpy().reshape(n, -1, 3)
         )
+        self._packed = wp.array(packed, dtype=wp.uint32, device=self.device)
+
+    def decode(self) -> None:
+        (stored, hidden, _), places = self._tiles.arguments, self._tiles.places
+        states = self._states[: len(self._reads)]
+        share = self._reads[1][1] if len(states) == 2 else 0.0
+        self._kernels.decode(stored, self._packed, hidden, states, share, places, self._rows, self.out)
 
 
-class ExactDecoder(_MapDecoder):
+class ExactDecoder(_OneTimeDecoder):
     """Plain decoder of static or dynamic tiles: a thread decodes a texel, in the training's order of operations."""
 
     def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:

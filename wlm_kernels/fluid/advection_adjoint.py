@@ -352,10 +352,10 @@ def _source(
     kept: float,
     low: wp.vec3i,
     cells: wp.vec3i,
+    number: int,
     # in, out:
     on_fields: _FieldArrays,
-    # out:
-    on_value: wp.array1d[wp.vec2],
+    on_values: wp.array1d[wp.vec2],
 ):
     p = low + cell_of(cells, wp.tid())
     if not within(box, walls, shape, centre, size, p):
@@ -366,7 +366,7 @@ def _source(
     if on_fields.temperature.shape[0] > 0:
         on_both[1] = on_fields.temperature[i]
         on_fields.temperature[i] = kept * on_both[1]
-    wp.atomic_add(on_value, 0, on_both)
+    wp.atomic_add(on_values, number, on_both)
 
 
 @wp.kernel
@@ -431,8 +431,9 @@ def source_backward(
     shape: int,
     centre: Sequence[float],
     size: Sequence[float],
+    number: int,
     on_fields: Fields,
-    on_value: wp.array,
+    on_values: wp.array,
     *,
     fixed: bool,
 ) -> None:
@@ -440,13 +441,15 @@ def source_backward(
 
     Args:
         box, walls, shape, centre, size, fixed: As for `add_source`.
+        number: Number of the source.
         on_fields: Gradients to the fields after it, overwritten by those to the fields before it.
-        on_value: vec2 [1], the gradients to the density and the temperature that it adds or sets, added to.
+        on_values: vec2 [S], the gradients to the density and the temperature that each source adds or sets; that of
+            this source is added to.
     """
     low, cells, total = region_of(box, centre, size)
     if total > 0:
-        inputs = [box, walls, shape, wp.vec3(*centre), wp.vec3(*size), 0.0 if fixed else 1.0, low, cells]
-        wp.launch(_source, total, inputs=inputs, outputs=[on_fields.arrays, on_value], device=on_value.device)
+        inputs = [box, walls, shape, wp.vec3(*centre), wp.vec3(*size), 0.0 if fixed else 1.0, low, cells, number]
+        wp.launch(_source, total, inputs=inputs, outputs=[on_fields.arrays, on_values], device=on_values.device)
 
 
 def buoyancy_backward(

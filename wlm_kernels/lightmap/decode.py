@@ -255,13 +255,10 @@ def frame_volume(
 
 @dataclass(frozen=True)
 class FastKernels:
-    """Kernels of a fast decoder for networks with H = `hidden` units in each hidden layer; see `decode`."""
+    """Kernels of a fast decoder for networks with H units in each hidden layer; see `decode`."""
 
-    hidden: int
     _lines: Any  # writes `columns` and `rows`
     _decode: Any
-    _texels: int  # of a column that a thread decodes
-    _network: bool  # whether `_lines` reads the networks and the encoded time, too
 
     def decode(
         self,
@@ -284,8 +281,7 @@ class FastKernels:
             output: vec3 [N, H + 1], output layers.
             time: The time, and the numbers that convert the networks' outputs to colour.
             volume: vec4 [N, R, R], scratch memory: F_uvt of all N tiles.
-            columns: Scratch memory, each column's part of the first layer, float [N, H, 128]; on matrix units F_ut of
-                each column, vec2 [N, 128].
+            columns: float [N, H, 128], scratch memory: each column's part of the first layer.
             rows: vec2 [N, 128], scratch memory: F_vt of each row.
             places: int [N], index of each tile in `time`.
             tiles: int [n], the tiles to decode.
@@ -293,11 +289,10 @@ class FastKernels:
         """
         device = out.device
         wp.launch(frame_volume, volume.shape, inputs=[stored, time.tau], outputs=[volume], device=device)
-        inputs = [stored, hidden, time] if self._network else [stored, time.tau]
-        wp.launch(self._lines, rows.shape, inputs=inputs, outputs=[columns, rows], device=device)
+        wp.launch(self._lines, rows.shape, inputs=[stored, hidden, time], outputs=[columns, rows], device=device)
         wp.launch(
             self._decode,
-            (out.shape[0], 128 // self._texels, 128),
+            (out.shape[0], 32, 128),
             inputs=[stored, hidden, output, time, volume, columns, rows, places, tiles],
             outputs=[out],
             device=device,
@@ -473,4 +468,4 @@ def strip_kernels(hidden: int, gelu: str, shared: bool = False) -> FastKernels:
         out[i, y + 2, x] = finish(time, place, y2)
         out[i, y + 3, x] = finish(time, place, y3)
 
-    return FastKernels(hidden, frame_lines, decode, 4, True)
+    return FastKernels(frame_lines, decode)

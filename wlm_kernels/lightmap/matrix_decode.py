@@ -1,58 +1,142 @@
-"""Decodes tiles with temporal maps and at least 32 hidden units on a GPU's matrix units (tensor cores).
+"""Decodes tiles with temporal maps on a GPU's matrix units (tensor cores), for hidden widths that are multiples of 16.
 
-Activations and weights are half floats, sums are float32, and GELU is its tanh approximation with the GPU's tanh
-instruction. A thread decodes eight texels of a column one after another, so that a block of threads loads its tile's
-weights once for 1,024 texels.
+A launch does everything: a block of threads decodes a strip of a tile, for which it reads F_uvt, F_ut and F_vt at one
+hour, or at two between which it interpolates the radiance. A thread decodes the texels of a column. Activations and
+weights are half floats, and GELU is its tanh form with the GPU's tanh instruction.
 
 Read first: `exact_kernels` in `wlm_kernels/lightmap/decode.py`.
 """
 
 import functools
+from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import warp as wp
 
-from wlm_kernels.lightmap.blocks import bits7
-from wlm_kernels.lightmap.decode import (
-    FastKernels,
-    Stored,
-    TimeState,
-    centred_texel,
-    finish_words,
-    frame_volume_at,
-    stored_plane_at,
-)
-from wlm_kernels.lightmap.features import CENTRE, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.decode import Stored, TimeState, bytes_over
+from wlm_kernels.lightmap.features import TEMPORAL_INPUTS
+from wlm_kernels.lightmap.output import bound_of
 from wlm_kernels.native import native_source, on_cuda
+from wlm_kernels.shared_exponent import pack_rgb9e5
 
-ROWS = 8
-"""Number of texels per thread."""
+ROWS = 16
+"""Rows of texels in a strip."""
 
+_BOUNDS = (128, 4)  # threads of a block, blocks of a multiprocessor: 128 registers per thread
 _STEP = 16  # size of a matrix product: the hidden width is a multiple of it
+_MAPS = 12  # inputs that come from the maps; the encoded time follows
+_UV_SCALE = np.sqrt(12.0) / 255.0
+_SCALE = (np.sqrt(2.0 / np.pi) * 0.044715) ** (1.0 / 3.0)  # of arguments of GELU, whose x^3 then has the factor 1
 
 
-@wp.kernel(enable_backward=False)
-def _frame_planes(
-    # in:
-    stored: Stored,
-    tau: float,
-    # out:
-    ut: wp.array2d[wp.vec2],
-    vt: wp.array2d[wp.vec2],
-):
-    """Writes F_ut and F_vt at the time `tau` to `ut` and `vt` [N, 128], scaled as inputs of the network."""
-    n, i = wp.tid()
-    p = (float(i) + 0.5) / 128.0
-    half = wp.vec2(0.5)
-    ut[n, i] = (stored_plane_at(stored.ut, n, p, tau, stored.periodic) - half) * CENTRE
-    vt[n, i] = (stored_plane_at(stored.vt, n, p, tau, stored.periodic) - half) * CENTRE
+@wp.func_native(
+    on_cuda(
+        """
+float y;
+asm("{.reg .f32 l; lg2.approx.f32 l, %1; mul.f32 l, l, %2; ex2.approx.f32 %0, l;}" : "=f"(y) : "f"(x), "f"(exponent));
+return y;
+""",
+        "return wp::pow(x, exponent);",
+    )
+)
+def power(x: float, exponent: float) -> float:
+    """Returns x ** exponent for x >= 0 and an exponent above 0, on a GPU with a relative error of about 1e-6."""
+    ...
+
+
+@wp.func
+def powers(c: wp.vec3, exponent: float) -> wp.vec3:
+    return wp.vec3(power(c[0], exponent), power(c[1], exponent), power(c[2], exponent))
+
+
+def pack_networks(hidden: np.ndarray, output: np.ndarray) -> np.ndarray:
+    """Arranges the weights of N networks as `native/matrix_decode.cuh` reads them.
+
+    Args:
+        hidden: float [N, 18 + H, H], hidden layers of networks with 16 inputs, see `wlm_kernels.mlp`.
+        output: float [N, H + 1, 3], output layers.
+
+    Returns:
+        uint32 [N, words], two half floats each: the operands of the three layers in the order of the lanes, then the
+        biases of the second and (as floats) of the third. Inputs 12 to 15 have no weights. F_uv is an input in steps of
+        1/255. Arguments of GELU are scaled by 0.3292035 and its results by twice that, see the kernel. The output has
+        eight columns, in two versions.
+    """
+    n, width = len(hidden), hidden.shape[2]
+    first = np.zeros((n, _STEP, width))
+    first[:, :4], first[:, 4:_MAPS] = hidden[:, :4] * (_SCALE * _UV_SCALE), hidden[:, 4:_MAPS] * _SCALE
+    bias = TEMPORAL_INPUTS + 1 + width
+    third = np.zeros((n, 2, width, 8))
+    third[:, 0, :, :3] = third[:, 1, :, 4:7] = output[:, :-1] / (2.0 * _SCALE)
+    layers = [
+        _operands(first),
+        _operands(hidden[:, TEMPORAL_INPUTS + 1 : bias] / 2.0),
+        _operands(third.reshape(n, 2 * width, 8)),
+        np.ascontiguousarray(hidden[:, bias] * _SCALE, np.float16).view(np.uint32),
+        np.pad(output[:, -1].astype(np.float32), ((0, 0), (0, 1))).view(np.uint32),
+    ]
+    return np.ascontiguousarray(np.concatenate(layers, axis=1))
+
+
+def _operands(weights: np.ndarray) -> np.ndarray:
+    """Arranges the weights of a layer, [N, inputs, units], as right operands of products, uint32 [N, words].
+
+    A lane holds of 16 inputs and 8 units the inputs 2 q, 2 q + 1, 2 q + 8, 2 q + 9 of unit g; see `matrix_units.cuh`.
+    """
+    n, inputs, units = weights.shape
+    parts = weights.reshape(n, inputs // _STEP, 2, 4, 2, units // 8, 8).transpose(0, 1, 5, 6, 3, 2, 4)
+    return np.ascontiguousarray(parts, np.float16).reshape(n, -1).view(np.uint32)
+
+
+@dataclass(frozen=True)
+class MatrixKernels:
+    """Kernels that decode at one hour and between two."""
+
+    _one: Any
+    _two: Any
+
+    def decode(
+        self,
+        stored: Stored,
+        packed: wp.array,
+        hidden: wp.array,
+        times: list[TimeState],
+        share: float,
+        places: wp.array,
+        tiles: wp.array,
+        out: wp.array,
+    ) -> None:
+        """Decodes n of N tiles to 32 bits per texel.
+
+        Args:
+            stored: The N tiles, all with temporal maps.
+            packed: uint32 [N, words], from `pack_networks`.
+            hidden: vecH [N, 18 + H], hidden layers.
+            times: One time, or two between which radiance is interpolated linearly (neural-dynamic-gi, eq. 2).
+            share: Weight of the second time, 0 to 1; 0 for one time.
+            places: int [N], index of each tile in `times`.
+            tiles: int [n], the tiles to decode.
+            out: uint32 [n, 128, 128], written: colour as 8-bit RGBA from the lowest byte, relative to the larger bound
+                of the times; or radiance as RGB9E5.
+        """
+        wp.launch(
+            self._one if len(times) == 1 else self._two,
+            (out.shape[0], 128 // ROWS, 128),
+            inputs=[stored, packed, hidden, times[0], times[-1], share, places, tiles],
+            outputs=[out],
+            device=out.device,
+            block_dim=128,
+        )
 
 
 @functools.cache
-def matrix_kernels(hidden: int, shared: bool = False) -> FastKernels:
-    """Builds (once) the decoder, whose networks are of half floats, for one hidden width.
+def matrix_kernels(hidden: int, resolution: int, shared: bool = False) -> MatrixKernels:
+    """Builds (once) the decoder for one shape of tiles.
 
     Args:
         hidden: H, width of the hidden layers, a multiple of 16.
+        resolution: Size of F_uvt along u and v.
         shared: Whether to write RGB9E5 instead of 8-bit RGBA.
 
     Raises:
@@ -60,56 +144,77 @@ def matrix_kernels(hidden: int, shared: bool = False) -> FastKernels:
     """
     if hidden % _STEP or hidden < _STEP:
         raise ValueError(f"hidden: expected a width that is a multiple of {_STEP} units, got {hidden}")
-    vec_in, vec_hidden = wp.types.vector(TEMPORAL_INPUTS, float), wp.types.vector(hidden, float)
-    finish = finish_words(shared)
-    constants = {"H": hidden, "NT": hidden // 8, "KT": hidden // _STEP}
+    return MatrixKernels(*(_decode_kernel(hidden, resolution, shared, hours) for hours in (1, 2)))
 
-    code = native_source(__package__, "matrix_units") + native_source(__package__, "matrix_forward", **constants)
 
-    @wp.func_native(on_cuda(code, "return wp::vec_t<3, float>();"))
+def _decode_kernel(width: int, resolution: int, shared: bool, hours: int) -> wp.Kernel:
+    vec_hidden, vec_result = wp.types.vector(width, float), wp.types.vector(12, float)
+    constants = {"H": width, "R": resolution, "ROWS": ROWS, "HOURS": hours}
+    radiance = shared or hours == 2
+    code = native_source(__package__, "matrix_units") + native_source(__package__, "matrix_decode", **constants)
+
+    @wp.func_native(on_cuda(code, "return wp::vec_t<12, float>();"))
     def forward(
-        hidden: wp.array2d[vec_hidden], output: wp.array2d[wp.vec3], n: int, fresh: int, f: vec_in
-    ) -> wp.vec3: ...
+        stored: Stored,
+        packed: wp.array2d[wp.uint32],
+        hidden: wp.array2d[vec_hidden],
+        tau: float,
+        encoding: wp.vec4,
+        n: int,
+        strip: int,
+        part: int,
+        hour: int,
+    ) -> vec_result: ...
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.kernel(module="unique", module_options={"enable_backward": False}, launch_bounds=_BOUNDS)
     def decode(
         # in:
         stored: Stored,
+        packed: wp.array2d[wp.uint32],
         hidden: wp.array2d[vec_hidden],
-        output: wp.array2d[wp.vec3],
-        time: TimeState,
-        volume: wp.array3d[wp.vec4],
-        ut: wp.array2d[wp.vec2],
-        vt: wp.array2d[wp.vec2],
+        early: TimeState,
+        late: TimeState,
+        share: float,
         places: wp.array1d[int],
         tiles: wp.array1d[int],
         # out:
         out: wp.array3d[wp.uint32],
     ):
-        i, part, x = wp.tid()
+        i, strip, x = wp.tid()
         n = tiles[i]
         place = places[n]
-        across = ut[n, x]
-        rows = int(wp.static(ROWS))  # a variable keeps the loop rolled
-        for r in range(rows):
-            y = part * wp.static(ROWS) + r
-            low = stored.uv[n, y // 4, x // 4, 0]
-            high = stored.uv[n, y // 4, x // 4, 1]
-            p0 = float(int(wp.rshift(low, wp.uint64(63))))
-            p1 = float(int(high & wp.uint64(1)))
-            a = wp.vec4(bits7(low, 7), bits7(low, 21), bits7(low, 35), bits7(low, 49)) * 2.0 + wp.vec4(p0)
-            b = wp.vec4(bits7(low, 14), bits7(low, 28), bits7(low, 42), bits7(low, 56)) * 2.0 + wp.vec4(p1)
-            uv = centred_texel(a, b, high, (y % 4) * 4 + x % 4)
-            uvt = frame_volume_at(volume, n, y, x)
-            down = vt[n, y]
-            f = vec_in()
-            for c in range(4):
-                f[c] = uv[c]
-                f[4 + c] = uvt[c]
-                f[12 + c] = time.encoding[c]
-            for c in range(2):
-                f[8 + c] = across[c]
-                f[10 + c] = down[c]
-            out[i, y, x] = finish(time, place, forward(hidden, output, n, wp.where(r == 0, 1, 0), f))
+        # Of a warp's 32 columns, a thread gets the result of another one than it brought.
+        lane = x % 32
+        column = x - lane + 8 * (lane % 4) + lane // 4
+        shift, spread = early.shift[place], early.spread[place]
+        early_scale, late_scale = early.scale[place], late.scale[place]
+        inverse = bound_of(wp.max(bound_of(early.inverse_peak[place]), bound_of(late.inverse_peak[place])))
+        # Variables keep the loops rolled.
+        parts = int(wp.static(ROWS // 4))
+        count = int(wp.static(hours))
+        for part in range(parts):
+            total = vec_result()
+            for hour in range(count):
+                tau = wp.where(hour == 0, early.tau, late.tau)
+                encoding = wp.where(hour == 0, early.encoding, late.encoding)
+                weight = wp.where(hour == 0, 1.0 - share, share)
+                scale = wp.where(hour == 0, early_scale, late_scale)
+                y = forward(stored, packed, hidden, tau, encoding, n, strip, part, hour)
+                for r in range(4):
+                    answer = wp.vec3(y[3 * r], y[3 * r + 1], y[3 * r + 2])
+                    light = wp.max(wp.cw_mul(shift + wp.cw_mul(spread, answer), scale), wp.vec3())
+                    if wp.static(radiance):
+                        light = powers(light, early.gamma)
+                    for c in range(3):
+                        total[3 * r + c] += weight * light[c]
+            for r in range(4):
+                light = wp.vec3(total[3 * r], total[3 * r + 1], total[3 * r + 2])
+                if wp.static(shared):
+                    word = pack_rgb9e5(light)
+                else:
+                    if wp.static(radiance):
+                        light = powers(light, 1.0 / early.gamma)
+                    word = bytes_over(light, inverse)
+                out[i, strip * wp.static(ROWS) + 4 * part + r, column] = word
 
-    return FastKernels(hidden, _frame_planes, decode, ROWS, False)
+    return decode

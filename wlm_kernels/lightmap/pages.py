@@ -48,9 +48,10 @@ _CONSTANT, _STATIC, _FRAMES = wp.constant(1), wp.constant(2), wp.constant(4)  # 
 
 @wp.struct
 class Tiles:
-    """The N tiles of all sheets, sheet after sheet and row by row, and the sheets S.
+    """The N tiles of the S sheets of one light group, sheet after sheet and row by row.
 
     Attributes:
+        sheet: Number of the group's first sheet among the sheets of all groups.
         size: [S], height and width of each sheet in texels.
         first, columns: [S], number of the sheet's first tile, and its tiles in a row.
         gamma: [S], exponent that converts colours to light.
@@ -62,6 +63,7 @@ class Tiles:
         colours: [C, T], light of the constant tiles at each stored time.
     """
 
+    sheet: int
     size: wp.array1d[wp.vec2i]
     first: wp.array1d[int]
     columns: wp.array1d[int]
@@ -228,9 +230,9 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
     ):
         k, i, j = wp.tid()
         slot = jobs.slot[k]
-        if slot >= 0:
+        sheet = jobs.place[k][0] - tiles.sheet
+        if slot >= 0 and sheet >= 0 and sheet < tiles.size.shape[0]:
             place = jobs.place[k]
-            sheet = place[0]
             level = place[1]
             step = 1 << level
             size = tiles.size[sheet]
@@ -306,7 +308,7 @@ def put(records, slots, parts, memory) -> None:
 def decode(
     kernel: wp.Kernel, source: tuple[Any, ...], clock, offsets, jobs: Jobs, grid: int, direct: bool, out
 ) -> None:
-    """Decodes squares of texels with one launch, which a CUDA graph can capture.
+    """Decodes squares of texels of one light group with one launch, which a CUDA graph can capture.
 
     Args:
         kernel: From `page_kernel`.
@@ -314,7 +316,7 @@ def decode(
             tiles stored as frames.
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
-        jobs: J squares.
+        jobs: J squares; those of other groups are left as they are.
         grid: Most samples of a texel of a mip along each axis.
         direct: Whether to decode tiles at every level, instead of reading coarse texels from `COARSE_LEVEL` on.
         out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.

@@ -33,25 +33,33 @@ VISIBLE, MISSING, STALE, AHEAD, WAITING, DECODED, GATHERED = range(7)
 """Counters of a frame: pages that are needed; pages among them without a slot, whose light has changed, that are not
 ready for the coming switch, and that wait for tiles; decoded pages; and pages that could have been decoded."""
 
-FRAME, ADOPT, DROP, PREPARE = range(4)
-"""Numbers of a frame: its number; whether the pages for the switch are now those to show, whether they are not needed
-any more; and whether to decode pages for a coming switch."""
+ADOPT, DROP, PREPARE = range(3)
+"""Numbers of a light group in a frame: whether the pages for the switch are now those to show, whether they are not
+needed any more; and whether to decode pages for a coming switch."""
 
 _VISIBLE, _MISSING, _STALE, _AHEAD, _WAITING, _DECODED, _GATHERED = (wp.constant(i) for i in range(7))
-_FRAME, _ADOPT, _DROP, _PREPARE = (wp.constant(i) for i in range(4))
+_ADOPT, _DROP, _PREPARE = (wp.constant(i) for i in range(3))
 _MOST, _KEEP, _SAMPLES, _COARSE = (wp.constant(i) for i in (MOST, KEEP, SAMPLES, COARSE_LEVEL))
 _FADE = wp.constant(0.75)  # share of its pixels that a page keeps in the next frame
+_IF_OFF = wp.constant(1.0 / 64.0)  # factor of the priority in a group whose weight is 0
 _IF_MISSING, _IF_AHEAD, _IF_STALE = wp.constant(64.0), wp.constant(32.0), wp.constant(8.0)  # factors of the priority
 _SHARE = wp.constant(2)  # column of a clock, see `pages`
 
-Times = wp.types.matrix(shape=(2, CLOCK), dtype=float)
+GROUPS = 8
+"""Most light groups."""
+
+Times = wp.types.matrix(shape=(2 * GROUPS, CLOCK), dtype=float)
+Switches = wp.types.matrix(shape=(GROUPS, 3), dtype=int)
 
 
 @wp.struct
 class Pages:
-    """The P pages of all sheets; see `wlm.lightmap.virtual.layout`.
+    """The P pages of the S sheets of G light groups; see `wlm.lightmap.virtual.layout`.
 
     Attributes:
+        sheets: [F, G], the sheets of each surface by group, or -1: what a pixel shows is the weighted sum of these.
+        group: [S], the group of each sheet.
+        weights: [G], factor of the light of each group.
         first: [S, L], number of the first page of each level of each sheet.
         columns: [S, L], pages in a row of each level.
         levels: [S], number of levels of each sheet.
@@ -59,7 +67,8 @@ class Pages:
         place: [P], sheet, level, row and column of each page.
         parent: [P], the page that covers this one in the next coarser level; -1 for the page of a whole sheet, which
             always has a slot.
-        ready: [P], whether a page can be decoded: the tiles that it reads are on the device.
+        ready: [P], 1 for a page whose tiles are on the device, 0 for one that waits for tiles, -1 for the page of a
+            damaged tile: the page above is needed in its place.
         change: [P, T + 1], relative change of a page's light from the first stored time up to each one, summed up over
             time. The last is that of a whole day if the times are periodic.
         slot: [P], slot of the physical texture, or -1.
@@ -72,6 +81,9 @@ class Pages:
         periodic: Whether the last stored time is followed by the first.
     """
 
+    sheets: wp.array2d[int]
+    group: wp.array1d[int]
+    weights: wp.array1d[wp.vec3]
     first: wp.array2d[int]
     columns: wp.array2d[int]
     levels: wp.array1d[int]
@@ -111,8 +123,10 @@ class Work:
     """Data that the launches of a frame pass on; a frame decodes at most B pages.
 
     Attributes:
-        clock: [2, CLOCK], the time of the frame, and the time after the coming switch; see `pages`.
-        state: [4], see `FRAME`.
+        clock: [2 G, CLOCK], the time of the frame for each group, and then the time after its coming switch; see
+            `pages`.
+        frame: [1], number of the frame.
+        switches: [G, 3], see `ADOPT`.
         counters: [7], see `VISIBLE`.
         gathered: [MOST], pages that could be decoded: twice the page, plus the row of the clock.
         priority: [MOST], priority of each gathered page.
@@ -123,7 +137,8 @@ class Work:
     """
 
     clock: wp.array2d[float]
-    state: wp.array1d[int]
+    frame: wp.array1d[int]
+    switches: wp.array2d[int]
     counters: wp.array1d[int]
     gathered: wp.array1d[int]
     priority: wp.array1d[float]
@@ -133,16 +148,17 @@ class Work:
 
 
 @wp.kernel(enable_backward=False)
-def _look(times: Times, frame: int, adopt: int, drop: int, prepare: int, work: Work):
+def _look(times: Times, switches: Switches, frame: int, work: Work):
     i = wp.tid()
-    if i < work.clock.shape[1]:
-        work.clock[0, i] = times[0, i]
-        work.clock[1, i] = times[1, i]
+    row = i // work.clock.shape[1]
+    if row < work.clock.shape[0]:
+        column = i % work.clock.shape[1]
+        work.clock[row, column] = times[row, column]
+    row = i // 3
+    if row < work.switches.shape[0]:
+        work.switches[row, i % 3] = switches[row, i % 3]
     if i == 0:
-        work.state[_FRAME] = frame
-        work.state[_ADOPT] = adopt
-        work.state[_DROP] = drop
-        work.state[_PREPARE] = prepare
+        work.frame[0] = frame
     if i < work.counters.shape[0]:
         work.counters[i] = 0
     if i < work.chosen.shape[0]:
@@ -188,6 +204,14 @@ def _page_at(pages: Pages, sheet: int, level: int, uv: wp.vec2) -> int:
     return pages.first[sheet, level] + row * columns + column
 
 
+@wp.func
+def _need(pages: Pages, sheet: int, level: int, uv: wp.vec2):
+    page = _page_at(pages, sheet, level, uv)
+    if pages.ready[page] < 0:
+        page = pages.parent[page]
+    wp.atomic_add(pages.need, page, 1)
+
+
 @wp.kernel(enable_backward=False)
 def _mark(
     # in:
@@ -204,14 +228,17 @@ def _mark(
     y = i * stride + down
     x = j * stride + right
     if y < sheet.shape[0] and x < sheet.shape[1]:
-        s = sheet[y, x]
-        if s >= 0 and s < pages.levels.shape[0]:
+        surface = sheet[y, x]
+        if surface >= 0 and surface < pages.sheets.shape[0]:
             if _finite(uv[y, x], derivative[y, x]):
-                level = _level_of(pages, s, derivative[y, x])
-                fine = int(level)
-                wp.atomic_add(pages.need, _page_at(pages, s, fine, uv[y, x]), 1)
-                if level > float(fine):
-                    wp.atomic_add(pages.need, _page_at(pages, s, fine + 1, uv[y, x]), 1)
+                for g in range(pages.sheets.shape[1]):
+                    s = pages.sheets[surface, g]
+                    if s >= 0:
+                        level = _level_of(pages, s, derivative[y, x])
+                        fine = int(level)
+                        _need(pages, s, fine, uv[y, x])
+                        if level > float(fine):
+                            _need(pages, s, fine + 1, uv[y, x])
 
 
 @wp.func
@@ -241,16 +268,17 @@ def _gather(work: Work, code: int, level: int, priority: float):
 @wp.kernel(enable_backward=False)
 def _score(pages: Pages, slots: Slots, tolerance: float, work: Work):
     p = wp.tid()
-    frame = work.state[_FRAME]
+    frame = work.frame[0]
+    group = pages.group[pages.place[p][0]]
     slot = pages.slot[p]
     ahead = pages.ahead[p]
     if ahead >= 0:
         spare = int(-1)
-        if work.state[_ADOPT] == 1:
+        if work.switches[group, _ADOPT] == 1:
             spare = slot
             slot = ahead
             ahead = -1
-        elif work.state[_DROP] == 1:
+        elif work.switches[group, _DROP] == 1:
             spare = ahead
             ahead = -1
         if spare >= 0:
@@ -270,7 +298,9 @@ def _score(pages: Pages, slots: Slots, tolerance: float, work: Work):
     waits = int(0)
     if frame - pages.seen[p] < _KEEP:
         wp.atomic_add(work.counters, _VISIBLE, 1)
-        now = _change_at(pages, p, work.clock, 0)
+        if wp.length_sq(pages.weights[group]) == 0.0:
+            area = _IF_OFF * area
+        now = _change_at(pages, p, work.clock, group)
         priority = float(0.0)
         early = float(0.0)
         if slot < 0:
@@ -284,8 +314,8 @@ def _score(pages: Pages, slots: Slots, tolerance: float, work: Work):
                 wp.atomic_add(work.counters, _STALE, 1)
         if ahead >= 0:
             slots.stamp[ahead] = frame
-        elif work.state[_PREPARE] == 1:
-            if _between(pages, p, now, _change_at(pages, p, work.clock, 1)) > tolerance:
+        elif work.switches[group, _PREPARE] == 1:
+            if _between(pages, p, now, _change_at(pages, p, work.clock, group + work.switches.shape[0])) > tolerance:
                 early = _IF_AHEAD * area
                 wp.atomic_add(work.counters, _AHEAD, 1)
         if pages.ready[p] == 1:
@@ -325,7 +355,7 @@ def _allocate(pages: Pages, slots: Slots, size: int, work: Work, jobs: Jobs):
     slot = int(-1)
     code = work.chosen[k]
     if code >= 0:
-        frame = work.state[_FRAME]
+        frame = work.frame[0]
         page = code // 2
         target = code % 2
         if target == 0:
@@ -354,12 +384,13 @@ def _allocate(pages: Pages, slots: Slots, size: int, work: Work, jobs: Jobs):
                     pages.ahead[page] = slot
         if slot >= 0:
             slots.stamp[slot] = frame
-            slots.mark[slot] = _change_at(pages, page, work.clock, target)
             place = pages.place[page]
+            row = pages.group[place[0]] + target * work.switches.shape[0]
+            slots.mark[slot] = _change_at(pages, page, work.clock, row)
             y = place[2] * pages.side - pages.border
             x = place[3] * pages.side - pages.border
             jobs.place[k] = wp.vec4i(place[0], place[1], y, x)
-            jobs.target[k] = target
+            jobs.target[k] = row
             wp.atomic_add(work.counters, _DECODED, 1)
     jobs.slot[k] = slot
 
@@ -409,23 +440,32 @@ def _sample(
     change: wp.array1d[float],
 ):
     i = wp.tid()
-    s = sheet[i]
-    light[i] = wp.vec3()
-    coarser[i] = -1
-    change[i] = 0.0
-    if s >= 0 and s < pages.levels.shape[0]:
+    surface = sheet[i]
+    total = wp.vec3()
+    most = int(-1)
+    lag = float(0.0)
+    if surface >= 0 and surface < pages.sheets.shape[0]:
         if _finite(uv[i], derivative[i]):
-            level = _level_of(pages, s, derivative[i])
-            fine = int(level)
-            share = level - float(fine)
-            colour = _read(pages, texture, s, fine, uv[i])
-            if share > 0.0:
-                colour = (1.0 - share) * colour + share * _read(pages, texture, s, fine + 1, uv[i])
-            light[i] = colour
-            entry = pages.table[_page_at(pages, s, fine, uv[i])]
-            shown = _page_at(pages, s, entry % 16, uv[i])
-            coarser[i] = entry % 16 - fine
-            change[i] = _between(pages, shown, _change_at(pages, shown, clock, 0), slots.mark[entry // 16])
+            for g in range(pages.sheets.shape[1]):
+                s = pages.sheets[surface, g]
+                weight = pages.weights[g]
+                if s >= 0 and wp.length_sq(weight) > 0.0:
+                    level = _level_of(pages, s, derivative[i])
+                    fine = int(level)
+                    share = level - float(fine)
+                    colour = _read(pages, texture, s, fine, uv[i])
+                    if share > 0.0:
+                        colour = (1.0 - share) * colour + share * _read(pages, texture, s, fine + 1, uv[i])
+                    total += wp.cw_mul(weight, colour)
+                    entry = pages.table[_page_at(pages, s, fine, uv[i])]
+                    shown = _page_at(pages, s, entry % 16, uv[i])
+                    most = wp.max(most, entry % 16 - fine)
+                    lag = wp.max(
+                        lag, _between(pages, shown, _change_at(pages, shown, clock, g), slots.mark[entry // 16])
+                    )
+    light[i] = total
+    coarser[i] = most
+    change[i] = lag
 
 
 class Look:
@@ -436,23 +476,24 @@ class Look:
     """
 
     def __init__(self, work: Work) -> None:
-        count = max(CLOCK, work.counters.shape[0], work.chosen.shape[0])
-        self._times = np.zeros((2, CLOCK), np.float32)
-        # The launch's argument uses this array's memory: building it from its numbers takes longer than the launch.
-        first = [Times.from_buffer(self._times), 0, 0, 0, 0]
+        count = max(work.clock.size, work.switches.size, work.counters.shape[0], work.chosen.shape[0])
+        self._times, self._switches = np.zeros((2 * GROUPS, CLOCK), np.float32), np.zeros((GROUPS, 3), np.int32)
+        # The launch's arguments use these arrays' memory: building them from numbers takes longer than the launch.
+        first = [Times.from_buffer(self._times), Switches.from_buffer(self._switches), 0]
         self._launch = wp.launch(_look, count, [*first, work], device=work.clock.device, record_cmd=True)
 
-    def __call__(self, times: np.ndarray, state: tuple[int, int, int, int]) -> None:
+    def __call__(self, times: np.ndarray, switches: np.ndarray, frame: int) -> None:
         """Launches the kernel on the current stream.
 
         Args:
-            times: [2, CLOCK], the rows of `Work.clock`.
-            state: The numbers of `Work.state`.
+            times: [2 G, CLOCK], the rows of `Work.clock`.
+            switches: Integers [G, 3], the rows of `Work.switches`.
+            frame: Number of the frame, higher than in the frame before.
         """
-        self._times[:] = times
+        self._times[: len(times)], self._switches[: len(switches)] = times, switches
         self._launch.set_param_at_index(0, Times.from_buffer(self._times))
-        for i, number in enumerate(state):
-            self._launch.set_param_at_index(1 + i, number)
+        self._launch.set_param_at_index(1, Switches.from_buffer(self._switches))
+        self._launch.set_param_at_index(2, frame)
         self._launch.launch()
 
 
@@ -460,7 +501,7 @@ def mark(sheet, uv, derivative, at: tuple[int, int], stride: int, pages: Pages) 
     """Counts the pixels that need each page.
 
     Args:
-        sheet: int [H, W], number of the sheet at each pixel; no sheet has a negative number.
+        sheet: int [H, W], number of the surface at each pixel; no surface has a negative number.
         uv: vec2 [H, W], texture coordinates; pixels with NaN or infinity do not count.
         derivative: vec4 [H, W], du/dx, du/dy, dv/dx, dv/dy per pixel.
         at: Row and column of the first pixel that is read, below `stride`.
@@ -499,9 +540,11 @@ def sample(texture, pages: Pages, slots: Slots, clock, points: tuple[Any, Any, A
         texture: uint32 [C, side + 2 border, side + 2 border], the physical texture, RGB9E5.
         pages, slots: The state.
         clock: `Work.clock`.
-        points: Sheets, int [n]; texture coordinates, vec2 [n]; and derivatives, vec4 [n]; as for `mark`.
-        light: vec3 [n], written; 0 for points on no sheet and for coordinates that are not finite.
+        points: Surfaces, int [n]; texture coordinates, vec2 [n]; and derivatives, vec4 [n]; as for `mark`.
+        light: vec3 [n], written: the weighted sum of the groups; 0 for points on no surface, and for coordinates that
+            are not finite.
         coarser: int [n], written: levels by which the finer page that is read is coarser than needed; -1 for no page.
+            Of several groups the most.
         change: float [n], written: relative change of the page's light since the time for which it was decoded.
     """
     inputs = [texture, pages, slots, clock, *points]

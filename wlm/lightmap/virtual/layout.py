@@ -23,7 +23,10 @@ class Layout:
     """The tiles and pages of S sheets; the arrays are described at `wlm_kernels.lightmap.virtual.Pages`.
 
     Attributes:
-        sheets, models: The sheets, and their models.
+        sheets, models: The sheets, group by group, and their models.
+        groups: Names of the light groups.
+        surfaces: int [F, G], index of the sheet of each surface (a layer of an atlas, or three channels of it) in each
+            group, or -1.
         side, border: Texels along a side of a page without its border, and of the border.
         tile_first: int [S + 1], number of the first tile of each sheet, and the number of all tiles.
         first, columns, levels, place, parent: As in `Pages`.
@@ -34,6 +37,8 @@ class Layout:
 
     sheets: list[Sheet]
     models: list[SheetModel]
+    groups: tuple[str, ...]
+    surfaces: np.ndarray
     side: int
     border: int
     tile_first: np.ndarray
@@ -83,7 +88,9 @@ class Layout:
         nothing = np.zeros(0, np.int32)
         arrays = {name: np.concatenate(part or [nothing]).astype(np.int32) for name, part in parts.items()}
         levels = np.array([len(grid) for grid in grids], np.int32)
-        return cls(list(model.sheets), models, side, border, tile_first, first, columns, levels, **arrays)
+        sheets = list(model.sheets)
+        surfaces = _surfaces(sheets, model.groups)
+        return cls(sheets, models, model.groups, surfaces, side, border, tile_first, first, columns, levels, **arrays)
 
     @property
     def whole(self) -> np.ndarray:
@@ -99,6 +106,16 @@ class Layout:
         """Returns the tiles below a page without its border, int [n]."""
         sheet = self.place[page, 0]
         return _numbers(self.inner[page], self.models[sheet].grid.cols) + self.tile_first[sheet]
+
+
+def _surfaces(sheets: list[Sheet], groups: tuple[str, ...]) -> np.ndarray:
+    """Returns `Layout.surfaces`."""
+    of = {sheet: (sheet.atlas, sheet.layer, sheet.channels) for sheet in sheets}
+    rows = {surface: row for row, surface in enumerate(dict.fromkeys(of.values()))}
+    found = np.full((len(rows), len(groups)), -1, np.int32)
+    for number, sheet in enumerate(sheets):
+        found[rows[of[sheet]], groups.index(sheet.group)] = number
+    return found
 
 
 def _numbers(box: np.ndarray, columns: int) -> np.ndarray:

@@ -53,7 +53,8 @@ vec3 wlm_virtual_level(int sheet, int level, vec2 uv)
     return textureLod(WLM_VIRTUAL_PAGES, vec3(at, float(entry >> 4)), 0.0).rgb;
 }}
 
-// Light of a sheet; u to the right, v down; dx and dy are dFdx(uv) and dFdy(uv).
+// Light of a sheet; u to the right, v down; dx and dy are dFdx(uv) and dFdy(uv). Of a lightmap with light groups, add
+// the light of the sheet of each group, times the group's weight.
 vec3 wlm_virtual_light(int sheet, vec2 uv, vec2 dx, vec2 dy)
 {{
     int head = {_HEAD} + {_SHEET} * sheet;

@@ -1,4 +1,4 @@
-"""The tiles of a virtual texture on a device: all of them, or as many as memory is given for, loaded when needed.
+"""The tiles of a light group on a device: all of them, or as many as memory is given for, loaded when needed.
 
 All tiles are read once, when the store is made, to decode `COARSE` x `COARSE` texels of each tile at each stored time.
 The coarsest mip levels are read from these texels, and the change of each tile's light between stored times is computed
@@ -102,9 +102,10 @@ class _Pool:
 
 
 class TileStore:
-    """The tiles of a model on a device.
+    """The tiles of a model of one light group on a device.
 
     Attributes:
+        layout: The tiles and pages of the group.
         tiles: The kernels' description of all tiles.
         source: The first arguments of the kernel that decodes pages, see `wlm_kernels.lightmap.pages.decode`.
         kernel: That kernel.
@@ -115,10 +116,25 @@ class TileStore:
     """
 
     def __init__(
-        self, model: LightmapModel, layout: Layout, device: str, gelu: str, room: int | None, clock: Clock
+        self,
+        model: LightmapModel,
+        layout: Layout,
+        first: int,
+        device: str,
+        gelu: str,
+        room: int | None,
+        clock: Clock,
     ) -> None:
-        """Reads all tiles and uploads as many as fit into `room` bytes; for the errors see `VirtualTexture`."""
-        self._model, self._layout, self._device = model, layout, device
+        """Reads all tiles and uploads as many as fit into `room` bytes; for the errors see `VirtualTexture`.
+
+        Args:
+            model, layout: The sheets of the group, and their layout.
+            first: Number of the group's first sheet among the sheets of all groups.
+            device, gelu, room: As for `VirtualTexture`.
+            clock: Clock of the group.
+        """
+        self._first = first
+        self._model, self.layout, self._device = model, layout, device
         self.warnings: list[str] = []
         self._loader: TileLoader | None = None
         self.kernel = kernels.page_kernel(layout.models[0].profile.hidden, gelu)
@@ -138,7 +154,7 @@ class TileStore:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._device)
 
     def _allocate(self, room: int | None) -> dict[int, _Pool]:
-        layout, own = self._layout, self._layout.models[0]
+        layout, own = self.layout, self.layout.models[0]
         shapes, times = _shapes(own), len(own.times)
         counts = {kind: int((self._kind == kind).sum()) for kind in PACKED_KINDS}
         size = {
@@ -179,7 +195,8 @@ class TileStore:
         return mapped
 
     def _make_tiles(self) -> None:
-        layout, tiles = self._layout, kernels.Tiles()
+        layout, tiles = self.layout, kernels.Tiles()
+        tiles.sheet = self._first
         sizes = np.array([(own.height, own.width) for own in layout.models], np.int32)
         tiles.size = self._array(sizes, wp.vec2i)
         tiles.first = self._array(layout.tile_first[:-1].astype(np.int32), int)
@@ -219,7 +236,7 @@ class TileStore:
     # ---- coarse texels ----
 
     def _read_all(self, clock: Clock) -> None:
-        layout, times = self._layout, len(clock.axis.times)
+        layout, times = self.layout, len(clock.axis.times)
         rows = self._array(np.stack([clock.row(float(time)) for time in clock.axis.times]), float)
         words = np.zeros((len(self._kind), times, kernels.COARSE, kernels.COARSE), np.uint32)
         for s, own in enumerate(layout.models):
@@ -256,7 +273,7 @@ class TileStore:
             part = own.only(numbers)
         if not len(numbers):
             return numbers
-        pool, tiles = self._pools[kind], self._layout.tile_first[s] + numbers
+        pool, tiles = self._pools[kind], self.layout.tile_first[s] + numbers
         first = int((pool.owner >= 0).sum())
         if first + len(tiles) > len(pool.owner):
             first = 0
@@ -271,7 +288,7 @@ class TileStore:
         try:
             own.only([number])
         except WlmError as error:
-            self._break(int(self._layout.tile_first[s]) + number, error)
+            self._break(int(self.layout.tile_first[s]) + number, error)
             return False
         return True
 
@@ -287,7 +304,9 @@ class TileStore:
         row, column = np.divmod(numbers, own.grid.cols)
         one = np.full(count, 1)
         side = kernels.COARSE
-        place = np.stack([s * one, kernels.COARSE_LEVEL * one, side * row, side * column], 1).astype(np.int32)
+        place = np.stack([(self._first + s) * one, kernels.COARSE_LEVEL * one, side * row, side * column], 1).astype(
+            np.int32
+        )
         jobs = kernels.Jobs()
         jobs.place = self._array(place.repeat(times, 0), wp.vec4i)
         jobs.target = self._array(np.tile(np.arange(times, dtype=np.int32), count), int)
@@ -319,15 +338,15 @@ class TileStore:
     # ---- tiles that are loaded when they are needed ----
 
     def ready(self) -> np.ndarray:
-        """Returns which pages can be decoded: all tiles that they read are here, or damaged; int32 [P].
+        """Returns `Pages.ready` of `wlm_kernels.lightmap.virtual`: whether the tiles of each page are here, int32 [P].
 
-        The page of a damaged tile itself is never decoded, so that the page above it is shown. The page of a whole
-        sheet is always decoded, with coarse texels in place of tiles that are not here.
+        Damaged tiles count as here: pages that read them have coarse texels in their place, but the page of such a tile
+        itself is never decoded. The page of a whole sheet is always decoded, with coarse texels for missing tiles.
         """
-        layout = self._layout
+        layout = self.layout
         missing = np.bincount(layout.reader[self.slot[layout.read] == kernels.WAITING], minlength=len(layout.parent))
         broken = (layout.own >= 0) & (self.slot[layout.own] == kernels.BROKEN)
-        return ((missing == 0) & ~broken).astype(np.int32)
+        return np.where(broken, -1, missing == 0).astype(np.int32)
 
     def stream(self, seen: np.ndarray, priority: np.ndarray, frame: int) -> bool:
         """Asks the loader for tiles and uploads those that it has loaded, some in each frame.
@@ -342,7 +361,7 @@ class TileStore:
         """
         if self._loader is None:
             return False
-        layout = self._layout
+        layout = self.layout
         self._used[layout.read[seen[layout.reader] > frame - KEEP]] = frame
         wanted = (priority[layout.reader] > 0) & (self.slot[layout.read] == kernels.WAITING)
         most = np.zeros(len(self.slot), np.int64)

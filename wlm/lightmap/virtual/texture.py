@@ -7,9 +7,10 @@ kernels of a frame are described in `wlm_kernels.lightmap.virtual` and `pages`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -18,6 +19,7 @@ import warp as wp
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.lightmap.decode import device_of, gelu_of
+from wlm.lightmap.groups import Weight, changed_weights
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.tiles import TILE
 from wlm.lightmap.virtual.clock import Clock
@@ -82,6 +84,7 @@ class VirtualTexture:
         model: The model.
         device: "cpu" or "cuda:N".
         layout: The tiles and pages of the sheets.
+        weights: float32 [3] by light group, the factors of red, green and blue; initially 1. Changed by `set_weights`.
         slots: Number of pages that the physical texture holds.
         decodes: Largest number of pages that are decoded in a frame.
         tolerance: Relative change of light up to which a page is not decoded again.
@@ -120,13 +123,12 @@ class VirtualTexture:
 
         Raises:
             WlmError: There is no such device, a setting is out of its range, `budget` or `tiles` is too small, or the
-                model has several light groups.
+                model has more than 8 light groups.
         """
         self.device = device_of(device)
         _check(decodes, tolerance, side, border)
-        if len(model.groups) > 1:
-            names = ", ".join(model.groups)
-            raise WlmError(f"{model.name}: expected a model with one light group for a virtual texture, found {names}")
+        if len(model.groups) > kernels.GROUPS:
+            raise WlmError(f"{model.name}: expected at most {kernels.GROUPS} light groups, got {len(model.groups)}")
         if gelu is None and self.device != "cpu" and model.light.profile.gelu == "tanh":
             gelu = "fast"
         self.model, self.decodes, self.tolerance = model, decodes, tolerance
@@ -140,9 +142,9 @@ class VirtualTexture:
                 f"budget: expected at least {needed} bytes, for {len(whole)} pages that always stay and the {decodes} "
                 f"that a frame decodes, got {budget}"
             )
-        self._clock = Clock(model.light.axis)
+        self.weights = {group: np.ones(3, np.float32) for group in model.groups}
         with interop.stream(self.device):
-            self._store = TileStore(model, layout, self.device, gelu_of(model.light, gelu), tiles, self._clock)
+            self._make_stores(gelu_of(model.light, gelu), tiles)
             self._make(edge)
             self._fill_whole(whole)
         self._step = interop.StepGraph(self._work, self.device)
@@ -151,19 +153,35 @@ class VirtualTexture:
         self._host = wp.zeros(self._frame_work.asked.shape, dtype=int, device="cpu", pinned=cuda)
         self._asked, self._arrival = False, wp.Event(self.device) if cuda else None
 
+    def _make_stores(self, gelu: str, room: int | None) -> None:
+        """Makes the clock and the tiles of each light group; each gets room in proportion to its tiles."""
+        model, layout = self.model, self.layout
+        self._clocks: list[Clock] = []
+        self._stores: list[TileStore] = []
+        first = 0
+        for group in model.groups:
+            sheets = {sheet: own for sheet, own in model.sheets.items() if sheet.group == group}
+            part = LightmapModel(model.name, model.source, model.profile, sheets)
+            share = None if room is None else int(room * part.memory_bytes / model.memory_bytes)
+            clock = Clock(part.light.axis)
+            own = Layout.of(part, layout.side, layout.border)
+            self._stores.append(TileStore(part, own, first, self.device, gelu, share, clock))
+            self._clocks.append(clock)
+            first += len(sheets)
+        # The pages of each group among all pages.
+        self._parts = np.cumsum([0, *(len(store.layout.parent) for store in self._stores)])
+
     def _make(self, edge: int) -> None:
         layout, count = self.layout, len(self.layout.parent)
         self._arrays: list[wp.array] = []
 
         def struct(kind: Any, **contents: Any) -> Any:
-            """Makes a Warp struct of copies of NumPy arrays, of arrays of given shapes filled with a value, and of
-            numbers."""
+            """Makes a Warp struct of arrays, shapes with a value behind that fills them, and numbers."""
             made = kind()
             for name, content in contents.items():
                 if not isinstance(content, int):
-                    array, dtype = isinstance(content, np.ndarray), kind.vars[name].type.dtype
-                    make = wp.array if array else partial(wp.full, value=content[-1] if not array else 0)
-                    content = make(content if array else content[:-1], dtype=dtype, device=self.device)
+                    values = np.full(content[:-1], content[-1]) if isinstance(content, tuple) else content
+                    content = wp.array(values, dtype=kind.vars[name].type.dtype, device=self.device)
                     self._arrays.append(content)
                 setattr(made, name, content)
             return made
@@ -172,11 +190,23 @@ class VirtualTexture:
         fixed = {name: getattr(layout, name) for name in ("first", "columns", "levels", "place", "parent")}
         missing = dict.fromkeys(("slot", "ahead", "seen"), (count, -1))
         fresh = dict.fromkeys(("need", "area"), (count, 0)) | {"table": (-(-count // _TABLE_ROW) * _TABLE_ROW, 0)}
-        change = page_changes(layout, self._store.change)
-        numbers = {"side": layout.side, "border": layout.border, "periodic": int(self.model.period is not None)}
-        ready = self._store.ready()
+        changes = [page_changes(store.layout, store.change) for store in self._stores]
+        longest = max(change.shape[1] for change in changes)
+        changes = [np.pad(change, ((0, 0), (0, longest - change.shape[1])), mode="edge") for change in changes]
+        periodic = any(clock.axis.period is not None for clock in self._clocks)
+        numbers = {"side": layout.side, "border": layout.border, "periodic": int(periodic)}
         self._pages = struct(
-            kernels.Pages, size=sizes, change=change, ready=ready, **fixed, **missing, **fresh, **numbers
+            kernels.Pages,
+            sheets=layout.surfaces,
+            group=np.array([layout.groups.index(sheet.group) for sheet in layout.sheets], np.int32),
+            weights=np.ones((len(layout.groups), 3), np.float32),
+            size=sizes,
+            change=np.concatenate(changes),
+            ready=self._ready(),
+            **fixed,
+            **missing,
+            **fresh,
+            **numbers,
         )
         self._slots = struct(kernels.Slots, owner=(self.slots, -1), stamp=(self.slots, -1), mark=(self.slots, 0))
         most = {
@@ -185,10 +215,9 @@ class VirtualTexture:
             "cost": (kernels.MOST, 0),
             "chosen": (self.decodes, -1),
         }
-        asked = (2, count, 0)
-        self._frame_work = struct(
-            kernels.Work, clock=(2, page_kernels.CLOCK, 0), state=(4, 0), counters=(7, 0), asked=asked, **most
-        )
+        groups = len(layout.groups)
+        frame = {"clock": (2 * groups, page_kernels.CLOCK, 0), "switches": (groups, 3, 0), "frame": (1, 0)}
+        self._frame_work = struct(kernels.Work, counters=(7, 0), asked=(2, count, 0), **frame, **most)
         jobs = {"target": (self.decodes, 0), "slot": (self.decodes, -1)}
         self._jobs = struct(page_kernels.Jobs, place=np.zeros((self.decodes, 4), np.int32), **jobs)
         self.texture = wp.zeros((self.slots, edge, edge), dtype=wp.uint32, device=self.device)
@@ -200,12 +229,11 @@ class VirtualTexture:
     def _fill_whole(self, whole: np.ndarray) -> None:
         """Gives the page of each whole sheet a slot, and decodes it at the first stored time."""
         layout, jobs = self.layout, self._jobs
-        row = self._clock.row(float(self.model.times[0]))
-        self._frame_work.clock.assign(np.stack([row, row]))
+        rows = np.stack([clock.row(float(clock.axis.times[0])) for clock in self._clocks] * 2)
+        self._frame_work.clock.assign(rows)
         slot, owner = np.full(len(layout.parent), -1, np.int32), np.full(self.slots, -1, np.int32)
         slot[whole], owner[: len(whole)] = np.arange(len(whole)), whole
         stamp, mark = np.where(owner >= 0, self._frame, -1).astype(np.int32), np.zeros(self.slots, np.float32)
-        mark[: len(whole)] = self._pages.change.numpy()[whole, int(row[page_kernels.BEFORE])]
         for array, values in ((self._pages.slot, slot), (self._slots.owner, owner), (self._slots.stamp, stamp)):
             array.assign(values)
         self._slots.mark.assign(mark)
@@ -214,10 +242,29 @@ class VirtualTexture:
             place, slots = np.zeros((self.decodes, 4), np.int32), np.full(self.decodes, -1, np.int32)
             place[: len(part)], slots[: len(part)] = layout.place[part], slot[part]
             place[: len(part), 2:] = -layout.border
+            target = np.zeros(self.decodes, np.int32)
+            target[: len(part)] = self._pages.group.numpy()[place[: len(part), 0]]
             jobs.place.assign(place)
+            jobs.target.assign(target)
             jobs.slot.assign(slots)
             self._decode()
         kernels.refer(self._pages)
+
+    def set_weights(self, weights: Mapping[str, Weight]) -> None:
+        """Sets the weights of some light groups for the following frames; the others keep theirs.
+
+        No page is decoded for it: the weights are factors when light is read. Pages of a group whose weight is 0 are
+        decoded, too, after all others, so that a lamp that is switched on is there at once.
+
+        Args:
+            weights: By group a factor of its light, or one each of red, green and blue, from 0 to 65,504.
+
+        Raises:
+            WlmError: The model has no such group, or a weight is wrong; no weight is changed.
+        """
+        self.weights = changed_weights(self.model.name, self.weights, weights)
+        with interop.stream(self.device):
+            self._pages.weights.assign(np.stack(list(self.weights.values())))
 
     # ---- frames ----
 
@@ -229,7 +276,8 @@ class VirtualTexture:
 
         Args:
             time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
-            sheet: int [H, W], index of the sheet in `model.sheets` at each pixel; negative at pixels without one.
+            sheet: int [H, W], index of the sheet at each pixel in `model.sheets`, or of a model of several light groups
+                of the surface in `layout.surfaces`; negative at pixels without one.
             uv: float [H, W, 2] (or `wp.vec2` [H, W]), texture coordinates, row 0 of the map at v = 0; clamped to [0,
                 1]. Pixels with NaN or infinity are ignored.
             derivatives: float [H, W, 4] (or `wp.vec4`), du/dx, du/dy, dv/dx, dv/dy per pixel.
@@ -238,12 +286,13 @@ class VirtualTexture:
             WlmError: The time is not finite.
             ValueError: The shapes do not match.
         """
-        times, state = self._clock.frame(time)
         with interop.stream(self.device):
             points = self._points(sheet, uv, derivatives, 2)
+            moved = [clock.frame(time) for clock in self._clocks]
             self._load()
             self._frame += 1
-            self._look(times, (self._frame, *state))
+            now, after = (np.stack([times[i] for times, _ in moved]) for i in range(2))
+            self._look(np.concatenate([now, after]), np.array([switches for _, switches in moved]), self._frame)
             turn = self._frame * _TURN % STRIDE**2
             kernels.mark(*points, (turn // STRIDE, turn % STRIDE), STRIDE, self._pages)
             self._step()
@@ -264,17 +313,17 @@ class VirtualTexture:
     def _decode(self) -> None:
         if self.device == "cpu" and not (self._jobs.slot.numpy() >= 0).any():
             return
-        store = self._store
-        page_kernels.decode(
-            store.kernel,
-            store.source,
-            self._frame_work.clock,
-            store.offsets,
-            self._jobs,
-            _GRID,
-            False,
-            self.texture,
-        )
+        for store in self._stores:
+            page_kernels.decode(
+                store.kernel,
+                store.source,
+                self._frame_work.clock,
+                store.offsets,
+                self._jobs,
+                _GRID,
+                False,
+                self.texture,
+            )
 
     def _points(self, sheet: Any, uv: Any, derivatives: Any, axes: int) -> tuple[wp.array, wp.array, wp.array]:
         """Converts the arguments to arrays on the device: those that are there already are not copied."""
@@ -293,12 +342,19 @@ class VirtualTexture:
         if not self._asked or (self._arrival is not None and not self._arrival.is_complete):
             return
         self._asked = False
-        if self._store.stream(*self._host.numpy(), self._frame):
-            self._pages.ready.assign(self._store.ready())
+        changed = [
+            store.stream(*self._host.numpy()[:, first:last], self._frame)
+            for store, (first, last) in zip(self._stores, pairwise(self._parts), strict=True)
+        ]
+        if any(changed):
+            self._pages.ready.assign(self._ready())
+
+    def _ready(self) -> np.ndarray:
+        return np.concatenate([store.ready() for store in self._stores])
 
     def _ask(self) -> None:
         """Starts to copy what the pages need to the host, unless an earlier copy is on its way."""
-        if self._store.complete or self._asked:
+        if self._asked or all(store.complete for store in self._stores):
             return
         wp.copy(self._host, self._frame_work.asked)
         if self._arrival is not None:
@@ -355,27 +411,29 @@ class VirtualTexture:
             counters = dict(zip(names, self._frame_work.counters.numpy().tolist(), strict=False))
             used = int((self._slots.owner.numpy() >= 0).sum())
         memory = {"texture": self.texture.capacity, "pages": sum(array.capacity for array in self._arrays)}
+        each = [store.memory for store in self._stores]
         return {
             **counters,
             "slots": self.slots,
             "used": used,
-            "memory": memory | self._store.memory,
-            "warnings": list(self._store.warnings),
+            "memory": memory | {name: sum(own[name] for own in each) for name in each[0]},
+            "warnings": self.warnings,
         }
 
     @property
     def warnings(self) -> list[str]:
         """A line for each tile of the file that is damaged; the light around it is shown instead."""
-        return self._store.warnings
+        return [line for store in self._stores for line in store.warnings]
 
     def wait(self, seconds: float) -> bool:
         """Waits until the loader has a tile, at most some seconds; returns whether it has one. For pictures that must
         be complete; a renderer does not wait."""
-        return self._store.wait(seconds)
+        return max(store.wait(seconds) for store in self._stores)
 
     def close(self) -> None:
         """Ends the thread that loads tiles, if there is one. A second call does nothing."""
-        self._store.close()
+        for store in self._stores:
+            store.close()
 
     def __enter__(self) -> Self:
         return self

@@ -22,6 +22,32 @@ struct Units {
         asm("mul.rn.f16x2 %0, %1, %2;" : "=r"(word) : "r"(a), "r"(b));
         return word;
     }
+    static __device__ unsigned add(unsigned a, unsigned b) {
+        unsigned word;
+        asm("add.rn.f16x2 %0, %1, %2;" : "=r"(word) : "r"(a), "r"(b));
+        return word;
+    }
+    static __device__ unsigned subtract(unsigned a, unsigned b) {
+        unsigned word;
+        asm("sub.rn.f16x2 %0, %1, %2;" : "=r"(word) : "r"(a), "r"(b));
+        return word;
+    }
+    static __device__ unsigned fma(unsigned a, unsigned b, unsigned c) {
+        unsigned word;
+        asm("fma.rn.f16x2 %0, %1, %2, %3;" : "=r"(word) : "r"(a), "r"(b), "r"(c));
+        return word;
+    }
+    static __device__ unsigned tanh(unsigned a) {
+        unsigned word;
+        asm("tanh.approx.f16x2 %0, %1;" : "=r"(word) : "r"(a));
+        return word;
+    }
+    // c += a b of 16 x 16 and 16 x 8; the sums are halves.
+    static __device__ void multiply_half(unsigned* c, const unsigned* a, unsigned low, unsigned high) {
+        asm("mma.sync.aligned.m16n8k16.row.col.f16.f16.f16.f16 {%0,%1}, {%2,%3,%4,%5}, {%6,%7}, {%0,%1};"
+            : "+r"(c[0]), "+r"(c[1])
+            : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(low), "r"(high));
+    }
     // c += a b of 16 x 16 and 16 x 8.
     static __device__ void multiply(float* c, const unsigned* a, unsigned low, unsigned high) {
         asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
