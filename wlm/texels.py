@@ -1,5 +1,6 @@
 """Operations on images of linear light, shared by the metrics, the systems and the benchmarks."""
 
+import math
 import os
 from concurrent.futures import ThreadPoolExecutor
 
@@ -193,10 +194,13 @@ def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
     Raises:
         WlmError: No valid texel is finite.
     """
-    notes = []
-    finite = np.isfinite(frame).all(axis=2)
-    all_finite = bool(finite.all())
-    good = mask if all_finite else mask & finite
+    notes, good = [], mask
+    with np.errstate(invalid="ignore"):
+        least, greatest = float(frame.min()), float(frame.max())  # NaN if there is one
+    all_finite = math.isfinite(least) and math.isfinite(greatest)
+    if not all_finite:
+        finite = np.isfinite(frame).all(axis=2)
+        good = mask & finite
     if not good.any():
         raise WlmError(f"{where}: expected a finite texel inside the mask, found only NaN and infinity")
     if not all_finite:
@@ -205,11 +209,12 @@ def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
             notes.append(f"{_texels(broken)} NaN or infinite: replaced by the nearest finite one in the mask")
             frame[mask & ~finite] = fill_gaps(frame, good)[mask & ~finite]
         frame[~mask & ~finite] = 0.0
-    if frame.min() < 0:
+        least, greatest = float(frame.min()), float(frame.max())
+    if least < 0:
         negative = np.count_nonzero((frame < 0).any(axis=2) & good)
         if negative:
             notes.append(f"{_texels(negative)} negative: clamped to 0")
-    if frame.max() > HALF_MAX:
+    if greatest > HALF_MAX:
         bright = np.count_nonzero((frame > HALF_MAX).any(axis=2) & good)
         if bright:
             notes.append(f"{_texels(bright)} above {HALF_MAX:,.0f}: clamped to it")

@@ -61,7 +61,8 @@ def warnings_of(scene: Scene) -> list[str]:
     """Returns a line for each source and obstacle that has no effect or another one than its picture."""
     grid, warnings, end = scene.grid, [], scene.time(scene.frames)
     low, high = np.asarray(grid.origin), grid.origin + grid.size
-    box = f"it is outside the box from {low.tolist()} to {high.tolist()}"
+    corners = (", ".join(f"{number:g}" for number in corner) for corner in (low, high))
+    box = f"it is outside the box from ({') to ('.join(corners)})"
     for i, ball in enumerate(scene.sources):
         if np.linalg.norm(np.clip(ball.centre, low, high) - ball.centre) >= ball.radius:
             warnings.append(f"sources.{i}: {box}, and emits no smoke")
