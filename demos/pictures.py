@@ -54,6 +54,7 @@ DEMOS = {
     "fluid-control.png": "fluid_control.png",
     "ops-bc7.png": "ops_bc7.png",
     "ops-march.png": "ops_march.png",
+    "ops-silhouette.png": "ops_silhouette.png",
     "smoke-light.png": "smoke/smoke_light.png",
 }
 

@@ -40,7 +40,7 @@ from wlm.formats.light import read_light
 from wlm.formats.mask import read_mask
 from wlm.formats.meshes import read_mesh
 from wlm.formats.reading import named_file, read_file
-from wlm.lightmap import data
+from wlm.lightmap import reading
 from wlm.lightmap.model import Profile
 from wlm.probe import load as load_probes
 from wlm.probe import load_positions
@@ -516,8 +516,8 @@ def test_slices_of_one_file_are_decoded_once(tmp_path, monkeypatch):
     frames = lightmap.load(tmp_path).light.frames
     np.testing.assert_array_equal(frames.reshape(8, 3), np.arange(24).reshape(8, 3))
     # All layers together may decode so many bytes: the light fits, the other layer does not.
-    monkeypatch.setattr(data, "FRAMES", frames.nbytes)
-    monkeypatch.setattr(data, "PICTURE_GROWTH", 0)
+    monkeypatch.setattr(reading, "FRAMES", frames.nbytes)
+    monkeypatch.setattr(reading, "PICTURE_GROWTH", 0)
     assert "decoded bytes for the size of the file" in refused(lightmap.load, tmp_path)
     assert lightmap.load(tmp_path, layers=["light"]).times.size == 8
 

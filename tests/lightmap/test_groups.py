@@ -12,7 +12,7 @@ from builders.small_sets import moving_light, tiny_profile, write_set
 import wlm
 from wlm.formats.artifact import read_artifact
 from wlm.formats.exr import write_exr
-from wlm.lightmap import Layer, from_arrays, from_groups, from_layers, load
+from wlm.lightmap import Layer, from_arrays, from_groups, from_layers, load, reading
 from wlm.lightmap.codec import group_sizes
 from wlm.lightmap.sheet import BASE
 
@@ -38,6 +38,11 @@ def test_the_decoder_adds_groups_by_their_weights(model):
         np.testing.assert_allclose(decoder.frame(time), expected, rtol=2e-5, atol=2e-5 * max(expected.max(), 1e-3))
     decoder.set_weights({"lamp": 0.5})
     assert decoder.weights["lamp"].tolist() == [0.5] * 3 and not decoder.weights["sky"].any(), "the others keep theirs"
+
+
+def test_a_lamp_is_read_once_at_any_time(model):
+    lamp = model.maps()["lamp"]
+    assert lamp.axis.reads(17.25) == [(0.0, 1.0)] and lamp.axis.place(17.25) == 0.5
 
 
 def test_wrong_weights_are_one_line_and_change_nothing(model):
@@ -227,6 +232,15 @@ def test_wrong_lists_of_groups_are_one_line(changes, words, sets, tmp_path):
     path = write_groups(tmp_path / "lit", sets, **changes)
     text = error_of(load, path)
     assert text.startswith(str(path)) and words in text
+
+
+def test_groups_are_bounded_together(sets, tmp_path, monkeypatch):
+    path = write_groups(tmp_path / "lit", {"sky": sets["sky"], "lamp": sets["lamp 0"]})
+    monkeypatch.setattr(reading, "PICTURE_GROWTH", 0)
+    # Each alone is within the bound.
+    monkeypatch.setattr(reading, "FRAMES", sets["sky"].light.frames.nbytes)
+    assert "set.json: lightmaps: expected at most" in error_of(load, path)
+    assert load(path, trust=True).groups == ("sky", "lamp")
 
 
 def test_a_group_of_a_layered_set_may_lack_atlases(tmp_path):

@@ -28,7 +28,6 @@ import hashlib
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -36,15 +35,14 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats.channels import read_channels, read_encoded
-from wlm.formats.light import noted, read_light
-from wlm.formats.limits import FRAMES, PICTURE_GROWTH, TIMES, Budget, check_growth
+from wlm.formats.limits import TIMES
 from wlm.formats.mask import read_mask
 from wlm.formats.scratch import room
 from wlm.lightmap.assumptions import set_lines, size_line
 from wlm.lightmap.groups import groups_of, times_of
 from wlm.lightmap.layout import odd_layout
-from wlm.lightmap.listing import AtlasInfo, LayerInfo, Listing, Source, list_set
+from wlm.lightmap.listing import Listing, list_set
+from wlm.lightmap.reading import ALL, FROM_ALPHA, Bounds, Reader, Stack, size_text
 from wlm.lightmap.sheet import (
     BASE,
     LIGHT,
@@ -57,14 +55,10 @@ from wlm.lightmap.sheet import (
     is_name,
     sheets_of,
 )
-from wlm.texels import doubts, repair
+from wlm.texels import repair
 
 _PIECE = 1 << 18  # frames times texels that are filled at once
 _TIME_TOLERANCE = 1e-6
-_READERS = 2  # decompression releases Python's lock; more threads than this only compete for the disk
-_LIGHT_CHANNELS = ("R", "G", "B")
-_ALPHA = "A"
-_ALL, _FROM_ALPHA = "all", "alpha"
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,27 +262,25 @@ def load(
     for listing in listings.values():
         day = listing.period if period is None else period
         check_times(str(listing.where), listing.labels, np.asarray(listing.times, np.float64), day)
-    sets, made = {}, 0
-    for group, listing in listings.items():
-        sets[group] = _read_set(listing, mask, period, trust, made)
-        made += sum(own.frames.nbytes for own in sets[group].sheets.values())
+    bounds = Bounds(f"{path}: lightmaps", list(listings.values()), trust)
+    sets = {group: _read_set(listing, mask, period, bounds) for group, listing in listings.items()}
     return from_groups(sets, next(iter(sets.values())).name) if [*sets] != [BASE] else sets[BASE]
 
 
 def _read_set(
-    listing: Listing, mask: str | os.PathLike[str] | None, given: float | None, trust: bool, made: int
+    listing: Listing, mask: str | os.PathLike[str] | None, given: float | None, bounds: Bounds
 ) -> LightmapSet:
-    """Reads the pictures of a set without groups; for the options see `load`, `made` is that of `_Reader`."""
+    """Reads the pictures of a set without groups; for the options see `load`."""
     stamps, period = np.asarray(listing.times, np.float64), listing.period if given is None else given
     lines = [f"{listing.where}: {line}" for line in set_lines(listing, given)]
-    reader = _Reader(listing, np.argsort(stamps, kind="stable"), trust, made)
+    reader = Reader(listing, np.argsort(stamps, kind="stable"), bounds)
     sheets: dict[Sheet, SheetFrames] = {}
     for atlas in listing.atlases:
         valid = mask_from = None
         chosen = str(mask) if mask is not None else atlas.mask
         for layer in listing.light_first:
             leads = valid is None
-            wanted = chosen if leads and layer.encoding == LIGHT.encoding and chosen in (_FROM_ALPHA, None) else _ALL
+            wanted = chosen if leads and layer.encoding == LIGHT.encoding and chosen in (FROM_ALPHA, None) else ALL
             stack = reader.read(atlas, layer, wanted, leads)
             if stack is None:
                 continue
@@ -299,7 +291,7 @@ def _read_set(
                 valid = _valid(first, size, stack, chosen)
                 mask_from = "the alpha of the light; --mask all takes all" if stack.alpha is not None else str(chosen)
             elif size != valid.shape[-2:]:
-                line = size_line(atlas.name, layer.name, _size(size), _size(valid.shape[-2:]))
+                line = size_line(atlas.name, layer.name, size_text(size), size_text(valid.shape[-2:]))
                 stack.warnings.append(f"{listing.where}: {line}")
             own = _resized(valid, *size)
             if not stack.present.all():
@@ -531,177 +523,13 @@ def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: fl
             raise WlmError(f"{where}: {labels[i]} and {labels[j]} have the same time, {times[i]:g}")
 
 
-@dataclass(frozen=True, eq=False)
-class _Stack:
-    frames: dict[Sheet, np.ndarray]
-    alpha: np.ndarray | None
-    present: np.ndarray  # bool [T], in the order of the times
-    warnings: list[str]
-
-
-class _Reader:
-    """Reads the pictures that a `Listing` names, one layer of one atlas at a time."""
-
-    def __init__(self, listing: Listing, order: np.ndarray, trust: bool, made: int) -> None:
-        self._listing, self._place, self._trust = listing, np.argsort(order), trust
-        self._sizes: dict[Sheet, tuple[int, int]] = {}
-        self._made = made  # bytes of the sheets that memory was allocated for, those of other groups included
-        self._held = sum(os.path.getsize(file) for file in set(listing.files) if os.path.exists(file))
-        # A file may serve many atlases and layers, each of which reads it whole.
-        most = max(FRAMES, PICTURE_GROWTH * self._held)
-        self._budget = Budget(f"{listing.where}: lightmaps", most, "decoded bytes")
-
-    def read(self, atlas: AtlasInfo, layer: LayerInfo, mask: str | None, leads: bool) -> _Stack | None:
-        """Reads a layer's pictures at all times; None without any. With `leads`, checks the atlas's stated size."""
-        key = atlas.name, layer.name
-        sources = {i: state[key] for i, state in enumerate(self._listing.states) if key in state}
-        if not sources:
-            return None
-        start, first = next(iter(sources.items()))
-        files: dict[str, list[int]] = {}
-        for index, source in sources.items():
-            files.setdefault(os.path.normpath(source.path), []).append(index)
-        notes: dict[int, list[str]] = {index: [] for index in sources}
-        whole, names = self._file(first.path, layer, layer.channels, notes[start])
-        pixels = _part(whole, first)
-        has_alpha = mask == _FROM_ALPHA or (mask is None and _ALPHA in names)
-        size, known = pixels.shape[:2], names
-        if leads and atlas.size not in (None, size):
-            raise WlmError(
-                f"{first.path}: has {_size(size)} pixels, but {self._listing.where} states {_size(atlas.size)}"
-            )
-        stack = self._stack(atlas, layer, size, names, has_alpha, first.path)
-        stack.present[self._place[list(sources)]] = True
-
-        def put(index: int, pixels: np.ndarray, names: tuple[str, ...]) -> int:
-            place, source = self._place[index], sources[index]
-            if pixels.shape[:2] != size:
-                raise WlmError(
-                    f"{source.path}: has {_size(pixels.shape)} pixels, but {first.path} has {_size(size)}; all times "
-                    "of a layer need one size"
-                )
-            if layer.encoding != LIGHT.encoding and names != known:
-                raise WlmError(
-                    f"{source.path}: has the channels {', '.join(names)}, but {first.path} has {', '.join(known)}; all "
-                    "times of a layer need the same"
-                )
-            for sheet, frames in stack.frames.items():
-                frames[place] = sheet.to_levels(pixels[..., [names.index(name) for name in sheet.channels]])
-            if stack.alpha is None:
-                return 0
-            if _ALPHA not in names:
-                found = ", ".join(names)
-                raise WlmError(f"{source.path}: expected a channel A for the mask, found the channels {found}")
-            alpha = pixels[..., names.index(_ALPHA)]
-            stack.alpha[place] = np.isfinite(alpha) & (alpha > 0)
-            return int(np.count_nonzero(~np.isfinite(alpha)))
-
-        def put_all(path: str) -> None:
-            """Reads a file once and stores its pictures for all times that use the file."""
-            indices = files[path]
-            at, read = indices[0], (whole, names)
-            if at != start:
-                read = self._file(sources[at].path, layer, layer.channels or names, notes[at])
-            for index in indices:
-                broken[index] = put(index, _part(read[0], sources[index]), read[1])
-
-        broken = dict.fromkeys(sources, 0)
-        pool = ThreadPoolExecutor(_READERS)
-        try:
-            # In order, so that the error names the first of several bad files.
-            list(pool.map(put_all, files))
-        finally:
-            pool.shutdown(cancel_futures=True)
-        stack.warnings.extend(noted([source.label for source in sources.values()], list(notes.values())))
-        for index, count in broken.items():
-            if count:
-                label = sources[index].label
-                stack.warnings.append(f"{label}: {count} texels are not valid: alpha is NaN or infinite")
-        if stack.alpha is not None:
-            stack.alpha[~stack.present] = stack.alpha.any(0)
-        return stack
-
-    def _stack(
-        self,
-        atlas: AtlasInfo,
-        layer: LayerInfo,
-        size: tuple[int, int],
-        names: tuple[str, ...],
-        alpha: bool,
-        first: Path,
-    ) -> _Stack:
-        channels = layer.channels or (_LIGHT_CHANNELS if layer.encoding == LIGHT.encoding else names)
-        if missing := [channel for channel in channels if channel not in names]:
-            found = ", ".join(names)
-            raise WlmError(f"{first}: layer {layer.name}: expected a channel {missing[0]}, found the channels {found}")
-        where = self._listing.where
-        sheets = sheets_of(atlas.name, layer.name, channels, layer.encoding)
-        self._sizes |= dict.fromkeys(sheets, size)
-        check_sheets(str(where), self._sizes)
-        count = len(self._listing.states)
-        if not self._trust:
-            total = sum(math.prod(at) for at in self._sizes.values()) * 3 * 4 * count
-            check_growth(f"{where}: lightmaps", self._held, total, PICTURE_GROWTH, FRAMES)
-        # One array from the start: a list of frames that is stacked at the end would need twice the memory.
-        text, frames = f"{where}: {count} lightmaps of {_size(size)}", {}
-        for sheet in sheets:
-            frames[sheet] = room((count, *size, 3), np.float32, text, self._made)
-            self._made += frames[sheet].nbytes
-        return _Stack(frames, np.zeros((count, *size), bool) if alpha else None, np.zeros(count, bool), [])
-
-    def _file(
-        self, path: Path, layer: LayerInfo, wanted: tuple[str, ...] | None, notes: list[str]
-    ) -> tuple[np.ndarray, tuple[str, ...]]:
-        pixels, names = _read(path, layer, notes)
-        grey = next((name for name in ("L", "Y") if name in names), None)
-        if grey is not None and "R" in (wanted or ()) and "R" not in names:
-            at = names.index(grey)
-            rest = [i for i in range(len(names)) if i != at]
-            pixels, names = pixels[..., [at, at, at, *rest]], (*_LIGHT_CHANNELS, *(names[i] for i in rest))
-            notes.append("its grey is taken as red, green and blue")
-        if not self._trust:
-            self._budget.spend(pixels.nbytes)
-        return pixels, names
-
-
-def _part(pixels: np.ndarray, source: Source) -> np.ndarray:
-    if source.slices == 1:
-        return pixels
-    height, rest = divmod(len(pixels), source.slices)
-    if rest or not height:
-        raise WlmError(
-            f"{source.path}: expected {source.slices} slices of equal height, found {len(pixels)} rows of pixels"
-        )
-    return pixels[source.slice * height : (source.slice + 1) * height]
-
-
-def _read(path: Path, layer: LayerInfo, notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    light = layer.encoding == LIGHT.encoding
-    if light and layer.stored is not None:
-        pixels, names = read_encoded(path, layer.stored, notes), _LIGHT_CHANNELS
-    elif light and layer.channels is None:
-        pixels, names = read_light(path, notes)
-        notes += doubts(pixels[..., :3])
-    else:
-        pixels, names, levels = read_channels(path, notes, light)
-        if levels and light:
-            raise WlmError(
-                f"{path}: layer {layer.name}: expected linear light, such as an EXR, found a picture of "
-                "integers: state what light they stand for with --encoding, or stored in a set.json"
-            )
-        if levels:
-            least, greatest = VALUE_RANGES[layer.encoding]
-            pixels = np.float32(least) + pixels * np.float32(greatest - least)
-    return pixels, names
-
-
-def _valid(first: Path, size: tuple[int, int], stack: _Stack, mask: str | None) -> np.ndarray:
+def _valid(first: Path, size: tuple[int, int], stack: Stack, mask: str | None) -> np.ndarray:
     """Returns the valid texels of an atlas, bool [H, W] or [T, H, W] in the order of the times."""
     if stack.alpha is not None:
         return stack.alpha
-    if mask == _FROM_ALPHA:
+    if mask == FROM_ALPHA:
         raise WlmError(f"{first}: expected a channel A for the mask, found none")
-    if mask in (_ALL, None):
+    if mask in (ALL, None):
         return np.ones(size, bool)
     return read_mask(Path(mask), first, size, ', "alpha" or "all"')
 
@@ -829,7 +657,3 @@ def _hash(frames: np.ndarray, times: np.ndarray, mask: np.ndarray) -> str:
     for frame in frames:
         digest.update(np.ascontiguousarray(frame, "<f4"))
     return digest.hexdigest()
-
-
-def _size(shape: Sequence[int]) -> str:
-    return f"{shape[1]}x{shape[0]}"

@@ -243,25 +243,28 @@ def antialias(colour: Tensor, raster: Raster, clip: Tensor, triangle: Tensor) ->
     height, width = raster.triangle.shape
     ndc = clip[:, :2] / clip[:, 3:]
     places = 0.5 * torch.stack([(1.0 + ndc[:, 0]) * width, (1.0 - ndc[:, 1]) * height], 1)  # in pixels
-    outline = _outline(places.detach(), triangle)
+    mesh, corner = _Mesh(places.detach(), triangle), triangle.reshape(-1)
     result = colour
     for axis in range(2):
         # Pixels p and their neighbours q: to the right for axis 0, below for axis 1.
         rows, columns = height - axis, width - 1 + axis
         first, second = (slice(0, rows), slice(0, columns)), (slice(axis, height), slice(1 - axis, width))
         (t, z), (other, other_z) = ((raster.triangle[at], raster.depth[at]) for at in (first, second))
-        nearer = torch.where((t < 0) | ((other >= 0) & (other_z < z)), other, t)
+        backwards = (t < 0) | ((other >= 0) & (other_z < z))
         centre = pixel_centres(height, width).to(places)[first]
-        offset = torch.zeros_like(centre[..., 0])
-        for k in range(3):
-            u, v = (places[triangle[nearer.clamp(min=0)][..., (k + i) % 3]] for i in (1, 2))
-            along, across = (v - u).abs().unbind(-1)
-            dominant = along <= across if axis == 0 else along > across
-            share = (centre - u)[..., 1 - axis] / torch.where(dominant, (v - u)[..., 1 - axis], 1.0)
-            s = (u + share[..., None] * (v - u) - centre)[..., axis]  # the crossing's distance from p
-            crosses = dominant & (share >= 0.0) & (share <= 1.0) & (s >= 0.0) & (s <= 1.0)
-            crosses = crosses & outline[nearer.clamp(min=0), k] & (nearer >= 0) & (t != other)
-            offset = torch.where(crosses, s - 0.5, offset)
+        edge = torch.full_like(t, -1)
+        for row, column in (t != other).nonzero().tolist():
+            start, sign = centre[row, column].tolist(), 1.0
+            if backwards[row, column]:
+                start[axis], sign = start[axis] + 1.0, -1.0
+            nearer = (other if sign < 0.0 else t)[row, column]
+            edge[row, column] = mesh.silhouette(int(nearer), start, axis, sign)
+        at = edge.clamp(min=0)
+        u, v = (places[corner[at - at % 3 + (at + i) % 3]] for i in (1, 2))
+        across = torch.where(edge >= 0, (v - u)[..., 1 - axis], 1.0)
+        share = (centre - u)[..., 1 - axis] / across
+        s = (u + share[..., None] * (v - u) - centre)[..., axis]  # the crossing's distance from p
+        offset = torch.where(edge >= 0, s - 0.5, 0.0)
         step = colour[first] - colour[second]
         change = torch.zeros_like(colour)
         change[second] = offset.clamp(min=0.0)[..., None] * step
@@ -272,25 +275,58 @@ def antialias(colour: Tensor, raster: Raster, clip: Tensor, triangle: Tensor) ->
     return result
 
 
-def _outline(places: Tensor, triangle: Tensor) -> Tensor:
-    """Returns bool [F, 3]: whether no other triangle continues behind the edge opposite each corner, on the screen."""
-    found = torch.ones(triangle.shape, dtype=torch.bool)
-    corners = triangle.tolist()
-    for t, own in enumerate(corners):
-        for k in range(3):
-            u, v, w = own[(k + 1) % 3], own[(k + 2) % 3], own[k]
-            for other, theirs in enumerate(corners):
-                rest = [corner for corner in theirs if corner not in (u, v)]
-                shared = other != t and len(rest) == 1 and {u, v} <= {*theirs}
-                if shared and _turn(places, u, v, w) * _turn(places, u, v, rest[0]) < 0:
-                    found[t, k] = False
-    return found.to(triangle.device)
+class _Mesh:
+    """Triangles [F, 3] with corners at places [V, 2] on the screen, in pixels, and which of them share an edge."""
+
+    def __init__(self, places: Tensor, triangle: Tensor) -> None:
+        self._places, self._corners = places.tolist(), triangle.tolist()
+        self._edges: dict[frozenset, list[int]] = {}
+        for edge in range(triangle.numel()):
+            self._edges.setdefault(frozenset(self._ends(edge)[:2]), []).append(edge)
+
+    def silhouette(self, t: int, start: list[float], axis: int, sign: float) -> int:
+        """Walks a pixel along an axis, from a place in triangle t; returns the edge of the silhouette on the way, or
+        -1."""
+        entered = -1
+        for _ in range(32):
+            left = None
+            for edge in range(3 * t, 3 * t + 3):
+                u, v, w = (self._places[corner] for corner in self._ends(edge))
+                leaves = sign * (v[1 - axis] - u[1 - axis]) * (1 if axis else -1) * _turn(u, v, w) < 0.0
+                if (
+                    edge != entered
+                    and leaves
+                    and (u[1 - axis] - start[1 - axis]) * (v[1 - axis] - start[1 - axis]) <= 0
+                ):
+                    share = (start[1 - axis] - u[1 - axis]) / (v[1 - axis] - u[1 - axis])
+                    left, way = edge, sign * (u[axis] + share * (v[axis] - u[axis]) - start[axis])
+                    steep = abs(v[1] - u[1]) >= abs(v[0] - u[0])
+            if left is None or way > 1.0:
+                return -1
+            entered = self._beyond(left)
+            if entered < 0:
+                return left if steep == (axis == 0) else -1
+            t = entered // 3
+        return -1
+
+    def _ends(self, edge: int) -> list[int]:
+        """Returns the corners of an edge and the corner opposite."""
+        corners = self._corners[edge // 3]
+        return [corners[(edge + i) % 3] for i in (1, 2, 0)]
+
+    def _beyond(self, edge: int) -> int:
+        """Returns the same edge in a triangle that lies on its other side, or -1."""
+        ends = self._ends(edge)
+        u, v, w = (self._places[corner] for corner in ends)
+        for other in self._edges[frozenset(ends[:2])]:
+            if other != edge and _turn(u, v, self._places[self._ends(other)[2]]) * _turn(u, v, w) < 0.0:
+                return other
+        return -1
 
 
-def _turn(places: Tensor, a: int, b: int, c: int) -> float:
+def _turn(a: list[float], b: list[float], c: list[float]) -> float:
     """Returns twice the signed area of a triangle of three places."""
-    (x, y), (s, t) = (places[b] - places[a]).tolist(), (places[c] - places[a]).tolist()
-    return x * t - y * s
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 # Ray marching through a density grid (neural-six-way-lightmaps, eq. 1 to 3)

@@ -16,17 +16,18 @@ from wlm_kernels.raster import silhouette as kernels
 def antialias(colour: torch.Tensor, raster: Raster, clip: torch.Tensor, triangle: torch.Tensor) -> torch.Tensor:
     """Blends the colours of neighbouring pixels where a silhouette passes between their centres.
 
-    Where an edge of the nearer of two triangles crosses the line from one pixel's centre to that of the next one, at
-    its right or below, and no triangle with the same two vertices continues the surface behind the edge, the colour on
-    each side of the edge counts up to the edge: an edge beyond the border of the pixels at the distance d adds d of the
-    nearer colour to the farther pixel, one before it d of the farther colour to the nearer pixel. So a long edge covers
-    the area that it should. An edge that runs more down than across is blended between pixels side by side, another
-    between pixels one above the other (Laine et al. 2020, "Modular Primitives for High-Performance Differentiable
-    Rendering", section 3.5).
+    Where a silhouette crosses the line from one pixel's centre to that of the next one, at its right or below, the
+    colour on each side of the edge counts up to the edge: an edge beyond the border of the pixels at the distance d
+    adds d of the nearer colour to the farther pixel, one before it d of the farther colour to the nearer pixel. So
+    a long edge covers the area that it should. An edge that runs more down than across is blended between pixels
+    side by side, another between pixels one above the other (Laine et al. 2020, "Modular Primitives for High-
+    Performance Differentiable Rendering", section 3.5).
 
-    Only edges of the triangles that are visible at pixel centres are found: of a mesh whose triangles are smaller than
-    pixels some part of the silhouette is missed. A seam, where triangles have different vertices at equal positions,
-    counts as a silhouette; it blends colours that the two sides have in common.
+    The silhouette is found from the nearer of the two visible triangles on, over the edges that it and its
+    neighbours share, up to 32 triangles: the first edge behind which no triangle with the same two vertices
+    continues the surface on the screen. A seam, where triangles have different vertices at equal positions, counts
+    as a silhouette; it blends colours that the two sides have in common. A surface that is seen at no pixel's
+    centre has no silhouette.
 
     Args:
         colour: float [H, W, C], or [B, H, W, C] for a batch; has a gradient.

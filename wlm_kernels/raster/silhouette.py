@@ -7,12 +7,17 @@ and on the edge itself where it lies between the two corners and has w > 0. Noth
 behind the viewer need no clipping.
 
 The edge is part of the silhouette unless another triangle with the same edge, of the same two vertices, continues on
-the other side of it on the screen. An edge counts only between pixels side by side if it runs more down than across on
-the screen, and else only between pixels one above the other: its crossings then cover one row or column each, and the
-area that a moving edge sweeps is counted once.
+the other side of it on the screen. In that triangle the way goes on, to the edge by which the line leaves it, until it
+meets the silhouette or the other pixel's centre: near the silhouette of a round surface triangles are thinner than a
+pixel.
+
+An edge counts only between pixels side by side if it runs more down than across on the screen, and else only between
+pixels one above the other: its crossings then cover one row or column each, and the area that a moving edge sweeps is
+counted once.
 
 Read `wlm/ops/plain.py` first (`antialias`), which intersects lines on the screen. The idea is that of Laine et al.
-2020, "Modular Primitives for High-Performance Differentiable Rendering", section 3.5.
+2020, "Modular Primitives for High-Performance Differentiable Rendering", section 3.5, which ends at the first
+triangle.
 """
 
 import warp as wp
@@ -23,6 +28,9 @@ wp.set_module_options({"enable_backward": False})
 
 _ZERO = wp.constant(wp.float64(0.0))
 _HALF = wp.constant(wp.float64(0.5))
+_ONE = wp.constant(wp.float64(1.0))
+# That a way from one pixel to the next may cross; far more than of any mesh that a picture resolves.
+_MOST_TRIANGLES = wp.constant(32)
 
 
 @wp.func
@@ -33,23 +41,23 @@ def _corner(clip: wp.array3d[float], image: int, vertex: int) -> wp.vec3d:
 
 
 @wp.func
-def _continues(
+def _beyond(
     clip: wp.array3d[float],
     triangle: wp.array2d[int],
     sides: wp.array1d[int],
     group: wp.array2d[int],
     image: int,
-    slot: int,
+    edge: int,
     n: wp.vec3d,
-) -> bool:
-    """Returns whether another triangle with the edge `slot` lies on the other side of it."""
-    own = wp.dot(n, _corner(clip, image, triangle[slot // 3, slot % 3]))
-    for place in range(group[slot, 0], group[slot, 1]):
+) -> int:
+    """Returns the same edge of a triangle that lies on the other side of it; -1 if there is none."""
+    own = wp.dot(n, _corner(clip, image, triangle[edge // 3, edge % 3]))
+    for place in range(group[edge, 0], group[edge, 1]):
         other = sides[place]
-        if other != slot:
+        if other != edge and has_corners(triangle, other // 3, clip.shape[1]):
             if wp.dot(n, _corner(clip, image, triangle[other // 3, other % 3])) * own < _ZERO:
-                return True
-    return False
+                return other
+    return -1
 
 
 @wp.func
@@ -85,7 +93,7 @@ def _find(
     other_column = column + 1 - axis
     if other_row == frame.height or other_column == frame.width:
         return
-    t = visible[image, row, column]
+    t = int(visible[image, row, column])
     other = visible[image, other_row, other_column]
     if t == other:
         return
@@ -95,19 +103,38 @@ def _find(
         return
     p = centre(frame, row, column)
     q = centre(frame, other_row, other_column)
-    for k in range(3):
-        u = _corner(clip, image, triangle[t, (k + 1) % 3])
-        v = _corner(clip, image, triangle[t, (k + 2) % 3])
+    # From the nearer triangle's pixel to the other one.
+    onwards = wp.where(t == other, -_ONE, _ONE)
+    entered = int(-1)
+    for _step in range(_MOST_TRIANGLES):
+        left = int(-1)
+        for k in range(3):
+            edge_k = 3 * t + k
+            if left < 0 and edge_k != entered:
+                u = _corner(clip, image, triangle[t, (k + 1) % 3])
+                v = _corner(clip, image, triangle[t, (k + 2) % 3])
+                n = wp.cross(u, v)
+                inside = wp.dot(n, _corner(clip, image, triangle[t, k]))
+                if onwards * wp.dot(n, q - p) * inside < _ZERO and _on_edge(u, v, p, axis):
+                    left = edge_k
+        if left < 0:
+            return
+        u = _corner(clip, image, triangle[t, (left + 1) % 3])
+        v = _corner(clip, image, triangle[t, (left + 2) % 3])
         n = wp.cross(u, v)
-        across = wp.abs(n[0]) * wp.float64(frame.height)
-        down = wp.abs(n[1]) * wp.float64(frame.width)
         at_p = wp.dot(n, p)
         at_q = wp.dot(n, q)
-        if (axis == 0) == (across >= down) and at_p * at_q <= _ZERO and at_p != at_q and _on_edge(u, v, p, axis):
-            if not _continues(clip, triangle, sides, group, image, 3 * t + k, n):
+        if at_p * at_q > _ZERO:
+            return
+        entered = _beyond(clip, triangle, sides, group, image, left, n)
+        if entered < 0:
+            across = wp.abs(n[0]) * wp.float64(frame.height)
+            down = wp.abs(n[1]) * wp.float64(frame.width)
+            if (axis == 0) == (across >= down):
                 offset[image, row, column, axis] = float(at_p / (at_p - at_q) - _HALF)
-                edge[image, row, column, axis] = 3 * t + k
-                return
+                edge[image, row, column, axis] = left
+            return
+        t = entered // 3
 
 
 @wp.kernel
