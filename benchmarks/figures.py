@@ -57,6 +57,8 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "nearest_psnr": Figure("nearest", "dB", ".2f"),  # interpolation of uncompressed probes, as the next figure
         "distance_psnr": Figure("by distance", "dB", ".2f"),
         "half_way_psnr": Figure("half-way", "dB", ".2f"),
+        "mixed_psnr": Figure("originals mixed", "dB", ".2f"),  # as `wlm.lightmap.held_out.HeldOut.mixed`
+        "stored_psnr": Figure("stored times", "dB", ".2f"),
         "coarse_psnr": Figure("coarse march", "dB", ".2f"),
         "network_psnr": Figure("network", "dB", ".2f"),
         "opacity_psnr": Figure("opacity", "dB", ".2f"),

@@ -1,8 +1,8 @@
 """Ablation of the feature maps and of the simulation of block compression (neural-dynamic-gi, section 11).
 
 One profile is fitted again and again in plain torch (`benchmarks.rivals.lightmap_torch`), from the same seed and for as
-many steps, each time with other feature maps of about the same size in bytes. Errors are those after quantisation, with
-the network fitted to the quantised maps at the end (section 4). The rows:
+many steps, each time with other feature maps of about the same size in bytes. Errors are those after quantisation;
+unless a row says otherwise, the network is fitted to the quantised maps at the end (section 4). The rows:
 
 - "hybrid": the maps F_uv, F_uvt, F_ut and F_vt over texture coordinates u, v and time t, as in paper and profile.
 - "2D alone": two maps F_uv and no other map. "3D alone": one F_uvt of 48 x 48 x 15 texels (table 6, figure 9).
@@ -10,7 +10,13 @@ the network fitted to the quantised maps at the end (section 4). The rows:
 - "8 channels of F_uv": two maps F_uv in place of F_ut and F_vt (table 8).
 - "no block simulation": the hybrid trained as 8-bit texels, which a BC7 encoder compresses at the end (table 7,
   figure 10).
+- "encoder at the end": the hybrid trained with noise in place of rounding, and compressed after the last step by an
+  encoder of all modes of BC7, as in the paper (section 3.4). The others round in training to the levels of mode 6.
 - "kernels": the hybrid fitted by `wlm.lightmap.compress`, as a check of the fit in plain torch.
+- "held out": `compress` without every second time, scored at these times alone, beside the originals of the times
+  around them, interpolated. Times that are close to others, as those before and after a lamp is switched, are kept.
+  "network": the network evaluates interpolated features, in place of a mix of radiance; "paper's axis": the axis of the
+  features is the hour, too.
 
 Only dynamic tiles, whose light changes over time by more than a common factor, are fitted and measured.
 """
@@ -26,6 +32,7 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note, check_only, demo_data
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, load
+from wlm.lightmap.evaluation import evaluate
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.tiles import TILE, TileGrid, place
@@ -44,10 +51,18 @@ VARIANTS = {
     "tri-plane": Features(uvt=0, channels=6),
     "8 channels of F_uv": Features(uv=2, channels=0),
     "no block simulation": Features(blocks=False),
+    "encoder at the end": Features(encoded=True),
 }
 """The feature maps of each row except the last, at the sizes of profile M."""
 
-ROWS = (*VARIANTS, KERNELS)
+HELD_OUT = {
+    "held out": {},
+    "held out, network": {"interpolation": "network"},
+    "held out, paper's axis": {"interpolation": "network", "time_axis": "paper"},
+}
+"""The rows whose errors are of times that the fit has not seen, and the settings of their fits."""
+
+ROWS = (*VARIANTS, KERNELS, *HELD_OUT)
 """The names of all rows."""
 
 _PROFILE = "M"
@@ -108,7 +123,8 @@ def run_rows(
     for name in ROWS:
         if not only or name in only:
             bench.note(f"fitting {name}")
-            rows.append(bench.kernels_row() if name == KERNELS else bench.variant_row(name))
+            makers = {KERNELS: bench.kernels_row} | dict.fromkeys(VARIANTS, bench.variant_row)
+            rows.append(makers.get(name, bench.held_out_row)(name))
             if done is not None:
                 done(rows)
     return rows
@@ -149,7 +165,7 @@ class _AblationBench(Bench):
         frames = (self._assembled(tiles[:, k]) for k in range(len(self._lightmaps.times)))
         return self._row(name, "in plain torch", fit.tile_bytes * len(tiles), frames, seconds)
 
-    def kernels_row(self) -> Row:
+    def kernels_row(self, name: str) -> Row:
         """Fits the unchanged profile with the fused kernels and returns its row."""
         profile, tiles = self._profile, sorted(self._targets.number.tolist())
         compress(self._set, profile.override({"steps": 10}), tiles=tiles, device=self.device)  # compiles
@@ -158,7 +174,25 @@ class _AblationBench(Bench):
         seconds = time.perf_counter() - start
         decoder = model.decoder(self.device)
         frames = (decoder.frame(t) for t in self._lightmaps.times)
-        return self._row(KERNELS, "fused kernels", model.memory_bytes, frames, seconds)
+        return self._row(name, "fused kernels", model.memory_bytes, frames, seconds)
+
+    def held_out_row(self, name: str) -> Row:
+        """Fits the profile with other settings without every second time, and returns the row of these times."""
+        times, steps = self._lightmaps.times, self._profile.steps
+        gaps = np.diff(times)
+        alone = np.minimum(gaps[:-1], gaps[1:]) > np.median(gaps) / 2.0 if len(gaps) else gaps.astype(bool)
+        left_out = times[1:-1][alone][::2].tolist()
+        if not left_out:
+            return self.missing_row(
+                METHOD, name, "expected a time between two others at the usual distance, found none"
+            )
+        profile, tiles = self._profile.override(HELD_OUT[name]), sorted(self._targets.number.tolist())
+        model = compress(self._set.without(left_out), profile, tiles=tiles, seed=_SEED, device=self.device)
+        report = evaluate(model, self._set, device=self.device, metrics=_METRICS)
+        held = report.light.held_out
+        figures = {"mixed_psnr": held.mixed.psnr, "stored_psnr": report.psnr, "steps": steps}
+        notes = f"fused kernels, {len(left_out)} of {len(times)} times left out"
+        return self.row(METHOD, name, notes, psnr=held.decoded.psnr, ssim=held.decoded.ssim, **figures)
 
     def _row(self, name: str, notes: str, size: int, frames: Iterable[np.ndarray], seconds: float) -> Row:
         lightmaps, steps = self._lightmaps, self._profile.steps

@@ -42,6 +42,8 @@ class Features:
         channels: Number of channels of F_ut and of F_vt; 0: there are no such maps.
         blocks: Whether F_uv and F_uvt are trained as endpoints and weights of BC7 blocks (eq. 7 and 8). Otherwise
             their texels are trained, and a BC7 encoder runs when they are frozen (extra `baselines`).
+        encoded: Whether the fit ends as in the paper (section 3.4): noise stands for quantisation up to the last step,
+            then an encoder of all modes of BC7 takes the texels of the blocks, and the network stays as it is.
     """
 
     uv: int = 1
@@ -51,6 +53,7 @@ class Features:
     rows: int = 24
     channels: int = 2
     blocks: bool = True
+    encoded: bool = False
 
     @classmethod
     def of(cls, profile: Profile) -> "Features":
@@ -153,8 +156,9 @@ class PlainFit:
             The loss of the step, the mean over tiles, samples and channels, a tensor on the device.
         """
         p, n, t = self._profile, *self._colour.shape[:2]
-        quantised = self._step >= round(p.quantise_from * p.steps)
-        if self._fixed is None and self._step >= round(p.freeze_from * p.steps):
+        until_end = self._features.encoded
+        quantised = self._step >= round(p.quantise_from * p.steps) and not until_end
+        if self._fixed is None and self._step >= round(p.freeze_from * p.steps) and not until_end:
             self._fixed = self._stored()
         place = (self._rand(n, p.samples) * self._count[:, None]).long()
         flat = self._texels.gather(1, place)
@@ -199,7 +203,7 @@ class PlainFit:
 
         blocks = [parts for parts in (self._uv, self._uvt) if parts]
         texels = plain.bc7_texels if self._features.blocks else levels
-        options = {"quantised": quantised} if self._features.blocks else {}
+        options = {"quantised": quantised and not self._features.encoded} if self._features.blocks else {}
         return [texels(*parts, **options) for parts in blocks] + [levels(values) for values in self._planes]
 
     @torch.no_grad()
@@ -207,7 +211,7 @@ class PlainFit:
         """Returns the texels of F_uv, F_uvt, F_ut and F_vt quantised as in a file; absent maps are left out."""
         maps = self._maps(quantised=True)
         count = len(maps) - len(self._planes)
-        if self._features.blocks:
+        if self._features.blocks and not self._features.encoded:
             return maps
         return [through_bc7(values) for values in maps[:count]] + maps[count:]
 

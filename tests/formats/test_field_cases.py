@@ -1,14 +1,18 @@
 """Inputs that people report in trackers of other software: each gives its light, a doubt, or the cause in one line."""
 
+import json
 import re
 import struct
 import zlib
+from pathlib import Path
 
+import imagecodecs
 import numpy as np
 import OpenEXR
 import pytest
 from builders.exr import exr_header
 from builders.textures import make_ktx2
+from PIL import Image
 
 import wlm
 from wlm.errors import WlmError
@@ -16,6 +20,7 @@ from wlm.formats.channels import read_encoded
 from wlm.formats.light import read_light
 from wlm.formats.meshes import read_mesh
 
+CORPUS = Path(__file__).resolve().parents[1] / "fuzz" / "corpus"
 SQUARE = "v 0 0 {z}\nv 1 0 {z}\nv 0 1 {z}\nv 1 1 {z}\nvt 0 0\nvt 0.5 0\nvt 0 1\nvt 0.5 1\n"
 ONE, TWO = SQUARE.format(z=0), SQUARE.format(z=1)
 FACE, BACK = "f 1/1 2/2 4/4\n", "f -4/-4 -3/-3 -1/-1\n"
@@ -131,3 +136,102 @@ def test_subsampled_channels_are_refused(tmp_path):
     (tmp_path / "a.exr").write_bytes(head + starts.tobytes() + b"".join(rows))
     with pytest.raises(WlmError, match="channel Y: expected 8x8 pixels in the data window, found 4x4"):
         read_light(tmp_path / "a.exr")
+
+
+LIGHT = np.array([[[0.25, 0.5, 1.0], [2.0, 0.125, 0.0]], [[4.0, 3.0, 0.75], [1.5, 8.0, 0.0625]]], np.float32)
+
+
+def exr(path, channels, **header) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **header}
+    OpenEXR.File(header, channels).write(str(path))
+
+
+def planes(*names):
+    return {name: np.ascontiguousarray(LIGHT[..., i % 3]) for i, name in enumerate(names)}
+
+
+@pytest.mark.parametrize(
+    ("channels", "header", "note"),
+    [
+        # Houdini's planes, in lower case behind the name of the layer, with a depth beside them.
+        (planes("C.r", "C.g", "C.b", "Pz"), {}, "the light is taken from 'C', its only layer of colour"),
+        # An identifier of objects in whole numbers beside the colours.
+        (planes("R", "G", "B") | {"id": np.ones((2, 2), np.uint32)}, {}, None),
+        (planes("red", "green", "blue"), {}, None),
+        ({"RGB": LIGHT}, {"lineOrder": OpenEXR.DECREASING_Y}, None),
+        ({"RGB": LIGHT}, {"pixelAspectRatio": 2.0}, None),
+        # A name of a view before the layer.
+        (planes("left.Bake.R", "left.Bake.G", "left.Bake.B"), {}, "the light is taken from 'left.Bake'"),
+    ],
+)
+def test_an_exr_of_another_writer(tmp_path, channels, header, note):
+    exr(tmp_path / "a.exr", channels, **header)
+    notes: list[str] = []
+    np.testing.assert_array_equal(read_light(tmp_path / "a.exr", notes)[0], LIGHT)
+    assert [line.startswith(note) for line in notes] == [True] if note else notes == []
+
+
+def test_radiance_and_pfm_of_another_writer(tmp_path):
+    codes = imagecodecs.rgbe_encode(LIGHT, header=True)
+    for name, content in {"up": codes.replace(b"-Y 2 +X 2", b"+Y 2 +X 2"), "rgbe": b"#?RGBE" + codes[10:]}.items():
+        (tmp_path / f"{name}.hdr").write_bytes(content)
+        light = read_light(tmp_path / f"{name}.hdr")[0]
+        np.testing.assert_allclose(light, LIGHT[::-1] if name == "up" else LIGHT, rtol=0.02, atol=0.04)
+    for head, values, note in (
+        (b"PF\n2 2\n2.0\n", LIGHT[::-1].astype(">f4"), "the scale of its header, 2, is not applied"),
+        (b"Pf\n2 2\n-1\n", LIGHT[::-1, :, :1].repeat(1, 2).astype("<f4"), "its only channel is taken as grey light"),
+    ):
+        (tmp_path / "a.pfm").write_bytes(head + values.tobytes())
+        notes: list[str] = []
+        light = read_light(tmp_path / "a.pfm", notes)[0]
+        np.testing.assert_array_equal(light, LIGHT if head[1:2] == b"F" else LIGHT[..., :1].repeat(3, 2))
+        assert notes == [note]
+
+
+def test_pictures_of_levels_that_state_what_is_not_applied(tmp_path):
+    picture = Image.fromarray(np.arange(12, dtype=np.uint8).reshape(2, 2, 3) * 20)
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    picture.save(tmp_path / "turned.jpg", exif=turned)
+    picture.save(tmp_path / "profile.png", icc_profile=b"Display P3".rjust(128, b"\0"))
+    picture.save(tmp_path / "srgb.png", icc_profile="sRGB IEC61966-2.1".encode("utf-16-be").rjust(128, b"\0"))
+    for name, said in (
+        ("turned.jpg", ["its EXIF orientation, 6, is ignored: rows are read as they are stored"]),
+        ("profile.png", ["its ICC profile is not applied: the primaries are taken as Rec. 709"]),
+        ("srgb.png", []),
+    ):
+        notes: list[str] = []
+        assert read_encoded(tmp_path / name, "srgb", notes).shape == (2, 2, 3)
+        assert notes == said
+    picture.convert("CMYK").save(tmp_path / "cmyk.jpg")
+    with pytest.raises(WlmError, match="expected a JPEG of grey, RGB or a palette, .* found mode CMYK"):
+        read_encoded(tmp_path / "cmyk.jpg", "srgb")
+
+
+@pytest.mark.parametrize(
+    ("names", "hours"),
+    [
+        (("lm-6AM", "lm-12PM", "lm-6PM"), [6.0, 12.0, 18.0]),
+        (("Lightmap_06h00", "Lightmap_18h30"), [6.0, 18.5]),
+        (("night_00_00h", "late_23_59h", "noon_12_00h"), None),
+    ],
+)
+def test_hours_in_names_of_another_project(tmp_path, names, hours):
+    for i, name in enumerate(names):
+        exr(tmp_path / f"{name}.exr", {"RGB": LIGHT * (i + 1)})
+    lightmaps = wlm.lightmap.load(tmp_path)
+    assert lightmaps.light.period == 24
+    if hours is not None:
+        assert lightmaps.light.times.tolist() == hours
+    assert any("hours from the names: " in line for line in lightmaps.warnings)
+
+
+def test_a_gltf_that_requires_what_is_not_read(tmp_path):
+    content = json.loads((CORPUS / "mesh.gltf").read_bytes())
+    for name in ("light.exr", "mask-grey.png"):
+        (tmp_path / name.replace("mask-grey", "image")).write_bytes((CORPUS / name).read_bytes())
+    for required, said in (("VENDOR_displaced", True), ("KHR_materials_unlit", False), ("MOZ_lightmap", False)):
+        content["extensionsUsed"] = content["extensionsRequired"] = [required]
+        (tmp_path / "a.gltf").write_text(json.dumps(content))
+        lines = wlm.atlas.load(tmp_path / "a.gltf", tmp_path / "light.exr").warnings
+        assert any("requires VENDOR_displaced, which is not read" in line for line in lines) == said

@@ -1,6 +1,7 @@
 """Readers of artifacts: the models of the four systems, the checkpoints of their fits, and pools of samples."""
 
 import functools
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -99,6 +100,15 @@ def _extreme(draw: Random, data: bytes) -> bytes:
     with np.errstate(over="ignore"):
         weights[first:last] = (weights[first:last] * draw.choice((0.0, 1e-9, 30.0, 1e3, 1e5, -1e9))).clip(-65504, 65504)
     return signed(data[:size], weights.astype("<f2").tobytes())
+
+
+@functools.cache
+def _networks() -> Sequence[bytes]:
+    """A network, and one with longer steps of its guiding map, for which another kernel is compiled."""
+    (data,) = stored("smoke.wlm")()
+    size = 8 + int.from_bytes(data[:8], "little")
+    header = re.sub(rb"'guide_step':[^,]*", b"'guide_step':32", data[:size])
+    return data, signed(header, data[size:])
 
 
 def _plume() -> Mapping[str, bytes]:
@@ -261,7 +271,7 @@ READERS = (
     Reader("lightmap", "a.wlm", stored(*_LIGHTMAPS), vary_artifact, _lightmap),
     Reader("probe", "a.wlm", stored("probe.wlm", "probe-pca.wlm"), vary_compact, _probe),
     Reader("atlas", "a.wlm", stored(*(f"atlas-{kind}.wlm" for kind in _ATLASES)), vary_artifact, _atlas),
-    Reader("smoke-network", "a.wlm", stored("smoke.wlm"), _extreme, _network, _plume, cost=2),
+    Reader("smoke-network", "a.wlm", _networks, _extreme, _network, _plume, cost=2),
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
     _checkpoints(lightmap_fit, "lightmap", cost=8),
     _checkpoints(probe_fit, "probe", cost=4),

@@ -40,6 +40,11 @@ def test_the_decoder_adds_groups_by_their_weights(model):
     assert decoder.weights["lamp"].tolist() == [0.5] * 3 and not decoder.weights["sky"].any(), "the others keep theirs"
 
 
+def test_a_lamp_is_read_once_at_any_time(model):
+    lamp = model.maps()["lamp"]
+    assert lamp.axis.reads(17.25) == [(0.0, 1.0)] and lamp.axis.place(17.25) == 0.5
+
+
 def test_wrong_weights_are_one_line_and_change_nothing(model):
     decoder = model.decoder()
     for weights, words in (

@@ -24,12 +24,13 @@ from wlm.atlas.charts import charts, welded
 from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.atlas.listing import Listing, SheetFiles, is_listing, read_listing
 from wlm.atlas.matching import all_by_name, chart_map, choose_mesh, fits_flipped, misfits, named, replace_strays
-from wlm.atlas.materials import Readings, Rectangle, own_lightmaps, settle, slot_readings
+from wlm.atlas.materials import EXTENSIONS, Readings, Rectangle, own_lightmaps, settle, slot_readings
 from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
 from wlm.formats.exr import CROPPED
 from wlm.formats.gltf import Arrays, GltfDocument, GltfPrimitive, document_from_meshes, read_gltf
 from wlm.formats.gltf_slots import usual_set
+from wlm.formats.gltf_writer import HARMLESS
 from wlm.formats.light import noted, read_light
 from wlm.formats.limits import FRAMES, PICTURE_GROWTH, check_growth
 from wlm.formats.mask import read_mask
@@ -259,6 +260,10 @@ def load(
         )
     elif listing.objects is not None:
         placed = _placed(str(path), readers, listing, places)
+    known = (*HARMLESS, *EXTENSIONS)
+    if required := [name for name in document.content.get("extensionsRequired", []) if not str(name).startswith(known)]:
+        listed = ", ".join(map(str, required[:8]))
+        notes = (*notes, f"{path}: requires {listed}, which is not read: is the mesh whole without it?")
     sheets: list[Sheet] = []
     objects, owner = [], {}
     size, decoded = sum(map(len, document.buffers)), 0

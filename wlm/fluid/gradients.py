@@ -183,9 +183,9 @@ class DifferentiableLattice:
     def _collide(self, work: "_Work", f: wp.array, done: int, forces: wp.array, out: wp.array) -> None:
         setup = self._setup
         spec = replace(setup.spec, forced=forces.shape[0] > 0)
-        work.clock.fill_(done)
+        work.done.fill_(done)
         inputs = [wp.vec3i(*setup.shape), f, setup.solid, setup.tau, setup.eddy, forces, 0]
-        outputs = [to_warp(work.clock), to_warp(work.trouble), work.sums, out]
+        outputs = [work.clock, work.trouble, work.sums, out]
         wp.launch(step_kernel(spec), self._cells, inputs=inputs, outputs=outputs, device=f.device)
 
     def _advance(
@@ -201,7 +201,7 @@ class DifferentiableLattice:
         self._collide(work, self._populations(f), done, forces, left)
         where = [setup.tables, wp.vec3i(*setup.shape), setup.bounded, 0, work.links, setup.solid]
         rise = 1.0 / max(setup.ramp, 1)
-        lattice_links.apply(setup.link_kernels, *where, to_warp(work.clock), rise, left, work.sums)
+        lattice_links.apply(setup.link_kernels, *where, work.clock, rise, left, work.sums)
         return out
 
     def _reverse(
@@ -306,7 +306,7 @@ class DifferentiableSolver:
             tail = (len(self._setup.sources), 2)
             check("sources", sources, (steps, *tail) if sources.ndim == 3 else tail, self.air.device)
             check_finite({"sources": (0.0, math.inf)}, sources=sources)
-            sources = sources.reshape(-1, *tail)
+            sources = sources if sources.ndim == 3 else sources[None]
         controls = self.air._inlet(inlet, steps), sources
         machine = _Smoke(self, self._solver.steps if begin is None else begin, controls[1])
         f, density, heat = _Steps.apply(machine, *_counts(steps, states), 3, state.populations, *smoke, *controls)
@@ -386,13 +386,15 @@ class _Work:
 
     Attributes:
         clock, trouble, sums: See `wlm_kernels.fluid.lattice.step_kernel`.
+        done, first_trouble: `clock` and `trouble` as tensors.
         links: The lattice's links with terms and values of this call.
     """
 
     def __init__(self, air: DifferentiableLattice) -> None:
         links, device = air._setup.links, air.device
-        self.clock = torch.zeros(2, dtype=torch.int32, device=device)
-        self.trouble = torch.full((1,), QUIET, dtype=torch.int64, device=device)
+        self.done = torch.zeros(2, dtype=torch.int32, device=device)
+        self.first_trouble = torch.full((1,), QUIET, dtype=torch.int64, device=device)
+        self.clock, self.trouble = to_warp(self.done), to_warp(self.first_trouble)
         self.sums = to_warp(torch.zeros(2, dtype=torch.float64, device=device))
         self.links = lattice_links.Links()
         self.links.cell, self.links.code, self.links.term = links.cell, links.code, links.term
@@ -643,7 +645,7 @@ def _counts(steps: int, states: int) -> tuple[int, int]:
 
 
 def _check_trouble(air: DifferentiableLattice, work: _Work) -> None:
-    if work.trouble.is_cuda and torch.cuda.is_current_stream_capturing():
+    if work.first_trouble.is_cuda and torch.cuda.is_current_stream_capturing():
         return
-    if (key := int(work.trouble)) != QUIET:
+    if (key := int(work.first_trouble)) != QUIET:
         raise blown_up(key, air._setup.shape)

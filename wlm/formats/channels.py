@@ -82,6 +82,9 @@ def read_encoded(path: str | os.PathLike[str], encoding: str, notes: list[str] |
     stated = "srgb" if "srgb" in entries else {1.0: "linear", 0.45455: "srgb"}.get(entries.get("gamma", 0.0))
     if stated and name in ("linear", "srgb") and stated != name:
         notes.append(f"the PNG says that its levels are {stated}: is its encoding {stated}, not {name}?")
+    profile = entries.get("icc_profile") or b"sRGB"
+    if not any(word in profile for word in (b"sRGB", "sRGB".encode("utf-16-be"))):
+        notes.append("its ICC profile is not applied: the primaries are taken as Rec. 709")
     if name in _ALPHA and "A" not in names:
         raise WlmError(f"{path}: encoding {name}: expected a picture with alpha, found the channels {''.join(names)}")
     colour, alpha = (pixels[..., :-1], pixels[..., -1:]) if "A" in names else (pixels, None)

@@ -42,8 +42,8 @@ _IMAGE_TYPES = {
 }
 # Extensions that refer to vertices by index and would be wrong for the new vertices.
 _OF_VERTICES = ("CESIUM_primitive_outline", "EXT_mesh_primitive_edge_visibility")
-# Extensions that refer to no accessor and no buffer view, so that unused ones can be found.
-_HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "EXT_texture_")
+HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantization", "EXT_texture_")
+"""Beginnings of the names of extensions that change no mesh, and refer to no accessor and no buffer view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ def encode_glb(
             tree.replace(meshes[node]["primitives"][each.primitive.primitive], each, uv_set)
         tree.embed_images()
         # An extension may refer to data in an unknown way.
-        if all(name.startswith(_HARMLESS) for name in tree.content.get("extensionsUsed", [])):
+        if all(name.startswith(HARMLESS) for name in tree.content.get("extensionsUsed", [])):
             tree.keep("accessors", _accessor_slots)
             tree.payloads = [tree.payloads[number] for number in tree.keep("bufferViews", _view_slots)]
     return _pack(document.path if path is None else path, tree.content, tree.payloads)

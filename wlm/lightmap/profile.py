@@ -146,6 +146,8 @@ class TimeAxis:
         """Returns the indices of the stored times before and after t, and the weight of the later one, 0 to 1."""
         t = self.wrap(t)
         n = len(self.times)
+        if n == 1:
+            return 0, 0, 0.0
         after = int(np.searchsorted(self.times, t, side="right"))
         before = after - 1
         if self.period is None:
@@ -153,8 +155,7 @@ class TimeAxis:
             gap = self.times[after] - self.times[before]
             return before, after, float((t - self.times[before]) / gap) if gap > 0 else 0.0
         before, after = before % n, after % n
-        gap = (self.times[after] - self.times[before]) % self.period
-        gap = gap if gap > 0 else self.period  # with one stored time the whole day is one interval
+        gap = (self.times[after] - self.times[before]) % self.period or self.period
         return before, after, float(((t - self.times[before]) % self.period) / gap)
 
     def place(self, t: float) -> float:

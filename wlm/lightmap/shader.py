@@ -270,10 +270,10 @@ ivec2 wlm_source(ivec2 texel)
 """
 
 _RADIANCE = """
-// Linear radiance of a texel of the map.
+// Linear radiance of a texel of the map, at most 65504: a target of half floats would make more infinite.
 vec3 wlm_radiance(ivec2 texel)
 {{
-    return pow(wlm_colour(texel), {gamma});
+    return min(pow(wlm_colour(texel), {gamma}), vec3(65504.0, 65504.0, 65504.0));
 }}
 """
 

@@ -2,8 +2,7 @@
 
 A launch does everything: a block of threads decodes a strip of a tile, for which it reads F_uvt, F_ut and F_vt at one
 hour, or at two between which it interpolates the radiance. A thread decodes the texels of a column. Activations and
-weights are half floats. GELU is its tanh form with the GPU's tanh instruction in half of the units, and in the others a
-polynomial.
+weights are half floats, and GELU is its tanh form with the GPU's tanh instruction.
 
 Read first: `exact_kernels` in `wlm_kernels/lightmap/decode.py`.
 """
@@ -28,6 +27,7 @@ _BOUNDS = (128, 4)  # threads of a block, blocks of a multiprocessor: 128 regist
 _STEP = 16  # size of a matrix product: the hidden width is a multiple of it
 _MAPS = 12  # inputs that come from the maps; the encoded time follows
 _UV_SCALE = np.sqrt(12.0) / 255.0
+_SCALE = (np.sqrt(2.0 / np.pi) * 0.044715) ** (1.0 / 3.0)  # of arguments of GELU, whose x^3 then has the factor 1
 
 
 @wp.func_native(
@@ -60,19 +60,20 @@ def pack_networks(hidden: np.ndarray, output: np.ndarray) -> np.ndarray:
     Returns:
         uint32 [N, words], two half floats each: the operands of the three layers in the order of the lanes, then the
         biases of the second and (as floats) of the third. Inputs 12 to 15 have no weights. F_uv is an input in steps of
-        1/255, and activations are doubled. The output has eight columns, in two versions.
+        1/255. Arguments of GELU are scaled by 0.3292035 and its results by twice that, see the kernel. The output has
+        eight columns, in two versions.
     """
     n, width = len(hidden), hidden.shape[2]
     first = np.zeros((n, _STEP, width))
-    first[:, :4], first[:, 4:_MAPS] = hidden[:, :4] * _UV_SCALE, hidden[:, 4:_MAPS]
+    first[:, :4], first[:, 4:_MAPS] = hidden[:, :4] * (_SCALE * _UV_SCALE), hidden[:, 4:_MAPS] * _SCALE
     bias = TEMPORAL_INPUTS + 1 + width
     third = np.zeros((n, 2, width, 8))
-    third[:, 0, :, :3] = third[:, 1, :, 4:7] = output[:, :-1] / 2.0
+    third[:, 0, :, :3] = third[:, 1, :, 4:7] = output[:, :-1] / (2.0 * _SCALE)
     layers = [
         _operands(first),
         _operands(hidden[:, TEMPORAL_INPUTS + 1 : bias] / 2.0),
         _operands(third.reshape(n, 2 * width, 8)),
-        np.ascontiguousarray(hidden[:, bias], np.float16).view(np.uint32),
+        np.ascontiguousarray(hidden[:, bias] * _SCALE, np.float16).view(np.uint32),
         np.pad(output[:, -1].astype(np.float32), ((0, 0), (0, 1))).view(np.uint32),
     ]
     return np.ascontiguousarray(np.concatenate(layers, axis=1))

@@ -14,7 +14,7 @@ function wlmPlace(lightmap, time) {
     after = Math.min(after, count - 1);
     [span, since] = [times[after] - times[before] || 1, time - times[before]];
   }
-  const share = since / span;
+  const share = count > 1 ? since / span : 0;
   let place = axis.rule === 'paper' && period ? time / period
     : tau[before] + share * (axis.repeats ? 1 / count : tau[after] - tau[before]);
   if (axis.repeats) place -= Math.floor(place);
