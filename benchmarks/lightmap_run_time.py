@@ -61,7 +61,7 @@ _ALL = 1 << 40  # bytes: the pages of all levels
 _EVERY = 6  # one of so many times is measured in a quick run
 _GAMMA, _BORDER, _GRID = 2.2, 4, 4  # of colours of 8 bits; of a page; samples of a texel of a mip along each axis
 _WARMUP = 32  # frames, in which modules are loaded and the graph is captured
-_WAIT_CYCLES = 600_000  # of the GPU, about 0.3 ms: longer than the host needs to queue a frame
+_WAIT_CYCLES = 3_000_000  # of the GPU, about 1.5 ms: longer than the host needs to queue a frame
 
 View = tuple[wp.array, wp.array, wp.array]
 Camera = Callable[[float], View]

@@ -13,7 +13,6 @@ from wlm.ops import plain
 
 QUAD = [[-0.7, -0.6, 0.1, 1.0], [1.2, -0.9, 0.2, 1.5], [1.0, 1.1, 0.0, 1.4], [-0.5, 0.6, 0.0, 0.8]]
 SHAPES = {
-    "triangle": ([[-0.7, -0.6, 0.1, 1.0], [0.8, -0.4, 0.2, 1.0], [0.1, 0.75, 0.0, 1.0]], [[0, 1, 2]]),
     "quad": (QUAD, [[0, 1, 2], [0, 2, 3]]),
     "behind the viewer": ([[-0.7, -0.6, 0.1, 1.0], [0.6, -0.5, 0.2, 1.0], [0.2, 1.5, 0.0, -0.3]], [[0, 1, 2]]),
     # Front and back faces share the edges of its outline.
@@ -117,7 +116,7 @@ def _colour(*shape: int, device: str = "cpu") -> torch.Tensor:
     return torch.from_numpy(np.random.default_rng(7).normal(size=shape).astype(np.float32)).to(device)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_against_float64(device: str, seed: int):
     """Values and gradients are those of the twin, which intersects lines on the screen."""
     clip, triangle = _scene(seed, device)

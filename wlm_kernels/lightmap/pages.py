@@ -129,6 +129,30 @@ def _valid(tiles: Tiles, tile: int, y: int, x: int) -> int:
 
 
 @wp.func
+def _sample(tiles: Tiles, sheet: int, level: int, depth: int, side: int, sample: int, y: int, x: int) -> wp.vec3i:
+    """Returns tile, row and column of one of side x side samples of the texel (y, x) of a level, or a tile of -1 if the
+    sample is not valid. With a `depth` below the level, samples are coarse texels, and all are valid."""
+    a = sample // side
+    b = sample - a * side
+    whole = 2 * side * side
+    ty = (y << level) + (2 * (a * side + b) + 1 << level) // whole
+    tx = (x << level) + (2 * (b * side + side - 1 - a) + 1 << level) // whole
+    if depth < level:  # of a coarse texel that reaches past the map's end, its first texel does not
+        ty -= ty % 16
+        tx -= tx % 16
+    size = tiles.size[sheet]
+    tile = int(-1)
+    if ty < size[0] and tx < size[1]:
+        tile = tiles.first[sheet] + (ty // 128) * tiles.columns[sheet] + tx // 128
+        ty = ty % 128
+        tx = tx % 128
+        if depth == level:
+            if _valid(tiles, tile, ty, tx) == 0:
+                tile = -1
+    return wp.vec3i(tile, ty, tx)
+
+
+@wp.func
 def _coarse_light(tiles: Tiles, clock: wp.array2d[float], target: int, tile: int, cell: int) -> wp.vec3:
     share = clock[target, _SHARE]
     early = unpack_rgb9e5(tiles.coarse[tile, int(clock[target, _BEFORE]), cell])
@@ -234,59 +258,57 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
         if slot >= 0 and sheet >= 0 and sheet < tiles.size.shape[0]:
             place = jobs.place[k]
             level = place[1]
-            step = 1 << level
             size = tiles.size[sheet]
-            rows = (size[0] + step - 1) // step
-            columns = (size[1] + step - 1) // step
+            rows = ((size[0] - 1) >> level) + 1
+            columns = ((size[1] - 1) >> level) + 1
             y = wp.clamp(place[2] + i, 0, rows - 1)
             x = wp.clamp(place[3] + j, 0, columns - 1)
             depth = level
             if level >= _LEVEL and direct == 0:
                 depth = level - _LEVEL
             side = wp.min(1 << depth, grid)
-            whole = 2 * side * side
-            light = wp.vec3()
-            count = int(0)
+            # The search comes first, so that the threads of a warp evaluate their networks together.
             o = int(0)
-            while o < offsets.shape[0] and count == 0:
+            found = int(0)
+            while o < offsets.shape[0] and found == 0:
                 yy = y + offsets[o][0]
                 xx = x + offsets[o][1]
-                o += 1
                 if yy >= 0 and xx >= 0 and yy < rows and xx < columns:
-                    for sample in range(side * side):
-                        a = sample // side
-                        b = sample - a * side
-                        ty = yy * step + step * (2 * (a * side + b) + 1) // whole
-                        tx = xx * step + step * (2 * (b * side + side - 1 - a) + 1) // whole
-                        if depth < level:  # of a coarse texel that reaches past the map's end, its first texel does not
-                            ty -= ty % 16
-                            tx -= tx % 16
-                        if ty < size[0] and tx < size[1]:
-                            tile = tiles.first[sheet] + (ty // 128) * tiles.columns[sheet] + tx // 128
-                            ty = ty % 128
-                            tx = tx % 128
-                            if depth < level:
-                                cell = (ty // 16) * _SIDE + tx // 16
-                                light += _coarse_light(tiles, clock, jobs.target[k], tile, cell)
-                                count += 1
-                            elif _valid(tiles, tile, ty, tx) == 1:
-                                light += texel_light(
-                                    tiles,
-                                    moving,
-                                    moving_hidden,
-                                    moving_output,
-                                    still,
-                                    still_hidden,
-                                    still_output,
-                                    frames,
-                                    clock,
-                                    jobs.target[k],
-                                    tiles.gamma[sheet],
-                                    tile,
-                                    ty,
-                                    tx,
-                                )
-                                count += 1
+                    sample = int(0)
+                    while sample < side * side and found == 0:
+                        if _sample(tiles, sheet, level, depth, side, sample, yy, xx)[0] >= 0:
+                            found = 1
+                        sample += 1
+                o += 1
+            light = wp.vec3()
+            count = int(0)
+            if found == 1:
+                yy = y + offsets[o - 1][0]
+                xx = x + offsets[o - 1][1]
+                for sample in range(side * side):
+                    at = _sample(tiles, sheet, level, depth, side, sample, yy, xx)
+                    if at[0] >= 0:
+                        count += 1
+                        if depth < level:
+                            cell = (at[1] // 16) * _SIDE + at[2] // 16
+                            light += _coarse_light(tiles, clock, jobs.target[k], at[0], cell)
+                        else:
+                            light += texel_light(
+                                tiles,
+                                moving,
+                                moving_hidden,
+                                moving_output,
+                                still,
+                                still_hidden,
+                                still_output,
+                                frames,
+                                clock,
+                                jobs.target[k],
+                                tiles.gamma[sheet],
+                                at[0],
+                                at[1],
+                                at[2],
+                            )
             out[slot, i, j] = pack_rgb9e5(light / float(wp.max(count, 1)))
 
     return decode_pages

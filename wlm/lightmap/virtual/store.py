@@ -31,7 +31,7 @@ from wlm_kernels.lightmap.virtual import KEEP
 _CHUNK = 64  # tiles that are read at once
 _GRID = 4  # samples of a coarse texel along each axis
 _DARK = 0.01  # of a tile's brightest time: changes of less light than that are not relative to it
-_UPLOADS = 4  # most loaded tiles that are copied to the device in a frame
+_UPLOADS = 8  # most loaded tiles that are copied to the device in a frame
 _ALIGNED = 64  # bytes; the first of an array in a pool
 _REQUESTS = 64  # most tiles that wait for the loader
 
@@ -147,6 +147,14 @@ class TileStore:
         self.offsets = self._array(np.array([(0, 0), *OFFSETS], np.int32), wp.vec2i)
         self._read_all(clock)
         self._used = np.full(len(self.slot), -1)  # last frame in which a page needed each tile
+        # The tiles of each page, the pages of each tile, and how many tiles each page lacks.
+        pages = np.arange(len(layout.parent) + 1)
+        self._reads = np.searchsorted(layout.reader, pages)
+        order = np.argsort(layout.read, kind="stable")
+        self._readers = layout.reader[order]
+        self._readers_of = np.searchsorted(layout.read[order], np.arange(len(self.slot) + 1))
+        waits = self.slot[layout.read] == kernels.WAITING
+        self._missing = np.bincount(layout.reader[waits], minlength=len(layout.parent))
         if not self.complete:
             self._loader = TileLoader(model, _REQUESTS)
 
@@ -343,10 +351,8 @@ class TileStore:
         Damaged tiles count as here: pages that read them have coarse texels in their place, but the page of such a tile
         itself is never decoded. The page of a whole sheet is always decoded, with coarse texels for missing tiles.
         """
-        layout = self.layout
-        missing = np.bincount(layout.reader[self.slot[layout.read] == kernels.WAITING], minlength=len(layout.parent))
-        broken = (layout.own >= 0) & (self.slot[layout.own] == kernels.BROKEN)
-        return np.where(broken, -1, missing == 0).astype(np.int32)
+        broken = (self.layout.own >= 0) & (self.slot[self.layout.own] == kernels.BROKEN)
+        return np.where(broken, -1, self._missing == 0).astype(np.int32)
 
     def stream(self, seen: np.ndarray, priority: np.ndarray, frame: int) -> bool:
         """Asks the loader for tiles and uploads those that it has loaded, some in each frame.
@@ -361,15 +367,17 @@ class TileStore:
         """
         if self._loader is None:
             return False
-        layout = self.layout
-        self._used[layout.read[seen[layout.reader] > frame - KEEP]] = frame
-        wanted = (priority[layout.reader] > 0) & (self.slot[layout.read] == kernels.WAITING)
-        most = np.zeros(len(self.slot), np.int64)
-        np.maximum.at(most, layout.read[wanted], priority[layout.reader[wanted]])
-        waiting = np.flatnonzero(most)
-        order = waiting[np.argsort(-most[waiting], kind="stable")][:_REQUESTS]
+        layout, most = self.layout, {}
+        # Of a view's few pages; all pages read tens of thousands of tiles.
+        for page in np.flatnonzero(seen > frame - KEEP).tolist():
+            read = layout.read[self._reads[page] : self._reads[page + 1]]
+            self._used[read] = frame
+            if priority[page] > 0:
+                waiting = read[self.slot[read] == kernels.WAITING].tolist()
+                most |= {tile: max(int(priority[page]), most.get(tile, 0)) for tile in waiting}
+        order = sorted(most, key=most.__getitem__, reverse=True)[:_REQUESTS]
         self._loader.cancel()
-        for tile in order.tolist():
+        for tile in order:
             s = int(np.searchsorted(layout.tile_first, tile, side="right")) - 1
             number = tile - int(layout.tile_first[s])
             self._loader.request(layout.sheets[s], number, float(most[tile]))
@@ -381,6 +389,7 @@ class TileStore:
                 continue
             if loaded.tile is None:
                 self._break(tile, loaded.error or WlmError("a tile could not be read"))
+                self._count(tile, -1)
                 changed = True
             elif self._room_for(tile, frame):
                 changed = True
@@ -402,8 +411,14 @@ class TileStore:
             return False  # the tile is asked for again
         if pool.owner[slot] >= 0:
             self.slot[pool.owner[slot]] = kernels.WAITING
+            self._count(int(pool.owner[slot]), 1)
         pool.owner[slot], self.slot[tile], self._used[tile] = tile, slot, frame
+        self._count(tile, -1)
         return True
+
+    def _count(self, tile: int, change: int) -> None:
+        """Adds to the number of missing tiles of the pages that read a tile."""
+        self._missing[self._readers[self._readers_of[tile] : self._readers_of[tile + 1]]] += change
 
     def wait(self, seconds: float) -> bool:
         """Waits until a requested tile is loaded, at most some seconds; returns whether there is one."""
