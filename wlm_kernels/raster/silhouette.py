@@ -52,10 +52,14 @@ def _beyond(
 ) -> int:
     """Returns the same edge of a triangle that lies on the other side of it; -1 if there is none."""
     own = wp.dot(n, _corner(clip, image, triangle[edge // 3, edge % 3]))
+    i = triangle[edge // 3, (edge % 3 + 1) % 3]
+    j = triangle[edge // 3, (edge % 3 + 2) % 3]
     for place in range(group[edge, 0], group[edge, 1]):
         other = sides[place]
         if other != edge and has_corners(triangle, other // 3, clip.shape[1]):
-            if wp.dot(n, _corner(clip, image, triangle[other // 3, other % 3])) * own < _ZERO:
+            vertex = triangle[other // 3, other % 3]
+            # A third corner that is an end of the edge lies on neither side, but rounding may put it on one.
+            if vertex != i and vertex != j and wp.dot(n, _corner(clip, image, vertex)) * own < _ZERO:
                 return other
     return -1
 
