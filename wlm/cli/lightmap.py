@@ -117,13 +117,6 @@ def compress(
     layers: _Layers = None,
     encoding: Encoding = None,
     groups: _Groups = None,
-    hold_out: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIMES",
-            help="Times of the set to leave out of the fit, such as 1:24:2; `wlm evaluate` scores them by themselves.",
-        ),
-    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -150,16 +143,9 @@ def compress(
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
     options |= {"workers": workers, "cluster": cluster}
 
-    def read() -> "LightmapSet":
-        from wlm.lightmap.data import parse_times
-
-        left_out = None if hold_out is None else parse_times(hold_out)
-        lightmaps = _load(set_path, times, mask, period, layers, encoding, groups, trust)
-        return lightmaps if left_out is None else lightmaps.without(left_out)
-
     _, model, facts = models.fit(
         "lightmap",
-        read,
+        lambda: _load(set_path, times, mask, period, layers, encoding, groups, trust),
         output,
         profile,
         settings,
