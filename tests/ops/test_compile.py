@@ -1,11 +1,19 @@
 """Operations under torch.compile, against plain calls: values and gradients, of every operation."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
 from builders.operation_subjects import WITHOUT, Subject, subjects
 
 from wlm import ops
+
+# Torch does not quote the paths that it gives to the compiler.
+_SKIPPED = pytest.mark.skipif(
+    shutil.which("g++") is None or " " in torch.__file__, reason="inductor needs g++ and a path without spaces"
+)
+BACKENDS = ["aot_eager", pytest.param("inductor", marks=[pytest.mark.slow, _SKIPPED])]
 
 
 def _results(subject: Subject, backend: str) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
@@ -23,7 +31,7 @@ def _results(subject: Subject, backend: str) -> tuple[list[torch.Tensor], list[t
     return [value.detach() for value in values], list(grads)
 
 
-@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", [name for name in ops.__all__ if name not in WITHOUT])
 def test_every_operation(name: str, backend: str):
     subject = subjects(name)[0]
@@ -37,7 +45,7 @@ def _picture(corners: torch.Tensor, attribute: torch.Tensor) -> torch.Tensor:
     return ops.interpolate(attribute, triangle, ops.rasterize(corners, triangle, 8, 8)).square().sum()
 
 
-@pytest.mark.parametrize("backend", ["aot_eager", "inductor"])
+@pytest.mark.parametrize("backend", BACKENDS)
 def test_a_picture(backend: str):
     """One operation after another, with nothing between."""
     corners = torch.tensor([[-1.0, -1, 0, 1], [1, -1, 0, 1], [1, 1, 0, 1]], requires_grad=True)
