@@ -42,7 +42,7 @@ MOST_ERROR, LEAST_GAIN = 0.08, 8.0
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What is found: raw numbers, which `controls` bounds.
+    """The unknowns as raw numbers, which `controls` bounds.
 
     Attributes:
         strength: [frame, NOZZLES].

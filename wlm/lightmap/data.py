@@ -42,6 +42,7 @@ from wlm.lightmap.assumptions import set_lines, size_line
 from wlm.lightmap.groups import groups_of, times_of
 from wlm.lightmap.layout import odd_layout
 from wlm.lightmap.listing import Listing, list_set
+from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.reading import ALL, FROM_ALPHA, Bounds, Reader, Stack, size_text
 from wlm.lightmap.sheet import (
     BASE,
@@ -95,6 +96,13 @@ class SheetFrames:
     def valid(self, index: int) -> np.ndarray:
         """Returns which texels are valid in the frame with this index, bool [H, W]."""
         return self.mask if self.covered is None else self.covered[index]
+
+    def at(self, time: float) -> np.ndarray:
+        """Returns the light at a time, between two stored ones interpolated (neural-dynamic-gi, eq. 2), [H, W, 3]."""
+        before, after, share = TimeAxis(self.times, self.period, "frames").neighbours(time)
+        if share == 0.0:
+            return self.frames[before]
+        return (1.0 - share) * self.frames[before] + share * self.frames[after]
 
     def select(self, indices: Sequence[int] | np.ndarray) -> "SheetFrames":
         """Returns the lightmaps with these indices, which are copied, as if the set had no others."""

@@ -235,7 +235,7 @@ def _mean(values: Sequence[float], weights: Sequence[int]) -> float:
 
 def psnr_of(model: SheetModel, lightmaps: SheetFrames, number: int, decoded: np.ndarray) -> float:
     """Returns the mean PSNR in dB over the tiles of a decoded map [H, W, 3], compared with input lightmap `number`."""
-    mask, name = lightmaps.mask & _stored(model), f"{model.name} at {lightmaps.times[number]:g}"
+    mask, name = lightmaps.mask & model.stored_texels, f"{model.name} at {lightmaps.times[number]:g}"
     options = {"name": name, "peak": model.profile.peak}
     return float(summarise([evaluate_frame(lightmaps.frames[number], decoded, mask, TILE, ("psnr",), **options)]).psnr)
 
@@ -293,7 +293,7 @@ def bits_per_texel(model: SheetModel, mask: np.ndarray, size: int) -> float:
 
 
 def _area(model: SheetModel, mask: np.ndarray) -> int:
-    stored = _stored(model)
+    stored = model.stored_texels
     area = mask.size if not (mask & ~stored).any() else int(stored.sum())
     if area == 0:
         raise WlmError(f"{model.name}: expected a file with tiles, found only empty tiles")
@@ -305,11 +305,6 @@ def count_kinds(model: SheetModel) -> dict[str, int]:
     return {kind.name.lower(): int((model.kind == kind).sum()) for kind in TileKind}
 
 
-def _stored(model: SheetModel) -> np.ndarray:
-    grid = model.grid
-    return grid.texels_of((model.kind != TileKind.EMPTY).reshape(grid.rows, grid.cols))
-
-
 def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
     """Checks that a sheet fits a model; returns which texels are scored, bool [H, W]: valid ones in stored tiles."""
     height, width = lightmaps.mask.shape
@@ -317,7 +312,7 @@ def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
         raise WlmError(
             f"{lightmaps.name}: has {width}x{height} texels, but the file {model.name} has {model.width}x{model.height}"
         )
-    mask = lightmaps.mask & _stored(model)
+    mask = lightmaps.mask & model.stored_texels
     if not mask.any():
         raise WlmError(f"{lightmaps.name}: no tile of the file {model.name} has a valid texel")
     return mask

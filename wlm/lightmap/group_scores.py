@@ -12,15 +12,14 @@ import numpy as np
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, SheetFrames
 from wlm.lightmap.decode import SheetDecoder
-from wlm.lightmap.groups import times_of
+from wlm.lightmap.groups import in_groups, times_of
 from wlm.lightmap.model import LightmapModel
-from wlm.lightmap.profile import TimeAxis
-from wlm.lightmap.sheet import BASE, Sheet
-from wlm.lightmap.tiles import TILE, TileKind
+from wlm.lightmap.sheet import Sheet
+from wlm.lightmap.tiles import TILE
 from wlm.metrics import Summary, evaluate_frame, summarise
 
 ORIGINALS, BAKE = "originals of the groups", "bake of all lights"
-"""What a sum is compared with."""
+"""References with which a sum is compared."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ def score_sums(
     """
     scores: list[SumScore] = []
     wanted = {} if all_lights is None else dict(all_lights.sheets)
-    for plain in dict.fromkeys(replace(sheet, group=BASE) for sheet in model.sheets if not sheet.linear):
+    for plain in dict.fromkeys(sheet.plain for sheet in model.sheets if not sheet.linear):
         groups = model.maps(plain)
         first, decoders = next(iter(groups.values())), [SheetDecoder(own, device) for own in groups.values()]
         together = sum_of(lightmaps, plain)
@@ -76,8 +75,7 @@ def score_sums(
                 height, width = bake.mask.shape
                 raise WlmError(f"{bake.name}: expected lightmaps of {first.width}x{first.height}, got {width}x{height}")
             references[BAKE] = bake
-        stored = np.any([own.kind != TileKind.EMPTY for own in groups.values()], axis=0)
-        mask = first.mask & first.grid.texels_of(stored.reshape(first.grid.rows, first.grid.cols))
+        mask = first.mask & np.any([own.stored_texels for own in groups.values()], axis=0)
         for reference, original in references.items():
             frames, inputs = [], []
             for i, time in enumerate(original.times.tolist()):
@@ -85,8 +83,8 @@ def score_sums(
                 inside = mask & original.valid(i)
                 frames.append(evaluate_frame(original.frames[i], decoded, inside, TILE, metrics, name=name))
                 if reference == BAKE:
-                    expected = _at(together, time)
-                    inputs.append(evaluate_frame(original.frames[i], expected, inside, TILE, ("psnr",), name=name))
+                    light = together.at(time)
+                    inputs.append(evaluate_frame(original.frames[i], light, inside, TILE, ("psnr",), name=name))
             summary, labels = summarise(frames, original.times), {"sheet": plain.label, "reference": reference}
             between = summarise(inputs).psnr if inputs else float("nan")
             scores.append(SumScore(**vars(summary), **labels, times=original.times, between_inputs=between))
@@ -103,21 +101,12 @@ def sum_of(lightmaps: LightmapSet, sheet: Sheet) -> SheetFrames:
         lightmaps: The input.
         sheet: The sheet of any of its groups.
     """
-    plain = replace(sheet, group=BASE)
-    groups = {one: own for one, own in lightmaps.sheets.items() if replace(one, group=BASE) == plain}
+    groups = in_groups(lightmaps.sheets, sheet)
     first, times = next(iter(groups.values())), times_of(groups)
     if len(groups) == 1:
         return first
     frames = np.zeros((len(times), *first.frames.shape[1:]), np.float32)
     for own in groups.values():
         for frame, time in zip(frames, times.tolist(), strict=True):
-            frame += _at(own, time)
-    return replace(first, name=f"{lightmaps.name} {plain.label}", times=times, frames=frames, covered=None)
-
-
-def _at(lightmaps: SheetFrames, time: float) -> np.ndarray:
-    """Returns the original light at a time, between two stored times interpolated (eq. 2), [H, W, 3]."""
-    before, after, share = TimeAxis(lightmaps.times, lightmaps.period, "frames").neighbours(time)
-    if share == 0.0:
-        return lightmaps.frames[before]
-    return (1.0 - share) * lightmaps.frames[before] + share * lightmaps.frames[after]
+            frame += own.at(time)
+    return replace(first, name=f"{lightmaps.name} {sheet.plain.label}", times=times, frames=frames, covered=None)

@@ -18,7 +18,7 @@ These are the rules:
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,8 @@ from wlm.lightmap.sheet import Sheet
 
 MOST_WEIGHT = HALF_MAX
 """Largest weight of a group: 65,504."""
+
+T = TypeVar("T")
 
 Weight = float | Sequence[float] | np.ndarray
 """A factor of a group's light, or three of red, green and blue."""
@@ -43,6 +45,16 @@ class Timed(Protocol):
 def groups_of(sheets: Iterable[Sheet]) -> tuple[str, ...]:
     """Returns the names of the groups of sheets, in their order."""
     return tuple(dict.fromkeys(sheet.group for sheet in sheets))
+
+
+def in_groups(sheets: Mapping[Sheet, T], sheet: Sheet) -> dict[Sheet, T]:
+    """Returns the entries of one sheet in all groups that have it.
+
+    Args:
+        sheets: Sheets of a set or a model.
+        sheet: The sheet of any of the groups.
+    """
+    return {one: own for one, own in sheets.items() if one.plain == sheet.plain}
 
 
 def times_of(sheets: Mapping[Sheet, Timed]) -> np.ndarray:

@@ -13,7 +13,7 @@ from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, SheetFrames, at_times
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.model import LightmapModel, SheetModel
-from wlm.lightmap.tiles import TILE, TileKind
+from wlm.lightmap.tiles import TILE
 from wlm.metrics import Summary, evaluate_frame, summarise
 
 
@@ -65,14 +65,11 @@ def score_held_out(
     held = np.setdiff1d(np.arange(len(whole.times)), at_times(whole.times, stored.times))
     if not len(held):
         return None
-    grid, decoder = model.grid, SheetDecoder(model, device)
-    mask = stored.mask & grid.texels_of((model.kind != TileKind.EMPTY).reshape(grid.rows, grid.cols))
+    decoder, mask = SheetDecoder(model, device), stored.mask & model.stored_texels
     frames: tuple[list, list] = ([], [])
     for i in held.tolist():
         time = float(whole.times[i])
-        before, after, share = model.axis.neighbours(time)
-        mixed = (1.0 - share) * stored.frames[before] + share * stored.frames[after]
-        for scores, light in zip(frames, (decoder.frame(time), mixed), strict=True):
+        for scores, light in zip(frames, (decoder.frame(time), stored.at(time)), strict=True):
             options = {"name": f"{model.name} at {time:g}", "peak": model.profile.peak}
             scores.append(evaluate_frame(whole.frames[i], light, mask & whole.valid(i), TILE, metrics, **options))
     times = whole.times[held]

@@ -17,7 +17,7 @@ file the arrays that hold maps, networks and frames are read when they are first
 import math
 from collections.abc import Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
@@ -26,9 +26,9 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import BLOCK_BYTES
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.parts import Part
-from wlm.lightmap.groups import groups_of, times_of
+from wlm.lightmap.groups import groups_of, in_groups, times_of
 from wlm.lightmap.profile import Profile, TimeAxis
-from wlm.lightmap.sheet import BASE, Sheet, first_light, layer_sheets
+from wlm.lightmap.sheet import Sheet, first_light, layer_sheets
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind
 from wlm.system import Model
 from wlm_kernels import mlp
@@ -264,6 +264,11 @@ class SheetModel:
         return TileGrid.of(self.height, self.width)
 
     @property
+    def stored_texels(self) -> np.ndarray:
+        """The texels of tiles that are not empty, bool [H, W]."""
+        return self.grid.texels_of((self.kind != TileKind.EMPTY).reshape(self.grid.rows, self.grid.cols))
+
+    @property
     def mapped(self) -> np.ndarray:
         """Numbers of the tiles with feature maps, in the order of `uv`, `peak` and `affine`, int [N_m]."""
         return self.numbers(*MAPPED_KINDS)
@@ -383,8 +388,7 @@ class LightmapModel(Model):
         Raises:
             WlmError: The model has no such sheet.
         """
-        wanted = replace(sheet or first_light(self.sheets), group=BASE)
-        found = {one.group: own for one, own in self.sheets.items() if replace(one, group=BASE) == wanted}
-        if not found:
-            raise WlmError(f"{self.name}: expected a sheet of the model, got {wanted.label}")
-        return found
+        wanted = sheet or first_light(self.sheets)
+        if not (found := in_groups(self.sheets, wanted)):
+            raise WlmError(f"{self.name}: expected a sheet of the model, got {wanted.plain.label}")
+        return {one.group: own for one, own in found.items()}

@@ -67,6 +67,11 @@ class Sheet:
         return f"{group}{self.atlas}/{self.layer} {joint.join(self.channels)}"
 
     @property
+    def plain(self) -> Sheet:
+        """The same sheet without a named group."""
+        return replace(self, group=BASE)
+
+    @property
     def linear(self) -> bool:
         """Whether the sheet holds levels in [0, 1] (directions, ratios, masks) instead of radiance."""
         return self.encoding != "radiance"
@@ -163,7 +168,7 @@ def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
             raise WlmError(f"{where}: {sheet.label} has {second} texels, but others of its layer have {first}")
         channels.setdefault((sheet.group, sheet.atlas), []).extend((sheet.layer, name) for name in sheet.channels)
         groups = layers.setdefault((sheet.atlas, sheet.layer), {})
-        groups.setdefault(sheet.group, set()).add(replace(sheet, group=BASE))
+        groups.setdefault(sheet.group, set()).add(sheet.plain)
     for (atlas, layer), groups in layers.items():
         first, *others = groups.values()
         if (others and any(sheet.linear for sheet in first)) or any(other != first for other in others):

@@ -20,7 +20,7 @@ _BOUNCE, _INLET, _OUTLET, _SLIP = (wp.constant(kind) for kind in (BOUNCE, INLET,
 
 @wp.struct
 class Flow:
-    """What the backward pass of a step needs to know about a lattice of N cells.
+    """The properties of a lattice of N cells that the backward pass of a step needs.
 
     Attributes:
         n: Cells along x, y and z.

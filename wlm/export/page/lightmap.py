@@ -24,7 +24,7 @@ from wlm.lightmap.evaluation import count_kinds, psnr_of
 from wlm.lightmap.group_scores import sum_of
 from wlm.lightmap.groups import times_of
 from wlm.lightmap.model import SheetModel
-from wlm.lightmap.sheet import BASE, LIGHT, first_light
+from wlm.lightmap.sheet import LIGHT, first_light
 from wlm.system import Meter, OnProgress
 from wlm.system import load as load_model
 from wlm.texels import exposure, fill_gaps
@@ -105,9 +105,9 @@ def lightmap_page(
     if reference is not None:
         manifest["reference"] = reference
     note = "Lightmaps over time, decoded on this GPU."
-    if replace(sheet, group=BASE) != LIGHT or others:
+    if sheet.plain != LIGHT or others:
         rest = f", without the file's {others} other sheet{'' if others == 1 else 's'}" if others else ""
-        note += f" Shown is {replace(sheet, group=BASE).label}{rest}."
+        note += f" Shown is {sheet.plain.label}{rest}."
     return Page("lightmap", whole.name, note, figures, manifest, arrays, [filled("lightmap_table.js").rstrip("\n")])
 
 
