@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.lightmap.decode import Stored, TimeState, bytes_over
+from wlm_kernels.lightmap.decode import Maps, Stored, TimeState, bytes_over
 from wlm_kernels.lightmap.features import TEMPORAL_INPUTS
 from wlm_kernels.lightmap.output import bound_of
 from wlm_kernels.native import native_source, on_cuda
@@ -77,6 +77,19 @@ def pack_networks(hidden: np.ndarray, output: np.ndarray) -> np.ndarray:
         np.pad(output[:, -1].astype(np.float32), ((0, 0), (0, 1))).view(np.uint32),
     ]
     return np.ascontiguousarray(np.concatenate(layers, axis=1))
+
+
+def packed_words(width: int) -> int:
+    """Returns the words of a network from `pack_networks`, for a hidden width."""
+    steps = width // _STEP
+    return 64 * (2 * steps + 2 * steps**2 + 2 * steps) + width // 2 + 4
+
+
+def pack_biases(hidden: np.ndarray) -> np.ndarray:
+    """Returns of the first layers of N networks, as `pack_networks` takes them, the biases and their change by each of
+    the four numbers of the encoded time, float32 [N, 5, H], scaled like the layers' sums."""
+    bias = hidden[:, TEMPORAL_INPUTS] + 0.5 * _UV_SCALE * hidden[:, :4].sum(1)
+    return (np.concatenate([bias[:, None], hidden[:, _MAPS:TEMPORAL_INPUTS]], 1) * _SCALE).astype(np.float32)
 
 
 def _operands(weights: np.ndarray) -> np.ndarray:
@@ -147,11 +160,44 @@ def matrix_kernels(hidden: int, resolution: int, shared: bool = False) -> Matrix
     return MatrixKernels(*(_decode_kernel(hidden, resolution, shared, hours) for hours in (1, 2)))
 
 
+@functools.cache
+def matrix_texels(hidden: int) -> Any:
+    """Builds (once) the `wp.func` that evaluates networks, at one texel per thread.
+
+    It is evaluate(packed, biases, f, encoding, n, time), a vec3. All threads of a warp must call it, in blocks of 128
+    threads. Its arguments are `packed`, uint32 [N, words], from `pack_networks`; `biases`, vecH [N, 5], from
+    `pack_biases`; `f`, vec12, F_uv in steps of 1/255 less 128, then F_uvt, F_ut and F_vt, scaled as the network takes
+    them; `encoding`, vec4, the encoded time; `n`, the number of the network, or -1 for a thread without one; `time`,
+    a number that is equal only where the encoding is.
+    """
+    vec_hidden = wp.types.vector(hidden, float)
+
+    @wp.func_native(on_cuda(_native("matrix_texels", H=hidden), "return wp::vec_t<3, float>();"))
+    def evaluate(
+        packed: wp.array2d[wp.uint32],
+        biases: wp.array2d[vec_hidden],
+        f: Maps,
+        encoding: wp.vec4,
+        n: int,
+        time: int,
+    ) -> wp.vec3: ...
+
+    return evaluate
+
+
+def _native(name: str, **constants: int) -> str:
+    """Returns the code of a native function that evaluates networks of width H."""
+    parts = (
+        native_source(__package__, "matrix_units"),
+        native_source(__package__, "matrix_network", H=constants.pop("H")),
+    )
+    return "".join(parts) + native_source(__package__, name, **constants)
+
+
 def _decode_kernel(width: int, resolution: int, shared: bool, hours: int) -> wp.Kernel:
     vec_hidden, vec_result = wp.types.vector(width, float), wp.types.vector(12, float)
-    constants = {"H": width, "R": resolution, "ROWS": ROWS, "HOURS": hours}
     radiance = shared or hours == 2
-    code = native_source(__package__, "matrix_units") + native_source(__package__, "matrix_decode", **constants)
+    code = _native("matrix_decode", H=width, R=resolution, ROWS=ROWS, HOURS=hours)
 
     @wp.func_native(on_cuda(code, "return wp::vec_t<12, float>();"))
     def forward(

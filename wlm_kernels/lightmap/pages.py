@@ -18,9 +18,12 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels import mlp
-from wlm_kernels.lightmap.decode import Stored, texel_network
-from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.blocks import stored_texel
+from wlm_kernels.lightmap.decode import Maps, Stored, map_texel, texel_network
+from wlm_kernels.lightmap.features import CENTRE, STATIC_INPUTS, TEMPORAL_INPUTS
 from wlm_kernels.lightmap.frames import StoredFrames, frame_colour, power
+from wlm_kernels.lightmap.matrix_decode import matrix_texels
+from wlm_kernels.native import on_cuda
 from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 
 COARSE_LEVEL, COARSE = 4, 8
@@ -38,6 +41,7 @@ one. Then for each of the two times at which networks are evaluated: its positio
 is not evaluated), the two stored times between which tile scales are interpolated, the weight of the later one, and the
 encoded time (four columns). The last is the number of columns."""
 
+_BLOCK = 128  # threads
 _LEVEL, _SIDE = wp.constant(COARSE_LEVEL), wp.constant(COARSE)
 _FULL, _EMPTY = wp.constant(FULL), wp.constant(EMPTY)
 _BEFORE, _AFTER, _SHARE, _TAU, _WEIGHT, _FIRST, _SECOND, _MIX, _ENCODING = (
@@ -160,6 +164,37 @@ def _coarse_light(tiles: Tiles, clock: wp.array2d[float], target: int, tile: int
 
 
 @wp.func
+def _stored_light(
+    tiles: Tiles,
+    frames: StoredFrames,
+    clock: wp.array2d[float],
+    target: int,
+    gamma: float,
+    kind: int,
+    slot: int,
+    y: int,
+    x: int,
+) -> wp.vec3:
+    """Returns the light of a constant tile, or of one stored as frames, in the slot of its kind."""
+    share = clock[target, _SHARE]
+    before = int(clock[target, _BEFORE])
+    after = int(clock[target, _AFTER])
+    if kind == _CONSTANT:
+        return (1.0 - share) * tiles.colours[slot, before] + share * tiles.colours[slot, after]
+    first = slot * frames.times
+    light = (1.0 - share) * power(frame_colour(frames, first + before, y, x), gamma)
+    if share > 0.0:
+        light += share * power(frame_colour(frames, first + after, y, x), gamma)
+    return light
+
+
+@wp.func
+def _encoding_of(clock: wp.array2d[float], target: int, r: int) -> wp.vec4:
+    at = _ENCODING + 4 * r
+    return wp.vec4(clock[target, at], clock[target, at + 1], clock[target, at + 2], clock[target, at + 3])
+
+
+@wp.func
 def _light_of(
     mapped: Mapped, clock: wp.array2d[float], target: int, r: int, n: int, gamma: float, y: wp.vec3
 ) -> wp.vec3:
@@ -171,78 +206,117 @@ def _light_of(
     return power(wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0)), gamma)
 
 
+@wp.func_native(on_cuda("return __reduce_max_sync(~0u, x);\n", "return x;"))
+def _most_of_warp(x: int) -> int:
+    """Returns the largest number of a warp, whose threads must all call it."""
+    ...
+
+
+def _plain_lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
+    """Builds the `wp.func`s that read moving and still tiles at a texel, each thread by itself, and the types of their
+    networks' arrays."""
+    vec_hidden = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu).vec_hidden
+    assert vec_hidden is mlp.kernels(STATIC_INPUTS, hidden, gelu).vec_hidden
+
+    def build(temporal: bool) -> Any:
+        network = texel_network(temporal, hidden, gelu)
+
+        @wp.func
+        def light(
+            mapped: Mapped,
+            first: wp.array2d[vec_hidden],
+            later: wp.array2d[wp.vec3],
+            clock: wp.array2d[float],
+            target: int,
+            gamma: float,
+            n: int,
+            y: int,
+            x: int,
+        ) -> wp.vec3:
+            light = wp.vec3()
+            if n >= 0:
+                two = int(2)  # a variable keeps the loop rolled
+                for r in range(two):
+                    weight = clock[target, _WEIGHT + r]
+                    if weight > 0.0:
+                        tau = clock[target, _TAU + r]
+                        out = network(mapped.stored, first, later, tau, _encoding_of(clock, target, r), n, y, x)
+                        light += weight * _light_of(mapped, clock, target, r, n, gamma, out)
+            return light
+
+        return light
+
+    return build(True), build(False), (vec_hidden, wp.vec3)
+
+
+def _matrix_lights(hidden: int) -> tuple[Any, Any, tuple[Any, ...]]:
+    """Builds the same as `_plain_lights` for a GPU's matrix units: all threads of a warp must call the functions."""
+    evaluate, vec_hidden = matrix_texels(hidden), wp.types.vector(hidden, float)
+
+    def build(temporal: bool) -> Any:
+        @wp.func
+        def light(
+            mapped: Mapped,
+            first: wp.array2d[vec_hidden],
+            later: wp.array2d[wp.uint32],
+            clock: wp.array2d[float],
+            target: int,
+            gamma: float,
+            n: int,
+            y: int,
+            x: int,
+        ) -> wp.vec3:
+            light = wp.vec3()
+            two = int(2)
+            for r in range(two):
+                weight = clock[target, _WEIGHT + r]
+                number = wp.where(weight > 0.0, n, -1)
+                f = Maps()
+                if number >= 0:
+                    if wp.static(temporal):
+                        f = map_texel(mapped.stored, n, clock[target, _TAU + r], y, x)
+                        for c in range(4, 12):
+                            f[c] = (f[c] - 0.5) * CENTRE
+                    else:
+                        uv = stored_texel(mapped.stored.uv, n, y, x)
+                        for c in range(4):
+                            f[c] = uv[c]
+                    for c in range(4):
+                        f[c] = f[c] * 255.0 - 128.0
+                out = evaluate(later, first, f, _encoding_of(clock, target, r), number, 2 * target + r)
+                if number >= 0:
+                    light += weight * _light_of(mapped, clock, target, r, n, gamma, out)
+            return light
+
+        return light
+
+    return build(True), build(False), (vec_hidden, wp.uint32)
+
+
 @functools.cache
-def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
+def page_kernel(hidden: int, gelu: str, matrix: bool = False) -> wp.Kernel:
     """Builds (once) the kernel that decodes squares of texels, for networks of one hidden width.
 
     Args:
-        hidden: H, width of the hidden layers.
-        gelu: One of `mlp.GELUS`.
+        hidden: H, width of the hidden layers; a multiple of 16 for matrix units.
+        gelu: One of `mlp.GELUS`; matrix units have their own.
+        matrix: Whether to evaluate networks on a GPU's matrix units, with half floats. The networks' two arrays are
+            then those of `pack_biases` and `pack_networks` instead of their hidden and output layers.
     """
-    vec_hidden = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu).vec_hidden
-    assert vec_hidden is mlp.kernels(STATIC_INPUTS, hidden, gelu).vec_hidden
-    temporal_network, static_network = (texel_network(temporal, hidden, gelu) for temporal in (True, False))
-
-    @wp.func
-    def texel_light(
-        tiles: Tiles,
-        moving: Mapped,
-        moving_hidden: wp.array2d[vec_hidden],
-        moving_output: wp.array2d[wp.vec3],
-        still: Mapped,
-        still_hidden: wp.array2d[vec_hidden],
-        still_output: wp.array2d[wp.vec3],
-        frames: StoredFrames,
-        clock: wp.array2d[float],
-        target: int,
-        gamma: float,
-        tile: int,
-        y: int,
-        x: int,
-    ) -> wp.vec3:
-        kind = tiles.kind[tile]
-        slot = tiles.slot[tile]
-        light = wp.vec3()
-        if slot < 0:
-            light = _coarse_light(tiles, clock, target, tile, (y // 16) * _SIDE + x // 16)
-        elif kind == _CONSTANT:
-            share = clock[target, _SHARE]
-            early = tiles.colours[slot, int(clock[target, _BEFORE])]
-            light = (1.0 - share) * early + share * tiles.colours[slot, int(clock[target, _AFTER])]
-        elif kind == _FRAMES:
-            share = clock[target, _SHARE]
-            first = slot * frames.times
-            light = (1.0 - share) * power(frame_colour(frames, first + int(clock[target, _BEFORE]), y, x), gamma)
-            if share > 0.0:
-                light += share * power(frame_colour(frames, first + int(clock[target, _AFTER]), y, x), gamma)
-        else:
-            two = int(2)  # a variable keeps the loop rolled
-            for r in range(two):
-                weight = clock[target, _WEIGHT + r]
-                if weight > 0.0:
-                    tau = clock[target, _TAU + r]
-                    at = _ENCODING + 4 * r
-                    encoding = wp.vec4(
-                        clock[target, at], clock[target, at + 1], clock[target, at + 2], clock[target, at + 3]
-                    )
-                    if kind == _STATIC:
-                        out = static_network(still.stored, still_hidden, still_output, tau, encoding, slot, y, x)
-                        light += weight * _light_of(still, clock, target, r, slot, gamma, out)
-                    else:
-                        out = temporal_network(moving.stored, moving_hidden, moving_output, tau, encoding, slot, y, x)
-                        light += weight * _light_of(moving, clock, target, r, slot, gamma, out)
-        return light
+    moving_light, still_light, (first_type, later_type) = (
+        _matrix_lights(hidden) if matrix else _plain_lights(hidden, gelu)
+    )
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def decode_pages(
         # in:
         tiles: Tiles,
         moving: Mapped,
-        moving_hidden: wp.array2d[vec_hidden],
-        moving_output: wp.array2d[wp.vec3],
+        moving_first: wp.array2d[first_type],
+        moving_later: wp.array2d[later_type],
         still: Mapped,
-        still_hidden: wp.array2d[vec_hidden],
-        still_output: wp.array2d[wp.vec3],
+        still_first: wp.array2d[first_type],
+        still_later: wp.array2d[later_type],
         frames: StoredFrames,
         clock: wp.array2d[float],
         offsets: wp.array1d[wp.vec2i],
@@ -252,24 +326,37 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
         # out:
         out: wp.array3d[wp.uint32],
     ):
-        k, i, j = wp.tid()
-        slot = jobs.slot[k]
-        sheet = jobs.place[k][0] - tiles.sheet
-        if slot >= 0 and sheet >= 0 and sheet < tiles.size.shape[0]:
+        i = wp.tid()
+        edge = out.shape[1]
+        k = i // (edge * edge)
+        slot = int(-1)
+        sheet = int(0)
+        if k < jobs.slot.shape[0]:
+            sheet = jobs.place[k][0] - tiles.sheet
+            if sheet >= 0 and sheet < tiles.size.shape[0]:
+                slot = jobs.slot[k]
+        side = int(1)
+        found = int(0)
+        level = int(0)
+        depth = int(0)
+        yy = int(0)
+        xx = int(0)
+        target = int(0)
+        if slot >= 0:
+            target = jobs.target[k]
             place = jobs.place[k]
             level = place[1]
             size = tiles.size[sheet]
             rows = ((size[0] - 1) >> level) + 1
             columns = ((size[1] - 1) >> level) + 1
-            y = wp.clamp(place[2] + i, 0, rows - 1)
-            x = wp.clamp(place[3] + j, 0, columns - 1)
+            y = wp.clamp(place[2] + i // edge % edge, 0, rows - 1)
+            x = wp.clamp(place[3] + i % edge, 0, columns - 1)
             depth = level
             if level >= _LEVEL and direct == 0:
                 depth = level - _LEVEL
             side = wp.min(1 << depth, grid)
             # The search comes first, so that the threads of a warp evaluate their networks together.
             o = int(0)
-            found = int(0)
             while o < offsets.shape[0] and found == 0:
                 yy = y + offsets[o][0]
                 xx = x + offsets[o][1]
@@ -280,36 +367,40 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
                             found = 1
                         sample += 1
                 o += 1
-            light = wp.vec3()
-            count = int(0)
-            if found == 1:
-                yy = y + offsets[o - 1][0]
-                xx = x + offsets[o - 1][1]
-                for sample in range(side * side):
-                    at = _sample(tiles, sheet, level, depth, side, sample, yy, xx)
-                    if at[0] >= 0:
-                        count += 1
-                        if depth < level:
-                            cell = (at[1] // 16) * _SIDE + at[2] // 16
-                            light += _coarse_light(tiles, clock, jobs.target[k], at[0], cell)
-                        else:
-                            light += texel_light(
-                                tiles,
-                                moving,
-                                moving_hidden,
-                                moving_output,
-                                still,
-                                still_hidden,
-                                still_output,
-                                frames,
-                                clock,
-                                jobs.target[k],
-                                tiles.gamma[sheet],
-                                at[0],
-                                at[1],
-                                at[2],
-                            )
-            out[slot, i, j] = pack_rgb9e5(light / float(wp.max(count, 1)))
+        light = wp.vec3()
+        count = int(0)
+        own = int(0)
+        if found == 1:
+            own = side * side
+        # Matrix units serve whole warps: a thread without a sample takes part in the others' networks.
+        most = int(own)
+        if wp.static(matrix):
+            most = _most_of_warp(own)
+        for sample in range(most):
+            n_moving = int(-1)
+            n_still = int(-1)
+            at = wp.vec3i(-1, 0, 0)
+            if sample < own:
+                at = _sample(tiles, sheet, level, depth, side, sample, yy, xx)
+            if at[0] >= 0:
+                count += 1
+                kind = tiles.kind[at[0]]
+                row = tiles.slot[at[0]]
+                if depth < level or row < 0:
+                    light += _coarse_light(tiles, clock, target, at[0], (at[1] // 16) * _SIDE + at[2] // 16)
+                elif kind == _STATIC:
+                    n_still = row
+                elif kind == _CONSTANT or kind == _FRAMES:
+                    light += _stored_light(tiles, frames, clock, target, tiles.gamma[sheet], kind, row, at[1], at[2])
+                else:
+                    n_moving = row
+            gamma = float(1.0)
+            if own > 0:
+                gamma = tiles.gamma[sheet]
+            light += moving_light(moving, moving_first, moving_later, clock, target, gamma, n_moving, at[1], at[2])
+            light += still_light(still, still_first, still_later, clock, target, gamma, n_still, at[1], at[2])
+        if slot >= 0:
+            out[slot, i // edge % edge, i % edge] = pack_rgb9e5(light / float(wp.max(count, 1)))
 
     return decode_pages
 
@@ -334,8 +425,8 @@ def decode(
 
     Args:
         kernel: From `page_kernel`.
-        source: `Tiles`; `Mapped`, hidden and output layers of the dynamic tiles, and the same of the static ones; the
-            tiles stored as frames.
+        source: `Tiles`; `Mapped` and the two arrays of the networks of the dynamic tiles, see `page_kernel`, and the
+            same of the static ones; the tiles stored as frames.
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
         jobs: J squares; those of other groups are left as they are.
@@ -344,5 +435,7 @@ def decode(
         out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.
     """
     inputs = [*source, clock, offsets, jobs, grid, int(direct)]
-    dim = (jobs.slot.shape[0], *out.shape[1:])
-    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=128)
+    texels = jobs.slot.shape[0] * out.shape[1] * out.shape[2]
+    # Whole blocks: the matrix units serve whole warps.
+    dim = -(-texels // _BLOCK) * _BLOCK
+    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=_BLOCK)

@@ -26,6 +26,8 @@ from wlm.texels import OFFSETS, nearest_valid
 from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap import frames as frame_kernels
 from wlm_kernels.lightmap import pages as kernels
+from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.matrix_decode import pack_biases, pack_networks, packed_words
 from wlm_kernels.lightmap.virtual import KEEP
 
 _CHUNK = 64  # tiles that are read at once
@@ -137,7 +139,10 @@ class TileStore:
         self._model, self.layout, self._device = model, layout, device
         self.warnings: list[str] = []
         self._loader: TileLoader | None = None
-        self.kernel = kernels.page_kernel(layout.models[0].profile.hidden, gelu)
+        hidden = layout.models[0].profile.hidden
+        # The matrix units have the GELU that is chosen for CUDA.
+        self._matrix = device != "cpu" and gelu == "fast" and hidden % 16 == 0
+        self.kernel = kernels.page_kernel(hidden, gelu, self._matrix)
         self._kind = np.concatenate([own.kind for own in layout.models]).astype(np.int32)
         self.slot = np.full(len(self._kind), kernels.WAITING, np.int32)
         self.slot[self._kind == TileKind.EMPTY] = 0
@@ -163,7 +168,7 @@ class TileStore:
 
     def _allocate(self, room: int | None) -> dict[int, _Pool]:
         layout, own = self.layout, self.layout.models[0]
-        shapes, times = _shapes(own), len(own.times)
+        shapes, times = _shapes(own, self._matrix), len(own.times)
         counts = {kind: int((self._kind == kind).sum()) for kind in PACKED_KINDS}
         size = {
             kind: sum(math.prod(shape) * wp.types.type_size_in_bytes(dtype) for dtype, shape in of.values())
@@ -181,7 +186,7 @@ class TileStore:
                 slots = least
         pools = {kind: _Pool(shapes[kind], slots[kind], self._device) for kind in PACKED_KINDS}
         moving, still = (
-            (self._mapped(own, pools[kind].arrays), *(pools[kind].arrays[name] for name in ("hidden", "output")))
+            (self._mapped(own, pools[kind].arrays), *(pools[kind].arrays[name] for name in ("first", "later")))
             for kind in (TileKind.DYNAMIC, TileKind.STATIC)
         )
         frames = frame_kernels.StoredFrames()
@@ -289,7 +294,7 @@ class TileStore:
         self.slot[gone[gone >= 0]] = kernels.WAITING
         pool.owner[first : first + len(tiles)] = tiles
         self.slot[tiles] = np.arange(first, first + len(tiles))
-        pool.put(self.slot[tiles], _rows(part, kind))
+        pool.put(self.slot[tiles], _rows(part, kind, self._matrix))
         return numbers
 
     def _is_good(self, s: int, own: SheetModel, number: int) -> bool:
@@ -395,7 +400,7 @@ class TileStore:
                 changed = True
                 taken.setdefault(int(self._kind[tile]), []).append((tile, loaded.tile))
         for kind, pairs in taken.items():
-            each = [_rows(own, kind) for _, own in pairs]
+            each = [_rows(own, kind, self._matrix) for _, own in pairs]
             rows = {name: np.concatenate([one[name] for one in each]) for name in each[0]}
             self._pools[kind].put(self.slot[[tile for tile, _ in pairs]], rows)
         if changed:
@@ -430,17 +435,19 @@ class TileStore:
             self._loader.close()
 
 
-def _shapes(own: SheetModel) -> dict[int, dict[str, tuple[Any, tuple[int, ...]]]]:
-    """Returns the type and shape of each array of a tile on the device, by kind; the first axis counts its rows."""
+def _shapes(own: SheetModel, matrix: bool) -> dict[int, dict[str, tuple[Any, tuple[int, ...]]]]:
+    """Returns the type and shape of each array of a tile on the device, by kind; the first axis counts its rows.
+    `first` and `later` are those of the networks, see `wlm_kernels.lightmap.pages.page_kernel`."""
     profile, times = own.profile, len(own.times)
     h, r = profile.hidden, profile.uvt_resolution // 4
     plane = (wp.vec2ub, (1, profile.plane_rows, profile.plane_columns))
 
     def mapped(temporal: bool) -> dict[str, tuple[Any, tuple[int, ...]]]:
+        rows = 5 if matrix else profile.inputs(temporal) + h + 2
         return {
             "uv": (wp.uint64, (1, BLOCKS, BLOCKS, 2)),
-            "hidden": (wp.types.vector(h, float), (1, profile.inputs(temporal) + h + 2)),
-            "output": (wp.vec3, (1, h + 1)),
+            "first": (wp.types.vector(h, float), (1, rows)),
+            "later": (wp.uint32, (1, packed_words(h))) if matrix else (wp.vec3, (1, h + 1)),
             "scale": (wp.vec3, (1, times)),
             "shift": (wp.vec3, (1,)),
             "spread": (wp.vec3, (1,)),
@@ -455,7 +462,7 @@ def _shapes(own: SheetModel) -> dict[int, dict[str, tuple[Any, tuple[int, ...]]]
     return {TileKind.DYNAMIC: mapped(True) | temporal, TileKind.STATIC: mapped(False), TileKind.FRAMES: frames}
 
 
-def _rows(part: SheetModel, kind: int) -> dict[str, np.ndarray]:
+def _rows(part: SheetModel, kind: int, matrix: bool) -> dict[str, np.ndarray]:
     """Returns the arrays of n tiles of one kind, [n, ...] each, with the bytes that `_shapes` describes."""
     if kind == TileKind.FRAMES:
         ends = part.ranges.astype(np.float32)
@@ -463,12 +470,18 @@ def _rows(part: SheetModel, kind: int) -> dict[str, np.ndarray]:
     dynamic, profile = kind == TileKind.DYNAMIC, part.profile
     net = (part.net if dynamic else part.net_static).astype(np.float32)
     split = (profile.inputs(dynamic) + profile.hidden + 2) * profile.hidden
+    first, later = net[:, :split], net[:, split:]
+    if matrix:
+        hidden = first.reshape(len(net), -1, profile.hidden)
+        if not dynamic:  # the inputs that static tiles lack have no weights
+            hidden = np.insert(hidden, [STATIC_INPUTS] * (TEMPORAL_INPUTS - STATIC_INPUTS), 0.0, axis=1)
+        first, later = pack_biases(hidden), pack_networks(hidden, later.reshape(len(net), -1, 3))
     affine = part.affine.astype(np.float32)
     maps = {"uvt": part.uvt, "ut": part.ut, "vt": part.vt} if dynamic else {}
     return maps | {
         "uv": part.uv,
-        "hidden": net[:, :split],
-        "output": net[:, split:],
+        "first": first,
+        "later": later,
         "scale": part.scales,
         "shift": affine[:, 0],
         "spread": affine[:, 1],

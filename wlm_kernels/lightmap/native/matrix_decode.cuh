@@ -1,21 +1,15 @@
 // Evaluates the network of a tile for four rows of texels: a thread brings the features of a column's four texels, and a
-// warp multiplies those of its 32 columns with the weights on the matrix units.
+// warp evaluates the network of its 32 columns together.
 //
-// Native, since Warp's tiles go through shared memory between layers: here the sums of one layer are the operand of the
-// next one as they lie in the registers (`matrix_units.cuh`). Numbers are half floats, two to a register.
-//
-// The body of the function `forward` of wlm_kernels/lightmap/matrix_decode.py, behind `matrix_units.cuh`. The function
+// The body of the function `forward` of wlm_kernels/lightmap/matrix_decode.py, behind `matrix_network.cuh`. The function
 // defines its arguments, and:
-//   H          hidden width, a multiple of 16
 //   R          size of F_uvt along u and v
 //   ROWS       rows of texels in a strip, a multiple of 4; a block of 128 threads decodes one strip of a tile
 //   HOURS      number of hours that a texel is evaluated at, 1 or 2
 // The weights in `packed` are those of `pack_networks`. A call evaluates rows 4 `part` to 4 `part` + 3 of the strip
 // `strip` at one hour; the first call of a block for an hour, with `part` 0, loads what the strip needs.
 
-constexpr int NT = H / 8, KT = H / 16;  // columns of 8 units, and steps of 16, in a layer
 constexpr int VOLUME = (ROWS * R + 127) / 128 + 2;  // rows of F_uvt that a strip reads
-constexpr int W1 = NT * 64, W2 = KT * NT * 64, W3 = 2 * KT * 64, B2 = H / 2, WORDS = W1 + W2 + W3 + B2 + 4;
 constexpr float SCALE = 3.4641016151377544f / 255.0f;
 __shared__ __align__(16) unsigned w1[HOURS][W1], later[WORDS - W1];
 __shared__ uint2 volume[HOURS][VOLUME][R], down[HOURS][ROWS];  // F_uvt; of each row its place in a cell of F_uvt, and F_vt
@@ -53,13 +47,7 @@ struct Place {
         b = wraps ? b % size : min(b, size - 1);
     }
 };
-// GELU of two numbers by its tanh form, x (1 + tanh(0.79788 x + 0.035677 x^3)) / 2. Numbers are scaled so that the factor
-// of x^3 is 1, and the result is doubled; `pack_networks` scales the weights.
-auto gelu = [](unsigned x) {
-    const unsigned slope = Units::fma(x, x, 0x40d940d9u);
-    return Units::fma(x, Units::tanh(Units::scale(x, slope)), x);
-};
-const int t = threadIdx.x, lane = t & 31, first = t & ~31, g = lane >> 2, q = lane & 3;
+const int t = threadIdx.x, first = t & ~31;
 if (part == 0) {
     const bool wraps = stored.periodic != 0;
     const int top = ((2 * strip * ROWS + 1) * R - 128) >> 8;  // of the first row of texels, in cells of F_uvt
@@ -150,9 +138,6 @@ for (int m = 0; m < 2; ++m)
     for (int j = 0; j < 2; ++j)
         fixed[m][j] = q == 0 ? across[hour][first + 16 * m + 8 * j + g] : q == 2 ? 0x3c003c00u : 0u;
 
-const unsigned *w2 = later, *w3 = later + W2, *b2 = w3 + W3;
-const float* b3 = reinterpret_cast<const float*>(b2 + B2);
-auto pair = [&](const unsigned* of, int i) { return *reinterpret_cast<const uint2*>(of + (i * 32 + lane) * 2); };
 wp::vec_t<12, float> result;
 #pragma unroll
 for (int r = 0; r < 4; ++r) {
@@ -172,7 +157,7 @@ for (int r = 0; r < 4; ++r) {
         Units::fma(step.y, row.x, high.y)
     );
     __syncwarp();
-    unsigned piece[4], a[2][KT][4], b[2][KT][4];
+    unsigned piece[4], b[2][KT][4];
     Units::load(piece, &staged[r & 1][t]);
     #pragma unroll
     for (int m = 0; m < 2; ++m) {
@@ -181,49 +166,9 @@ for (int r = 0; r < 4; ++r) {
         b[m][0][2] = q == 1 ? row.y : fixed[m][0];
         b[m][0][3] = q == 1 ? row.y : fixed[m][1];
     }
-    // Two groups of 16 texels, so that a weight that is read serves both.
-    #pragma unroll
-    for (int i = 0; i < NT; ++i) {
-        const uint2 of = pair(w1[hour], i);
-        #pragma unroll
-        for (int m = 0; m < 2; ++m) {
-            unsigned sums[2] = {0u, 0u};
-            Units::multiply_half(sums, b[m][0], of.x, of.y);
-            a[m][i / 2][2 * (i & 1)] = gelu(sums[0]);
-            a[m][i / 2][2 * (i & 1) + 1] = gelu(sums[1]);
-        }
-    }
-    #pragma unroll
-    for (int i = 0; i < NT; ++i) {
-        const unsigned bias = b2[4 * i + q];
-        unsigned sums[2][2] = {{bias, bias}, {bias, bias}};
-        #pragma unroll
-        for (int k = 0; k < KT; ++k) {
-            const uint2 of = pair(w2, k * NT + i);
-            #pragma unroll
-            for (int m = 0; m < 2; ++m) Units::multiply_half(sums[m], a[m][k], of.x, of.y);
-        }
-        #pragma unroll
-        for (int m = 0; m < 2; ++m) {
-            b[m][i / 2][2 * (i & 1)] = gelu(sums[m][0]);
-            b[m][i / 2][2 * (i & 1) + 1] = gelu(sums[m][1]);
-        }
-    }
-    // The first group's channels are columns 0 to 2 of the output, the second's 4 to 6.
-    const float red = b3[2 * (q & 1)], green = b3[2 * (q & 1) + 1];
-    float s[4] = {red, green, red, green};
-    #pragma unroll
-    for (int m = 0; m < 2; ++m)
-        #pragma unroll
-        for (int k = 0; k < KT; ++k) {
-            const uint2 of = pair(w3, m * KT + k);
-            Units::multiply(s, b[m][k], of.x, of.y);
-        }
-    // A lane with even q has two channels of its group's rows g and g + 8, its neighbour the third: they swap.
-    const bool odd = q & 1;
-    const float one = __shfl_xor_sync(~0u, odd ? s[0] : s[2], 1), other = __shfl_xor_sync(~0u, s[3], 1);
-    result.c[3 * r] = odd ? one : s[0];
-    result.c[3 * r + 1] = odd ? other : s[1];
-    result.c[3 * r + 2] = odd ? s[2] : one;
+    const float3 output = network(b, [&](int i) { return pair(w1[hour], i); }, later);
+    result.c[3 * r] = output.x;
+    result.c[3 * r + 1] = output.y;
+    result.c[3 * r + 2] = output.z;
 }
 return result;
