@@ -19,6 +19,7 @@ from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.encodings.frames import bc7_tables
 from wlm.lightmap.loading import TileLoader
 from wlm.lightmap.model import BLOCKS, PACKED_KINDS, LightmapModel, SheetModel
+from wlm.lightmap.sheet import Sheet
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.virtual.clock import Clock
 from wlm.lightmap.virtual.layout import Layout
@@ -79,11 +80,15 @@ class _Pool:
         """Frees the memory through which tiles are uploaded, which has the size of the largest upload."""
         self._staging = self._records = None
 
-    def put(self, slots: np.ndarray, rows: dict[str, np.ndarray]) -> None:
-        """Copies n tiles, arrays [n, ...] by name, into slots, int [n]."""
-        parts = [np.ascontiguousarray(rows[name]).view(np.uint8).reshape(len(slots), -1) for name in self._names]
+    def records(self, rows: dict[str, np.ndarray]) -> np.ndarray:
+        """Returns n tiles, arrays [n, ...] by name, as `put` takes them: uint8 [n, bytes]."""
+        parts = [np.ascontiguousarray(rows[name]).view(np.uint8).reshape(len(rows[name]), -1) for name in self._names]
+        return np.concatenate(parts, 1)
+
+    def put(self, slots: np.ndarray, records: np.ndarray) -> None:
+        """Copies n tiles, see `records`, into slots, int [n]."""
         at = wp.array(slots.astype(np.int32), dtype=int, device=self._device)
-        kernels.put(self._upload(np.concatenate(parts, 1)), at, self._parts, self._memory)
+        kernels.put(self._upload(records), at, self._parts, self._memory)
 
     def _upload(self, records: np.ndarray) -> wp.array:
         """Copies records to the device. Host memory that CUDA may read by itself makes no frame wait for the copy."""
@@ -161,7 +166,7 @@ class TileStore:
         waits = self.slot[layout.read] == kernels.WAITING
         self._missing = np.bincount(layout.reader[waits], minlength=len(layout.parent))
         if not self.complete:
-            self._loader = TileLoader(model, _REQUESTS)
+            self._loader = TileLoader(model, _REQUESTS, self._record)
 
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._device)
@@ -294,7 +299,7 @@ class TileStore:
         self.slot[gone[gone >= 0]] = kernels.WAITING
         pool.owner[first : first + len(tiles)] = tiles
         self.slot[tiles] = np.arange(first, first + len(tiles))
-        pool.put(self.slot[tiles], _rows(part, kind, self._matrix))
+        pool.put(self.slot[tiles], pool.records(_rows(part, kind, self._matrix)))
         return numbers
 
     def _is_good(self, s: int, own: SheetModel, number: int) -> bool:
@@ -374,38 +379,47 @@ class TileStore:
             return False
         layout, most = self.layout, {}
         # Of a view's few pages; all pages read tens of thousands of tiles.
-        for page in np.flatnonzero(seen > frame - KEEP).tolist():
-            read = layout.read[self._reads[page] : self._reads[page + 1]]
-            self._used[read] = frame
+        pages = np.flatnonzero(seen > frame - KEEP).tolist()
+        reads = {page: layout.read[self._reads[page] : self._reads[page + 1]] for page in pages}
+        if pages:
+            self._used[np.concatenate(list(reads.values()))] = frame
+        for page in pages:
             if priority[page] > 0:
-                waiting = read[self.slot[read] == kernels.WAITING].tolist()
+                waiting = reads[page][self.slot[reads[page]] == kernels.WAITING].tolist()
                 most |= {tile: max(int(priority[page]), most.get(tile, 0)) for tile in waiting}
         order = sorted(most, key=most.__getitem__, reverse=True)[:_REQUESTS]
-        self._loader.cancel()
-        for tile in order:
-            s = int(np.searchsorted(layout.tile_first, tile, side="right")) - 1
-            number = tile - int(layout.tile_first[s])
-            self._loader.request(layout.sheets[s], number, float(most[tile]))
-        taken: dict[int, list[tuple[int, SheetModel]]] = {}
+        sheets = np.searchsorted(layout.tile_first, order, side="right") - 1
+        self._loader.replace(
+            (layout.sheets[s], tile - int(layout.tile_first[s]), float(most[tile]))
+            for s, tile in zip(sheets.tolist(), order, strict=True)
+        )
+        taken: dict[int, list[tuple[int, np.ndarray]]] = {}
         changed = False
         for loaded in self._loader.take(_UPLOADS):
-            tile = int(layout.tile_first[layout.sheets.index(loaded.sheet)]) + loaded.number
+            tile = self._tile(loaded.sheet, loaded.number)
             if self.slot[tile] != kernels.WAITING:
                 continue
-            if loaded.tile is None:
-                self._break(tile, loaded.error or WlmError("a tile could not be read"))
+            if loaded.error is not None:
+                self._break(tile, loaded.error)
                 self._count(tile, -1)
                 changed = True
             elif self._room_for(tile, frame):
                 changed = True
-                taken.setdefault(int(self._kind[tile]), []).append((tile, loaded.tile))
+                taken.setdefault(int(self._kind[tile]), []).append((tile, loaded.prepared))
         for kind, pairs in taken.items():
-            each = [_rows(own, kind, self._matrix) for _, own in pairs]
-            rows = {name: np.concatenate([one[name] for one in each]) for name in each[0]}
-            self._pools[kind].put(self.slot[[tile for tile, _ in pairs]], rows)
+            records = np.concatenate([record for _, record in pairs])
+            self._pools[kind].put(self.slot[[tile for tile, _ in pairs]], records)
         if changed:
             self.tiles.slot.assign(self.slot)
         return changed
+
+    def _tile(self, sheet: Sheet, number: int) -> int:
+        return int(self.layout.tile_first[self.layout.sheets.index(sheet)]) + number
+
+    def _record(self, sheet: Sheet, number: int, content: SheetModel) -> np.ndarray:
+        """Converts a tile to the bytes that are uploaded."""
+        kind = int(self._kind[self._tile(sheet, number)])
+        return self._pools[kind].records(_rows(content, kind, self._matrix))
 
     def _room_for(self, tile: int, frame: int) -> bool:
         """Gives a tile the slot of the tile that was not needed for the longest time; False if all are needed."""
