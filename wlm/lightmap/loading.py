@@ -1,6 +1,7 @@
 """Loads tiles of a lightmap file in a thread of its own, for a renderer whose frames must not wait for a disk."""
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -183,6 +184,7 @@ class TileLoader:
                 if not self._closed:
                     self._results.append(result)
                 self._change.notify_all()
+            time.sleep(0.0)  # a frame that waits for Python's lock goes on now, not after Python's 5 ms
 
     def _next(self) -> tuple[Sheet, int] | None:
         """Waits for the most important request and takes it; None if the loader was closed."""

@@ -20,9 +20,8 @@ from wlm_kernels.lightmap.output import bound_of
 from wlm_kernels.native import native_source, on_cuda
 from wlm_kernels.shared_exponent import pack_rgb9e5
 
-ROWS = 16
-"""Rows of texels in a strip."""
-
+_ROWS = 16  # of texels in a strip, or half as many
+_SHARED = 48 << 10  # bytes of shared memory of a block
 _BOUNDS = (128, 4)  # threads of a block, blocks of a multiprocessor: 128 registers per thread
 _STEP = 16  # size of a matrix product: the hidden width is a multiple of it
 _MAPS = 12  # inputs that come from the maps; the encoded time follows
@@ -104,10 +103,11 @@ def _operands(weights: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MatrixKernels:
-    """Kernels that decode at one hour and between two."""
+    """Kernels that decode at one hour and between two, and the rows of a strip of each."""
 
     _one: Any
     _two: Any
+    _rows: tuple[int, ...]
 
     def decode(
         self,
@@ -135,7 +135,7 @@ class MatrixKernels:
         """
         wp.launch(
             self._one if len(times) == 1 else self._two,
-            (out.shape[0], 128 // ROWS, 128),
+            (out.shape[0], 128 // self._rows[len(times) - 1], 128),
             inputs=[stored, packed, hidden, times[0], times[-1], share, places, tiles],
             outputs=[out],
             device=out.device,
@@ -157,7 +157,8 @@ def matrix_kernels(hidden: int, resolution: int, shared: bool = False) -> Matrix
     """
     if hidden % _STEP or hidden < _STEP:
         raise ValueError(f"hidden: expected a width that is a multiple of {_STEP} units, got {hidden}")
-    return MatrixKernels(*(_decode_kernel(hidden, resolution, shared, hours) for hours in (1, 2)))
+    rows = tuple(_rows(hidden, resolution, hours) for hours in (1, 2))
+    return MatrixKernels(*(_decode_kernel(hidden, resolution, shared, 1 + i, rows[i]) for i in range(2)), rows)
 
 
 @functools.cache
@@ -194,10 +195,17 @@ def _native(name: str, **constants: int) -> str:
     return "".join(parts) + native_source(__package__, name, **constants)
 
 
-def _decode_kernel(width: int, resolution: int, shared: bool, hours: int) -> wp.Kernel:
+def _rows(width: int, resolution: int, hours: int) -> int:
+    """Returns the rows of a strip: as many as the arrays of `matrix_decode.cuh` leave room for in shared memory."""
+    own = 4 * packed_words(width) + 4 * (hours - 1) * 4 * _STEP * width // 8 + 2 * 128 * 16 + hours * 128 * 4
+    volume = hours * 8 * (((_ROWS * resolution + 127) // 128 + 2) * resolution + _ROWS)
+    return _ROWS if own + volume <= _SHARED else _ROWS // 2
+
+
+def _decode_kernel(width: int, resolution: int, shared: bool, hours: int, rows: int) -> wp.Kernel:
     vec_hidden, vec_result = wp.types.vector(width, float), wp.types.vector(12, float)
     radiance = shared or hours == 2
-    code = _native("matrix_decode", H=width, R=resolution, ROWS=ROWS, HOURS=hours)
+    code = _native("matrix_decode", H=width, R=resolution, ROWS=rows, HOURS=hours)
 
     @wp.func_native(on_cuda(code, "return wp::vec_t<12, float>();"))
     def forward(
@@ -236,7 +244,7 @@ def _decode_kernel(width: int, resolution: int, shared: bool, hours: int) -> wp.
         early_scale, late_scale = early.scale[place], late.scale[place]
         inverse = bound_of(wp.max(bound_of(early.inverse_peak[place]), bound_of(late.inverse_peak[place])))
         # Variables keep the loops rolled.
-        parts = int(wp.static(ROWS // 4))
+        parts = int(wp.static(rows // 4))
         count = int(wp.static(hours))
         for part in range(parts):
             total = vec_result()
@@ -261,6 +269,6 @@ def _decode_kernel(width: int, resolution: int, shared: bool, hours: int) -> wp.
                     if wp.static(radiance):
                         light = powers(light, 1.0 / early.gamma)
                     word = bytes_over(light, inverse)
-                out[i, strip * wp.static(ROWS) + 4 * part + r, column] = word
+                out[i, strip * wp.static(rows) + 4 * part + r, column] = word
 
     return decode

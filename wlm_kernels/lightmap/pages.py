@@ -18,16 +18,16 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels import mlp
-from wlm_kernels.lightmap.blocks import stored_texel
-from wlm_kernels.lightmap.decode import Maps, Stored, map_texel, texel_network
-from wlm_kernels.lightmap.features import CENTRE, STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.decode import Stored, texel_network
+from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 from wlm_kernels.lightmap.frames import StoredFrames, frame_colour, power
-from wlm_kernels.lightmap.matrix_decode import matrix_texels
-from wlm_kernels.native import on_cuda
 from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 
 COARSE_LEVEL, COARSE = 4, 8
 """The finest level that is read from the table of coarse texels, and their number along a side of a tile."""
+
+BLOCK = 128
+"""Threads of a block of a launch."""
 
 WAITING, BROKEN = -1, -2
 """Values of `Tiles.slot`: the tile is not on the device; it is damaged."""
@@ -41,13 +41,15 @@ one. Then for each of the two times at which networks are evaluated: its positio
 is not evaluated), the two stored times between which tile scales are interpolated, the weight of the later one, and the
 encoded time (four columns). The last is the number of columns."""
 
-_BLOCK = 128  # threads
 _LEVEL, _SIDE = wp.constant(COARSE_LEVEL), wp.constant(COARSE)
 _FULL, _EMPTY = wp.constant(FULL), wp.constant(EMPTY)
 _BEFORE, _AFTER, _SHARE, _TAU, _WEIGHT, _FIRST, _SECOND, _MIX, _ENCODING = (
     wp.constant(i) for i in (BEFORE, AFTER, SHARE, TAU, WEIGHT, FIRST, SECOND, MIX, ENCODING)
 )
-_CONSTANT, _STATIC, _FRAMES = wp.constant(1), wp.constant(2), wp.constant(4)  # of `wlm.lightmap.tiles.TileKind`
+_CONSTANT, _STATIC, _DYNAMIC = wp.constant(1), wp.constant(2), wp.constant(3)  # of `wlm.lightmap.tiles.TileKind`
+COARSE_TEXELS = -1
+"""Instead of the kind of a tile: its coarse texels are read."""
+_COARSE_TEXELS = wp.constant(COARSE_TEXELS)
 
 
 @wp.struct
@@ -99,11 +101,13 @@ class Jobs:
         place: [J], sheet, level, row and column of the first texel, which may lie outside the level.
         target: [J], row of the clock with the time.
         slot: [J], index of the square in the output, or -1 for nothing to decode.
+        first: [J + 1], first block of `BLOCK` threads of each square, and at the end their number, for `matrix_pages`.
     """
 
     place: wp.array1d[wp.vec4i]
     target: wp.array1d[int]
     slot: wp.array1d[int]
+    first: wp.array1d[int]
 
 
 @wp.kernel(enable_backward=False)
@@ -132,70 +136,126 @@ def _valid(tiles: Tiles, tile: int, y: int, x: int) -> int:
     return int(wp.rshift(tiles.bits[mask, y, x // 32], wp.uint32(x % 32)) & wp.uint32(1))
 
 
+@wp.struct
+class Square:
+    """A square of texels that is decoded.
+
+    Attributes:
+        slot: Its index in the output, or -1 if there is nothing to decode in this light group.
+        sheet: The sheet, among those of its group.
+        level: The mip level.
+        depth: The level below it whose texels are the samples: the first one, or that of coarse texels.
+        side: The samples of a texel lie in a grid of so many along each axis.
+        rows, columns: Size of the level.
+    """
+
+    slot: int
+    sheet: int
+    level: int
+    depth: int
+    side: int
+    rows: int
+    columns: int
+
+
 @wp.func
-def _sample(tiles: Tiles, sheet: int, level: int, depth: int, side: int, sample: int, y: int, x: int) -> wp.vec3i:
-    """Returns tile, row and column of one of side x side samples of the texel (y, x) of a level, or a tile of -1 if the
-    sample is not valid. With a `depth` below the level, samples are coarse texels, and all are valid."""
-    a = sample // side
-    b = sample - a * side
-    whole = 2 * side * side
-    ty = (y << level) + (2 * (a * side + b) + 1 << level) // whole
-    tx = (x << level) + (2 * (b * side + side - 1 - a) + 1 << level) // whole
-    if depth < level:  # of a coarse texel that reaches past the map's end, its first texel does not
-        ty -= ty % 16
-        tx -= tx % 16
-    size = tiles.size[sheet]
+def square_of(tiles: Tiles, jobs: Jobs, k: int, grid: int, direct: int) -> Square:
+    square = Square()
+    place = jobs.place[k]
+    square.sheet = place[0] - tiles.sheet
+    square.slot = -1
+    if square.sheet >= 0 and square.sheet < tiles.size.shape[0]:
+        square.slot = jobs.slot[k]
+        size = tiles.size[square.sheet]
+        square.level = place[1]
+        square.rows = ((size[0] - 1) >> place[1]) + 1
+        square.columns = ((size[1] - 1) >> place[1]) + 1
+        square.depth = place[1]
+        if place[1] >= _LEVEL and direct == 0:
+            square.depth = place[1] - _LEVEL
+        square.side = wp.min(1 << square.depth, grid)
+    return square
+
+
+@wp.func
+def texel_of(square: Square, place: wp.vec4i, i: int, j: int) -> wp.vec2i:
+    """Returns row and column of a texel of a square in its level; beyond the level's end those of its last texel."""
+    return wp.vec2i(wp.clamp(place[2] + i, 0, square.rows - 1), wp.clamp(place[3] + j, 0, square.columns - 1))
+
+
+@wp.func
+def sample_at(tiles: Tiles, square: Square, sample: int, at: wp.vec2i) -> wp.vec3i:
+    """Returns tile, row and column of one of side x side samples of a texel of a level, or a tile of -1 if the texel
+    lies outside or the sample is not valid. With a `depth` below the level, samples are coarse texels, all valid."""
     tile = int(-1)
-    if ty < size[0] and tx < size[1]:
-        tile = tiles.first[sheet] + (ty // 128) * tiles.columns[sheet] + tx // 128
-        ty = ty % 128
-        tx = tx % 128
-        if depth == level:
-            if _valid(tiles, tile, ty, tx) == 0:
-                tile = -1
+    ty = int(0)
+    tx = int(0)
+    if at[0] >= 0 and at[1] >= 0 and at[0] < square.rows and at[1] < square.columns:
+        side = square.side
+        a = sample // side
+        b = sample - a * side
+        whole = 2 * side * side
+        ty = (at[0] << square.level) + (2 * (a * side + b) + 1 << square.level) // whole
+        tx = (at[1] << square.level) + (2 * (b * side + side - 1 - a) + 1 << square.level) // whole
+        if square.depth < square.level:  # of a coarse texel that reaches past the map's end, its first texel does not
+            ty -= ty % 16
+            tx -= tx % 16
+        size = tiles.size[square.sheet]
+        if ty < size[0] and tx < size[1]:
+            tile = tiles.first[square.sheet] + (ty // 128) * tiles.columns[square.sheet] + tx // 128
+            ty = ty % 128
+            tx = tx % 128
+            if square.depth == square.level:
+                if _valid(tiles, tile, ty, tx) == 0:
+                    tile = -1
     return wp.vec3i(tile, ty, tx)
 
 
 @wp.func
-def _coarse_light(tiles: Tiles, clock: wp.array2d[float], target: int, tile: int, cell: int) -> wp.vec3:
-    share = clock[target, _SHARE]
-    early = unpack_rgb9e5(tiles.coarse[tile, int(clock[target, _BEFORE]), cell])
-    return (1.0 - share) * early + share * unpack_rgb9e5(tiles.coarse[tile, int(clock[target, _AFTER]), cell])
+def kind_of(tiles: Tiles, square: Square, tile: int) -> int:
+    """Returns how a sample in a tile is read: the kind of the tile, or `COARSE_TEXELS`."""
+    kind = tiles.kind[tile]
+    if square.depth < square.level or tiles.slot[tile] < 0:
+        kind = _COARSE_TEXELS
+    return kind
 
 
 @wp.func
-def _stored_light(
+def stored_light(
     tiles: Tiles,
     frames: StoredFrames,
     clock: wp.array2d[float],
     target: int,
     gamma: float,
     kind: int,
-    slot: int,
-    y: int,
-    x: int,
+    at: wp.vec3i,
 ) -> wp.vec3:
-    """Returns the light of a constant tile, or of one stored as frames, in the slot of its kind."""
+    """Returns the light of a sample, from `sample_at`, for which no network is evaluated."""
     share = clock[target, _SHARE]
     before = int(clock[target, _BEFORE])
     after = int(clock[target, _AFTER])
+    if kind == _COARSE_TEXELS:
+        cell = (at[1] // 16) * _SIDE + at[2] // 16
+        early = unpack_rgb9e5(tiles.coarse[at[0], before, cell])
+        return (1.0 - share) * early + share * unpack_rgb9e5(tiles.coarse[at[0], after, cell])
+    slot = tiles.slot[at[0]]
     if kind == _CONSTANT:
         return (1.0 - share) * tiles.colours[slot, before] + share * tiles.colours[slot, after]
     first = slot * frames.times
-    light = (1.0 - share) * power(frame_colour(frames, first + before, y, x), gamma)
+    light = (1.0 - share) * power(frame_colour(frames, first + before, at[1], at[2]), gamma)
     if share > 0.0:
-        light += share * power(frame_colour(frames, first + after, y, x), gamma)
+        light += share * power(frame_colour(frames, first + after, at[1], at[2]), gamma)
     return light
 
 
 @wp.func
-def _encoding_of(clock: wp.array2d[float], target: int, r: int) -> wp.vec4:
+def encoding_of(clock: wp.array2d[float], target: int, r: int) -> wp.vec4:
     at = _ENCODING + 4 * r
     return wp.vec4(clock[target, at], clock[target, at + 1], clock[target, at + 2], clock[target, at + 3])
 
 
 @wp.func
-def _light_of(
+def light_of(
     mapped: Mapped, clock: wp.array2d[float], target: int, r: int, n: int, gamma: float, y: wp.vec3
 ) -> wp.vec3:
     """Converts the output y of the network of the mapped tile n at the time r of a clock's row to light."""
@@ -206,15 +266,8 @@ def _light_of(
     return power(wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0)), gamma)
 
 
-@wp.func_native(on_cuda("return __reduce_max_sync(~0u, x);\n", "return x;"))
-def _most_of_warp(x: int) -> int:
-    """Returns the largest number of a warp, whose threads must all call it."""
-    ...
-
-
-def _plain_lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
-    """Builds the `wp.func`s that read moving and still tiles at a texel, each thread by itself, and the types of their
-    networks' arrays."""
+def _lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
+    """Builds the `wp.func`s that read dynamic and static tiles at a texel, and the types of their networks' arrays."""
     vec_hidden = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu).vec_hidden
     assert vec_hidden is mlp.kernels(STATIC_INPUTS, hidden, gelu).vec_hidden
 
@@ -234,14 +287,13 @@ def _plain_lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
             x: int,
         ) -> wp.vec3:
             light = wp.vec3()
-            if n >= 0:
-                two = int(2)  # a variable keeps the loop rolled
-                for r in range(two):
-                    weight = clock[target, _WEIGHT + r]
-                    if weight > 0.0:
-                        tau = clock[target, _TAU + r]
-                        out = network(mapped.stored, first, later, tau, _encoding_of(clock, target, r), n, y, x)
-                        light += weight * _light_of(mapped, clock, target, r, n, gamma, out)
+            two = int(2)  # a variable keeps the loop rolled
+            for r in range(two):
+                weight = clock[target, _WEIGHT + r]
+                if weight > 0.0:
+                    tau = clock[target, _TAU + r]
+                    out = network(mapped.stored, first, later, tau, encoding_of(clock, target, r), n, y, x)
+                    light += weight * light_of(mapped, clock, target, r, n, gamma, out)
             return light
 
         return light
@@ -249,63 +301,15 @@ def _plain_lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
     return build(True), build(False), (vec_hidden, wp.vec3)
 
 
-def _matrix_lights(hidden: int) -> tuple[Any, Any, tuple[Any, ...]]:
-    """Builds the same as `_plain_lights` for a GPU's matrix units: all threads of a warp must call the functions."""
-    evaluate, vec_hidden = matrix_texels(hidden), wp.types.vector(hidden, float)
-
-    def build(temporal: bool) -> Any:
-        @wp.func
-        def light(
-            mapped: Mapped,
-            first: wp.array2d[vec_hidden],
-            later: wp.array2d[wp.uint32],
-            clock: wp.array2d[float],
-            target: int,
-            gamma: float,
-            n: int,
-            y: int,
-            x: int,
-        ) -> wp.vec3:
-            light = wp.vec3()
-            two = int(2)
-            for r in range(two):
-                weight = clock[target, _WEIGHT + r]
-                number = wp.where(weight > 0.0, n, -1)
-                f = Maps()
-                if number >= 0:
-                    if wp.static(temporal):
-                        f = map_texel(mapped.stored, n, clock[target, _TAU + r], y, x)
-                        for c in range(4, 12):
-                            f[c] = (f[c] - 0.5) * CENTRE
-                    else:
-                        uv = stored_texel(mapped.stored.uv, n, y, x)
-                        for c in range(4):
-                            f[c] = uv[c]
-                    for c in range(4):
-                        f[c] = f[c] * 255.0 - 128.0
-                out = evaluate(later, first, f, _encoding_of(clock, target, r), number, 2 * target + r)
-                if number >= 0:
-                    light += weight * _light_of(mapped, clock, target, r, n, gamma, out)
-            return light
-
-        return light
-
-    return build(True), build(False), (vec_hidden, wp.uint32)
-
-
 @functools.cache
-def page_kernel(hidden: int, gelu: str, matrix: bool = False) -> wp.Kernel:
-    """Builds (once) the kernel that decodes squares of texels, for networks of one hidden width.
+def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
+    """Builds (once) the kernel that decodes squares of texels, one texel per thread, for networks of one hidden width.
 
     Args:
-        hidden: H, width of the hidden layers; a multiple of 16 for matrix units.
-        gelu: One of `mlp.GELUS`; matrix units have their own.
-        matrix: Whether to evaluate networks on a GPU's matrix units, with half floats. The networks' two arrays are
-            then those of `pack_biases` and `pack_networks` instead of their hidden and output layers.
+        hidden: H, width of the hidden layers.
+        gelu: One of `mlp.GELUS`.
     """
-    moving_light, still_light, (first_type, later_type) = (
-        _matrix_lights(hidden) if matrix else _plain_lights(hidden, gelu)
-    )
+    moving_light, still_light, (first_type, later_type) = _lights(hidden, gelu)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def decode_pages(
@@ -326,81 +330,41 @@ def page_kernel(hidden: int, gelu: str, matrix: bool = False) -> wp.Kernel:
         # out:
         out: wp.array3d[wp.uint32],
     ):
-        i = wp.tid()
-        edge = out.shape[1]
-        k = i // (edge * edge)
-        slot = int(-1)
-        sheet = int(0)
-        if k < jobs.slot.shape[0]:
-            sheet = jobs.place[k][0] - tiles.sheet
-            if sheet >= 0 and sheet < tiles.size.shape[0]:
-                slot = jobs.slot[k]
-        side = int(1)
-        found = int(0)
-        level = int(0)
-        depth = int(0)
-        yy = int(0)
-        xx = int(0)
-        target = int(0)
-        if slot >= 0:
+        k, i, j = wp.tid()
+        square = square_of(tiles, jobs, k, grid, direct)
+        if square.slot >= 0:
             target = jobs.target[k]
-            place = jobs.place[k]
-            level = place[1]
-            size = tiles.size[sheet]
-            rows = ((size[0] - 1) >> level) + 1
-            columns = ((size[1] - 1) >> level) + 1
-            y = wp.clamp(place[2] + i // edge % edge, 0, rows - 1)
-            x = wp.clamp(place[3] + i % edge, 0, columns - 1)
-            depth = level
-            if level >= _LEVEL and direct == 0:
-                depth = level - _LEVEL
-            side = wp.min(1 << depth, grid)
+            samples = square.side * square.side
+            start = texel_of(square, jobs.place[k], i, j)
             # The search comes first, so that the threads of a warp evaluate their networks together.
             o = int(0)
+            found = int(0)
             while o < offsets.shape[0] and found == 0:
-                yy = y + offsets[o][0]
-                xx = x + offsets[o][1]
-                if yy >= 0 and xx >= 0 and yy < rows and xx < columns:
-                    sample = int(0)
-                    while sample < side * side and found == 0:
-                        if _sample(tiles, sheet, level, depth, side, sample, yy, xx)[0] >= 0:
-                            found = 1
-                        sample += 1
+                sample = int(0)
+                while sample < samples and found == 0:
+                    if sample_at(tiles, square, sample, start + offsets[o])[0] >= 0:
+                        found = 1
+                    sample += 1
                 o += 1
-        light = wp.vec3()
-        count = int(0)
-        own = int(0)
-        if found == 1:
-            own = side * side
-        # Matrix units serve whole warps: a thread without a sample takes part in the others' networks.
-        most = int(own)
-        if wp.static(matrix):
-            most = _most_of_warp(own)
-        for sample in range(most):
-            n_moving = int(-1)
-            n_still = int(-1)
-            at = wp.vec3i(-1, 0, 0)
-            if sample < own:
-                at = _sample(tiles, sheet, level, depth, side, sample, yy, xx)
-            if at[0] >= 0:
-                count += 1
-                kind = tiles.kind[at[0]]
-                row = tiles.slot[at[0]]
-                if depth < level or row < 0:
-                    light += _coarse_light(tiles, clock, target, at[0], (at[1] // 16) * _SIDE + at[2] // 16)
-                elif kind == _STATIC:
-                    n_still = row
-                elif kind == _CONSTANT or kind == _FRAMES:
-                    light += _stored_light(tiles, frames, clock, target, tiles.gamma[sheet], kind, row, at[1], at[2])
-                else:
-                    n_moving = row
-            gamma = float(1.0)
-            if own > 0:
-                gamma = tiles.gamma[sheet]
-            light += moving_light(moving, moving_first, moving_later, clock, target, gamma, n_moving, at[1], at[2])
-            light += still_light(still, still_first, still_later, clock, target, gamma, n_still, at[1], at[2])
-        if slot >= 0:
-            out[slot, i // edge % edge, i % edge] = pack_rgb9e5(light / float(wp.max(count, 1)))
+            light = wp.vec3()
+            count = int(0)
+            if found == 1:
+                gamma = tiles.gamma[square.sheet]
+                for sample in range(samples):
+                    at = sample_at(tiles, square, sample, start + offsets[o - 1])
+                    if at[0] >= 0:
+                        count += 1
+                        kind = kind_of(tiles, square, at[0])
+                        n = tiles.slot[at[0]]
+                        if kind == _DYNAMIC:
+                            light += moving_light(
+                                moving, moving_first, moving_later, clock, target, gamma, n, at[1], at[2]
+                            )
+                        elif kind == _STATIC:
+                            light += still_light(still, still_first, still_later, clock, target, gamma, n, at[1], at[2])
+                        else:
+                            light += stored_light(tiles, frames, clock, target, gamma, kind, at)
+            out[square.slot, i, j] = pack_rgb9e5(light / float(wp.max(count, 1)))
 
     return decode_pages
 
@@ -419,23 +383,30 @@ def put(records, slots, parts, memory) -> None:
 
 
 def decode(
-    kernel: wp.Kernel, source: tuple[Any, ...], clock, offsets, jobs: Jobs, grid: int, direct: bool, out
+    kernel: wp.Kernel,
+    source: tuple[Any, ...],
+    clock,
+    offsets,
+    jobs: Jobs,
+    grid: int,
+    direct: bool,
+    out,
+    blocks: int | None = None,
 ) -> None:
     """Decodes squares of texels of one light group with one launch, which a CUDA graph can capture.
 
     Args:
-        kernel: From `page_kernel`.
-        source: `Tiles`; `Mapped` and the two arrays of the networks of the dynamic tiles, see `page_kernel`, and the
-            same of the static ones; the tiles stored as frames.
+        kernel: From `page_kernel` or `matrix_pages.page_kernel`.
+        source: `Tiles`; `Mapped` and the two arrays of the networks of the dynamic tiles, and the same of the static
+            ones; the tiles stored as frames. The arrays are the hidden and output layers, or those of `matrix_pages`.
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
         jobs: J squares; those of other groups are left as they are.
         grid: Most samples of a texel of a mip along each axis.
         direct: Whether to decode tiles at every level, instead of reading coarse texels from `COARSE_LEVEL` on.
         out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.
+        blocks: For a kernel of `matrix_pages` the blocks to launch, at least as many as the squares need.
     """
     inputs = [*source, clock, offsets, jobs, grid, int(direct)]
-    texels = jobs.slot.shape[0] * out.shape[1] * out.shape[2]
-    # Whole blocks: the matrix units serve whole warps.
-    dim = -(-texels // _BLOCK) * _BLOCK
-    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=_BLOCK)
+    dim = (jobs.slot.shape[0], *out.shape[1:]) if blocks is None else blocks * BLOCK
+    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=BLOCK)

@@ -26,13 +26,14 @@ from wlm.lightmap.virtual.layout import Layout
 from wlm.texels import OFFSETS, nearest_valid
 from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap import frames as frame_kernels
+from wlm_kernels.lightmap import matrix_pages
 from wlm_kernels.lightmap import pages as kernels
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
 from wlm_kernels.lightmap.matrix_decode import pack_biases, pack_networks, packed_words
 from wlm_kernels.lightmap.virtual import KEEP
 
 _CHUNK = 64  # tiles that are read at once
-_GRID = 4  # samples of a coarse texel along each axis
+_GRID = 4  # most samples of a texel along each axis; those of a coarse texel
 _DARK = 0.01  # of a tile's brightest time: changes of less light than that are not relative to it
 _UPLOADS = 8  # most loaded tiles that are copied to the device in a frame
 _ALIGNED = 64  # bytes; the first of an array in a pool
@@ -147,7 +148,7 @@ class TileStore:
         hidden = layout.models[0].profile.hidden
         # The matrix units have the GELU that is chosen for CUDA.
         self._matrix = device != "cpu" and gelu == "fast" and hidden % 16 == 0
-        self.kernel = kernels.page_kernel(hidden, gelu, self._matrix)
+        self.kernel = matrix_pages.page_kernel(hidden) if self._matrix else kernels.page_kernel(hidden, gelu)
         self._kind = np.concatenate([own.kind for own in layout.models]).astype(np.int32)
         self.slot = np.full(len(self._kind), kernels.WAITING, np.int32)
         self.slot[self._kind == TileKind.EMPTY] = 0
@@ -251,6 +252,11 @@ class TileStore:
             "tables": sum(array.capacity for array in rest),
         }
 
+    def decode(self, clock: wp.array, offsets: wp.array, jobs: kernels.Jobs, direct: bool, out: wp.array, blocks: int):
+        """Decodes squares of texels; for the arguments see `wlm_kernels.lightmap.pages.decode`."""
+        most = blocks if self._matrix else None
+        kernels.decode(self.kernel, self.source, clock, offsets, jobs, _GRID, direct, out, most)
+
     # ---- coarse texels ----
 
     def _read_all(self, clock: Clock) -> None:
@@ -329,8 +335,10 @@ class TileStore:
         jobs.place = self._array(place.repeat(times, 0), wp.vec4i)
         jobs.target = self._array(np.tile(np.arange(times, dtype=np.int32), count), int)
         jobs.slot = self._array(np.arange(count * times, dtype=np.int32), int)
+        each = -(-side * side * _GRID**2 // kernels.BLOCK)  # blocks
+        jobs.first = self._array(each * np.arange(count * times + 1, dtype=np.int32), int)
         out = wp.zeros((count * times, side, side), dtype=wp.uint32, device=self._device)
-        kernels.decode(self.kernel, self.source, rows, self.offsets[:1], jobs, _GRID, True, out)
+        self.decode(rows, self.offsets[:1], jobs, True, out, each * count * times)
         return out.numpy().reshape(count, times, side, side)
 
     def _fill(self, own: SheetModel, words: np.ndarray, slot: np.ndarray) -> None:
