@@ -20,8 +20,6 @@ from wlm_kernels.lightmap.blocks import bits7, byte_mix, index_level, stored_tex
 from wlm_kernels.lightmap.features import CENTRE, STATIC_INPUTS, TEMPORAL_INPUTS
 from wlm_kernels.shared_exponent import pack_rgb9e5
 
-Maps = wp.types.vector(12, float)
-
 
 @wp.struct
 class Stored:
@@ -93,25 +91,6 @@ def stored_volume_at(stored: Stored, n: int, u: float, v: float, tau: float) -> 
                 xx = axis_index(x + i, width, 0)
                 c = cy * wp.where(i == 0, 1.0 - fx, fx)
                 f += c * stored_texel(stored.uvt, s, yy, xx)
-    return f
-
-
-@wp.func
-def map_texel(stored: Stored, n: int, tau: float, y: int, x: int) -> Maps:
-    """Reads the maps of tile n at its texel (y, x): 4 channels of F_uv, 4 of F_uvt, 2 of F_ut, 2 of F_vt, in [0, 1]."""
-    u = (float(x) + 0.5) / 128.0
-    v = (float(y) + 0.5) / 128.0
-    uv = stored_texel(stored.uv, n, y, x)
-    uvt = stored_volume_at(stored, n, u, v, tau)
-    ut = stored_plane_at(stored.ut, n, u, tau, stored.periodic)
-    vt = stored_plane_at(stored.vt, n, v, tau, stored.periodic)
-    f = Maps()
-    for c in range(4):
-        f[c] = uv[c]
-        f[4 + c] = uvt[c]
-    for c in range(2):
-        f[8 + c] = ut[c]
-        f[10 + c] = vt[c]
     return f
 
 
@@ -192,16 +171,21 @@ def texel_network(temporal: bool, hidden: int, gelu: str) -> Any:
         x: int,
     ) -> wp.vec3:
         f = vec_in()
+        uv = stored_texel(stored.uv, n, y, x)
+        for c in range(4):
+            f[c] = uv[c]
         if wp.static(temporal):
-            maps = map_texel(stored, n, tau, y, x)
-            for c in range(12):
-                f[c] = maps[c]
+            u = (float(x) + 0.5) / 128.0
+            v = (float(y) + 0.5) / 128.0
+            uvt = stored_volume_at(stored, n, u, v, tau)
+            ut = stored_plane_at(stored.ut, n, u, tau, stored.periodic)
+            vt = stored_plane_at(stored.vt, n, v, tau, stored.periodic)
             for c in range(4):
+                f[4 + c] = uvt[c]
                 f[12 + c] = encoding[c]
-        else:
-            uv = stored_texel(stored.uv, n, y, x)
-            for c in range(4):
-                f[c] = uv[c]
+            for c in range(2):
+                f[8 + c] = ut[c]
+                f[10 + c] = vt[c]
         for c in range(wp.static(centred)):
             f[c] = (f[c] + 0.0 - 0.5) * CENTRE
         return third(output, n, act(second(hidden, n, act(first(hidden, n, f)))))

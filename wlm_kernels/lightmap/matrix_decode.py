@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.lightmap.decode import Maps, Stored, TimeState, bytes_over
+from wlm_kernels.lightmap.decode import Stored, TimeState, bytes_over
 from wlm_kernels.lightmap.features import TEMPORAL_INPUTS
 from wlm_kernels.lightmap.output import bound_of
 from wlm_kernels.native import native_source, on_cuda
@@ -27,6 +27,9 @@ _STEP = 16  # size of a matrix product: the hidden width is a multiple of it
 _MAPS = 12  # inputs that come from the maps; the encoded time follows
 _UV_SCALE = np.sqrt(12.0) / 255.0
 _SCALE = (np.sqrt(2.0 / np.pi) * 0.044715) ** (1.0 / 3.0)  # of arguments of GELU, whose x^3 then has the factor 1
+
+
+Maps = wp.types.vector(_MAPS, float)
 
 
 @wp.func_native(
@@ -161,19 +164,31 @@ def matrix_kernels(hidden: int, resolution: int, shared: bool = False) -> Matrix
     return MatrixKernels(*(_decode_kernel(hidden, resolution, shared, 1 + i, rows[i]) for i in range(2)), rows)
 
 
+def _native(*names: str, **constants: int) -> str:
+    """Returns the code of a native function from its parts, with integer constants."""
+    units = native_source(__package__, "matrix_units", **constants)
+    return units + "".join(native_source(__package__, name) for name in names)
+
+
+@wp.func_native(on_cuda(_native("matrix_maps", "map_inputs"), "return wp::vec_t<12, float>();"))
+def map_inputs(stored: Stored, n: int, tau: float, y: int, x: int) -> Maps:
+    """Reads the maps of tile n at its texel (y, x) as `matrix_texels` takes them: F_uv in steps of 1/255 less 128, then
+    F_uvt, F_ut and F_vt, scaled as the network takes them. On a GPU only."""
+    ...
+
+
 @functools.cache
 def matrix_texels(hidden: int) -> Any:
     """Builds (once) the `wp.func` that evaluates networks, at one texel per thread.
 
     It is evaluate(packed, biases, f, encoding, n, time), a vec3. All threads of a warp must call it, in blocks of 128
     threads. Its arguments are `packed`, uint32 [N, words], from `pack_networks`; `biases`, vecH [N, 5], from
-    `pack_biases`; `f`, vec12, F_uv in steps of 1/255 less 128, then F_uvt, F_ut and F_vt, scaled as the network takes
-    them; `encoding`, vec4, the encoded time; `n`, the number of the network, or -1 for a thread without one; `time`,
-    a number that is equal only where the encoding is.
+    `pack_biases`; `f`, vec12, from `map_inputs`; `encoding`, vec4, the encoded time; `n`, the number of the network, or
+    -1 for a thread without one; `time`, a number that is equal only where the encoding is.
     """
     vec_hidden = wp.types.vector(hidden, float)
 
-    @wp.func_native(on_cuda(_native("matrix_texels", H=hidden), "return wp::vec_t<3, float>();"))
+    @wp.func_native(on_cuda(_native("matrix_network", "matrix_texels", H=hidden), "return wp::vec_t<3, float>();"))
     def evaluate(
         packed: wp.array2d[wp.uint32],
         biases: wp.array2d[vec_hidden],
@@ -186,15 +201,6 @@ def matrix_texels(hidden: int) -> Any:
     return evaluate
 
 
-def _native(name: str, **constants: int) -> str:
-    """Returns the code of a native function that evaluates networks of width H."""
-    parts = (
-        native_source(__package__, "matrix_units"),
-        native_source(__package__, "matrix_network", H=constants.pop("H")),
-    )
-    return "".join(parts) + native_source(__package__, name, **constants)
-
-
 def _rows(width: int, resolution: int, hours: int) -> int:
     """Returns the rows of a strip: as many as the arrays of `matrix_decode.cuh` leave room for in shared memory."""
     own = 4 * packed_words(width) + 4 * (hours - 1) * 4 * _STEP * width // 8 + 2 * 128 * 16 + hours * 128 * 4
@@ -205,7 +211,7 @@ def _rows(width: int, resolution: int, hours: int) -> int:
 def _decode_kernel(width: int, resolution: int, shared: bool, hours: int, rows: int) -> wp.Kernel:
     vec_hidden, vec_result = wp.types.vector(width, float), wp.types.vector(12, float)
     radiance = shared or hours == 2
-    code = _native("matrix_decode", H=width, R=resolution, ROWS=rows, HOURS=hours)
+    code = _native("matrix_network", "matrix_maps", "matrix_decode", H=width, R=resolution, ROWS=rows, HOURS=hours)
 
     @wp.func_native(on_cuda(code, "return wp::vec_t<12, float>();"))
     def forward(

@@ -13,10 +13,8 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.lightmap.blocks import stored_texel
-from wlm_kernels.lightmap.decode import Maps, map_texel
-from wlm_kernels.lightmap.features import CENTRE
 from wlm_kernels.lightmap.frames import StoredFrames
-from wlm_kernels.lightmap.matrix_decode import matrix_texels
+from wlm_kernels.lightmap.matrix_decode import Maps, map_inputs, matrix_texels
 from wlm_kernels.lightmap.pages import (
     BLOCK,
     COARSE_LEVEL,
@@ -119,15 +117,11 @@ def page_kernel(hidden: int) -> wp.Kernel:
                 if n >= 0 and weight > 0.0:
                     number = n
                     if wp.static(temporal):
-                        f = map_texel(mapped.stored, n, clock[target, _TAU + r], y, x)
-                        for c in range(4, 12):
-                            f[c] = (f[c] - 0.5) * CENTRE
+                        f = map_inputs(mapped.stored, n, clock[target, _TAU + r], y, x)
                     else:
                         uv = stored_texel(mapped.stored.uv, n, y, x)
                         for c in range(4):
-                            f[c] = uv[c]
-                    for c in range(4):
-                        f[c] = f[c] * 255.0 - 128.0
+                            f[c] = uv[c] * 255.0 - 128.0
                 out = evaluate(packed, biases, f, encoding_of(clock, target, r), number, 2 * target + r)
                 if number >= 0:
                     light += weight * light_of(mapped, clock, target, r, n, gamma, out)
@@ -174,16 +168,17 @@ def page_kernel(hidden: int) -> wp.Kernel:
             return
         target = jobs.target[k]
         gamma = tiles.gamma[square.sheet]
-        samples = square.side * square.side
-        threads = samples
+        samples = 1 << (2 * square.bits)
+        shift = 2 * square.bits
         turns = int(1)
         if square.depth < square.level:  # coarse texels are quick to read: a thread reads all
-            threads = 1
+            shift = 0
             turns = samples
+        threads = 1 << shift
         edge = out.shape[1]
-        flat = (thread - jobs.first[k] * _BLOCK) // threads
+        flat = (thread - jobs.first[k] * _BLOCK) >> shift
         inside = flat < edge * edge
-        own = thread % threads
+        own = thread & (threads - 1)
         i = flat // edge
         j = flat % edge
         start = texel_of(square, jobs.place[k], i, j)

@@ -20,7 +20,8 @@ import warp as wp
 from wlm_kernels import mlp
 from wlm_kernels.lightmap.decode import Stored, texel_network
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
-from wlm_kernels.lightmap.frames import StoredFrames, frame_colour, power
+from wlm_kernels.lightmap.frames import StoredFrames, frame_colour
+from wlm_kernels.lightmap.matrix_decode import powers
 from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 
 COARSE_LEVEL, COARSE = 4, 8
@@ -145,7 +146,7 @@ class Square:
         sheet: The sheet, among those of its group.
         level: The mip level.
         depth: The level below it whose texels are the samples: the first one, or that of coarse texels.
-        side: The samples of a texel lie in a grid of so many along each axis.
+        bits: The samples of a texel lie in a grid of 2^bits along each axis.
         rows, columns: Size of the level.
     """
 
@@ -153,7 +154,7 @@ class Square:
     sheet: int
     level: int
     depth: int
-    side: int
+    bits: int
     rows: int
     columns: int
 
@@ -173,7 +174,7 @@ def square_of(tiles: Tiles, jobs: Jobs, k: int, grid: int, direct: int) -> Squar
         square.depth = place[1]
         if place[1] >= _LEVEL and direct == 0:
             square.depth = place[1] - _LEVEL
-        square.side = wp.min(1 << square.depth, grid)
+        square.bits = wp.min(square.depth, grid)
     return square
 
 
@@ -185,18 +186,18 @@ def texel_of(square: Square, place: wp.vec4i, i: int, j: int) -> wp.vec2i:
 
 @wp.func
 def sample_at(tiles: Tiles, square: Square, sample: int, at: wp.vec2i) -> wp.vec3i:
-    """Returns tile, row and column of one of side x side samples of a texel of a level, or a tile of -1 if the texel
+    """Returns tile, row and column of one of the samples of a texel of a level, or a tile of -1 if the texel
     lies outside or the sample is not valid. With a `depth` below the level, samples are coarse texels, all valid."""
     tile = int(-1)
     ty = int(0)
     tx = int(0)
     if at[0] >= 0 and at[1] >= 0 and at[0] < square.rows and at[1] < square.columns:
-        side = square.side
-        a = sample // side
+        side = 1 << square.bits
+        a = sample >> square.bits
         b = sample - a * side
-        whole = 2 * side * side
-        ty = (at[0] << square.level) + (2 * (a * side + b) + 1 << square.level) // whole
-        tx = (at[1] << square.level) + (2 * (b * side + side - 1 - a) + 1 << square.level) // whole
+        # Divisions by twice the number of samples.
+        ty = (at[0] << square.level) + ((2 * (a * side + b) + 1 << square.level) >> (2 * square.bits + 1))
+        tx = (at[1] << square.level) + ((2 * (b * side + side - 1 - a) + 1 << square.level) >> (2 * square.bits + 1))
         if square.depth < square.level:  # of a coarse texel that reaches past the map's end, its first texel does not
             ty -= ty % 16
             tx -= tx % 16
@@ -242,9 +243,9 @@ def stored_light(
     if kind == _CONSTANT:
         return (1.0 - share) * tiles.colours[slot, before] + share * tiles.colours[slot, after]
     first = slot * frames.times
-    light = (1.0 - share) * power(frame_colour(frames, first + before, at[1], at[2]), gamma)
+    light = (1.0 - share) * powers(frame_colour(frames, first + before, at[1], at[2]), gamma)
     if share > 0.0:
-        light += share * power(frame_colour(frames, first + after, at[1], at[2]), gamma)
+        light += share * powers(frame_colour(frames, first + after, at[1], at[2]), gamma)
     return light
 
 
@@ -263,7 +264,7 @@ def light_of(
     early = mapped.scale[n, int(clock[target, _FIRST + r])]
     scale = (1.0 - share) * early + share * mapped.scale[n, int(clock[target, _SECOND + r])]
     c = wp.cw_mul(mapped.shift[n] + wp.cw_mul(mapped.spread[n], y), scale)
-    return power(wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0)), gamma)
+    return powers(wp.max(c, wp.vec3()), gamma)
 
 
 def _lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
@@ -334,7 +335,7 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
         square = square_of(tiles, jobs, k, grid, direct)
         if square.slot >= 0:
             target = jobs.target[k]
-            samples = square.side * square.side
+            samples = 1 << (2 * square.bits)
             start = texel_of(square, jobs.place[k], i, j)
             # The search comes first, so that the threads of a warp evaluate their networks together.
             o = int(0)
@@ -402,7 +403,7 @@ def decode(
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
         jobs: J squares; those of other groups are left as they are.
-        grid: Most samples of a texel of a mip along each axis.
+        grid: Logarithm to base 2 of the most samples of a texel along each axis.
         direct: Whether to decode tiles at every level, instead of reading coarse texels from `COARSE_LEVEL` on.
         out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.
         blocks: For a kernel of `matrix_pages` the blocks to launch, at least as many as the squares need.

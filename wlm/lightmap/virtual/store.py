@@ -33,7 +33,8 @@ from wlm_kernels.lightmap.matrix_decode import pack_biases, pack_networks, packe
 from wlm_kernels.lightmap.virtual import KEEP
 
 _CHUNK = 64  # tiles that are read at once
-_GRID = 4  # most samples of a texel along each axis; those of a coarse texel
+_GRID_BITS = 2
+_GRID = 1 << _GRID_BITS  # most samples of a texel along each axis; those of a coarse texel
 _DARK = 0.01  # of a tile's brightest time: changes of less light than that are not relative to it
 _UPLOADS = 8  # most loaded tiles that are copied to the device in a frame
 _ALIGNED = 64  # bytes; the first of an array in a pool
@@ -255,7 +256,7 @@ class TileStore:
     def decode(self, clock: wp.array, offsets: wp.array, jobs: kernels.Jobs, direct: bool, out: wp.array, blocks: int):
         """Decodes squares of texels; for the arguments see `wlm_kernels.lightmap.pages.decode`."""
         most = blocks if self._matrix else None
-        kernels.decode(self.kernel, self.source, clock, offsets, jobs, _GRID, direct, out, most)
+        kernels.decode(self.kernel, self.source, clock, offsets, jobs, _GRID_BITS, direct, out, most)
 
     # ---- coarse texels ----
 

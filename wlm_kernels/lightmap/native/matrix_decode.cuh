@@ -1,8 +1,8 @@
 // Evaluates the network of a tile for four rows of texels: a thread brings the features of a column's four texels, and a
 // warp evaluates the network of its 32 columns together.
 //
-// The body of the function `forward` of wlm_kernels/lightmap/matrix_decode.py, behind `matrix_network.cuh`. The function
-// defines its arguments, and:
+// The body of the function `forward` of wlm_kernels/lightmap/matrix_decode.py, behind `matrix_network.cuh` and
+// `matrix_maps.cuh`. The function defines its arguments, and:
 //   R          size of F_uvt along u and v
 //   ROWS       rows of texels in a strip, a multiple of 4; a block of 128 threads decodes one strip of a tile
 //   HOURS      number of hours that a texel is evaluated at, 1 or 2
@@ -10,43 +10,11 @@
 // `strip` at one hour; the first call of a block for an hour, with `part` 0, loads what the strip needs.
 
 constexpr int VOLUME = (ROWS * R + 127) / 128 + 2;  // rows of F_uvt that a strip reads
-constexpr float SCALE = 3.4641016151377544f / 255.0f;
 __shared__ __align__(16) unsigned w1[HOURS][W1], later[WORDS - W1];
 __shared__ uint2 volume[HOURS][VOLUME][R], down[HOURS][ROWS];  // F_uvt; of each row its place in a cell of F_uvt, and F_vt
 __shared__ unsigned across[HOURS][128];  // F_ut of each column
 __shared__ uint4 staged[2][128];
 
-// The endpoints of a block of BC7 mode 6, so that a texel's bytes are (a + w d) / 64, rounded, for two channels at once.
-struct Ends {
-    unsigned a01, a23, d01, d23;
-    __device__ Ends(const uint4& b) {
-        const unsigned p = (b.y >> 31) * 0x10001u, o = (b.z & 1u) * 0x10001u;
-        a01 = 2 * (b.x >> 7 & 127u | b.x >> 5 & 0x7f0000u) + p;
-        a23 = 2 * (b.y >> 3 & 127u | b.y >> 1 & 0x7f0000u) + p;
-        d01 = 2 * (b.x >> 14 & 127u | __funnelshift_r(b.x, b.y, 12) & 0x7f0000u) + o - a01;
-        d23 = 2 * (b.y >> 10 & 127u | b.y >> 8 & 0x7f0000u) + o - a23;
-        a01 = 64 * a01 + 0x200020u;
-        a23 = 64 * a23 + 0x200020u;
-    }
-    // The weight of an index in 64ths, which is (64 index + 7) / 15.
-    static __device__ unsigned weight(unsigned index) { return index * 279680u + 30590u >> 16; }
-    static __device__ unsigned bytes(unsigned a, unsigned d, unsigned w) { return a + w * d >> 6 & 0xff00ffu; }
-    // Bytes less 128 as halves: 0x6400 is 1024, whose lowest bit is 1.
-    static __device__ unsigned halves(unsigned two) { return Units::add(two | 0x64006400u, 0xe480e480u); }
-};
-// A position on an axis of `size` cells, see wlm_kernels/interpolate.py.
-struct Place {
-    int a, b;
-    float part;
-    __device__ Place(float p, int size, bool wraps) {
-        const float at = p * size - 0.5f, low = floorf(at);
-        a = (int)low;
-        b = a + 1;
-        part = at - low;
-        a = wraps ? (a + size) % size : max(a, 0);
-        b = wraps ? b % size : min(b, size - 1);
-    }
-};
 const int t = threadIdx.x, first = t & ~31;
 if (part == 0) {
     const bool wraps = stored.periodic != 0;
@@ -71,41 +39,25 @@ if (part == 0) {
     const Place slice(tau, stored.slices, wraps);
     const uint4* blocks = reinterpret_cast<const uint4*>(stored.uvt.data) + size_t(n) * stored.slices * (R / 4) * (R / 4);
     for (int i = t; i < VOLUME * R; i += 128) {
-        const int y = min(max(top + i / R, 0), R - 1), x = i % R, shift = 16 * (y & 1) + 4 * (x & 3);
+        const int y = min(max(top + i / R, 0), R - 1), x = i % R;
         float f[4] = {};
         for (int k = 0; k < 2; ++k) {
             const uint4 block = blocks[((k == 0 ? slice.a : slice.b) * (R / 4) + y / 4) * (R / 4) + x / 4];
             const Ends ends(block);
-            const unsigned word = (y & 2) ? block.w : block.z;
-            const unsigned weight = Ends::weight((y & 3) + (x & 3) == 0 ? word >> 1 & 7u : word >> shift & 15u);
-            const unsigned low = Ends::bytes(ends.a01, ends.d01, weight), high = Ends::bytes(ends.a23, ends.d23, weight);
-            const float share = k == 0 ? 1.0f - slice.part : slice.part;
-            f[0] += share * (low & 255u);
-            f[1] += share * (low >> 16);
-            f[2] += share * (high & 255u);
-            f[3] += share * (high >> 16);
+            ends.add(f, k == 0 ? 1.0f - slice.part : slice.part, Ends::weight(Ends::index(block, y, x)));
         }
         for (int c = 0; c < 4; ++c) f[c] = (f[c] - 127.5f) * SCALE;
         volume[hour][i / R][x] = make_uint2(Units::pack(f[0], f[1]), Units::pack(f[2], f[3]));
     }
-    auto plane = [&](const wp::array_t<wp::vec_t<2, wp::uint8>>& of, int i) {
-        const int rows = of.shape[1], columns = of.shape[2];
-        const Place row(tau, rows, wraps), column((i + 0.5f) / 128.0f, columns, false);
-        const uchar2* at = reinterpret_cast<const uchar2*>(of.data) + size_t(n) * rows * columns;
-        float f[2] = {};
-        for (int k = 0; k < 4; ++k) {
-            const uchar2 v = at[((k & 2) ? row.b : row.a) * columns + ((k & 1) ? column.b : column.a)];
-            const float share = ((k & 2) ? row.part : 1.0f - row.part) * ((k & 1) ? column.part : 1.0f - column.part);
-            f[0] += share * v.x;
-            f[1] += share * v.y;
-        }
-        return Units::pack((f[0] - 127.5f) * SCALE, (f[1] - 127.5f) * SCALE);
+    auto packed_plane = [&](const wp::array_t<wp::vec_t<2, wp::uint8>>& of, int i) {
+        const float2 f = plane(of, n, i, tau, wraps);
+        return Units::pack(f.x, f.y);
     };
-    across[hour][t] = plane(stored.ut, t);
+    across[hour][t] = packed_plane(stored.ut, t);
     if (t < ROWS) {
         const int y = strip * ROWS + t;
         const float share = (((2 * y + 1) * R - 128) & 255) / 256.0f;
-        down[hour][t] = make_uint2(Units::pack(share, share), plane(stored.vt, y));
+        down[hour][t] = make_uint2(Units::pack(share, share), packed_plane(stored.vt, y));
     }
     __syncthreads();
 }
