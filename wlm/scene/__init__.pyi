@@ -1,0 +1,6 @@
+# Written by python -m wlm._facade from `_PLACES` of the package.
+from wlm.scene.content import Moving as Moving
+from wlm.scene.content import Puff as Puff
+from wlm.scene.content import Scene as Scene
+from wlm.scene.content import load as load
+from wlm.scene.mesh import Mesh as Mesh
