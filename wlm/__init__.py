@@ -9,8 +9,8 @@
 
 `wlm.lightmap`, `wlm.atlas`, `wlm.probe` and `wlm.smoke` have the same functions, and `load` reads the files of all.
 `wlm.fluid` simulates smoke, `wlm.ops` has the kernels as differentiable torch operations, `wlm.export` writes folders,
-kits for engines and HTML pages, `wlm.inspection` describes files, `wlm.bake` makes inputs, and `wlm.scene` reads a scene
-that all four systems light over a day.
+kits for engines and HTML pages, `wlm.inspection` describes files, `wlm.bake` makes inputs, and `wlm.scene` reads a
+scene that all four systems light over a day.
 """
 
 from wlm._facade import facade
