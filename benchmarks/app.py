@@ -96,6 +96,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "Measure the virtual texture of lightmaps and its rivals: frames of a walk and a day through a set.",
         ("walked_path", "quick", "device"),
     ),
+    "shader-speed": (
+        "Measure the exported shaders of lightmaps on a GPU, beside our decoder.",
+        ("quick", "device"),
+    ),
     "lightmap-ablation": (
         "Measure lightmaps over time: other feature maps of equal size, or no simulation of block compression.",
         ("quick", "device", "set_path", "steps", "only"),

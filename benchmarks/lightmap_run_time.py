@@ -519,13 +519,22 @@ def large_model(side: int) -> LightmapModel:
     """Makes a model of four sheets of dynamic tiles with random maps and networks, for profile M at 26 times."""
     times = np.concatenate([np.arange(24.0), [18.45, 18.55]])
     times.sort()
-    sheets = {Sheet(atlas=str(number)): _large_sheet(side, times, number) for number in range(_SHEETS)}
+    profile = Profile.load("M")
+    sheets = {Sheet(atlas=str(number)): random_sheet(side, times, number, profile) for number in range(_SHEETS)}
     first = next(iter(sheets.values()))
     return LightmapModel("large", "0123456789abcdef", first.profile, sheets)
 
 
-def _large_sheet(side: int, times: np.ndarray, seed: int) -> SheetModel:
-    random, profile = np.random.default_rng(seed), Profile.load("M").for_times(len(times))
+def random_sheet(side: int, times: np.ndarray, seed: int, profile: Profile) -> SheetModel:
+    """Makes a sheet of dynamic tiles with random maps and networks.
+
+    Args:
+        side: Texels along each side, a multiple of 128.
+        times: Stored times, hours of a day.
+        seed: Seed of the random numbers.
+        profile: Sizes of maps and networks.
+    """
+    random, profile = np.random.default_rng(seed), profile.for_times(len(times))
     count = (side // TILE) ** 2
     kind = np.full(count, TileKind.DYNAMIC, np.uint8)
     table = part_table(profile, kind, len(times))
