@@ -64,7 +64,7 @@ def write_scene(folder: Path, **changes: Any) -> Path:
     floor = [[-2, 0, 2], [2, 0, 2], [2, 0, -2], [-2, 0, -2]], FLOOR, [[0, 1], [u, 1], [u, 0], [0, 0]]
     wall = [[-2, 0, -2], [2, 0, -2], [2, 3, -2], [-2, 3, -2]], WALL, [[u, 1], [1, 1], [1, 0], [u, 0]]
     write_glb(folder / "room.glb", [square(*floor), square(*wall)])
-    write_glb(folder / "car.glb", [square([[-0.4, 0, 0], [0.4, 0, 0], [0.4, 0.4, 0], [-0.4, 0.4, 0]], SQUARE)])
+    write_glb(folder / "car.glb", [square([[-0.4, 0, 0], [0.4, 0, 0], [0.4, 0.6, 0], [-0.4, 0.6, 0]], SQUARE)])
     model().save(folder / "room.wlm")
     y, x, z = np.mgrid[0:4, -2:3, -2:3].reshape(3, -1)
     for hour, radiance in LIGHT.items():
@@ -82,6 +82,11 @@ def write_scene(folder: Path, **changes: Any) -> Path:
     for index, hour in ((2, 12.0), (5, 22.0)):
         light = np.repeat((SKY + SUN)[:, index], [SEEN, WIDTH - SEEN], 0).astype(np.float32)
         write_exr(folder / f"original_{hour:.2f}h.exr", np.broadcast_to(light, (HEIGHT, WIDTH, 3)))
+    return write_file(folder / "room.yaml", **changes)
+
+
+def write_file(path: Path, **changes: Any) -> Path:
+    """Writes the scene's YAML file with changed keys; None removes a key."""
     content = {
         "title": "a room",
         "mesh": "room.glb",
@@ -91,16 +96,15 @@ def write_scene(folder: Path, **changes: Any) -> Path:
             {"hour": 0, "colour": [0.0, 0.0, 0.1], "exposure": 1.0},
             {"hour": 12, "colour": [0.5, 0.6, 0.8], "exposure": -1.0},
         ],
-        "moving": [{"mesh": "car.glb", "path": [[-1, 0.5, 0], [1, 0.5, 0]], "seconds": 4}],
-        "smoke": [{"files": "smoke", "position": [1, 0, -1], "size": 0.5, "rate": 2}],
+        "moving": [{"mesh": "car.glb", "path": [[-0.6, 0.2, -1], [-0.6, 0.2, 1]], "seconds": 4}],
+        "smoke": [{"files": "smoke", "position": [1, 0.2, -1], "size": 1.0, "rate": 2}],
         "camera": [
-            {"second": 0, "eye": [0, 1.5, 5], "target": [0, 1, 0], "fov": 60},
-            {"second": 2, "eye": [0.5, 1.5, 5], "target": [0, 1, 0], "fov": 60},
-            {"second": 4, "eye": [0, 1.5, 4.5], "target": [0, 1, 0], "fov": 60},
+            {"second": 0, "eye": [0, 1.5, 4], "target": [0, 1, 0], "fov": 60},
+            {"second": 2, "eye": [0.5, 1.5, 4], "target": [0, 1, 0], "fov": 60},
+            {"second": 4, "eye": [0, 1.5, 3.5], "target": [0, 1, 0], "fov": 60},
         ],
         "day": {"first": 5, "last": 29, "seconds": 4},
         "originals": ["original_12.00h.exr", "original_22.00h.exr"],
     } | changes
-    path = folder / "room.yaml"
     path.write_text(yaml.safe_dump({name: value for name, value in content.items() if value is not None}))
     return path

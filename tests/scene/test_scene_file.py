@@ -1,6 +1,7 @@
 """The file of a scene: what it shows at a time, and one line about what is wrong in it."""
 
 import math
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -15,18 +16,7 @@ from wlm.inspection import inspect
 from wlm.scene.mesh import read_mesh
 
 
-@pytest.fixture(scope="module")
-def room(tmp_path_factory) -> Path:
-    return day_scenes.write_scene(tmp_path_factory.mktemp("room"))
-
-
-@pytest.fixture(scope="module")
-def scene(room):
-    with wlm.scene.load(room) as scene:
-        yield scene
-
-
-def changed(room: Path, old: str, new: str) -> Path:
+def edited(room: Path, old: str, new: str) -> Path:
     text = room.read_text()
     assert old in text
     path = room.with_name("changed.yaml")
@@ -57,19 +47,19 @@ def test_the_camera_is_a_catmull_rom_curve(scene):
     eye, target, fov = scene.camera_at(1.0)
     # Half-way, a cubic with the slopes m is the mean of the ends plus an eighth of the difference of the slopes.
     slopes = np.array([[0.25, 0.0, 0.0], [0.0, 0.0, -0.125]])
-    np.testing.assert_allclose(eye, [0.25, 1.5, 5.0] + 2.0 / 8.0 * (slopes[0] - slopes[1]))
+    np.testing.assert_allclose(eye, [0.25, 1.5, 4.0] + 2.0 / 8.0 * (slopes[0] - slopes[1]))
     np.testing.assert_allclose(target, [0, 1, 0])
     assert fov == 60.0
-    np.testing.assert_array_equal(scene.camera_at(-1.0)[0], [0, 1.5, 5])
-    np.testing.assert_array_equal(scene.camera_at(9.0)[0], [0, 1.5, 4.5])
+    np.testing.assert_array_equal(scene.camera_at(-1.0)[0], [0, 1.5, 4])
+    np.testing.assert_array_equal(scene.camera_at(9.0)[0], [0, 1.5, 3.5])
 
 
 def test_a_moving_object_goes_round_and_looks_ahead(scene):
     (car,) = scene.moving
-    np.testing.assert_allclose(car.pose(1.0)[:3, 3], [0, 0.5, 0], atol=1e-12)
-    np.testing.assert_allclose(car.pose(1.0)[:3, 2], [1, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(car.pose(7.0)[:3, 3], [0, 0.5, 0], atol=1e-12)
-    np.testing.assert_allclose(car.pose(7.0)[:3, 2], [-1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(car.pose(1.0)[:3, 3], [-0.6, 0.2, 0], atol=1e-12)
+    np.testing.assert_allclose(car.pose(1.0)[:3, 2], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(car.pose(7.0)[:3, 3], [-0.6, 0.2, 0], atol=1e-12)
+    np.testing.assert_allclose(car.pose(7.0)[:3, 2], [0, 0, -1], atol=1e-12)
     assert math.isclose(np.linalg.det(car.pose(7.0)[:3, :3]), 1.0)
 
 
@@ -96,18 +86,19 @@ def test_smoke_plays_again(scene):
 )
 def test_one_line_names_the_key(room, old, new, line):
     with pytest.raises(WlmError) as error:
-        wlm.scene.load(changed(room, old, new))
+        wlm.scene.load(edited(room, old, new))
     assert line in str(error.value) and "\n" not in str(error.value) and str(room.parent) in str(error.value)
 
 
 def test_probes_are_needed_by_what_they_light(room):
     rows = "probes:\n- file: probes_0.wlm\n  hour: 0.0\n- file: probes_12.wlm\n  hour: 12.0\n"
     with pytest.raises(WlmError, match="probes: expected at least one entry"):
-        wlm.scene.load(changed(room, rows, ""))
+        wlm.scene.load(edited(room, rows, ""))
 
 
-def test_inspect_describes_the_scene(room):
+def test_inspect_describes_the_scene_and_names_the_command(room):
     (found,) = inspect(room)
+    assert shlex.split(found.command) == ["wlm", "run", str(room), "-o", "DIR"]
     assert found.what == (
         "a scene over 4 s, from 5 h to 29 h: 4 triangles, 2 light groups, probes of 2 hours, 1 moving object, "
         "smoke at 1 place"

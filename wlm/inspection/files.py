@@ -55,6 +55,7 @@ _EXPORTS = {
     "wlm-bevy-irradiance-volume": "an irradiance volume for Bevy",
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
     "wlm-smoke-frames": FRAMES,
+    "wlm-scene-run": "pictures and figures of a scene that wlm run wrote",
 }
 _MODELS = {
     "lightmap": "compressed lightmaps over time",
@@ -366,7 +367,7 @@ def _scene(path: Path) -> Finding:
         if scene.smoke:
             parts.append(f"smoke at {count_of(scene.smoke, 'place')}")
         what = f"a scene over {scene.day.seconds:g} s, from {scene.day.first:g} h to {scene.day.last:g} h: "
-    return Finding(path, what + ", ".join(parts))
+    return Finding(path, what + ", ".join(parts), command("run", path, "-o", "DIR"))
 
 
 def _checkpoint(path: Path) -> Finding:

@@ -3,9 +3,11 @@
 from wlm._facade import facade
 
 _PLACES = {
+    "Frame": "wlm.scene.frame",
     "Mesh": "wlm.scene.mesh",
     "Moving": "wlm.scene.content",
     "Puff": "wlm.scene.content",
+    "Renderer": "wlm.scene.frame",
     "Scene": "wlm.scene.content",
     "load": "wlm.scene.content",
 }

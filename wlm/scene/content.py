@@ -18,6 +18,7 @@ from wlm.formats.reading import named_file
 from wlm.lightmap.hours import DAY, hours_of_names
 from wlm.lightmap.model import LightmapModel
 from wlm.probe.model import ProbeModel
+from wlm.probe.sphere import irradiance, unit_or_zero
 from wlm.scene.file import Day, SceneFile
 from wlm.scene.mesh import Mesh, read_mesh
 from wlm.smoke.data import six_way_files
@@ -57,6 +58,24 @@ class Moving:
             z = np.array([steps[i, 0], 0.0, steps[i, 2]]) / across
             pose[:3, :3] = np.stack([np.cross([0.0, 1.0, 0.0], z), [0.0, 1.0, 0.0], z], 1)
         return pose
+
+    def centre(self, pose: np.ndarray) -> np.ndarray:
+        """Returns the centre of the mesh's bounding box in a pose, float64 [3], where probes are read for it."""
+        position = self.mesh.position.astype(np.float64)
+        return pose[:3, :3] @ (0.5 * (position.min(0) + position.max(0))) + pose[:3, 3]
+
+    def lit(self, pose: np.ndarray, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the vertices in a pose, and their radiance by base colour / pi times irradiance, float32 [V, 3] each.
+
+        Args:
+            pose: [4, 4].
+            coefficients: [9, 3], SH of radiance at the centre.
+        """
+        normal = unit_or_zero(self.mesh.normal @ pose[:3, :3].T)
+        normal[~normal.any(1)] = [0.0, 1.0, 0.0]  # of triangles without area, which are not drawn
+        light = np.maximum(irradiance(coefficients, normal), 0.0)
+        position = self.mesh.position @ pose[:3, :3].T + pose[:3, 3]
+        return position.astype(np.float32), (self.mesh.colour / math.pi * light).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
