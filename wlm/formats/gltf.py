@@ -331,6 +331,43 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
         return normals
 
 
+def vertex_colours(document: GltfDocument, primitives: Sequence[GltfPrimitive]) -> list[np.ndarray]:
+    """Returns the base colours of vertices: `COLOR_0`, or white without it, times the factor of the material.
+
+    Returns:
+        For each primitive float32 [V, 3], linear, from 0 to 1.
+
+    Raises:
+        WlmError: The material reads its base colour from a texture, or see `read_gltf`.
+    """
+    with reported(document.path):
+        colours = []
+        for each in primitives:
+            material = {} if each.material is None else document.item("materials", each.material)
+            shading = material.get("pbrMetallicRoughness", {})
+            if "baseColorTexture" in shading:
+                raise WlmError(
+                    f"{document.path}: materials[{each.material}]: expected a base colour by its factor or COLOR_0, "
+                    "found a texture; store its colours in COLOR_0"
+                )
+            factor = np.array(shading.get("baseColorFactor", (1.0,) * 4), np.float32)
+            if factor.shape != (4,):
+                raise WlmError(f"{document.path}: materials[{each.material}].baseColorFactor: expected four numbers")
+            attributes = document.item("meshes", each.mesh)["primitives"][each.primitive]["attributes"]
+            own = np.ones((len(each.row), 3), np.float32)
+            if "COLOR_0" in attributes:
+                number = attributes["COLOR_0"]
+                kind = "VEC3" if document.item("accessors", number).get("type") == "VEC3" else "VEC4"
+                own = _floats(document, number, kind)
+                if len(own) <= each.row.max():
+                    raise WlmError(
+                        f"{document.path}: {each.name}: expected {each.row.max() + 1} colours or more, found {len(own)}"
+                    )
+                own = own[each.row, :3]
+            colours.append(np.clip(own * factor[:3], 0.0, 1.0))
+        return colours
+
+
 @contextmanager
 def reported(path: str | os.PathLike[str]) -> Iterator[None]:
     """Turns exceptions that malformed JSON of a glTF file causes in the block into one-line errors."""

@@ -375,16 +375,28 @@ class VirtualTexture:
         shape = np.shape(sheet) if not isinstance(sheet, wp.array) else sheet.shape
         flat = [np.asarray(part.numpy() if isinstance(part, wp.array) else part) for part in (sheet, uv, derivatives)]
         with interop.stream(self.device):
-            points = self._points(flat[0].reshape(-1), flat[1].reshape(-1, 2), flat[2].reshape(-1, 4), 1)
-            count = len(points[0])
-            light = wp.empty(count, dtype=wp.vec3, device=self.device)
-            coarser = wp.empty(count, dtype=int, device=self.device)
-            change = wp.empty(count, dtype=float, device=self.device)
-            clock = self._frame_work.clock
-            kernels.sample(self.texture, self._pages, self._slots, clock, points, light, coarser, change)
+            light, coarser, change = self.read(flat[0].reshape(-1), flat[1].reshape(-1, 2), flat[2].reshape(-1, 4))
             return Reading(
                 light.numpy().reshape(*shape, 3), coarser.numpy().reshape(shape), change.numpy().reshape(shape)
             )
+
+    def read(self, sheet: Any, uv: Any, derivatives: Any) -> tuple[wp.array, wp.array, wp.array]:
+        """Reads light as `sample` does, without a copy to the host: the fields of a `Reading` on the device.
+
+        Args:
+            sheet, uv, derivatives: As for `frame`, but with one axis, of n points.
+
+        Returns:
+            `wp.vec3` [n], int [n] and float [n].
+        """
+        with interop.stream(self.device):
+            points = self._points(sheet, uv, derivatives, 1)
+            light, coarser, change = (
+                wp.empty(len(points[0]), dtype=dtype, device=self.device) for dtype in (wp.vec3, int, float)
+            )
+            clock = self._frame_work.clock
+            kernels.sample(self.texture, self._pages, self._slots, clock, points, light, coarser, change)
+            return light, coarser, change
 
     def state(self) -> State:
         """Copies the physical texture and the tables from the device to the host."""
