@@ -16,6 +16,7 @@ LAYERS = (
     ["wlm.fluid"],
     ["wlm.lightmap", "wlm.atlas", "wlm.probe", "wlm.smoke"],
     ["wlm.bake"],
+    ["wlm.scene"],
     ["wlm.inspection"],
     ["wlm.export", "wlm.view"],
     ["wlm.cli"],

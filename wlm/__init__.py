@@ -9,14 +9,15 @@
 
 `wlm.lightmap`, `wlm.atlas`, `wlm.probe` and `wlm.smoke` have the same functions, and `load` reads the files of all.
 `wlm.fluid` simulates smoke, `wlm.ops` has the kernels as differentiable torch operations, `wlm.export` writes folders,
-kits for engines and HTML pages, `wlm.inspection` describes files, and `wlm.bake` makes inputs.
+kits for engines and HTML pages, `wlm.inspection` describes files, `wlm.bake` makes inputs, and `wlm.scene` reads a
+scene that all four systems light over a day.
 """
 
 from wlm._facade import facade
 
 __version__ = "0.1.0"
 
-_PACKAGES = ("atlas", "bake", "export", "fluid", "inspection", "lightmap", "ops", "probe", "smoke")
+_PACKAGES = ("atlas", "bake", "export", "fluid", "inspection", "lightmap", "ops", "probe", "scene", "smoke")
 _PLACES = {name: f"wlm.{name}" for name in _PACKAGES} | {"WlmError": "wlm.errors", "load": "wlm.system"}
 
 __all__ = sorted([*_PLACES, "__version__"])

@@ -7,6 +7,7 @@ from wlm import inspection as inspection
 from wlm import lightmap as lightmap
 from wlm import ops as ops
 from wlm import probe as probe
+from wlm import scene as scene
 from wlm import smoke as smoke
 from wlm.errors import WlmError as WlmError
 from wlm.system import load as load

@@ -36,6 +36,8 @@ from wlm.formats.meshes import read_mesh
 from wlm.inspection import inspect
 from wlm.inspection.finding import UNREADABLE
 from wlm.probe.data import load_positions
+from wlm.scene.file import SceneFile
+from wlm.scene.mesh import read_mesh as read_coloured
 from wlm.smoke.data import load_frames, read_shaded
 from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.network.settings import DatasetSettings
@@ -175,6 +177,22 @@ def _own_lights() -> Sequence[bytes]:
         content["nodes"][1]["extensions"], content["extensions"] = node, root
         scenes.append(json.dumps(content).encode())
     return scenes
+
+
+def _coloured() -> Sequence[bytes]:
+    """A glTF file whose positions are its normals and its base colours, too."""
+    (plain,) = corpus("mesh.gltf")()
+    content = json.loads(plain)
+    content["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [0.5, 1.0, 0.25, 1.0]}}]
+    for primitive in (each for mesh in content["meshes"] for each in mesh["primitives"]):
+        attributes = primitive["attributes"]
+        attributes["NORMAL"] = attributes["COLOR_0"] = attributes["POSITION"]
+        primitive["material"] = 0
+    return [json.dumps(content).encode()]
+
+
+def _colours(path: Path) -> None:
+    check_finite(**vars(read_coloured(path, with_uv=True)))
 
 
 def _own_lit(path: Path) -> None:
@@ -481,6 +499,7 @@ _ALL = (
     Reader("glb", "a.glb", corpus("mesh.glb"), vary_glb, _mesh, _light, cost=2),
     Reader("gltf-lights", "a.gltf", _own_lights, vary_gltf, _own_lit, cost=2),
     Reader("gltf-bake", "a.gltf", corpus("mesh.gltf"), vary_gltf, _surfaces, _light, cost=2),
+    Reader("gltf-colours", "a.gltf", _coloured, vary_gltf, _colours, cost=2),
     Reader("obj", "a.obj", corpus("mesh.obj"), _obj_lines, _obj, _light),
     Reader("atlas-lights", "lights.json", _light_lists, _json, read_listing),
     Reader("probes-npz", "a.npz", corpus("probes.npz", "probes-known.npz"), vary_npz, _probes),
@@ -506,6 +525,7 @@ _ALL = (
     _settings("yaml-smoke-network", lambda: wlm.smoke.Profile, "smoke-network-*"),
     _settings("yaml-scene", lambda: Scene, "smoke-*", _scene_figures),
     _settings("yaml-dataset", lambda: DatasetSettings, "dataset"),
+    _settings("yaml-day", lambda: SceneFile, "day"),
 )
 
 READERS: dict[str, Reader] = {reader.name: reader for reader in _ALL}

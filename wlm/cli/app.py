@@ -23,6 +23,7 @@ from typer.core import TyperGroup
 from wlm import __version__
 from wlm.cli import bake, doctor, inspect, smoke, verbs, view, web
 from wlm.cli import probe_volume as probe
+from wlm.cli import run as run_scene
 from wlm.cli.signals import exit_code, handled
 from wlm.errors import WlmError, one_line
 
@@ -154,6 +155,7 @@ for _name, _about in (
 app.command()(inspect.inspect)
 app.command()(view.view)
 app.command()(web.web)
+app.command()(run_scene.run)
 app.command()(doctor.doctor)
 app.add_typer(probe.app, name="probe")
 app.add_typer(smoke.app, name="smoke")

@@ -24,6 +24,7 @@ from wlm.cli.console import (
 from wlm.cli.options import (
     AsJson,
     CheckpointEvery,
+    Colours,
     Device,
     Encoding,
     Engine,
@@ -35,6 +36,7 @@ from wlm.cli.options import (
     Seed,
     ShaderLanguage,
     Trust,
+    Weights,
     output_option,
 )
 from wlm.cli.settings import with_settings
@@ -210,20 +212,8 @@ def decode(
     atlas: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the atlas; default the first that has the layer.")
     ] = None,
-    weights: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--weight", metavar="GROUP=NUMBER", help="Factor of a light group, 0: off; default 1. May be repeated."
-        ),
-    ] = None,
-    colours: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--colour",
-            metavar="GROUP=R,G,B",
-            help="Factors of red, green and blue of a light group, besides its weight. May be repeated.",
-        ),
-    ] = None,
+    weights: Weights = None,
+    colours: Colours = None,
     device: Device = "cpu",
 ) -> None:
     """Decode a whole lightmap at one time: the sum of its light groups."""
@@ -237,7 +227,7 @@ def decode(
     model = load(file, "lightmap")
     sheets = model.layer(layer, atlas)
     decoder = model.decoder(device)
-    decoder.set_weights(_weights(weights, colours))
+    decoder.set_weights(group_weights(weights, colours))
     frame = decoder.frame(time, layer, atlas)
     names = [name for sheet in sheets if sheet.group == sheets[0].group for name in sheet.channels]
     write_planes(output, dict(zip(names, np.moveaxis(frame, 2, 0), strict=True)))
@@ -308,7 +298,7 @@ def _by_group(option: str, given: list[str] | None, value: str) -> dict[str, str
     return result
 
 
-def _weights(weights: list[str] | None, colours: list[str] | None) -> dict[str, list[float]]:
+def group_weights(weights: list[str] | None, colours: list[str] | None) -> dict[str, list[float]]:
     """Returns the factors of red, green and blue of the groups that the options name."""
     factors: dict[str, list[float]] = {}
     for option, given, value, count in (("--weight", weights, "NUMBER", 1), ("--colour", colours, "R,G,B", 3)):

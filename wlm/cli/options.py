@@ -69,6 +69,22 @@ Key = Annotated[
 ]
 
 
+Weights = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--weight", metavar="GROUP=NUMBER", help="Factor of a light group, 0: off; default 1. May be repeated."
+    ),
+]
+Colours = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--colour",
+        metavar="GROUP=R,G,B",
+        help="Factors of red, green and blue of a light group, besides its weight. May be repeated.",
+    ),
+]
+
+
 def output_option(metavar: str, help_text: str) -> Any:
     """Returns the typer option `--output` (`-o`) for the annotation of a path."""
     return typer.Option("--output", "-o", metavar=metavar, help=help_text)

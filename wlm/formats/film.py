@@ -1,10 +1,11 @@
-"""Writing of H.264 films (`.mp4`), frame by frame, by the ffmpeg of an optional package."""
+"""Writing of films, frame by frame: H.264 (`.mp4`) by the ffmpeg of an optional package, and animated WebP."""
 
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
+from PIL import Image
 
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
@@ -14,18 +15,27 @@ EXTRA = "film"
 """The optional extra with the package that writes films."""
 
 _QUALITY = 8  # imageio-ffmpeg's quality, 0 to 10
+_WEBP_QUALITY = 80  # Pillow's quality, 0 to 100
 
 
 @contextmanager
 def film(path: str | os.PathLike[str], height: int, width: int, rate: float) -> Iterator[Callable[[np.ndarray], None]]:
-    """Writes an `.mp4` film atomically, at the end of the block.
+    """Writes an `.mp4` film or an animated `.webp` atomically, at the end of the block.
 
-    Yields a function that adds a frame, uint8 [height, width, 3] in sRGB. Sizes must be even, since chroma has half the
-    resolution; `rate` is the number of frames per second.
+    Yields a function that adds a frame, uint8 [height, width, 3] in sRGB. Sizes of an `.mp4` must be even, since chroma
+    has half the resolution; frames of a `.webp` stay in memory until the end. `rate` is the number of frames a second.
 
     Raises:
         WlmError: The package is missing, a size is odd, or the file cannot be written.
     """
+    if os.fspath(path).lower().endswith(".webp"):
+        pictures: list[Image.Image] = []
+        yield lambda pixels: pictures.append(Image.fromarray(pixels))
+        ends = np.round(1000.0 / rate * np.arange(len(pictures) + 1)).astype(int)  # milliseconds
+        options = {"append_images": pictures[1:], "duration": np.diff(ends).tolist(), "quality": _WEBP_QUALITY}
+        with atomic_path(path) as part:
+            pictures[0].save(part, "WEBP", save_all=True, loop=0, **options)
+        return
     if height % 2 or width % 2:
         raise WlmError(f"{path}: expected frames of even width and height, found {width} x {height} pixels")
     ffmpeg = need("imageio_ffmpeg", EXTRA)

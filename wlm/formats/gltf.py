@@ -30,6 +30,7 @@ a file missing or damaged             error that names the file, and the field
 
 import base64
 import binascii
+import json
 import os
 import re
 import struct
@@ -309,12 +310,18 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
     with reported(document.path):
         transforms = dict(_walk(document))
         normals: list[np.ndarray | None] = []
+        stored: dict[int, np.ndarray] = {}  # primitives often share their accessors
+        budget = Budget(document.path, document.most, "stored normals")
         for each in primitives:
             attributes = document.item("meshes", each.mesh)["primitives"][each.primitive]["attributes"]
             if "NORMAL" not in attributes:
                 normals.append(None)
                 continue
-            local = _floats(document, attributes["NORMAL"], "VEC3")
+            number = attributes["NORMAL"]
+            if number not in stored:
+                budget.spend(_count(document, number))
+                stored[number] = _floats(document, number, "VEC3")
+            local = stored[number]
             if len(local) <= each.row.max():
                 raise WlmError(
                     f"{document.path}: {each.name}: expected {each.row.max() + 1} normals or more, found {len(local)}"
@@ -329,6 +336,43 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
             good = np.isfinite(length) & (length > 0)
             normals.append(np.divide(turned, length, out=np.zeros_like(turned), where=good))
         return normals
+
+
+def vertex_colours(document: GltfDocument, primitives: Sequence[GltfPrimitive]) -> list[np.ndarray]:
+    """Returns the base colours of vertices: `COLOR_0`, or white without it, times the factor of the material.
+
+    Returns:
+        For each primitive float32 [V, 3], linear, from 0 to 1.
+
+    Raises:
+        WlmError: The material reads its base colour from a texture, or see `read_gltf`.
+    """
+    with reported(document.path):
+        colours = []
+        for each in primitives:
+            material = {} if each.material is None else document.item("materials", each.material)
+            shading = material.get("pbrMetallicRoughness", {})
+            if "baseColorTexture" in shading:
+                raise WlmError(
+                    f"{document.path}: materials[{each.material}]: expected a base colour by its factor or COLOR_0, "
+                    "found a texture; store its colours in COLOR_0"
+                )
+            factor = np.array(shading.get("baseColorFactor", (1.0,) * 4), np.float32)
+            if factor.shape != (4,):
+                raise WlmError(f"{document.path}: materials[{each.material}].baseColorFactor: expected four numbers")
+            attributes = document.item("meshes", each.mesh)["primitives"][each.primitive]["attributes"]
+            own = np.ones((len(each.row), 3), np.float32)
+            if "COLOR_0" in attributes:
+                number = attributes["COLOR_0"]
+                kind = "VEC3" if document.item("accessors", number).get("type") == "VEC3" else "VEC4"
+                own = _floats(document, number, kind)
+                if len(own) <= each.row.max():
+                    raise WlmError(
+                        f"{document.path}: {each.name}: expected {each.row.max() + 1} colours or more, found {len(own)}"
+                    )
+                own = own[each.row, :3]
+            colours.append(np.clip(own * factor[:3], 0.0, 1.0))
+        return colours
 
 
 @contextmanager
@@ -620,7 +664,7 @@ def texture_transform(where: str, info: dict) -> tuple[int | None, np.ndarray]:
     KHR_texture_transform, float64 [2, 3]: UV' = transform[:, :2] UV + transform[:, 2].
 
     Raises:
-        WlmError: The transform is malformed; `where` names the slot.
+        WlmError: The transform or the UV set is malformed; `where` names the slot.
     """
     transform = info.get("extensions", {}).get("KHR_texture_transform", {})
     names = {"scale": [1.0, 1.0], "rotation": 0.0, "offset": [0.0, 0.0]}
@@ -633,7 +677,10 @@ def texture_transform(where: str, info: dict) -> tuple[int | None, np.ndarray]:
         )
     cosine, sine = np.cos(turn), np.sin(turn)
     matrix = np.column_stack([np.array([[cosine, sine], [-sine, cosine]]) * scale, offset])
-    return transform.get("texCoord", info.get("texCoord")), matrix
+    number = transform.get("texCoord", info.get("texCoord"))
+    if number is not None and (not isinstance(number, int) or number < 0):
+        raise WlmError(f"{where}: texCoord: expected the number of a UV set, found {json.dumps(number)[:60]}")
+    return number, matrix
 
 
 def image_file(document: GltfDocument, number: int) -> Path:

@@ -55,6 +55,7 @@ _EXPORTS = {
     "wlm-bevy-irradiance-volume": "an irradiance volume for Bevy",
     "wlm-bundle": "a model that wlm export wrote: textures, buffers and a shader",
     "wlm-smoke-frames": FRAMES,
+    "wlm-scene-run": "pictures and figures of a scene that wlm run wrote",
 }
 _MODELS = {
     "lightmap": "compressed lightmaps over time",
@@ -318,6 +319,8 @@ def _settings(path: Path) -> Finding:
         return Finding(path, what, command("smoke", "simulate", path, "-o", "DIR"))
     if "geometry" in values:
         return _bake_scene(path)
+    if "light" in values:
+        return _scene(path)
     fitting, faults = [], {}
     for system in _MODELS:
         profile = import_module(f"wlm.{system}").Profile
@@ -350,6 +353,21 @@ def _bake_scene(path: Path) -> Finding:
     if find_spec("mitsuba") is None:
         problems.append("wlm bake needs Mitsuba: pip install 'wlm[bake]'")
     return Finding(path, what, command("bake", *use), tuple(problems))
+
+
+def _scene(path: Path) -> Finding:
+    from wlm.scene import load as load_scene
+
+    with load_scene(path) as scene:
+        parts = [f"{len(scene.mesh.triangle):,} triangles", count_of(scene.light.groups, "light group")]
+        if scene.probes:
+            parts.append(f"probes of {count_of(scene.probes, 'hour')}")
+        if scene.moving:
+            parts.append(count_of(scene.moving, "moving object"))
+        if scene.smoke:
+            parts.append(f"smoke at {count_of(scene.smoke, 'place')}")
+        what = f"a scene over {scene.day.seconds:g} s, from {scene.day.first:g} h to {scene.day.last:g} h: "
+    return Finding(path, what + ", ".join(parts), command("run", path, "-o", "DIR"))
 
 
 def _checkpoint(path: Path) -> Finding:

@@ -130,6 +130,11 @@ class Canvas:
         actor.prop.SetScalarOpacityUnitDistance(voxel)
         self._drawn[panel, name] = actor, grid
 
+    def background(self, panel: int, colour: np.ndarray) -> None:
+        """Fills a panel behind the meshes with a colour [3] in [0, 1]."""
+        self._plotter.subplot(0, panel)
+        self._plotter.set_background(tuple(map(float, colour)), all_renderers=False)
+
     def hide(self, panel: int, *names: str) -> None:
         """Hides meshes; names that were never drawn are ignored."""
         for name in names:

@@ -538,9 +538,18 @@ def select(pages: Pages, slots: Slots, tolerance: float, work: Work, jobs: Jobs)
     wp.launch(_allocate, count, inputs=[pages, slots, size, work, jobs], device=device)
 
 
-def most_blocks(decodes: int, texels: int) -> int:
-    """Returns the most blocks that the pages of a frame need, see `matrix_pages`, for the texels of a page."""
-    return decodes + -(-max(SAMPLES * decodes, MOST_SAMPLES) * texels // BLOCK)
+def most_blocks(decodes: int, texels: int, levels: np.ndarray) -> int:
+    """Returns the most blocks that the pages of a frame need, see `matrix_pages`.
+
+    Args:
+        decodes: Most pages of a frame.
+        texels: Texels of a page.
+        levels: int [P], the level of each page.
+    """
+    samples = np.where(levels < COARSE_LEVEL, 4 ** np.minimum(levels, 2), 1)
+    # Each page may be decoded for a coming switch too.
+    every = 2 * int((-(-texels * samples // BLOCK)).sum())
+    return min(decodes + -(-max(SAMPLES * decodes, MOST_SAMPLES) * texels // BLOCK), every)
 
 
 def refer(pages: Pages) -> None:

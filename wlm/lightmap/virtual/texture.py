@@ -219,6 +219,7 @@ class VirtualTexture:
         self._frame_work = struct(kernels.Work, counters=(7, 0), asked=(2, count, 0), **frame, **most)
         jobs = {"target": (self.decodes, 0), "slot": (self.decodes, -1), "first": (self.decodes + 1, 0)}
         self._jobs = struct(page_kernels.Jobs, place=np.zeros((self.decodes, 4), np.int32), **jobs)
+        self._blocks = kernels.most_blocks(self.decodes, edge * edge, layout.place[:, 1])
         self.texture = wp.zeros((self.slots, edge, edge), dtype=wp.uint32, device=self.device)
         self.table = self._pages.table
         self._look = kernels.Look(self._frame_work)
@@ -237,9 +238,7 @@ class VirtualTexture:
             array.assign(values)
         self._slots.mark.assign(mark)
         # One after another: together they may take more samples than a frame.
-        first = np.full(
-            self.decodes + 1, kernels.most_blocks(self.decodes, self.texture.shape[1] * self.texture.shape[2]), np.int32
-        )
+        first = np.full(self.decodes + 1, self._blocks, np.int32)
         first[0] = 0
         jobs.first.assign(first)
         for page in whole.tolist():
@@ -315,9 +314,8 @@ class VirtualTexture:
     def _decode(self) -> None:
         if self.device == "cpu" and not (self._jobs.slot.numpy() >= 0).any():
             return
-        blocks = kernels.most_blocks(self.decodes, self.texture.shape[1] * self.texture.shape[2])
         for store in self._stores:
-            store.decode(self._frame_work.clock, store.offsets, self._jobs, False, self.texture, blocks)
+            store.decode(self._frame_work.clock, store.offsets, self._jobs, False, self.texture, self._blocks)
 
     def _points(self, sheet: Any, uv: Any, derivatives: Any, axes: int) -> tuple[wp.array, wp.array, wp.array]:
         """Converts the arguments to arrays on the device: those that are there already are not copied."""
@@ -369,16 +367,28 @@ class VirtualTexture:
         shape = np.shape(sheet) if not isinstance(sheet, wp.array) else sheet.shape
         flat = [np.asarray(part.numpy() if isinstance(part, wp.array) else part) for part in (sheet, uv, derivatives)]
         with interop.stream(self.device):
-            points = self._points(flat[0].reshape(-1), flat[1].reshape(-1, 2), flat[2].reshape(-1, 4), 1)
-            count = len(points[0])
-            light = wp.empty(count, dtype=wp.vec3, device=self.device)
-            coarser = wp.empty(count, dtype=int, device=self.device)
-            change = wp.empty(count, dtype=float, device=self.device)
-            clock = self._frame_work.clock
-            kernels.sample(self.texture, self._pages, self._slots, clock, points, light, coarser, change)
+            light, coarser, change = self.read(flat[0].reshape(-1), flat[1].reshape(-1, 2), flat[2].reshape(-1, 4))
             return Reading(
                 light.numpy().reshape(*shape, 3), coarser.numpy().reshape(shape), change.numpy().reshape(shape)
             )
+
+    def read(self, sheet: Any, uv: Any, derivatives: Any) -> tuple[wp.array, wp.array, wp.array]:
+        """Reads light as `sample` does, without a copy to the host: the fields of a `Reading` on the device.
+
+        Args:
+            sheet, uv, derivatives: As for `frame`, but with one axis, of n points.
+
+        Returns:
+            `wp.vec3` [n], int [n] and float [n].
+        """
+        with interop.stream(self.device):
+            points = self._points(sheet, uv, derivatives, 1)
+            light, coarser, change = (
+                wp.empty(len(points[0]), dtype=dtype, device=self.device) for dtype in (wp.vec3, int, float)
+            )
+            clock = self._frame_work.clock
+            kernels.sample(self.texture, self._pages, self._slots, clock, points, light, coarser, change)
+            return light, coarser, change
 
     def state(self) -> State:
         """Copies the physical texture and the tables from the device to the host."""
