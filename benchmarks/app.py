@@ -67,6 +67,9 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
         _Path, "--mask", help="Image that is white at valid texels of --lightmap.", metavar="FILE.png"
     ),
     "scene_path": _option(Path, "--set", ..., help="Lightmap set that names its mesh.", metavar="SET"),
+    "walked_path": _option(
+        _Path, "--set", help="Lightmap set that names its mesh. Default: a large set of random maps.", metavar="SET"
+    ),
     "hours": _option(list[float] | None, "--hour", help="Hour of the set to measure. Repeatable; default: all."),
     "side": _option(int | None, "--side", help="Texels of the set's longer side after downsampling.", min=1),
     "budget": _option(
@@ -90,8 +93,12 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("quick", "device"),
     ),
     "lightmap-run-time": (
-        "Measure the virtual texture of lightmaps: frames of a walk and a day through a set and a large set.",
-        ("scene_path", "quick", "device"),
+        "Measure the virtual texture of lightmaps and its rivals: frames of a walk and a day through a set.",
+        ("walked_path", "quick", "device"),
+    ),
+    "shader-speed": (
+        "Measure the exported shaders of lightmaps on a GPU, beside our decoder.",
+        ("quick", "device"),
     ),
     "lightmap-ablation": (
         "Measure lightmaps over time: other feature maps of equal size, or no simulation of block compression.",

@@ -11,6 +11,9 @@ The results table has these kinds of rows:
   alone errs by 0.00196, half a level.
 - method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
   (`wlm.lightmap.runtime`): its errors, and the time to decode it.
+- method "pages", one row for each profile with networks: all pages of all mips as a virtual texture holds them, RGB9E5
+  with a border of 4 texels, from one list (`wlm.lightmap.virtual`): errors of the texels of the map, the largest as for
+  "exact", and the time to decode all pages.
 - the rivals of `benchmarks.rivals.lightmap`, on the same lightmaps: block codecs, temporal PCA, a neural texture codec
   and a video codec; between stored times their lightmaps are interpolated linearly.
 - method "fit", one row for each profile: the speed of the fit alone. Method "fit in plain torch" has the speed of the
@@ -59,6 +62,7 @@ from wlm.lightmap.runtime import (
 )
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, place
 from wlm.lightmap.view_scores import VIEWS, Tally, views_of
+from wlm.lightmap.virtual.texture import STRIDE, VirtualTexture
 from wlm.metrics import METRICS, FrameMetrics, evaluate_frame, summarise
 
 PROFILES = ("L", "M", "H", "M64", "standard", "fine", "M-paper")
@@ -76,6 +80,8 @@ _QUICK_SAMPLES = 2048
 _QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
 _FULL_TILES = 64  # tiles of a lightmap of 1024 x 1024
 _PLAIN_STEPS = {"cpu": 10, "cuda": 1000}  # steps of the fit in plain torch that are timed
+_ALL, _PAGES = 1 << 40, 1024  # bytes of a virtual texture that holds all pages; most pages that it decodes at once
+_PAGE_FRAMES = 2  # frames after which all pages of a time are there
 _LOADS = 50  # tiles that are unpacked for the time of one
 _ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
 
@@ -156,7 +162,10 @@ def run_rows(
         raise ValueError("expected at least one profile and one time")
     bench = _LightmapBench(lightmaps, np.asarray(chosen), device, progress, repeats)
     fits = [bench.fit_profile(profile) for profile in profiles]
-    peers = [row(fit) for fit in fits for row in (bench.profile_row, bench.texture_row)]
+    peers = []
+    for fit in fits:
+        makers = (bench.profile_row, bench.texture_row, *[bench.pages_row] * bool(len(fit.model.light.mapped)))
+        peers += [make(fit) for make in makers]
     best = next((fit for fit in fits if fit.option == "M"), fits[0])
     if len(best.model.light.mapped):
         # On the CPU "fast" is "tanh".
@@ -186,6 +195,23 @@ def _repeated(model: SheetModel, count: int) -> SheetModel:
     arrays = {name: np.concatenate([array] * count) for name, array in model.parts.items()}
     width, height = TILE * len(model.kind), TILE * count
     return replace(model, width=width, height=height, mask=np.ones((height, width), bool), **arrays)
+
+
+def _view_of_all_pages(texture: VirtualTexture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns sheet, UV and derivatives of a view that needs every page: a square of pixels for each."""
+    layout, own = texture.layout, texture.layout.models[0]
+    _, level, row, column = layout.place.T
+    texel = 2.0 ** (level + 0.01)[:, None] / [own.width, own.height]
+    uv = (np.stack([column, row], 1) + 0.5) * layout.side * 2.0 ** level[:, None] / [own.width, own.height]
+    slopes = np.stack([texel[:, 0], 0.0 * level, 0.0 * level, texel[:, 1]], 1)
+    zero = np.zeros((STRIDE, STRIDE * len(level)), np.int32)
+    return zero, *(np.repeat(part[None], STRIDE, 0).repeat(STRIDE, 1).astype(np.float32) for part in (uv, slopes))
+
+
+def _texels(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns sheet, UV and derivatives at the centre of each texel of a map."""
+    y, x = (np.mgrid[: shape[0], : shape[1]] + 0.5) / np.reshape(shape, (2, 1, 1))
+    return np.zeros(shape, np.int32), np.stack([x, y], 2), np.zeros((*shape, 4), np.float32)
 
 
 def _load_ms(model: SheetModel) -> float | None:
@@ -276,6 +302,31 @@ class _LightmapBench(Bench):
         )
         decoder.set_time(self.times[0])
         return row, self.replay(decoder.decode)
+
+    def pages_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
+        """Returns the row of the pages of a virtual texture, and a call that decodes all of them."""
+        self.note(f"{fit.option}: measuring the pages")
+        texture, timed = (
+            VirtualTexture(fit.model, self.device, budget=_ALL, decodes=_PAGES, tolerance=1e-6) for _ in range(2)
+        )
+        view, found, worst = _view_of_all_pages(texture), [], 0.0
+        for t in self.times:
+            for _ in range(_PAGE_FRAMES):
+                texture.frame(t, *view)
+            found.append(texture.sample(*_texels(self.lightmaps.mask.shape)).light)
+            if t in self.error_times:
+                worst = max(worst, self._largest_error(fit.model.light, found[-1], t))
+        timed.frame(self.times[-1], *view)  # all pages are missing, so that its list has all of them
+        row = self.row(
+            "pages",
+            fit.option,
+            f"{self.scored_at}errors of the map itself, the largest as a share of 255; time of all pages of all mips "
+            f"with borders of {texture.layout.border} texels, {self.mode}",
+            max_error=worst,
+            pages_decoded=timed.report()["decoded"],
+            **self._score(found, fit.option, ("psnr",)),
+        )
+        return row, self.replay(timed.stages["decode"])
 
     def option_row(self, fit: Fit, path: str, gelu: str) -> tuple[Row, Callable[[], object]]:
         """Returns the row of one decoding kernel with one form of the GELU, and a call that decodes with it."""
@@ -369,6 +420,18 @@ class _LightmapBench(Bench):
             steps=steps,
         )
         return [row]
+
+    def _largest_error(self, model: SheetModel, light: np.ndarray, t: float) -> float:
+        """Returns the largest error of valid texels, in gamma space and relative to a tile's bound."""
+        worst = 0.0
+        for number in np.flatnonzero(model.kind != TileKind.EMPTY).tolist():
+            window, peak = self.grid.window(number), bound64(model, number, t)
+            valid = self.lightmaps.mask[window]
+            if peak > 0.0 and valid.any():
+                exact = np.minimum(colour_tile64(model, number, t) / peak, 1.0)[: len(valid), : valid.shape[1]]
+                colour = np.minimum(light[window] ** (1.0 / model.profile.gamma) / peak, 1.0)
+                worst = max(worst, float(np.abs(colour - exact)[valid].max()))
+        return worst
 
     def _assembled(self, tiles: np.ndarray) -> np.ndarray:
         image = np.zeros((self.grid.height, self.grid.width, 3), tiles.dtype)

@@ -1,4 +1,4 @@
-"""Measures the virtual texture of lightmaps as a renderer uses it: a walk and a day through a set and a large set.
+"""Measures the virtual texture of lightmaps as a renderer uses it: a walk and a day through a set, or a large set.
 
 A row is one path of a camera at 1280 x 720 pixels, with one setting:
 
@@ -8,22 +8,31 @@ A row is one path of a camera at 1280 x 720 pixels, with one setting:
 
 `frame_ms` is the time of a frame on the device, without the gaps of the host that queues it: on CUDA a short wait is
 queued first. `current` is the share of pixels that show the page that they need, with its light changed by at most the
-tolerance; `nearly_current` also counts pages that are one level coarser. `cached_psnr` compares views, as a screen
-shows them, with views in which every page is decoded at the frame's time; `view_psnr` compares them with the
-uncompressed lightmaps, and `gain` is its difference to that of the views with every page decoded.
+tolerance; `nearly_current` also counts pages that are one level coarser. `staleness` is the relative change of a page's
+light since the time for which it was decoded, over pixels. `cached_psnr` compares views, as a screen shows them, with
+views in which every page is decoded at the frame's time; `view_psnr` and `view_flip` compare them with the uncompressed
+lightmaps, read trilinearly, and `gain` is the difference of their PSNR to that of the views with every page decoded.
+Views are compared at a quarter of their pixels.
+
+The rivals of `benchmarks.rivals.lightmap_run_time` show the same views at the same times: all maps decoded in each
+frame or at each stored time, and all lightmaps as blocks of BC7 or BC6H on the GPU. `frame_ms` of a rival has no upload
+of numbers of the time, and no reading of textures, which `shader-speed` measures; its views are read trilinearly from
+means of the decoded texels.
 
 Rows "format" have the error of the physical texture's format beside its rival, 8 bits per channel in gamma space
 relative to the bound of a page. Rows "mips" have the error of the mips, whose texels are means of 16 samples, against
 means of all texels. Both are of the uncompressed lightmaps; `texel_rms` is relative to a texel's brightest channel.
 
-The large set has four sheets of 4096 x 4096 texels at 26 times, of random maps and networks that change about as much
-in an hour as a real set does. Its sheets are a plain on which the camera walks. Only some of its tiles are on the
-device.
+The large set, which is measured if no set is given, has four sheets of 4096 x 4096 texels at 26 times, of random maps
+and networks that change about as much in an hour as a real set does. Its sheets are a plain on which the camera walks.
+Only some of its tiles are on the device.
 """
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 from unittest import mock
 
@@ -31,6 +40,8 @@ import numpy as np
 import torch
 import warp as wp
 
+from benchmarks.rivals.lightmap import RIVALS
+from benchmarks.rivals.lightmap_run_time import Blocks, EveryFrame, EveryTime, neighbours
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm import interop
@@ -38,14 +49,14 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
 from wlm.formats.geometry import read_geometry
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
-from wlm.lightmap.data import LightmapSet, load
+from wlm.lightmap.data import LightmapSet, SheetFrames, load
 from wlm.lightmap.fit import compress
 from wlm.lightmap.model import LightmapModel, SheetModel, part_table
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.sheet import Sheet
 from wlm.lightmap.tiles import TILE, TileKind
-from wlm.lightmap.virtual.texture import VirtualTexture
-from wlm.metrics import psnr_from_mse
+from wlm.lightmap.virtual.texture import BUDGET, Reading, VirtualTexture
+from wlm.metrics import Pictures, psnr_from_mse
 from wlm.ops import raster
 from wlm.texels import exposure, filmic, nearest_valid, to_srgb
 
@@ -56,6 +67,8 @@ _SCORED, _QUICK_SCORED = 40, 4  # one of so many frames is scored
 _WALK_HOURS = (18.4, 18.57)
 _LARGE, _SHEETS, _LARGE_TIMES = 4096, 4, 26
 _LARGE_BUDGET, _LARGE_TILES = 32 << 20, 24 << 20
+_SPARSE = 2  # distance along both axes of the pixels whose colours are compared
+_BLOCKS = ("bc7", "bc6h")
 _METRES = 128.0  # side of a sheet of the large set
 _ALL = 1 << 40  # bytes: the pages of all levels
 _EVERY = 6  # one of so many times is measured in a quick run
@@ -67,59 +80,96 @@ View = tuple[wp.array, wp.array, wp.array]
 Camera = Callable[[float], View]
 
 
-def run(*, scene_path: str | os.PathLike[str], quick: bool, device: str, progress: Note | None = None) -> list[Row]:
-    """Measures the virtual texture on a set with profile M, and on the large set.
+def run(
+    *, walked_path: str | os.PathLike[str] | None = None, quick: bool, device: str, progress: Note | None = None
+) -> list[Row]:
+    """Measures the virtual texture of one set with profile M, or of the large set.
 
     Args:
-        scene_path: A lightmap set that names its mesh.
+        walked_path: A lightmap set that names its mesh; None: the large set.
         quick: Whether to fit for 200 steps, and to draw few and small frames of a large set of 512 x 512 texels.
         device: "cpu" or "cuda:0".
         progress: Called with a line before each part of the work.
 
     Returns:
-        Three rows for each of the two sets: a walk, and a day with 8 and with 64 pages per frame; and the rows of
-        formats and mips.
+        Three rows: a walk, and a day with 8 and with 64 pages per frame; then the rows of the rivals in the walk and
+        in the day, and of a set those of formats and mips.
 
     Raises:
         WlmError: The set, its mesh or the device does not exist.
     """
-    lightmaps = load(scene_path)
-    bench = _RunTime("lightmap", device, progress, scene=lightmaps.name, clock="frame_ms")
+    if walked_path is None:
+        side = 512 if quick else _LARGE
+        bench = _RunTime(f"{side} x {side} x {_LARGE_TIMES} x {_SHEETS}", quick, device, progress)
+        bench.note("making its tiles")
+        model = large_model(side)
+        return bench.rows(model, _PlainCamera(side, bench.size, bench.device), None, _LARGE_BUDGET, _LARGE_TILES)
+    lightmaps = load(walked_path)
+    bench = _RunTime(f"{lightmaps.name}, run time", quick, device, progress)
     if lightmaps.light.mesh is None:
         raise WlmError(f"{lightmaps.name}: expected a set that names its mesh, for a walk through it")
-    bench.quick, bench.size = quick, _QUICK_SIZE if quick else _SIZE
     bench.note("fitting profile M")
     model = compress(lightmaps, "M", device=bench.device, **({"steps": 200} if quick else {}))
-    rows = bench.rows(model, _RoomCamera(lightmaps, bench.size, bench.device), {}, lightmaps)
-    rows += bench.format_rows(lightmaps)
-    side = 512 if quick else _LARGE
-    bench.scene = f"{side} x {side} x {_LARGE_TIMES} x {_SHEETS}"
-    bench.note("making its tiles")
-    large = large_model(side)
-    limits = {"budget": _LARGE_BUDGET, "tiles": _LARGE_TILES}
-    return rows + bench.rows(large, _PlainCamera(side, bench.size, bench.device), limits, None)
+    rows = bench.rows(model, _RoomCamera(lightmaps, bench.size, bench.device), lightmaps.light)
+    return rows + bench.format_rows(lightmaps.light)
 
 
 class _RunTime(Bench):
-    """The benchmark of one set: draws frames with a virtual texture, times and scores them."""
+    """The benchmark of one set: draws frames with a virtual texture and with its rivals, times and scores them."""
 
-    quick: bool
-    size: tuple[int, int]
+    def __init__(self, scene: str, quick: bool, device: str, progress: Note | None) -> None:
+        super().__init__("lightmap", device, progress, scene=scene, clock="frame_ms")
+        self.quick, self.size = quick, _QUICK_SIZE if quick else _SIZE
 
     def rows(
-        self, model: LightmapModel, camera: Camera, limits: dict[str, int], lightmaps: LightmapSet | None
+        self,
+        model: LightmapModel,
+        camera: Camera,
+        sheet: SheetFrames | None,
+        budget: int = BUDGET,
+        tiles: int | None = None,
     ) -> list[Row]:
-        """Returns the rows of a walk and of a day."""
+        """Returns the rows of a walk and of a day.
+
+        Args:
+            model: The compressed set.
+            camera: Draws its views.
+            sheet: The uncompressed lightmaps; None: errors are not measured.
+            budget, tiles: As for `VirtualTexture`.
+        """
+        paths = {name: self._path(name, camera, sheet) for name in ("walk", "day")}
         found = []
-        for path, decodes in (("walk", 8), ("day", 8), ("day", 64)):
-            self.note(f"{path}, {decodes} pages a frame")
-            found.append(self._row(model, camera, limits, lightmaps, path, decodes))
+        for name, decodes in (("walk", 8), ("day", 8), ("day", 64)):
+            self.note(f"{name}, {decodes} pages a frame")
+            texture = VirtualTexture(model, self.device, budget=budget, decodes=decodes, tiles=tiles)
+            with texture:
+                found.append(self._row(texture, camera, paths[name]))
+        return found + self.rival_rows(model, sheet, paths.values())
+
+    def rival_rows(self, model: LightmapModel, sheet: SheetFrames | None, paths: Iterable["_Path"]) -> list[Row]:
+        """Returns a row for each rival and path."""
+        found = []
+        for path in paths:
+            hours = [shot.hour for shot in path.shots.values()]
+            makers: dict[str, Callable[[], Any]] = {
+                kind.title: partial(kind, model, self.device) for kind in (EveryFrame, EveryTime)
+            }
+            if sheet is not None:
+                makers |= {f"{RIVALS[name].title} resident": partial(Blocks, name, sheet, hours) for name in _BLOCKS}
+            for title, make in makers.items():
+                self.note(f"{path.name}, {title}")
+                try:
+                    rival = make()
+                except WlmError as error:
+                    found.append(self.missing_row(title, path.name, error))
+                    continue
+                found.append(self._rival_row(rival, title, path))
         return found
 
-    def format_rows(self, lightmaps: LightmapSet) -> list[Row]:
+    def format_rows(self, sheet: SheetFrames) -> list[Row]:
         """Returns the rows of formats and mips, of some of the uncompressed lightmaps."""
         self.note("formats and mips")
-        sheet, found = lightmaps.light, []
+        found = []
         frames = sheet.frames[:: _EVERY if self.quick else 1].astype(np.float32)
         shared = unpack_rgb9e5(pack_rgb9e5(frames))
         for method, decoded in (("RGB9E5", shared), ("RGBA8", np.stack([_as_bytes(frame) for frame in frames]))):
@@ -130,67 +180,76 @@ class _RunTime(Bench):
             found.append(self.row("mips", f"level {level}", **_differences(sampled, exact, covered & met)))
         return found
 
-    def _row(
-        self,
-        model: LightmapModel,
-        camera: Camera,
-        limits: dict[str, int],
-        lightmaps: LightmapSet | None,
-        path: str,
-        decodes: int,
-    ) -> Row:
-        count = (_WALK if path == "walk" else _DAY) // (_QUICK if self.quick else 1)
-        hours = np.linspace(*_WALK_HOURS, count) if path == "walk" else np.arange(count) * 24.0 / count
+    def _path(self, name: str, camera: Camera, sheet: SheetFrames | None) -> "_Path":
+        count = (_WALK if name == "walk" else _DAY) // (_QUICK if self.quick else 1)
+        hours = np.linspace(*_WALK_HOURS, count) if name == "walk" else np.arange(count) * 24.0 / count
         # A third of a turn in a day: the camera is almost still.
-        places = np.arange(count) / count * (1.0 if path == "walk" else 1.0 / 3.0)
+        places = np.arange(count) / count * (1.0 if name == "walk" else 1.0 / 3.0)
         every = _QUICK_SCORED if self.quick else _SCORED
-        whole = None
-        if lightmaps is not None:
+        shots = {}
+        if sheet is not None:
+            nearest = nearest_valid(sheet.mask)
+            for frame in range(every // 2, count, every):
+                shots[frame] = _Shot(float(hours[frame]), camera(float(places[frame])), sheet, nearest, self.device)
+        return _Path(name, hours.tolist(), places.tolist(), every, shots)
+
+    def _row(self, texture: VirtualTexture, camera: Camera, path: "_Path") -> Row:
+        model, whole = texture.model, None
+        if path.shots:
             whole = VirtualTexture(model, self.device, budget=_ALL, decodes=1024, tolerance=1e-6)
-        with VirtualTexture(model, self.device, decodes=decodes, **limits) as texture:
-            for _ in range(_WARMUP * (1 if self.quick else 8)):
-                texture.frame(float(hours[0]), *camera(float(places[0])))
-                texture.wait(0.1)
-            times, hosts, decoded, visible = [], [], [], []
-            shares, errors = _Shares(), _Errors(lightmaps)
-            stages: dict[str, list[float]] = {}
-            for frame, (hour, place) in enumerate(zip(hours.tolist(), places.tolist(), strict=True)):
-                view = camera(place)
-                if frame % every == 1:
-                    self._time_stages(texture, hour, view, stages)
-                else:
-                    device_ms, host_ms = self._timed(lambda hour=hour, view=view: texture.frame(hour, *view))
-                    times.append(device_ms)
-                    hosts.append(host_ms)
-                report = texture.report()
-                decoded.append(report["decoded"])
-                visible.append(report["visible"])
-                if frame % every == every // 2:
-                    reading = texture.sample(*view)
-                    shares.add(reading, texture.tolerance)
-                    if whole is not None and lightmaps is not None:
-                        errors.add(reading.light, _all_decoded(whole, hour, view), lightmaps, hour, view, self.device)
-            memory = report["memory"]
+        for _ in range(_WARMUP * (1 if self.quick else 8)):
+            texture.frame(path.hours[0], *camera(path.places[0]))
+            texture.wait(0.1)
+        times, hosts, decoded, visible = [], [], [], []
+        shares, errors = _Shares(), _Errors()
+        stages: dict[str, list[float]] = {}
+        for frame, (hour, place) in enumerate(zip(path.hours, path.places, strict=True)):
+            view = camera(place)
+            if frame % path.every == 1:
+                self._time_stages(texture, hour, view, stages)
+            else:
+                device_ms, host_ms = self._timed(lambda hour=hour, view=view: texture.frame(hour, *view))
+                times.append(device_ms)
+                hosts.append(host_ms)
+            report = texture.report()
+            decoded.append(report["decoded"])
+            visible.append(report["visible"])
+            if frame % path.every == path.every // 2:
+                reading = texture.sample(*view)
+                shares.add(reading, texture.tolerance)
+                if whole is not None:
+                    best = _all_decoded(whole, hour, view)
+                    errors.add(path.shots[frame], *(light[::_SPARSE, ::_SPARSE] for light in (reading.light, best)))
         full = {"memory_full": sum(own.memory_bytes for own in model.sheets.values()) / 2**20}
-        parts = {f"{name}_memory": memory[name] / 2**20 for name in ("texture", "tiles", "coarse")}
         return self.row(
             "virtual texture",
-            f"{path}, {decodes} pages a frame",
-            f"{count} frames of {self.size[1]}x{self.size[0]} pixels",
-            frame_ms=float(np.mean(times)),
-            frame_ms_p95=float(np.percentile(times, 95)),
-            frame_ms_max=float(np.max(times)),
+            f"{path.name}, {texture.decodes} pages a frame",
+            self._notes(path),
+            **_frame_times(times),
             host_ms=float(np.median(hosts)),
             **{f"{name}_ms": float(np.mean(values)) for name, values in stages.items()},
             pages_visible=float(np.mean(visible)),
             pages_decoded=float(np.mean(decoded)),
             pages_decoded_max=float(np.max(decoded)),
-            memory=sum(memory.values()) / 2**20,
-            **parts,
+            **_memory(report["memory"]),
             **full,
             **shares.figures(),
             **errors.figures(),
         )
+
+    def _rival_row(self, rival: EveryFrame | Blocks, title: str, path: "_Path") -> Row:
+        times, errors = [], _Errors()
+        for frame, hour in enumerate(path.hours):
+            work = rival.prepare(hour)
+            times.append(0.0 if work is None else self._timed(work)[0])
+            if frame in path.shots:
+                errors.add(path.shots[frame], path.shots[frame].read(rival.light(hour)))
+        # The first frame fills memory.
+        figures = _frame_times(times[1:]) | _memory(rival.memory) | errors.figures()
+        return self.row(title, path.name, self._notes(path), **figures)
+
+    def _notes(self, path: "_Path") -> str:
+        return f"{len(path.hours)} frames of {self.size[1]}x{self.size[0]} pixels"
 
     def _timed(self, call: Callable[[], None]) -> tuple[float, float]:
         """Returns the milliseconds of a call on the device, and those of the host to queue it."""
@@ -230,61 +289,113 @@ def _all_decoded(whole: VirtualTexture, hour: float, view: View) -> np.ndarray:
     return whole.sample(*view).light
 
 
+def _frame_times(times: Sequence[float]) -> dict[str, float]:
+    mean, p95, most = np.mean(times), np.percentile(times, 95), np.max(times)
+    return {"frame_ms": float(mean), "frame_ms_p95": float(p95), "frame_ms_max": float(most)}
+
+
+def _memory(parts: Mapping[str, int]) -> dict[str, float]:
+    """Returns the figures of memory in MiB, by part and in total."""
+    figures = {f"{name}_memory": size / 2**20 for name, size in parts.items()}
+    return figures | {"memory": sum(figures.values())}
+
+
 class _Shares:
-    """Counts the pixels that show what they need."""
+    """Counts the pixels that show what they need, and averages the change of light since pages were decoded."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(3)
+        self._change: list[np.ndarray] = []
 
-    def add(self, reading: Any, tolerance: float) -> None:
+    def add(self, reading: Reading, tolerance: float) -> None:
         lit = reading.coarser >= 0
         now = lit & (reading.change <= tolerance)
         self._counts += [lit.sum(), (now & (reading.coarser == 0)).sum(), (now & (reading.coarser <= 1)).sum()]
+        self._change.append(reading.change[lit])
 
     def figures(self) -> dict[str, float]:
         lit, current, nearly = self._counts
-        return {"current": current / lit, "nearly_current": nearly / lit} if lit else {}
+        if not lit:
+            return {}
+        change = np.concatenate(self._change)
+        stale = {"staleness": float(change.mean()), "staleness_p95": float(np.percentile(change, 95))}
+        return {"current": current / lit, "nearly_current": nearly / lit, **stale}
+
+
+@dataclass(frozen=True)
+class _Path:
+    """A path of a camera: the hour and the place of each frame, and the frames whose views are scored.
+
+    Attributes:
+        name: "walk" or "day".
+        every: One of so many frames is scored.
+        shots: The scored views by their frames; empty if errors are not measured.
+    """
+
+    name: str
+    hours: list[float]
+    places: list[float]
+    every: int
+    shots: "dict[int, _Shot]"
+
+
+class _Shot:
+    """What the uncompressed lightmaps show in a view, at a quarter of its pixels.
+
+    Attributes:
+        hour: Time of the view.
+        picture: [h, w, 3], sRGB in [0, 1].
+        lit: bool [h, w], the pixels with a surface.
+    """
+
+    def __init__(
+        self, hour: float, view: View, sheet: SheetFrames, nearest: tuple[np.ndarray, np.ndarray], device: str
+    ) -> None:
+        number, uv, slopes = (wp.to_torch(part)[::_SPARSE, ::_SPARSE] for part in view)
+        self.hour, self.lit, self._uv = hour, (number >= 0).cpu().numpy(), uv.contiguous()
+        # The level of a square pixel with the longer side: the virtual texture's, not that of an ellipse.
+        height, width = sheet.mask.shape
+        size = torch.tensor([width, height], device=device)
+        texels = torch.linalg.vector_norm(slopes.reshape(*uv.shape, 2) * size[:, None], dim=2).amax(2)
+        self._slopes = torch.diag_embed(texels[..., None] / size)
+        before, after, share = neighbours(sheet.times, hour)
+        frame = (1.0 - share) * sheet.frames[before] + share * sheet.frames[after]
+        self._gain, self._device = np.float32(exposure(frame[sheet.mask])), device
+        self.picture = self.shown(self.read(frame[nearest].astype(np.float32)))
+
+    def read(self, image: np.ndarray) -> np.ndarray:
+        """Reads the view's light from a map, float32 [H, W, 3], trilinearly."""
+        light = raster.texture(torch.tensor(image, device=self._device), self._uv, derivatives=self._slopes)
+        return light.cpu().numpy()
+
+    def shown(self, light: np.ndarray) -> np.ndarray:
+        """Returns light of the view's pixels as a screen shows it; pixels without a surface are black."""
+        return to_srgb(filmic(np.maximum(light, 0.0) * self._gain)) * self.lit[..., None]
 
 
 class _Errors:
     """Compares views with the uncompressed lightmaps, and with views in which every page is decoded."""
 
-    def __init__(self, lightmaps: LightmapSet | None) -> None:
-        self._sums = np.zeros(3)
-        self._count = 0
-        self._nearest = None if lightmaps is None else nearest_valid(lightmaps.light.mask)
+    def __init__(self) -> None:
+        self._views = Pictures()
+        self._sums, self._count = np.zeros(2), 0
 
-    def add(
-        self, light: np.ndarray, whole: np.ndarray, lightmaps: LightmapSet, hour: float, view: View, device: str
-    ) -> None:
-        """Adds a view: its light, its light with all pages decoded, and the original's at the hour."""
-        sheet = lightmaps.light
-        before, after, share = _neighbours(sheet.times, hour)
-        frame = (1.0 - share) * sheet.frames[before] + share * sheet.frames[after]
-        gain = np.float32(exposure(frame[sheet.mask]))
-        image = torch.tensor(frame[self._nearest].astype(np.float32), device=device)
-        original = raster.texture(image, wp.to_torch(view[1])).cpu().numpy()
-        lit = view[0].numpy() >= 0
-        lit[1::2] = lit[:, 1::2] = False  # a quarter of the pixels is enough
-        shown = [to_srgb(filmic(np.maximum(each[lit], 0.0) * gain)) for each in (light, whole, original)]
-        pairs = ((0, 2), (1, 2), (0, 1))
-        self._sums += [np.square(shown[a] - shown[b], dtype=np.float64).sum() for a, b in pairs]
-        self._count += shown[0].size
+    def add(self, shot: _Shot, light: np.ndarray, whole: np.ndarray | None = None) -> None:
+        """Adds a view: its light and, if it is known, its light with all pages decoded."""
+        own = shot.shown(light)
+        self._views.add(shot.picture, own, shot.lit)
+        if whole is not None and shot.lit.any():
+            best = shot.shown(whole)
+            pairs = ((best, shot.picture), (own, best))
+            self._sums += [np.square(a[shot.lit] - b[shot.lit], dtype=np.float64).sum() for a, b in pairs]
+            self._count += 3 * int(shot.lit.sum())
 
     def figures(self) -> dict[str, float]:
-        if not self._count:
-            return {}
-        own, best, cached = (psnr_from_mse(total / self._count, 1.0) for total in self._sums)
-        return {"view_psnr": own, "gain": own - best, "cached_psnr": cached}
-
-
-def _neighbours(times: np.ndarray, hour: float) -> tuple[int, int, float]:
-    """Returns the stored times around an hour, of a day, and the weight of the later one. A lamp's switch is held."""
-    after = int(np.searchsorted(times, hour, side="right"))
-    before = after - 1
-    gap = (times[after % len(times)] - times[before]) % 24.0
-    held = gap <= np.median(np.diff(times)) / 4
-    return before, after % len(times), 0.0 if held else float((hour - times[before]) % 24.0 / gap)
+        figures = {"view_psnr": self._views.psnr, "view_flip": self._views.flip}
+        if self._count:
+            best, cached = (psnr_from_mse(total / self._count, 1.0) for total in self._sums)
+            figures |= {"gain": self._views.psnr - best, "cached_psnr": cached}
+        return figures
 
 
 # ---- formats and mips ----
@@ -408,13 +519,22 @@ def large_model(side: int) -> LightmapModel:
     """Makes a model of four sheets of dynamic tiles with random maps and networks, for profile M at 26 times."""
     times = np.concatenate([np.arange(24.0), [18.45, 18.55]])
     times.sort()
-    sheets = {Sheet(atlas=str(number)): _large_sheet(side, times, number) for number in range(_SHEETS)}
+    profile = Profile.load("M")
+    sheets = {Sheet(atlas=str(number)): random_sheet(side, times, number, profile) for number in range(_SHEETS)}
     first = next(iter(sheets.values()))
     return LightmapModel("large", "0123456789abcdef", first.profile, sheets)
 
 
-def _large_sheet(side: int, times: np.ndarray, seed: int) -> SheetModel:
-    random, profile = np.random.default_rng(seed), Profile.load("M").for_times(len(times))
+def random_sheet(side: int, times: np.ndarray, seed: int, profile: Profile) -> SheetModel:
+    """Makes a sheet of dynamic tiles with random maps and networks.
+
+    Args:
+        side: Texels along each side, a multiple of 128.
+        times: Stored times, hours of a day.
+        seed: Seed of the random numbers.
+        profile: Sizes of maps and networks.
+    """
+    random, profile = np.random.default_rng(seed), profile.for_times(len(times))
     count = (side // TILE) ** 2
     kind = np.full(count, TileKind.DYNAMIC, np.uint8)
     table = part_table(profile, kind, len(times))

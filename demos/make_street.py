@@ -192,6 +192,20 @@ def make_probes(mesh: GltfPrimitive, albedo: np.ndarray, sets: dict[str, Lightma
     return gather.points, found
 
 
+def check(path: Path, mesh: GltfPrimitive, albedo: np.ndarray, sets: dict[str, LightmapSet]) -> None:
+    """Compares the light of the surfaces with that of a path tracer, without sky, at every tenth of its probes."""
+    with np.load(path) as file:
+        traced = {key: file[key][::10] for key in file}
+    sky, sun = sets["sky"].light, sets["sun"].light
+    gather = Gather(mesh, albedo, traced.pop("position").astype(np.float32), len(sky.mask))
+    for key, expected in ((key, values[gather.free]) for key, values in traced.items()):
+        hour = float(key.removeprefix("sh_"))
+        found = gather.reflected(fill_gaps(sky.at(hour) + sun.at(hour), sky.mask), np.zeros(3))
+        ratio = np.median(found[:, 0] / np.maximum(expected[:, 0], 1e-6))
+        error = np.sqrt(np.mean((found - expected) ** 2) / np.mean(expected**2))
+        print(f"{hour:g} h: {len(found)} probes, {ratio:.3f} of the path tracer's light, RMS error {100 * error:.1f}%")
+
+
 def make(args: argparse.Namespace) -> None:
     """Writes the chosen parts."""
     out: Path = args.out
@@ -200,6 +214,8 @@ def make(args: argparse.Namespace) -> None:
     sets = groups(city, city_sun)
     _, (mesh,) = read_gltf(args.city / "scene.glb")
     albedo = np.load(args.city / "albedo.npz")["face_albedo"]
+    if args.check:
+        check(args.check, mesh, albedo, sets)
     if "mesh" in args.parts:
         save_mesh(out / "street.glb", mesh.position, mesh.triangle, albedo, mesh.uv[0])
     if "originals" in args.parts:
@@ -239,10 +255,11 @@ def main() -> None:
     )
     parser.add_argument("city_sun", type=Path, metavar="CITY_SUN", help="that of the bake with it")
     parser.add_argument("out", type=Path, metavar="OUT_DIR", help="the folder to write to")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what to make; everything by default")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what to make; else all")
     parser.add_argument("--profile", default="standard", help="profile of the lightmaps")
     parser.add_argument("--steps", type=int, help="steps of their fit; by default those of the profile")
     parser.add_argument("--probes", default="pca", help="profile of the probes")
+    parser.add_argument("--check", type=Path, metavar="NPZ", help="probes of a path tracer to compare the gather with")
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
     args = parser.parse_args()
     quiet_warp()

@@ -28,8 +28,9 @@ COMMANDS = [
     (
         ["lightmap-run-time", "--set", "a/city", "--quick"],
         "lightmap-run-time --set city --quick --device cpu",
-        {"scene_path": Path("a/city"), "quick": True},
+        {"walked_path": Path("a/city"), "quick": True},
     ),
+    (["shader-speed", "--quick"], "shader-speed --quick --device cpu", {"quick": True}),
     (["lightmap-file", "--quick"], "lightmap-file --quick --device cpu", {"quick": True}),
     (
         ["probe", "--no-rivals", "--probes", "a/room.npz", "--key", "sh", "--key", "sh_noon"],

@@ -10,6 +10,7 @@ from builders.small_sets import moving_light, tiny_profile
 
 from benchmarks import Panel
 from benchmarks import lightmap_run_time as bench
+from benchmarks.rivals.lightmap_run_time import EveryFrame, EveryTime
 from wlm.formats.geometry import Geometry
 from wlm.lightmap.fit import compress
 from wlm.lightmap.tiles import TileKind
@@ -69,30 +70,66 @@ def test_mips_and_formats():
 
 
 @pytest.fixture(scope="module")
-def rows(room, patch):
+def model(room):
+    return compress(room, tiny_profile())
+
+
+@pytest.fixture(scope="module")
+def run(patch):
     patch.setattr(bench, "_QUICK", 120)
-    run = bench._RunTime("lightmap", "cpu", None, scene="room", clock="frame_ms")
-    run.quick, run.size = True, SIZE
-    model = compress(room, tiny_profile())
-    return [*run.rows(model, bench._RoomCamera(room, SIZE, "cpu"), {}, room), *run.format_rows(room)]
+    run = bench._RunTime("room, run time", True, "cpu", None)
+    run.size = SIZE
+    return run
+
+
+@pytest.fixture(scope="module")
+def rows(room, model, run):
+    return [*run.rows(model, bench._RoomCamera(room, SIZE, "cpu"), room.light), *run.format_rows(room.light)]
 
 
 def test_every_row_has_its_figures(rows, tmp_path):
-    check_outputs(rows, tmp_path, [Panel("texel_rms")], rows[3:])
+    own, rivals = rows[:3], rows[3:11]
+    check_outputs(rows, tmp_path, [Panel("texel_rms")], rows[11:])
     paths = ["walk, 8 pages a frame", "day, 8 pages a frame", "day, 64 pages a frame"]
+    others = ("all decoded each frame", "all decoded each stored time", "BC7 resident", "BC6H resident")
     assert keys(rows) == [
         *(("virtual texture", path) for path in paths),
+        *((name, path) for path in ("walk", "day") for name in others),
         *(("format", name) for name in ("RGB9E5", "RGBA8")),
         *(("mips", f"level {level}") for level in (3, 4)),
     ]
-    for row in rows[:3]:
+    for row in own:
         assert 0.0 < row["current"] <= row["nearly_current"] <= 1.0 and row["cached_psnr"] > 30.0
-        assert row["frame_ms"] <= row["frame_ms_max"] and row["pages_decoded"] <= row["pages_decoded_max"]
-    assert rows[2]["current"] == 1.0 and abs(rows[2]["gain"]) < 0.3
-    assert rows[3]["texel_rms"] < 0.002 < rows[4]["texel_rms"]
+        assert 0.0 <= row["staleness"] <= row["staleness_p95"] and row["pages_decoded"] <= row["pages_decoded_max"]
+    for row in (*own, *rivals):
+        assert row["frame_ms"] <= row["frame_ms_max"] and 0.0 < row["view_flip"] < 1.0 < row["view_psnr"]
+        parts = ("texture", "tiles", "coarse", "pages", "masks", "tables")
+        assert row["memory"] == pytest.approx(sum(row.get(f"{part}_memory") or 0.0 for part in parts))
+    assert own[2]["current"] == 1.0 and abs(own[2]["gain"]) < 0.3
+    for cached, (each, stored, *blocks) in ((own[0], rivals[:4]), (own[2], rivals[4:])):
+        assert each["frame_ms"] > stored["frame_ms"] and abs(each["view_psnr"] - cached["view_psnr"]) < 1.0
+        assert each["view_psnr"] == pytest.approx(stored["view_psnr"], abs=0.5)
+        # A fit of a few steps is far from the blocks.
+        assert all(row["frame_ms"] == 0.0 and row["view_psnr"] > each["view_psnr"] + 3.0 for row in blocks)
+    assert rows[11]["texel_rms"] < 0.002 < rows[12]["texel_rms"]
+
+
+def test_rivals_read_the_light_of_an_hour(room, model):
+    each, stored = EveryFrame(model, "cpu"), EveryTime(model, "cpu")
+    decoder, work = model.decoder(), []
+    for hour in (1.0, 2.0, 13.0, 18.5, 23.0, 23.5, 18.5):
+        launches = stored.prepare(hour)
+        work.append(launches is not None)
+        if launches is not None:
+            launches()
+        light = decoder.frame(18.45 if hour == 18.5 else hour)  # the lamp is not on yet
+        for rival in (each, stored):
+            np.testing.assert_allclose(rival.light(hour), light, rtol=0, atol=light.max() / 256)
+    assert work == [True, False, True, True, True, False, True]
+    assert stored.memory["texture"] == 2 * each.memory["texture"] and stored.memory["tiles"] == model.memory_bytes
 
 
 def test_a_set_without_a_mesh_is_refused(monkeypatch):
     monkeypatch.setattr(bench, "load", lambda path: SimpleNamespace(name="set", light=SimpleNamespace(mesh=None)))
     with pytest.raises(bench.WlmError, match="set: expected a set that names its mesh"):
-        bench.run(scene_path="a", quick=True, device="cpu")
+        bench.run(walked_path="a", quick=True, device="cpu")

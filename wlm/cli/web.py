@@ -15,7 +15,8 @@ def web(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="A .wlm of lightmaps, meshes or probes; or six-way lightmaps (.exr, one per frame, or a folder).",
+            help="A .wlm of lightmaps, meshes or probes; six-way lightmaps (.exr, one per frame, or a folder); or a "
+            "scene (.yaml).",
         ),
     ],
     output: Annotated[Path, output_option("PAGE.html", "The page to write.")],

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 import torch
-from builders import atlas_meshes, atlas_models, probe_models, probe_sets, rooms, small_sets
+from builders import atlas_meshes, atlas_models, day_scenes, probe_models, probe_sets, rooms, small_sets
 from builders.light_groups import random_groups
 from builders.synthetic import random_model
 from PIL import Image
@@ -20,6 +20,7 @@ from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
 from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import TileKind
+from wlm.scene.frame import Renderer
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
 from wlm.smoke.lightmaps import SixWay
@@ -466,3 +467,93 @@ def test_light_groups_are_added_by_their_sliders(tmp_path, show):
     assert page.evaluate(decodes) == maps, "nothing is decoded again"
     assert "off" in page.locator("#panel label:has-text('lamp') output").inner_text()
     page.close()
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A scene of known light with a moving square and smoke, and its page."""
+    path = day_scenes.write_scene(tmp_path_factory.mktemp("room"))
+    write_page(path.with_suffix(".html"), [path])
+    return path
+
+
+def test_a_scene_is_drawn_as_in_python(room, show):
+    page = show(room.with_suffix(".html"), width=340 + 320, height=240)
+    page.keyboard.press("m")  # nothing moves by itself
+    page.evaluate("wlm.then(({kind}) => { kind.samples = 0; })")  # one sample a pixel, at its middle, as here
+    with wlm.scene.load(room) as scene, Renderer(scene, 240, 320, samples=1) as renderer:
+        # In daylight, within the switch of a lamp, and at night; the smoke is over the wall and the moving square.
+        for hour, second in ((9.0, 0.3), (18.5, 1.7), (23.0, 3.1)):
+            expected = renderer.draw(second, hour=hour, complete=True).picture().astype(int)
+            page.evaluate(f"wlm.then(({{kind}}) => kind.show({hour}, {second}))")
+            seen = picture(page)
+            assert seen.shape == expected.shape
+            apart = np.abs(seen - expected).max(-1)
+            # Edges may fall on a pixel's middle.
+            assert (apart <= 2).mean() > 0.99 and np.unique(seen.reshape(-1, 3), axis=0).shape[0] > 20
+
+
+def test_a_person_moves_around_in_a_scene(room, show):
+    page = show(room.with_suffix(".html"), touch=True)
+    page.keyboard.press("m")
+    page.evaluate("wlm.then(({kind}) => kind.show(12, 0))")
+    still = picture(page)
+    np.testing.assert_array_equal(picture(page), still)
+    page.get_by_label("sun", exact=True).evaluate("(input) => { input.value = 0; input.oninput(); }")
+    dim = picture(page)
+    assert dim.mean() < still.mean() - 1
+    # In the error view the same picture of the original is compared, which has the sun.
+    page.get_by_role("button", name="original", exact=True).click()
+    assert np.abs(picture(page) - still).mean() < 1
+    page.get_by_role("button", name="decoded", exact=True).click()
+    camera = "wlm.then(({kind}) => [kind.view, ...kind.flight.eye, kind.flight.yaw])"
+    start = page.evaluate(camera)
+    assert start[0] == "path"
+    box = page.locator("#view").bounding_box()
+    page.mouse.move(box["x"] + 200, box["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 260, box["y"] + 200)
+    page.mouse.up()
+    turned = page.evaluate(camera)
+    assert turned[0] == "fly" and turned[1:4] == start[1:4] and turned[4] > start[4]
+    page.keyboard.down("w")
+    wait_for(page, f"kind.flight.eye[2] < {start[3] - 0.01}")  # the camera looks along -z
+    page.keyboard.up("w")
+    page.keyboard.press("o")
+    assert page.evaluate(camera)[0] == "orbit" and np.abs(picture(page) - dim).max() > 20
+    page.keyboard.press("c")
+    np.testing.assert_array_equal(picture(page), dim)
+    # A played day is the film: its second follows from the hour, and all moves.
+    page.keyboard.press(" ")
+    wait_for(page, "kind.time > 13 && Math.abs(kind.second - (kind.shown - 5) / 6) < 0.2")
+    page.keyboard.press(" ")
+    page.keyboard.press("m")
+    wait_for(page, "!kind.waiting.length")
+    second = page.evaluate("wlm.then(({kind}) => kind.second)")
+    wait_for(page, f"kind.second > {second}")
+    text = help_of(page)
+    for words in ("the hour", "play, pause", "fly", "follow the path", "orbit"):
+        assert words in text
+
+
+def test_a_scene_fits_a_phone(room, show):
+    page = show(room.with_suffix(".html"), width=330, height=640, touch=True)
+    page.keyboard.press("m")
+    page.evaluate("wlm.then(({kind}) => kind.show(12, 0))")
+    box = page.locator("#view").bounding_box()
+    assert box["width"] == 330 and box["height"] >= 320
+    assert page.evaluate("document.documentElement.scrollWidth") <= 330
+    for control in page.locator("#panel button, #panel input").all():
+        each = control.bounding_box()
+        assert each["x"] >= 0 and each["x"] + each["width"] <= 330
+    before = picture(page)
+    page.evaluate("""() => {
+        const view = document.getElementById('view');
+        const touch = (kind, id, x, y) => view.dispatchEvent(new PointerEvent(
+            kind, {pointerId: id, clientX: x, clientY: y, pointerType: 'touch', bubbles: true}));
+        view.setPointerCapture = () => {};
+        for (const [id, x] of [[5, 150], [6, 180]]) touch('pointerdown', id, x, 100);
+        touch('pointermove', 6, 280, 100);
+        for (const id of [5, 6]) touch('pointerup', id, 200, 100);
+    }""")
+    assert np.abs(picture(page) - before).max() > 20, "two fingers move the camera"

@@ -1,6 +1,7 @@
 """Pages: what they carry, and what a page can't be made of."""
 
 import base64
+import dataclasses
 import hashlib
 import json
 import re
@@ -9,7 +10,8 @@ import zlib
 import numpy as np
 import pytest
 import torch
-from builders import atlas_meshes, probe_models, small_sets
+import yaml
+from builders import atlas_meshes, day_scenes, probe_models, small_sets
 from builders.contract import FILES
 from typer.testing import CliRunner
 
@@ -163,6 +165,65 @@ def test_frames_of_smoke_are_of_one_size(tmp_path):
     (tmp_path / "a_2.exr").write_bytes((tmp_path / "a_1.exr").read_bytes())
     folder, files = make_page([tmp_path]), make_page([tmp_path / "a_1.exr", tmp_path / "a_2.exr"])
     assert folder.manifest == files.manifest and folder.title == files.title == tmp_path.name
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return day_scenes.write_scene(tmp_path_factory.mktemp("room"))
+
+
+def test_a_scene_carries_the_light_where_it_is_used(room, tmp_path):
+    page = make_page([room])
+    scene, arrays = page.manifest["scene"], page.arrays
+    assert (page.kind, page.title, page.manifest["time"]) == ("scene", "a room", 12.0)
+    for group in page.manifest["groups"]:
+        np.testing.assert_allclose(group["lightmap"]["switches"], [[18.45, 18.55]], atol=1e-6)
+    assert scene["probe_hours"] == [0.0, 12.0] and page.manifest["reference"]["times"] == [12.0, 22.0]
+    assert min(page.manifest["reference"]["psnr"]) > 50, "the groups are added"
+    # Even light: the first coefficient alone, at all places.
+    for name, places in (("moving_0_light", scene["moving"][0]["places"]), ("smoke_0_light", 1)):
+        light = arrays[name].reshape(2, places, 9, 3)
+        expected = np.sqrt(4 * np.pi) * np.array(list(day_scenes.LIGHT.values()))
+        np.testing.assert_allclose(light[:, :, 0], np.broadcast_to(expected[:, None, None], (2, places, 3)), rtol=0.01)
+        assert np.abs(light[:, :, 1:]).max() < 0.01
+    codes = arrays["first"][[50, 50], [20, 200]].astype(np.int64)
+    back = np.stack([codes >> shift & 511 for shift in (0, 9, 18)], 1) * 2.0 ** ((codes >> 27) - 24)[:, None]
+    np.testing.assert_allclose(back, (day_scenes.SKY + day_scenes.SUN)[:, 2], rtol=0.01)
+    with wlm.scene.load(room) as loaded:
+        at = scene["path_rate"] * 3
+        np.testing.assert_allclose(arrays["path"][at], np.hstack(loaded.camera_at(3.0)), rtol=1e-6)
+    arrays = page.arrays | {f"again_{name}": values for name, values in page.arrays.items()}
+    size = page.write(tmp_path / "page.html")
+    dataclasses.replace(page, arrays=arrays).write(tmp_path / "twice.html")
+    assert (tmp_path / "twice.html").stat().st_size < 1.1 * size, "equal arrays are stored once"
+
+
+def test_a_scene_without_objects_and_originals_has_a_page(room, tmp_path):
+    path = room.with_name("bare.yaml")
+    text = yaml.safe_load(room.read_text())
+    path.write_text(yaml.safe_dump({k: v for k, v in text.items() if k in ("title", "mesh", "light", "sky", "camera")}))
+    result = CliRunner().invoke(app, ["web", str(path), "-o", str(tmp_path / "page.html")])
+    assert result.exit_code == 0, result.output
+    manifest, _ = parts(tmp_path / "page.html")
+    assert manifest["scene"]["moving"] == manifest["scene"]["smoke"] == manifest["scene"]["probe_hours"] == []
+    assert "reference" not in manifest
+
+
+def test_what_a_scene_lacks_is_said_in_one_line(room, tmp_path):
+    small = room.with_name("small_12.00h.exr")
+    write_exr(small, np.ones((4, 4, 3), np.float32))
+    for changes, said in (
+        ({"originals": [small.name]}, "small_12.00h.exr: expected a lightmap of 247x108, found 4x4"),
+        ({"mesh": "absent.glb"}, "mesh: there is no file"),
+        ({"speed": 2}, "speed"),
+    ):
+        path = room.with_name("changed.yaml")
+        path.write_text(yaml.safe_dump(yaml.safe_load(room.read_text()) | changes))
+        with pytest.raises(WlmError, match=re.escape(said)) as caught:
+            write_page(tmp_path / "page.html", [path])
+        assert "\n" not in str(caught.value) and not (tmp_path / "page.html").exists()
+    with pytest.raises(WlmError, match="--mesh has no meaning"):
+        make_page([room], mesh=room.with_name("room.glb"))
 
 
 def test_the_command_writes_a_page_of_a_folder(tmp_path):

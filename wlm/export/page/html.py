@@ -28,7 +28,7 @@ class Page:
     """The content of a page.
 
     Attributes:
-        kind: `lightmap`, `atlas`, `probe` or `smoke`; selects the page's main script.
+        kind: `lightmap`, `atlas`, `probe`, `smoke` or `scene`; selects the page's main script.
         title: Title of the panel and of the browser's window.
         note: A sentence that the page shows below its title; may be empty.
         figures: Rows of the panel's table: a name and a text each.
@@ -54,12 +54,14 @@ class Page:
         Raises:
             WlmError: A number of the manifest is not finite, or the file cannot be written.
         """
-        content, places = bytearray(), {}
+        content, places, held = bytearray(), {}, dict[bytes, list[int]]()
         for name, values in self.arrays.items():
             part = np.ascontiguousarray(values).tobytes()
-            content += bytes(-len(content) % _ALIGNMENT)
-            places[name] = [len(content), len(part)]
-            content += part
+            if part not in held:  # equal arrays are stored once
+                content += bytes(-len(content) % _ALIGNMENT)
+                held[part] = [len(content), len(part)]
+                content += part
+            places[name] = held[part]
         manifest = {
             "kind": self.kind,
             "title": self.title,
@@ -74,19 +76,19 @@ class Page:
             text = json.dumps(manifest, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
         except ValueError as error:
             raise WlmError(f"{self.title}: cannot make the page: a number for its script is NaN or infinite") from error
-        scripts = [*map(_asset, _COMMON), *self.scripts, *map(_asset, (f"{self.kind}.js", "main.js"))]
+        scripts = [*map(asset, _COMMON), *self.scripts, *map(asset, (f"{self.kind}.js", "main.js"))]
         script = "\n".join(["'use strict';", *scripts])
         pieces = {
             # The browser runs this script alone, whatever a name brought into the page.
             "SCRIPT-HASH": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
             "TITLE": html.escape(self.title),
-            "STYLE": _asset("page.css"),
+            "STYLE": asset("page.css"),
             "MANIFEST": text,
             "CONTENT": base64.b64encode(zlib.compress(bytes(content), 9)).decode(),
             "SCRIPT": script,
         }
         # The template is split before it is filled, since the parts may contain marks.
-        first, *rest = _asset("page.html").split("@")
+        first, *rest = asset("page.html").split("@")
         page = [first, *(pieces.get(part, part) for part in rest)]
         return atomic_write(path, "".join(page).encode())
 
@@ -99,5 +101,6 @@ def pack_triangles(geometry: Geometry, up: Literal["y", "z"]) -> tuple[dict[str,
     return {name: values for name, values in parts.items() if values is not None}, box
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Returns the text of a file of `assets`."""
     return (resources.files("wlm.export.page") / "assets" / name).read_text(encoding="utf-8").rstrip("\n")

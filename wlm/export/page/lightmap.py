@@ -23,8 +23,8 @@ from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.evaluation import count_kinds, psnr_of
 from wlm.lightmap.group_scores import sum_of
 from wlm.lightmap.groups import times_of
-from wlm.lightmap.model import SheetModel
-from wlm.lightmap.sheet import LIGHT, first_light
+from wlm.lightmap.model import LightmapModel, SheetModel
+from wlm.lightmap.sheet import LIGHT, Sheet, first_light
 from wlm.system import Meter, OnProgress
 from wlm.system import load as load_model
 from wlm.texels import exposure, fill_gaps
@@ -55,14 +55,7 @@ def lightmap_page(
     sheet = first_light(whole.sheets)
     groups = whole.maps(sheet)
     others, model = len(whole.sheets) - len(groups), groups[sheet.group]
-    described, arrays = [], dict[str, np.ndarray]()
-    for number, (name, own) in enumerate(groups.items()):
-        bundle = sheet_bundle(replace(sheet, group=name), own, whole.name, whole.source)
-        described.append({"name": name, "shader": bundle.shader, "lightmap": _described(bundle)})
-        textures = {key: texture for key, texture in bundle.textures.items() if key != "valid"}
-        arrays |= {f"{number}_{key}": texture.data for key, texture in textures.items()}
-        arrays[f"{number}_networks"] = bundle.buffers.get("networks", np.zeros((0, 4), np.float32))
-    arrays["valid"] = np.packbits(model.mask)
+    described, arrays = pack_groups(whole, sheet)
     decoders = [SheetDecoder(own) for own in groups.values()]
 
     def decode(time: float) -> np.ndarray:
@@ -74,7 +67,7 @@ def lightmap_page(
     if original is not None:
         given = load(original)
         light = given.find(sheet) if len(given.groups) == 1 else sum_of(given, sheet)
-        reference, originals = _originals(model, light, decode, original, hours, progress)
+        reference, originals = pack_originals(model, light, decode, original, hours, progress)
         arrays |= originals
         # The page starts at an hour with an original.
         time = min(reference["times"], key=lambda stored: abs(stored - time))
@@ -111,6 +104,19 @@ def lightmap_page(
     return Page("lightmap", whole.name, note, figures, manifest, arrays, [filled("lightmap_table.js").rstrip("\n")])
 
 
+def pack_groups(whole: LightmapModel, sheet: Sheet) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
+    """Returns what the script needs to decode the light groups of a sheet: a description of each group, and arrays."""
+    described, arrays = [], dict[str, np.ndarray]()
+    for number, (name, own) in enumerate(whole.maps(sheet).items()):
+        bundle = sheet_bundle(replace(sheet, group=name), own, whole.name, whole.source)
+        described.append({"name": name, "shader": bundle.shader, "lightmap": _described(bundle)})
+        textures = {key: texture for key, texture in bundle.textures.items() if key != "valid"}
+        arrays |= {f"{number}_{key}": texture.data for key, texture in textures.items()}
+        arrays[f"{number}_networks"] = bundle.buffers.get("networks", np.zeros((0, 4), np.float32))
+        arrays["valid"] = np.packbits(own.mask)
+    return described, arrays
+
+
 def _described(bundle: Bundle) -> dict[str, Any]:
     """Returns what the script needs to know of the bundle of a light group."""
     textures = {
@@ -121,7 +127,7 @@ def _described(bundle: Bundle) -> dict[str, Any]:
     return {name: bundle.document[name] for name in _DESCRIBED} | {"textures": textures}
 
 
-def _originals(
+def pack_originals(
     model: SheetModel,
     lightmaps: SheetFrames,
     decode: Callable[[float], np.ndarray],

@@ -16,6 +16,7 @@ _PAGES = {
     "atlas": ("wlm.export.page.atlas", "atlas_page"),
     "lightmap": ("wlm.export.page.lightmap", "lightmap_page"),
     "probe": ("wlm.export.page.probe", "probe_page"),
+    "settings": ("wlm.export.page.scene", "scene_page"),
     "six-way": ("wlm.export.page.smoke", "smoke_page"),
 }
 """Module and function that make the page of a kind of content."""
@@ -45,11 +46,11 @@ def make_page(
     up: Literal["y", "z"] = "y",
     progress: OnProgress | None = None,
 ) -> Page:
-    """Makes the HTML page of one model or of a smoke animation.
+    """Makes the HTML page of one model, of a smoke animation or of a scene.
 
     Args:
-        files: One `.wlm` of lightmaps over time, lightmaps of meshes or probes; or six-way lightmaps of smoke, one EXR
-            a frame, or their folder.
+        files: One `.wlm` of lightmaps over time, lightmaps of meshes or probes; six-way lightmaps of smoke, one EXR a
+            frame, or their folder; or the YAML file of a scene, see `wlm.scene.load`.
         mesh: Mesh file of the scene. To show lightmaps over time, it must have the UVs of the lightmaps.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Name of the array to read from an original probe file with several arrays.
@@ -65,7 +66,9 @@ def make_page(
     if kind == "smoke":
         raise WlmError(f"{paths[0]}: a smoke network has no picture of its own; expected lightmaps predicted by it")
     if kind not in _PAGES:
-        raise WlmError(f"{paths[0]}: expected a .wlm file or six-way EXRs; wlm view shows inputs of a compression too")
+        raise WlmError(
+            f"{paths[0]}: expected a .wlm file, a scene or six-way EXRs; wlm view shows inputs of a compression too"
+        )
     module, function = _PAGES[kind]
     make = getattr(import_module(module), function)
     known = signature(make).parameters

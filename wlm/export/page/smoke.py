@@ -30,23 +30,11 @@ def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgres
     """
     if not 0 < rate < float("inf"):
         raise WlmError(f"--rate: expected a number above 0, got {rate}")
-    arrays: dict[str, np.ndarray] = {}
-    most, hot, sizes = [], False, []
-    meter = Meter(progress, "read", len(paths))
-    for i, path in enumerate(paths):
-        frame = read_six_way(path)
-        hot |= frame.emission is not None
-        sizes.append("{2}x{1}".format(*frame.lightmaps.shape))
-        if sizes[i] != sizes[0]:
-            raise WlmError(f"{path}: expected {sizes[0]} pixels as the first frame, found {sizes[i]}")
-        planes, scales = _planes(frame)
-        # Square roots in 8 bits, whose steps are perceptually more even.
-        codes = np.round(np.sqrt(planes) * 255.0).astype(np.uint8).transpose(1, 2, 0)
-        arrays[f"first_{i}"], arrays[f"second_{i}"] = codes[..., :4], codes[..., 4:]
-        most.append(scales)
-        if meter.due(len(most)):
-            meter.report(len(most))
-    height, width = frame.lightmaps.shape[1:]
+    codes, most, hot = pack_frames(paths, progress)
+    arrays = {}
+    for i, code in enumerate(codes):
+        arrays[f"first_{i}"], arrays[f"second_{i}"] = code[..., :4], code[..., 4:]
+    height, width = codes.shape[1:3]
     shown = [*DIRECTIONS, "opacity"] + ["emission"] * hot
     manifest = {
         "width": width,
@@ -63,6 +51,33 @@ def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgres
     title = paths[0].stem if len(paths) == 1 else paths[0].resolve().parent.name
     note = "Six-way lightmaps of smoke. Drag over the picture: the light follows the pointer."
     return Page("smoke", title, note, figures, manifest, arrays)
+
+
+def pack_frames(paths: Sequence[Path], progress: OnProgress | None) -> tuple[np.ndarray, list[list[float]], bool]:
+    """Reads frames of smoke for a script.
+
+    Returns:
+        Codes uint8 [N, H, W, 8] of the six lightmaps, the opacity and the emission: square roots, whose steps are
+        perceptually more even. The largest number of each frame's lightmaps, opacity and emission, which its codes are
+        relative to. And whether any frame has emission.
+
+    Raises:
+        WlmError: A file cannot be read or has another size.
+    """
+    codes, most, hot = list[np.ndarray](), list[list[float]](), False
+    meter = Meter(progress, "read", len(paths))
+    for path in paths:
+        frame = read_six_way(path)
+        hot |= frame.emission is not None
+        planes, scales = _planes(frame)
+        codes.append(np.round(np.sqrt(planes) * 255.0).astype(np.uint8).transpose(1, 2, 0))
+        if codes[-1].shape != codes[0].shape:
+            first, found = ("{1}x{0}".format(*code.shape) for code in (codes[0], codes[-1]))
+            raise WlmError(f"{path}: expected {first} pixels as the first frame, found {found}")
+        most.append(scales)
+        if meter.due(len(most)):
+            meter.report(len(most))
+    return np.stack(codes), most, hot
 
 
 def _planes(frame: SixWay) -> tuple[np.ndarray, list[float]]:

@@ -2,8 +2,8 @@
 
 async function readContent() {
   const manifest = JSON.parse(document.getElementById('manifest').textContent);
-  const text = atob(document.getElementById('content').textContent.trim());
-  const packed = Uint8Array.from(text, (letter) => letter.charCodeAt(0));
+  const text = document.getElementById('content').textContent.trim();
+  const packed = Uint8Array.fromBase64?.(text) ?? Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   if (typeof DecompressionStream === 'undefined') throw new Error('this browser is too old to unpack the page');
   let bytes;
   try {

@@ -1,6 +1,17 @@
-// Conversion of linear light to screen colours: exposure, tone mapping, sRGB, and false colours of an error.
+// Light of spherical harmonics; conversion of linear light to screen colours: exposure, tone mapping, sRGB, and false
+// colours of an error.
 
 const TONES = ['clamped', 'filmic'];
+
+// Radiance of a white diffuse surface under spherical harmonics of radiance: irradiance / pi.
+const DIFFUSE = `
+vec3 wlm_diffuse(vec3 n, vec3 c[9])
+{
+    vec3 light = 0.2820948 * c[0] + 0.3257350 * (n.y * c[1] + n.z * c[2] + n.x * c[3]);
+    light += 0.2731371 * (n.x * n.y * c[4] + n.y * n.z * c[5] + n.x * n.z * c[7]);
+    return light + 0.0788479 * (3.0 * n.z * n.z - 1.0) * c[6] + 0.1365686 * (n.x * n.x - n.y * n.y) * c[8];
+}
+`;
 
 const DISPLAY = `
 uniform float u_exposure;
@@ -45,14 +56,14 @@ const VIEWS = ['decoded', 'original', 'split', 'error'];
 // The display state of all kinds of pages, and its controls.
 class Display {
   constructor(page, panel, changed) {
-    this.values = {u_exposure: page.manifest.exposure, u_tone: 0, u_view: 0, u_wipe: 0, u_gain: 8};
+    this.values = {u_exposure: page.manifest.exposure, u_tone: page.manifest.tone ?? 0, u_view: 0, u_wipe: 0, u_gain: 8};
     this.share = 0.5;
     const stops = (value) => `${value > 0 ? '+' : ''}${value.toFixed(1)} EV`;
     panel.slider('exposure', {
       min: -8, max: 8, step: 0.1, value: 0, text: stops, keys: ['[', ']'], by: 0.5,
       changed: (value) => { this.values.u_exposure = page.manifest.exposure * 2 ** value; changed(); },
     });
-    const tone = panel.choices('tone', TONES, TONES[0], (name) => {
+    const tone = panel.choices('tone', TONES, TONES[this.values.u_tone], (name) => {
       this.values.u_tone = TONES.indexOf(name);
       changed();
     });

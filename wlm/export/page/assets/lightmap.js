@@ -7,7 +7,12 @@ void main() { radiance = vec4(wlm_radiance(ivec2(gl_FragCoord.xy)), 1.0); }`;
 const MAIN_FILL = `
 uniform sampler2D u_map;
 out vec4 radiance;
-void main() { radiance = texelFetch(u_map, wlm_source(ivec2(gl_FragCoord.xy)), 0); }`;
+void main() {
+    ivec2 at = ivec2(gl_FragCoord.xy), source = wlm_source(at);
+    // Alpha is the weight of a texel in smaller mip levels: one that fills a gap counts where no valid one does.
+    float weight = texelFetch(WLM_LIGHTMAP_VALID, at, 0).x > 0.5 ? 1.0 : source != at ? 1.0 / 256.0 : 0.0;
+    radiance = vec4(texelFetch(u_map, source, 0).rgb, weight);
+}`;
 const MAIN_ADD = `
 uniform sampler2D u_early, u_late;
 uniform float u_share;
@@ -15,8 +20,8 @@ uniform vec3 u_weight;
 out vec4 radiance;
 void main() {
     ivec2 at = ivec2(gl_FragCoord.xy);
-    vec3 light = mix(texelFetch(u_early, at, 0), texelFetch(u_late, at, 0), u_share).rgb;
-    radiance = vec4(u_weight * light, 1.0);
+    vec4 light = mix(texelFetch(u_early, at, 0), texelFetch(u_late, at, 0), u_share);
+    radiance = vec4(u_weight, 1.0) * light;
 }`;
 const LIGHT = `
 uniform sampler2D u_light;
@@ -26,17 +31,22 @@ const LONG_FRAME = 40, SHORT_FRAME = 25;  // milliseconds between two pictures
 // A light group: decodes stored hours into `next`, which the groups share, and keeps one or two of them in `maps`.
 class LightGroup {
   constructor(graphics, page, number, next, valid) {
-    const {gl} = graphics, {width, height, groups} = page.manifest, {name, shader, lightmap} = groups[number];
-    Object.assign(this, {graphics, page, number, next, name, lightmap, tiles: lightmap.tiles, weight: [1, 1, 1]});
-    const program = (main) => graphics.program(WHOLE, HEAD + shader + main);
-    this.programs = {tile: program(MAIN_TILE), fill: program(MAIN_FILL)};
-    this.networks = this.#array('networks', Float32Array);
-    this.textures = {wlm_lightmap_networks: graphics.fours(this.networks), wlm_lightmap_valid: valid, ...this.#upload()};
+    const {gl} = graphics, {width, height, groups} = page.manifest, {name, lightmap} = groups[number];
+    Object.assign(this, {graphics, page, number, next, name, lightmap, valid, tiles: lightmap.tiles, weight: [1, 1, 1]});
     this.layers = new Set();
     this.maps = Array.from(
       {length: Math.min(lightmap.times.length, 2)}, () => graphics.target(width, height, graphics.half(), gl.LINEAR));
     this.seen = [];
     this.waiting = [];
+  }
+
+  // Compiles the shaders and uploads the textures, before the first decoding.
+  #prepare() {
+    const {graphics, page, number, valid} = this, {shader} = page.manifest.groups[number];
+    const program = (main) => graphics.program(WHOLE, HEAD + shader + main);
+    this.programs = {tile: program(MAIN_TILE), fill: program(MAIN_FILL)};
+    this.networks = this.#array('networks', Float32Array);
+    this.textures = {wlm_lightmap_networks: graphics.fours(this.networks), wlm_lightmap_valid: valid, ...this.#upload()};
   }
 
   #array(name, kind) { return this.page.array(`${this.number}_${name}`, kind); }
@@ -74,6 +84,7 @@ class LightGroup {
 
   // Prepares a time of `wlmReads`: its table, the images that it reads, and an empty map.
   #ask(read) {
+    if (!this.programs) this.#prepare();
     const {graphics, lightmap, next} = this, {gl} = graphics, old = this.table;
     this.asked = read;
     this.table = graphics.fours(wlmTable(lightmap, this.networks, read));
@@ -85,11 +96,18 @@ class LightGroup {
     next.owner = this;
   }
 
+  // The time whose light is shown: within a switch of a lamp, from `start` to `end`, the light before it.
+  #held(time) {
+    const {switches = [], period} = this.lightmap;
+    const since = (start) => period ? ((time - start) % period + period) % period : time - start;
+    return switches.find(([start, end]) => since(start) > 0 && since(start) < end - start)?.[0] ?? time;
+  }
+
   #map(read) { return this.maps.find((map) => map.key === read.key); }
 
   // Decodes up to `count` tiles that a time still needs; returns whether it needed any.
   work(time, count) {
-    const reads = wlmReads(this.lightmap, time);
+    const reads = wlmReads(this.lightmap, this.#held(time));
     if (!this.waiting.length) {
       const missing = reads.find((read) => !this.#map(read));
       if (!missing) {
@@ -143,6 +161,7 @@ class LightmapPage {
     this.time = manifest.time;
     this.first = period ? 0 : times[0];
     this.length = period ?? times.at(-1) - this.first;
+    this.speed = this.length / 12;  // hours a second while playing
     this.originals = new Originals(graphics, page);
     if (this.length > 0 && times.length > 1) {
       this.setTime = panel.slider('hour', {
@@ -158,8 +177,12 @@ class LightmapPage {
     }
     if (this.groups.length > 1) for (const group of this.groups) this.#dial(group);
     this.display = new Display(page, panel, changed);
-    this.surface = new Surface(
-      graphics, page, LIGHT, this.display, panel, changed, (column, row) => this.#tell(column, row));
+    this.surface = this.makeSurface();
+  }
+
+  makeSurface() {
+    const {graphics, page, display, panel, changed} = this;
+    return new Surface(graphics, page, LIGHT, display, panel, changed, (column, row) => this.#tell(column, row));
   }
 
   // The controls of a group: its weight, and its colour as a screen shows it.
@@ -263,8 +286,7 @@ class LightmapPage {
     if (this.playing === undefined || this.waiting.length) return;
     // The slider was moved in the meantime.
     if (this.time !== this.played) this.playing = this.time - this.first;
-    // One day lasts twelve seconds.
-    this.playing = (this.playing + Math.min(elapsed, 250) / 12000 * this.length) % this.length;
+    this.playing = (this.playing + Math.min(elapsed, 250) / 1000 * this.speed) % this.length;
     this.setTime(this.#shown(this.first + this.playing));
     this.played = this.time;
   }

@@ -4,6 +4,7 @@ const KINDS = {
   lightmap: typeof LightmapPage === 'undefined' ? null : LightmapPage,
   atlas: typeof AtlasPage === 'undefined' ? null : AtlasPage,
   probe: typeof ProbePage === 'undefined' ? null : ProbePage,
+  scene: typeof ScenePage === 'undefined' ? null : ScenePage,
   smoke: typeof SmokePage === 'undefined' ? null : SmokePage,
 };
 

@@ -33,7 +33,6 @@ void main()
 }`;
 const TABLES = 4;
 
-// Radiance of a white diffuse surface under spherical harmonics of radiance: irradiance / pi.
 const LIT = `${HEAD}
 in vec3 a_position;
 in vec3 a_normal;
@@ -45,14 +44,7 @@ uniform float u_radius;  // of spheres; 0: the vertices are a mesh's own
 out vec3 v_decoded;
 out vec3 v_original;
 int wlm_row;
-
-vec3 wlm_diffuse(vec3 n, vec3 c[9])
-{
-    vec3 light = 0.2820948 * c[0] + 0.3257350 * (n.y * c[1] + n.z * c[2] + n.x * c[3]);
-    light += 0.2731371 * (n.x * n.y * c[4] + n.y * n.z * c[5] + n.x * n.z * c[7]);
-    return light + 0.0788479 * (3.0 * n.z * n.z - 1.0) * c[6] + 0.1365686 * (n.x * n.x - n.y * n.y) * c[8];
-}
-
+${DIFFUSE}
 void main()
 {
     int row = u_radius > 0.0 ? gl_InstanceID : gl_VertexID;
