@@ -82,11 +82,8 @@ def rows(screen):
 
 
 def test_every_way_shows_what_python_decodes(rows):
-    shaders = [
-        ("GLSL", "M, numbers in textures"),
-        ("GLSL", "M, numbers in buffers"),
-        ("WGSL", "M, numbers in textures"),
-    ]
+    places = ("textures", "buffers")
+    shaders = [(language, f"M, numbers in {place}") for language in ("GLSL", "WGSL") for place in places]
     reads = ["nothing", "virtual texture", "two hours of RGB9E5", "two hours of BC7", "two hours of BC6H"]
     assert keys(rows) == [("ours", "M"), *shaders, *(("read", name) for name in reads)]
     for row in rows[1:5]:
