@@ -14,7 +14,6 @@ from builders.rooms import write_room
 from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
-from wlm.atlas import matching
 from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.atlas.data import LightmappedScene, from_arrays, join, load
 from wlm.atlas.evaluation import compare
@@ -496,21 +495,31 @@ def test_a_lightmap_goes_to_the_mesh_that_it_fits(tmp_path):
     assert len(load(scene, tmp_path / "grey.exr").sheets[0].parts) == 3
 
 
-@pytest.mark.parametrize("band", [None, 8])
-def test_an_upside_down_lightmap_is_noticed(tmp_path, monkeypatch, band):
-    """By all of its texels, and as a large one by bands of rows."""
-    if band is not None:
-        monkeypatch.setattr(matching, "_LOOKED_AT", 0)
-        monkeypatch.setattr(matching, "_BAND", band)
+TURNS = {
+    "upside down (--flip)": lambda light: light[::-1],
+    "mirrored left to right": lambda light: light[:, ::-1],
+    "turned by 180 degrees": lambda light: light[::-1, ::-1],
+    "transposed, rows as columns": lambda light: light.swapaxes(0, 1),
+    "turned by 90 degrees counterclockwise": lambda light: np.rot90(light, -1),
+    "turned by 90 degrees clockwise": np.rot90,
+    "transposed and turned by 180 degrees": lambda light: np.rot90(light, 2).swapaxes(0, 1),
+}
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (16, 16)])
+def test_a_turned_lightmap_is_noticed(tmp_path, size):
+    """The warning names the turn that makes it fit; also for a lightmap of another aspect, and for a large one."""
     position, triangle, uv = box((0, 0, 0), (1, 1, 1))
     uv = shifted(uv)
-    light = baked(uv)
+    light = baked(uv).repeat(size[0], 0).repeat(size[1], 1)
     scene = write_scene(tmp_path / "a.gltf", [Thing("a", position, triangle, [uv])])
-    for flip in (False, True):
-        write_exr(tmp_path / "a.exr", light[:: -1 if flip else 1])
-        warnings = load(scene, tmp_path / "a.exr").warnings
-        assert any("better upside down: see flip (--flip)" in line for line in warnings) == flip
-        (sheet,) = load(scene, tmp_path / "a.exr", flip=flip).sheets
+    assert not any("smoother" in line for line in from_arrays(position, triangle, uv, light).warnings)
+    for words, turn in TURNS.items() if size[0] == 1 else list(TURNS.items())[:1]:
+        found = [line for line in from_arrays(position, triangle, uv, turn(light)).warnings if "smoother" in line]
+        assert len(found) == 1 and f"of TEXCOORD_0 with the lightmap {words} than in those of TEXCOORD_0" in found[0]
+    if size == (1, 1):
+        write_exr(tmp_path / "a.exr", light[::-1])
+        (sheet,) = load(scene, tmp_path / "a.exr", flip=True).sheets
         np.testing.assert_allclose(sheet.lightmap[sheet.mask], light[sheet.mask], rtol=1e-3)
 
 

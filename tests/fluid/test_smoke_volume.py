@@ -385,7 +385,7 @@ def test_damage(tmp_path: Path):
         load_volume(path)
     assert load_volume(path, density="heat").shape == (24, 16, 32)
     write(path, placed=scaled(1, 1, 1e-7))
-    with pytest.raises(WlmError, match="a.vdb: density: expected at most 134217728 cubic voxels"):
+    with pytest.raises(WlmError, match="a.vdb: density: expected at most 16777216 cubic voxels"):
         load_volume(path)
 
 

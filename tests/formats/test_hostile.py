@@ -27,6 +27,7 @@ from benchmarks.rows import read_runs
 from tests.fuzz.worker import Limits
 from wlm import atlas, lightmap
 from wlm.atlas.stored import with_uvs
+from wlm.bake.geometry import read_geometry
 from wlm.cli.console import note, show, show_text, table
 from wlm.config import load_settings
 from wlm.errors import WlmError, printable
@@ -309,6 +310,16 @@ def test_an_accessor_that_is_not_drawn_is_bounded_where_it_is_copied(tmp_path):
     mesh = atlas.load(path, tmp_path / "a.exr")
     expected = "accessors[2]: count: expected at most 4194304 without a bufferView"
     assert expected in refused(with_uvs, mesh, mesh.sheets[0].uv[mesh.sheets[0].triangle])
+
+
+def test_normals_without_data_are_bounded_together(tmp_path):
+    """Each mesh has normals of its own, of 4 million zeros, to the positions that all share."""
+    meshes = [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 2 + i}}]} for i in range(3)]
+    accessors = [*tree()["accessors"][:2], *([accessor(2**22)] * 3)]
+    nodes = [{"mesh": i} for i in range(3)]
+    changes = {"meshes": meshes, "nodes": nodes, "accessors": accessors, "scenes": [{"nodes": [0, 1, 2]}], "scene": 0}
+    expected = "expected at most 4194304 stored normals for the size of the file"
+    assert expected in refused(lambda path: read_geometry(path, None), write(tmp_path / "a.gltf", tree(**changes)))
 
 
 @pytest.mark.parametrize("trust", [False, True])

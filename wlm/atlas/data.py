@@ -23,7 +23,7 @@ import numpy as np
 from wlm.atlas.charts import charts, welded
 from wlm.atlas.coverage import covered_texels, touched_texels
 from wlm.atlas.listing import Listing, SheetFiles, is_listing, read_listing
-from wlm.atlas.matching import all_by_name, chart_map, choose_mesh, fits_flipped, misfits, named, replace_strays
+from wlm.atlas.matching import all_by_name, chart_map, choose_mesh, misfits, named, replace_strays
 from wlm.atlas.materials import EXTENSIONS, Readings, Rectangle, own_lightmaps, settle, slot_readings
 from wlm.errors import WlmError
 from wlm.formats.channels import read_encoded
@@ -636,7 +636,7 @@ def _checked(
         cropped = any(CROPPED in line for line in warnings)
         given = name, lightmaps[0], position, triangle[active], uv, chart, used, alternatives
         lines = [] if cropped else misfits(*given)
-        mask, repairs = _checked_light(name, uv, triangle[active], chart, used, lightmaps, mask, names)
+        mask, repairs = _checked_light(name, uv, triangle[active], used, lightmaps, mask, names)
         warnings += lines + repairs
         lightmaps = fill_gaps(lightmaps, mask)
     return Sheet(name, position, triangle, uv, active, lightmaps, mask, tuple(parts), tuple(warnings))
@@ -646,7 +646,6 @@ def _checked_light(
     name: str,
     uv: np.ndarray,
     triangle: np.ndarray,  # only active triangles
-    chart: np.ndarray,
     used: str,
     lightmaps: np.ndarray,
     mask: np.ndarray | None,
@@ -683,8 +682,6 @@ def _checked_light(
                 f"{name}: {_count(missed, 'texel')} of {covered} that triangles cover are outside the mask: "
                 f"does it belong to another UV set than {used}, or is it upside down?"
             )
-    if fits_flipped(lightmaps[0], chart):
-        warnings.append(f"{names[0]}: fits the mesh's charts better upside down: see flip (--flip)")
     for lightmap, path in zip(lightmaps, names, strict=False):
         if specks := replace_strays(lightmap, mask, coverage > 0):
             warnings.append(f"{path}: {_count(specks, 'texel')} in specks far above all other light: replaced")

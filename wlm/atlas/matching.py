@@ -1,5 +1,5 @@
-"""Finds from a lightmap's own light which mesh it was baked for, whether it is upside down, and which texels are stray:
-invalid, or far too bright for their place.
+"""Finds from a lightmap's own light which mesh it was baked for, whether it is turned or mirrored, and which texels are
+stray: invalid, or far too bright for their place.
 
 Within a chart light is smooth except at the edges of shadows; it is not smooth across gaps, other charts and values
 that a baker leaves between charts. So the mean difference between neighbouring texels of one chart is smallest with the
@@ -9,6 +9,7 @@ UVs that the lightmap was baked for.
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,16 +25,28 @@ from wlm.texels import fill_gaps
 
 _STEP = 3.0  # octaves: larger steps, and steps to NaN or infinity, are clamped to this
 _DARK = 0.02  # fraction of the median light that is added first, so that dark texels have no steps
-# On 15 lightmaps, in both orientations, the right one has at most 0.82 of the other's roughness.
-_BETTER = 0.85
+_BETTER = 0.85  # other UVs fit better if the light's roughness in their charts is below this multiple
 _LOOKED_AT, _BAND = 1 << 22, 16  # texels examined per lightmap, and rows per band: enough, within a second
 _LEAST, _FEWEST = 0.005, 1024  # smallest roughness in octaves; fewest texels in charts for a meaningful mean
 _SHARED = 0.02  # fraction of texels under several meshes; a smaller one is rounding at neighbouring charts
 _BRIGHT, _PERCENTILE = 16.0, 99.5  # a speck is brighter than this multiple of this percentile of the light
 _WIDEST = 3  # a speck is narrower than this number of texels
-# Squares weigh the edges of charts more than the noise inside: on a room with filled gaps, the right UVs have at most
-# 0.88 of the squares of 23 other layouts, but 1.2 of their mean.
-_SQUARES = 2
+# Ways in which a lightmap may lie instead, likeliest first: words, and whether its charts are transposed and then
+# mirrored in v and in u. Of those that fit about equally well the first is named.
+_TURNS = (
+    ("", False, 1, 1),
+    ("upside down (--flip)", False, -1, 1),
+    ("mirrored left to right", False, 1, -1),
+    ("turned by 180 degrees", False, -1, -1),
+    ("transposed, rows as columns", True, 1, 1),
+    ("turned by 90 degrees counterclockwise", True, 1, -1),
+    ("turned by 90 degrees clockwise", True, -1, 1),
+    ("transposed and turned by 180 degrees", True, -1, -1),
+)
+# Another turn must have less than this multiple of the roughness; less than the second where the roughness is below
+# `_SMOOTH` of that of the whole picture, as it is with the right UVs and in large charts of smooth light.
+_TURNED, _MUCH, _SMOOTH = 0.8, 0.4, 0.45
+_ALIKE = 0.95  # of several that fit, the first one is named whose roughness is within this ratio of the smallest
 _EXAMINED = 1024  # longest side of the picture in which UVs are compared
 _APART, _TINY = 0.25, 0.02  # shares of charts without light and of light without charts, and of light in charts
 _BOX = "its UVs, about"
@@ -132,27 +145,43 @@ def chart_map(position: np.ndarray, uv: np.ndarray, triangle: np.ndarray, height
     return np.where(seen < 0, -1, number[seen.clip(0)])
 
 
-def roughness(lightmap: np.ndarray, chart: np.ndarray, power: int = 1) -> float:
+def roughness(lightmap: np.ndarray, chart: np.ndarray) -> float:
     """Returns the mean difference, in octaves (factors of 2), between neighbouring texels of one chart (`chart_map`);
     infinity without such texels. NaN and infinity count as large differences. A large lightmap is sampled in evenly
-    spread bands of rows with `_LOOKED_AT` texels in all. `power` is the exponent of the differences."""
+    spread bands of rows with `_LOOKED_AT` texels in all."""
     bands = _bands(*chart.shape)
     with np.errstate(invalid="ignore"):
         greys = [lightmap[band].astype(np.float64).mean(axis=2) for band in bands]
-    lit = np.concatenate([grey[np.isfinite(grey) & (grey > 0)] for grey in greys])
-    if not lit.size:
+    if not (floor := _floor(greys)):
         return float("inf")
-    floor = _DARK * np.median(lit)
     total, count = 0.0, 0
     for band, grey in zip(bands, greys, strict=True):
-        finite = np.isfinite(grey)
-        octave = np.log2(np.where(finite, grey.clip(0.0), 0.0) + floor)
-        for axis in (0, 1):
-            (a, b), (c, d), (e, f) = (_neighbours(values, axis) for values in (octave, chart[band], finite))
-            inside = (c == d) & (c >= 0)
-            step = np.where(e & f, np.minimum(np.abs(a - b), _STEP), _STEP)
-            total, count = total + float((step[inside] ** power).sum()), count + int(inside.sum())
+        for step, inside in zip(_steps(grey, floor), _inside(chart[band]), strict=True):
+            total, count = total + float(step[inside].sum()), count + int(inside.sum())
     return total / count if count else float("inf")
+
+
+def _floor(greys: Sequence[np.ndarray]) -> float:
+    """Returns the light that is added to all texels before they are compared; 0 if no texel is lit."""
+    lit = np.concatenate([grey[np.isfinite(grey) & (grey > 0)] for grey in greys])
+    return _DARK * float(np.median(lit)) if lit.size else 0.0
+
+
+def _steps(grey: np.ndarray, floor: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the differences in octaves between neighbours in a column [H - 1, W] and in a row [H, W - 1]."""
+    finite = np.isfinite(grey)
+    octave = np.log2(np.where(finite, grey.clip(0.0), 0.0) + floor)
+    found = []
+    for axis in (0, 1):
+        (a, b), (c, d) = _neighbours(octave, axis), _neighbours(finite, axis)
+        found.append(np.where(c & d, np.minimum(np.abs(a - b), _STEP), _STEP))
+    return found[0], found[1]
+
+
+def _inside(chart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tests which neighbours in a column [H - 1, W] and in a row [H, W - 1] are of one chart."""
+    (a, b), (c, d) = _neighbours(chart, 0), _neighbours(chart, 1)
+    return (a == b) & (a >= 0), (c == d) & (c >= 0)
 
 
 def _bands(height: int, width: int) -> list[slice]:
@@ -164,12 +193,63 @@ def _bands(height: int, width: int) -> list[slice]:
     return [slice(row, row + _BAND) for row in first]
 
 
-def fits_flipped(lightmap: np.ndarray, chart: np.ndarray) -> bool:
-    """Tests whether a lightmap fits its charts (`chart_map`) clearly better upside down."""
-    if np.count_nonzero(chart >= 0) < _FEWEST:
-        return False
-    flipped, rough = roughness(lightmap[::-1], chart), roughness(lightmap, chart)
-    return flipped < min(_BETTER * rough, rough - _LEAST)
+class _Turned(NamedTuple):
+    """A lightmap in one of `_TURNS`.
+
+    Attributes:
+        words: Words for the turn, "" for the lightmap as it is.
+        roughness: Mean squared difference, in octaves, between neighbouring texels of one chart. Squares weigh the
+            edges of charts more than the noise inside: on a room with filled gaps, the right UVs have at most 0.88 of
+            the squares of 23 other layouts, but 1.2 of their mean.
+        black: The number of texels in charts without light.
+    """
+
+    words: str
+    roughness: float
+    black: int
+
+
+class _Picture:
+    """The light of a lightmap [H, W, 3], compared with charts that are turned instead of it."""
+
+    def __init__(self, light: np.ndarray, lit: np.ndarray) -> None:
+        """Takes the light, of which a texel at least is lit, and which texels are, bool [H, W]."""
+        with np.errstate(invalid="ignore"):
+            grey = light.astype(np.float64).mean(axis=2)
+        self._dark = ~lit
+        self._steps = [step**2 for step in _steps(grey, _floor([grey]))]
+        self.everywhere = sum(float(step.sum()) for step in self._steps) / sum(step.size for step in self._steps)
+
+    def turned(self, chart: np.ndarray) -> list[_Turned]:
+        """Returns the roughness in the charts (`chart_map`) for each of `_TURNS`, infinity without neighbours."""
+        height, width = chart.shape
+        # Nearest texels, where the lightmap is not square.
+        exchanged = chart[np.ix_(np.arange(width) * height // width, np.arange(height) * width // height)].T
+        charts = [(_inside(each), each >= 0) for each in (chart, exchanged)]
+        found = []
+        for words, transposed, v, u in _TURNS:
+            inside, covered = charts[transposed]
+            total = sum(
+                float(np.einsum("ij,ij->", step, each[::v, ::u]))
+                for step, each in zip(self._steps, inside, strict=True)
+            )
+            count = sum(np.count_nonzero(each) for each in inside)
+            black = np.count_nonzero(covered[::v, ::u] & self._dark)
+            found.append(_Turned(words, total / count if count else float("inf"), black))
+        return found
+
+
+def _better_turn(turns: Sequence[_Turned], everywhere: float, texels: int, apart: bool, smooth: bool) -> _Turned | None:
+    """Returns the turn that fits clearly better than the lightmap as it is, the first of `turns`, or None. `apart` is
+    whether the light as it is lies outside of the `texels` texels in charts, `smooth` whether it is smooth in them."""
+    now = turns[0].roughness
+    limit = everywhere if apart else min((_MUCH if smooth else _TURNED) * now, now - _LEAST**2)
+    black = _APART * texels if apart else max(turns[0].black, _APART * texels)
+    best = None
+    for each in turns[1:]:
+        if each.roughness < limit and each.black <= black:
+            best, limit = each, _ALIKE * each.roughness
+    return best
 
 
 def misfits(
@@ -182,8 +262,9 @@ def misfits(
     used: str,
     alternatives: Sequence[tuple[str, np.ndarray]],
 ) -> list[str]:
-    """Returns a list of one line of doubt if a lightmap [H, W, 3] fits its charts badly, else an empty list: other UVs
-    make it clearly smoother in the charts, light and charts lie apart, or the charts leave nearly all of the light out.
+    """Returns a list of one line of doubt if a lightmap [H, W, 3] fits its charts badly, else an empty list: other UVs,
+    or the lightmap turned or mirrored, make it clearly smoother in the charts, light and charts lie apart, or the
+    charts leave nearly all of the light out.
 
     Args:
         name: The lightmap's name.
@@ -207,15 +288,15 @@ def misfits(
     black = np.count_nonzero(inside & ~lit) / max(texels, 1)
     away = np.count_nonzero(lit & ~near) / np.count_nonzero(lit)
     apart = min(black, away) > _APART
+    picture = _Picture(light, lit)
+    turns = picture.turned(chart)
+    rough = float("inf") if apart else turns[0].roughness
+    # The light is smoother in charts than across their edges. Few texels say little about the UVs that are used.
+    everywhere = picture.everywhere * (1.0 if texels >= _FEWEST else _BETTER)
+    limit = min(_BETTER * rough, rough - _LEAST**2, everywhere)
+    smooth = rough < _SMOOTH * picture.everywhere
+    found: list[tuple[float, str]] = []
     others = [*alternatives, *_stretched(uv, triangle, lit)]
-    if others:
-        rough = float("inf") if apart else roughness(light, chart, _SQUARES)
-        # The light is smoother in charts than across their edges. Few texels say little about the UVs that are used.
-        everywhere = roughness(light, np.zeros((height, width), np.int32), _SQUARES) * (
-            1.0 if texels >= _FEWEST else _BETTER
-        )
-        limit = min(_BETTER * rough, rough - _LEAST**2, everywhere)
-    best: tuple[float, str] | None = None
     for words, uvs in others:
         other = uvs.astype(np.float64)
         if not np.isfinite(other).all() or other.min() < -_OUTSIDE or other.max() > 1.0 + _OUTSIDE:
@@ -226,17 +307,21 @@ def misfits(
         if count < max(_FEWEST, texels // 4 if texels >= _FEWEST else 4 * texels):
             continue
         overlaps = np.count_nonzero(covered_texels(other, triangle, height, width) > 1)
-        for words_of, picture in ((words, light), (f"{words} with the lightmap upside down (--flip)", light[::-1])):
-            found = roughness(picture, charted, _SQUARES)
-            dark = np.count_nonzero((charted >= 0) & ~(picture > 0).any(axis=2))
-            if overlaps <= _SHARED * count and dark <= _APART * count and found < limit:
-                # A stretched box is only roughly right, and the lightmap upside down is a second change.
-                less_likely = words.startswith(_BOX) or words_of != words
-                ranked = (found / (_BETTER if less_likely else 1.0), words_of)
-                best = min(best or ranked, ranked)
-    if best is not None:
+        for turn in picture.turned(charted)[: 2 if words.startswith(_BOX) else None]:
+            # A stretched box is only roughly right, and a turned lightmap is a second change.
+            if smooth and turn.words:
+                continue
+            rough = turn.roughness / (_BETTER if turn.words or words.startswith(_BOX) else 1.0)
+            if overlaps <= _SHARED * count and turn.black <= _APART * count and rough < limit:
+                found.append((rough, f"{words} with the lightmap {turn.words}" if turn.words else words))
+    turned = None if texels < _FEWEST else _better_turn(turns, picture.everywhere, texels, apart, smooth)
+    if turned is not None:
+        found.append((turned.roughness, f"{used} with the lightmap {turned.words}"))
+    if found:
+        smallest = min(found)[0]
+        best = next(words for rough, words in found if rough <= smallest / _ALIKE)
         return [
-            f"{name}: the light is smoother in the charts of {best[1]} than in those of {used}: does it belong to them?"
+            f"{name}: the light is smoother in the charts of {best} than in those of {used}: does it belong to them?"
         ]
     if np.count_nonzero(lit) >= _FEWEST and texels:
         if apart:

@@ -21,7 +21,7 @@ from wlm.errors import WlmError
 from wlm.fluid.grids import UPS, Grid, choose, is_level_set, on_one_lattice
 from wlm.formats.atomic import atomic_path
 from wlm.formats.exr import HALF_MAX
-from wlm.formats.limits import RESAMPLED, SURE_VOXELS, VOLUME_BYTES, VOXELS, check_growth
+from wlm.formats.limits import RESAMPLED, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, check_growth
 from wlm.formats.nanovdb import NanoVdbFile
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import FileBytes, open_file, read_file
@@ -223,7 +223,7 @@ def load_volume(
         volume = _turned(volume, up) if up != "y" else volume
     else:
         grids, warnings = _read_grids(path, names, trust)
-        most = LARGEST if trust else min(VOXELS, max(SURE_VOXELS, RESAMPLED * sum(g.values.numel() for g in grids)))
+        most = LARGEST if trust else min(VOXELS, max(SURE_BOX, RESAMPLED * sum(g.values.numel() for g in grids)))
         lattice, (smoke, *heat) = on_one_lattice(grids, most, up)
         place = {"voxel": lattice.voxel, "origin": lattice.origin, "device": device}
         volume = from_array(smoke, temperature=heat[0] if heat else None, **place, **factors)

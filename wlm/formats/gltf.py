@@ -30,6 +30,7 @@ a file missing or damaged             error that names the file, and the field
 
 import base64
 import binascii
+import json
 import os
 import re
 import struct
@@ -309,12 +310,18 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
     with reported(document.path):
         transforms = dict(_walk(document))
         normals: list[np.ndarray | None] = []
+        stored: dict[int, np.ndarray] = {}  # primitives often share their accessors
+        budget = Budget(document.path, document.most, "stored normals")
         for each in primitives:
             attributes = document.item("meshes", each.mesh)["primitives"][each.primitive]["attributes"]
             if "NORMAL" not in attributes:
                 normals.append(None)
                 continue
-            local = _floats(document, attributes["NORMAL"], "VEC3")
+            number = attributes["NORMAL"]
+            if number not in stored:
+                budget.spend(_count(document, number))
+                stored[number] = _floats(document, number, "VEC3")
+            local = stored[number]
             if len(local) <= each.row.max():
                 raise WlmError(
                     f"{document.path}: {each.name}: expected {each.row.max() + 1} normals or more, found {len(local)}"
@@ -657,7 +664,7 @@ def texture_transform(where: str, info: dict) -> tuple[int | None, np.ndarray]:
     KHR_texture_transform, float64 [2, 3]: UV' = transform[:, :2] UV + transform[:, 2].
 
     Raises:
-        WlmError: The transform is malformed; `where` names the slot.
+        WlmError: The transform or the UV set is malformed; `where` names the slot.
     """
     transform = info.get("extensions", {}).get("KHR_texture_transform", {})
     names = {"scale": [1.0, 1.0], "rotation": 0.0, "offset": [0.0, 0.0]}
@@ -670,7 +677,10 @@ def texture_transform(where: str, info: dict) -> tuple[int | None, np.ndarray]:
         )
     cosine, sine = np.cos(turn), np.sin(turn)
     matrix = np.column_stack([np.array([[cosine, sine], [-sine, cosine]]) * scale, offset])
-    return transform.get("texCoord", info.get("texCoord")), matrix
+    number = transform.get("texCoord", info.get("texCoord"))
+    if number is not None and (not isinstance(number, int) or number < 0):
+        raise WlmError(f"{where}: texCoord: expected the number of a UV set, found {json.dumps(number)[:60]}")
+    return number, matrix
 
 
 def image_file(document: GltfDocument, number: int) -> Path:

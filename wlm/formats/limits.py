@@ -90,7 +90,7 @@ SURE_VOXELS = 1 << 27
 """Voxels that are allowed for any size of file: 512^3, for frames of a simulation without smoke."""
 
 SURE_BOX = 1 << 24
-"""Voxels of the bounding box of a VDB grid that are allowed for any size of grid: 256^3."""
+"""Voxels of the bounding box of a VDB grid, and of its cubic voxels, that are allowed for any size of grid: 256^3."""
 
 VOXELS_A_BYTE = 64
 """Voxels of the bounding box per byte of a NanoVDB grid or of a `.vdb` file: 1 of 256 voxels may be stored."""
