@@ -33,7 +33,7 @@ SOFTWARE_GL = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--e
 PAPER, INK = "#1b1b1f", "#e8e8e8"
 GAP = 10  # between pictures
 STREET = (7.0, 12.0, 18.75, 22.0)  # hours of the street
-SECOND, VIEW = 2.0, (396, 704)  # of the street: the camera's place by the second of its film, height and width
+SECOND, VIEW = 2.0, (360, 640)  # of the street: the camera's place by the second of its film, height and width
 
 # By file: what is opened, its options, the view, and the sliders.
 VIEWS: dict[str, tuple[Sequence[str], dict[str, Any], str, dict[str, float]]] = {

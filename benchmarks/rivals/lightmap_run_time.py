@@ -6,6 +6,7 @@ the light before the switch of a lamp is held until the switch, as the virtual t
 """
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import warp as wp
@@ -19,7 +20,7 @@ from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.runtime import MapDecoder
 from wlm.lightmap.tiles import TILE
 from wlm.texels import nearest_valid
-from wlm.workers import each
+from wlm.workers import cores
 
 _BLOCK_BYTES, _RANGE_BYTES = 16, 12  # of a block of 4 x 4 texels; of the range of a tile of BC7
 
@@ -154,8 +155,9 @@ class Blocks:
         need_bc()
         self.title, self._sheet = f"{RIVALS[name].title} resident", sheet
         wanted = sorted({i for hour in hours for i in neighbours(sheet.times, hour)[:2]})
-        encoded = each(lambda i: RIVALS[name].encode(sheet.frames[i], sheet.mask).decoded, wanted)
-        self._decoded = dict(zip(wanted, encoded, strict=True))
+        with ThreadPoolExecutor(cores()) as pool:
+            encoded = pool.map(lambda i: RIVALS[name].encode(sheet.frames[i], sheet.mask).decoded, wanted)
+            self._decoded = dict(zip(wanted, encoded, strict=True))
         height, width = sheet.mask.shape
         size = -(-height // TILE) * -(-width // TILE) * _RANGE_BYTES if name == "bc7" else 0
         while True:
