@@ -35,7 +35,7 @@ test: lint
 test-all: lint
 	$(BIN)/pytest -n 2 --dist loadfile -m ""
 
-# Reads 20,000 changed files of each kind in about half an hour on two cores; writes the counts to out/fuzz.json.
+# Reads up to 20,000 changed files of each kind, which takes some hours on two cores; writes the counts to out/fuzz.json.
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz --cases 20000 --json out/fuzz.json
 
