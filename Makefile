@@ -6,7 +6,7 @@ BIN := .venv/bin
 # The target is a stamp and not the folder, whose modification time changes with every file added.
 STAMP := .venv/.installed
 
-DEMOS := lightmap atlas probe bake smoke smoke_light smoke_network ops_march ops_bc7 fluid_control ops_silhouette
+DEMOS := lightmap atlas probe bake smoke smoke_light smoke_network ops_march ops_bc7 fluid_control ops_silhouette scene
 
 # Two demos at a time, in this order: compiling kernels, which takes most of the time, keeps one core busy. The gallery
 # shows files of the others.
@@ -35,7 +35,7 @@ test: lint
 test-all: lint
 	$(BIN)/pytest -n 2 --dist loadfile -m ""
 
-# Reads 20,000 changed files of each kind in about half an hour on two cores; writes the counts to out/fuzz.json.
+# Reads up to 20,000 changed files of each kind, which takes some hours on two cores; writes the counts to out/fuzz.json.
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz --cases 20000 --json out/fuzz.json
 

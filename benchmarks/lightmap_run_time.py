@@ -155,22 +155,21 @@ class _RunTime(Bench):
 
     def rival_rows(self, model: LightmapModel, sheet: SheetFrames | None, paths: Iterable["_Path"]) -> list[Row]:
         """Returns a row for each rival and path."""
-        found = []
-        for path in paths:
-            hours = [shot.hour for shot in path.shots.values()]
-            makers: dict[str, Callable[[], Any]] = {
-                kind.title: partial(kind, model, self.device) for kind in (EveryFrame, EveryTime)
-            }
-            if sheet is not None:
-                makers |= {f"{RIVALS[name].title} resident": partial(Blocks, name, sheet, hours) for name in _BLOCKS}
-            for title, make in makers.items():
-                self.note(f"{path.name}, {title}")
-                try:
-                    rival = make()
-                except WlmError as error:
-                    found.append(self.missing_row(title, path.name, error))
-                    continue
-                found.append(self._rival_row(rival, title, path))
+        paths, found = list(paths), []
+        hours = [shot.hour for path in paths for shot in path.shots.values()]
+        makers: dict[str, Callable[[], Any]] = {
+            kind.title: partial(kind, model, self.device) for kind in (EveryFrame, EveryTime)
+        }
+        if sheet is not None:
+            makers |= {f"{RIVALS[name].title} resident": partial(Blocks, name, sheet, hours) for name in _BLOCKS}
+        for title, make in makers.items():
+            self.note(title)
+            try:
+                rival = make()
+            except WlmError as error:
+                found += [self.missing_row(title, path.name, error) for path in paths]
+                continue
+            found += [self._rival_row(rival, title, path) for path in paths]
         return found
 
     def format_rows(self, sheet: SheetFrames) -> list[Row]:

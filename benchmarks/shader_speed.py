@@ -5,8 +5,8 @@ The map has 1024 x 1024 texels with random maps and networks. The rows:
 - "ours": the fast decoder at a stored hour, 8 bits per channel, of profiles M and `standard`.
 - "GLSL": the exported shader, which draws the same hour as half floats, through OpenGL; numbers of networks and of the
   hour are in textures as exported, or by the shader's macros in storage buffers.
-- "WGSL": its translation, through wgpu, as a compute shader; a time is the difference of long and short runs, over the
-  difference of their dispatches.
+- "WGSL": its translation, through wgpu, as a compute shader, with the same two places of numbers; a time is the
+  difference of long and short runs, over the difference of their dispatches.
 - "read": a view of 1280 x 720 pixels of four sheets, read trilinearly: from a virtual texture, and from two hours of
   BC7, BC6H and RGB9E5 with mips, interpolated. "nothing" reads the view's coordinates alone, as all others do.
 
@@ -109,7 +109,8 @@ class _ShaderBench(Bench):
         for language, option, draw in (
             ("GLSL", "numbers in textures", lambda: self._glsl(made, False)),
             ("GLSL", "numbers in buffers", lambda: self._glsl(made, True)),
-            ("WGSL", "numbers in textures", lambda: self._wgsl(made)),
+            ("WGSL", "numbers in textures", lambda: self._wgsl(made, False)),
+            ("WGSL", "numbers in buffers", lambda: self._wgsl(made, True)),
         ):
             self.note(f"{language} of {name}, {option}")
             try:
@@ -154,7 +155,7 @@ class _ShaderBench(Bench):
         picture = screen.picture(text, (self._side, self._side), textures, stored)
         return picture.read(), picture.time(self._repeats), screen.name
 
-    def _wgsl(self, made: Bundle) -> tuple[np.ndarray, float, str]:
+    def _wgsl(self, made: Bundle, buffers: bool) -> tuple[np.ndarray, float, str]:
         import wgpu
 
         adapters = wgpu.gpu.enumerate_adapters_sync()
@@ -169,6 +170,10 @@ class _ShaderBench(Bench):
             required_features=["texture-compression-bc"], required_limits={"max-texture-dimension-2d": side}
         )
         text = translate(made.shader + _SHOWN, "wgsl")
+        for name in ("hour", "networks") if buffers else ():
+            own = f"wlm_lightmap_{name}"
+            text = text.replace(f"var {own}: texture_2d<f32>", f"var<storage, read> {own}: array<vec4f>")
+            text = text.replace(f"textureLoad({own}, vec2i(i & 1023, i >> 10), 0)", f"{own}[i]")
         code = f"""{text}
 @group(1) @binding(0) var wlm_out: texture_storage_2d<rgba16float, write>;
 @compute @workgroup_size(8, 8) fn main(@builtin(global_invocation_id) id: vec3u)
@@ -181,7 +186,7 @@ class _ShaderBench(Bench):
         # The mask is read to fill gaps only, which no shader is asked for here.
         names = re.findall(r"@binding\((\d+)\) var(?:<[^>]*>)? (?!wlm_lightmap_valid\b)(\w+)", text)
         entries = [
-            {"binding": int(place), "resource": _wgpu_resource(gpu, made, name)}
+            {"binding": int(place), "resource": _wgpu_resource(gpu, made, name, buffers)}
             for place, name in names
             if len(re.findall(rf"\b{name}\b", text)) > 1
         ]
@@ -283,13 +288,15 @@ def _uniform(buffer: str) -> str:
     return "wlm_lightmap_hour" if buffer == "hours" else f"wlm_lightmap_{buffer}"
 
 
-def _wgpu_resource(gpu: Any, made: Bundle, name: str) -> Any:
-    """Uploads what a binding of a translated shader needs: a texture, or the sampler."""
+def _wgpu_resource(gpu: Any, made: Bundle, name: str, buffers: bool) -> Any:
+    """Uploads what a binding of a translated shader needs: a texture, a buffer of numbers, or the sampler."""
     import wgpu
 
     part = name.removeprefix("wlm_lightmap_")
     if part in ("networks", "hour"):
         data = _rows_of_fours(made.buffers["networks"] if part == "networks" else made.buffers["hours"][0])
+        if buffers:
+            return {"buffer": gpu.create_buffer_with_data(data=data, usage=wgpu.BufferUsage.STORAGE)}
         fmt, size, pitch, rows = "rgba32float", (_ROW, len(data), 1), 16 * _ROW, len(data)
     elif part in made.textures:
         own = made.textures[part]

@@ -1,4 +1,4 @@
-"""The pictures of README and docs: what `wlm view` and `wlm web` show of what the demos leave.
+"""The pictures of README and docs: the street, and what `wlm view` and `wlm web` show of what the demos leave.
 
     make pictures
 
@@ -16,27 +16,25 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from PIL import Image, ImageColor, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont
 
+import wlm
 from wlm.cli.console import quiet_warp
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
+from wlm.scene import Renderer
 from wlm.view.opening import open_scene
-from wlm.view.window import STRIP, Window
+from wlm.view.window import Window
 
 HERE = Path(__file__).resolve().parent
 DATA = HERE / "data"
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 SOFTWARE_GL = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-PANEL = 300  # pixels of a page's panel
-PAPER, INK, SOFT, MARK = "#1b1b1f", "#e8e8e8", "#a0a0a8", "#ffb454"
-COLUMN, UPPER, LOWER, GAP, HEAD = 690, 260, 280, 10, 58  # of the gallery: its pictures, between and above them
-ROOMY = 420  # wide enough for a page to have its panel at the side
-TITLE = 60  # of a panel of the window
-FLAT = 1.08  # height of a page's picture over that of the lightmap in it
+PAPER, INK = "#1b1b1f", "#e8e8e8"
+GAP = 10  # between pictures
+STREET = (7.0, 12.0, 18.75, 22.0)  # hours of the street
+SECOND, VIEW = 2.0, (360, 640)  # of the street: the camera's place by the second of its film, height and width
 
-HOURS = (3.0, 7.0, 12.0, 18.5, 21.0)
-LIGHTMAPS = ("right", "left", "top", "bottom", "front", "back")
 # By file: what is opened, its options, the view, and the sliders.
 VIEWS: dict[str, tuple[Sequence[str], dict[str, Any], str, dict[str, float]]] = {
     "lightmap.png": (["city.wlm"], {"original": DATA / "city"}, "light", {"hour": 12.0}),
@@ -69,12 +67,6 @@ class Browser:
         """Opens a page of `gallery.py` or a report; a size in pixels."""
         page = self._chromium.new_page(viewport={"width": width, "height": height}, **options)
         page.goto((self._folder / f"{name}.html").as_uri())
-        return page
-
-    def stage(self, name: str, width: int, height: int) -> Any:
-        """Opens a page whose picture, beside the panel, has a size."""
-        page = self.open(name, PANEL + width, height)
-        page.evaluate("wlm.then(() => 0)")
         return page
 
 
@@ -131,93 +123,14 @@ def stack(pictures: Sequence[Image.Image], gap: int = GAP) -> Image.Image:
     return result
 
 
-def middle(picture: Image.Image, width: int, height: int) -> Image.Image:
-    """The middle of a picture."""
-    left, top = (picture.width - width) // 2, (picture.height - height) // 2
-    return picture.crop((left, top, left + width, top + height))
-
-
-def cell(title: str, words: str, picture: Image.Image) -> Image.Image:
-    """A picture of the gallery below what it shows."""
-    result = Image.new("RGB", (COLUMN, HEAD + picture.height), PAPER)
-    pen = ImageDraw.Draw(result)
-    pen.text((0, 4), title, MARK, ImageFont.load_default(24))
-    pen.text((0, 34), words, SOFT, ImageFont.load_default(16))
-    result.paste(picture, (0, HEAD))
-    return result
-
-
-def gallery(pages: Browser, out: Path) -> Image.Image:
-    """The four systems."""
-    cells = [
-        cell("Lightmaps over the day", "one file, read by a GPU at any hour", day(pages)),
-        cell("The lightmap of a mesh", "a small colour texture, read through a small table", room(pages)),
-        cell("Light probes", "decoded anywhere, from a few 3D Gaussians", street(pages, out)),
-        cell("Smoke", "six lightmaps, baked or by a network: lit from anywhere", plume(pages)),
-    ]
-    both = row([(stack(cells[::2], 2 * GAP), ""), (stack(cells[1::2], 2 * GAP), "")], 3 * GAP)
-    framed = Image.new("RGB", (both.width + 4 * GAP, both.height + 3 * GAP), PAPER)
-    framed.paste(both, (2 * GAP, GAP))
-    return framed
-
-
-def day(pages: Browser) -> Image.Image:
-    """Hours of the city's lightmap."""
-    side = (COLUMN - (len(HOURS) - 1) * GAP) // len(HOURS)
-    page, hours = pages.stage("city", ROOMY, round(UPPER * FLAT)), []
-    for hour in HOURS:
-        do(page, f"await kind.read({hour});")
-        hours.append((middle(take(page, "#view"), side, UPPER), f"{int(hour)}:{round(hour % 1 * 60):02}"))
-    return row(hours)
-
-
-def room(pages: Browser) -> Image.Image:
-    """The room's lightmap, and the room under it beside the original."""
-    page = pages.stage("room", ROOMY, round(UPPER * FLAT))
-    page.get_by_role("button", name="unwrapped").click()
-    unwrapped = middle(take(page, "#view"), UPPER, UPPER)
-    page = pages.stage("room", COLUMN - GAP - UPPER, UPPER)
-    page.get_by_role("button", name="split").click()
-    do(page, "const {mesh} = kind.surface; mesh.distance = 0.92; mesh.centre[1] -= 0.16 * mesh.radius; mesh.changed();")
-    return row([(unwrapped, "the lightmap"), (take(page, "#view"), "")])
-
-
-def street(pages: Browser, out: Path) -> Image.Image:
-    """The street's probes as white balls, and its Gaussians from `wlm view` on the page's paper."""
-    size = (COLUMN - GAP) // 2, LOWER
-    page = pages.stage("street", ROOMY, LOWER)
-    do(page, "await kind.read(); Object.assign(kind.camera, {yaw: 0.6, pitch: 0.42, distance: 0.84});")
-    do(page, "const {camera} = kind; camera.centre[1] -= 0.07 * camera.radius; camera.changed();")
-    page.keyboard.press("[")
-    balls = middle(take(page, "#view"), *size)
-    files, options, view, _ = VIEWS["probe.png"]
-    # Twice as large, without the title and the sliders; the other two panels are left out.
-    wide, high = 2 * size[0], 2 * size[1]
-    shown = Window(open_scene([out / file for file in files], **options), size=(3 * wide, TITLE + high + STRIP))
-    try:
-        shown.choose(view)
-        shown.set("sigma", 0.6)
-        shown.set("exposure", 0.5)
-        pixels = shown.picture()[TITLE : TITLE + high, :wide]
-    finally:
-        shown.close()
-    pixels[(pixels == pixels[-1, 0]).all(-1)] = ImageColor.getrgb(PAPER)
-    held = Image.fromarray(pixels).resize(size, Image.Resampling.LANCZOS)
-    return row([(balls, "probes, as white balls"), (held, "the Gaussians that hold them")])
-
-
-def plume(pages: Browser) -> Image.Image:
-    """The plume's six lightmaps, and the plume under a light."""
-    page = pages.stage("plume", ROOMY, LOWER)
-    do(page, "kind.camera.distance = 0.926; kind.toward = unit([0.75, 0.6, 0.3]); kind.camera.changed();")
-    small, maps = (LOWER - GAP) // 2, []
-    wide = COLUMN - 3 * (small + GAP)
-    lit = middle(take(page, "#view"), wide, LOWER)
-    for name in LIGHTMAPS:
-        page.get_by_role("button", name=name, exact=True).click()
-        shown = middle(take(page, "#view"), LOWER, LOWER)
-        maps.append((shown.resize((small, small), Image.Resampling.LANCZOS), name))
-    return row([(stack([row(maps[:3]), row(maps[3:])]), ""), (lit, "any light")])
+def street() -> Image.Image:
+    """The street at four hours."""
+    views = []
+    with wlm.scene.load(DATA / "street" / "street.yaml") as scene, Renderer(scene, *VIEW, samples=3) as renderer:
+        for hour in STREET:
+            drawn = Image.fromarray(renderer.draw(SECOND, hour=hour, complete=True).picture())
+            views.append((drawn, f"{int(hour)}:{round(hour % 1 * 60):02}"))
+    return stack([row(views[:2]), row(views[2:])])
 
 
 def page_and_phone(pages: Browser) -> Image.Image:
@@ -262,8 +175,8 @@ def main() -> None:
     args = parser.parse_args()
     quiet_warp()
     try:
+        save(args.out / "street.png", street())
         with browser(args.demos) as pages:
-            save(args.out / "gallery.png", gallery(pages, args.demos))
             save(args.out / "web.png", page_and_phone(pages))
         for name in VIEWS:
             save(args.out / name, window(args.demos, name))

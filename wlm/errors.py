@@ -1,4 +1,8 @@
-"""The error class for messages to the user."""
+"""The error class for messages to the user, and which errors are those of a broken package."""
+
+import sys
+from traceback import walk_tb
+from types import FrameType
 
 _LIMIT = 2000  # characters: enough for several long paths
 
@@ -38,3 +42,33 @@ class WlmError(Exception):
 
     def __init__(self, message: object) -> None:
         super().__init__(one_line(message))
+
+
+def broken_package(error: BaseException) -> str:
+    """Returns the name of the package whose import raised an error: one that is missing, or whose files or shared
+    libraries are damaged or do not fit together; "" if the error has another cause."""
+    if isinstance(error, ImportError) and error.name:
+        found = error.name
+    elif isinstance(error, SyntaxError):
+        found = _package_of(error.filename or "")
+    elif isinstance(error, ImportError) and type(error) not in (ImportError, ModuleNotFoundError):
+        found = type(error).__module__  # the class of a package that imports its parts on demand, as imagecodecs does
+    else:
+        # Code of a module at its top level runs while it is imported.
+        names = [str(frame.f_globals.get("__name__")) for frame, _ in walk_tb(error.__traceback__) if _is_top(frame)]
+        found = next((name for name in names if not _own(name)), "wlm")
+    return "" if _own(found) else found.split(".")[0]
+
+
+def _is_top(frame: FrameType) -> bool:
+    return frame.f_code.co_name == "<module>"
+
+
+def _own(module: str) -> bool:
+    return module.split(".", 1)[0] in ("", "__main__", "wlm", "wlm_kernels")
+
+
+def _package_of(file: str) -> str:
+    """Returns the name of the package in a folder of `sys.path` that a Python file belongs to, "" if none."""
+    inside = [file.removeprefix(f"{folder}/") for folder in sys.path if folder and file.startswith(f"{folder}/")]
+    return min(inside, key=len).split("/")[0].removesuffix(".py") if inside else ""

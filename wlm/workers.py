@@ -240,7 +240,7 @@ class Actors(Workers):
         """
         try:
             import ray
-        except ImportError as error:
+        except ModuleNotFoundError as error:
             raise WlmError('cluster: expected the package Ray, found none: pip install "wlm[cluster]"') from error
         self._ray, self._mine = ray, not ray.is_initialized()
         if self._mine:

@@ -6,19 +6,21 @@ the light before the switch of a lamp is held until the switch, as the virtual t
 """
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import warp as wp
 
 from benchmarks.rivals.lightmap import RIVALS
 from benchmarks.rivals.rival import need_bc
+from wlm import interop
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.runtime import MapDecoder
 from wlm.lightmap.tiles import TILE
 from wlm.texels import nearest_valid
-from wlm.workers import each
+from wlm.workers import cores
 
 _BLOCK_BYTES, _RANGE_BYTES = 16, 12  # of a block of 4 x 4 texels; of the range of a tile of BC7
 
@@ -55,7 +57,9 @@ class EveryFrame:
 
     def __init__(self, model: LightmapModel, device: str) -> None:
         """Uploads all tiles and allocates the textures; for errors see `MapDecoder`."""
-        self._decoders = [MapDecoder(own, device) for own in model.sheets.values()]
+        self._device = interop.check_device(device)
+        with interop.stream(self._device):
+            self._decoders = [MapDecoder(own, self._device) for own in model.sheets.values()]
         self._times, self._mask = model.times, model.light.mask
         texels = sum(level.size for decoder in self._decoders for level in decoder.levels)
         self.memory = {"tiles": model.memory_bytes, "texture": self._buffers * 4 * texels}
@@ -68,13 +72,19 @@ class EveryFrame:
 
     def light(self, hour: float) -> np.ndarray:
         work = self.prepare(hour)
-        if work is not None:
-            work()
-        return self._decoders[0].numpy()[nearest_valid(self._mask)]
+        with interop.stream(self._device):
+            if work is not None:
+                work()
+            return self._mixed(neighbours(self._times, hour)[2])[nearest_valid(self._mask)]
+
+    def _mixed(self, share: float) -> np.ndarray:
+        """Returns the decoded map; `share` is the weight of the stored time after the hour."""
+        return self._decoders[0].numpy()
 
     def _set_time(self, hour: float) -> None:
-        for decoder in self._decoders:
-            decoder.set_time(hour)
+        with interop.stream(self._device):  # the stream of the frames
+            for decoder in self._decoders:
+                decoder.set_time(hour)
 
     def _decode(self) -> None:
         for decoder in self._decoders:
@@ -89,10 +99,11 @@ class EveryTime(EveryFrame):
 
     def __init__(self, model: LightmapModel, device: str) -> None:
         super().__init__(model, device)
-        self._late = [
-            [wp.zeros(level.shape, dtype=level.dtype, device=level.device) for level in decoder.levels]
-            for decoder in self._decoders
-        ]
+        with interop.stream(self._device):
+            self._late = [
+                [wp.zeros(level.shape, dtype=level.dtype, device=level.device) for level in decoder.levels]
+                for decoder in self._decoders
+            ]
         self._held: list[int] = []
 
     def prepare(self, hour: float) -> Callable[[], None] | None:
@@ -102,7 +113,8 @@ class EveryTime(EveryFrame):
             return None
         if self._held[1:] != wanted[:1]:  # the clock jumped
             self._set_time(float(self._times[wanted[0]]))
-            self._decode()
+            with interop.stream(self._device):
+                self._decode()
             self._swap()
         self._set_time(float(self._times[wanted[1]]))
         self._held = wanted
@@ -113,13 +125,9 @@ class EveryTime(EveryFrame):
 
         return work
 
-    def light(self, hour: float) -> np.ndarray:
-        work = self.prepare(hour)
-        if work is not None:
-            work()
-        share = np.float32(neighbours(self._times, hour)[2])
+    def _mixed(self, share: float) -> np.ndarray:
         early, late = (unpack_rgb9e5(level.numpy()) for level in (self._decoders[0].levels[0], self._late[0][0]))
-        return ((1 - share) * early + share * late)[nearest_valid(self._mask)]
+        return np.float32(1.0 - share) * early + np.float32(share) * late
 
     def _swap(self) -> None:
         """Makes the maps that were just decoded the later ones; the next decode overwrites the earlier ones."""
@@ -147,8 +155,9 @@ class Blocks:
         need_bc()
         self.title, self._sheet = f"{RIVALS[name].title} resident", sheet
         wanted = sorted({i for hour in hours for i in neighbours(sheet.times, hour)[:2]})
-        encoded = each(lambda i: RIVALS[name].encode(sheet.frames[i], sheet.mask).decoded, wanted)
-        self._decoded = dict(zip(wanted, encoded, strict=True))
+        with ThreadPoolExecutor(cores()) as pool:
+            encoded = pool.map(lambda i: RIVALS[name].encode(sheet.frames[i], sheet.mask).decoded, wanted)
+            self._decoded = dict(zip(wanted, encoded, strict=True))
         height, width = sheet.mask.shape
         size = -(-height // TILE) * -(-width // TILE) * _RANGE_BYTES if name == "bc7" else 0
         while True:

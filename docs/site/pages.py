@@ -22,6 +22,7 @@ PACKAGES = (
     "wlm.ops",
     "wlm.bake",
     "wlm.inspection",
+    "wlm.scene",
     "wlm.export",
 )
 _OUTSIDE = re.compile(

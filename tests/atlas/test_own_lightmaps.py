@@ -359,6 +359,7 @@ def test_charts_outside_the_square_are_refused(tmp_path):
         return error_of(load, scene(tmp_path, {}, sets=[*others, uv]), tmp_path / EXR)
 
     assert "are they in texels?" in told(UV * SIDE + 1)
+    assert "whole numbers of KHR_mesh_quantization need the KHR_texture_transform" in told(np.round(UV * 4095))
     assert "all UVs lie outside [0, 1] in TEXCOORD_0" in told(UV - [1, 0])
     assert "those of TEXCOORD_0 (--uv-set 0) lie within it" in told(UV + [0, 2], UV)
     shifted = UV + np.where(np.arange(len(UV)) < 4, 1.0, 0.0)[:, None] * [1, 0]
@@ -414,6 +415,61 @@ def test_bakes_named_after_their_mesh(tmp_path):
     ]
     text = error_of(load, write_scene(path, things), folder)
     assert "are both lightmaps of Floor" in text
+
+
+def test_bakes_named_like_their_mesh_with_a_suffix(tmp_path):
+    """The longest name wins: a wall's bake is not that of the big wall, nor that of a copy."""
+    labels = ("Wall", "Wall_Big", "Wall.001", "Wall2")
+    path = write_scene(tmp_path / "room.gltf", [Thing(label, POSITION, TRIANGLE, [UV]) for label in labels])
+    (tmp_path / "b").mkdir()
+    for label in labels:
+        write_exr(tmp_path / f"b/LM_{label}_denoised.exr", light())
+    found = load(path, tmp_path / "b")
+    assert {f"LM_{each.label}_denoised.exr": found.sheets[each.sheet].name for each in found.objects} == {
+        name: name for name in (f"LM_{label}_denoised.exr" for label in labels)
+    }
+
+
+def test_lightmaps_of_material_variants_are_not_read_in_silence(tmp_path):
+    path = scene(tmp_path, moz(), images=({"uri": EXR}, {"uri": "night.exr"}), textures=({"source": 0}, {"source": 1}))
+    with changed(path) as content:
+        content["materials"].append({"extensions": {"MOZ_lightmap": {"index": 1}}})
+        variants = {"mappings": [{"material": 1, "variants": [0]}]}
+        content["meshes"][0]["primitives"][0]["extensions"] = {"KHR_materials_variants": variants}
+    found = load(path)
+    assert_lit(found)
+    assert any("the lightmaps of the default materials are read alone" in line for line in found.warnings)
+
+
+@pytest.mark.parametrize(("angle", "scale"), [(0.5, (1.0, 1.0)), (np.pi / 2, (-1.0, 2.0)), (np.pi, (1.0, 1.0))])
+def test_a_turned_and_mirrored_transform(tmp_path, angle, scale):
+    cosine, sine, offset = np.cos(angle), np.sin(angle), np.array([0.3, 0.1])
+    stored = (UV - offset) @ np.linalg.inv(np.array([[cosine, sine], [-sine, cosine]]) * scale).T
+    transform = {"rotation": angle, "offset": offset.tolist(), "scale": list(scale)}
+    for slot in ({"occlusionTexture": {"index": 0, "texCoord": 1}}, moz(texCoord=1)):
+        info = slot.get("occlusionTexture") or slot["extensions"]["MOZ_lightmap"]
+        info["extensions"] = {"KHR_texture_transform": transform}
+        path = scene(tmp_path, slot, sets=(OTHER, stored))
+        assert_lit(load(path, tmp_path / EXR if "occlusionTexture" in slot else None))
+
+
+@pytest.mark.parametrize("kind", ["uint8", "int16"])
+def test_quantised_geometry_under_a_mirroring_node(tmp_path, kind):
+    most = np.iinfo(kind).max
+    write_exr(tmp_path / EXR, light())
+    maker = GltfMaker()
+    attributes = {
+        "POSITION": maker.add(np.round((2 * POSITION - 1) * 127).astype(np.int8), normalized=True),
+        "TEXCOORD_0": maker.add(np.round(UV * most).astype(kind), normalized=True),
+    }
+    primitive = {"attributes": attributes, "indices": maker.add(np.uint32(TRIANGLE).reshape(-1))}
+    nodes = [{"mesh": 0, "scale": [-1, 1, 1]}, {"children": [0], "scale": [1, 2, 1]}]
+    maker.content |= {"meshes": [{"primitives": [primitive]}], "nodes": nodes, "scenes": [{"nodes": [1]}]}
+    (sheet,) = load(maker.save(tmp_path / "a.glb"), tmp_path / EXR).sheets
+    corner = sheet.position[sheet.triangle]
+    volume = np.einsum("ij,ij->", corner[:, 0], np.cross(corner[:, 1], corner[:, 2])) / 6
+    assert volume == pytest.approx(16, rel=1e-5)  # fronts outside
+    np.testing.assert_allclose(np.sort(sheet.uv, axis=0), np.sort(UV, axis=0), atol=1 / most)
 
 
 @pytest.mark.parametrize("number", [-1, 65534, 65535])

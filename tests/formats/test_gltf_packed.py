@@ -114,7 +114,7 @@ def test_damage(tmp_path, monkeypatch):
 @pytest.mark.parametrize("name", [DRACO, MESHOPT, "KHR_meshopt_compression"])
 def test_a_missing_package_is_named(tmp_path, monkeypatch, name):
     def missing(package):
-        raise ImportError(package)
+        raise ModuleNotFoundError(package, name=package)
 
     monkeypatch.setattr(importlib, "import_module", missing)
     maker = GltfMaker()

@@ -12,6 +12,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 import wlm
 from wlm.errors import WlmError
 from wlm.interop import available_devices
+from wlm.scene import frame as frame_module
 from wlm.scene.frame import Renderer
 from wlm.scene.probes import six_lights
 from wlm.smoke.camera import VECTORS, weights
@@ -20,6 +21,7 @@ from wlm.view.scene_run import run
 
 SIZE = HEIGHT, WIDTH = 72, 128
 SKY, FLOOR, WALL, CAR = range(4)
+FRAMES = 11
 
 
 def mixed(times, values, hour):
@@ -123,6 +125,24 @@ def test_weights_and_points_of_pixels(renderer, scene):
     assert (np.abs(smooth - whole).max(-1) > 0.02).sum() > 50  # mixed colours at edges
 
 
+def test_a_camera_may_pass_above_its_target(changed):
+    rows = [{"second": s, "eye": [0, 2, z], "target": [0, 0, 0]} for s, z in ((0, 1), (4, -1))]
+    path = changed(camera=rows, probes=None, moving=None, smoke=None)
+    with wlm.scene.load(path) as scene, Renderer(scene, 9, 16, samples=1) as renderer:
+        assert scene.camera_at(2.0)[0].tolist() == [0.0, 2.0, 0.0]
+        above = renderer.draw(2.0, complete=True)
+        assert torch.isfinite(above.screen).all() and above.surface[4, 8]
+        assert not torch.equal(above.screen, renderer.draw(1.0, complete=True).screen)
+
+
+def test_the_smoke_of_a_folder_has_a_bound(scene, monkeypatch):
+    monkeypatch.setattr(frame_module, "_SMOKE_BYTES", 2 * 8 * 8 * 8 * 2 - 1)
+    with pytest.raises(
+        WlmError, match="smoke: expected at most 0 MiB of six-way lightmaps, found 2 frames of 1024 bytes"
+    ):
+        Renderer(scene, 9, 16)
+
+
 def test_an_original_is_shown_instead(renderer, scene):
     second = scene.second_at(12.0)
     frame = renderer.draw(second, original=renderer.original(12.0))
@@ -144,11 +164,11 @@ def test_the_display_is_that_of_the_window(renderer):
 def test_a_lamp_is_on_in_the_first_frame_after_its_switch(changed, tmp_path):
     day = {"first": 18, "last": 19, "seconds": 1}
     path = changed(day=day, probes=None, moving=None, smoke=None, originals=None)
-    after = math.ceil(0.55 * 21)  # the first frame of 21 after 18.55
+    after = math.ceil(0.55 * FRAMES)  # the first frame after 18.55
     with wlm.scene.load(path) as scene:
         with Renderer(scene, 18, 32, samples=1, decodes=2) as few:
-            drawn = [few.draw(i / 21, complete=i == 0) for i in range(21)]
-        run(scene, tmp_path / "out", hours=[], frames=21, height=18, width=32, samples=1)
+            drawn = [few.draw(i / FRAMES, complete=i == 0) for i in range(FRAMES)]
+        run(scene, tmp_path / "out", hours=[], frames=FRAMES, height=18, width=32, samples=1)
     floor = [frame.screen[-3, 16, 0].item() for frame in drawn]
     lamp = floor[-1] - floor[0]
     assert lamp > 0.2 and max(floor[:after]) < floor[0] + 0.1 * lamp < floor[-1] - 0.1 * lamp < min(floor[after:])
@@ -160,7 +180,7 @@ def test_a_lamp_is_on_in_the_first_frame_after_its_switch(changed, tmp_path):
             red = np.asarray(film.convert("RGB"))[-3, 16, 0] / 255.0
             shown += [red] * film.info["duration"]
     assert len(shown) == 1000
-    dark, lit = shown[(1000 * after - 500) // 21], shown[(1000 * after + 500) // 21]
+    dark, lit = shown[(1000 * after - 500) // FRAMES], shown[(1000 * after + 500) // FRAMES]
     assert abs(dark - floor[0]) < 0.04 and abs(lit - floor[-1]) < 0.04
 
 

@@ -440,6 +440,13 @@ def test_light_on_the_screen():
     assert Display().error(one, one).max() == 0
 
 
+def test_run_opens_a_window_only_on_a_display(tmp_path, monkeypatch, show):
+    del show  # only for its check of OpenGL
+    monkeypatch.delenv("DISPLAY", raising=False)
+    result = CliRunner().invoke(app, ["run", str(day_scenes.write_scene(tmp_path)), "--window"])
+    assert result.exit_code == 2 and "expected a display" in result.stderr and result.stderr.count("\n") == 1
+
+
 def test_a_scene_of_a_day_follows_its_hour_and_light_groups(show, tmp_path):
     path = day_scenes.write_scene(tmp_path)
     with wlm.scene.load(path) as content:

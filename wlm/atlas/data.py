@@ -712,7 +712,10 @@ def _check_inside(
     extent = f"u {u:.3g} to {right:.3g}, v {v:.3g} to {bottom:.3g}"
     inside = [words for words, other in alternatives if other.min() >= -_EDGE and other.max() <= 1.0 + _EDGE]
     if max(right, bottom) - min(u, v) > _TEXELS:
-        advice = "are they in texels? Divide them by the size of the lightmap"
+        advice = (
+            "are they in texels? Divide them by the size of the lightmap; whole numbers of KHR_mesh_quantization need "
+            "the KHR_texture_transform of a material that reads them"
+        )
     else:
         advice = (
             "are they those of a repeated texture, or of UDIM tiles? Tiles need a folder of lightmaps NAME.1001.exr"

@@ -135,6 +135,10 @@ def own_lightmaps(
         return _own(document, primitives, name, encoding, uv_set)
 
 
+def _parts(document: GltfDocument) -> list[dict]:
+    return [each for mesh in document.content["meshes"] for each in mesh["primitives"]]
+
+
 def _none(document: GltfDocument) -> str:
     """Returns an error text: that a glTF document names no lightmap, which unknown extension or slots it has."""
     used = [
@@ -199,6 +203,8 @@ def _own(
     if defaults:
         names = ", ".join(f"TEXCOORD_{number}" for number in sorted(defaults))
         notes.append(f"{document.path}: {name}: texCoord is not stated: {names} is read (see --uv-set)")
+    if any("KHR_materials_variants" in each.get("extensions", {}) for each in _parts(document)):
+        notes.append(f"{document.path}: KHR_materials_variants: the lightmaps of the default materials are read alone")
     if lacking:
         notes.append(f"{document.path}: {name}: {lacking} primitives lack the UVs that it names: left out")
     return Listing(document.path, ("light",), files, held=held, notes=tuple(notes)), readings

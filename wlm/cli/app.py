@@ -25,7 +25,7 @@ from wlm.cli import bake, doctor, inspect, smoke, verbs, view, web
 from wlm.cli import probe_volume as probe
 from wlm.cli import run as run_scene
 from wlm.cli.signals import exit_code, handled
-from wlm.errors import WlmError, one_line
+from wlm.errors import WlmError, broken_package, one_line
 
 BAD_INPUT = 2
 _INTERRUPTED = 130  # typer's code for KeyboardInterrupt
@@ -51,22 +51,18 @@ class Group(TyperGroup):
             # pydantic adds "Value error" in front of messages.
             text = one_line(error.format_message()).replace("Value error, ", "")
             line = f"{text} (see {_command_path(error)} --help)"
-        except OSError as error:
-            if error.errno == errno.EPIPE:
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno == errno.EPIPE:
                 sys.exit(1)
-            if error.errno is None:
+            if package := broken_package(error):
+                reason = f"{type(error).__name__}: {error}"
+                line = one_line(f"the package {package} cannot be imported: {reason}; install it again")
+            elif isinstance(error, OSError) and error.errno is not None:
+                line = one_line(f"{error.filename or 'the system'}: {error.strerror}{_cache_hint(error)}")
+            elif isinstance(error, RuntimeError) and str(error).startswith("Symlink loop"):
+                line = one_line(str(error))  # Python before 3.13 raises this where it follows symbolic links
+            else:
                 raise
-            line = one_line(f"{error.filename or 'the system'}: {error.strerror}{_cache_hint(error)}")
-        except ImportError as error:
-            # An import of the program's own is a bug.
-            if not error.name or error.name.split(".")[0] == "wlm":
-                raise
-            line = one_line(f"the package {error.name.split('.')[0]} cannot be imported: {error}; install it again")
-        except RuntimeError as error:
-            # Python before 3.13 raises this where it follows symbolic links.
-            if not str(error).startswith("Symlink loop"):
-                raise
-            line = one_line(str(error))
         sys.stderr.write(f"error: {line}\n")
         sys.exit(BAD_INPUT)
 

@@ -29,12 +29,17 @@ def need(package: str, extra: str) -> ModuleType:
     """Imports an optional package.
 
     Raises:
-        WlmError: The package is missing; the line names the extra to install.
+        WlmError: The package is missing or broken; the line names the extra to install.
     """
     try:
         return importlib.import_module(package)
-    except ImportError as error:
-        raise WlmError(f"{extra}: {package} is missing; needs the extra: pip install 'wlm[{extra}]'") from error
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == package:
+            raise WlmError(f"{extra}: {package} is missing; needs the extra: pip install 'wlm[{extra}]'") from error
+        raise WlmError(
+            f"{extra}: {package} is installed but cannot be imported: {type(error).__name__}: {error}; install it "
+            f"again: pip install --force-reinstall 'wlm[{extra}]'"
+        ) from error
 
 
 def decode_bc6h(blocks: bytes, height: int, width: int, extra: str, signed: bool = False) -> np.ndarray:

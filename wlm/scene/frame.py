@@ -40,6 +40,7 @@ DECODES = 64
 
 _SETTLE = 128  # most repetitions of a frame that must be complete; 64 look at every pixel
 _LARGEST = 8192  # pixels along a side, with all points
+_SMOKE_BYTES = 1 << 30  # of the lightmaps of one folder
 
 
 @dataclass(eq=False)
@@ -125,7 +126,8 @@ class Renderer:
         self.scene, self.height, self.width, self.samples = scene, height, width, samples
         self.device = interop.check_device(device)
         self._device = torch.device(self.device)
-        self._smoke = [_book(puff, self._device) for puff in scene.smoke]
+        books = {puff.files: _book(puff, self._device) for puff in scene.smoke}
+        self._smoke = [books[puff.files] for puff in scene.smoke]
         with interop.stream(self.device):
             self._probes = DayProbes(scene.probes, self.device) if scene.moving or scene.smoke else None
             meshes = [scene.mesh, *(moving.mesh for moving in scene.moving)]
@@ -204,7 +206,7 @@ class Renderer:
             parts["probes: volume"] = self._probes.volume.memory_bytes
             parts["probes: light"] = 4 * self._probes.volume.light.count * self._probes.volume.channels
         if self._smoke:
-            parts["smoke"] = sum(book.nbytes for book in self._smoke)
+            parts["smoke"] = sum(book.nbytes for book in set(self._smoke))
         return parts
 
     def close(self) -> None:
@@ -325,6 +327,11 @@ def _book(puff: Puff, device: torch.device) -> torch.Tensor:
         if frames and planes.shape != frames[0].shape:
             raise WlmError(f"{path}: expected frames of one size, found another than in {puff.files[0].name}")
         frames.append(planes.to(device, torch.float16))
+        if len(puff.files) * frames[0].nbytes > _SMOKE_BYTES:
+            raise WlmError(
+                f"{path.parent}: expected at most {_SMOKE_BYTES >> 20} MiB of six-way lightmaps, found "
+                f"{len(puff.files)} frames of {frames[0].nbytes} bytes"
+            )
     return torch.stack(frames)
 
 

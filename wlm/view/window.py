@@ -71,7 +71,7 @@ class Window:
             )
         if not off_screen and self._plotter.render_window.GetClassName() in _HIDDEN:
             self._plotter.close()
-            raise WlmError("view: expected a display, found none; --screenshot needs none")
+            raise WlmError("view: expected a display, found none; wlm view --screenshot needs none")
         self.canvas = Canvas(pyvista, self._plotter, count)
         self._widgets: dict[str, tuple[Any, Any]] = {}
         self._furnish()

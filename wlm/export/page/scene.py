@@ -24,6 +24,7 @@ from wlm.lightmap.model import SheetModel
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.sheet import first_light
 from wlm.lightmap.virtual.clock import Clock
+from wlm.probe.volume.walk import settle
 from wlm.scene import Mesh, Scene, load
 from wlm.scene.probes import DayProbes
 from wlm.system import OnProgress
@@ -60,9 +61,10 @@ def _page(scene: Scene, progress: OnProgress | None) -> Page:
     for entry, own in zip(described, groups.values(), strict=True):
         times = [*own.times.tolist(), float(own.times[0]) + (own.period or 0.0)]
         entry["lightmap"]["switches"] = [times[i : i + 2] for i in Clock(own.axis).switches]
-    parts, moving = _moving(scene)
-    arrays |= _mesh("mesh", scene.mesh) | parts
-    parts, smoke = _smoke(scene, progress)
+    probes = DayProbes(scene.probes) if scene.moving or scene.smoke else None
+    parts, moving = _moving(scene, probes)
+    arrays |= _mesh("mesh", scene.mesh, "uv") | parts
+    parts, smoke = _smoke(scene, probes, progress)
     arrays |= parts
     hours = np.array([hour for hour, _ in scene.probes])
     film = np.arange(int(np.ceil(scene.day.seconds * _PATH_RATE)) + 1) / _PATH_RATE
@@ -112,40 +114,42 @@ def _page(scene: Scene, progress: OnProgress | None) -> Page:
     return Page("scene", scene.title, note, figures, manifest, arrays, scripts)
 
 
-def _mesh(name: str, mesh: Mesh) -> dict[str, np.ndarray]:
-    parts = {part: getattr(mesh, part) for part in ("position", "normal", "colour", "uv")}
+def _mesh(name: str, mesh: Mesh, further: str) -> dict[str, np.ndarray]:
+    parts = {part: getattr(mesh, part) for part in ("position", "colour", further)}
     parts["triangles"] = mesh.triangle.astype(np.uint32)
     return {f"{name}_{part}": values for part, values in parts.items()}
 
 
-def _moving(scene: Scene) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
+def _moving(scene: Scene, probes: DayProbes | None) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
     """Returns the arrays of moving objects, with the coefficients [hours, places, 27] along their paths, and rows."""
     arrays, rows = dict[str, np.ndarray](), []
     for i, each in enumerate(scene.moving):
         places = [each.centre(each.pose(each.seconds * k / _PLACES)) for k in range(_PLACES)]
-        arrays |= _mesh(f"moving_{i}", each.mesh) | {f"moving_{i}_light": _probe_light(scene, places)}
+        arrays |= _mesh(f"moving_{i}", each.mesh, "normal") | {f"moving_{i}_light": _probe_light(probes, places)}
         rows.append({"path": each.path.tolist(), "seconds": each.seconds, "places": _PLACES})
     return arrays, rows
 
 
-def _smoke(scene: Scene, progress: OnProgress | None) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
+def _smoke(
+    scene: Scene, probes: DayProbes | None, progress: OnProgress | None
+) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
     """Returns the arrays of smoke, with the coefficients [hours, 1, 27] at its middle, and rows of the manifest."""
     arrays, rows = dict[str, np.ndarray](), []
     for i, puff in enumerate(scene.smoke):
         codes, most, _ = pack_frames(puff.files, progress)
         for number, code in enumerate(codes):
             arrays[f"smoke_{i}_first_{number}"], arrays[f"smoke_{i}_second_{number}"] = code[..., :4], code[..., 4:]
-        arrays[f"smoke_{i}_light"] = _probe_light(scene, [puff.position + [0.0, 0.5 * puff.size, 0.0]])
+        arrays[f"smoke_{i}_light"] = _probe_light(probes, [puff.position + [0.0, 0.5 * puff.size, 0.0]])
         row = {"position": puff.position.tolist(), "size": puff.size, "rate": puff.rate, "most": most}
         rows.append(row | {"pixels": codes.shape[2:0:-1]})
     return arrays, rows
 
 
-def _probe_light(scene: Scene, places: Sequence[np.ndarray]) -> np.ndarray:
+def _probe_light(probes: DayProbes, places: Sequence[np.ndarray]) -> np.ndarray:
     """Returns coefficients at places [M, 3], float32 [hours of the probes, M, 27], each from a volume around it."""
-    probes, light = DayProbes(scene.probes), []
+    light = []
     for place in places:
-        probes.at(place[None], 0.0, place)
+        settle(probes.volume, place)
         light.append(probes.volume.read(place[None]).values.reshape(-1, 27))
     return np.stack(light, 1)
 

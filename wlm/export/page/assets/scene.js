@@ -249,13 +249,13 @@ class ScenePage extends LightmapPage {
     this.map = graphics.target(manifest.width, manifest.height, graphics.half(), gl.LINEAR);
     gl.bindTexture(gl.TEXTURE_2D, this.map.texture);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-    const mesh = (name, program) => graphics.geometry(program, {
-      a_position: [3, page.array(`${name}_position`, Float32Array)], a_normal: [3, page.array(`${name}_normal`, Float32Array)],
-      a_colour: [3, page.array(`${name}_colour`, Float32Array)], a_uv: [2, page.array(`${name}_uv`, Float32Array)],
-    }, page.array(`${name}_triangles`, Uint32Array));
-    this.mesh = mesh('mesh', this.programs.mapped);
+    const mesh = (name, program, parts) => graphics.geometry(
+      program, Object.fromEntries(Object.entries(parts).map(([part, size]) =>
+        [`a_${part}`, [size, page.array(`${name}_${part}`, Float32Array)]])), page.array(`${name}_triangles`, Uint32Array));
+    this.mesh = mesh('mesh', this.programs.mapped, {position: 3, colour: 3, uv: 2});
     this.moving = scene.moving.map((given, i) => ({
-      ...given, mesh: mesh(`moving_${i}`, this.programs.probed), light: page.array(`moving_${i}_light`, Float32Array),
+      ...given, mesh: mesh(`moving_${i}`, this.programs.probed, {position: 3, colour: 3, normal: 3}),
+      light: page.array(`moving_${i}_light`, Float32Array),
     }));
     const picture = (name, [width, height]) => graphics.plain(
       width, height, [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], page.array(name, Uint8Array), gl.LINEAR);
@@ -283,7 +283,7 @@ class ScenePage extends LightmapPage {
     this.choose('path');
     panel.key('c', 'C', 'follow the path of the camera', () => this.choose('path'));
     panel.key('o', 'O', 'orbit around the scene', () => this.choose('orbit'));
-    panel.toggle('move', 'm', true, (on) => { this.moves = on; });
+    panel.toggle('motion', 'm', true, (on) => { this.moves = on; });
     panel.explain('drag', 'look around; orbit: turn the camera');
     panel.explain('W A S D, Q E', 'fly; down, up');
     panel.explain('wheel, two fingers', 'forward and back; orbit: zoom, move');
@@ -312,7 +312,8 @@ class ScenePage extends LightmapPage {
     return [now.slice(0, 3), now.slice(3, 6), now[6]];
   }
 
-  // Coefficients of probes at the hour; within a switch of a lamp, those before it. `light` has rows of them by hour and, of `places`, at even steps of a closed path.
+  // Coefficients of probes at the hour; within a switch of a lamp, those before it. `light` has rows of them by hour, and of
+  // `places` at even steps of a closed path.
   #probe(light, places = 1, at = 0) {
     const {probe_hours: hours, probe_switches: switches} = this.scene, [before, after, weight] = betweenHours(hours, this.hour);
     const share = switches.includes(before) ? 0 : weight, step = at * places;
