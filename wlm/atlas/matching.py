@@ -225,15 +225,12 @@ class _Picture:
         height, width = chart.shape
         # Nearest texels, where the lightmap is not square.
         exchanged = chart[np.ix_(np.arange(width) * height // width, np.arange(height) * width // height)].T
-        charts = [(_inside(each), each >= 0) for each in (chart, exchanged)]
+        charts = [([one.astype(np.float64) for one in _inside(each)], each >= 0) for each in (chart, exchanged)]
+        counts = [sum(float(each.sum()) for each in inside) for inside, _ in charts]
         found = []
         for words, transposed, v, u in _TURNS:
-            inside, covered = charts[transposed]
-            total = sum(
-                float(np.einsum("ij,ij->", step, each[::v, ::u]))
-                for step, each in zip(self._steps, inside, strict=True)
-            )
-            count = sum(np.count_nonzero(each) for each in inside)
+            (inside, covered), count = charts[transposed], counts[transposed]
+            total = sum(float(np.vdot(step, each[::v, ::u])) for step, each in zip(self._steps, inside, strict=True))
             black = np.count_nonzero(covered[::v, ::u] & self._dark)
             found.append(_Turned(words, total / count if count else float("inf"), black))
         return found
