@@ -159,6 +159,8 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "select_ms": Figure("selection", "ms", ".3f"),
         "table_ms": Figure("page table", "ms", ".3f"),
         "host_ms": Figure("on the host", "ms", ".3f"),
+        "host_ms_p95": Figure("on the host 95%", "ms", ".3f"),
+        "host_ms_max": Figure("on the host, most", "ms", ".2f"),
         "pages_visible": Figure("pages in view", form=".3g"),
         "pages_decoded": Figure("decoded", form=".3g"),
         "current": Figure("current", "%", ".2f"),

@@ -21,6 +21,7 @@ _PLAIN = {
 _FETCHED = ("R32_UINT", "R32G32B32A32_FLOAT")  # textures without a filter
 _MIN_FILTER, _MAG_FILTER, _WRAP_S, _WRAP_T, _BASE_LEVEL, _MAX_LEVEL = 0x2801, 0x2800, 0x2802, 0x2803, 0x813C, 0x813D
 _NEAREST, _LINEAR, _LINEAR_MIPS, _CLAMP = 0x2600, 0x2601, 0x2703, 0x812F
+_EGL = "libEGL.so.1"
 _LIBRARIES = ("libGL.so.1", "libOpenGL.so.0", "libGL.so")
 _DEVICES = 9  # EGL devices that are tried
 _SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "swrast")
@@ -52,7 +53,7 @@ class Screen:
         answers = []
         for library in _LIBRARIES:
             for device in range(_DEVICES):
-                settings = {"libgl": library, "device_index": device}
+                settings = {"libgl": library, "libegl": _EGL, "device_index": device}
                 try:
                     context = moderngl.create_context(standalone=True, backend="egl", require=430, **settings)
                 except Exception as error:  # moderngl has no class of its own for it
@@ -61,7 +62,7 @@ class Screen:
                 self.name = context.info["GL_RENDERER"]
                 if not hardware or not self.name.lower().startswith(_SOFTWARE):
                     self._moderngl, self._context = moderngl, context
-                    self._get = ctypes.CDLL("libEGL.so.1").eglGetProcAddress
+                    self._get = ctypes.CDLL(_EGL).eglGetProcAddress
                     self._get.restype, self._get.argtypes = ctypes.c_void_p, [ctypes.c_char_p]
                     return
                 answers.append(f"{library} {device}: {self.name}")

@@ -16,7 +16,7 @@ import wlm_kernels
 from wlm_kernels import mlp
 from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
-from wlm_kernels.lightmap import matrix_decode, pages
+from wlm_kernels.lightmap import matrix_decode, matrix_pages, pages
 from wlm_kernels.lightmap import step as lightmap_step
 from wlm_kernels.lightmap.frames import KERNELS as FRAMES
 from wlm_kernels.probe import decode as probe_decode
@@ -109,9 +109,10 @@ FACTORIES = [
     *_cases("step", lambda *of: lightmap_step.step_kernels(*of, "cuda"), [], BOTH, WIDTHS, ("tanh", "exact")),
     *_cases("exact_decode", lambda *of: list(lightmap_decode.exact_kernels(*of, "tanh")), [], BOTH, WIDTHS),
     *_cases("strip_decode", lambda *of: lightmap_decode.strip_kernels(of[0], "fast", of[1]), [], WIDTHS, BOTH),
-    *_cases("matrix_decode", matrix_decode.matrix_kernels, [(16, 32, True)], (16, 48, 64), (4, 32, 40), BOTH),
+    *_cases("matrix_decode", matrix_decode.matrix_kernels, [(16, 32, True)], (16, 48, 64), (4, 32, 128), BOTH),
     *_cases("frames", lambda: list(FRAMES), []),
     *_cases("pages", lambda *of: [pages.page_kernel(*of)], [], (8, 16, 64), ("fast", "exact")),
+    *_cases("matrix_pages", lambda width: [matrix_pages.page_kernel(width)], [(16,)], (16, 48, 64)),
     *_cases("gaussian_step", lambda latent: probe_step.step_kernels(latent, "cuda"), [], LATENTS),
     *_cases("gaussian_sum", gaussian_sum.sum_kernels, [], LATENTS),
     *_cases("probe_network", _probe_network, [((9, 64, 27),)], ((9, 64, 27), (1, 8, 3), (12, 48, 12), (12, 128, 75))),

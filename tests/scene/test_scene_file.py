@@ -54,6 +54,13 @@ def test_the_camera_is_a_catmull_rom_curve(scene):
     np.testing.assert_array_equal(scene.camera_at(9.0)[0], [0, 1.5, 3.5])
 
 
+def test_the_field_of_view_does_not_swing_beyond_its_range(changed):
+    fields = (1, 150, 150, 1)
+    rows = [{"second": s, "fov": fov, "eye": [0, 1, 5], "target": [0, 1, 0]} for s, fov in enumerate(fields)]
+    with wlm.scene.load(changed(camera=rows)) as scene:
+        assert scene.camera_at(1.5)[2] == 150.0 and scene.camera_at(0.0)[2] == 1.0
+
+
 def test_a_moving_object_goes_round_and_looks_ahead(scene):
     (car,) = scene.moving
     np.testing.assert_allclose(car.pose(1.0)[:3, 3], [-0.6, 0.2, 0], atol=1e-12)

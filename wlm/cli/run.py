@@ -27,7 +27,9 @@ def run(
     ] = None,
     width: Annotated[int, typer.Option(min=1, help="Width in pixels.")] = 960,
     height: Annotated[int, typer.Option(min=1, help="Height in pixels.")] = 540,
-    samples: Annotated[int, typer.Option(min=1, max=4, help="Points along a side of a pixel.")] = 2,
+    samples: Annotated[
+        int | None, typer.Option(min=1, max=4, help="Points along a side of a pixel; default 2.")
+    ] = None,
     weights: Weights = None,
     colours: Colours = None,
     window: Annotated[
@@ -37,32 +39,35 @@ def run(
 ) -> None:
     """Draw a scene over its day: lightmaps, moving objects under probes, and smoke, from a path of the camera.
 
-    Writes pictures at hours, a film of the day (H.264 with the extra wlm[film], else an animated WebP), and report.json
+    Writes pictures at hours, a film of the day (H.264 with the extra "film", else an animated WebP), and report.json
     with times by stage, memory by part, and errors against the original lightmaps.
     """
     if output is None and not window:
         raise WlmError("wlm run: expected --output DIR, or --window")
+    drawn = {"output": output, "hours": hours, "frames": frames, "samples": samples}
+    if window and (name := next((name for name, value in drawn.items() if value is not None), None)):
+        raise WlmError(f"wlm run: --{name} has no meaning with --window; leave it out")
     quiet_warp()
     from wlm.cli.lightmap import group_weights
     from wlm.lightmap.data import parse_times
     from wlm.scene import load
 
-    given = {"weights": group_weights(weights, colours), "height": height, "width": width}
+    given = {"weights": group_weights(weights, colours), "height": height, "width": width, "device": device}
     with load(scene) as content:
         if window:
             _open(content, **given)
             return
-        given |= {"hours": None if hours is None else parse_times(hours), "frames": frames, "samples": samples}
-        _draw(scene=content, output=output, device=device, **given)
+        given |= {"hours": None if hours is None else parse_times(hours), "frames": frames, "samples": samples or 2}
+        _draw(scene=content, output=output, **given)
 
 
-def _open(scene: "Scene", weights: Any, height: int, width: int) -> None:
+def _open(scene: "Scene", weights: Any, height: int, width: int, device: str) -> None:
     from wlm.formats.hdr_blocks import need
     from wlm.view.scene_window import day_scene
     from wlm.view.window import Window
 
     need("pyvista", "view")
-    shown = Window(day_scene(scene, weights), size=(width, height), off_screen=False)
+    shown = Window(day_scene(scene, weights, device), size=(width, height), off_screen=False)
     try:
         shown.tone("filmic")
         shown.show()

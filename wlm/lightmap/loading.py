@@ -1,9 +1,12 @@
 """Loads tiles of a lightmap file in a thread of its own, for a renderer whose frames must not wait for a disk."""
 
 import threading
+import time
 from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Self
+from itertools import islice
+from typing import Any, Self
 
 from wlm.errors import WlmError
 from wlm.lightmap.model import LightmapModel, SheetModel
@@ -18,12 +21,14 @@ class Loaded:
         sheet, number: The sheet and the number of the tile in its grid.
         tile: The sheet with this tile alone: its arrays have one row, as they are uploaded. None after an error.
         error: The error of a damaged file in one line; None of a tile.
+        prepared: The result of the loader's `prepare`; None without it.
     """
 
     sheet: Sheet
     number: int
     tile: SheetModel | None
     error: WlmError | None
+    prepared: Any = None
 
 
 class TileLoader:
@@ -36,16 +41,23 @@ class TileLoader:
     The loader may be used in a `with` statement, which closes it. The model stays open.
     """
 
-    def __init__(self, model: LightmapModel, most: int = 64) -> None:
+    def __init__(
+        self,
+        model: LightmapModel,
+        most: int = 64,
+        prepare: Callable[[Sheet, int, SheetModel], Any] | None = None,
+    ) -> None:
         """Starts the thread.
 
         Args:
             model: The model, usually from `wlm.load`.
             most: Largest number of waiting requests, and of results that nobody has taken; at least 1.
+            prepare: Called in the thread with the sheet, the number and the content of each tile, for work that no
+                frame should wait for.
         """
         if most < 1:
             raise WlmError(f"most: expected at least 1, got {most}")
-        self._model, self._most = model, most
+        self._model, self._most, self._prepare = model, most, prepare
         self._waiting: dict[tuple[Sheet, int], float] = {}
         self._results: deque[Loaded] = deque()
         self._change = threading.Condition()
@@ -68,11 +80,9 @@ class TileLoader:
         Raises:
             WlmError: The model has no such tile, or the loader is closed.
         """
-        if sheet not in self._model.sheets or not 0 <= number < len(self._model.sheets[sheet].kind):
-            raise WlmError(f"{self._model.name}: expected a tile of one of its sheets, got tile {number} of {sheet}")
+        self._check(sheet, number)
         with self._change:
-            if self._closed:
-                raise WlmError(f"{self._model.name}: expected an open loader, got one that was closed")
+            self._check_open()
             tile = (sheet, number)
             if tile == self._current:
                 return True
@@ -85,6 +95,31 @@ class TileLoader:
             self._waiting[tile] = priority
             self._change.notify_all()
             return True
+
+    def replace(self, requests: Iterable[tuple[Sheet, int, float]]) -> None:
+        """Drops all waiting requests and asks for other tiles: sheet, number and priority of each. Of more than `most`
+        the first ones count.
+
+        Raises:
+            WlmError: The model has no such tile, or the loader is closed; nothing is dropped.
+        """
+        asked = list(islice(requests, self._most))
+        for sheet, number, _ in asked:
+            self._check(sheet, number)
+        with self._change:
+            self._check_open()
+            self._waiting = {(sheet, number): priority for sheet, number, priority in asked}
+            if self._current is not None:
+                self._waiting.pop(self._current, None)
+            self._change.notify_all()
+
+    def _check(self, sheet: Sheet, number: int) -> None:
+        if sheet not in self._model.sheets or not 0 <= number < len(self._model.sheets[sheet].kind):
+            raise WlmError(f"{self._model.name}: expected a tile of one of its sheets, got tile {number} of {sheet}")
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise WlmError(f"{self._model.name}: expected an open loader, got one that was closed")
 
     def cancel(self, sheet: Sheet | None = None, number: int | None = None) -> int:
         """Drops waiting requests: of one tile, of all tiles of a sheet, or all.
@@ -136,7 +171,9 @@ class TileLoader:
         while (tile := self._next()) is not None:
             sheet, number = tile
             try:
-                result = Loaded(sheet, number, self._model.sheets[sheet].only([number]), None)
+                content = self._model.sheets[sheet].only([number])
+                prepared = None if self._prepare is None else self._prepare(sheet, number, content)
+                result = Loaded(sheet, number, content, None, prepared)
             except WlmError as error:
                 result = Loaded(sheet, number, None, error)
             except MemoryError as error:
@@ -147,6 +184,7 @@ class TileLoader:
                 if not self._closed:
                     self._results.append(result)
                 self._change.notify_all()
+            time.sleep(0.0)  # a frame that waits for Python's lock goes on now, not after Python's 5 ms
 
     def _next(self) -> tuple[Sheet, int] | None:
         """Waits for the most important request and takes it; None if the loader was closed."""

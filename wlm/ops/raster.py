@@ -144,9 +144,12 @@ def interpolate(
         visible = torch.where(visible < 0, visible, visible + number * len(triangle))
         triangle = (triangle + number * attribute.shape[1]).reshape(-1, 3)
         attribute = attribute.reshape(-1, attribute.shape[2])
-    rows = -1, barycentric.shape[-2]
-    values = _Interpolate.apply(attribute, triangle, visible.reshape(rows), barycentric.reshape(*rows, 2))
-    values = values.reshape(*barycentric.shape[:-1], attribute.shape[1])
+    if barycentric.ndim == 3:
+        values = _Interpolate.apply(attribute, triangle, visible, barycentric)
+    else:
+        rows = -1, barycentric.shape[-2]
+        values = _Interpolate.apply(attribute, triangle, visible.reshape(rows), barycentric.reshape(*rows, 2))
+        values = values.reshape(*barycentric.shape[:-1], attribute.shape[1])
     return (values, _slopes(attribute, triangle, visible, raster.derivative)) if derivatives else values
 
 

@@ -19,7 +19,7 @@ from wlm.lightmap.hours import DAY, hours_of_names
 from wlm.lightmap.model import LightmapModel
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import irradiance, unit_or_zero
-from wlm.scene.file import Day, SceneFile
+from wlm.scene.file import FIELDS, Day, SceneFile
 from wlm.scene.mesh import Mesh, read_mesh
 from wlm.smoke.data import six_way_files
 from wlm.system import load as load_model
@@ -157,7 +157,7 @@ class Scene:
             slopes[1:-1] = (rows[2:] - rows[:-2]) / (times[2:] - times[:-2])[:, None]
             slopes[[0, -1]] = np.diff(rows, axis=0)[[0, -1]] / np.diff(times)[[0, -1], None]
             row = CubicHermiteSpline(times, rows, slopes)(np.clip(second, times[0], times[-1]))
-        return row[:3], row[3:6], float(row[6])
+        return row[:3], row[3:6], float(np.clip(row[6], *FIELDS))  # the curve may swing beyond its rows
 
     def close(self) -> None:
         """Closes the file of the lightmaps."""

@@ -10,6 +10,9 @@ from pydantic_core import PydanticCustomError
 
 from wlm.lightmap.hours import DAY
 
+FIELDS = (1.0, 150.0)
+"""Smallest and largest vertical field of view, degrees."""
+
 _FARTHEST = 1e6
 _Number = Annotated[float, Field(ge=-_FARTHEST, le=_FARTHEST)]
 _Vector = tuple[_Number, _Number, _Number]
@@ -67,7 +70,7 @@ class CameraRow(_Part):
     second: float = Field(ge=0.0, le=3600.0)
     eye: _Vector
     target: _Vector
-    fov: float = Field(50.0, ge=1.0, le=150.0)
+    fov: float = Field(50.0, ge=FIELDS[0], le=FIELDS[1])
 
     @model_validator(mode="after")
     def _looks(self) -> CameraRow:

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from wlm.lightmap.hours import DAY
 from wlm.lightmap.virtual.texture import BUDGET, VirtualTexture
 from wlm.ops.raster import Raster, interpolate, rasterize, texture
 from wlm.probe.sphere import unit_or_zero
-from wlm.scene.content import Puff, Scene
+from wlm.scene.content import Scene
 from wlm.scene.probes import DayProbes, six_lights
 from wlm.smoke.data import read_six_way
 from wlm.texels import fill_gaps, filmic
@@ -126,7 +127,7 @@ class Renderer:
         self.scene, self.height, self.width, self.samples = scene, height, width, samples
         self.device = interop.check_device(device)
         self._device = torch.device(self.device)
-        books = {puff.files: _book(puff, self._device) for puff in scene.smoke}
+        books = {files: _book(files, self._device) for files in {puff.files for puff in scene.smoke}}
         self._smoke = [books[puff.files] for puff in scene.smoke]
         with interop.stream(self.device):
             self._probes = DayProbes(scene.probes, self.device) if scene.moving or scene.smoke else None
@@ -315,22 +316,22 @@ class Renderer:
         return points.reshape(shape).mean((1, 3))
 
 
-def _book(puff: Puff, device: torch.device) -> torch.Tensor:
+def _book(files: Sequence[Path], device: torch.device) -> torch.Tensor:
     """Reads the frames of smoke, float16 [N, H, W, 8]: six lightmaps, transparency and emission."""
     frames = []
-    for path in puff.files:
+    for path in files:
         six = read_six_way(path)
         if six.transparency is None:
             raise WlmError(f"{path}: expected transparency, found none")
         glow = torch.zeros_like(six.transparency) if six.emission is None else six.emission
         planes = torch.cat([six.lightmaps, six.transparency[None], glow[None]]).permute(1, 2, 0)
         if frames and planes.shape != frames[0].shape:
-            raise WlmError(f"{path}: expected frames of one size, found another than in {puff.files[0].name}")
+            raise WlmError(f"{path}: expected frames of one size, found another than in {files[0].name}")
         frames.append(planes.to(device, torch.float16))
-        if len(puff.files) * frames[0].nbytes > _SMOKE_BYTES:
+        if len(files) * frames[0].nbytes > _SMOKE_BYTES:
             raise WlmError(
                 f"{path.parent}: expected at most {_SMOKE_BYTES >> 20} MiB of six-way lightmaps, found "
-                f"{len(puff.files)} frames of {frames[0].nbytes} bytes"
+                f"{len(files)} frames of {frames[0].nbytes} bytes"
             )
     return torch.stack(frames)
 

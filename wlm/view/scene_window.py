@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from wlm.interop import check_device
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.groups import Weight, changed_weights
 from wlm.lightmap.hours import DAY
@@ -22,17 +23,18 @@ from wlm.view.scene import Scene, Slider, State
 _MOST = 4.0  # of the slider of a light group
 
 
-def day_scene(content: Content, weights: Mapping[str, Weight] | None = None) -> Scene:
+def day_scene(content: Content, weights: Mapping[str, Weight] | None = None, device: str = "cpu") -> Scene:
     """Makes the scene of a window: a slider for the hour, and one for the weight of each light group.
 
     Args:
         content: The scene; it must stay open.
         weights: Factors of light groups, by which the sliders multiply.
+        device: "cpu", "cuda" or "cuda:N": decodes the lightmaps and the probes.
 
     Raises:
-        WlmError: There is no such group, or a weight is wrong.
+        WlmError: There is no such group or device, or a weight is wrong.
     """
-    model = content.light
+    model, device = content.light, check_device(device)
     factors = changed_weights(model.name, {group: np.ones(3, np.float32) for group in model.groups}, weights or {})
     hour = Slider("hour", 0.0, DAY, content.day.first % DAY, 0.25, wraps=True, clock=True)
     sliders = (hour, *(Slider(_label(group), 0.0, _MOST, 1.0, 0.1) for group in model.groups))
@@ -47,8 +49,8 @@ def day_scene(content: Content, weights: Mapping[str, Weight] | None = None) -> 
         plays="hour",
         content=content,
         factors=factors,
-        decoder=model.decoder("cpu"),
-        probes=DayProbes(content.probes) if content.moving else None,
+        decoder=model.decoder(device),
+        probes=DayProbes(content.probes, device) if content.moving else None,
         base=fill_gaps(colours, raster.triangle.numpy() >= 0),
     )
 

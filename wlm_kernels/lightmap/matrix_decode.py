@@ -20,14 +20,16 @@ from wlm_kernels.lightmap.output import bound_of
 from wlm_kernels.native import native_source, on_cuda
 from wlm_kernels.shared_exponent import pack_rgb9e5
 
-ROWS = 16
-"""Rows of texels in a strip."""
-
+_ROWS = 16  # of texels in a strip, or half as many
+_SHARED = 48 << 10  # bytes of shared memory of a block
 _BOUNDS = (128, 4)  # threads of a block, blocks of a multiprocessor: 128 registers per thread
 _STEP = 16  # size of a matrix product: the hidden width is a multiple of it
 _MAPS = 12  # inputs that come from the maps; the encoded time follows
 _UV_SCALE = np.sqrt(12.0) / 255.0
 _SCALE = (np.sqrt(2.0 / np.pi) * 0.044715) ** (1.0 / 3.0)  # of arguments of GELU, whose x^3 then has the factor 1
+
+
+Maps = wp.types.vector(_MAPS, float)
 
 
 @wp.func_native(
@@ -79,6 +81,19 @@ def pack_networks(hidden: np.ndarray, output: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate(layers, axis=1))
 
 
+def packed_words(width: int) -> int:
+    """Returns the words of a network from `pack_networks`, for a hidden width."""
+    steps = width // _STEP
+    return 64 * (2 * steps + 2 * steps**2 + 2 * steps) + width // 2 + 4
+
+
+def pack_biases(hidden: np.ndarray) -> np.ndarray:
+    """Returns of the first layers of N networks, as `pack_networks` takes them, the biases and their change by each of
+    the four numbers of the encoded time, float32 [N, 5, H], scaled like the layers' sums."""
+    bias = hidden[:, TEMPORAL_INPUTS] + 0.5 * _UV_SCALE * hidden[:, :4].sum(1)
+    return (np.concatenate([bias[:, None], hidden[:, _MAPS:TEMPORAL_INPUTS]], 1) * _SCALE).astype(np.float32)
+
+
 def _operands(weights: np.ndarray) -> np.ndarray:
     """Arranges the weights of a layer, [N, inputs, units], as right operands of products, uint32 [N, words].
 
@@ -91,10 +106,11 @@ def _operands(weights: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MatrixKernels:
-    """Kernels that decode at one hour and between two."""
+    """Kernels that decode at one hour and between two, and the rows of a strip of each."""
 
     _one: Any
     _two: Any
+    _rows: tuple[int, ...]
 
     def decode(
         self,
@@ -122,7 +138,7 @@ class MatrixKernels:
         """
         wp.launch(
             self._one if len(times) == 1 else self._two,
-            (out.shape[0], 128 // ROWS, 128),
+            (out.shape[0], 128 // self._rows[len(times) - 1], 128),
             inputs=[stored, packed, hidden, times[0], times[-1], share, places, tiles],
             outputs=[out],
             device=out.device,
@@ -144,14 +160,58 @@ def matrix_kernels(hidden: int, resolution: int, shared: bool = False) -> Matrix
     """
     if hidden % _STEP or hidden < _STEP:
         raise ValueError(f"hidden: expected a width that is a multiple of {_STEP} units, got {hidden}")
-    return MatrixKernels(*(_decode_kernel(hidden, resolution, shared, hours) for hours in (1, 2)))
+    rows = tuple(_rows(hidden, resolution, hours) for hours in (1, 2))
+    return MatrixKernels(*(_decode_kernel(hidden, resolution, shared, 1 + i, rows[i]) for i in range(2)), rows)
 
 
-def _decode_kernel(width: int, resolution: int, shared: bool, hours: int) -> wp.Kernel:
+def _native(*names: str, **constants: int) -> str:
+    """Returns the code of a native function from its parts, with integer constants."""
+    units = native_source(__package__, "matrix_units", **constants)
+    return units + "".join(native_source(__package__, name) for name in names)
+
+
+@wp.func_native(on_cuda(_native("matrix_maps", "map_inputs"), "return wp::vec_t<12, float>();"))
+def map_inputs(stored: Stored, n: int, tau: float, y: int, x: int) -> Maps:
+    """Reads the maps of tile n at its texel (y, x) as `matrix_texels` takes them: F_uv in steps of 1/255 less 128, then
+    F_uvt, F_ut and F_vt, scaled as the network takes them. On a GPU only."""
+    ...
+
+
+@functools.cache
+def matrix_texels(hidden: int) -> Any:
+    """Builds (once) the `wp.func` that evaluates networks, at one texel per thread.
+
+    It is evaluate(packed, biases, f, encoding, n, time), a vec3. All threads of a warp must call it, in blocks of 128
+    threads. Its arguments are `packed`, uint32 [N, words], from `pack_networks`; `biases`, vecH [N, 5], from
+    `pack_biases`; `f`, vec12, from `map_inputs`; `encoding`, vec4, the encoded time; `n`, the number of the network, or
+    -1 for a thread without one; `time`, a number that is equal only where the encoding is.
+    """
+    vec_hidden = wp.types.vector(hidden, float)
+
+    @wp.func_native(on_cuda(_native("matrix_network", "matrix_texels", H=hidden), "return wp::vec_t<3, float>();"))
+    def evaluate(
+        packed: wp.array2d[wp.uint32],
+        biases: wp.array2d[vec_hidden],
+        f: Maps,
+        encoding: wp.vec4,
+        n: int,
+        time: int,
+    ) -> wp.vec3: ...
+
+    return evaluate
+
+
+def _rows(width: int, resolution: int, hours: int) -> int:
+    """Returns the rows of a strip: as many as the arrays of `matrix_decode.cuh` leave room for in shared memory."""
+    own = 4 * packed_words(width) + 4 * (hours - 1) * 4 * _STEP * width // 8 + 2 * 128 * 16 + hours * 128 * 4
+    volume = hours * 8 * (((_ROWS * resolution + 127) // 128 + 2) * resolution + _ROWS)
+    return _ROWS if own + volume <= _SHARED else _ROWS // 2
+
+
+def _decode_kernel(width: int, resolution: int, shared: bool, hours: int, rows: int) -> wp.Kernel:
     vec_hidden, vec_result = wp.types.vector(width, float), wp.types.vector(12, float)
-    constants = {"H": width, "R": resolution, "ROWS": ROWS, "HOURS": hours}
     radiance = shared or hours == 2
-    code = native_source(__package__, "matrix_units") + native_source(__package__, "matrix_decode", **constants)
+    code = _native("matrix_network", "matrix_maps", "matrix_decode", H=width, R=resolution, ROWS=rows, HOURS=hours)
 
     @wp.func_native(on_cuda(code, "return wp::vec_t<12, float>();"))
     def forward(
@@ -190,7 +250,7 @@ def _decode_kernel(width: int, resolution: int, shared: bool, hours: int) -> wp.
         early_scale, late_scale = early.scale[place], late.scale[place]
         inverse = bound_of(wp.max(bound_of(early.inverse_peak[place]), bound_of(late.inverse_peak[place])))
         # Variables keep the loops rolled.
-        parts = int(wp.static(ROWS // 4))
+        parts = int(wp.static(rows // 4))
         count = int(wp.static(hours))
         for part in range(parts):
             total = vec_result()
@@ -215,6 +275,6 @@ def _decode_kernel(width: int, resolution: int, shared: bool, hours: int) -> wp.
                     if wp.static(radiance):
                         light = powers(light, 1.0 / early.gamma)
                     word = bytes_over(light, inverse)
-                out[i, strip * wp.static(ROWS) + 4 * part + r, column] = word
+                out[i, strip * wp.static(rows) + 4 * part + r, column] = word
 
     return decode

@@ -20,11 +20,15 @@ import warp as wp
 from wlm_kernels import mlp
 from wlm_kernels.lightmap.decode import Stored, texel_network
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
-from wlm_kernels.lightmap.frames import StoredFrames, frame_colour, power
+from wlm_kernels.lightmap.frames import StoredFrames, frame_colour
+from wlm_kernels.lightmap.matrix_decode import powers
 from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 
 COARSE_LEVEL, COARSE = 4, 8
 """The finest level that is read from the table of coarse texels, and their number along a side of a tile."""
+
+BLOCK = 128
+"""Threads of a block of a launch."""
 
 WAITING, BROKEN = -1, -2
 """Values of `Tiles.slot`: the tile is not on the device; it is damaged."""
@@ -43,7 +47,10 @@ _FULL, _EMPTY = wp.constant(FULL), wp.constant(EMPTY)
 _BEFORE, _AFTER, _SHARE, _TAU, _WEIGHT, _FIRST, _SECOND, _MIX, _ENCODING = (
     wp.constant(i) for i in (BEFORE, AFTER, SHARE, TAU, WEIGHT, FIRST, SECOND, MIX, ENCODING)
 )
-_CONSTANT, _STATIC, _FRAMES = wp.constant(1), wp.constant(2), wp.constant(4)  # of `wlm.lightmap.tiles.TileKind`
+_CONSTANT, _STATIC, _DYNAMIC = wp.constant(1), wp.constant(2), wp.constant(3)  # of `wlm.lightmap.tiles.TileKind`
+COARSE_TEXELS = -1
+"""Instead of the kind of a tile: its coarse texels are read."""
+_COARSE_TEXELS = wp.constant(COARSE_TEXELS)
 
 
 @wp.struct
@@ -95,11 +102,13 @@ class Jobs:
         place: [J], sheet, level, row and column of the first texel, which may lie outside the level.
         target: [J], row of the clock with the time.
         slot: [J], index of the square in the output, or -1 for nothing to decode.
+        first: [J + 1], first block of `BLOCK` threads of each square, and at the end their number, for `matrix_pages`.
     """
 
     place: wp.array1d[wp.vec4i]
     target: wp.array1d[int]
     slot: wp.array1d[int]
+    first: wp.array1d[int]
 
 
 @wp.kernel(enable_backward=False)
@@ -128,39 +137,126 @@ def _valid(tiles: Tiles, tile: int, y: int, x: int) -> int:
     return int(wp.rshift(tiles.bits[mask, y, x // 32], wp.uint32(x % 32)) & wp.uint32(1))
 
 
+@wp.struct
+class Square:
+    """A square of texels that is decoded.
+
+    Attributes:
+        slot: Its index in the output, or -1 if there is nothing to decode in this light group.
+        sheet: The sheet, among those of its group.
+        level: The mip level.
+        depth: The level below it whose texels are the samples: the first one, or that of coarse texels.
+        bits: The samples of a texel lie in a grid of 2^bits along each axis.
+        rows, columns: Size of the level.
+    """
+
+    slot: int
+    sheet: int
+    level: int
+    depth: int
+    bits: int
+    rows: int
+    columns: int
+
+
 @wp.func
-def _sample(tiles: Tiles, sheet: int, level: int, depth: int, side: int, sample: int, y: int, x: int) -> wp.vec3i:
-    """Returns tile, row and column of one of side x side samples of the texel (y, x) of a level, or a tile of -1 if the
-    sample is not valid. With a `depth` below the level, samples are coarse texels, and all are valid."""
-    a = sample // side
-    b = sample - a * side
-    whole = 2 * side * side
-    ty = (y << level) + (2 * (a * side + b) + 1 << level) // whole
-    tx = (x << level) + (2 * (b * side + side - 1 - a) + 1 << level) // whole
-    if depth < level:  # of a coarse texel that reaches past the map's end, its first texel does not
-        ty -= ty % 16
-        tx -= tx % 16
-    size = tiles.size[sheet]
+def square_of(tiles: Tiles, jobs: Jobs, k: int, grid: int, direct: int) -> Square:
+    square = Square()
+    place = jobs.place[k]
+    square.sheet = place[0] - tiles.sheet
+    square.slot = -1
+    if square.sheet >= 0 and square.sheet < tiles.size.shape[0]:
+        square.slot = jobs.slot[k]
+        size = tiles.size[square.sheet]
+        square.level = place[1]
+        square.rows = ((size[0] - 1) >> place[1]) + 1
+        square.columns = ((size[1] - 1) >> place[1]) + 1
+        square.depth = place[1]
+        if place[1] >= _LEVEL and direct == 0:
+            square.depth = place[1] - _LEVEL
+        square.bits = wp.min(square.depth, grid)
+    return square
+
+
+@wp.func
+def texel_of(square: Square, place: wp.vec4i, i: int, j: int) -> wp.vec2i:
+    """Returns row and column of a texel of a square in its level; beyond the level's end those of its last texel."""
+    return wp.vec2i(wp.clamp(place[2] + i, 0, square.rows - 1), wp.clamp(place[3] + j, 0, square.columns - 1))
+
+
+@wp.func
+def sample_at(tiles: Tiles, square: Square, sample: int, at: wp.vec2i) -> wp.vec3i:
+    """Returns tile, row and column of one of the samples of a texel of a level, or a tile of -1 if the texel
+    lies outside or the sample is not valid. With a `depth` below the level, samples are coarse texels, all valid."""
     tile = int(-1)
-    if ty < size[0] and tx < size[1]:
-        tile = tiles.first[sheet] + (ty // 128) * tiles.columns[sheet] + tx // 128
-        ty = ty % 128
-        tx = tx % 128
-        if depth == level:
-            if _valid(tiles, tile, ty, tx) == 0:
-                tile = -1
+    ty = int(0)
+    tx = int(0)
+    if at[0] >= 0 and at[1] >= 0 and at[0] < square.rows and at[1] < square.columns:
+        side = 1 << square.bits
+        a = sample >> square.bits
+        b = sample - a * side
+        # Divisions by twice the number of samples.
+        ty = (at[0] << square.level) + ((2 * (a * side + b) + 1 << square.level) >> (2 * square.bits + 1))
+        tx = (at[1] << square.level) + ((2 * (b * side + side - 1 - a) + 1 << square.level) >> (2 * square.bits + 1))
+        if square.depth < square.level:  # of a coarse texel that reaches past the map's end, its first texel does not
+            ty -= ty % 16
+            tx -= tx % 16
+        size = tiles.size[square.sheet]
+        if ty < size[0] and tx < size[1]:
+            tile = tiles.first[square.sheet] + (ty // 128) * tiles.columns[square.sheet] + tx // 128
+            ty = ty % 128
+            tx = tx % 128
+            if square.depth == square.level:
+                if _valid(tiles, tile, ty, tx) == 0:
+                    tile = -1
     return wp.vec3i(tile, ty, tx)
 
 
 @wp.func
-def _coarse_light(tiles: Tiles, clock: wp.array2d[float], target: int, tile: int, cell: int) -> wp.vec3:
-    share = clock[target, _SHARE]
-    early = unpack_rgb9e5(tiles.coarse[tile, int(clock[target, _BEFORE]), cell])
-    return (1.0 - share) * early + share * unpack_rgb9e5(tiles.coarse[tile, int(clock[target, _AFTER]), cell])
+def kind_of(tiles: Tiles, square: Square, tile: int) -> int:
+    """Returns how a sample in a tile is read: the kind of the tile, or `COARSE_TEXELS`."""
+    kind = tiles.kind[tile]
+    if square.depth < square.level or tiles.slot[tile] < 0:
+        kind = _COARSE_TEXELS
+    return kind
 
 
 @wp.func
-def _light_of(
+def stored_light(
+    tiles: Tiles,
+    frames: StoredFrames,
+    clock: wp.array2d[float],
+    target: int,
+    gamma: float,
+    kind: int,
+    at: wp.vec3i,
+) -> wp.vec3:
+    """Returns the light of a sample, from `sample_at`, for which no network is evaluated."""
+    share = clock[target, _SHARE]
+    before = int(clock[target, _BEFORE])
+    after = int(clock[target, _AFTER])
+    if kind == _COARSE_TEXELS:
+        cell = (at[1] // 16) * _SIDE + at[2] // 16
+        early = unpack_rgb9e5(tiles.coarse[at[0], before, cell])
+        return (1.0 - share) * early + share * unpack_rgb9e5(tiles.coarse[at[0], after, cell])
+    slot = tiles.slot[at[0]]
+    if kind == _CONSTANT:
+        return (1.0 - share) * tiles.colours[slot, before] + share * tiles.colours[slot, after]
+    first = slot * frames.times
+    light = (1.0 - share) * powers(frame_colour(frames, first + before, at[1], at[2]), gamma)
+    if share > 0.0:
+        light += share * powers(frame_colour(frames, first + after, at[1], at[2]), gamma)
+    return light
+
+
+@wp.func
+def encoding_of(clock: wp.array2d[float], target: int, r: int) -> wp.vec4:
+    at = _ENCODING + 4 * r
+    return wp.vec4(clock[target, at], clock[target, at + 1], clock[target, at + 2], clock[target, at + 3])
+
+
+@wp.func
+def light_of(
     mapped: Mapped, clock: wp.array2d[float], target: int, r: int, n: int, gamma: float, y: wp.vec3
 ) -> wp.vec3:
     """Converts the output y of the network of the mapped tile n at the time r of a clock's row to light."""
@@ -168,81 +264,64 @@ def _light_of(
     early = mapped.scale[n, int(clock[target, _FIRST + r])]
     scale = (1.0 - share) * early + share * mapped.scale[n, int(clock[target, _SECOND + r])]
     c = wp.cw_mul(mapped.shift[n] + wp.cw_mul(mapped.spread[n], y), scale)
-    return power(wp.vec3(wp.max(c[0], 0.0), wp.max(c[1], 0.0), wp.max(c[2], 0.0)), gamma)
+    return powers(wp.max(c, wp.vec3()), gamma)
 
 
-@functools.cache
-def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
-    """Builds (once) the kernel that decodes squares of texels, for networks of one hidden width.
-
-    Args:
-        hidden: H, width of the hidden layers.
-        gelu: One of `mlp.GELUS`.
-    """
+def _lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
+    """Builds the `wp.func`s that read dynamic and static tiles at a texel, and the types of their networks' arrays."""
     vec_hidden = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu).vec_hidden
     assert vec_hidden is mlp.kernels(STATIC_INPUTS, hidden, gelu).vec_hidden
-    temporal_network, static_network = (texel_network(temporal, hidden, gelu) for temporal in (True, False))
 
-    @wp.func
-    def texel_light(
-        tiles: Tiles,
-        moving: Mapped,
-        moving_hidden: wp.array2d[vec_hidden],
-        moving_output: wp.array2d[wp.vec3],
-        still: Mapped,
-        still_hidden: wp.array2d[vec_hidden],
-        still_output: wp.array2d[wp.vec3],
-        frames: StoredFrames,
-        clock: wp.array2d[float],
-        target: int,
-        gamma: float,
-        tile: int,
-        y: int,
-        x: int,
-    ) -> wp.vec3:
-        kind = tiles.kind[tile]
-        slot = tiles.slot[tile]
-        light = wp.vec3()
-        if slot < 0:
-            light = _coarse_light(tiles, clock, target, tile, (y // 16) * _SIDE + x // 16)
-        elif kind == _CONSTANT:
-            share = clock[target, _SHARE]
-            early = tiles.colours[slot, int(clock[target, _BEFORE])]
-            light = (1.0 - share) * early + share * tiles.colours[slot, int(clock[target, _AFTER])]
-        elif kind == _FRAMES:
-            share = clock[target, _SHARE]
-            first = slot * frames.times
-            light = (1.0 - share) * power(frame_colour(frames, first + int(clock[target, _BEFORE]), y, x), gamma)
-            if share > 0.0:
-                light += share * power(frame_colour(frames, first + int(clock[target, _AFTER]), y, x), gamma)
-        else:
+    def build(temporal: bool) -> Any:
+        network = texel_network(temporal, hidden, gelu)
+
+        @wp.func
+        def light(
+            mapped: Mapped,
+            first: wp.array2d[vec_hidden],
+            later: wp.array2d[wp.vec3],
+            clock: wp.array2d[float],
+            target: int,
+            gamma: float,
+            n: int,
+            y: int,
+            x: int,
+        ) -> wp.vec3:
+            light = wp.vec3()
             two = int(2)  # a variable keeps the loop rolled
             for r in range(two):
                 weight = clock[target, _WEIGHT + r]
                 if weight > 0.0:
                     tau = clock[target, _TAU + r]
-                    at = _ENCODING + 4 * r
-                    encoding = wp.vec4(
-                        clock[target, at], clock[target, at + 1], clock[target, at + 2], clock[target, at + 3]
-                    )
-                    if kind == _STATIC:
-                        out = static_network(still.stored, still_hidden, still_output, tau, encoding, slot, y, x)
-                        light += weight * _light_of(still, clock, target, r, slot, gamma, out)
-                    else:
-                        out = temporal_network(moving.stored, moving_hidden, moving_output, tau, encoding, slot, y, x)
-                        light += weight * _light_of(moving, clock, target, r, slot, gamma, out)
+                    out = network(mapped.stored, first, later, tau, encoding_of(clock, target, r), n, y, x)
+                    light += weight * light_of(mapped, clock, target, r, n, gamma, out)
+            return light
+
         return light
+
+    return build(True), build(False), (vec_hidden, wp.vec3)
+
+
+@functools.cache
+def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
+    """Builds (once) the kernel that decodes squares of texels, one texel per thread, for networks of one hidden width.
+
+    Args:
+        hidden: H, width of the hidden layers.
+        gelu: One of `mlp.GELUS`.
+    """
+    moving_light, still_light, (first_type, later_type) = _lights(hidden, gelu)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def decode_pages(
         # in:
         tiles: Tiles,
         moving: Mapped,
-        moving_hidden: wp.array2d[vec_hidden],
-        moving_output: wp.array2d[wp.vec3],
+        moving_first: wp.array2d[first_type],
+        moving_later: wp.array2d[later_type],
         still: Mapped,
-        still_hidden: wp.array2d[vec_hidden],
-        still_output: wp.array2d[wp.vec3],
+        still_first: wp.array2d[first_type],
+        still_later: wp.array2d[later_type],
         frames: StoredFrames,
         clock: wp.array2d[float],
         offsets: wp.array1d[wp.vec2i],
@@ -253,63 +332,40 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
         out: wp.array3d[wp.uint32],
     ):
         k, i, j = wp.tid()
-        slot = jobs.slot[k]
-        sheet = jobs.place[k][0] - tiles.sheet
-        if slot >= 0 and sheet >= 0 and sheet < tiles.size.shape[0]:
-            place = jobs.place[k]
-            level = place[1]
-            size = tiles.size[sheet]
-            rows = ((size[0] - 1) >> level) + 1
-            columns = ((size[1] - 1) >> level) + 1
-            y = wp.clamp(place[2] + i, 0, rows - 1)
-            x = wp.clamp(place[3] + j, 0, columns - 1)
-            depth = level
-            if level >= _LEVEL and direct == 0:
-                depth = level - _LEVEL
-            side = wp.min(1 << depth, grid)
+        square = square_of(tiles, jobs, k, grid, direct)
+        if square.slot >= 0:
+            target = jobs.target[k]
+            samples = 1 << (2 * square.bits)
+            start = texel_of(square, jobs.place[k], i, j)
             # The search comes first, so that the threads of a warp evaluate their networks together.
             o = int(0)
             found = int(0)
             while o < offsets.shape[0] and found == 0:
-                yy = y + offsets[o][0]
-                xx = x + offsets[o][1]
-                if yy >= 0 and xx >= 0 and yy < rows and xx < columns:
-                    sample = int(0)
-                    while sample < side * side and found == 0:
-                        if _sample(tiles, sheet, level, depth, side, sample, yy, xx)[0] >= 0:
-                            found = 1
-                        sample += 1
+                sample = int(0)
+                while sample < samples and found == 0:
+                    if sample_at(tiles, square, sample, start + offsets[o])[0] >= 0:
+                        found = 1
+                    sample += 1
                 o += 1
             light = wp.vec3()
             count = int(0)
             if found == 1:
-                yy = y + offsets[o - 1][0]
-                xx = x + offsets[o - 1][1]
-                for sample in range(side * side):
-                    at = _sample(tiles, sheet, level, depth, side, sample, yy, xx)
+                gamma = tiles.gamma[square.sheet]
+                for sample in range(samples):
+                    at = sample_at(tiles, square, sample, start + offsets[o - 1])
                     if at[0] >= 0:
                         count += 1
-                        if depth < level:
-                            cell = (at[1] // 16) * _SIDE + at[2] // 16
-                            light += _coarse_light(tiles, clock, jobs.target[k], at[0], cell)
-                        else:
-                            light += texel_light(
-                                tiles,
-                                moving,
-                                moving_hidden,
-                                moving_output,
-                                still,
-                                still_hidden,
-                                still_output,
-                                frames,
-                                clock,
-                                jobs.target[k],
-                                tiles.gamma[sheet],
-                                at[0],
-                                at[1],
-                                at[2],
+                        kind = kind_of(tiles, square, at[0])
+                        n = tiles.slot[at[0]]
+                        if kind == _DYNAMIC:
+                            light += moving_light(
+                                moving, moving_first, moving_later, clock, target, gamma, n, at[1], at[2]
                             )
-            out[slot, i, j] = pack_rgb9e5(light / float(wp.max(count, 1)))
+                        elif kind == _STATIC:
+                            light += still_light(still, still_first, still_later, clock, target, gamma, n, at[1], at[2])
+                        else:
+                            light += stored_light(tiles, frames, clock, target, gamma, kind, at)
+            out[square.slot, i, j] = pack_rgb9e5(light / float(wp.max(count, 1)))
 
     return decode_pages
 
@@ -328,21 +384,30 @@ def put(records, slots, parts, memory) -> None:
 
 
 def decode(
-    kernel: wp.Kernel, source: tuple[Any, ...], clock, offsets, jobs: Jobs, grid: int, direct: bool, out
+    kernel: wp.Kernel,
+    source: tuple[Any, ...],
+    clock,
+    offsets,
+    jobs: Jobs,
+    grid: int,
+    direct: bool,
+    out,
+    blocks: int | None = None,
 ) -> None:
     """Decodes squares of texels of one light group with one launch, which a CUDA graph can capture.
 
     Args:
-        kernel: From `page_kernel`.
-        source: `Tiles`; `Mapped`, hidden and output layers of the dynamic tiles, and the same of the static ones; the
-            tiles stored as frames.
+        kernel: From `page_kernel` or `matrix_pages.page_kernel`.
+        source: `Tiles`; `Mapped` and the two arrays of the networks of the dynamic tiles, and the same of the static
+            ones; the tiles stored as frames. The arrays are the hidden and output layers, or those of `matrix_pages`.
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
         jobs: J squares; those of other groups are left as they are.
-        grid: Most samples of a texel of a mip along each axis.
+        grid: Logarithm to base 2 of the most samples of a texel along each axis.
         direct: Whether to decode tiles at every level, instead of reading coarse texels from `COARSE_LEVEL` on.
         out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.
+        blocks: For a kernel of `matrix_pages` the blocks to launch, at least as many as the squares need.
     """
     inputs = [*source, clock, offsets, jobs, grid, int(direct)]
-    dim = (jobs.slot.shape[0], *out.shape[1:])
-    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=128)
+    dim = (jobs.slot.shape[0], *out.shape[1:]) if blocks is None else blocks * BLOCK
+    wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=BLOCK)

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.lightmap.pages import CLOCK, COARSE_LEVEL, Jobs
+from wlm_kernels.lightmap.matrix_pages import MOST_SAMPLES, blocks_of
+from wlm_kernels.lightmap.pages import BLOCK, CLOCK, COARSE_LEVEL, Jobs
 from wlm_kernels.shared_exponent import unpack_rgb9e5
 
 GROUP = 32  # slots from which one is chosen
@@ -393,6 +394,15 @@ def _allocate(pages: Pages, slots: Slots, size: int, work: Work, jobs: Jobs):
             jobs.target[k] = row
             wp.atomic_add(work.counters, _DECODED, 1)
     jobs.slot[k] = slot
+    edge = pages.side + 2 * pages.border
+    before = int(0)
+    for i in range(k + 1):
+        if i == k:
+            jobs.first[k] = before
+        if work.chosen[i] >= 0:
+            before += blocks_of(pages.place[work.chosen[i] // 2][1], edge * edge)
+    if k == work.chosen.shape[0] - 1:
+        jobs.first[k + 1] = before
 
 
 @wp.kernel(enable_backward=False)
@@ -526,6 +536,20 @@ def select(pages: Pages, slots: Slots, tolerance: float, work: Work, jobs: Jobs)
     wp.launch(_rank, MOST, inputs=[work], device=device)
     size = max(1, min(GROUP, slots.owner.shape[0] // count))
     wp.launch(_allocate, count, inputs=[pages, slots, size, work, jobs], device=device)
+
+
+def most_blocks(decodes: int, texels: int, levels: np.ndarray) -> int:
+    """Returns the most blocks that the pages of a frame need, see `matrix_pages`.
+
+    Args:
+        decodes: Most pages of a frame.
+        texels: Texels of a page.
+        levels: int [P], the level of each page.
+    """
+    samples = np.where(levels < COARSE_LEVEL, 4 ** np.minimum(levels, 2), 1)
+    # Each page may be decoded for a coming switch too.
+    every = 2 * int((-(-texels * samples // BLOCK)).sum())
+    return min(decodes + -(-max(SAMPLES * decodes, MOST_SAMPLES) * texels // BLOCK), every)
 
 
 def refer(pages: Pages) -> None:

@@ -19,17 +19,22 @@ from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.encodings.frames import bc7_tables
 from wlm.lightmap.loading import TileLoader
 from wlm.lightmap.model import BLOCKS, PACKED_KINDS, LightmapModel, SheetModel
+from wlm.lightmap.sheet import Sheet
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.virtual.clock import Clock
 from wlm.lightmap.virtual.layout import Layout
 from wlm.texels import OFFSETS, nearest_valid
 from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap import frames as frame_kernels
+from wlm_kernels.lightmap import matrix_pages
 from wlm_kernels.lightmap import pages as kernels
+from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
+from wlm_kernels.lightmap.matrix_decode import pack_biases, pack_networks, packed_words
 from wlm_kernels.lightmap.virtual import KEEP
 
 _CHUNK = 64  # tiles that are read at once
-_GRID = 4  # samples of a coarse texel along each axis
+_GRID_BITS = 2
+_GRID = 1 << _GRID_BITS  # most samples of a texel along each axis; those of a coarse texel
 _DARK = 0.01  # of a tile's brightest time: changes of less light than that are not relative to it
 _UPLOADS = 8  # most loaded tiles that are copied to the device in a frame
 _ALIGNED = 64  # bytes; the first of an array in a pool
@@ -77,11 +82,15 @@ class _Pool:
         """Frees the memory through which tiles are uploaded, which has the size of the largest upload."""
         self._staging = self._records = None
 
-    def put(self, slots: np.ndarray, rows: dict[str, np.ndarray]) -> None:
-        """Copies n tiles, arrays [n, ...] by name, into slots, int [n]."""
-        parts = [np.ascontiguousarray(rows[name]).view(np.uint8).reshape(len(slots), -1) for name in self._names]
+    def records(self, rows: dict[str, np.ndarray]) -> np.ndarray:
+        """Returns n tiles, arrays [n, ...] by name, as `put` takes them: uint8 [n, bytes]."""
+        parts = [np.ascontiguousarray(rows[name]).view(np.uint8).reshape(len(rows[name]), -1) for name in self._names]
+        return np.concatenate(parts, 1)
+
+    def put(self, slots: np.ndarray, records: np.ndarray) -> None:
+        """Copies n tiles, see `records`, into slots, int [n]."""
         at = wp.array(slots.astype(np.int32), dtype=int, device=self._device)
-        kernels.put(self._upload(np.concatenate(parts, 1)), at, self._parts, self._memory)
+        kernels.put(self._upload(records), at, self._parts, self._memory)
 
     def _upload(self, records: np.ndarray) -> wp.array:
         """Copies records to the device. Host memory that CUDA may read by itself makes no frame wait for the copy."""
@@ -137,7 +146,10 @@ class TileStore:
         self._model, self.layout, self._device = model, layout, device
         self.warnings: list[str] = []
         self._loader: TileLoader | None = None
-        self.kernel = kernels.page_kernel(layout.models[0].profile.hidden, gelu)
+        hidden = layout.models[0].profile.hidden
+        # The matrix units have the GELU that is chosen for CUDA.
+        self._matrix = device != "cpu" and gelu == "fast" and hidden % 16 == 0
+        self.kernel = matrix_pages.page_kernel(hidden) if self._matrix else kernels.page_kernel(hidden, gelu)
         self._kind = np.concatenate([own.kind for own in layout.models]).astype(np.int32)
         self.slot = np.full(len(self._kind), kernels.WAITING, np.int32)
         self.slot[self._kind == TileKind.EMPTY] = 0
@@ -156,14 +168,14 @@ class TileStore:
         waits = self.slot[layout.read] == kernels.WAITING
         self._missing = np.bincount(layout.reader[waits], minlength=len(layout.parent))
         if not self.complete:
-            self._loader = TileLoader(model, _REQUESTS)
+            self._loader = TileLoader(model, _REQUESTS, self._record)
 
     def _array(self, values: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._device)
 
     def _allocate(self, room: int | None) -> dict[int, _Pool]:
         layout, own = self.layout, self.layout.models[0]
-        shapes, times = _shapes(own), len(own.times)
+        shapes, times = _shapes(own, self._matrix), len(own.times)
         counts = {kind: int((self._kind == kind).sum()) for kind in PACKED_KINDS}
         size = {
             kind: sum(math.prod(shape) * wp.types.type_size_in_bytes(dtype) for dtype, shape in of.values())
@@ -181,7 +193,7 @@ class TileStore:
                 slots = least
         pools = {kind: _Pool(shapes[kind], slots[kind], self._device) for kind in PACKED_KINDS}
         moving, still = (
-            (self._mapped(own, pools[kind].arrays), *(pools[kind].arrays[name] for name in ("hidden", "output")))
+            (self._mapped(own, pools[kind].arrays), *(pools[kind].arrays[name] for name in ("first", "later")))
             for kind in (TileKind.DYNAMIC, TileKind.STATIC)
         )
         frames = frame_kernels.StoredFrames()
@@ -241,6 +253,11 @@ class TileStore:
             "tables": sum(array.capacity for array in rest),
         }
 
+    def decode(self, clock: wp.array, offsets: wp.array, jobs: kernels.Jobs, direct: bool, out: wp.array, blocks: int):
+        """Decodes squares of texels; for the arguments see `wlm_kernels.lightmap.pages.decode`."""
+        most = blocks if self._matrix else None
+        kernels.decode(self.kernel, self.source, clock, offsets, jobs, _GRID_BITS, direct, out, most)
+
     # ---- coarse texels ----
 
     def _read_all(self, clock: Clock) -> None:
@@ -289,7 +306,7 @@ class TileStore:
         self.slot[gone[gone >= 0]] = kernels.WAITING
         pool.owner[first : first + len(tiles)] = tiles
         self.slot[tiles] = np.arange(first, first + len(tiles))
-        pool.put(self.slot[tiles], _rows(part, kind))
+        pool.put(self.slot[tiles], pool.records(_rows(part, kind, self._matrix)))
         return numbers
 
     def _is_good(self, s: int, own: SheetModel, number: int) -> bool:
@@ -319,8 +336,10 @@ class TileStore:
         jobs.place = self._array(place.repeat(times, 0), wp.vec4i)
         jobs.target = self._array(np.tile(np.arange(times, dtype=np.int32), count), int)
         jobs.slot = self._array(np.arange(count * times, dtype=np.int32), int)
+        each = -(-side * side * _GRID**2 // kernels.BLOCK)  # blocks
+        jobs.first = self._array(each * np.arange(count * times + 1, dtype=np.int32), int)
         out = wp.zeros((count * times, side, side), dtype=wp.uint32, device=self._device)
-        kernels.decode(self.kernel, self.source, rows, self.offsets[:1], jobs, _GRID, True, out)
+        self.decode(rows, self.offsets[:1], jobs, True, out, each * count * times)
         return out.numpy().reshape(count, times, side, side)
 
     def _fill(self, own: SheetModel, words: np.ndarray, slot: np.ndarray) -> None:
@@ -369,38 +388,47 @@ class TileStore:
             return False
         layout, most = self.layout, {}
         # Of a view's few pages; all pages read tens of thousands of tiles.
-        for page in np.flatnonzero(seen > frame - KEEP).tolist():
-            read = layout.read[self._reads[page] : self._reads[page + 1]]
-            self._used[read] = frame
+        pages = np.flatnonzero(seen > frame - KEEP).tolist()
+        reads = {page: layout.read[self._reads[page] : self._reads[page + 1]] for page in pages}
+        if pages:
+            self._used[np.concatenate(list(reads.values()))] = frame
+        for page in pages:
             if priority[page] > 0:
-                waiting = read[self.slot[read] == kernels.WAITING].tolist()
+                waiting = reads[page][self.slot[reads[page]] == kernels.WAITING].tolist()
                 most |= {tile: max(int(priority[page]), most.get(tile, 0)) for tile in waiting}
         order = sorted(most, key=most.__getitem__, reverse=True)[:_REQUESTS]
-        self._loader.cancel()
-        for tile in order:
-            s = int(np.searchsorted(layout.tile_first, tile, side="right")) - 1
-            number = tile - int(layout.tile_first[s])
-            self._loader.request(layout.sheets[s], number, float(most[tile]))
-        taken: dict[int, list[tuple[int, SheetModel]]] = {}
+        sheets = np.searchsorted(layout.tile_first, order, side="right") - 1
+        self._loader.replace(
+            (layout.sheets[s], tile - int(layout.tile_first[s]), float(most[tile]))
+            for s, tile in zip(sheets.tolist(), order, strict=True)
+        )
+        taken: dict[int, list[tuple[int, np.ndarray]]] = {}
         changed = False
         for loaded in self._loader.take(_UPLOADS):
-            tile = int(layout.tile_first[layout.sheets.index(loaded.sheet)]) + loaded.number
+            tile = self._tile(loaded.sheet, loaded.number)
             if self.slot[tile] != kernels.WAITING:
                 continue
-            if loaded.tile is None:
-                self._break(tile, loaded.error or WlmError("a tile could not be read"))
+            if loaded.error is not None:
+                self._break(tile, loaded.error)
                 self._count(tile, -1)
                 changed = True
             elif self._room_for(tile, frame):
                 changed = True
-                taken.setdefault(int(self._kind[tile]), []).append((tile, loaded.tile))
+                taken.setdefault(int(self._kind[tile]), []).append((tile, loaded.prepared))
         for kind, pairs in taken.items():
-            each = [_rows(own, kind) for _, own in pairs]
-            rows = {name: np.concatenate([one[name] for one in each]) for name in each[0]}
-            self._pools[kind].put(self.slot[[tile for tile, _ in pairs]], rows)
+            records = np.concatenate([record for _, record in pairs])
+            self._pools[kind].put(self.slot[[tile for tile, _ in pairs]], records)
         if changed:
             self.tiles.slot.assign(self.slot)
         return changed
+
+    def _tile(self, sheet: Sheet, number: int) -> int:
+        return int(self.layout.tile_first[self.layout.sheets.index(sheet)]) + number
+
+    def _record(self, sheet: Sheet, number: int, content: SheetModel) -> np.ndarray:
+        """Converts a tile to the bytes that are uploaded."""
+        kind = int(self._kind[self._tile(sheet, number)])
+        return self._pools[kind].records(_rows(content, kind, self._matrix))
 
     def _room_for(self, tile: int, frame: int) -> bool:
         """Gives a tile the slot of the tile that was not needed for the longest time; False if all are needed."""
@@ -430,17 +458,19 @@ class TileStore:
             self._loader.close()
 
 
-def _shapes(own: SheetModel) -> dict[int, dict[str, tuple[Any, tuple[int, ...]]]]:
-    """Returns the type and shape of each array of a tile on the device, by kind; the first axis counts its rows."""
+def _shapes(own: SheetModel, matrix: bool) -> dict[int, dict[str, tuple[Any, tuple[int, ...]]]]:
+    """Returns the type and shape of each array of a tile on the device, by kind; the first axis counts its rows.
+    `first` and `later` are those of the networks, see `wlm_kernels.lightmap.pages.page_kernel`."""
     profile, times = own.profile, len(own.times)
     h, r = profile.hidden, profile.uvt_resolution // 4
     plane = (wp.vec2ub, (1, profile.plane_rows, profile.plane_columns))
 
     def mapped(temporal: bool) -> dict[str, tuple[Any, tuple[int, ...]]]:
+        rows = 5 if matrix else profile.inputs(temporal) + h + 2
         return {
             "uv": (wp.uint64, (1, BLOCKS, BLOCKS, 2)),
-            "hidden": (wp.types.vector(h, float), (1, profile.inputs(temporal) + h + 2)),
-            "output": (wp.vec3, (1, h + 1)),
+            "first": (wp.types.vector(h, float), (1, rows)),
+            "later": (wp.uint32, (1, packed_words(h))) if matrix else (wp.vec3, (1, h + 1)),
             "scale": (wp.vec3, (1, times)),
             "shift": (wp.vec3, (1,)),
             "spread": (wp.vec3, (1,)),
@@ -455,7 +485,7 @@ def _shapes(own: SheetModel) -> dict[int, dict[str, tuple[Any, tuple[int, ...]]]
     return {TileKind.DYNAMIC: mapped(True) | temporal, TileKind.STATIC: mapped(False), TileKind.FRAMES: frames}
 
 
-def _rows(part: SheetModel, kind: int) -> dict[str, np.ndarray]:
+def _rows(part: SheetModel, kind: int, matrix: bool) -> dict[str, np.ndarray]:
     """Returns the arrays of n tiles of one kind, [n, ...] each, with the bytes that `_shapes` describes."""
     if kind == TileKind.FRAMES:
         ends = part.ranges.astype(np.float32)
@@ -463,12 +493,18 @@ def _rows(part: SheetModel, kind: int) -> dict[str, np.ndarray]:
     dynamic, profile = kind == TileKind.DYNAMIC, part.profile
     net = (part.net if dynamic else part.net_static).astype(np.float32)
     split = (profile.inputs(dynamic) + profile.hidden + 2) * profile.hidden
+    first, later = net[:, :split], net[:, split:]
+    if matrix:
+        hidden = first.reshape(len(net), -1, profile.hidden)
+        if not dynamic:  # the inputs that static tiles lack have no weights
+            hidden = np.insert(hidden, [STATIC_INPUTS] * (TEMPORAL_INPUTS - STATIC_INPUTS), 0.0, axis=1)
+        first, later = pack_biases(hidden), pack_networks(hidden, later.reshape(len(net), -1, 3))
     affine = part.affine.astype(np.float32)
     maps = {"uvt": part.uvt, "ut": part.ut, "vt": part.vt} if dynamic else {}
     return maps | {
         "uv": part.uv,
-        "hidden": net[:, :split],
-        "output": net[:, split:],
+        "first": first,
+        "later": later,
         "scale": part.scales,
         "shift": affine[:, 0],
         "spread": affine[:, 1],

@@ -40,7 +40,6 @@ TOLERANCE = 0.02
 STRIDE = 8
 """Distance between the pixels that are read in a frame to find the pages that a view needs, a power of two."""
 
-_GRID = 4  # most samples of a texel of a mip along each axis
 _TURN = 27  # order in which the pixels of a square of STRIDE x STRIDE take turns: any odd number reaches all
 _MOST_DECODES = 1024
 _TABLE_ROW = 1024  # pages in a row of the page table, as a texture
@@ -218,8 +217,9 @@ class VirtualTexture:
         groups = len(layout.groups)
         frame = {"clock": (2 * groups, page_kernels.CLOCK, 0), "switches": (groups, 3, 0), "frame": (1, 0)}
         self._frame_work = struct(kernels.Work, counters=(7, 0), asked=(2, count, 0), **frame, **most)
-        jobs = {"target": (self.decodes, 0), "slot": (self.decodes, -1)}
+        jobs = {"target": (self.decodes, 0), "slot": (self.decodes, -1), "first": (self.decodes + 1, 0)}
         self._jobs = struct(page_kernels.Jobs, place=np.zeros((self.decodes, 4), np.int32), **jobs)
+        self._blocks = kernels.most_blocks(self.decodes, edge * edge, layout.place[:, 1])
         self.texture = wp.zeros((self.slots, edge, edge), dtype=wp.uint32, device=self.device)
         self.table = self._pages.table
         self._look = kernels.Look(self._frame_work)
@@ -237,15 +237,16 @@ class VirtualTexture:
         for array, values in ((self._pages.slot, slot), (self._slots.owner, owner), (self._slots.stamp, stamp)):
             array.assign(values)
         self._slots.mark.assign(mark)
-        for start in range(0, len(whole), self.decodes):
-            part = whole[start : start + self.decodes]
+        # One after another: together they may take more samples than a frame.
+        first = np.full(self.decodes + 1, self._blocks, np.int32)
+        first[0] = 0
+        jobs.first.assign(first)
+        for page in whole.tolist():
             place, slots = np.zeros((self.decodes, 4), np.int32), np.full(self.decodes, -1, np.int32)
-            place[: len(part)], slots[: len(part)] = layout.place[part], slot[part]
-            place[: len(part), 2:] = -layout.border
-            target = np.zeros(self.decodes, np.int32)
-            target[: len(part)] = self._pages.group.numpy()[place[: len(part), 0]]
+            place[0], slots[0] = layout.place[page], slot[page]
+            place[0, 2:] = -layout.border
             jobs.place.assign(place)
-            jobs.target.assign(target)
+            jobs.target.assign(np.full(self.decodes, self._pages.group.numpy()[place[0, 0]], np.int32))
             jobs.slot.assign(slots)
             self._decode()
         kernels.refer(self._pages)
@@ -314,16 +315,7 @@ class VirtualTexture:
         if self.device == "cpu" and not (self._jobs.slot.numpy() >= 0).any():
             return
         for store in self._stores:
-            page_kernels.decode(
-                store.kernel,
-                store.source,
-                self._frame_work.clock,
-                store.offsets,
-                self._jobs,
-                _GRID,
-                False,
-                self.texture,
-            )
+            store.decode(self._frame_work.clock, store.offsets, self._jobs, False, self.texture, self._blocks)
 
     def _points(self, sheet: Any, uv: Any, derivatives: Any, axes: int) -> tuple[wp.array, wp.array, wp.array]:
         """Converts the arguments to arrays on the device: those that are there already are not copied."""

@@ -283,7 +283,7 @@ class ScenePage extends LightmapPage {
     this.choose('path');
     panel.key('c', 'C', 'follow the path of the camera', () => this.choose('path'));
     panel.key('o', 'O', 'orbit around the scene', () => this.choose('orbit'));
-    panel.toggle('move', 'm', true, (on) => { this.moves = on; });
+    panel.toggle('motion', 'm', true, (on) => { this.moves = on; });
     panel.explain('drag', 'look around; orbit: turn the camera');
     panel.explain('W A S D, Q E', 'fly; down, up');
     panel.explain('wheel, two fingers', 'forward and back; orbit: zoom, move');
