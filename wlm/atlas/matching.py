@@ -218,7 +218,7 @@ class _Picture:
             grey = np.float32(1 / 3) * (light[..., 0] + light[..., 1] + light[..., 2])
         self._dark = ~lit
         self._steps = [step * step for step in _steps(grey, np.float32(_floor([grey])))]
-        texels = sum(step.size for step in self._steps)
+        texels = max(sum(step.size for step in self._steps), 1)  # of a single texel there are no steps
         self.everywhere = sum(float(step.sum(dtype=np.float64)) for step in self._steps) / texels
 
     def turned(self, chart: np.ndarray) -> list[_Turned]:
