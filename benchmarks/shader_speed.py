@@ -3,10 +3,10 @@
 The map has 1024 x 1024 texels with random maps and networks. The rows:
 
 - "ours": the fast decoder at a stored hour, 8 bits per channel, of profiles M and `standard`.
-- "GLSL": the exported shader, which draws the same hour as half floats, through OpenGL; numbers of networks and of the
-  hour are in textures as exported, or by the shader's macros in storage buffers.
-- "WGSL": its translation, through wgpu, as a compute shader, with the same two places of numbers; a time is the
-  difference of long and short runs, over the difference of their dispatches.
+- "GLSL": the exported shader as a compute shader through OpenGL, which decodes the same hour to half floats; numbers
+  of networks and of the hour are in textures as exported, or by the shader's macros in storage buffers.
+- "WGSL": its translation through wgpu, with the same two places of numbers; a time is the difference of long and short
+  runs, over the difference of their dispatches.
 - "read": a view of 1280 x 720 pixels of four sheets, read trilinearly: from a virtual texture, and from two hours of
   BC7, BC6H and RGB9E5 with mips, interpolated. "nothing" reads the view's coordinates alone, as all others do.
 

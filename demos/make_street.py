@@ -1,8 +1,8 @@
 """Makes the files of the scene `demos/data/street` from two bakes of a city, without and with the sun's direct light.
 
-`demos/data/street` was made from bakes of 512 x 512 texels, on a CPU; a GPU takes the whole fit in less time:
+`demos/data/street` was made from bakes of 512 x 512 texels, on a GPU:
 
-    python demos/make_street.py .../city .../city_sun demos/data/street --steps 3000 --samples 1024
+    python demos/make_street.py .../city .../city_sun demos/data/street --device cuda:0
 
 The scene file `street.yaml` is written by hand. The light of the sun is the difference of both bakes. Its direction and
 the light of the lamps, which moving objects need, are fitted to the bakes.
@@ -241,7 +241,7 @@ def make(args: argparse.Namespace) -> None:
             size = model.save(out / name)
             print(f"{name}: {len(points)} probes, {size} bytes, {wlm.probe.evaluate(model, probes).psnr:.1f} dB")
     if "light" in args.parts:
-        settings = {name: value for name in ("steps", "samples") if (value := getattr(args, name))}
+        settings = {"steps": args.steps} if args.steps else {}
         both = wlm.lightmap.from_groups(sets, "street")
         model = wlm.lightmap.compress(both, args.profile, device=args.device, **settings)
         print(f"street.wlm: {model.save(out / 'street.wlm')} bytes, {model.memory_bytes} bytes in the memory of a GPU")
@@ -257,8 +257,7 @@ def main() -> None:
     parser.add_argument("out", type=Path, metavar="OUT_DIR", help="the folder to write to")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what to make; else all")
     parser.add_argument("--profile", default="M", help="profile of the lightmaps")
-    for name in ("steps", "samples"):
-        parser.add_argument(f"--{name}", type=int, help=f"{name} of their fit; by default those of the profile")
+    parser.add_argument("--steps", type=int, help="steps of their fit; by default those of the profile")
     parser.add_argument("--probes", default="pca", help="profile of the probes")
     parser.add_argument("--check", type=Path, metavar="NPZ", help="probes of a path tracer to compare the gather with")
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")

@@ -34,7 +34,7 @@ def test_the_sum_of_the_groups_is_the_original(street, hour):
     mask = street.light.light.mask
     original = read_light(street.originals[hour])[0][mask]
     error = street.light.decoder().frame(hour)[mask] - original
-    assert np.sqrt(np.mean(error**2)) < 0.02 * np.ptp(original)
+    assert np.sqrt(np.mean(error**2)) < 0.01 * np.ptp(original)
 
 
 def test_vehicles_stay_on_the_road(street):

@@ -214,26 +214,24 @@ class _Picture:
 
     def __init__(self, light: np.ndarray, lit: np.ndarray) -> None:
         """Takes the light, of which a texel at least is lit, and which texels are, bool [H, W]."""
-        with np.errstate(invalid="ignore"):
-            grey = light.astype(np.float64).mean(axis=2)
+        with np.errstate(invalid="ignore", over="ignore"):
+            grey = np.float32(1 / 3) * (light[..., 0] + light[..., 1] + light[..., 2])
         self._dark = ~lit
-        self._steps = [step**2 for step in _steps(grey, _floor([grey]))]
-        self.everywhere = sum(float(step.sum()) for step in self._steps) / sum(step.size for step in self._steps)
+        self._steps = [step * step for step in _steps(grey, np.float32(_floor([grey])))]
+        texels = max(sum(step.size for step in self._steps), 1)  # of a single texel there are no steps
+        self.everywhere = sum(float(step.sum(dtype=np.float64)) for step in self._steps) / texels
 
     def turned(self, chart: np.ndarray) -> list[_Turned]:
         """Returns the roughness in the charts (`chart_map`) for each of `_TURNS`, infinity without neighbours."""
         height, width = chart.shape
         # Nearest texels, where the lightmap is not square.
         exchanged = chart[np.ix_(np.arange(width) * height // width, np.arange(height) * width // height)].T
-        charts = [(_inside(each), each >= 0) for each in (chart, exchanged)]
+        charts = [([one.astype(np.float32) for one in _inside(each)], each >= 0) for each in (chart, exchanged)]
+        counts = [sum(np.count_nonzero(each) for each in inside) for inside, _ in charts]
         found = []
         for words, transposed, v, u in _TURNS:
-            inside, covered = charts[transposed]
-            total = sum(
-                float(np.einsum("ij,ij->", step, each[::v, ::u]))
-                for step, each in zip(self._steps, inside, strict=True)
-            )
-            count = sum(np.count_nonzero(each) for each in inside)
+            (inside, covered), count = charts[transposed], counts[transposed]
+            total = sum(float(np.vdot(step, each[::v, ::u])) for step, each in zip(self._steps, inside, strict=True))
             black = np.count_nonzero(covered[::v, ::u] & self._dark)
             found.append(_Turned(words, total / count if count else float("inf"), black))
         return found
@@ -284,10 +282,10 @@ def misfits(
     chart = chart[::step, ::step]
     inside = chart >= 0
     texels = np.count_nonzero(inside)
-    near = maximum_filter(inside, 2 * _REACH + 1)
-    black = np.count_nonzero(inside & ~lit) / max(texels, 1)
-    away = np.count_nonzero(lit & ~near) / np.count_nonzero(lit)
-    apart = min(black, away) > _APART
+    black, away = np.count_nonzero(inside & ~lit) / max(texels, 1), 0.0
+    if black > _APART:
+        away = np.count_nonzero(lit & ~maximum_filter(inside, 2 * _REACH + 1)) / np.count_nonzero(lit)
+    apart = away > _APART
     picture = _Picture(light, lit)
     turns = picture.turned(chart)
     rough = float("inf") if apart else turns[0].roughness
