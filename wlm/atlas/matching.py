@@ -276,7 +276,7 @@ def misfits(
     light = lightmap[::step, ::step]
     height, width = light.shape[:2]
     with np.errstate(invalid="ignore"):
-        lit = (light > 0).any(axis=2)
+        lit = (light[..., 0] > 0) | (light[..., 1] > 0) | (light[..., 2] > 0)
     if not lit.any():
         return []
     chart = chart[::step, ::step]
