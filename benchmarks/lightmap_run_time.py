@@ -348,7 +348,7 @@ class _Path:
 
 
 class _Shot:
-    """What the uncompressed lightmaps show in a view, at a quarter of its pixels.
+    """A view under the uncompressed lightmaps, at a quarter of its pixels.
 
     Attributes:
         hour: Time of the view.

@@ -17,7 +17,6 @@ from wlm_kernels.lightmap.frames import StoredFrames
 from wlm_kernels.lightmap.matrix_decode import Maps, map_inputs, matrix_texels
 from wlm_kernels.lightmap.pages import (
     BLOCK,
-    COARSE_LEVEL,
     COARSE_TEXELS,
     TAU,
     WEIGHT,
@@ -28,6 +27,7 @@ from wlm_kernels.lightmap.pages import (
     kind_of,
     light_of,
     sample_at,
+    samples_of,
     square_of,
     stored_light,
     texel_of,
@@ -35,10 +35,7 @@ from wlm_kernels.lightmap.pages import (
 from wlm_kernels.native import on_cuda
 from wlm_kernels.shared_exponent import pack_rgb9e5
 
-MOST_SAMPLES = 16
-"""Most samples of a texel."""
-
-_BLOCK, _LEVEL, _COARSE_TEXELS = wp.constant(BLOCK), wp.constant(COARSE_LEVEL), wp.constant(COARSE_TEXELS)
+_BLOCK, _COARSE_TEXELS = wp.constant(BLOCK), wp.constant(COARSE_TEXELS)
 _TAU, _WEIGHT = wp.constant(TAU), wp.constant(WEIGHT)
 _STATIC, _DYNAMIC = wp.constant(2), wp.constant(3)  # of `wlm.lightmap.tiles.TileKind`
 
@@ -46,8 +43,7 @@ _STATIC, _DYNAMIC = wp.constant(2), wp.constant(3)  # of `wlm.lightmap.tiles.Til
 @wp.func
 def blocks_of(level: int, texels: int) -> int:
     """Returns the blocks that a page needs: a thread for each sample of a texel, or for each texel of coarse texels."""
-    samples = wp.where(level < _LEVEL, 1 << (2 * wp.min(level, 2)), 1)
-    return (texels * samples + _BLOCK - 1) // _BLOCK
+    return (texels * samples_of(level) + _BLOCK - 1) // _BLOCK
 
 
 @wp.func_native(on_cuda("return __any_sync(~0u, x);\n", "return x;"))
@@ -145,7 +141,6 @@ def page_kernel(hidden: int) -> wp.Kernel:
         clock: wp.array2d[float],
         offsets: wp.array1d[wp.vec2i],
         jobs: Jobs,
-        grid: int,
         direct: int,
         # out:
         out: wp.array3d[wp.uint32],
@@ -163,7 +158,7 @@ def page_kernel(hidden: int) -> wp.Kernel:
                 k = middle
             else:
                 beyond = middle
-        square = square_of(tiles, jobs, k, grid, direct)
+        square = square_of(tiles, jobs, k, direct)
         if square.slot < 0:
             return
         target = jobs.target[k]

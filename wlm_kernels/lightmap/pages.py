@@ -27,6 +27,9 @@ from wlm_kernels.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 COARSE_LEVEL, COARSE = 4, 8
 """The finest level that is read from the table of coarse texels, and their number along a side of a tile."""
 
+GRID_BITS = 2
+"""Logarithm to base 2 of the most samples of a texel along each axis."""
+
 BLOCK = 128
 """Threads of a block of a launch."""
 
@@ -42,6 +45,7 @@ one. Then for each of the two times at which networks are evaluated: its positio
 is not evaluated), the two stored times between which tile scales are interpolated, the weight of the later one, and the
 encoded time (four columns). The last is the number of columns."""
 
+_BITS = wp.constant(GRID_BITS)
 _LEVEL, _SIDE = wp.constant(COARSE_LEVEL), wp.constant(COARSE)
 _FULL, _EMPTY = wp.constant(FULL), wp.constant(EMPTY)
 _BEFORE, _AFTER, _SHARE, _TAU, _WEIGHT, _FIRST, _SECOND, _MIX, _ENCODING = (
@@ -160,7 +164,7 @@ class Square:
 
 
 @wp.func
-def square_of(tiles: Tiles, jobs: Jobs, k: int, grid: int, direct: int) -> Square:
+def square_of(tiles: Tiles, jobs: Jobs, k: int, direct: int) -> Square:
     square = Square()
     place = jobs.place[k]
     square.sheet = place[0] - tiles.sheet
@@ -174,8 +178,14 @@ def square_of(tiles: Tiles, jobs: Jobs, k: int, grid: int, direct: int) -> Squar
         square.depth = place[1]
         if place[1] >= _LEVEL and direct == 0:
             square.depth = place[1] - _LEVEL
-        square.bits = wp.min(square.depth, grid)
+        square.bits = wp.min(square.depth, _BITS)
     return square
+
+
+@wp.func
+def samples_of(level: int) -> int:
+    """Returns the samples of a texel of a page; 1 for a level that is read from coarse texels, which cost little."""
+    return wp.where(level < _LEVEL, 1 << (2 * wp.min(level, _BITS)), 1)
 
 
 @wp.func
@@ -267,8 +277,8 @@ def light_of(
     return powers(wp.max(c, wp.vec3()), gamma)
 
 
-def _lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
-    """Builds the `wp.func`s that read dynamic and static tiles at a texel, and the types of their networks' arrays."""
+def _lights(hidden: int, gelu: str) -> tuple[Any, Any]:
+    """Builds the `wp.func`s that read dynamic and static tiles at a texel."""
     vec_hidden = mlp.kernels(TEMPORAL_INPUTS, hidden, gelu).vec_hidden
     assert vec_hidden is mlp.kernels(STATIC_INPUTS, hidden, gelu).vec_hidden
 
@@ -278,8 +288,8 @@ def _lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
         @wp.func
         def light(
             mapped: Mapped,
-            first: wp.array2d[vec_hidden],
-            later: wp.array2d[wp.vec3],
+            hidden_layers: wp.array2d[vec_hidden],
+            output_layers: wp.array2d[wp.vec3],
             clock: wp.array2d[float],
             target: int,
             gamma: float,
@@ -293,13 +303,14 @@ def _lights(hidden: int, gelu: str) -> tuple[Any, Any, tuple[Any, ...]]:
                 weight = clock[target, _WEIGHT + r]
                 if weight > 0.0:
                     tau = clock[target, _TAU + r]
-                    out = network(mapped.stored, first, later, tau, encoding_of(clock, target, r), n, y, x)
+                    encoding = encoding_of(clock, target, r)
+                    out = network(mapped.stored, hidden_layers, output_layers, tau, encoding, n, y, x)
                     light += weight * light_of(mapped, clock, target, r, n, gamma, out)
             return light
 
         return light
 
-    return build(True), build(False), (vec_hidden, wp.vec3)
+    return build(True), build(False)
 
 
 @functools.cache
@@ -310,29 +321,29 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
         hidden: H, width of the hidden layers.
         gelu: One of `mlp.GELUS`.
     """
-    moving_light, still_light, (first_type, later_type) = _lights(hidden, gelu)
+    moving_light, still_light = _lights(hidden, gelu)
+    vec_hidden = wp.types.vector(hidden, float)
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def decode_pages(
         # in:
         tiles: Tiles,
         moving: Mapped,
-        moving_first: wp.array2d[first_type],
-        moving_later: wp.array2d[later_type],
+        moving_hidden: wp.array2d[vec_hidden],
+        moving_output: wp.array2d[wp.vec3],
         still: Mapped,
-        still_first: wp.array2d[first_type],
-        still_later: wp.array2d[later_type],
+        still_hidden: wp.array2d[vec_hidden],
+        still_output: wp.array2d[wp.vec3],
         frames: StoredFrames,
         clock: wp.array2d[float],
         offsets: wp.array1d[wp.vec2i],
         jobs: Jobs,
-        grid: int,
         direct: int,
         # out:
         out: wp.array3d[wp.uint32],
     ):
         k, i, j = wp.tid()
-        square = square_of(tiles, jobs, k, grid, direct)
+        square = square_of(tiles, jobs, k, direct)
         if square.slot >= 0:
             target = jobs.target[k]
             samples = 1 << (2 * square.bits)
@@ -359,10 +370,12 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
                         n = tiles.slot[at[0]]
                         if kind == _DYNAMIC:
                             light += moving_light(
-                                moving, moving_first, moving_later, clock, target, gamma, n, at[1], at[2]
+                                moving, moving_hidden, moving_output, clock, target, gamma, n, at[1], at[2]
                             )
                         elif kind == _STATIC:
-                            light += still_light(still, still_first, still_later, clock, target, gamma, n, at[1], at[2])
+                            light += still_light(
+                                still, still_hidden, still_output, clock, target, gamma, n, at[1], at[2]
+                            )
                         else:
                             light += stored_light(tiles, frames, clock, target, gamma, kind, at)
             out[square.slot, i, j] = pack_rgb9e5(light / float(wp.max(count, 1)))
@@ -389,7 +402,6 @@ def decode(
     clock,
     offsets,
     jobs: Jobs,
-    grid: int,
     direct: bool,
     out,
     blocks: int | None = None,
@@ -403,11 +415,10 @@ def decode(
         clock: float [times, CLOCK], the times.
         offsets: vec2i [25], 0 and the offsets to the texels that may fill a gap, in search order.
         jobs: J squares; those of other groups are left as they are.
-        grid: Logarithm to base 2 of the most samples of a texel along each axis.
         direct: Whether to decode tiles at every level, instead of reading coarse texels from `COARSE_LEVEL` on.
         out: uint32 [slots, side, side], RGB9E5, written: the J squares, whose sides are those of this array.
         blocks: For a kernel of `matrix_pages` the blocks to launch, at least as many as the squares need.
     """
-    inputs = [*source, clock, offsets, jobs, grid, int(direct)]
+    inputs = [*source, clock, offsets, jobs, int(direct)]
     dim = (jobs.slot.shape[0], *out.shape[1:]) if blocks is None else blocks * BLOCK
     wp.launch(kernel, dim, inputs=inputs, outputs=[out], device=out.device, block_dim=BLOCK)

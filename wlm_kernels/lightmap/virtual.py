@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from wlm_kernels.lightmap.matrix_pages import MOST_SAMPLES, blocks_of
-from wlm_kernels.lightmap.pages import BLOCK, CLOCK, COARSE_LEVEL, Jobs
+from wlm_kernels.lightmap.matrix_pages import blocks_of
+from wlm_kernels.lightmap.pages import BLOCK, CLOCK, COARSE_LEVEL, GRID_BITS, Jobs, samples_of
 from wlm_kernels.shared_exponent import unpack_rgb9e5
 
 GROUP = 32  # slots from which one is chosen
@@ -40,7 +40,7 @@ needed any more; and whether to decode pages for a coming switch."""
 
 _VISIBLE, _MISSING, _STALE, _AHEAD, _WAITING, _DECODED, _GATHERED = (wp.constant(i) for i in range(7))
 _ADOPT, _DROP, _PREPARE = (wp.constant(i) for i in range(3))
-_MOST, _KEEP, _SAMPLES, _COARSE = (wp.constant(i) for i in (MOST, KEEP, SAMPLES, COARSE_LEVEL))
+_MOST, _KEEP, _SAMPLES = (wp.constant(i) for i in (MOST, KEEP, SAMPLES))
 _FADE = wp.constant(0.75)  # share of its pixels that a page keeps in the next frame
 _IF_OFF = wp.constant(1.0 / 64.0)  # factor of the priority in a group whose weight is 0
 _IF_MISSING, _IF_AHEAD, _IF_STALE = wp.constant(64.0), wp.constant(32.0), wp.constant(8.0)  # factors of the priority
@@ -263,7 +263,7 @@ def _gather(work: Work, code: int, level: int, priority: float):
     if i < _MOST:
         work.gathered[i] = code
         work.priority[i] = priority
-        work.cost[i] = wp.where(level < _COARSE, 1 << (2 * wp.min(level, 2)), 1)
+        work.cost[i] = samples_of(level)
 
 
 @wp.kernel(enable_backward=False)
@@ -546,10 +546,10 @@ def most_blocks(decodes: int, texels: int, levels: np.ndarray) -> int:
         texels: Texels of a page.
         levels: int [P], the level of each page.
     """
-    samples = np.where(levels < COARSE_LEVEL, 4 ** np.minimum(levels, 2), 1)
+    samples = np.where(levels < COARSE_LEVEL, 4 ** np.minimum(levels, GRID_BITS), 1)
     # Each page may be decoded for a coming switch too.
     every = 2 * int((-(-texels * samples // BLOCK)).sum())
-    return min(decodes + -(-max(SAMPLES * decodes, MOST_SAMPLES) * texels // BLOCK), every)
+    return min(decodes + -(-max(SAMPLES * decodes, 4**GRID_BITS) * texels // BLOCK), every)
 
 
 def refer(pages: Pages) -> None:

@@ -33,8 +33,7 @@ from wlm_kernels.lightmap.matrix_decode import pack_biases, pack_networks, packe
 from wlm_kernels.lightmap.virtual import KEEP
 
 _CHUNK = 64  # tiles that are read at once
-_GRID_BITS = 2
-_GRID = 1 << _GRID_BITS  # most samples of a texel along each axis; those of a coarse texel
+_GRID = 1 << kernels.GRID_BITS  # most samples of a texel along each axis; those of a coarse texel
 _DARK = 0.01  # of a tile's brightest time: changes of less light than that are not relative to it
 _UPLOADS = 8  # most loaded tiles that are copied to the device in a frame
 _ALIGNED = 64  # bytes; the first of an array in a pool
@@ -253,10 +252,12 @@ class TileStore:
             "tables": sum(array.capacity for array in rest),
         }
 
-    def decode(self, clock: wp.array, offsets: wp.array, jobs: kernels.Jobs, direct: bool, out: wp.array, blocks: int):
+    def decode(
+        self, clock: wp.array, offsets: wp.array, jobs: kernels.Jobs, direct: bool, out: wp.array, blocks: int
+    ) -> None:
         """Decodes squares of texels; for the arguments see `wlm_kernels.lightmap.pages.decode`."""
         most = blocks if self._matrix else None
-        kernels.decode(self.kernel, self.source, clock, offsets, jobs, _GRID_BITS, direct, out, most)
+        kernels.decode(self.kernel, self.source, clock, offsets, jobs, direct, out, most)
 
     # ---- coarse texels ----
 
