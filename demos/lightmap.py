@@ -8,20 +8,17 @@ is M with fewer and smaller steps, so that the demo ends soon.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
+from demo_command import run_demo
 
 import wlm
-from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.exr import read_exr, write_exr
-from wlm.interop import check_device
 from wlm.lightmap import LightmapSet, Report
 from wlm.view.display import white_of
 from wlm.view.pictures import contact_sheet, encode
@@ -107,20 +104,5 @@ def _index(lightmaps: LightmapSet, stamp: float) -> int:
     return int(np.argmin(np.abs(lightmaps.times - stamp)))
 
 
-def main() -> None:
-    """Reads the command line, runs the demo and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder to write to")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:0"')
-    args = parser.parse_args()
-    quiet_warp()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        figures = run(args.out, check_device(args.device))
-    except (WlmError, OSError) as error:
-        sys.exit(f"error: {error}")
-    show_figures(f"{args.out.name}/city.wlm", ["", "value"], figures.items())
-
-
 if __name__ == "__main__":
-    main()
+    run_demo(__doc__, run, lambda out: f"{out.name}/city.wlm")

@@ -9,24 +9,21 @@ reader itself, endpoints and weights settle where the pictures are nearest; a se
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from demo_command import run_demo
 
 from wlm import atlas, ops
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.views import visible_uv
-from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.formats.bc7 import decode_image
-from wlm.interop import check_device
 from wlm.ops.views import View
 from wlm.view.display import white_of
 from wlm.view.pictures import contact_sheet, encode
@@ -135,20 +132,5 @@ def _picture(path: Path, scene: LightmappedScene, images: dict[str, torch.Tensor
     contact_sheet(path, cells, ["lightmap, 256 x 256", *(f"{name}, BC7 {TEXELS} x {TEXELS}" for name in [*images][1:])])
 
 
-def main() -> None:
-    """Reads the command line, runs the demo and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder to write to")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:0"')
-    args = parser.parse_args()
-    quiet_warp()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        figures = run(args.out, check_device(args.device))
-    except (WlmError, OSError) as error:
-        sys.exit(f"error: {error}")
-    show_figures(str(args.out / "ops_bc7.png"), ["", "value"], figures.items())
-
-
 if __name__ == "__main__":
-    main()
+    run_demo(__doc__, run, lambda out: str(out / "ops_bc7.png"))

@@ -10,20 +10,17 @@ to which a constant wind has carried the smoke, show the wind.
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
+from demo_command import run_demo
 
 from wlm import ops, smoke
-from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
-from wlm.interop import check_device
 from wlm.view.pictures import contact_sheet, to_bytes
 
 HERE = Path(__file__).resolve().parent
@@ -156,20 +153,5 @@ def run(out: Path, device: str) -> dict[str, float]:
     return figures
 
 
-def main() -> None:
-    """Reads the command line, runs the demo and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder to write to")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:0"')
-    args = parser.parse_args()
-    quiet_warp()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        figures = run(args.out, check_device(args.device))
-    except (WlmError, OSError) as error:
-        sys.exit(f"error: {error}")
-    show_figures(str(args.out / "ops_march.png"), ["", "value"], figures.items())
-
-
 if __name__ == "__main__":
-    main()
+    run_demo(__doc__, run, lambda out: str(out / "ops_march.png"))

@@ -9,20 +9,17 @@ from its centre, by a polynomial of their direction. All views are one batch: a 
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
 import trimesh
+from demo_command import run_demo
 
 from wlm import ops
-from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
-from wlm.interop import check_device
 from wlm.ops.views import View, sphere_views
 from wlm.view.pictures import contact_sheet, to_bytes
 
@@ -203,20 +200,5 @@ def _enlarged(picture: torch.Tensor) -> np.ndarray:
     return to_bytes(picture.detach().repeat_interleave(SCALE, 0).repeat_interleave(SCALE, 1))
 
 
-def main() -> None:
-    """Reads the command line, runs the demo and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder to write to")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:0"')
-    args = parser.parse_args()
-    quiet_warp()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        figures = run(args.out, check_device(args.device))
-    except (WlmError, OSError) as error:
-        sys.exit(f"error: {error}")
-    show_figures(str(args.out / "ops_silhouette.png"), ["", "value"], figures.items())
-
-
 if __name__ == "__main__":
-    main()
+    run_demo(__doc__, run, lambda out: str(out / "ops_silhouette.png"))

@@ -8,17 +8,15 @@ steps, so that the demo ends soon.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
+from demo_command import run_demo
+
 import wlm
-from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
-from wlm.interop import check_device
 from wlm.probe.volume.walk import camera_path, settle, walk
 from wlm.view.opening import open_scene
 from wlm.view.window import Window
@@ -111,20 +109,5 @@ def _check(result: dict[str, float], dead_probes_lit: bool) -> None:
             raise WlmError(f"demo: {name}: expected at least {bound}, got {result[name]:.4g}")
 
 
-def main() -> None:
-    """Reads the command line, runs the demo and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder to write to")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:0"')
-    args = parser.parse_args()
-    quiet_warp()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        figures = run(args.out, check_device(args.device))
-    except (WlmError, OSError) as error:
-        sys.exit(f"error: {error}")
-    show_figures(f"{args.out.name}/street.wlm", ["", "value"], figures.items())
-
-
 if __name__ == "__main__":
-    main()
+    run_demo(__doc__, run, lambda out: f"{out.name}/street.wlm")

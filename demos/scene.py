@@ -8,18 +8,15 @@ lamps must be lit.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from demo_command import run_demo
 from PIL import Image
 
 import wlm
-from wlm.cli.console import quiet_warp, show_figures
 from wlm.errors import WlmError
-from wlm.interop import check_device
 from wlm.view.scene_run import run as draw
 
 HERE = Path(__file__).resolve().parent
@@ -72,20 +69,5 @@ def _levels(path: Path) -> np.ndarray:
     return np.array(levels)
 
 
-def main() -> None:
-    """Reads the command line, runs the demo and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder to write to")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:0"')
-    args = parser.parse_args()
-    quiet_warp()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        figures = run(args.out, check_device(args.device))
-    except (WlmError, OSError) as error:
-        sys.exit(f"error: {error}")
-    show_figures(f"{args.out.name}/street", ["", "value"], figures.items())
-
-
 if __name__ == "__main__":
-    main()
+    run_demo(__doc__, run, lambda out: f"{out.name}/street")

@@ -357,6 +357,7 @@ def test_control(device: str, monkeypatch):
     """The demo's scene, for fewer steps: the smoke of other sources in another wind is found again."""
     spec = importlib.util.spec_from_file_location("fluid_control", ROOT / "demos" / "fluid_control.py")
     demo = importlib.util.module_from_spec(spec)
+    monkeypatch.syspath_prepend(ROOT / "demos")
     # Its dataclass looks there for the names of types.
     monkeypatch.setitem(sys.modules, "fluid_control", demo)
     spec.loader.exec_module(demo)

@@ -11,6 +11,7 @@ DEMOS = Path(__file__).resolve().parents[2] / "demos"
 
 def _demo(monkeypatch: pytest.MonkeyPatch, name: str, **changes: float) -> dict:
     """The names of a demo, with other constants."""
+    monkeypatch.syspath_prepend(DEMOS)
     names = runpy.run_path(str(DEMOS / f"{name}.py"))
     for key, value in changes.items():
         assert key in names
