@@ -23,6 +23,7 @@ def open_scene(
     mesh: _Path | None = None,
     original: _Path | None = None,
     key: str | None = None,
+    time: float | None = None,
     walk: _Path | None = None,
     block: float | None = None,
     extinction: float | None = None,
@@ -37,6 +38,7 @@ def open_scene(
         mesh: Mesh file that the light belongs to; for lightmaps it needs their UVs.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Name of the array to show of a probe file with several.
+        time: Hour of the day to show of light probes that have several.
         walk: File with the viewpoints of the cascaded volume, as `wlm.probe.load_positions` reads it.
         block: Side of the cascaded volume's finest blocks; None to derive it from the probes' spacing.
         extinction: Extinction of a volume of smoke, per unit of length at density 1.
@@ -48,8 +50,8 @@ def open_scene(
         WlmError: A file is missing, damaged, or of a kind that has no picture; or an option has no meaning for it.
     """
     options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "block": block}
-    options |= {"extinction": extinction, "flat": flat}
-    given = {name: value for name, value in options.items() if value not in (None, False)}
+    options |= {"extinction": extinction, "flat": flat or None, "time": time}
+    given = {name: value for name, value in options.items() if value is not None}
     kind, paths = content_of(files)
     if kind not in _OPENERS:
         raise WlmError(f"{paths[0]}: {_REASONS.get(kind, _EXPECTED)}")
@@ -95,6 +97,7 @@ def _probes(
     mesh: _Path | None = None,
     original: _Path | None = None,
     key: str | None = None,
+    time: float | None = None,
     walk: _Path | None = None,
     block: float | None = None,
 ) -> Scene:
@@ -103,10 +106,10 @@ def _probes(
     from wlm.view.probe_scene import model_probes, probe_scene, set_probes
 
     if content_of(paths)[0] == "probe":
-        probes = model_probes(load(paths[0], "probe"), original, key, title)
+        probes = model_probes(load(paths[0], "probe").at(time), original, key, title, time)
     else:
         check_options(paths[0], ("original",) if original else (), ())
-        probes = set_probes(load_probes(paths[0], key=key), title)
+        probes = set_probes(load_probes(paths[0], key=key).at(time), title)
     geometry = None if mesh is None else read_geometry(mesh, with_uv=False)
     path = None if walk is None else load_positions(walk)
     return probe_scene(probes, title=title, geometry=geometry, walk=path, block=block, up=up)
