@@ -7,7 +7,6 @@ The mathematics is not shared. Each system, a package of `wlm`, has these module
     fit.py         training                        `compress` (smoke: `train`)
     codec.py       model to file parts and back    `encode`, `decode`
     decode.py      the runtime path                `Decoder`
-    exact.py       a float64 reference of the decoder
     evaluation.py  scores                          `evaluate`
     bundle.py      textures, buffers and shader    `bundle`
 """

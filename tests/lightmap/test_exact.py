@@ -15,6 +15,7 @@ from builders.small_sets import moving_light, static_light, tiny_profile
 from builders.synthetic import any_blocks, random_model, random_sheet
 
 import wlm
+from benchmarks.lightmap_exact import bound64, colour_tile64, decode_tile64
 from benchmarks.rivals.lightmap import encode_set
 from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
@@ -23,7 +24,6 @@ from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.frames import choose_frames, needed_blocks, round_half
 from wlm.lightmap.encodings.maps import tile_bytes
 from wlm.lightmap.evaluation import count_kinds
-from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, open_checkpoint
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.runtime import ExactDecoder, FrameDecoder

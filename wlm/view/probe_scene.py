@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from trimesh import Trimesh, creation
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
-from wlm.ops.plain import rotations
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
 from wlm.probe.model import ProbeModel
@@ -200,7 +199,7 @@ class _ProbeScene(Scene):
     def _draw_gaussians(self, canvas: Canvas, state: State) -> None:
         model = self.probes.model
         rows = model.content.rows().astype(np.float64)
-        turn = rotations(torch.from_numpy(rows[:, ROTATION])).numpy()
+        turn = Rotation.from_quat(np.roll(rows[:, ROTATION], -1, axis=1)).as_matrix()  # scipy has w last
         shape = turn * np.exp(rows[:, SCALE])[:, None, :]
         centre = model.origin + model.extent * rows[:, CENTRE]
         ball, faces = _icosphere(1)
