@@ -1,9 +1,9 @@
 """Measures the frames of a scene as `wlm run` draws them at 1280 x 720 pixels, and the error of its pictures.
 
-The scene is the street of the demo, over its day of 24 seconds. A row "a frame" is a number of samples of each pixel along
-an axis: `frame_ms` is the mean time of a frame with all work of the host; the rows behind it are of its stages. Pages of
-lightmaps are decoded as the camera and the light move. `view_psnr` and `view_flip` are means over the hours whose
-original lightmaps the scene has, of the pixels that show its mesh.
+The scene is the street of the demo, over its day of 24 seconds. A row "a frame" is a number of samples of each pixel
+along an axis: `frame_ms` is the mean time of a frame with all work of the host; the rows behind it are of its stages.
+Pages of lightmaps are decoded as the camera and the light move. `view_psnr` and `view_flip` are means over the hours
+whose original lightmaps the scene has, of the pixels that show its mesh.
 """
 
 import time
