@@ -203,7 +203,7 @@ class SheetFit:
         meter = Meter(progress, "tiles", len(self.index))
         facts = _classify(lightmaps, self.index, meter, profile.gamma, profile.peak, profile.static_budget_db)
         self.kinds = np.array([tile.kind for tile in facts])
-        framed = choose_frames(self.kinds, self.index, lightmaps.mask, times, profile)
+        framed = choose_frames(self.kinds, times, profile)
         self.warning = None
         if profile.frames == "auto" and framed.any() and (warning := missing_encoder(int(framed.sum()))):
             self.warning, framed[:] = f"{lightmaps.name}: {warning}", False
