@@ -189,12 +189,7 @@ class SheetFit:
         tiles: Sequence[int] | None = None,
         progress: OnProgress | None = None,
     ) -> None:
-        """Classifies the tiles (all, or those with the given numbers) and encodes the tiles that are stored as frames.
-
-        Raises:
-            WlmError: A tile's number is outside the grid or given twice, `tiles` is empty, or frames have no BC7
-                encoder.
-        """
+        """Classifies the tiles, all or those of the given numbers, and encodes those that are stored as frames."""
         # Frames are chosen by the sizes that the profile names, so that two states stay frames.
         fitted, self._lightmaps = profile.for_times(len(lightmaps.times)), lightmaps
         grid, times = TileGrid.of(*lightmaps.mask.shape), len(lightmaps.times)

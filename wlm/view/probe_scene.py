@@ -54,11 +54,7 @@ class Probes:
 
 
 def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None, title: str) -> Probes:
-    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`.
-
-    Raises:
-        WlmError: The numbers of a probe are not spherical harmonics, or the positions are unknown.
-    """
+    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`."""
     position, given, live, _ = probes_of(model, original, key)
     count = _coefficients(model.outputs, title)
     decoder, places = model.decoder(position=position), position[live]
@@ -72,11 +68,7 @@ def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key
 
 
 def set_probes(probes: ProbeSet, title: str) -> Probes:
-    """Takes the probes of an input file; the light between probes is that of the nearest one.
-
-    Raises:
-        WlmError: The numbers of a probe are not spherical harmonics.
-    """
+    """Takes the probes of an input file; the light between probes is that of the nearest one."""
     count = _coefficients(probes.outputs, title)
     places, values = probes.position[probes.live], probes.values[probes.live]
     tree = cKDTree(places)
@@ -107,9 +99,6 @@ def probe_scene(
         walk: [F, 3], viewpoints of the cascaded volume; None for a loop through the scene.
         block: Side of the volume's finest blocks; None to derive it from the probes' spacing.
         up: The axis that points up.
-
-    Raises:
-        WlmError: The side is not above 0.
     """
     light = StoredLight(next(iter(probes.values.values())))  # the decoded light, or else the original
     volume = Volume(probes.position, light, block=block)

@@ -97,9 +97,6 @@ def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> 
 
     Returns:
         BC7 blocks, uint8 [T, 32, 32, 16], and the least and greatest colour of each frame, float16 [T, 2, 3].
-
-    Raises:
-        WlmError: The BC7 encoder is not installed.
     """
     texels = colour[:, valid]
     ranges = np.stack([round_half(texels.min(1), -np.inf), round_half(texels.max(1), np.inf)], 1)
