@@ -8,6 +8,7 @@ from builders.atlas_models import grouped
 from kernels.compare import close, exact
 from reference import cascade as reference
 
+from benchmarks import plain
 from wlm import interop
 from wlm.atlas.cascade import fit as cascade
 from wlm.atlas.cascade import pack as packing
@@ -16,7 +17,6 @@ from wlm.atlas.data import LightmappedScene, from_arrays
 from wlm.atlas.model import AtlasModel, Profile
 from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
-from wlm.ops import plain
 from wlm.ops import raster as ops_raster
 from wlm.ops.views import clip_positions, normalised, sphere_views
 

@@ -8,11 +8,11 @@ import warp as wp
 from builders.lightmap_codes import codes_at
 from builders.synthetic import random_sheet
 
+from benchmarks.lightmap_exact import decode_tile64
 from kernels.compare import array, close
 from kernels.stepping import Case, draw, trainer
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.maps import MapTiles
-from wlm.lightmap.exact import decode_tile64
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.runtime import ExactDecoder, StripDecoder
 from wlm.lightmap.tiles import TileKind

@@ -6,8 +6,8 @@ import torch
 import warp as wp
 from reference import gaussians as reference
 
+from benchmarks import plain
 from kernels.compare import array
-from wlm.ops import plain
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe.cubes import Cubes

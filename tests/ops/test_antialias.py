@@ -8,8 +8,8 @@ import torch
 import trimesh
 from kernels.compare import close
 
+from benchmarks import plain
 from wlm import ops
-from wlm.ops import plain
 
 QUAD = [[-0.7, -0.6, 0.1, 1.0], [1.2, -0.9, 0.2, 1.5], [1.0, 1.1, 0.0, 1.4], [-0.5, 0.6, 0.0, 0.8]]
 SHAPES = {

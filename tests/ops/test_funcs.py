@@ -11,8 +11,9 @@ import warp as wp
 from builders.operation_cases import gaussians, network_of, normal, points_between, uniform
 from kernels.compare import close
 
+from benchmarks import plain
 from wlm import ops
-from wlm.ops import funcs, plain
+from wlm.ops import funcs
 
 NETWORK = funcs.network(5, 17, 4)
 TANH = funcs.network(5, 17, 4, "tanh")

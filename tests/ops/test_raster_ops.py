@@ -5,8 +5,8 @@ import pytest
 import torch
 from kernels.compare import close, exact
 
+from benchmarks import plain
 from wlm import ops
-from wlm.ops import plain
 
 SIZE = (30, 41)
 
