@@ -477,9 +477,7 @@ def evaluate_frame(
     height, width = valid.shape
     shape = (-(-height // tile), -(-width // tile))
     result = FrameMetrics(
-        *(np.full(shape, math.nan) for _ in range(5)),
-        valid=np.zeros(shape, np.int64),
-        metrics=tuple(metrics),
+        *(np.full(shape, math.nan) for _ in range(5)), valid=np.zeros(shape, np.int64), metrics=tuple(metrics)
     )
     error = None
     if "flip" in metrics and valid.any():

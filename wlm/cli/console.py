@@ -249,12 +249,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
         yield line
         return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
     with Bar(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=None, note="")
 

@@ -19,8 +19,7 @@ def view(
     files: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FILE...",
-            help="A .wlm, an input of wlm compress, smoke, or six-way lightmaps (one .exr a frame).",
+            metavar="FILE...", help="A .wlm, an input of wlm compress, smoke, or six-way lightmaps (one .exr a frame)."
         ),
     ],
     mesh: SceneFile = None,

@@ -65,9 +65,7 @@ _OVERHEAD = 512  # cost of a primitive under a node, in corners
 _LARGEST_TRANSFORM = 1e9  # magnitude of the numbers of a texture transform
 _MOVES, _UNMOVED = {"matrix", "translation", "rotation", "scale"}, np.eye(4)
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
-_REFUSED = {
-    "EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance",
-}
+_REFUSED = {"EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,11 +41,7 @@ class SumScore(Summary):
 
 
 def score_sums(
-    model: LightmapModel,
-    lightmaps: LightmapSet,
-    all_lights: LightmapSet | None,
-    device: str,
-    metrics: Sequence[str],
+    model: LightmapModel, lightmaps: LightmapSet, all_lights: LightmapSet | None, device: str, metrics: Sequence[str]
 ) -> list[SumScore]:
     """Scores the sum of the groups of each sheet of light.
 

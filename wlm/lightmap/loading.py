@@ -42,10 +42,7 @@ class TileLoader:
     """
 
     def __init__(
-        self,
-        model: LightmapModel,
-        most: int = 64,
-        prepare: Callable[[Sheet, int, SheetModel], Any] | None = None,
+        self, model: LightmapModel, most: int = 64, prepare: Callable[[Sheet, int, SheetModel], Any] | None = None
     ) -> None:
         """Starts the thread.
 
