@@ -128,15 +128,10 @@ class GltfPrimitive:
 
 
 def read_gltf(path: str | os.PathLike[str], trust: bool = False) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Reads a `.glb` or `.gltf` file, recognised by its first bytes.
+    """Reads a `.glb` or `.gltf` file, recognised by its first bytes; `GltfDocument` explains `trust`.
 
-    Args:
-        path: The file.
-        trust: See `GltfDocument`.
-
-    Returns:
-        The document, and the primitives with triangles that its scene draws (the default scene, else the first scene,
-        else all nodes), in depth-first order of the nodes.
+    Returns the document, and the primitives with triangles that its scene draws (the default scene, else the first
+    scene, else all nodes), in depth-first order of the nodes.
     """
     return parse_gltf(path, read_file(path, MESH_BYTES, "the glTF file"), trust)
 

@@ -88,12 +88,8 @@ def score_sums(
 
 
 def sum_of(lightmaps: LightmapSet, sheet: Sheet) -> SheetFrames:
-    """Returns the sum of the light groups of an input as one sheet, at the times of all of them.
-
-    Args:
-        lightmaps: The input.
-        sheet: The sheet of any of its groups.
-    """
+    """Returns the sum of the light groups of an input as one sheet, at the times of all of them; `sheet` is that of any
+    of its groups."""
     groups = in_groups(lightmaps.sheets, sheet)
     first, times = next(iter(groups.values())), times_of(groups)
     if len(groups) == 1:
