@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scipy.special import expit
 
-from wlm.ops.plain import gaussian_sum
+from benchmarks.plain import gaussian_sum
 from wlm.probe.gaussian.model import CUT
 from wlm.probe.model import ProbeModel
 

@@ -25,20 +25,12 @@ _INTEGER_LENGTH = 80  # characters: 64 binary digits with signs between them
 
 
 def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settings:
-    """Reads a YAML file, one mapping, into a settings model and checks it, see `check_settings`.
-
-    Raises:
-        WlmError: One line with the file, the field, what was expected and what was found.
-    """
+    """Reads a YAML file, one mapping, into a settings model and checks it, see `check_settings`."""
     return check_settings(cls, read_yaml(path), f"{path}: ")
 
 
 def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
-    """Reads a YAML file that is one mapping.
-
-    Raises:
-        WlmError: The file cannot be read, or has other content.
-    """
+    """Reads a YAML file that is one mapping."""
     try:
         text = read_file(path, SETTINGS_BYTES, "the settings").decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -76,9 +68,6 @@ def check_settings(
 
     Returns:
         The checked settings.
-
-    Raises:
-        WlmError: One line with the field, the expectation and the value found, for the first of several problems.
     """
     try:
         return cls.model_validate(values, extra=extra)
@@ -87,11 +76,7 @@ def check_settings(
 
 
 def profile_path(system: str, name: str) -> Path:
-    """Finds the profile `configs/<system>-<name>.yaml`, in a checkout or in the installed package.
-
-    Raises:
-        WlmError: There is no such profile; the line lists the known ones.
-    """
+    """Finds the profile `configs/<system>-<name>.yaml`, in a checkout or in the installed package."""
     file_name = f"{system}-{name}.yaml"
     for folder in _profile_folders():
         # The name is compared with the listing and not joined to a path, so that `../x` cannot leave the folder.

@@ -34,9 +34,6 @@ def check_device(name: str) -> str:
 
     Returns:
         The name that both Warp and torch accept: "cpu" or "cuda:N".
-
-    Raises:
-        WlmError: No such device; the line lists the available devices.
     """
     full_name = "cuda:0" if name == "cuda" else name
     devices = available_devices()
@@ -54,11 +51,7 @@ def device_name(device: torch.device) -> str:
 
 
 def free_memory(device: wp.Device) -> int:
-    """Returns the number of bytes that can be allocated on a device.
-
-    Raises:
-        WlmError: The system doesn't report it.
-    """
+    """Returns the number of bytes that can be allocated on a device."""
     if device.is_cuda:
         return device.free_memory
     for line in Path("/proc/meminfo").read_text().splitlines():

@@ -72,10 +72,6 @@ def check_pair(
         test: `[H, W, C]`, linear.
         mask: `[H, W]`, or None for all texels.
         where: Name of this pair in error messages ("city 12 h").
-
-    Raises:
-        WlmError: Shapes differ, or a valid texel of either image is NaN or infinite; the message names the
-            image, the first such texel and their number. Texels outside the mask may hold anything.
     """
     ref = np.asarray(ref, np.float64)
     test = np.asarray(test, np.float64)
@@ -121,9 +117,6 @@ def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray, data_range: float)
     Returns:
         The mean; NaN where the image is smaller than the window, no valid texel has its window inside, or the
         range is zero.
-
-    Raises:
-        WlmError: Shapes differ, or a valid texel is NaN or infinite.
     """
     ref, test, valid = check_pair(ref, test, mask, "ssim")
     filled = fill_gaps(ref, valid)
@@ -164,9 +157,6 @@ def flip_exposures(ref: np.ndarray, valid: np.ndarray) -> tuple[float, float] | 
 
     Returns:
         `(start, stop)` in stops (log2), start <= stop; None where no valid texel is above zero.
-
-    Raises:
-        WlmError: The image is not RGB.
     """
     _check_rgb(ref)
     luminance = np.maximum(ref[valid], 0.0) @ _LUMINANCE
@@ -184,9 +174,6 @@ def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
 
     Returns:
         `[H, W]` float64 in [0, 1].
-
-    Raises:
-        WlmError: Shapes differ, the images are not RGB, or a value is NaN or infinite.
     """
     ref, test, _ = check_pair(ref, test, None, "flip")
     _check_rgb(ref)
@@ -206,9 +193,6 @@ def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | N
 
     Returns:
         `[H, W]` float64 in [0, 1], 0 where no difference is visible.
-
-    Raises:
-        WlmError: The images are not RGB.
     """
     import flip_evaluator  # imported here because the import is slow
 
@@ -479,10 +463,6 @@ def evaluate_frame(
 
     Returns:
         Scores for each tile.
-
-    Raises:
-        WlmError: Shapes differ, a valid texel of either image is NaN or infinite, or an argument is out of
-            range.
     """
     unknown = [metric for metric in metrics if metric not in METRICS]
     if unknown:
@@ -533,9 +513,6 @@ def summarise(frames: Sequence[FrameMetrics], times: Sequence[float] | np.ndarra
     Args:
         frames: The scores of each lightmap, in order of time.
         times: The time of each lightmap; None: 0, 1, 2 and so on.
-
-    Raises:
-        WlmError: No frames, or frames of different grids or metrics.
     """
     if not frames:
         raise WlmError("summarise: expected at least one lightmap's metrics")

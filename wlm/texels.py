@@ -61,9 +61,6 @@ def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     Returns:
         A new array of the image's shape and dtype. Valid texels are copied unchanged. With an empty mask
         the result is zero everywhere.
-
-    Raises:
-        WlmError: The mask's shape is not the image's height and width.
     """
     image = np.asarray(image)
     valid = np.asarray(mask).astype(bool)
@@ -190,9 +187,6 @@ def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
 
     Returns:
         One line with the count for each kind of change to valid texels.
-
-    Raises:
-        WlmError: No valid texel is finite.
     """
     notes, good = [], mask
     with np.errstate(invalid="ignore"):

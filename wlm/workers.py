@@ -131,9 +131,6 @@ class Processes(Workers):
         Args:
             make: The class of the workers, from an importable module.
             arguments: Constructor arguments of each worker.
-
-        Raises:
-            WlmError: The system can't start that number of processes.
         """
         self.count = len(arguments)
         self._make, self._arguments = make, arguments
@@ -234,9 +231,6 @@ class Actors(Workers):
             most: Maximum number of workers.
             address: Address of the cluster, as for `ray.init`.
             share: Resources of one worker: `{"CPU": 2}` or `{"GPU": 1}`.
-
-        Raises:
-            WlmError: Ray is missing, there is no cluster at that address, or it lacks the resources.
         """
         try:
             import ray

@@ -10,7 +10,7 @@ caches the functions of one shape. GELU is "exact" (erf), "tanh" (the tanh form,
 (the tanh form with the GPU's tanh instruction, whose relative error is 2^-11; on the CPU the same as "tanh").
 
 `MlpKernels.backward` computes the gradients of the inputs and of each layer's result. The gradients of the weights are
-matrix products of these, which `wlm.ops.mlp` leaves to torch. `wlm.ops.plain.mlp` is the same network in ten lines.
+matrix products of these, which `wlm.ops.mlp` leaves to torch. `benchmarks.plain.mlp` is the same network in ten lines.
 """
 
 import functools

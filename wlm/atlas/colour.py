@@ -41,9 +41,6 @@ def quantise(
 ) -> dict[str, np.ndarray]:
     """Encodes the colour texture T_p, [H, W, 3] on any device. Returns the arrays `texels` and, for a block format,
     `blocks` of `AtlasModel`. BC6H weights the squared errors of texels with `weight` [H, W].
-
-    Raises:
-        WlmError: An optional package isn't installed; the message names the extra.
     """
     if colour in BLOCK_CODECS:
         blocks, decoded = encode(texels, colour, weight, device)
@@ -57,9 +54,6 @@ def quantise(
 def stored(samples: torch.Tensor, weight: torch.Tensor, colour: str) -> torch.Tensor:
     """Returns the samples of T tiles after encoding and decoding, float32 [T, ny, nx, 3], at least 0; for block formats
     ny and nx are multiples of 4. For half floats, whose rounding is too small to matter, samples stay as they are.
-
-    Raises:
-        WlmError: An optional package isn't installed; the message names the extra.
     """
     if colour == "half":
         return samples

@@ -122,9 +122,6 @@ def own_lightmaps(
 
     Returns:
         The list, without objects and with a note for each assumption; and the readings.
-
-    Raises:
-        WlmError: The file names no lightmap that can be read; the line names the extension or the slots that it has.
     """
     with reported(document.path):
         name = slot or own_extension(document)
@@ -324,9 +321,6 @@ def slot_readings(
     Returns:
         The readings of all primitives that have these UVs, all of sheet 0; empty if no transform applies. And one line
         about the transforms.
-
-    Raises:
-        WlmError: A material is malformed.
     """
     readings: Readings = {}
     used: dict[str, None] = {}
@@ -354,9 +348,6 @@ def settle(
 
     Returns:
         The document, its primitives, n of the UV set, and by node the number of its sheet and its rectangle.
-
-    Raises:
-        WlmError: The materials of one node read different lightmaps.
     """
     by_node: dict[int, set[Reading | None]] = {}
     for each in primitives:

@@ -414,11 +414,7 @@ def _in_place(path: Path, arrays: dict[str, Any], most: int, device: str, trust:
 
 
 def grid_heads(path: Path) -> tuple[GridHead, ...]:
-    """Returns the names, types and classes of the grids of a `.nvdb` or `.vdb` file; none for a `.npz`.
-
-    Raises:
-        WlmError: The file is missing or damaged.
-    """
+    """Returns the names, types and classes of the grids of a `.nvdb` or `.vdb` file; none for a `.npz`."""
     if path.suffix.lower() not in _FILES:
         return ()
     kind, what = _FILES[path.suffix.lower()]

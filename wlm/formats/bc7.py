@@ -182,9 +182,6 @@ def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.n
 
     Returns:
         The blocks, uint8 [H/4, W/4, 16].
-
-    Raises:
-        WlmError: The package is missing.
     """
     texcomp = need("ispc_texcomp", extra)
     height, width = picture.shape[:2]

@@ -42,9 +42,6 @@ def read_channels(
     Returns:
         The pixels, float32 [H, W, C], the top row first; the channel names, R, G, B and A first; and whether the values
         are integers, scaled to [0, 1].
-
-    Raises:
-        WlmError: The file is missing, of another kind, cut short or damaged.
     """
     notes = [] if notes is None else notes
     with open_file(path, "the picture") as file:
@@ -62,10 +59,6 @@ def read_encoded(path: str | os.PathLike[str], encoding: str, notes: list[str] |
         path: The file.
         encoding: The encoding, such as "srgb" or "rgbm:16:1".
         notes: Each assumption, and each doubt about the encoding, adds a line.
-
-    Raises:
-        WlmError: The encoding is unknown; the file is missing, damaged or not a picture of integers; or it lacks the
-            alpha that the encoding needs.
     """
     notes = [] if notes is None else notes
     name, largest, gamma = parse_encoding(encoding)
@@ -111,9 +104,6 @@ def parse_encoding(encoding: str) -> tuple[str, float, float]:
     """Returns the name of an encoding, its range, which is 0 if none is stated, and its gamma.
 
     The name of "layer:NAME" is "layer:".
-
-    Raises:
-        WlmError: The encoding is not in the module's table.
     """
     if encoding.startswith(_LAYER) and len(encoding) > len(_LAYER):
         return _LAYER, 0.0, 1.0

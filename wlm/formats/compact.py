@@ -51,9 +51,6 @@ def parse_compact(where: object, mapped: bytes | memoryview) -> tuple[str, int, 
 
     Returns:
         System, version, parts as views, and the number of bytes before them.
-
-    Raises:
-        WlmError: The file is cut short, damaged, of another version or of a system without compact artifacts.
     """
     view = np.frombuffer(mapped, np.uint8)
     begin = view[:4].tobytes()

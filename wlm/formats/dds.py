@@ -118,12 +118,7 @@ def write_dds(
 
 
 def read_dds(path: str | os.PathLike[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the largest mip of a DDS texture of light; returns float32 [H, W, 3 or 4] and the channel names.
-
-    Raises:
-        WlmError: The file is missing, is not a DDS file, is cut short or damaged, has another format, is an array, a
-            cube or a volume, or the package that decodes it is missing.
-    """
+    """Reads the largest mip of a DDS texture of light; returns float32 [H, W, 3 or 4] and the channel names."""
     with open_file(path, "the DDS file") as file:
         held = os.fstat(file.fileno()).st_size
         head = file.read(_HEADER.size)

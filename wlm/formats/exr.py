@@ -49,10 +49,6 @@ def read_exr(
 
     Returns:
         The pixels, float32 [H, W, 3 or 4], and the names of the channels, ("R", "G", "B") or ("R", "G", "B", "A").
-
-    Raises:
-        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has deep data, or has no colour or
-            several layers of it.
     """
     notes = [] if notes is None else notes
     channels = _channels(path)
@@ -78,9 +74,6 @@ def read_every_channel(
     Returns:
         The pixels, float32 [H, W, C], and the names of the channels: R, G, B and A first, others sorted. In a file of
         several parts, a name begins with that of its part, such as "beauty.R".
-
-    Raises:
-        WlmError: See `read_exr`, but no layer of colour is needed.
     """
     notes = [] if notes is None else notes
     channels, first = _channels(path), (*_COLOUR, _ALPHA)
@@ -103,11 +96,7 @@ _Channels = Mapping[str, tuple[OpenEXR.Part, Any]]  # the part and the channel o
 
 
 def _channels(path: str | os.PathLike[str]) -> _Channels:
-    """Reads all channels of an EXR file; in a file of several parts, a name begins with that of its part.
-
-    Raises:
-        WlmError: The file is missing, is not an EXR file, is cut short or damaged, or has deep data.
-    """
+    """Reads all channels of an EXR file; in a file of several parts, a name begins with that of its part."""
     check_header(path)
     parts, reason = [], "no pixels found"
     with _captured_chatter() as chatter:
@@ -226,11 +215,7 @@ def _window(part: OpenEXR.Part, name: str) -> tuple[int, int, int, int]:
 
 
 def _chromaticities(path: str | os.PathLike[str], header: Mapping[str, Any], notes: list[str]) -> Sequence[float]:
-    """Returns the chromaticities that a header states; those of Rec. 709, the format's default, if it states none.
-
-    Raises:
-        WlmError: The header says that the values are not linear.
-    """
+    """Returns the chromaticities that a header states; those of Rec. 709, the format's default, if it states none."""
     if "chromaticities" in header:
         return tuple(header["chromaticities"])
     space = str(header.get("colorInteropID", ""))
@@ -315,10 +300,6 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
 
     Returns:
         The planes by name, float32 [H, W], NaN included; and the note of the header, empty if the file has none.
-
-    Raises:
-        WlmError: The file is missing, is not an EXR file, is damaged, has several parts or deep data, or a channel is
-            neither half nor float.
     """
     header, *others = check_header(path)
     if others:
@@ -337,9 +318,6 @@ def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]
     """Reads the size of the display window and the names of all channels of an EXR file, without its pixels.
 
     In a file of several parts, a name begins with that of its part.
-
-    Raises:
-        WlmError: See `wlm.formats.exr_header.check_header`.
     """
     parts = check_header(path)
     return *parts[0].size, tuple(name for part in parts for name in part.full_names(len(parts) > 1))

@@ -30,9 +30,6 @@ def claim(folder: Path, index: str, format_name: str) -> None:
     """Checks, before long work, that a folder can be written and holds no files other than an earlier output.
 
     The earlier output is recognised by its index file and the `format` in it.
-
-    Raises:
-        WlmError: The path is a file, the folder holds other files, or it or its parent cannot be written.
     """
     try:
         if folder.exists() and read_index(folder / index).get("format") != format_name:
@@ -51,11 +48,7 @@ def claim(folder: Path, index: str, format_name: str) -> None:
 
 @contextmanager
 def made_parents(folder: Path) -> Iterator[None]:
-    """Creates the missing parent folders of an output, and removes them again if the block raises.
-
-    Raises:
-        WlmError: A folder cannot be created.
-    """
+    """Creates the missing parent folders of an output, and removes them again if the block raises."""
     parent = Path(os.path.abspath(folder)).parent
     missing = [each for each in (parent, *parent.parents) if not each.exists()]
     try:
@@ -83,9 +76,6 @@ def staged(folder: Path, index: str, format_name: str) -> Iterator[Path]:
         folder: The folder; made if it does not exist.
         index: Name of the index file, which the block has to write.
         format_name: The index's `format`.
-
-    Raises:
-        WlmError: A file cannot be written (the message names the real folder), or another process is writing there.
     """
     with locked(folder):
         claim(folder, index, format_name)

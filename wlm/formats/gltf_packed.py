@@ -43,9 +43,6 @@ def unpack(
 
     Returns:
         The tree and the buffers; those that were given if nothing is compressed.
-
-    Raises:
-        WlmError: A package is missing, or the data is damaged or too large for the file.
     """
     stated = (*content.get("extensionsUsed", []), *content.get("extensionsRequired", []))
     used = [name for name in (DRACO, *MESHOPT) if name in stated]

@@ -44,9 +44,6 @@ def lightmap_transform(
 
     Returns:
         The name of the slot, "" for none; and the rows of the matrix [2, 3] that moves (u, v, 1).
-
-    Raises:
-        WlmError: The material is malformed.
     """
     attributes = document.item("meshes", primitive.mesh)["primitives"][primitive.primitive]["attributes"]
     quantised = document.item("accessors", attributes[f"TEXCOORD_{uv_set}"])["componentType"] != _FLOAT
@@ -67,11 +64,7 @@ def lightmap_transform(
 
 
 def lightmap_uv(document: GltfDocument, primitive: GltfPrimitive, uv_set: int) -> np.ndarray:
-    """Returns the lightmap UVs of a primitive, float32 [V, 2], with the transform that applies to them.
-
-    Raises:
-        WlmError: The material is malformed.
-    """
+    """Returns the lightmap UVs of a primitive, float32 [V, 2], with the transform that applies to them."""
     with reported(document.path):
         transform = lightmap_transform(document, primitive, uv_set)[1]
     if transform == IDENTITY:

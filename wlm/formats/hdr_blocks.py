@@ -26,11 +26,7 @@ _TEXELS_A_THREAD = 4096  # the least work of a thread, about 20 ms
 
 
 def need(package: str, extra: str) -> ModuleType:
-    """Imports an optional package.
-
-    Raises:
-        WlmError: The package is missing or broken; the line names the extra to install.
-    """
+    """Imports an optional package."""
     try:
         return importlib.import_module(package)
     except Exception as error:
@@ -43,11 +39,7 @@ def need(package: str, extra: str) -> ModuleType:
 
 
 def decode_bc6h(blocks: bytes, height: int, width: int, extra: str, signed: bool = False) -> np.ndarray:
-    """Decodes BC6H to half [H, W, 3], H and W multiples of 4; blocks of reserved modes become black.
-
-    Raises:
-        WlmError: The package is missing.
-    """
+    """Decodes BC6H to half [H, W, 3], H and W multiples of 4; blocks of reserved modes become black."""
     return need("imagecodecs", extra).bcn_decode(blocks, -6 if signed else 6, shape=(height, width, 3))
 
 

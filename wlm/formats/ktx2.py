@@ -182,10 +182,6 @@ def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> t
 
     Returns:
         The pixels, float32 [H, W, 3 or 4], and the channel names.
-
-    Raises:
-        WlmError: The file is missing, is not a KTX2 file, is cut short or damaged, has another format, is an array, a
-            cube or a volume, has swizzled or nonlinear channels, or the package that decodes it is missing.
     """
     pixels, layout, right, down = _read(path, False, [] if notes is None else notes)
     return np.ascontiguousarray(pixels[0, :: 1 if down else -1, :: 1 if right else -1]), layout.names
@@ -201,9 +197,6 @@ def read_ktx2_volume(path: str | os.PathLike[str]) -> np.ndarray:
 
     Returns:
         The texels, float32 [D, H, W, 3]; alpha is left out.
-
-    Raises:
-        WlmError: As for `read_ktx2`, or the height is not a multiple of that of the blocks.
     """
     return _read(path, True, [])[0][..., :3]
 

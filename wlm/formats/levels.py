@@ -72,9 +72,6 @@ def read_levels(
     Returns:
         The levels, float32 [H, W, C] in [0, 1], the top row first, and the names of the channels: L, or R, G and B,
         then A if there is alpha.
-
-    Raises:
-        WlmError: The file is missing, damaged, animated, or not of grey, of RGB or of a palette.
     """
     if kind == "TIFF":
         pixels, names = tiff.read_tiff(path, notes)

@@ -67,9 +67,6 @@ def read_light(path: str | os.PathLike[str], notes: _Notes | None = None) -> tup
     Returns:
         The pixels, float32 [H, W, 3 or 4], the top row first, and the names of the channels, ("R", "G", "B") or ("R",
         "G", "B", "A").
-
-    Raises:
-        WlmError: The file is missing, of another kind, cut short or damaged.
     """
     with open_file(path, "the lightmap") as file:
         first = file.read(_FIRST)

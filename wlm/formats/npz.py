@@ -41,9 +41,6 @@ def read_npz(
 
     Returns:
         The selected arrays by name. None of them contains Python objects.
-
-    Raises:
-        WlmError: The file is missing, damaged or not a `.npz` file, or an array exceeds the limits.
     """
     # A malicious file can make zipfile and NumPy raise nearly any exception: NumPy parses the header as Python.
     with damaged(f"{path}: cannot read the arrays", Exception), open_file(path, "the arrays") as file:

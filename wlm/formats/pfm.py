@@ -21,11 +21,7 @@ _NUMBER = 4  # bytes
 
 
 def header_of(path: str | os.PathLike[str], head: bytes) -> tuple[int, int, int, float, int]:
-    """Returns the width, the height, the channels (1 or 3), the scale and the offset of the first number.
-
-    Raises:
-        WlmError: The header is damaged.
-    """
+    """Returns the width, the height, the channels (1 or 3), the scale and the offset of the first number."""
     match = _HEADER.match(head[:_HEADER_BYTES])
     try:
         scale = float(match[4]) if match else 0.0
@@ -43,9 +39,6 @@ def read_pfm(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarray
 
     Returns:
         The pixels, float32 [H, W, 3], the top row first, and the names of the channels. Grey is repeated.
-
-    Raises:
-        WlmError: The file is missing, is not a PFM picture, or is cut short.
     """
     with open_file(path, "the PFM picture") as file:
         held = os.fstat(file.fileno()).st_size

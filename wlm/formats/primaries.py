@@ -47,9 +47,6 @@ def to_rec709(pixels: np.ndarray, chromaticities: Sequence[float], where: str, n
         chromaticities: x, y of red, green, blue and white.
         where: The file and its field, for messages.
         notes: A line is added if the chromaticities are not those of Rec. 709.
-
-    Raises:
-        WlmError: The chromaticities are not finite, or do not form a triangle.
     """
     if _close(chromaticities, REC709):
         return

@@ -38,10 +38,6 @@ def read_radiance(path: str | os.PathLike[str], notes: list[str] | None = None) 
     Returns:
         The pixels, float32 [H, W, 3], the top row first whatever the file's orientation, and the names of the
         channels.
-
-    Raises:
-        WlmError: The file is missing, is not a Radiance picture, is cut short or damaged, contains gamma-corrected
-            values, or the package imagecodecs is missing.
     """
     notes = [] if notes is None else notes
     with open_file(path, "the Radiance picture") as file:

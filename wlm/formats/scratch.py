@@ -30,9 +30,6 @@ def room(shape: tuple[int, ...], dtype: type[np.generic] | np.dtype, where: str,
 
     Returns:
         An ordinary array.
-
-    Raises:
-        WlmError: The memory or the disk is too small.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     try:

@@ -22,10 +22,6 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
         The kind, and the files; a folder of six-way lightmaps is replaced by its files. The kind is the system of a
         model ("lightmap", "atlas", "probe" or "smoke"); "six-way"; "set" of lightmaps over time; "probes"; "volume" of
         smoke or frames of a simulation; or another kind of `wlm.inspection.files.kind_of`, such as "picture" or "mesh".
-
-    Raises:
-        WlmError: There is no file, a file is missing or cannot be read, or there are several of another kind than
-            six-way lightmaps.
     """
     paths = [Path(file) for file in files]
     if not paths:
@@ -49,11 +45,7 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
 
 
 def check_options(path: Path, given: Sequence[str], known: Sequence[str]) -> None:
-    """Checks that the options `given` with a file are among those `known` for its kind.
-
-    Raises:
-        WlmError: An option has no meaning for this kind of file.
-    """
+    """Checks that the options `given` with a file are among those `known` for its kind."""
     for name in given:
         if name not in known:
             raise WlmError(f"{path}: --{name} has no meaning for this file; leave the option out")

@@ -72,9 +72,6 @@ def kind_of(path: Path) -> str:
 
     Returns:
         A key of the table of kinds, "" if the kind is unknown.
-
-    Raises:
-        WlmError: The file cannot be read.
     """
     with open_file(path, "the file") as file:
         head = file.read(VOLUME_HEAD)
@@ -102,11 +99,7 @@ def inspect_file(path: Path) -> Finding:
 
 
 def file_system(path: Path) -> str:
-    """Returns the system that compresses a file ("lightmap", "atlas", "probe" or "smoke"), "" if there is none.
-
-    Raises:
-        WlmError: The file cannot be read.
-    """
+    """Returns the system that compresses a file ("lightmap", "atlas", "probe" or "smoke"), "" if there is none."""
     kind = kind_of(path)
     return _KINDS[kind].system if kind else ""
 

@@ -79,9 +79,6 @@ def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
     Args:
         model: The model.
         device: Device that decodes the reference image.
-
-    Raises:
-        WlmError: There is no such device, a number of the model is not finite, or a texture is larger than GPUs take.
     """
     if len(model.sheets) == 1:
         ((sheet, own),) = model.sheets.items()

@@ -486,9 +486,6 @@ def parse_times(text: str) -> list[float]:
 
     Returns:
         The times in the order written, at least one.
-
-    Raises:
-        WlmError: A part is not a number or a range, a step never reaches the stop, or there are over 100,000 times.
     """
     times: list[float] = []
     for part in text.split(","):
@@ -513,11 +510,7 @@ def parse_times(text: str) -> list[float]:
 
 
 def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: float | None) -> None:
-    """Checks the times [T] by the module's rules; `labels` names the lightmap of each time in messages.
-
-    Raises:
-        WlmError: A time or the period is wrong, or two times are equal.
-    """
+    """Checks the times [T] by the module's rules; `labels` names the lightmap of each time in messages."""
     if period is not None and not (math.isfinite(period) and period > 0):
         raise WlmError(f"{where}: expected a finite period above 0, got {period:g}")
     for label, time in zip(labels, times, strict=True):

@@ -59,9 +59,6 @@ def score_sums(
     Returns:
         Of each sheet in several groups the score against the originals, and of each sheet that is in `all_lights` the
         score against it.
-
-    Raises:
-        WlmError: `all_lights` has another size, groups, or no sheet of the model.
     """
     scores: list[SumScore] = []
     wanted = {} if all_lights is None else dict(all_lights.sheets)

@@ -76,9 +76,6 @@ def changed_weights(
         where: Name of the model, for messages.
         weights: The weights of all groups.
         changes: The new weights by group.
-
-    Raises:
-        WlmError: There is no such group, or a weight is not one or three finite numbers from 0 to `MOST_WEIGHT`.
     """
     result = dict(weights)
     for group, given in changes.items():

@@ -34,11 +34,7 @@ class HeldOut:
 
 
 def stored_part(model: LightmapModel, lightmaps: LightmapSet) -> LightmapSet:
-    """Returns a set with the same sheets as a model, without the times that the model does not store.
-
-    Raises:
-        WlmError: The set lacks a time of the model.
-    """
+    """Returns a set with the same sheets as a model, without the times that the model does not store."""
     sheets = {}
     for sheet, own in model.sheets.items():
         frames = lightmaps.sheets[sheet]

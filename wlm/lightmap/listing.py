@@ -137,10 +137,6 @@ def list_set(
 
     Returns:
         A listing for each light group; for a set that names none, one of the name `BASE`.
-
-    Raises:
-        WlmError: The set cannot be read, a field is missing or wrong, a file lies outside the folder, there are too
-            many states, a state has no picture, or a group's name is wrong or given twice.
     """
     found = _listings(path, times, layers, trust, stored is not None)
     for name, own in (groups or {}).items():

@@ -76,9 +76,6 @@ class TileLoader:
 
         Returns:
             False if the request was dropped, since `most` requests wait that are at least as important.
-
-        Raises:
-            WlmError: The model has no such tile, or the loader is closed.
         """
         self._check(sheet, number)
         with self._change:
@@ -99,9 +96,6 @@ class TileLoader:
     def replace(self, requests: Iterable[tuple[Sheet, int, float]]) -> None:
         """Drops all waiting requests and asks for other tiles: sheet, number and priority of each. Of more than `most`
         the first ones count.
-
-        Raises:
-            WlmError: The model has no such tile, or the loader is closed; nothing is dropped.
         """
         asked = list(islice(requests, self._most))
         for sheet, number, _ in asked:

@@ -204,9 +204,6 @@ class SheetModel:
 
         Args:
             numbers: Numbers of the tiles in the grid, in any order; empty tiles stay empty.
-
-        Raises:
-            WlmError: A number is not one of the grid, or a tile of the file is damaged.
         """
         # In this order, since another thread may read all tiles meanwhile.
         stored = None if self.pieces is None else vars(self)["_tiles"]
@@ -226,11 +223,7 @@ class SheetModel:
         return part
 
     def check(self) -> None:
-        """Reads and checks the mask and all tiles of a sheet of a file, some at a time, and keeps none.
-
-        Raises:
-            WlmError: The mask or a tile is damaged.
-        """
+        """Reads and checks the mask and all tiles of a sheet of a file, some at a time, and keeps none."""
         numbers = self.numbers(*PACKED_KINDS)
         if "_tiles" in vars(self):
             vars(self)["_tiles"].mask.bits()

@@ -145,9 +145,6 @@ class StripDecoder(_OneTimeDecoder):
             device: "cpu", "cuda" or "cuda:N".
             gelu: GELU variant to use instead of the model's, see `wlm_kernels.mlp`; None: the model's.
             shared: Whether texels are linear radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
-
-        Raises:
-            WlmError: There is no such device or GELU variant, or the sheet has no dynamic tile.
         """
         super().__init__(model, device, gelu, TileKind.DYNAMIC, shared)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
@@ -170,12 +167,7 @@ class MatrixDecoder(_MapDecoder):
     """
 
     def __init__(self, model: SheetModel, device: str = "cuda", shared: bool = False) -> None:
-        """Uploads the dynamic tiles of a sheet; for the arguments see `StripDecoder`.
-
-        Raises:
-            WlmError: The device is not a GPU, the networks' hidden width is not a multiple of 16, or the sheet has no
-                dynamic tile.
-        """
+        """Uploads the dynamic tiles of a sheet; for the arguments see `StripDecoder`."""
         name, profile = device_of(device), model.profile
         if name == "cpu":
             raise WlmError("device: expected cuda for MatrixDecoder, got cpu")
@@ -268,9 +260,6 @@ class MapDecoder:
                 and mask.
             device: "cpu", "cuda" or "cuda:N".
             mips: Number of mips besides the map itself; None: down to one texel.
-
-        Raises:
-            WlmError: There is no such device, the map does not have that many mips, or the groups differ in size.
         """
         self.device = device_of(device)
         self.groups = {BASE: model} if isinstance(model, SheetModel) else dict(model)

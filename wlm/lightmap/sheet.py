@@ -151,11 +151,6 @@ def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
     Args:
         where: The set or the file, for messages.
         sizes: Height and width of each sheet.
-
-    Raises:
-        WlmError: There is no sheet; there are too many sheets, channels in an atlas, or texels in all sheets together;
-            a channel occurs twice; sheets of a layer of an atlas differ in size; or two groups have a layer that is not
-            light, or that has other channels in each of them.
     """
     if not 1 <= len(sizes) <= MOST_SHEETS:
         raise WlmError(f"{where}: expected 1 to {MOST_SHEETS} sheets of three channels, found {len(sizes)}")

@@ -157,9 +157,6 @@ def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = No
 
     Returns:
         The N tiles.
-
-    Raises:
-        WlmError: A tile's number is outside the grid or given twice, or `tiles` is empty.
     """
     grid = TileGrid.of(*lightmaps.mask.shape)
     return cut(lightmaps, np.arange(grid.count) if tiles is None else np.array(list(tiles), np.int64)).encoded(gamma)

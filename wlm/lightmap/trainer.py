@@ -464,12 +464,7 @@ class Trainer:
         return pack_mode6(levels.numpy(), index)
 
     def check(self) -> None:
-        """Checks that the fit has not diverged.
-
-        Raises:
-            WlmError: It diverged: the loss or the maps of a tile are not finite, or its network exceeds the range of
-                half floats.
-        """
+        """Checks that the fit has not diverged."""
         broken = ~torch.isfinite(self.loss)
         for values in (*self.views.values(), self.hidden.detach().half(), self.output.detach().half()):
             broken |= ~torch.isfinite(values.reshape(self.tiles, -1)).all(1)

@@ -85,9 +85,6 @@ class Views:
             count: Number of cameras.
             indices: Indices of the times that will be added; None: all.
             device: Device that draws: "cpu", "cuda" or "cuda:N".
-
-        Raises:
-            WlmError: There is no such device, or the mesh is a point.
         """
         self._lightmaps, self._geometry, self._device = lightmaps, geometry, check_device(device)
         low, high = geometry.box
@@ -145,9 +142,6 @@ def views_of(
     Returns:
         The views, or None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh
         cannot be read, else none.
-
-    Raises:
-        WlmError: The count is negative, or there is no such device.
     """
     if count < 0:
         raise WlmError(f"views: expected at least 0, got {count}")
@@ -247,9 +241,6 @@ class Tally:
             index: Index of the time, above that of the last call.
             decoded: The map at that time, linear radiance [H, W, 3].
             metrics: Its metrics from `evaluate_frame` with the same mask: the scored tiles and their ranges.
-
-        Raises:
-            WlmError: A texel that is read is NaN or infinite.
         """
         filled = self._lightmaps.frames[index][self._nearest]
         decoded = np.asarray(decoded, np.float32)

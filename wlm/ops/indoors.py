@@ -72,9 +72,6 @@ def indoors(position: np.ndarray, triangle: np.ndarray, *, metres: bool, device:
     """Finds the valid eye positions in a scene of positions float [V, 3], y up, and at least one triangle, int [F, 3].
 
     The result is the same in every run. `metres` tells whether the unit is known to be the metre.
-
-    Raises:
-        WlmError: There is no such device.
     """
     device = check_device(device)
     corner = np.asarray(position, np.float64)[triangle]

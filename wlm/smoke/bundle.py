@@ -28,9 +28,6 @@ def bundle(book: Book, *, name: str = "smoke", device: str = "cpu") -> Bundle:
         book: The flip book; one of its textures must store the opacity of the smoke.
         name: Name of the smoke, for an engine's assets.
         device: Ignored, since a flip book is always in the memory of the CPU.
-
-    Raises:
-        WlmError: The flip book has no opacity, or its light is not finite.
     """
     if not any(ALPHA in names for names in book.channels.values()):
         raise WlmError(f"{name}: the flip book has no opacity: expected an alpha channel in one of its textures")

@@ -43,9 +43,6 @@ def open_scene(
         flat: Whether a lightmap is shown unwrapped, although its mesh is known.
         up: The axis that points up.
         progress: Called about twice a second while frames of smoke are read.
-
-    Raises:
-        WlmError: A file is missing, damaged, or of a kind that has no picture; or an option has no meaning for it.
     """
     options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "block": block}
     options |= {"extinction": extinction, "flat": flat}

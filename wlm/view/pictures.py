@@ -40,11 +40,7 @@ def encode(light: np.ndarray, hit: np.ndarray, white: float) -> np.ndarray:
 
 
 def save_png(path: str | os.PathLike[str], pixels: np.ndarray) -> None:
-    """Writes uint8 [H, W, 3] as a PNG, atomically.
-
-    Raises:
-        WlmError: The file cannot be written.
-    """
+    """Writes uint8 [H, W, 3] as a PNG, atomically."""
     with atomic_path(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")
 

@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from trimesh import Trimesh, creation
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
-from wlm.ops.plain import rotations
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
 from wlm.probe.model import ProbeModel
@@ -55,11 +54,7 @@ class Probes:
 
 
 def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None, title: str) -> Probes:
-    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`.
-
-    Raises:
-        WlmError: The numbers of a probe are not spherical harmonics, or the positions are unknown.
-    """
+    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`."""
     position, given, live, _ = probes_of(model, original, key)
     count = _coefficients(model.outputs, title)
     decoder, places = model.decoder(position=position), position[live]
@@ -73,11 +68,7 @@ def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key
 
 
 def set_probes(probes: ProbeSet, title: str) -> Probes:
-    """Takes the probes of an input file; the light between probes is that of the nearest one.
-
-    Raises:
-        WlmError: The numbers of a probe are not spherical harmonics.
-    """
+    """Takes the probes of an input file; the light between probes is that of the nearest one."""
     count = _coefficients(probes.outputs, title)
     places, values = probes.position[probes.live], probes.values[probes.live]
     tree = cKDTree(places)
@@ -108,9 +99,6 @@ def probe_scene(
         walk: [F, 3], viewpoints of the cascaded volume; None for a loop through the scene.
         block: Side of the volume's finest blocks; None to derive it from the probes' spacing.
         up: The axis that points up.
-
-    Raises:
-        WlmError: The side is not above 0.
     """
     light = StoredLight(next(iter(probes.values.values())))  # the decoded light, or else the original
     volume = Volume(probes.position, light, block=block)
@@ -200,7 +188,7 @@ class _ProbeScene(Scene):
     def _draw_gaussians(self, canvas: Canvas, state: State) -> None:
         model = self.probes.model
         rows = model.content.rows().astype(np.float64)
-        turn = rotations(torch.from_numpy(rows[:, ROTATION])).numpy()
+        turn = Rotation.from_quat(np.roll(rows[:, ROTATION], -1, axis=1)).as_matrix()  # scipy has w last
         shape = turn * np.exp(rows[:, SCALE])[:, None, :]
         centre = model.origin + model.extent * rows[:, CENTRE]
         ball, faces = _icosphere(1)

@@ -30,9 +30,6 @@ def day_scene(content: Content, weights: Mapping[str, Weight] | None = None, dev
         content: The scene; it must stay open.
         weights: Factors of light groups, by which the sliders multiply.
         device: "cpu", "cuda" or "cuda:N": decodes the lightmaps and the probes.
-
-    Raises:
-        WlmError: There is no such group or device, or a weight is wrong.
     """
     model, device = content.light, check_device(device)
     factors = changed_weights(model.name, {group: np.ones(3, np.float32) for group in model.groups}, weights or {})

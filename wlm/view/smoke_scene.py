@@ -43,9 +43,6 @@ def six_way_scene(paths: Sequence[Path], *, title: str, progress: OnProgress | N
         paths: One EXR a frame, of one size, as `wlm smoke bake` or `predict` wrote them.
         title: Title of the window.
         progress: Called about twice a second.
-
-    Raises:
-        WlmError: A file cannot be read, or has another size than the first one.
     """
     frames: list[SixWay] = []
     meter = Meter(progress, "read", len(paths))
@@ -76,9 +73,6 @@ def volume_scene(frames: Frames, *, title: str, up: int = 1) -> Scene:
         frames: Frames as `wlm.smoke.data.load_frames` returns them.
         title: Title of the window.
         up: The axis that points up.
-
-    Raises:
-        WlmError: The first frame is missing or damaged.
     """
     frames.load(frames.numbers[0])
     number = frame_slider(len(frames.numbers))

@@ -18,8 +18,8 @@ as in glTF, the centre is u = (i + 1/2) / W, v = (j + 1/2) / H, and the triangle
 
 A triangle covers nothing if a corner isn't finite or doesn't exist, or if it has no area.
 
-Edge functions are in `edges`; interpolation and gradients in `gradient`. Read `wlm/ops/plain.py` first (`rasterize`),
-which solves for the corners' weights at each pixel instead.
+Edge functions are in `edges`; interpolation and gradients in `gradient`. `rasterize` of `benchmarks/plain.py`
+is to be read first: it solves for the corners' weights at each pixel instead.
 """
 
 import math

@@ -15,7 +15,7 @@ An edge counts only between pixels side by side if it runs more down than across
 pixels one above the other: its crossings then cover one row or column each, and the area that a moving edge sweeps is
 counted once.
 
-Read `wlm/ops/plain.py` first (`antialias`), which intersects lines on the screen. The idea is that of Laine et al.
+Read `benchmarks/plain.py` first (`antialias`), which intersects lines on the screen. The idea is that of Laine et al.
 2020, "Modular Primitives for High-Performance Differentiable Rendering", section 3.5, which ends at the first
 triangle.
 """

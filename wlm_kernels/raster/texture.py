@@ -14,7 +14,7 @@ coordinate that is NaN, or infinite and not clamped, reads NaN; it has no gradie
 Other kernels read textures with `axis_at`, `read`, `read_slope` and `add`. One `Axis` for u and one for v suffice for
 all channels and their gradients.
 
-Read `wlm/ops/plain.py` first (`texture`), which does the same with torch's `grid_sample`.
+Read `benchmarks/plain.py` first (`texture`), which does the same with torch's `grid_sample`.
 """
 
 import warp as wp

@@ -9,7 +9,7 @@ x_n = sigma(p_n) h and T_n = exp(-x_0 - ... - x_(n-1)) (neural-six-way-lightmaps
 
 where tau_l, the optical depth from a point to light l, is computed at the nodes of a lattice, which all rays use, and
 interpolated linearly between them. The derivatives are exact: steps depend only on the geometry, and a ray ends early
-only where its transparency is 0 in float32. `wlm.ops.plain.march` is the same in torch.
+only where its transparency is 0 in float32. `benchmarks.plain.march` is the same in torch.
 
 Adjoints run from a ray's end to its start, so that the light behind a sample is a running sum. They are added to the
 gradients of the density, the emission and the nodes by atomic additions: on CUDA in any order, so that the last bits

@@ -17,11 +17,11 @@ from builders.shader_subjects import POINTS, Subject, points_of
 from builders.smoke_shader_subjects import smoke_subjects
 from builders.synthetic import random_model as random_lightmap
 
+from benchmarks.atlas_exact import decode64
 from wlm import probe
 from wlm.atlas.bundle import sheet_texels
 from wlm.atlas.colour import quantise
 from wlm.atlas.decode import Decoder as AtlasDecoder
-from wlm.atlas.exact import decode64
 from wlm.atlas.model import AtlasModel, Profile, SheetPlace, pack_tiles
 from wlm.atlas.shader import glsl as atlas_glsl
 from wlm.errors import WlmError

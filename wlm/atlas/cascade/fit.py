@@ -113,9 +113,6 @@ def fit_cascade(
 
     Returns:
         A model of method "cascade"; or "plain", with the colour texture T_p alone, if `lut_scale` is 0.
-
-    Raises:
-        WlmError: An error of `pack` or `tune`, or the package that encodes T_p's block format isn't installed.
     """
     (sheet,), facts = scene.sheets, {}
     count = len(sheet.triangle)
@@ -184,9 +181,6 @@ def tune(
 ) -> Textures:
     """Tunes the textures of a cascade so that the mesh looks as it does with the original lightmap. `uv`, float32 [F,
     3, 2], are the corners' UVs for the cascade. The checkpoint saves the state between steps.
-
-    Raises:
-        WlmError: There is no such device, or the textures became NaN or infinite (the fit diverged).
     """
     device = interop.check_device(device)
     with interop.stream(device), one_thread(device):

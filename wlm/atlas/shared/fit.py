@@ -44,9 +44,6 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
 
     The model's report has the numbers of tiles, samples and components of each sheet, and the error for each number of
     components that was tried.
-
-    Raises:
-        WlmError: The budget is less than the smallest model takes.
     """
     device = stages.device
     with stages("weights"):

@@ -156,9 +156,6 @@ def fitted(
         profile: The settings.
         seed: Seed of all random choices.
         stages: Reports and times the stages.
-
-    Raises:
-        WlmError: The budget is less than the smallest tiles take.
     """
     states = len(scene.states)
     # One state has one component.

@@ -79,9 +79,6 @@ def layout(error: torch.Tensor | np.ndarray, sizes: list[Size], room: float, lea
     """Chooses a size for each of T tiles, and places the tiles' rectangles in textures that take at most `room` bits;
     returns None if not even the smallest sizes fit. `error`, float64 [sizes, T] on any device, is the error of each
     tile at each size; a bit is only spent where it reduces the error by at least `least`.
-
-    Raises:
-        WlmError: A texture has more texels along a side than an entry of T_c can name.
     """
     cost = np.array([size.bits for size in sizes], np.float64)
     sides = np.array([(size.nx, size.ny) for size in sizes])

@@ -40,10 +40,6 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
     Returns:
         Entries for the folder's index: shader and textures.
-
-    Raises:
-        WlmError: The colours are ASTC blocks, which the engine's kit can't load, the engine can't read the UV set, or
-            a texture is larger than the engine accepts.
     """
     if bundle.model.levels:
         bundle = make_bundle(bundle.model.without_mips())

@@ -36,9 +36,6 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
     Returns:
         Entries for the folder's index: shader and textures.
-
-    Raises:
-        WlmError: The flip book has another layout, or a texture is larger than the engine accepts.
     """
     if bundle.document["layout"] != _LAYOUT:
         raise WlmError(f"layout: expected {_LAYOUT} for {engine}, got {bundle.document['layout']}")

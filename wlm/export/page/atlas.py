@@ -32,9 +32,6 @@ def atlas_page(
         paths: The model's file.
         original: The lightmap that was compressed, to compare with.
         up: The axis that points up in the scene.
-
-    Raises:
-        WlmError: The model has several lightmaps, or the original cannot be read or has another size.
     """
     model = load(paths[0], "atlas")
     if model.method == "shared":

@@ -68,12 +68,7 @@ def probe_page(
     key: str | None = None,
     up: Literal["y", "z"] = "y",
 ) -> Page:
-    """Makes the HTML page of a probe model, which shows spheres at the positions of the model or the original.
-
-    Raises:
-        WlmError: The numbers of a probe are not spherical harmonics; the positions are unknown; the mesh or the
-            original cannot be read; or the original has other probes.
-    """
+    """Makes the HTML page of a probe model, which shows spheres at the positions of the model or the original."""
     model, file_bytes = load_model(paths[0], "probe"), paths[0].stat().st_size
     coefficients = sh_count(model.outputs)
     if coefficients is None:

@@ -44,10 +44,6 @@ def scene_page(paths: Sequence[Path], *, progress: OnProgress | None = None) -> 
     Args:
         paths: The YAML file.
         progress: Called about twice a second while smoke and originals are read.
-
-    Raises:
-        WlmError: The file or one that it names is missing or damaged, or an original has another size than the
-            lightmaps.
     """
     with load(paths[0]) as scene:
         return _page(scene, progress)

@@ -45,28 +45,24 @@ def missing_encoder(count: int) -> str | None:
         return None
     tiles = "1 tile" if count == 1 else f"{count} tiles"
     return (
-        f"{tiles} would be smaller and better as BC7 frames, but {_ENCODER} is missing, so networks are fitted "
+        f"{tiles} would take no more bytes as BC7 frames, but {_ENCODER} is missing, so networks are fitted "
         f"to them; needs the extra: pip install 'wlm[{EXTRA}]'"
     )
 
 
-def choose_frames(
-    kinds: np.ndarray, numbers: Sequence[int] | np.ndarray, mask: np.ndarray, times: int, profile: Profile
-) -> np.ndarray:
+def choose_frames(kinds: np.ndarray, times: int, profile: Profile) -> np.ndarray:
     """Returns which of N tiles are stored as frames, see `Profile.frames`, bool [N].
 
     Args:
-        kinds, numbers: `TileKind` and number in the grid of each of the N tiles.
-        mask: bool [H, W], the valid texels of the map.
+        kinds: `TileKind` of each of the N tiles.
         times: Number of stored times.
         profile: The settings.
     """
     chosen = np.isin(kinds, (TileKind.STATIC, TileKind.DYNAMIC))
     if profile.frames == "auto":
-        for i in np.flatnonzero(chosen):
-            share = needed_blocks(mask, int(numbers[i])).mean()
-            network = tile_bytes(profile, bool(kinds[i] == TileKind.DYNAMIC)) - (1.0 - share) * TILE * TILE
-            chosen[i] = times * (share * TILE * TILE + _RANGE_BYTES) <= network
+        for kind in (TileKind.STATIC, TileKind.DYNAMIC):
+            network = tile_bytes(profile, kind == TileKind.DYNAMIC)
+            chosen &= (kinds != kind) | (times * (TILE * TILE + _RANGE_BYTES) <= network)
     return chosen & (profile.frames != "never")
 
 
@@ -101,9 +97,6 @@ def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> 
 
     Returns:
         BC7 blocks, uint8 [T, 32, 32, 16], and the least and greatest colour of each frame, float16 [T, 2, 3].
-
-    Raises:
-        WlmError: The BC7 encoder is not installed.
     """
     texels = colour[:, valid]
     ranges = np.stack([round_half(texels.min(1), -np.inf), round_half(texels.max(1), np.inf)], 1)

@@ -7,6 +7,7 @@ of the maps that no valid texel of the lightmap reads at a stored time to zero, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,6 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import BLOCK_BYTES, pack_mode6, unpack_mode6
 from wlm.formats.folder import rounded
 from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, side_by_side
-from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import SheetModel, decode_scale
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.tiles import TILE, TileKind
@@ -28,6 +28,7 @@ from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap.levels import LEVELS
 
 _SLACK = 1e-4  # of a texel: float32 may round a position to either side of a texel's middle
+_SQRT_12 = math.sqrt(12.0)  # features in [0, 1] enter the network as (f - 1/2) sqrt(12)
 _MODE_6 = np.uint64(1 << 6)
 _LOW_7 = np.uint64(127)
 _END_SHIFTS = (7 + 7 * np.arange(8)).astype(np.uint64)  # R0 R1 G0 G1 B0 B1 A0 A1 in the low half of a block
@@ -346,7 +347,7 @@ def shader_networks(sheet: SheetModel) -> np.ndarray:
             layers, output = net[:count].astype(np.float64).reshape(-1, hidden), net[count:].reshape(-1, 3)
             inputs = len(layers) - hidden - 2
             # W (f - 1/2) sqrt(12) + b = (sqrt(12) W) f + (b - sqrt(12)/2 W 1).
-            layers[:centred] *= SQRT_12
+            layers[:centred] *= _SQRT_12
             layers[inputs] -= 0.5 * layers[:centred].sum(0)
             added = wide - hidden
             layers = np.insert(layers, np.full(added, len(layers) - 1), 0.0, axis=0)

@@ -63,9 +63,6 @@ def read_shots(
         count: Largest number of frames, which are evenly spread over all; None: all frames.
         progress: Called after each frame.
         notes: As for `read_shaded`.
-
-    Raises:
-        WlmError: A file is damaged or of another kind.
     """
     numbers = spread(tuple(files), count)
     meter = Meter(progress, "read", len(numbers))
@@ -225,9 +222,6 @@ def mip_padding(height: int, width: int, levels: int) -> int:
 
     A texel of the coarsest level must not span two cells, and the half texel that a filter reads beyond a frame's edge
     must be within its padding.
-
-    Raises:
-        WlmError: No padding makes both sides of a cell multiples of a texel of the coarsest level.
     """
     part = 2**levels
     for padding in range(part // 2, part // 2 + part):
@@ -256,9 +250,6 @@ def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, t
 
     Returns:
         The names of the channels of each file, and the number of values that were clipped to the range of the files.
-
-    Raises:
-        WlmError: The suffix is wrong, a number is not finite, or a file cannot be written.
     """
     output = Path(output)
     paths = {name: output.with_name(f"{output.stem}_{i}{output.suffix}") for i, name in enumerate(book.pages, 1)}

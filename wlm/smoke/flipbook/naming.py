@@ -30,11 +30,7 @@ _LETTERS = "RGBA"
 
 
 def parse_layout(text: str) -> Layout:
-    """Returns a layout by its name or by its channels, such as "right,left,top,alpha:bottom,back,front,emission".
-
-    Raises:
-        WlmError: It is neither, or a direction is missing or repeated.
-    """
+    """Returns a layout by its name or by its channels, such as "right,left,top,alpha:bottom,back,front,emission"."""
     if text in LAYOUTS:
         return LAYOUTS[text]
     pages = tuple(tuple(page.split(",")) for page in text.split(":"))
