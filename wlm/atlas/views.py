@@ -60,10 +60,6 @@ def visible_uv(
         For each camera, on the device: int32 [h, w], number of the visible triangle, -1 for none or one without a
             lightmap; float32 [h, w, 2], barycentric weights of the triangle's corners 0 and 1 (all three add up to 1);
             float32 [h, w, 2], UVs. Weights and UVs are 0 in uncovered pixels.
-
-    Raises:
-        WlmError: There is no such device.
-        ValueError: The resolution is out of range.
     """
     all_of = scene.triangles
     lit = torch.tensor(all_of.sheet >= 0, device=check_device(device))
@@ -114,10 +110,6 @@ def visibility(
     Returns:
         float64 [height, width] on the device: for each cell the number of pixels, in the pictures of all cameras, whose
         UV lies in it; a UV of 1 lies in the last cell.
-
-    Raises:
-        WlmError: There is no such device.
-        ValueError: A size is out of range.
     """
     if height < 1 or width < 1:
         raise ValueError(f"height, width: expected at least 1 cell each, got {height} and {width}")

@@ -138,11 +138,7 @@ def write_index(path: Path, content: dict[str, Any]) -> int:
 
 
 def compact_json(content: Any) -> str:
-    """Returns JSON text with one key per line, and each list of numbers on one line.
-
-    Raises:
-        ValueError: A number is NaN or infinite.
-    """
+    """Returns JSON text with one key per line, and each list of numbers on one line."""
     text = json.dumps(content, indent=1, allow_nan=False)
     # Otherwise each number would have its own line. JSON strings hold no raw line break, so they are not changed.
     return _NUMBERS.sub(lambda match: "[" + " ".join(match[1].split()) + "]", text) + "\n"

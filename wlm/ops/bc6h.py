@@ -23,9 +23,6 @@ def bc6h_blocks(light: torch.Tensor, weight: torch.Tensor | None = None) -> tupl
 
     Returns:
         The blocks, uint8 [N, 16], and their decoded texels, float32 [N, 16, 3].
-
-    Raises:
-        ValueError: A tensor's shape, type or device doesn't fit.
     """
     count = len(light)
     weight = torch.ones_like(light[..., 0]) if weight is None else weight

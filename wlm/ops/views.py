@@ -88,9 +88,6 @@ def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> l
         count: Number of cameras, at least 0.
         seed: None spreads them evenly (a Fibonacci sphere); otherwise they are random, independent and uniform. A
             generator continues from its current state.
-
-    Raises:
-        ValueError: A negative count.
     """
     if count < 0:
         raise ValueError(f"count: expected at least 0, got {count}")
@@ -174,10 +171,6 @@ def visible_points(
         For each camera, on the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights
         of its corners 0 and 1; float32 [h, w, 2], the UVs at the visible point. The latter two are 0 in uncovered
         pixels.
-
-    Raises:
-        WlmError: There is no such device.
-        ValueError: The resolution is out of range.
     """
     device = check_device(device)
     if not 1 <= resolution <= MOST_PIXELS:

@@ -44,11 +44,7 @@ _MARGIN = 1.05  # image height over box height, so that no smoke touches the edg
 
 
 def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarray:
-    """Returns a direction scaled to length 1, float64 [3].
-
-    Raises:
-        ValueError: The direction has length 0, or is not three finite numbers.
-    """
+    """Returns a direction scaled to length 1, float64 [3]."""
     vector = np.asarray(vector, np.float64)
     length = np.linalg.norm(vector)
     if vector.shape != (3,) or not _SHORTEST < length < np.inf:
@@ -68,9 +64,6 @@ def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.n
 
     Returns:
         float64 [..., 6], not negative.
-
-    Raises:
-        ValueError: The rule is unknown, or a direction has length 0 or is not finite.
     """
     if rule not in RULES:
         raise ValueError(f"rule: expected one of {', '.join(RULES)}, got {rule!r}")

@@ -97,10 +97,6 @@ def run(
 
     Yields:
         The frames. Each stage waits for the device, so that its duration is measured separately.
-
-    Raises:
-        ValueError: Six-way lighting with a perspective camera.
-        WlmError: As `wlm.smoke.simulation.make_solver`; an obstacle is too fast; or the simulation diverged.
     """
     lighting = Lighting(scene.smoke.albedo) if lighting is None else lighting
     solver = make_solver(scene, device=device)

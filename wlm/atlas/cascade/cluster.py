@@ -89,9 +89,6 @@ def cluster(
         largest: Largest number of samples along a side of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
         device: "cpu" or "cuda:N"; the result is the same on all.
         progress: Called with the triangles done in the stages "compare patches" and "cluster", in turn.
-
-    Raises:
-        ValueError: There are more samples of the lightmap in all than 32 bits can count.
     """
     count = len(triangle)
     excluded = np.zeros(count, bool) if active is None else ~active

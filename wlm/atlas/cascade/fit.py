@@ -291,11 +291,7 @@ class _Step:
 
     @torch.no_grad()
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores the arrays that `state` returned.
-
-        Raises:
-            ValueError: The state belongs to another fit; nothing has changed.
-        """
+        """Restores the arrays that `state` returned."""
         table = {"step": Part(np.int32, (1,), least=0, most=len(self._rates))}
         for name, parameter in self._tuned.items():
             shapes = {name: parameter.shape} | {f"{name}.{key}": parameter.shape for key in _MOMENTS[1:]}

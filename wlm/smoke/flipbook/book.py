@@ -140,9 +140,6 @@ def pack_book(
         gain: Factor of the light; None: the largest with which no light is above 1.
         padding: Pixels around each frame that repeat its border, so that filters and mips do not mix frames.
         rate: Frames per second; None: that of the scene, or `RATE`.
-
-    Raises:
-        ValueError: The frames have several sizes, the layout is unknown, or a number is out of its range.
     """
     frames = [shot.six for shot in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):

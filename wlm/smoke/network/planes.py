@@ -63,9 +63,6 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
 
     Returns:
         [..., 3, H, W]: light in sRGB; opacity; depth, from 1 at `near` to 0 at `far`, and 0 without a surface.
-
-    Raises:
-        ValueError: The number of planes is wrong.
     """
     if maps.ndim < 3 or maps.shape[-3] != 3:
         raise ValueError(f"maps: expected shape [..., 3, H, W], got {tuple(maps.shape)}")
@@ -86,9 +83,6 @@ def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March)
     Returns:
         float32 [C, H, W], the planes that `GUIDES` lists; 0 where there is no smoke, except emission of fire without
         smoke.
-
-    Raises:
-        ValueError: The kind is unknown, or the camera is in perspective or too far away for float64.
     """
     near, far = span(volume, camera)
     if not near < far:
@@ -121,9 +115,6 @@ def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera |
         planes: [8, H, W] in the order of `PLANES`.
         hot: Whether the smoke emits light; False: the result has no emission.
         camera: Camera of the lightmaps; None: unknown.
-
-    Raises:
-        ValueError: The number of planes is wrong.
     """
     if planes.ndim != 3 or planes.shape[0] != len(PLANES):
         raise ValueError(f"planes: expected shape [{len(PLANES)}, H, W], got {tuple(planes.shape)}")
