@@ -103,20 +103,11 @@ def psnr_from_mse(error: float, peak: float) -> float:
 
 
 def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray, data_range: float) -> float:
-    """Returns the mean SSIM over the valid texels whose window lies inside the image.
+    """Returns the mean SSIM, for a signal of the given range, of images [H, W, C] over the texels of a mask [H, W]
+    whose window lies inside the image; NaN if there is none or the range is zero.
 
-    Outside the mask both images take the reference's nearest valid value, so that decoded values there do not
-    affect windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
-
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, true where a texel counts.
-        data_range: The signal's range in the images' units.
-
-    Returns:
-        The mean; NaN where the image is smaller than the window, no valid texel has its window inside, or the
-        range is zero.
+    Outside the mask both images take the reference's nearest valid value, so that decoded values there do not affect
+    windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
     """
     ref, test, valid = check_pair(ref, test, mask, "ssim")
     filled = fill_gaps(ref, valid)
@@ -146,17 +137,11 @@ def _ssim_filled(ref: np.ndarray, test: np.ndarray, valid: np.ndarray, data_rang
 
 
 def flip_exposures(ref: np.ndarray, valid: np.ndarray) -> tuple[float, float] | None:
-    """Chooses the first and last exposure for HDR-FLIP, from percentiles of the valid reference's luminance.
+    """Chooses the first and last exposure for HDR-FLIP, `(start, stop)` in stops (log2), from the reference's luminance
+    where `valid`; None where no valid texel is above zero.
 
-    HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of
-    the texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
-
-    Args:
-        ref: `[H, W, 3]`, linear RGB, finite where valid.
-        valid: bool `[H, W]`, true where a texel counts.
-
-    Returns:
-        `(start, stop)` in stops (log2), start <= stop; None where no valid texel is above zero.
+    HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of the
+    texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
     """
     _check_rgb(ref)
     luminance = np.maximum(ref[valid], 0.0) @ _LUMINANCE

@@ -77,15 +77,8 @@ class Views:
         indices: Sequence[int] | np.ndarray | None = None,
         device: str = "cpu",
     ) -> None:
-        """Places the cameras.
-
-        Args:
-            lightmaps: The sheet, whose times, mask and exposures are used.
-            geometry: The mesh, with UVs.
-            count: Number of cameras.
-            indices: Indices of the times that will be added; None: all.
-            device: Device that draws: "cpu", "cuda" or "cuda:N".
-        """
+        """Places `count` cameras for the times of a sheet that will be added, all or those with the given indices;
+        `geometry` has UVs."""
         self._lightmaps, self._geometry, self._device = lightmaps, geometry, check_device(device)
         low, high = geometry.box
         if not (high > low).any():

@@ -182,17 +182,12 @@ def picture(
     time: float = 0.0,
     rule: str = "squared",
 ) -> torch.Tensor:
-    """Draws lit smoke and a scene's obstacles, as one call of `Drawing` does.
+    """Draws lit smoke and a scene's obstacles, as one call of `Drawing` does, which explains the other options: float32
+    [H, W, 3], linear.
 
-    Args:
-        smoke: Lightmaps with their camera and transparency, and with their depth if there are obstacles; or smoke that
-            was lit before, by single or multiple scattering.
-        lights: Lights of the lightmaps; None for smoke that was lit already.
-        albedo, background, ramp, obstacles, rule: As of `Drawing`.
-        time: Time of the obstacles, seconds.
-
-    Returns:
-        float32 [H, W, 3], linear.
+    `smoke` are lightmaps with their camera and transparency, and with their depth if there are obstacles; or smoke that
+    was lit before, by single or multiple scattering, which needs no lights. `time` is that of the obstacles, in
+    seconds.
     """
     lit = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
     if lit.camera is None:
