@@ -169,12 +169,8 @@ def flip_exposures(ref: np.ndarray, valid: np.ndarray) -> tuple[float, float] | 
 
 
 def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """LDR-FLIP between two display images, sRGB in [0, 1], [H, W, 3], at flip_evaluator's default of 67 pixels per
-    degree.
-
-    Returns:
-        `[H, W]` float64 in [0, 1].
-    """
+    """Computes LDR-FLIP, float64 [H, W] in [0, 1], between two display images, sRGB in [0, 1], [H, W, 3], at
+    flip_evaluator's default of 67 pixels per degree."""
     ref, test, _ = check_pair(ref, test, None, "flip")
     _check_rgb(ref)
     return _ldr_flip(ref, test, srgb=True)
@@ -233,16 +229,11 @@ def _check_rgb(image: np.ndarray) -> None:
 
 
 def picture_error(reference: np.ndarray, test: np.ndarray, seen: np.ndarray, flip: bool = True) -> tuple[float, float]:
-    """Computes the error of a test picture against a reference picture.
+    """Returns the mean squared error and the mean LDR-FLIP, or NaN without `flip`, of the covered pixels of a test
+    picture.
 
-    Args:
-        reference: [H, W, 3], sRGB in [0, 1]; uncovered pixels have the same value in both images.
-        test: [H, W, 3], sRGB in [0, 1].
-        seen: bool [H, W], true for covered pixels, at least one.
-        flip: Whether FLIP is computed too.
-
-    Returns:
-        The mean squared error and the mean LDR-FLIP, or NaN, of the covered pixels.
+    Both pictures are [H, W, 3], sRGB in [0, 1]; `seen`, bool [H, W], is true for covered pixels, at least one; all
+    others have the same value in both.
     """
     error = float(np.square(reference - test, dtype=np.float64)[seen].mean())
     if not flip:
@@ -477,9 +468,7 @@ def evaluate_frame(
     height, width = valid.shape
     shape = (-(-height // tile), -(-width // tile))
     result = FrameMetrics(
-        *(np.full(shape, math.nan) for _ in range(5)),
-        valid=np.zeros(shape, np.int64),
-        metrics=tuple(metrics),
+        *(np.full(shape, math.nan) for _ in range(5)), valid=np.zeros(shape, np.int64), metrics=tuple(metrics)
     )
     error = None
     if "flip" in metrics and valid.any():
@@ -544,14 +533,10 @@ def summarise(frames: Sequence[FrameMetrics], times: Sequence[float] | np.ndarra
 
 
 def lowest(psnr: np.ndarray, times: Sequence[float] | np.ndarray) -> dict[str, float | int] | None:
-    """Returns the lowest PSNR of tiles and its place.
+    """Returns the lowest PSNR of tiles, [T, ny, nx] in dB, NaN for tiles without a score, and its place; None if all
+    are NaN.
 
-    Args:
-        psnr: [T, ny, nx], in dB; NaN for tiles without a score.
-        times: The T times.
-
-    Returns:
-        `psnr`; `time`; `tile`, the number of the tile, row by row; its `row` and `column`. None if all are NaN.
+    The keys are `psnr`; `time`; `tile`, the number of the tile, row by row; its `row` and `column`.
     """
     if np.isnan(psnr).all():
         return None

@@ -81,10 +81,8 @@ def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Finds the invalid texels within `REACH` texels of a valid one, and the valid texel that is nearest to each.
 
     `mask` is bool [H, W], true where a texel is valid. Of several equally near texels the first in reading order is
-    taken, so that all decoders (Python, shader, web page) take the same one.
-
-    Returns:
-        Row and column of each such texel, int [G, 2], in reading order, and row and column of its nearest valid texel.
+    taken, so that all decoders (Python, shader, web page) take the same one. Returns row and column of each such texel,
+    int [G, 2], in reading order, and those of its nearest valid texel.
     """
     height, width = mask.shape
     found = np.zeros(mask.shape, np.int8)  # 1 + the index in `OFFSETS`

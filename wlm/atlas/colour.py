@@ -34,10 +34,7 @@ def block_grid(height: int, width: int) -> tuple[int, int]:
 
 
 def quantise(
-    texels: np.ndarray | torch.Tensor,
-    colour: str,
-    weight: np.ndarray | torch.Tensor | None = None,
-    device: str = "cpu",
+    texels: np.ndarray | torch.Tensor, colour: str, weight: np.ndarray | torch.Tensor | None = None, device: str = "cpu"
 ) -> dict[str, np.ndarray]:
     """Encodes the colour texture T_p, [H, W, 3] on any device. Returns the arrays `texels` and, for a block format,
     `blocks` of `AtlasModel`. BC6H weights the squared errors of texels with `weight` [H, W].
@@ -91,10 +88,7 @@ def _of_blocks(texels: torch.Tensor, count: int, ny: int, nx: int) -> torch.Tens
 
 
 def encode(
-    texels: np.ndarray | torch.Tensor,
-    codec: str,
-    weight: np.ndarray | torch.Tensor | None = None,
-    device: str = "cpu",
+    texels: np.ndarray | torch.Tensor, codec: str, weight: np.ndarray | torch.Tensor | None = None, device: str = "cpu"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Encodes a linear texture, [H, W, 3] on any device, as "bc6h" or "astc". Values, also infinite ones, are clamped
     to [0, 65504]. If H or W is no multiple of 4, the last row or column is repeated.

@@ -38,12 +38,9 @@ class Points:
 
 
 def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) -> list[View | Viewpoint]:
-    """Makes cameras around a scene and, where viewers can stand in it, as many cameras inside.
+    """Makes `count` cameras around a scene and, where viewers can stand in it, as many inside.
 
-    Args:
-        scene: The scene.
-        count: Number of cameras around it, at least 0.
-        seed: None spreads the cameras evenly; a number places all cameras, also inside ones, at random.
+    Without a seed they are spread evenly; a seed places all, also those inside, at random.
     """
     return [*sphere_views(count, seed), *scene.indoors.views(count, 0 if seed is None else seed)]
 
@@ -134,16 +131,11 @@ def visibility(
 
 
 def texel_triangles(sheet: Sheet, height: int, width: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Finds the active triangle that contains the centre of each cell of a grid over UV space.
+    """Finds the active triangle that contains the centre of each cell of a grid [height, width] over UV space, row 0 at
+    v = 0.
 
-    Args:
-        sheet: The sheet.
-        height, width: Size of the grid, row 0 at v = 0.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        On the device: int64 [height, width], the number of the triangle in the sheet (the first if there are several,
-        -1 for none); float32 [height, width, 2], the barycentric weights of its corners 0 and 1.
+    Returns on the device: int64 [height, width], the number of the triangle in the sheet (the first if there are
+    several, -1 for none); float32 [height, width, 2], the barycentric weights of its corners 0 and 1.
     """
     active = torch.tensor(np.flatnonzero(sheet.active), device=device)
     raster = ops_raster.rasterize_uv(
@@ -156,10 +148,6 @@ def texel_triangles(sheet: Sheet, height: int, width: int, device: str) -> tuple
 
 
 def sheet_charts(sheet: Sheet) -> np.ndarray:
-    """Numbers the charts of a sheet.
-
-    Returns:
-        int32 [F]: active triangles connected by edges whose ends coincide in space and in UV space have the same
-        number; -1 for triangles that aren't active.
-    """
+    """Numbers the charts of a sheet, int32 [F]: active triangles connected by edges whose ends coincide in space and in
+    UV space have the same number; -1 for triangles that aren't active."""
     return charts(welded(sheet.position, sheet.uv, sheet.triangle), sheet.active)

@@ -68,13 +68,7 @@ def fit(
 
 
 def export(
-    file: Path,
-    output: Path,
-    engine: str | None,
-    shader: str | None,
-    exact: bool,
-    device: str,
-    **options: Any,
+    file: Path, output: Path, engine: str | None, shader: str | None, exact: bool, device: str, **options: Any
 ) -> None:
     """Exports a model to a folder and lists the written files. `options` that are None are left out.
 

@@ -77,10 +77,7 @@ def score_walks(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[st
     from wlm.probe.volume.walk import score_volume
 
     decoder = model.decoder(device, position=probes.position)
-    lights = {
-        "original": StoredLight(probes.values, decoder.device),
-        "decoded": decoder.light(probes.position),
-    }
+    lights = {"original": StoredLight(probes.values, decoder.device), "decoded": decoder.light(probes.position)}
     with running("walk") as progress:
         return {name: score_volume(probes, light, progress=progress) for name, light in lights.items()}
 

@@ -174,14 +174,10 @@ def decode_image(blocks: np.ndarray) -> np.ndarray:
 
 def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.ndarray:
     """Encodes an opaque image, uint8 [H, W, 3] with sizes in multiples of 4, by Intel's ISPC texture compressor, in one
-    thread.
+    thread; returns blocks, uint8 [H/4, W/4, 16].
 
-    Args:
-        extra: Name of the optional extra of wlm that installs the compressor, for the error message.
-        profile: Quality of the compressor: "ultrafast", "veryfast", "fast", "basic" or "slow".
-
-    Returns:
-        The blocks, uint8 [H/4, W/4, 16].
+    `extra` names the extra of wlm that installs the compressor, `profile` its quality: "ultrafast", "veryfast", "fast",
+    "basic" or "slow".
     """
     texcomp = need("ispc_texcomp", extra)
     height, width = picture.shape[:2]

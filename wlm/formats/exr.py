@@ -64,16 +64,11 @@ def read_exr(
 def read_every_channel(
     path: str | os.PathLike[str], notes: list[str] | None = None, light: bool = False
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads all channels of an EXR file, over its display window; `read_exr` explains `notes`.
+    """Reads all channels of an EXR file, over its display window; each conversion adds a line to `notes`.
 
-    Args:
-        path: The file.
-        notes: Each conversion adds a line.
-        light: Whether the colours of each layer are light, which is converted to the primaries of Rec. 709.
-
-    Returns:
-        The pixels, float32 [H, W, C], and the names of the channels: R, G, B and A first, others sorted. In a file of
-        several parts, a name begins with that of its part, such as "beauty.R".
+    With `light` the colours of each layer are light, which is converted to the primaries of Rec. 709. Returns the
+    pixels, float32 [H, W, C], and the names of the channels: R, G, B and A first, others sorted. In a file of several
+    parts, a name begins with that of its part, such as "beauty.R".
     """
     notes = [] if notes is None else notes
     channels, first = _channels(path), (*_COLOUR, _ALPHA)

@@ -175,13 +175,11 @@ def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) 
 
 
 def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the largest mip of a KTX2 texture of light, plain or compressed by zstd or zlib.
+    """Reads the largest mip of a KTX2 texture of light, plain or compressed by zstd or zlib; returns the pixels,
+    float32 [H, W, 3 or 4], and the channel names.
 
     The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored. Other
     primaries are converted to Rec. 709, which adds a line to `notes`.
-
-    Returns:
-        The pixels, float32 [H, W, 3 or 4], and the channel names.
     """
     pixels, layout, right, down = _read(path, False, [] if notes is None else notes)
     return np.ascontiguousarray(pixels[0, :: 1 if down else -1, :: 1 if right else -1]), layout.names

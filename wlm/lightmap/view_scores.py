@@ -136,12 +136,8 @@ def views_of(
 ) -> tuple[Views | None, list[str]]:
     """Makes the `Views` of a sheet, from the mesh that the sheet names.
 
-    Args:
-        lightmaps, count, indices, device: As for `Views`.
-
-    Returns:
-        The views, or None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh
-        cannot be read, else none.
+    Returns None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh cannot be
+    read, else none.
     """
     if count < 0:
         raise WlmError(f"views: expected at least 0, got {count}")

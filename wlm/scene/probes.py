@@ -30,12 +30,7 @@ class DayProbes:
     """
 
     def __init__(self, probes: Sequence[tuple[float, ProbeModel]], device: str = "cpu") -> None:
-        """Decodes all probes.
-
-        Args:
-            probes: Rising hours and probes of 27 numbers, all at the same positions.
-            device: "cpu" or "cuda:N".
-        """
+        """Decodes all probes: rising hours with models of 27 numbers a probe, all at the same positions."""
         decoders = [model.decoder(device) for _, model in probes]
         light = StoredLight(np.concatenate([decoder.decode_probes() for decoder in decoders], 1), device)
         live = np.logical_and.reduce([model.live for _, model in probes])
@@ -44,15 +39,11 @@ class DayProbes:
         self._settled = False
 
     def at(self, points: np.ndarray, hour: float, viewpoint: np.ndarray) -> np.ndarray:
-        """Returns SH coefficients of radiance at points, float32 [M, 9, 3].
+        """Returns SH coefficients of radiance at points [M, 3] and any hour, float32 [M, 9, 3].
 
         Between the hours of two files they are mixed linearly, except across a switch of a lamp
-        (`wlm.lightmap.virtual.clock`): until its end, the light is that before it.
-
-        Args:
-            points: [M, 3].
-            hour: Any hour; 24 is 0.
-            viewpoint: [3], the viewer, around whom the volume is finest.
+        (`wlm.lightmap.virtual.clock`): until its end, the light is that before it. The volume is finest around
+        `viewpoint`, [3].
         """
         if self._settled:
             self.volume.update(viewpoint)

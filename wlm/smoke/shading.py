@@ -60,12 +60,10 @@ def _on_device(ramp: Ramp, dtype: torch.dtype, device: torch.device) -> tuple[to
 
 
 def glow_of(emission: torch.Tensor, ramp: Ramp | None, thrown: torch.Tensor | None = None) -> torch.Tensor:
-    """Returns the light of fire, [H, W, 3], or [H, W, 1] if it is grey.
+    """Returns the light of fire, [H, W, 3], or [H, W, 1] if it is grey (without a ramp), from the light [H, W] that
+    smoke emits.
 
-    Args:
-        emission: [H, W], light that the smoke emits.
-        ramp: Colour of the emission; None: grey.
-        thrown: [H, W, 3], emitted light that the smoke scatters, which gets the mean colour of the visible fire.
+    `thrown`, [H, W, 3], is emitted light that the smoke scatters, which gets the mean colour of the visible fire.
     """
     glow = emission[..., None] if ramp is None else ramp(emission)
     if thrown is None:

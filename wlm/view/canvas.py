@@ -1,13 +1,10 @@
-"""Draws named meshes, lines and volumes in the panels of a window; drawing a name again updates it."""
+"""Draws named meshes and lines in the panels of a window; drawing a name again updates it."""
 
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-
-_LEVELS = 256  # of the opacity table of smoke
-_STEP = 0.5  # voxels between two samples of smoke; 1 shows stripes, and much smaller steps lose colour to rounding
 
 
 class Canvas:
@@ -87,48 +84,6 @@ class Canvas:
         """Draws the edges of a box between two corners [3]."""
         mesh = self._pyvista.Box(np.stack([low, high], 1).ravel())
         self._add(panel, name, mesh, color=colour, style="wireframe", line_width=1.5)
-
-    def smoke(
-        self,
-        panel: int,
-        name: str,
-        colour: np.ndarray,
-        density: np.ndarray,
-        depth: float,
-        voxel: float,
-        origin: np.ndarray,
-    ) -> None:
-        """Draws a volume.
-
-        Args:
-            panel: Index of the panel.
-            name: Name of the volume.
-            colour: uint8 [X, Y, Z, 3].
-            density: float [X, Y, Z] in [0, 1].
-            depth: Optical depth along a voxel's edge at density 1.
-            voxel: Length of a voxel's edge.
-            origin: [3], corner of the first voxel.
-        """
-        codes = np.concatenate([colour, (density[..., None] * 255.0 + 0.5).astype(np.uint8)], -1)
-        codes = np.ascontiguousarray(codes.transpose(2, 1, 0, 3).reshape(-1, 4))
-        grid = self._pyvista.ImageData(
-            dimensions=density.shape, spacing=(voxel,) * 3, origin=np.asarray(origin) + 0.5 * voxel
-        )
-        grid.point_data["smoke"] = codes
-        self._plotter.subplot(0, panel)
-        options = {"name": f"{panel} {name}", "render": False, "reset_camera": False, "show_scalar_bar": False}
-        # The volume is made anew, since this mapper does not notice changed voxels. The GPU mapper of VTK 9.7 reads the
-        # opacities of coloured voxels as much smaller, and ignores their unit of length.
-        actor = self._plotter.add_volume(grid, scalars="smoke", mapper="fixed_point", **options)
-        actor.mapper.SetAutoAdjustSampleDistances(False)
-        actor.mapper.SetSampleDistance(_STEP * voxel)
-        actor.mapper.SetImageSampleDistance(1.0 if self._plotter.off_screen else 2.0)
-        opacity = actor.prop.GetScalarOpacity(0)
-        opacity.RemoveAllPoints()
-        for level in range(_LEVELS):
-            opacity.AddPoint(level, 1.0 - np.exp(-depth * level / (_LEVELS - 1)))
-        actor.prop.SetScalarOpacityUnitDistance(voxel)
-        self._drawn[panel, name] = actor, grid
 
     def background(self, panel: int, colour: np.ndarray) -> None:
         """Fills a panel behind the meshes with a colour [3] in [0, 1]."""

@@ -221,13 +221,7 @@ class _Step:
     """One step of tuning, as a callable. Its buffers are allocated once, so that a CUDA graph may capture the step."""
 
     def __init__(
-        self,
-        sheet: Sheet,
-        uv: np.ndarray,
-        textures: Textures,
-        profile: Profile,
-        seed: int,
-        device: str,
+        self, sheet: Sheet, uv: np.ndarray, textures: Textures, profile: Profile, seed: int, device: str
     ) -> None:
         self._weight = profile.gradient
         # A black lightmap has no mean to divide by, and needs none.

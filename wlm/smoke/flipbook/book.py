@@ -244,12 +244,8 @@ def mip_levels(height: int, width: int, padding: int) -> int:
 def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, tuple[str, ...]], int]:
     """Writes the textures of a flip book to files NAME_1 and NAME_2, atomically: all of them or none.
 
-    Args:
-        book: The flip book.
-        output: Path in an existing folder: NAME with the suffix .exr, .png or .tga of all files.
-
-    Returns:
-        The names of the channels of each file, and the number of values that were clipped to the range of the files.
+    `output` is NAME with the suffix .exr, .png or .tga of all files, in an existing folder. Returns the names of the
+    channels of each file, and the number of values that were clipped to the range of the files.
     """
     output = Path(output)
     paths = {name: output.with_name(f"{output.stem}_{i}{output.suffix}") for i, name in enumerate(book.pages, 1)}

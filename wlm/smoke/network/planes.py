@@ -39,13 +39,11 @@ def to_srgb(linear: torch.Tensor) -> torch.Tensor:
 
 
 def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
-    """Returns the distances from the camera at which the bounding sphere of the volume's box begins and ends.
+    """Returns the distances from the camera, in world units, at which the bounding sphere of the volume's box begins
+    and ends; the near one is negative if the camera is inside the sphere.
 
     A camera that turns about the box's centre has the same distances in all positions, so that depths are comparable.
     Distances are measured along the axis of an orthographic camera, or from the eye of a perspective camera.
-
-    Returns:
-        Near and far distance in world units; the near distance is negative if the camera is inside the sphere.
     """
     away = torch.as_tensor(camera.position, dtype=torch.float64) - torch.as_tensor(volume.centre)
     if camera.perspective:
@@ -107,15 +105,8 @@ def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March)
 
 
 def encode_lightmaps(six: SixWay) -> torch.Tensor:
-    """Encodes six-way lightmaps, opacity and emission as planes for the network.
-
-    Returns:
-        [8, H, W] in the order of `PLANES`: six lightmaps in sRGB, opacity, and emission e as e / (1 + e) in sRGB, 0
-        where the smoke is cold.
-
-    Raises:
-        ValueError: The lightmaps have no transparency.
-    """
+    """Encodes six-way lightmaps, which have transparency, as planes [8, H, W] for the network, in the order of
+    `PLANES`: six lightmaps in sRGB, opacity, and emission e as e / (1 + e) in sRGB, 0 where the smoke is cold."""
     if six.transparency is None:
         raise ValueError("six: expected lightmaps with transparency, got lightmaps without it")
     transparency = six.transparency
