@@ -22,16 +22,12 @@ _MOST = 26  # times of an alternative that a line lists
 
 
 def hours_of_names(stems: Sequence[str]) -> tuple[list[float | None], str]:
-    """Reads the hour at the end of each name: `_18h`, `_18h30`, `_1830h`, `_6pm`, `_18.5` or `_18_30h`.
+    """Reads the hour at the end of each name without its suffix: `_18h`, `_18h30`, `_1830h`, `_6pm`, `_18.5` or
+    `_18_30h`.
 
     The two digits of `_18_30h` are minutes if those of all names are 00, 15, 30 or 45; otherwise, and after a point,
     they are decimals. A number before them that is the same in all names is part of the name: `_2_06h`, `_2_18h`.
-
-    Args:
-        stems: Names without their suffixes.
-
-    Returns:
-        The hours, None for a name without one; and a line about names that may be read differently, or "".
+    Returns the hours, None for a name without one; and a line about names that may be read differently, or "".
     """
     found = [_HOUR.search(stem) for stem in stems]
     pairs = [match for match in found if match and match["part"]]
