@@ -57,7 +57,6 @@ def fit(
 
 
 def export(
-<<<<<<< HEAD
     file: Path,
     output: Path,
     engine: str | None,
@@ -66,9 +65,6 @@ def export(
     device: str,
     time: float | None = None,
     **options: Any,
-=======
-    file: Path, output: Path, engine: str | None, shader: str | None, exact: bool, device: str, **options: Any
->>>>>>> main
 ) -> None:
     """Exports a model to a folder and lists the written files. `time` is that of light probes with several hours.
     `options` that are None are left out.
