@@ -84,68 +84,59 @@ _NETWORK = """
 const int WLM_LIGHTMAP_FOURS = {fours}; // of {hidden} units
 
 {gelu}
-// G of eq. 4, behind the first layer's sums: two hidden layers, and a linear one whose start this returns.
-vec3 wlm_lightmap_output(vec4 a[WLM_LIGHTMAP_FOURS], int start)
+// b + x W, where the rows of W are `apart` groups of four apart.
+vec4 wlm_lightmap_add(vec4 b, vec4 x, int at, int apart)
 {{
-    vec4 b[WLM_LIGHTMAP_FOURS];
-    int at = start + 4 * WLM_LIGHTMAP_FOURS * WLM_LIGHTMAP_FOURS;
-    for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++)
-        b[j] = wlm_lightmap_four(at + j);
-    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
-        vec4 x = wlm_gelu(a[i]);
-        at = start + 4 * i * WLM_LIGHTMAP_FOURS;
-        for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++) {{
-            b[j] += x.x * wlm_lightmap_four(at + j);
-            b[j] += x.y * wlm_lightmap_four(at + WLM_LIGHTMAP_FOURS + j);
-            b[j] += x.z * wlm_lightmap_four(at + 2 * WLM_LIGHTMAP_FOURS + j);
-            b[j] += x.w * wlm_lightmap_four(at + 3 * WLM_LIGHTMAP_FOURS + j);
-        }}
-    }}
-    at = start + (4 * WLM_LIGHTMAP_FOURS + 1) * WLM_LIGHTMAP_FOURS;
-    vec4 y = wlm_lightmap_four(at + 4 * WLM_LIGHTMAP_FOURS);
-    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
-        vec4 x = wlm_gelu(b[i]);
-        y += x.x * wlm_lightmap_four(at + 4 * i) + x.y * wlm_lightmap_four(at + 4 * i + 1);
-        y += x.z * wlm_lightmap_four(at + 4 * i + 2) + x.w * wlm_lightmap_four(at + 4 * i + 3);
-    }}
-    return y.xyz;
+    vec4 sum = b + x.x * wlm_lightmap_four(at) + x.y * wlm_lightmap_four(at + apart);
+    return sum + x.z * wlm_lightmap_four(at + 2 * apart) + x.w * wlm_lightmap_four(at + 3 * apart);
 }}
 
-// Colour of a tile of maps: `record` is the position of its record, `inner` the texel in the tile.
+// Colour of a tile of maps: `record` is the position of its record, `inner` the texel in the tile. G of eq. 4 has two
+// hidden layers. Four units of the first at a time are added to the second, whose array has constant indices: registers.
 vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 {{
     int row = int(tile.y);
     int start = int(tile.z);
+    int second = start + 5 * WLM_LIGHTMAP_FOURS;
     ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
-    vec4 a[WLM_LIGHTMAP_FOURS];
-    for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++)
-        a[j] = wlm_lightmap_entry(record + 3 + j);
-    vec4 x = texelFetch(WLM_LIGHTMAP_UV, at, 0);
-{sum}    int rest = start + 5 * WLM_LIGHTMAP_FOURS;
-{dynamic}    vec3 y = wlm_lightmap_output(a, rest);
-    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
-    vec3 colour = gain + wlm_lightmap_entry(record + 2).xyz * y;
-    return max(colour, vec3(0.0, 0.0, 0.0));
+    vec4 uv = texelFetch(WLM_LIGHTMAP_UV, at, 0);
+{inputs}    int third = second + (4 * WLM_LIGHTMAP_FOURS + 1) * WLM_LIGHTMAP_FOURS;
+    vec4 b[WLM_LIGHTMAP_FOURS];
+{biases}    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
+        vec4 a = wlm_lightmap_add(wlm_lightmap_entry(record + 3 + i), uv, start + i, WLM_LIGHTMAP_FOURS);
+{sums}        a = wlm_gelu(a);
+        int w = second + 4 * WLM_LIGHTMAP_FOURS * i;
+{products}    }}
+    vec4 y = wlm_lightmap_four(third + 4 * WLM_LIGHTMAP_FOURS);
+{outputs}    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
+    return max(gain + wlm_lightmap_entry(record + 2).xyz * y.xyz, vec3(0.0, 0.0, 0.0));
 }}
 """
+_UNITS = {
+    "biases": "    b[{j}] = wlm_lightmap_four(third + {j} - WLM_LIGHTMAP_FOURS);\n",
+    "products": "        b[{j}] = wlm_lightmap_add(b[{j}], a, w + {j}, WLM_LIGHTMAP_FOURS);\n",
+    "outputs": "    y = wlm_lightmap_add(y, wlm_gelu(b[{j}]), third + 4 * {j}, 1);\n",
+}
+"""Lines of the network for each four units of the second layer."""
 
-_SUM = """\
-{indent}for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++) {{
-{indent}    int w = start{skip} + j;
-{indent}    a[j] += x.x * wlm_lightmap_four(w) + x.y * wlm_lightmap_four(w + WLM_LIGHTMAP_FOURS);
-{indent}    a[j] += x.z * wlm_lightmap_four(w + 2 * WLM_LIGHTMAP_FOURS);
-{indent}    a[j] += x.w * wlm_lightmap_four(w + 3 * WLM_LIGHTMAP_FOURS);
-{indent}}}
+_INPUTS = """\
+    vec4 uvt = vec4(0.0, 0.0, 0.0, 0.0);
+    vec4 planes = uvt;
+    bool dynamic = int(tile.x) == 2;
+    if (dynamic) {{
+        vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
+        uvt = wlm_lightmap_volume(row, place);
+        planes = vec4(wlm_lightmap_plane(2 * row, place.x), wlm_lightmap_plane(2 * row + 1, place.y));
+        // The encoded time is in the bias.
+        second = start + 17 * WLM_LIGHTMAP_FOURS;
+    }}
 """
 
-_DYNAMIC = """\
-    if (int(tile.x) == 2) {{
-        vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
-        x = wlm_lightmap_volume(row, place);
-{uvt_sum}        x = vec4(wlm_lightmap_plane(2 * row, place.x), wlm_lightmap_plane(2 * row + 1, place.y));
-{plane_sum}        // The encoded time is in the bias.
-        rest = start + 17 * WLM_LIGHTMAP_FOURS;
-    }}
+_SUMS = """\
+        if (dynamic) {
+            a = wlm_lightmap_add(a, uvt, start + 4 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
+            a = wlm_lightmap_add(a, planes, start + 8 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
+        }
 """
 
 _MAPS = """
@@ -353,14 +344,9 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
     if "uvt" in names:
         text += _MAPS.format(**words)
     if mapped:
-        sums = [
-            _SUM.format(indent=" " * (8 if i else 4), skip=f" + {4 * i} * WLM_LIGHTMAP_FOURS" if i else "")
-            for i in range(3)
-        ]
-        temporal = ""
-        if "uvt" in names:
-            temporal = _DYNAMIC.format(uvt_sum=sums[1], plane_sum=sums[2], **words)
-        text += _NETWORK.format(gelu=_GELU[profile.gelu], sum=sums[0], dynamic=temporal, **words)
+        units = {name: "".join(line.format(j=j) for j in range(fours(profile))) for name, line in _UNITS.items()}
+        inputs, sums = (_INPUTS.format(**words), _SUMS) if "uvt" in names else ("", "")
+        text += _NETWORK.format(gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words)
     text += images + _COLOUR.format(kinds=kinds, **words) + _SOURCE.format(**words)
     if values is None:
         return text + _RADIANCE.format(**words)
