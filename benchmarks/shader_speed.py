@@ -17,6 +17,7 @@ filter has 8 bits for a position between two texels. A way that this machine can
 import re
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,10 +29,12 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.bundle import Bundle
 from wlm.errors import WlmError
+from wlm.export.compute import compute_shader
 from wlm.export.shading import translate
 from wlm.lightmap.bundle import sheet_bundle
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.runtime import fast_decoder
+from wlm.lightmap.shader import GROUP_SIZE
 from wlm.lightmap.sheet import Sheet
 from wlm.lightmap.virtual.shader import sheet_words, virtual_glsl
 from wlm.lightmap.virtual.texture import VirtualTexture
@@ -47,6 +50,14 @@ _DISPATCHES = (10, 110)  # of the two runs of WGSL
 _BUFFERS = {"networks": ("NET", 0), "hours": ("HOUR_AT", 1)}  # macro and binding of each buffer
 
 _SHOWN = "vec4 shown(ivec2 pixel) { return vec4(wlm_radiance(pixel), 1.0); }\n"
+_WGSL_MAIN = """
+@group(1) @binding(0) var wlm_out: texture_storage_2d<rgba16float, write>;
+@compute @workgroup_size(8, 8) fn main(@builtin(global_invocation_id) id: vec3u)
+{
+    textureStore(wlm_out, id.xy, shown(vec2i(id.xy)));
+}
+"""
+_TEXTURES, _BUFFERED, _GROUPS = "numbers in textures", "numbers in buffers", "groups share a network"
 _READ = """
 uniform sampler2D u_view;
 uniform sampler2D u_slopes;
@@ -106,12 +117,11 @@ class _ShaderBench(Bench):
         (ours,) = self.time_rows([(self.row("ours", name, f"8 bits, {self.mode}"), self.replay(decoder.decode))])
         made = sheet_bundle(Sheet(), model, name, "0" * 16, self.device)
         rows = [ours]
-        for language, option, draw in (
-            ("GLSL", "numbers in textures", lambda: self._glsl(made, False)),
-            ("GLSL", "numbers in buffers", lambda: self._glsl(made, True)),
-            ("WGSL", "numbers in textures", lambda: self._wgsl(made, False)),
-            ("WGSL", "numbers in buffers", lambda: self._wgsl(made, True)),
-        ):
+        for language, option, draw in [
+            (language, option, partial(draw, made, option == _TEXTURES, option == _GROUPS))
+            for language, draw in (("GLSL", self._glsl), ("WGSL", self._wgsl))
+            for option in (_TEXTURES, _BUFFERED, _GROUPS)
+        ]:
             self.note(f"{language} of {name}, {option}")
             try:
                 picture, duration, renderer = draw()
@@ -136,26 +146,26 @@ class _ShaderBench(Bench):
             raise self._screen
         return self._screen
 
-    def _glsl(self, made: Bundle, buffers: bool) -> tuple[np.ndarray, float, str]:
+    def _glsl(self, made: Bundle, textured: bool, groups: bool) -> tuple[np.ndarray, float, str]:
         screen = self._opened()
         textures = {
             f"wlm_lightmap_{name}": screen.texture([part.data], part.fmt, part.width, part.height, part.layers)
             for name, part in made.textures.items()
         }
-        text, stored = made.shader + _SHOWN, {}
+        text, stored = compute_shader(made, "glsl") if groups else made.shader + _SHOWN, {}
         numbers = {"networks": made.buffers["networks"], "hours": made.buffers["hours"][0]}
         for name, (macro, place) in _BUFFERS.items():
-            if buffers:
+            if not textured:
                 block = f"layout(std430, binding = {place}) readonly buffer Wlm{place} {{ vec4 wlm_{name}[]; }};\n"
                 text = f"{block}#define WLM_LIGHTMAP_{macro}(i) wlm_{name}[i]\n{text}"
                 stored[place] = np.float32(numbers[name])
             else:
                 rows = _rows_of_fours(numbers[name])
                 textures[_uniform(name)] = screen.texture([rows], "R32G32B32A32_FLOAT", _ROW, len(rows))
-        picture = screen.picture(text, (self._side, self._side), textures, stored)
+        picture = screen.picture(text, (self._side, self._side), textures, stored, GROUP_SIZE if groups else None)
         return picture.read(), picture.time(self._repeats), screen.name
 
-    def _wgsl(self, made: Bundle, buffers: bool) -> tuple[np.ndarray, float, str]:
+    def _wgsl(self, made: Bundle, textured: bool, groups: bool) -> tuple[np.ndarray, float, str]:
         import wgpu
 
         adapters = wgpu.gpu.enumerate_adapters_sync()
@@ -166,27 +176,23 @@ class _ShaderBench(Bench):
         # Vulkan before OpenGL.
         adapter = min(found, key=lambda each: str(each.info["backend_type"]) != "Vulkan")
         side = adapter.limits["max-texture-dimension-2d"]
+        shared = "max-compute-workgroup-storage-size"
         gpu = adapter.request_device_sync(
-            required_features=["texture-compression-bc"], required_limits={"max-texture-dimension-2d": side}
+            required_features=["texture-compression-bc"],
+            required_limits={"max-texture-dimension-2d": side, shared: adapter.limits[shared]},
         )
-        text = translate(made.shader + _SHOWN, "wgsl")
-        for name in ("hour", "networks") if buffers else ():
+        text = compute_shader(made, "wgsl") if groups else translate(made.shader + _SHOWN, "wgsl") + _WGSL_MAIN
+        for name in () if textured else ("hour", "networks"):
             own = f"wlm_lightmap_{name}"
             text = text.replace(f"var {own}: texture_2d<f32>", f"var<storage, read> {own}: array<vec4f>")
             text = text.replace(f"textureLoad({own}, vec2i(i & 1023, i >> 10), 0)", f"{own}[i]")
-        code = f"""{text}
-@group(1) @binding(0) var wlm_out: texture_storage_2d<rgba16float, write>;
-@compute @workgroup_size(8, 8) fn main(@builtin(global_invocation_id) id: vec3u)
-{{
-    textureStore(wlm_out, id.xy, shown(vec2i(id.xy)));
-}}"""
         pipeline = gpu.create_compute_pipeline(
-            layout="auto", compute={"module": gpu.create_shader_module(code=code), "entry_point": "main"}
+            layout="auto", compute={"module": gpu.create_shader_module(code=text), "entry_point": "main"}
         )
         # The mask is read to fill gaps only, which no shader is asked for here.
-        names = re.findall(r"@binding\((\d+)\) var(?:<[^>]*>)? (?!wlm_lightmap_valid\b)(\w+)", text)
+        names = re.findall(r"@group\(0\) @binding\((\d+)\) var(?:<[^>]*>)? (?!wlm_lightmap_valid\b)(\w+)", text)
         entries = [
-            {"binding": int(place), "resource": _wgpu_resource(gpu, made, name, buffers)}
+            {"binding": int(place), "resource": _wgpu_resource(gpu, made, name, not textured)}
             for place, name in names
             if len(re.findall(rf"\b{name}\b", text)) > 1
         ]
@@ -198,6 +204,8 @@ class _ShaderBench(Bench):
             for i, each in enumerate((entries, [{"binding": 0, "resource": out.create_view()}]))
         ]
 
+        columns, rows = GROUP_SIZE if groups else (8, 8)
+
         def dispatch(count: int) -> float:
             encoder = gpu.create_command_encoder()
             work = encoder.begin_compute_pass()
@@ -205,7 +213,7 @@ class _ShaderBench(Bench):
             for i, group in enumerate(groups):
                 work.set_bind_group(i, group)
             for _ in range(count):
-                work.dispatch_workgroups(self._side // 8, self._side // 8)
+                work.dispatch_workgroups(self._side // columns, self._side // rows)
             work.end()
             start = time.perf_counter()
             gpu.queue.submit([encoder.finish()])

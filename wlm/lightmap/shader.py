@@ -10,6 +10,15 @@ from wlm.texels import REACH
 EXACT = "WLM_LIGHTMAP_EXACT"
 """Macro that makes the shader interpolate texels in float32 instead of with the GPU's texture filter."""
 
+GROUP_SIZE = (32, 8)
+"""Columns and rows of such a group; both divide a tile's side."""
+
+GROUP = "WLM_LIGHTMAP_GROUP"
+"""Macro for compute shaders, whose groups of invocations share the network of a tile."""
+
+GROUP_SIZE = (32, 8)
+"""Columns and rows of such a group; both divide a tile's side."""
+
 HEAD = 2
 """Groups of four floats before the records of the tiles in the table of an hour."""
 
@@ -26,13 +35,12 @@ vec4 wlm_gelu(vec4 x)
 }
 """,
     "tanh": """\
-// The tanh form of GELU, which the model was trained with; within 4.8e-4 of the exact one.
+// The tanh form of GELU, which the model was trained with, as x / (1 + exp(-2 z)), since the tanh of drivers takes
+// several times as long; within 4.8e-4 of the exact form.
 vec4 wlm_gelu(vec4 x)
 {
-    // Some drivers' tanh is a quotient of exponentials and overflows; beyond 9 it is 1 in a float anyway.
-    vec4 z = x * (0.79788456 + 0.035677408 * x * x);
-    z = clamp(z, vec4(-9.0, -9.0, -9.0, -9.0), vec4(9.0, 9.0, 9.0, 9.0));
-    return 0.5 * x * (1.0 + tanh(z));
+    vec4 z = x * (-2.3022082 - 0.10294324 * x * x); // for powers of 2, which end before a float overflows
+    return x / (1.0 + exp2(min(z, vec4(80.0, 80.0, 80.0, 80.0))));
 }
 """,
 }
@@ -51,12 +59,18 @@ _HEAD = """\
 // If WLM_LIGHTMAP_EXACT is defined, four texels are fetched and mixed in floats; otherwise the filter unit mixes four
 // texels, with about 8 bits for a position between two of them.
 //
-// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: if these are in
+{group}// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: if these are in
 // buffers change them, or define WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) before this file.
 
 {samplers}{reads}
 const int WLM_LIGHTMAP_COLUMNS = {columns}; // tiles in a row of the map
 const int WLM_LIGHTMAP_RECORD = {record}; // fours of a tile in the table, after {head} of all
+"""
+
+_ABOUT_GROUP = """\
+// Compute shaders decode faster with WLM_LIGHTMAP_GROUP defined, in groups of {columns} x {rows} texels of one tile
+// (wlm_lightmap_begin), which keep the network of the tile in {kilobytes} KB of shared memory.
+//
 """
 
 _TEXTURES = {
@@ -84,19 +98,38 @@ _NETWORK = """
 const int WLM_LIGHTMAP_FOURS = {fours}; // of {hidden} units
 
 {gelu}
+#ifdef WLM_LIGHTMAP_GROUP
+shared vec4 wlm_lightmap_weights[{weights}];
+#endif
+
+// Four floats of a network: of the group's tile, or of all networks.
+vec4 wlm_lightmap_weight(int i)
+{{
+#ifdef WLM_LIGHTMAP_GROUP
+    return wlm_lightmap_weights[i];
+#else
+    return wlm_lightmap_four(i);
+#endif
+}}
+
 // b + x W, where the rows of W are `apart` groups of four apart.
 vec4 wlm_lightmap_add(vec4 b, vec4 x, int at, int apart)
 {{
-    vec4 sum = b + x.x * wlm_lightmap_four(at) + x.y * wlm_lightmap_four(at + apart);
-    return sum + x.z * wlm_lightmap_four(at + 2 * apart) + x.w * wlm_lightmap_four(at + 3 * apart);
+    vec4 sum = b + x.x * wlm_lightmap_weight(at) + x.y * wlm_lightmap_weight(at + apart);
+    return sum + x.z * wlm_lightmap_weight(at + 2 * apart) + x.w * wlm_lightmap_weight(at + 3 * apart);
 }}
 
 // Colour of a tile of maps: `record` is the position of its record, `inner` the texel in the tile. G of eq. 4 has two
-// hidden layers. Four units of the first at a time are added to the second, whose array has constant indices: registers.
+// hidden layers. Four units of the first at a time are added to the second, whose array has constant indices, so that
+// it is in registers.
 vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 {{
     int row = int(tile.y);
+#ifdef WLM_LIGHTMAP_GROUP
+    int start = 0;
+#else
     int start = int(tile.z);
+#endif
     int second = start + 5 * WLM_LIGHTMAP_FOURS;
     ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
     vec4 uv = texelFetch(WLM_LIGHTMAP_UV, at, 0);
@@ -107,13 +140,13 @@ vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 {sums}        a = wlm_gelu(a);
         int w = second + 4 * WLM_LIGHTMAP_FOURS * i;
 {products}    }}
-    vec4 y = wlm_lightmap_four(third + 4 * WLM_LIGHTMAP_FOURS);
+    vec4 y = wlm_lightmap_weight(third + 4 * WLM_LIGHTMAP_FOURS);
 {outputs}    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
     return max(gain + wlm_lightmap_entry(record + 2).xyz * y.xyz, vec3(0.0, 0.0, 0.0));
 }}
 """
 _UNITS = {
-    "biases": "    b[{j}] = wlm_lightmap_four(third + {j} - WLM_LIGHTMAP_FOURS);\n",
+    "biases": "    b[{j}] = wlm_lightmap_weight(third + {j} - WLM_LIGHTMAP_FOURS);\n",
     "products": "        b[{j}] = wlm_lightmap_add(b[{j}], a, w + {j}, WLM_LIGHTMAP_FOURS);\n",
     "outputs": "    y = wlm_lightmap_add(y, wlm_gelu(b[{j}]), third + 4 * {j}, 1);\n",
 }
@@ -220,6 +253,23 @@ vec3 wlm_colour(ivec2 texel)
 }}
 """
 
+_BEGIN = """
+#ifdef WLM_LIGHTMAP_GROUP
+// Shares the network of a tile in a group of {invocations} invocations: each one calls it once, with a texel of the
+// tile that is the same for all and with its own index, and then decodes texels of this tile only.
+void wlm_lightmap_begin(ivec2 texel, int index)
+{{
+    ivec2 place = texel / {TILE};
+    vec4 tile = wlm_lightmap_entry({head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD);
+    int kind = int(tile.x);
+    int count = kind == 1 ? {static} : kind == 2 ? {weights} : 0;
+    for (int i = index; i < count; i += {invocations})
+        wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i);
+    barrier();
+}}
+#endif
+"""
+
 _MAPPED_KIND = """\
     if (int(tile.x) == 1 || int(tile.x) == 2)
         return wlm_lightmap_mapped(tile, record, inner);
@@ -308,6 +358,9 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
         "planes": columns(2 * dynamic, profile.plane_rows, profile.plane_columns),
         "frames": columns(len(model.frames), TILE, TILE),
     }
+    wide = fours(profile)
+    rest = (4 * wide + 6) * wide + 1  # fours of a network after the weights of its first layer
+    weights = (16 if dynamic else 4) * wide + rest
     gamma, inverse = (", ".join([repr(float(number))] * 3) for number in (profile.gamma, 1.0 / profile.gamma))
     words = {
         "TILE": TILE,
@@ -316,7 +369,7 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
         "columns": model.grid.cols,
         "record": record_fours(model),
         "head": HEAD,
-        "fours": fours(profile),
+        "fours": wide,
         "hidden": profile.hidden,
         "side": side,
         "slices": slices,
@@ -332,6 +385,9 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
         "planes_height": -(-2 * dynamic // across["planes"]) * profile.plane_rows,
         "reach": REACH,
         "beyond": 2 * REACH * REACH + 1,
+        "static": 4 * wide + rest,
+        "weights": weights,
+        "invocations": GROUP_SIZE[0] * GROUP_SIZE[1],
         # repr gives the shortest decimals that are the number again, and always a point or an exponent.
         "gamma": f"vec3({gamma})",
         "inverse": f"vec3({inverse})",
@@ -340,13 +396,19 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
     kinds, images = _MAPPED_KIND if mapped else "", ""
     if "frames" in names:
         kinds, images = kinds + _FRAMES_KIND.format(**words), _FRAMES.format(**words)
-    text = _head(names, words | {"last": "wlm_radiance" if values is None else "wlm_value"})
+    group = ""
+    if mapped:
+        kilobytes = f"{16 * words['weights'] / 1024:.0f}"
+        group = _ABOUT_GROUP.format(columns=GROUP_SIZE[0], rows=GROUP_SIZE[1], kilobytes=kilobytes)
+    text = _head(names, words | {"last": "wlm_radiance" if values is None else "wlm_value", "group": group})
     if "uvt" in names:
         text += _MAPS.format(**words)
     if mapped:
-        units = {name: "".join(line.format(j=j) for j in range(fours(profile))) for name, line in _UNITS.items()}
+        units = {name: "".join(line.format(j=j) for j in range(wide)) for name, line in _UNITS.items()}
         inputs, sums = (_INPUTS.format(**words), _SUMS) if "uvt" in names else ("", "")
-        text += _NETWORK.format(gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words)
+        text += _NETWORK.format(gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words) + _BEGIN.format(
+            **words
+        )
     text += images + _COLOUR.format(kinds=kinds, **words) + _SOURCE.format(**words)
     if values is None:
         return text + _RADIANCE.format(**words)

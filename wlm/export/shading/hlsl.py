@@ -32,6 +32,7 @@ class HlslWriter(Writer):
         "mix": "lerp",
         "uintBitsToFloat": "asfloat",
         "unpackHalf2x16": "wlm_halves",
+        "barrier": "GroupMemoryBarrierWithGroupSync",
     }
 
     def head(self) -> list[str]:
@@ -45,7 +46,7 @@ class HlslWriter(Writer):
         if variable.way == "uniform":
             # A float3 in an array of a constant buffer takes the space of a float4.
             return [f"cbuffer {variable.name}_values", "{", f"    {self.local(variable)};", "};"]
-        return [f"static const {self.local(variable)};"]
+        return [f"{'groupshared' if variable.way == 'shared' else 'static const'} {self.local(variable)};"]
 
     def parameter(self, variable: Variable) -> str:
         way = "" if variable.way == "in" else f"{variable.way} "

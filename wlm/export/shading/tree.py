@@ -42,13 +42,13 @@ class Node:
 
 @dataclass(frozen=True)
 class Variable:
-    """A parameter, constant, local variable, texture, uniform or buffer.
+    """A parameter, constant, local or shared variable, texture, uniform or buffer.
 
     Attributes:
         type: GLSL type.
         name: Name.
         size: Length of an array; None for other types.
-        way: `in`, `out` or `inout` for a parameter or local variable; `const`, `uniform` or `buffer`.
+        way: `in`, `out` or `inout` for a parameter or local variable; `const`, `uniform`, `buffer` or `shared`.
         value: Initial value, or None.
     """
 
@@ -149,7 +149,7 @@ class _Reader:
             elif self.taken("layout"):
                 self._skip_round()
                 shader.items.append((self._buffer(), blank))
-            elif self.word.text in ("uniform", "const"):
+            elif self.word.text in ("uniform", "const", "shared"):
                 variable = self._variable(self.take().text)
                 tail = self._end()
                 if tail:
