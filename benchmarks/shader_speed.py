@@ -3,10 +3,12 @@
 The map has 1024 x 1024 texels with random maps and networks. The rows:
 
 - "ours": the fast decoder at a stored hour, 8 bits per channel, of profiles M and `standard`.
-- "GLSL": the exported shader as a compute shader through OpenGL, which decodes the same hour to half floats; numbers
-  of networks and of the hour are in textures as exported, or by the shader's macros in storage buffers.
-- "WGSL": its translation through wgpu, with the same two places of numbers; a time is the difference of long and short
-  runs, over the difference of their dispatches.
+- "GLSL": the exported functions in a compute shader through OpenGL, which decodes the same hour to half floats; numbers
+  of networks and of the hour are in textures as exported, or by the shader's macros in storage buffers. "groups share a
+  network" is the exported compute shader, with storage buffers.
+- "WGSL": the same translated, through wgpu; a time is the difference of long and short runs, over the difference of
+  their dispatches.
+- "Chromium", on the CPU: the page of a map of 128 x 128 texels, by WebGL2 in software, beside our decoder of this map.
 - "read": a view of 1280 x 720 pixels of four sheets, read trilinearly: from a virtual texture, and from two hours of
   BC7, BC6H and RGB9E5 with mips, interpolated. "nothing" reads the view's coordinates alone, as all others do.
 
@@ -24,6 +26,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks.lightmap_run_time import _PlainCamera, large_model, random_sheet
+from benchmarks.rivals.browser_run import page_time
 from benchmarks.rivals.gl_run import Screen
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
@@ -32,10 +35,12 @@ from wlm.errors import WlmError
 from wlm.export.compute import compute_shader
 from wlm.export.shading import translate
 from wlm.lightmap.bundle import sheet_bundle
+from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.runtime import fast_decoder
 from wlm.lightmap.shader import GROUP_SIZE
-from wlm.lightmap.sheet import Sheet
+from wlm.lightmap.sheet import LIGHT, Sheet
+from wlm.lightmap.tiles import TILE
 from wlm.lightmap.virtual.shader import sheet_words, virtual_glsl
 from wlm.lightmap.virtual.texture import VirtualTexture
 
@@ -96,7 +101,8 @@ def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
     bench = _ShaderBench(quick, device, progress)
     # In software OpenGL compiles the larger network for minutes.
     profiles = _PROFILES[:1] if bench.device == "cpu" else _PROFILES
-    return [*(row for name in profiles for row in bench.profile_rows(name)), *bench.read_rows()]
+    rows = [row for name in profiles for row in bench.profile_rows(name)]
+    return [*rows, *(bench.page_rows() if bench.device == "cpu" else []), *bench.read_rows()]
 
 
 class _ShaderBench(Bench):
@@ -133,6 +139,19 @@ class _ShaderBench(Bench):
             figures = {"decode_ms": duration, "times_ours": duration / ours["decode_ms"], "max_error": error}
             rows.append(self.row(language, f"{name}, {option}", renderer, **figures))
         return rows
+
+    def page_rows(self) -> list[Row]:
+        """Returns the rows of a tile in a browser, and of our decoder of this tile."""
+        self.note("decoding a tile in Chromium")
+        sheet, scene = random_sheet(TILE, np.array(_HOURS), 0, Profile.load("M")), f"a tile, {TILE} x {TILE}"
+        decoder = fast_decoder(sheet, self.device)
+        (ours,) = self.time_rows([(self.row("ours", "M", f"8 bits, {self.mode}", scene=scene), decoder.decode)])
+        try:
+            duration = page_time(LightmapModel("tile", "0" * 16, sheet.profile, {LIGHT: sheet}), self._repeats)
+        except Exception as error:  # whatever a browser says
+            return [ours, self.missing_row("Chromium", "M", error)]
+        figures = {"decode_ms": duration, "times_ours": duration / ours["decode_ms"]}
+        return [ours, self.row("Chromium", "M", "WebGL2 by SwiftShader", scene=scene, **figures)]
 
     def read_rows(self) -> list[Row]:
         """Returns the rows of the ways to read a view."""

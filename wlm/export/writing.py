@@ -93,7 +93,7 @@ def export(
 
 
 def _write_raw(bundle: Bundle, folder: Path, language: str, exact: bool) -> None:
-    entries: dict[str, Any] = {"engine": None, "shader": None}
+    entries: dict[str, Any] = {"engine": None, "shader": None, "compute": None}
     if bundle.shader:
         if exact and not bundle.exact:
             raise WlmError(f"{bundle.name}: exact has no meaning here: the shader uses no texture filter")

@@ -146,9 +146,9 @@ vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 }}
 """
 _UNITS = {
-    "biases": "    b[{j}] = wlm_lightmap_weight(third + {j} - WLM_LIGHTMAP_FOURS);\n",
+    "biases": "    b[{j}] = wlm_lightmap_weight(third - WLM_LIGHTMAP_FOURS + {j});\n",
     "products": "        b[{j}] = wlm_lightmap_add(b[{j}], a, w + {j}, WLM_LIGHTMAP_FOURS);\n",
-    "outputs": "    y = wlm_lightmap_add(y, wlm_gelu(b[{j}]), third + 4 * {j}, 1);\n",
+    "outputs": "    y = wlm_lightmap_add(y, wlm_gelu(b[{j}]), third + {at}, 1);\n",
 }
 """Lines of the network for each four units of the second layer."""
 
@@ -255,8 +255,8 @@ vec3 wlm_colour(ivec2 texel)
 
 _BEGIN = """
 #ifdef WLM_LIGHTMAP_GROUP
-// Shares the network of a tile in a group of {invocations} invocations: each one calls it once, with a texel of the
-// tile that is the same for all and with its own index, and then decodes texels of this tile only.
+// Shares the network of a tile in a group of {invocations} invocations. Each calls it once, with a texel of the tile,
+// the same for all, and its own index, and then decodes texels of this tile only.
 void wlm_lightmap_begin(ivec2 texel, int index)
 {{
     ivec2 place = texel / {TILE};
@@ -404,7 +404,7 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
     if "uvt" in names:
         text += _MAPS.format(**words)
     if mapped:
-        units = {name: "".join(line.format(j=j) for j in range(wide)) for name, line in _UNITS.items()}
+        units = {name: "".join(line.format(j=j, at=4 * j) for j in range(wide)) for name, line in _UNITS.items()}
         inputs, sums = (_INPUTS.format(**words), _SUMS) if "uvt" in names else ("", "")
         text += _NETWORK.format(gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words) + _BEGIN.format(
             **words
