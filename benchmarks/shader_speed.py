@@ -19,7 +19,7 @@ filter has 8 bits for a position between two texels. A way that this machine can
 import re
 import time
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -184,7 +184,8 @@ class _ShaderBench(Bench):
         picture = screen.picture(text, (self._side, self._side), textures, stored, GROUP_SIZE if groups else None)
         return picture.read(), picture.time(self._repeats), screen.name
 
-    def _wgsl(self, made: Bundle, textured: bool, groups: bool) -> tuple[np.ndarray, float, str]:
+    @cached_property
+    def _device_of_wgpu(self) -> tuple[Any, Any]:
         import wgpu
 
         adapters = wgpu.gpu.enumerate_adapters_sync()
@@ -200,6 +201,12 @@ class _ShaderBench(Bench):
             required_features=["texture-compression-bc"],
             required_limits={"max-texture-dimension-2d": side, shared: adapter.limits[shared]},
         )
+        return adapter, gpu
+
+    def _wgsl(self, made: Bundle, textured: bool, groups: bool) -> tuple[np.ndarray, float, str]:
+        import wgpu
+
+        adapter, gpu = self._device_of_wgpu
         text = compute_shader(made, "wgsl") if groups else translate(made.shader + _SHOWN, "wgsl") + _WGSL_MAIN
         for name in () if textured else ("hour", "networks"):
             own = f"wlm_lightmap_{name}"
@@ -218,7 +225,7 @@ class _ShaderBench(Bench):
         kinds = wgpu.TextureUsage
         size = (self._side, self._side, 1)
         out = gpu.create_texture(size=size, format="rgba16float", usage=kinds.STORAGE_BINDING | kinds.COPY_SRC)
-        groups = [
+        bound = [
             gpu.create_bind_group(layout=pipeline.get_bind_group_layout(i), entries=each)
             for i, each in enumerate((entries, [{"binding": 0, "resource": out.create_view()}]))
         ]
@@ -229,7 +236,7 @@ class _ShaderBench(Bench):
             encoder = gpu.create_command_encoder()
             work = encoder.begin_compute_pass()
             work.set_pipeline(pipeline)
-            for i, group in enumerate(groups):
+            for i, group in enumerate(bound):
                 work.set_bind_group(i, group)
             for _ in range(count):
                 work.dispatch_workgroups(self._side // columns, self._side // rows)
