@@ -25,6 +25,7 @@ from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.virtual.clock import Clock
 from wlm.lightmap.virtual.layout import Layout
 from wlm.texels import OFFSETS, nearest_valid
+from wlm.workers import cores, each
 from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap import frames as frame_kernels
 from wlm_kernels.lightmap import matrix_pages
@@ -327,24 +328,29 @@ class TileStore:
 
     def _coarse(self, s: int, own: SheetModel, numbers: np.ndarray, rows: wp.array) -> np.ndarray:
         """Decodes coarse texels of n tiles at all T stored times, uint32 [n, T, COARSE, COARSE]."""
-        count, times = len(numbers), rows.shape[0]
+        count, times, side = len(numbers), rows.shape[0], kernels.COARSE
         self.tiles.slot.assign(self.slot)
-        row, column = np.divmod(numbers, own.grid.cols)
-        one = np.full(count, 1)
-        side = kernels.COARSE
-        place = np.stack([(self._first + s) * one, kernels.COARSE_LEVEL * one, side * row, side * column], 1).astype(
-            np.int32
-        )
-        jobs = kernels.Jobs()
-        jobs.place = self._array(place.repeat(times, 0), wp.vec4i)
-        jobs.target = self._array(np.tile(np.arange(times, dtype=np.int32), count), int)
-        jobs.slot = self._array(np.arange(count * times, dtype=np.int32), int)
-        jobs.part = wp.zeros(count * times, dtype=int, device=self._device)
-        jobs.lead = wp.zeros(count * times, dtype=float, device=self._device)
-        each = -(-side * side * matrix_pages.GROUP // kernels.BLOCK)  # blocks
-        jobs.first = self._array(each * np.arange(count * times + 1, dtype=np.int32), int)
         out = wp.zeros((count * times, side, side), dtype=wp.uint32, device=self._device)
-        self.decode(rows, self.offsets[:1], jobs, True, out)
+
+        def decode(rank: np.ndarray) -> None:
+            place = np.empty((len(rank), 4), np.int32)
+            place[:, 0], place[:, 1] = self._first + s, kernels.COARSE_LEVEL
+            place[:, 2:] = side * np.stack(np.divmod(numbers[rank], own.grid.cols), 1)
+            jobs, most = kernels.Jobs(), len(rank) * times
+            jobs.place = self._array(place.repeat(times, 0), wp.vec4i)
+            jobs.target = self._array(np.tile(np.arange(times, dtype=np.int32), len(rank)), int)
+            jobs.slot = self._array((rank[:, None] * times + np.arange(times)).ravel().astype(np.int32), int)
+            jobs.part, jobs.lead = (wp.zeros(most, dtype=dtype, device=self._device) for dtype in (int, float))
+            blocks = -(-side * side * matrix_pages.GROUP // kernels.BLOCK)
+            jobs.first = self._array(blocks * np.arange(most + 1, dtype=np.int32), int)
+            self.decode(rows, self.offsets[:1], jobs, True, out)
+
+        ranks = np.arange(count)
+        if self._device == "cpu":  # a launch takes one core
+            wp.load_module(self.kernel.module, "cpu", block_dim=kernels.BLOCK)
+            list(each(decode, np.array_split(ranks, min(cores(), count))))
+        else:
+            decode(ranks)
         return out.numpy().reshape(count, times, side, side)
 
     def _fill(self, own: SheetModel, words: np.ndarray, slot: np.ndarray) -> np.ndarray:
