@@ -24,7 +24,7 @@ SHAPES = [
     {"support": "sphere"},
     {"latent": 1, "hidden": 8, "bits": 4, "outputs": 3},
     {"latent": 4, "outputs": 5, "count": 1},
-    {"turn": 0.0},
+    {"turn": 0.0, "error": "absolute"},
     {"latent": 13, "hidden": 24, "bits": 16, "outputs": 12, "probes": 7},
 ]
 _VALUES = """

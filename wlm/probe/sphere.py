@@ -18,6 +18,12 @@ def sh_count(outputs: int) -> int | None:
     return count if count > 0 and outputs == 3 * count and math.isqrt(count) ** 2 == count else None
 
 
+def ambient_numbers(outputs: int) -> int:
+    """Returns how many of a probe's first numbers are ambient light, which is never negative: 3 if a probe with
+    `outputs` numbers holds spherical harmonics, else 0."""
+    return 0 if sh_count(outputs) is None else 3
+
+
 def coefficient_bands(coefficients: int) -> np.ndarray:
     """Returns the band l of each coefficient, int64 [C]: 0, 1, 1, 1, 2, ...
 
@@ -93,7 +99,8 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
         normals: [M, 3], of unit length.
 
     Returns:
-        float64 [..., M, 3], pi times the radiance if that is constant.
+        float64 [..., M, 3], pi times the radiance if that is constant. Where few bands ring below 0, it is 0: a surface
+        receives no negative light.
 
     Raises:
         ValueError: A shape is different, a normal's length is not 1, or C is not a square.
@@ -101,7 +108,7 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
     values = np.asarray(values, np.float64)
     if values.ndim < 2 or values.shape[-1] != 3:
         raise ValueError(f"values: expected [..., C, 3], got {values.shape}")
-    return irradiance_weights(normals, values.shape[-2]) @ values
+    return np.maximum(irradiance_weights(normals, values.shape[-2]) @ values, 0.0)
 
 
 def irradiance_weights(normals: np.ndarray, coefficients: int) -> np.ndarray:

@@ -143,7 +143,7 @@ class _ProbeScene(Scene):
             at_vertices = probes.decode(self.geometry.position.astype(np.float64))
             at_vertices = at_vertices.reshape(len(at_vertices), -1, 3)
             weights = irradiance_weights(_normals(self.geometry), at_vertices.shape[1])
-            self._surface = np.einsum("vc,vcd->vd", weights, at_vertices) / math.pi
+            self._surface = np.maximum(np.einsum("vc,vcd->vd", weights, at_vertices), 0.0) / math.pi
 
     def draw(self, canvas: Canvas, state: State) -> None:
         display = state.display(self._brightness)
