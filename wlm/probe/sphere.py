@@ -99,8 +99,7 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
         normals: [M, 3], of unit length.
 
     Returns:
-        float64 [..., M, 3], pi times the radiance if that is constant. Where few bands ring below 0, it is 0: a surface
-        receives no negative light.
+        float64 [..., M, 3], pi times the radiance if that is constant. Few bands ring below 0: clamp what is shown.
 
     Raises:
         ValueError: A shape is different, a normal's length is not 1, or C is not a square.
@@ -108,7 +107,7 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
     values = np.asarray(values, np.float64)
     if values.ndim < 2 or values.shape[-1] != 3:
         raise ValueError(f"values: expected [..., C, 3], got {values.shape}")
-    return np.maximum(irradiance_weights(normals, values.shape[-2]) @ values, 0.0)
+    return irradiance_weights(normals, values.shape[-2]) @ values
 
 
 def irradiance_weights(normals: np.ndarray, coefficients: int) -> np.ndarray:
