@@ -72,9 +72,6 @@ def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
 
     Returns:
         An array that shares the tensor's memory and keeps it alive.
-
-    Raises:
-        ValueError: The tensor doesn't fit the type.
     """
     # Wrapping a tensor doesn't initialise Warp, unlike every other call.
     wp.init()
@@ -153,9 +150,6 @@ class StepGraph:
         step: The work, in torch and Warp, on `device`.
         device: A result of `check_device`.
         warmup: Number of eager calls before the capture, at least 1.
-
-    Raises:
-        ValueError: `warmup` is less than 1.
     """
 
     def __init__(self, step: Callable[[], None], device: str, warmup: int = 3) -> None:

@@ -103,20 +103,11 @@ def psnr_from_mse(error: float, peak: float) -> float:
 
 
 def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray, data_range: float) -> float:
-    """Returns the mean SSIM over the valid texels whose window lies inside the image.
+    """Returns the mean SSIM, for a signal of the given range, of images [H, W, C] over the texels of a mask [H, W]
+    whose window lies inside the image; NaN if there is none or the range is zero.
 
-    Outside the mask both images take the reference's nearest valid value, so that decoded values there do not
-    affect windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
-
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, true where a texel counts.
-        data_range: The signal's range in the images' units.
-
-    Returns:
-        The mean; NaN where the image is smaller than the window, no valid texel has its window inside, or the
-        range is zero.
+    Outside the mask both images take the reference's nearest valid value, so that decoded values there do not affect
+    windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
     """
     ref, test, valid = check_pair(ref, test, mask, "ssim")
     filled = fill_gaps(ref, valid)
@@ -146,17 +137,11 @@ def _ssim_filled(ref: np.ndarray, test: np.ndarray, valid: np.ndarray, data_rang
 
 
 def flip_exposures(ref: np.ndarray, valid: np.ndarray) -> tuple[float, float] | None:
-    """Chooses the first and last exposure for HDR-FLIP, from percentiles of the valid reference's luminance.
+    """Chooses the first and last exposure for HDR-FLIP, `(start, stop)` in stops (log2), from the reference's luminance
+    where `valid`; None where no valid texel is above zero.
 
-    HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of
-    the texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
-
-    Args:
-        ref: `[H, W, 3]`, linear RGB, finite where valid.
-        valid: bool `[H, W]`, true where a texel counts.
-
-    Returns:
-        `(start, stop)` in stops (log2), start <= stop; None where no valid texel is above zero.
+    HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of the
+    texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
     """
     _check_rgb(ref)
     luminance = np.maximum(ref[valid], 0.0) @ _LUMINANCE
@@ -169,12 +154,8 @@ def flip_exposures(ref: np.ndarray, valid: np.ndarray) -> tuple[float, float] | 
 
 
 def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """LDR-FLIP between two display images, sRGB in [0, 1], [H, W, 3], at flip_evaluator's default of 67 pixels per
-    degree.
-
-    Returns:
-        `[H, W]` float64 in [0, 1].
-    """
+    """Computes LDR-FLIP, float64 [H, W] in [0, 1], between two display images, sRGB in [0, 1], [H, W, 3], at
+    flip_evaluator's default of 67 pixels per degree."""
     ref, test, _ = check_pair(ref, test, None, "flip")
     _check_rgb(ref)
     return _ldr_flip(ref, test, srgb=True)
@@ -233,16 +214,11 @@ def _check_rgb(image: np.ndarray) -> None:
 
 
 def picture_error(reference: np.ndarray, test: np.ndarray, seen: np.ndarray, flip: bool = True) -> tuple[float, float]:
-    """Computes the error of a test picture against a reference picture.
+    """Returns the mean squared error and the mean LDR-FLIP, or NaN without `flip`, of the covered pixels of a test
+    picture.
 
-    Args:
-        reference: [H, W, 3], sRGB in [0, 1]; uncovered pixels have the same value in both images.
-        test: [H, W, 3], sRGB in [0, 1].
-        seen: bool [H, W], true for covered pixels, at least one.
-        flip: Whether FLIP is computed too.
-
-    Returns:
-        The mean squared error and the mean LDR-FLIP, or NaN, of the covered pixels.
+    Both pictures are [H, W, 3], sRGB in [0, 1]; `seen`, bool [H, W], is true for covered pixels, at least one; all
+    others have the same value in both.
     """
     error = float(np.square(reference - test, dtype=np.float64)[seen].mean())
     if not flip:
@@ -477,9 +453,7 @@ def evaluate_frame(
     height, width = valid.shape
     shape = (-(-height // tile), -(-width // tile))
     result = FrameMetrics(
-        *(np.full(shape, math.nan) for _ in range(5)),
-        valid=np.zeros(shape, np.int64),
-        metrics=tuple(metrics),
+        *(np.full(shape, math.nan) for _ in range(5)), valid=np.zeros(shape, np.int64), metrics=tuple(metrics)
     )
     error = None
     if "flip" in metrics and valid.any():
@@ -544,14 +518,10 @@ def summarise(frames: Sequence[FrameMetrics], times: Sequence[float] | np.ndarra
 
 
 def lowest(psnr: np.ndarray, times: Sequence[float] | np.ndarray) -> dict[str, float | int] | None:
-    """Returns the lowest PSNR of tiles and its place.
+    """Returns the lowest PSNR of tiles, [T, ny, nx] in dB, NaN for tiles without a score, and its place; None if all
+    are NaN.
 
-    Args:
-        psnr: [T, ny, nx], in dB; NaN for tiles without a score.
-        times: The T times.
-
-    Returns:
-        `psnr`; `time`; `tile`, the number of the tile, row by row; its `row` and `column`. None if all are NaN.
+    The keys are `psnr`; `time`; `tile`, the number of the tile, row by row; its `row` and `column`.
     """
     if np.isnan(psnr).all():
         return None

@@ -148,9 +148,6 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact", outputs: int = 3) -> 
         hidden: H >= 1, width of the two hidden layers.
         gelu: One of `GELUS`.
         outputs: O >= 1, number of outputs.
-
-    Raises:
-        ValueError: A size is below 1, or the activation is unknown.
     """
     if min(inputs, hidden, outputs) < 1 or gelu not in GELUS:
         raise ValueError(f"MLP: expected sizes above 0 and GELU {GELUS}, got {inputs, hidden, outputs, gelu}")

@@ -172,34 +172,6 @@ def test_the_unit_of_radiance_does_not_matter(space: str):
     assert not tune(black, uv, Textures(0 * start.colour, start.lut), profile).colour.any()
 
 
-def test_rates_that_fall():
-    """The first step is as long as at full rate, the last one as short as it is to be; less noise is left."""
-    mesh, profile = _box(), _profile(space="uv", steps=40, final_rate=0.1)
-    uv, start = _start(mesh, profile)
-    step = cascade._Step(mesh.sheets[0], uv, start, profile, 0, "cpu")
-    unit = mesh.sheets[0].lightmap[mesh.sheets[0].mask].mean()
-    before = step.textures().colour
-    step()
-    assert np.abs(step.textures().colour - before).max() / unit == pytest.approx(profile.colour_rate, rel=1e-3)
-    for _ in range(39):
-        step()
-    np.testing.assert_allclose([float(rate) for rate in step._rate], [1e-3, 2e-4], rtol=1e-5)
-    rough = _profile(space="uv", steps=60, colour_rate=0.03, lut_rate=5e-3)
-    constant, decayed = (tune(mesh, uv, start, rough.model_copy(update={"final_rate": share})) for share in (1.0, 0.01))
-    assert _error(mesh, uv, decayed.colour, decayed.lut) < 0.9 * _error(mesh, uv, constant.colour, constant.lut)
-
-
-def test_no_steps_and_progress():
-    mesh, profile = _box(), _profile(steps=0)
-    uv, start = _start(mesh, profile)
-    tuned = tune(mesh, uv, start, profile, progress=lambda *_: pytest.fail("nothing is done"))
-    close(tuned.colour, start.colour, 1e-6)
-    np.testing.assert_array_equal(tuned.lut, start.lut)
-    reports = []
-    tune(mesh, uv, start, _profile(steps=7), progress=reports.append)
-    assert (reports[-1].stage, reports[-1].done, reports[-1].total) == ("fit", 7, 7)
-
-
 def test_a_fit_that_diverged():
     mesh, profile = _box(), _profile(steps=1)
     uv, start = _start(mesh, profile)

@@ -19,7 +19,7 @@ from wlm.lightmap.tiles import TileKind
 from wlm_kernels.lightmap.matrix_decode import pack_networks
 
 KINDS = (3, 2, 3, 1)  # dynamic, static, dynamic, constant
-STORED, BETWEEN = (0.0, 13.0), (3.3, 21.7)  # 21.7 lies between the last stored time and the next day's first
+BETWEEN = (3.3, 21.7)  # 21.7 lies between the last stored time and the next day's first
 
 
 def _model(hidden: int, gelu: str, **settings) -> SheetModel:

@@ -237,13 +237,6 @@ def test_gaussians_by_hand_and_by_the_tape(device: str):
         close(grad, arguments[name].grad, 1e-5, name)
 
 
-def test_what_a_network_refuses():
-    with pytest.raises(ValueError, match="^MLP: expected sizes above 0"):
-        funcs.network(0, 8, 3)
-    with pytest.raises(ValueError, match="^MLP: expected sizes above 0 and GELU .*relu"):
-        funcs.network(2, 8, 3, "relu")
-
-
 @pytest.mark.slow
 def test_compiled_for_cuda(tmp_path: Path):
     """The functions and their gradients compile for a GPU on machines without one."""

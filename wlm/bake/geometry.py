@@ -231,12 +231,7 @@ def unwrap(
         rows = np.column_stack([vertex.astype(np.float64), corner])
         unique, index = np.unique(rows, axis=0, return_inverse=True)
         replacements.append(
-            Replacement(
-                primitive,
-                unique[:, 0].astype(np.int64),
-                index.reshape(-1, 3).astype(np.int32),
-                unique[:, 1:],
-            )
+            Replacement(primitive, unique[:, 0].astype(np.int64), index.reshape(-1, 3).astype(np.int32), unique[:, 1:])
         )
     return replacements
 

@@ -60,11 +60,7 @@ def place_probes(settings: ProbeSettings, geometry: Geometry) -> np.ndarray:
 
 
 def bake_probes(
-    task: Task,
-    *,
-    device: str = "cpu",
-    checkpoint: Checkpoint | None = None,
-    progress: OnProgress | None = None,
+    task: Task, *, device: str = "cpu", checkpoint: Checkpoint | None = None, progress: OnProgress | None = None
 ) -> BakedProbes:
     """Bakes a scene's probes at each of its hours.
 

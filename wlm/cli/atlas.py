@@ -165,8 +165,7 @@ def decode(
     sheet: Annotated[int, typer.Option(min=0, help="Number of the lightmap in the list of wlm info, from 0.")] = 0,
     state: Annotated[float, typer.Option(min=0.0, help="Number of the state, from 0; 1.5 mixes states 1 and 2.")] = 0.0,
     view: Annotated[
-        int | None,
-        typer.Option(min=0, help="Number, from 0, of a camera of wlm evaluate: draw its view instead."),
+        int | None, typer.Option(min=0, help="Number, from 0, of a camera of wlm evaluate: draw its view instead.")
     ] = None,
     views: _Views = None,
     resolution: _Resolution = None,

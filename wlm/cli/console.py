@@ -65,11 +65,9 @@ def show(content: Table) -> None:
 def show_figures(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str | float]], text: Sequence[str] = ()
 ) -> None:
-    """Prints a table of texts and numbers to stdout.
+    """Prints a table of texts and numbers, a cell for each column; `table` explains the other arguments.
 
-    Args:
-        title, columns, text: Arguments of `table`.
-        rows: A cell for each column. Integers are written in full, floats with four digits.
+    Integers are written in full, floats with four digits.
     """
     content = table(title, columns, text)
     for row in rows:
@@ -88,12 +86,9 @@ def _figure(value: Any) -> str:
 
 
 def show_facts(title: str, facts: Mapping[str, Any]) -> None:
-    """Prints facts as a table of two columns.
+    """Prints facts, JSON values by name, as a table of two columns; underscores in names become spaces.
 
-    Args:
-        title: Title of the table.
-        facts: JSON values by name; underscores in names become spaces. A mapping becomes a section of the table, in
-            which each line has the name of the mapping and that of an entry.
+    A mapping becomes a section of the table, in which each line has the name of the mapping and that of an entry.
     """
     rows = table(title, ["", "value"])
     for name, value in facts.items():
@@ -249,12 +244,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
         yield line
         return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
     with Bar(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=None, note="")
 

@@ -248,11 +248,7 @@ def export(
     models.export(file, output, engine, shader, exact, device)
 
 
-def info(
-    file: ModelFile,
-    as_json: AsJson = False,
-    device: Device = "cpu",
-) -> None:
+def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> None:
     """Show what a file of lightmaps contains, and its memory on a device."""
     from wlm.lightmap.codec import group_sizes
 

@@ -34,20 +34,9 @@ def fit(
 ) -> tuple[Any, Any, dict[str, Any]]:
     """Compresses an input into a file; shows progress, keeps a checkpoint, and prints warnings.
 
-    Args:
-        system: Name of the system, whose package has `Profile`, `compress` and `open_checkpoint`.
-        load: Reads the input, after the settings have been checked.
-        output: The `.wlm` to write.
-        profile: Name of the profile or path of a YAML file.
-        settings: Settings that replace those of the profile, by name.
-        seed, device, resume, every: Values of the options `--seed`, `--device`, `--resume` and `--checkpoint-every`.
-        options: Further options of `compress`.
-
-    Returns:
-        The input, the model, and the first facts of the result's table.
-
-    Raises:
-        WlmError: An option, the input or the output is wrong.
+    The package of the system has `Profile`, `compress` and `open_checkpoint`. `load` reads the input, after the
+    settings, which replace those of the profile, have been checked; `options` are further options of `compress`.
+    Returns the input, the model, and the first facts of the result's table.
     """
     check_output(output, ".wlm")
     quiet_warp()
@@ -68,13 +57,7 @@ def fit(
 
 
 def export(
-    file: Path,
-    output: Path,
-    engine: str | None,
-    shader: str | None,
-    exact: bool,
-    device: str,
-    **options: Any,
+    file: Path, output: Path, engine: str | None, shader: str | None, exact: bool, device: str, **options: Any
 ) -> None:
     """Exports a model to a folder and lists the written files. `options` that are None are left out.
 

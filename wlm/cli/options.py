@@ -42,8 +42,7 @@ Encoding = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Trust = Annotated[
-    bool,
-    typer.Option("--trust", help="Trust the input file: it may name files in other folders and have any size."),
+    bool, typer.Option("--trust", help="Trust the input file: it may name files in other folders and have any size.")
 ]
 Profile = Annotated[str, typer.Option(metavar="NAME|FILE.yaml", help="Name of a settings profile, or a YAML file.")]
 Engine = Annotated[

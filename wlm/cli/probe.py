@@ -213,7 +213,16 @@ def export(
 
 
 def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> None:
-    """Show what a file of light probes contains, and its memory on a device."""
+    """Show what a file of light probes contains, and its memory on a device, with that of a volume of its probes."""
+
+    def volume_bytes(model: "ProbeModel") -> dict[str, int]:
+        import numpy as np
+
+        from wlm.probe.volume.cascade import Volume
+        from wlm.probe.volume.light import StoredLight
+
+        light = StoredLight(np.zeros((model.probes, model.outputs)), device)
+        return Volume(model.stored_positions(), light, live=model.live).memory
 
     def facts(model: "ProbeModel") -> dict[str, Any]:
         return {
@@ -224,6 +233,7 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
             "bits_per_probe": file.stat().st_size * 8 / model.probes,
             "positions_stored": model.has_positions,
             "GPU_bytes": model.content.nbytes,
+            **({"volume_bytes": volume_bytes(model)} if model.has_positions else {}),
             **model.content.facts(),
         }
 

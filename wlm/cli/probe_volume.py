@@ -65,6 +65,10 @@ def volume(
     lit = known.position[known.live]
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else np.array(at))
     show_files(output, export(volume_bundle(made), output))
+    rows = table("the volume on the device", ["part", "bytes"])
+    for part, size in (made.memory | {"in all": made.memory_bytes}).items():
+        rows.add_row(part, f"{size:,}")
+    show(rows)
 
 
 def score_walks(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:
@@ -73,10 +77,7 @@ def score_walks(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[st
     from wlm.probe.volume.walk import score_volume
 
     decoder = model.decoder(device, position=probes.position)
-    lights = {
-        "original": StoredLight(probes.values, decoder.device),
-        "decoded": decoder.light(probes.position),
-    }
+    lights = {"original": StoredLight(probes.values, decoder.device), "decoded": decoder.light(probes.position)}
     with running("walk") as progress:
         return {name: score_volume(probes, light, progress=progress) for name, light in lights.items()}
 
@@ -90,6 +91,8 @@ def show_walks(walks: dict[str, dict[str, Any]]) -> None:
         rows.add_row(name, *(number(figures[key], ".2f") for figures in walks.values()))
     for name, key in _COSTS.items():
         rows.add_row(name, *(number(figures[key]["mean"], ".3g") for figures in walks.values()))
+    for part in next(iter(walks.values()))["memory"]:
+        rows.add_row(f"bytes of the {part}", *(f"{figures['memory'][part]:,}" for figures in walks.values()))
     rows.add_row("bytes of the volume", *(f"{figures['memory_bytes']:,}" for figures in walks.values()))
     show(rows)
 

@@ -19,16 +19,7 @@ from wlm.cli.console import (
     table,
     write_json,
 )
-from wlm.cli.options import (
-    AsJson,
-    CheckpointEvery,
-    Device,
-    ModelFile,
-    ReportFile,
-    Resume,
-    Seed,
-    output_option,
-)
+from wlm.cli.options import AsJson, CheckpointEvery, Device, ModelFile, ReportFile, Resume, Seed, output_option
 from wlm.cli.settings import Generated, with_settings
 
 if TYPE_CHECKING:

@@ -67,11 +67,7 @@ def make_face(
 
 
 def bounded_axes(faces: Mapping[str, Face]) -> tuple[int, int, int]:
-    """Returns 1 for each axis that has faces and 0 for each periodic axis.
-
-    Raises:
-        ValueError: Only one end of an axis has a face.
-    """
+    """Returns 1 for each axis that has faces and 0 for each periodic axis."""
     bounded = []
     for low, high in zip(FACES[::2], FACES[1::2], strict=True):
         if (low in faces) != (high in faces):

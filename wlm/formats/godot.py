@@ -123,11 +123,10 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
 
 
 def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the light probes of a Godot 4 lightmap bake.
+    """Reads the light probes of a Godot 4 lightmap bake, at least one.
 
-    Returns:
-        The positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB (the module's
-        description defines them); N is at least 1.
+    Returns the positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB, which the
+    module's description defines.
     """
     points, colours, _, _ = _read(path)
     return points, colours.reshape(len(points), COEFFICIENTS, 4)[..., :3].copy()

@@ -88,12 +88,8 @@ def read_light(path: str | os.PathLike[str], notes: _Notes | None = None) -> tup
 
 
 def noted(labels: Sequence[str], notes: Sequence[Sequence[str]]) -> list[str]:
-    """Returns the notes about several files, one line for each text: the first file that has it, and how many more do.
-
-    Args:
-        labels: The name of each file.
-        notes: The lines about each file, as `read_light` adds them.
-    """
+    """Returns the notes about several files, the lines that `read_light` adds, one line for each text: the label of the
+    first file that has it, and how many more do."""
     found: dict[str, list[str]] = {}
     for label, lines in zip(labels, notes, strict=True):
         for line in lines:

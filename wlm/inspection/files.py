@@ -193,14 +193,11 @@ def describe_volume(path: Path, volume: "DensityVolume", file: Path, output: str
 
 
 def scene_command(mesh: Path, *light: Path) -> tuple[str, tuple[str, ...]]:
-    """Reads a mesh with its lightmaps.
+    """Reads a mesh with its lightmaps: a lightmap, a folder or a list of them, or none for those that a glTF file names
+    itself.
 
-    Args:
-        mesh: The file of the mesh.
-        light: A lightmap, a folder or a list of lightmaps; none for those that a glTF file names itself.
-
-    Returns:
-        The command that compresses them, "" if they cannot be read together, and problems and assumptions, a line each.
+    Returns the command that compresses them, "" if they cannot be read together, and problems and assumptions, a line
+    each.
     """
     # This imports torch.
     from wlm.atlas.data import load as load_scene

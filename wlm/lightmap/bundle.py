@@ -136,20 +136,12 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
 
 
 def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
-    """Computes the tables that the shader reads, one for each given hour.
+    """Computes the tables that the shader reads for stored times, or for any times if the model interpolates with the
+    network (`Profile.interpolation`): float32 [times, rows, 4], two rows, then `record_fours` rows for each tile.
 
     The bundle's JSON document describes the content of a table under "about" and "hours". In addition, the fourth
-    number of a table is the number of tile columns of the grid.
-
-    Args:
-        model: The sheet.
-        times: Stored times, or any times if the model interpolates with the network (`Profile.interpolation`).
-
-    Returns:
-        float32 [times, rows, 4]: two rows, then `record_fours` rows for each tile.
-
-    Raises:
-        ValueError: A time lies between two stored times, and the model blends their radiance, which needs two tables.
+    number of a table is the number of tile columns of the grid. Raises a ValueError for a time between two stored times
+    if the model blends their radiance, which needs two tables.
     """
     axis, profile, size = model.axis, model.profile, record_fours(model)
     tables = np.zeros((len(times), HEAD + model.kind.size * size, 4), np.float32)

@@ -48,12 +48,7 @@ def groups_of(sheets: Iterable[Sheet]) -> tuple[str, ...]:
 
 
 def in_groups(sheets: Mapping[Sheet, T], sheet: Sheet) -> dict[Sheet, T]:
-    """Returns the entries of one sheet in all groups that have it.
-
-    Args:
-        sheets: Sheets of a set or a model.
-        sheet: The sheet of any of the groups.
-    """
+    """Returns the entries of one sheet, given as that of any group, in all groups that have it."""
     return {one: own for one, own in sheets.items() if one.plain == sheet.plain}
 
 

@@ -62,15 +62,11 @@ _KINDS = {
 
 
 def encode_scale(values: np.ndarray, gamma: float, up: bool = False) -> np.ndarray:
-    """Encodes values >= 0 as 8-bit logarithmic codes: code 0 is 0, codes 1 to 255 divide `SCALE_SPAN` evenly.
+    """Encodes values >= 0 in gamma space, of any shape, as 8-bit logarithmic codes: code 0 is 0, codes 1 to 255 divide
+    `SCALE_SPAN` evenly; `up` rounds up, for upper bounds.
 
     At gamma 2.2 one step is 4.7%. The span is fixed, so that the bytes of a tile do not depend on other tiles. Values
     above 0 but below the span take code 1.
-
-    Args:
-        values: Any shape, in gamma space.
-        gamma: Gamma of that space.
-        up: Whether to round up, for upper bounds, instead of to the nearest code.
     """
     low, high = (bound / gamma for bound in SCALE_SPAN)
     with np.errstate(divide="ignore"):

@@ -77,15 +77,8 @@ class Views:
         indices: Sequence[int] | np.ndarray | None = None,
         device: str = "cpu",
     ) -> None:
-        """Places the cameras.
-
-        Args:
-            lightmaps: The sheet, whose times, mask and exposures are used.
-            geometry: The mesh, with UVs.
-            count: Number of cameras.
-            indices: Indices of the times that will be added; None: all.
-            device: Device that draws: "cpu", "cuda" or "cuda:N".
-        """
+        """Places `count` cameras for the times of a sheet that will be added, all or those with the given indices;
+        `geometry` has UVs."""
         self._lightmaps, self._geometry, self._device = lightmaps, geometry, check_device(device)
         low, high = geometry.box
         if not (high > low).any():
@@ -136,12 +129,8 @@ def views_of(
 ) -> tuple[Views | None, list[str]]:
     """Makes the `Views` of a sheet, from the mesh that the sheet names.
 
-    Args:
-        lightmaps, count, indices, device: As for `Views`.
-
-    Returns:
-        The views, or None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh
-        cannot be read, else none.
+    Returns None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh cannot be
+    read, else none.
     """
     if count < 0:
         raise WlmError(f"views: expected at least 0, got {count}")

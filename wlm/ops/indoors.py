@@ -49,12 +49,9 @@ class Indoors:
     height: float
 
     def views(self, count: int, seed: int = 0) -> list[Viewpoint]:
-        """Creates views from the eye positions in turn, with directions spread evenly around the horizon and slightly
-        up and down; the list is empty if there is no eye position.
-
-        Args:
-            count: Number of views.
-            seed: Selects a rotation of all directions and the first eye position.
+        """Creates `count` views from the eye positions in turn, with directions spread evenly around the horizon and
+        slightly up and down; none if there is no eye position. `seed` selects a rotation of all directions and the
+        first eye position.
         """
         if not len(self.eye):
             return []

@@ -14,7 +14,7 @@ from wlm.system import OnProgress, load
 from wlm.view.scene import Scene
 
 _Path = str | os.PathLike[str]
-_EXPECTED = "expected a .wlm, a lightmap, a set of lightmaps, light probes, or smoke"
+_EXPECTED = "expected a .wlm, a lightmap, a set of lightmaps, light probes, or six-way lightmaps of smoke"
 
 
 def open_scene(
@@ -25,7 +25,6 @@ def open_scene(
     key: str | None = None,
     walk: _Path | None = None,
     block: float | None = None,
-    extinction: float | None = None,
     flat: bool = False,
     up: Literal["y", "z"] = "y",
     progress: OnProgress | None = None,
@@ -39,13 +38,11 @@ def open_scene(
         key: Name of the array to show of a probe file with several.
         walk: File with the viewpoints of the cascaded volume, as `wlm.probe.load_positions` reads it.
         block: Side of the cascaded volume's finest blocks; None to derive it from the probes' spacing.
-        extinction: Extinction of a volume of smoke, per unit of length at density 1.
         flat: Whether a lightmap is shown unwrapped, although its mesh is known.
         up: The axis that points up.
         progress: Called about twice a second while frames of smoke are read.
     """
-    options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "block": block}
-    options |= {"extinction": extinction, "flat": flat}
+    options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "block": block, "flat": flat}
     given = {name: value for name, value in options.items() if value not in (None, False)}
     kind, paths = content_of(files)
     if kind not in _OPENERS:
@@ -127,13 +124,6 @@ def _picture(paths: list[Path], title: str, up: int, mesh: _Path | None = None, 
     return lightmap_scene(None, from_arrays(light, [0.0], name=title).light, title=title, up=up)
 
 
-def _volume(paths: list[Path], title: str, up: int, extinction: float | None = None) -> Scene:
-    from wlm.smoke.data import load_frames
-    from wlm.view.smoke_scene import volume_scene
-
-    return volume_scene(load_frames(paths[0], extinction=extinction), title=title, up=up)
-
-
 def _six_way(paths: list[Path], title: str, up: int, progress: OnProgress | None = None) -> Scene:
     from wlm.view.smoke_scene import six_way_scene
 
@@ -148,11 +138,11 @@ _OPENERS: dict[str, Callable[..., Scene]] = {
     "probes": _probes,
     "set": _lightmap_set,
     "six-way": _six_way,
-    "volume": _volume,
 }
 _REASONS = {
     "mesh": "a mesh has no light of its own; expected the light, with this as --mesh",
     "smoke": "a network has no picture of its own; expected the lightmaps that it predicts",
+    "volume": "a volume of smoke is drawn by wlm smoke light; expected six-way lightmaps",
 }
 
 

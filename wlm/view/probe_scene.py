@@ -180,7 +180,7 @@ class _ProbeScene(Scene):
     def caption(self, state: State) -> str:
         text = self.probes.note
         if state.view == "volume" and self._stats is not None:
-            held, waiting = self.volume.unscroll()[1].sum(), self._stats.left
+            held, waiting = sum(valid.sum() for valid in self.volume.unscroll()[1]), self._stats.left
             size = self.volume.sizes[0]
             text += f"; {held:,} blocks, the finest {size:.3g} wide, {self._stats.updated} new, {waiting:,} waiting"
         return text
@@ -210,7 +210,7 @@ class _ProbeScene(Scene):
             self._frame = frame
         values, valid = self.volume.unscroll()
         centres, sides, light = [], [], []
-        side, inner = self.volume.side, None
+        inner = None
         for level, size in enumerate(self.volume.sizes):
             place = np.argwhere(valid[level])
             centre = (self.volume.base[level] + place + 0.5) * size
@@ -219,7 +219,7 @@ class _ProbeScene(Scene):
             if inner is not None:
                 seen = ((centre < inner[0]) | (centre > inner[1])).any(1)
             low = self.volume.base[level] * size
-            inner = low, low + side * size
+            inner = low, low + self.volume.sides[level] * size
             canvas.box(0, windows[level], *inner, _WINDOWS[level % len(_WINDOWS)])
             centres.append(centre[seen])
             sides.append(np.full(seen.sum(), _SHRUNK * size))

@@ -97,10 +97,6 @@ def run(
 
     Yields:
         The frames. Each stage waits for the device, so that its duration is measured separately.
-
-    Raises:
-        ValueError: Six-way lighting with a perspective camera.
-        WlmError: As `wlm.smoke.simulation.make_solver`; an obstacle is too fast; or the simulation diverged.
     """
     lighting = Lighting(scene.smoke.albedo) if lighting is None else lighting
     solver = make_solver(scene, device=device)
@@ -153,15 +149,10 @@ class _Clock:
 
 
 def write_all(frames: Iterator[Frame], write: Callable[[int, np.ndarray], None]) -> tuple[dict[str, list[float]], bool]:
-    """Writes frames as they are made.
+    """Passes each frame of `run` to `write`, a function of its number and its pixels.
 
-    Args:
-        frames: Frames of `run`.
-        write: Function of a frame's number and its pixels.
-
-    Returns:
-        The durations of each stage, "writing" among them, one for each frame that had the stage; and whether any frame
-        has smoke.
+    Returns the durations of each stage, "writing" among them, one for each frame that had the stage; and whether any
+    frame has smoke.
     """
     smoke = False
     seconds: dict[str, list[float]] = {}

@@ -305,9 +305,6 @@ def make_box(coarse: Sequence[int], refinement: int, ends: Sequence[tuple[int, i
         coarse: Coarse cells along x, y and z.
         refinement: Fine cells along an edge of a coarse cell, at least 1.
         ends: For each axis the kind of its low and its high end: `PERIODIC`, `OPEN` or `CLOSED`.
-
-    Raises:
-        ValueError: The refinement is below 1, only one end of an axis is periodic, or there are too many fine cells.
     """
     if refinement < 1:
         raise ValueError(f"refinement: expected at least 1, got {refinement}")

@@ -204,9 +204,6 @@ def codes(filter: str, boundary: str) -> tuple[int, int]:
     Args:
         filter: "linear" interpolates between the four nearest texels; "nearest" reads the nearest one.
         boundary: "clamp", "wrap" or "mirror", see the module.
-
-    Raises:
-        ValueError: The filter or the boundary mode is unknown.
     """
     for name, value, names in (("filter", filter, FILTERS), ("boundary", boundary, BOUNDARIES)):
         if value not in names:

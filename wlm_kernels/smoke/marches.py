@@ -241,9 +241,6 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
         view: An orthographic camera, [H, W] pixels.
         march: Settings. The default cutoff causes an error below 1e-3 in every plane.
         out: float [9, H, W], written: the images `PLANES`, each light of irradiance 4 pi.
-
-    Raises:
-        ValueError: The camera is in perspective.
     """
     require_orthographic(view, "six-way lightmaps")
     if march.step < BRICK:
@@ -408,9 +405,6 @@ def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: 
         reach: Distance in voxels that smoke with a velocity of 1 moves between the frames.
         march: Only its step and cutoff are used; samples lie in the middles of the steps.
         out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.
-
-    Raises:
-        ValueError: The camera is in perspective.
     """
     require_orthographic(view, "motion vectors")
     _motion(medium.in_bricks(), out.shape[1:], [velocity, reach, view, parameters(march)], [out])

@@ -181,9 +181,6 @@ def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
         reach: Edge of a block in pixels: 4, 8, 16 or 32.
         half: Whether the numbers T are half floats; else they are float32.
         cuda: Whether the kernels run on a GPU.
-
-    Raises:
-        ValueError: The edge or the reach is out of its range.
     """
     if edge not in range(1, 16, 2):
         raise ValueError(f"edge: expected an odd number of pixels from 1 to 15, got {edge}")

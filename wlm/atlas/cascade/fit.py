@@ -221,13 +221,7 @@ class _Step:
     """One step of tuning, as a callable. Its buffers are allocated once, so that a CUDA graph may capture the step."""
 
     def __init__(
-        self,
-        sheet: Sheet,
-        uv: np.ndarray,
-        textures: Textures,
-        profile: Profile,
-        seed: int,
-        device: str,
+        self, sheet: Sheet, uv: np.ndarray, textures: Textures, profile: Profile, seed: int, device: str
     ) -> None:
         self._weight = profile.gradient
         # A black lightmap has no mean to divide by, and needs none.
@@ -297,11 +291,7 @@ class _Step:
 
     @torch.no_grad()
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores the arrays that `state` returned.
-
-        Raises:
-            ValueError: The state belongs to another fit; nothing has changed.
-        """
+        """Restores the arrays that `state` returned."""
         table = {"step": Part(np.int32, (1,), least=0, most=len(self._rates))}
         for name, parameter in self._tuned.items():
             shapes = {name: parameter.shape} | {f"{name}.{key}": parameter.shape for key in _MOMENTS[1:]}

@@ -38,13 +38,8 @@ _FILMIC = 1  # of the tones of the script
 
 
 def scene_page(paths: Sequence[Path], *, progress: OnProgress | None = None) -> Page:
-    """Makes the HTML page of a scene: its lightmaps are decoded by the page, and the light of its probes is stored at
-    the smoke and along the paths of moving objects.
-
-    Args:
-        paths: The YAML file.
-        progress: Called about twice a second while smoke and originals are read.
-    """
+    """Makes the HTML page of a scene's YAML file: its lightmaps are decoded by the page, and the light of its probes is
+    stored at the smoke and along the paths of moving objects."""
     with load(paths[0]) as scene:
         return _page(scene, progress)
 

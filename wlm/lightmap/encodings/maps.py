@@ -297,13 +297,11 @@ class MapTiles(DeviceTiles):
         return state
 
     def launch(self, state: decode_kernels.TimeState, rows: wp.array, form: int, out: wp.array) -> None:
-        """Decodes tiles with the same order of operations as the training, one thread per texel.
+        """Decodes the tiles `rows`, int [k], indices into `numbers`, in the training's order of operations, one thread
+        per texel.
 
-        Args:
-            state: From `state`.
-            rows: int [k], indices into `numbers`.
-            form: Output: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for RGB9E5 (uint32).
-            out: [k, 128, 128], written.
+        `form` is the output written to `out`, [k, 128, 128]: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for
+        RGB9E5 (uint32).
         """
         inputs = [*self.arguments, state, self.places, rows]
         wp.launch(self._kernels[form], out.shape, inputs=inputs, outputs=[out], device=self._device)

@@ -8,7 +8,7 @@ from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel, check_points
 from wlm.probe.pca.model import Components
 from wlm.probe.sphere import ambient_numbers
-from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.cascade import SIDE, Volume
 from wlm.probe.volume.light import at_probes
 from wlm.probe.volume.walk import settle
 from wlm_kernels.probe.components import decode_components
@@ -50,7 +50,7 @@ class ComponentDecoder(Decoder):
         values = np.empty((len(points), model.outputs), np.float32)
         covered = np.empty(len(points), bool)
         # One viewpoint for each cube of points; the finest window reaches beyond the cube on all sides.
-        side = 0.5 * volume.side * volume.sizes[0]
+        side = 0.5 * SIDE * volume.sizes[0]
         cube = np.floor((points - own.min(0)) / side)
         for viewpoint in np.unique(cube, axis=0):
             here = (cube == viewpoint).all(1)
