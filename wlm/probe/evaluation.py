@@ -15,6 +15,7 @@ from wlm.errors import WlmError
 from wlm.metrics import LostLight, psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
+from wlm.probe.hours import listed_times
 from wlm.probe.model import ProbeModel
 from wlm.probe.places import nearest_weights
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
@@ -24,6 +25,7 @@ from wlm.system import Report as BaseReport
 NORMALS = 32
 """Number of normals: the mean square of any L2 irradiance over them is within 6% of that over the sphere, 0.3 dB."""
 
+_OF_HOUR = ("psnr", "psnr_live", "irradiance_psnr", "between_psnr")
 _NEAREST = 8  # probes that are weighted by the inverse square of their distance
 _ROWS = 32768  # probes per piece, so that float64 copies stay at some tens of MB
 
@@ -42,6 +44,8 @@ class Report(BaseReport):
         bits_per_probe: `bytes * 8 / N`, over all probes; the paper's bpp.
         ratio: Bytes of the file divided by `N * D * 4`, the bytes of the input in float32.
         gpu_bytes: Bytes of the buffers that a GPU holds; 0 if unknown.
+        hours: For each of several hours its `time`, `psnr`, `psnr_live`, `irradiance_psnr` and `between_psnr`; other
+            figures are those of the hour with the lowest PSNR.
         peak: Range of the input's coefficients.
         psnr: PSNR over all coefficients of all probes.
         psnr_live: PSNR over the live probes; dead probes decode exactly to zero.
@@ -73,6 +77,7 @@ class Report(BaseReport):
     warnings: list[str] = field(default_factory=list)
     between_psnr: float | None = None
     gpu_bytes: int = 0
+    hours: list[dict[str, Any]] = field(default_factory=list)
 
 
 def evaluate(
@@ -89,32 +94,54 @@ def evaluate(
         model: The model.
         probes: The input, in the order of the fit.
         device: Where the model is decoded.
-        progress: Called after the decode and at the end.
+        progress: Called after each hour.
         file_bytes: Size of the model's file; None: the size that `model.save` would write.
 
     Returns:
         The report.
 
     Raises:
-        WlmError: The device does not exist, the set has other probes, or a decoded number is not finite.
+        WlmError: The device does not exist, the set has other probes or hours, or a decoded number is not finite.
     """
-    meter = Meter(progress, "evaluate", 2)
     if len(probes.position) != model.probes:
         raise WlmError(f"{probes.name}: has {probes.probes} probes, but {model.probes} were compressed")
+    if not np.array_equal(probes.times, model.times):
+        found, expected = (listed_times(times) or "one" for times in (probes.times, model.times))
+        raise WlmError(f"{probes.name}: has the hours {found}, but {expected} were compressed; choose with --key")
     decoder = model.decoder(device, position=probes.position)
+    size = model.file_bytes() if file_bytes is None else file_bytes
+    times = probes.times.tolist() or [None]
+    meter = Meter(progress, "evaluate", len(times))
+    reports = []
+    for done, time in enumerate(times, 1):
+        if time is not None:
+            decoder.set_time(time)
+        reports.append(_evaluate(decoder, probes.at(time), size))
+        meter.report(done, PSNR_dB=reports[-1].psnr)
+    worst = min(reports, key=lambda report: report.psnr)
+    hours = [
+        {"time": time} | {name: getattr(each, name) for name in _OF_HOUR}
+        for time, each in zip(times, reports, strict=True)
+    ]
+    return replace(
+        worst,
+        gpu_bytes=model.content.nbytes,
+        ratio=worst.ratio / len(times),
+        warnings=[text for report in reports for text in report.warnings],
+        hours=hours if len(times) > 1 else [],
+    )
+
+
+def _evaluate(decoder: Decoder, probes: ProbeSet, file_bytes: int) -> Report:
+    """Compares the light that a decoder has at its present time with that of one hour."""
     decoded = decoder.decode_probes()
-    meter.report(1)
-    report = score(decoded, probes, model.file_bytes() if file_bytes is None else file_bytes)
     lost = LostLight()
     lost.add(probes.values, decoded)
-    report = replace(
-        report,
+    return replace(
+        score(decoded, probes, file_bytes),
         warnings=lost.warnings(probes.name, "probe", "the set"),
         between_psnr=between_psnr(decoder, probes),
-        gpu_bytes=model.content.nbytes,
     )
-    meter.report(2, PSNR_dB=report.psnr)
-    return report
 
 
 def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
@@ -130,11 +157,13 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         no probe is live. The PSNRs of bands and irradiance are None if D is not 3 (l + 1)² for any band l.
 
     Raises:
-        WlmError: The number of probes or of their numbers differs, or a number is NaN or infinite.
+        WlmError: The number of probes or of their numbers differs, a number is NaN or infinite, or the input has
+            several hours.
         ValueError: `file_bytes` is not positive, or `decoded` is no matrix.
     """
     if file_bytes <= 0:
         raise ValueError(f"file_bytes: expected a positive number, got {file_bytes}")
+    probes = probes.at()
     decoded, values, live = np.asarray(decoded), probes.values, probes.live
     if decoded.ndim != 2:
         raise ValueError(f"decoded: expected an array [N, D], got {decoded.shape}")

@@ -22,6 +22,7 @@ from wlm.probe.model import CODES, ProbeModel, Profile, box_of
 from wlm.probe.pca.model import ENOUGH, fit_components
 from wlm.system import Meter, OnProgress
 
+_MOST_LATENT = 32
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps after which progress and checkpoint may be due
 
 
@@ -73,6 +74,9 @@ def compress(
     have less error in no more GPU memory, which is the case for a few hundred probes; `ProbeModel.choice` says why.
     Dead probes take no part in the fit: the model stores one bit per probe if any probe is dead.
 
+    Several hours are fitted as one, with probes that have the numbers of all hours; those of each hour are divided by
+    their root mean square.
+
     Args:
         probes: The set.
         profile: The settings: a name, a YAML file, or a `Profile`.
@@ -94,6 +98,34 @@ def compress(
     """
     profile = Profile.load(profile).override(overrides)
     device = interop.check_device(device)
+    if not probes.live.any():
+        raise WlmError(f"{probes.name}: every probe is dark: there is nothing to fit")
+    rest = device, progress, checkpoint, positions
+    if not len(probes.times):
+        return _compress(probes, profile, seed, *rest)
+    hours, outputs = len(probes.times), probes.outputs
+    by_hour = np.split(probes.values, hours, axis=1)
+    scales = np.sqrt([np.einsum("nd,nd->", light, light, dtype=np.float64) for light in by_hour])
+    scales /= scales.max()
+    even = [light / np.float32(scale or 1.0) for light, scale in zip(by_hour, scales, strict=True)]
+    joint = replace(probes, values=np.concatenate(even, 1), times=np.zeros(0))
+    longer = profile.model_copy(update={"latent": min(_MOST_LATENT, round(profile.latent * _longer(hours)))})
+    model = _compress(joint, longer, seed, *rest)
+    content: Any = model.content
+    content = replace(content, outputs=outputs, hours=hours)
+    return replace(model, outputs=outputs, content=content, times=probes.times, scales=scales)
+
+
+def _compress(
+    probes: ProbeSet,
+    profile: Profile,
+    seed: int,
+    device: str,
+    progress: OnProgress | None,
+    checkpoint: Checkpoint | None,
+    positions: bool,
+) -> ProbeModel:
+    """Compresses a set of one hour."""
     box = box_of(probes.position)
     stored = np.zeros((0, 3), np.uint16)
     if positions:
@@ -128,6 +160,11 @@ def compress(
     if profile.method == "gaussians":
         return gaussians
     return _better(gaussians, partial(make, profile=pca), probes, device)
+
+
+def _longer(hours: int) -> float:
+    """Returns how much longer the latents of a fit of several hours are than those of one hour."""
+    return 1.0 + 0.5 * math.log2(hours)
 
 
 def _fit_gaussians(

@@ -53,9 +53,15 @@ class Probes:
     note: str
 
 
-def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None, title: str) -> Probes:
-    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`."""
-    position, given, live, _ = probes_of(model, original, key)
+def model_probes(
+    model: ProbeModel,
+    original: str | os.PathLike[str] | None,
+    key: str | None,
+    title: str,
+    time: float | None = None,
+) -> Probes:
+    """Takes the probes of a model of one hour; the other arguments are those of `wlm.probe.places.probes_of`."""
+    position, given, live, _ = probes_of(model, original, key, time)
     count = _coefficients(model.outputs, title)
     decoder, places = model.decoder(position=position), position[live]
     values = {"decoded": decoder.decode_probes()[live].reshape(-1, count, 3)}

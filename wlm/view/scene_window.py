@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from wlm.formats.hours import DAY
 from wlm.interop import check_device
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.groups import Weight, changed_weights
-from wlm.lightmap.hours import DAY
 from wlm.ops.raster import interpolate, rasterize_uv
 from wlm.scene.content import Scene as Content
 from wlm.scene.probes import DayProbes

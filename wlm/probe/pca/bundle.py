@@ -94,6 +94,7 @@ def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     has_basis = bool(len(content.basis))
     shader = component_glsl(content.count, model.outputs, has_basis)
     document = {"about": _ABOUT, "live": len(values), "components": content.count, "basis": has_basis}
+    document["hour"] = {"buffer": "probes", "first_word": 2 + content.count, "words": halves.size // 2}
     reference = {"live": chosen.astype(np.int32), "values": values[chosen]}
     buffers = {"probes": np.concatenate(words)}
     return Bundle("probe", model.name, shader, document, buffers=buffers, reference=reference)

@@ -10,7 +10,7 @@ Radiance Transfer, 2003, with one cluster.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -27,13 +27,14 @@ _MOST_LOG = 88.0  # largest logarithm in a file: the exponential still fits floa
 
 @dataclass(frozen=True, eq=False)
 class Components(Content):
-    """V live probes of D numbers, each a sum of K components.
+    """V live probes of D numbers at each of T hours, a sum of K components.
 
     Attributes:
-        outputs: Numbers per probe, D.
+        outputs: Numbers per probe at one hour, D.
         code: uint8 [V, 1 + K], codes of the logarithm of the magnitude and of the coefficients.
         bounds: float16 [2, 1 + K], lowest value and step of each column of `code`.
-        basis: float16 [K, D]; empty where the directions are the unit vectors, K = D.
+        basis: float16 [K, T D]; empty where the directions are the unit vectors, K = T D.
+        hours: T, number of hours.
     """
 
     METHOD: ClassVar[str] = "pca"
@@ -44,6 +45,7 @@ class Components(Content):
     code: np.ndarray
     bounds: np.ndarray
     basis: np.ndarray
+    hours: int = 1
 
     @property
     def count(self) -> int:
@@ -52,7 +54,14 @@ class Components(Content):
 
     @property
     def nbytes(self) -> int:
-        return component_bytes(len(self.code), self.outputs, self.count, identity=not len(self.basis))
+        live, several = len(self.code), self.hours > 1
+        one = component_bytes(live, self.outputs, self.count, identity=not (several or len(self.basis)))
+        return one + (4 * self.hours * self.count * -(-self.outputs // 2) if several else 0)
+
+    def at(self, factors: np.ndarray) -> Self:
+        basis = self.basis.astype(np.float64) if len(self.basis) else np.eye(self.count)
+        mixed = factors @ basis.reshape(self.count, self.hours, -1)
+        return replace(self, basis=np.clip(mixed, -65504, 65504).astype(np.float16), hours=1)
 
     def facts(self) -> dict[str, Any]:
         return {"components": self.count, "basis": "principal components" if len(self.basis) else "unit vectors"}
@@ -74,7 +83,9 @@ class Components(Content):
         return {"code": self.code.T, "bounds": self.bounds, "basis": self.basis}
 
     @classmethod
-    def from_parts(cls, profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Self:
+    def from_parts(
+        cls, profile: Profile, outputs: int, hours: int, stored: Mapping[str, np.ndarray], dropped: int
+    ) -> Self:
         bounds = stored["bounds"].astype(np.float64)
         most = np.maximum(np.abs(bounds[0]), np.abs(bounds[0] + 255.0 * bounds[1]))
         largest = float(np.abs(stored["basis"].astype(np.float64)).max(initial=0.0)) if stored["basis"].size else 1.0
@@ -82,7 +93,8 @@ class Components(Content):
             raise ValueError(f"part bounds: expected steps of at least 0, and log magnitudes within {_MOST_LOG:g}")
         if not np.exp(most[0]) * most[1:].sum() * largest <= np.finfo(np.float32).max:
             raise ValueError("parts bounds and basis: expected light within the range of float32")
-        return cls(outputs, np.ascontiguousarray(stored["code"].T), stored["bounds"], stored["basis"])
+        code = np.ascontiguousarray(stored["code"].T)
+        return cls(outputs // hours, code, stored["bounds"], stored["basis"], hours)
 
 
 def component_bytes(live: int, outputs: int, count: int, *, identity: bool) -> int:

@@ -1,7 +1,9 @@
-"""Reads the hours of lightmaps from the names of their files or folders."""
+"""Hours of the day: in the names of files, folders and arrays, and between stored ones."""
 
 import re
 from collections.abc import Sequence
+
+import numpy as np
 
 DAY = 24.0
 """Hours in a day, the period of hours that names state."""
@@ -64,3 +66,26 @@ def _hour(match: re.Match[str] | None, minutes: bool, clock: bool) -> float | No
     if match["bare"]:
         return float(match["bare"])
     return int(match["whole"]) + int(match["part"]) / 60 if minutes else float(f"{match['whole']}.{match['part']}")
+
+
+def neighbours(times: np.ndarray, period: float | None, t: float) -> tuple[int, int, float]:
+    """Returns the indices of the stored times before and after a time, and the weight of the later one, 0 to 1.
+
+    Args:
+        times: float64 [T], increasing.
+        period: Length of the day; the last and the first time are neighbours. None: `t` is within the times.
+        t: The time, finite.
+    """
+    count = len(times)
+    if count == 1:
+        return 0, 0, 0.0
+    t = t if period is None else t % period
+    after = int(np.searchsorted(times, t, side="right"))
+    before = after - 1
+    if period is None:
+        before, after = max(before, 0), min(after, count - 1)
+        gap = times[after] - times[before]
+        return before, after, float((t - times[before]) / gap) if gap > 0 else 0.0
+    before, after = before % count, after % count
+    gap = (times[after] - times[before]) % period or period
+    return before, after, float(((t - times[before]) % period) / gap)
