@@ -100,6 +100,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
         "Measure the exported shaders of lightmaps on a GPU, beside our decoder.",
         ("quick", "device"),
     ),
+    "scene": (
+        "Measure the frames of the street as `wlm run` draws them, and the error of its pictures.",
+        ("quick", "device"),
+    ),
     "lightmap-ablation": (
         "Measure lightmaps over time: other feature maps of equal size, or no simulation of block compression.",
         ("quick", "device", "set_path", "steps", "only"),

@@ -33,6 +33,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from benchmarks.atlas_exact import decode64
 from benchmarks.plot import Panel
 from benchmarks.rivals.atlas import RIVALS, share_of
 from benchmarks.rivals.rival import Rival
@@ -44,7 +45,6 @@ from wlm.atlas.data import LightmappedScene, Sheet, from_arrays
 from wlm.atlas.data import load as load_scene
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluation import Sampler, compare
-from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
 from wlm.errors import WlmError

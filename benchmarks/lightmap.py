@@ -35,6 +35,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from benchmarks.lightmap_exact import bound64, colour_tile64, decode_tile64
 from benchmarks.plot import Panel
 from benchmarks.rivals.lightmap import RIVALS, check_rival, encode_set, usual
 from benchmarks.rivals.lightmap_torch import PlainFit
@@ -47,7 +48,6 @@ from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings import encoding_of
 from wlm.lightmap.evaluation import bits_per_texel, count_kinds
-from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.profile import Profile, TimeAxis

@@ -1,7 +1,7 @@
 """Measures the differentiable operations: their errors against float64, and their times beside the references in torch.
 
-The references, `wlm.ops.plain`, are what a reader would write in torch; they use as many threads as torch does, and a
-call of an operation on a CPU one.
+The references, `benchmarks.plain`, are what a reader would write in torch; they use as many threads as torch does, and
+a call of an operation on a CPU one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks import plain
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note, check_only
 from wlm import ops
-from wlm.ops import plain
 from wlm.ops.views import View, clip_positions, normalised
 
 _FEW = 2  # samples of a call of a reference
@@ -48,7 +48,7 @@ class Work:
         return {name: each.requires_grad_(name in self.leaves) for name, each in made.items()}
 
     def run(self, module: Any, tensors: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Returns the results by `wlm.ops` or `wlm.ops.plain`."""
+        """Returns the results by `wlm.ops` or `benchmarks.plain`."""
         call = self.call or getattr(module, self.op)
         results = call(module, **tensors) if self.call else call(**tensors, **self.options)
         return results if isinstance(results, tuple) else (results,)

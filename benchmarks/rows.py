@@ -38,7 +38,7 @@ class Row:
     """A row of results: the measured figures of one method with one option on one scene.
 
     Attributes:
-        system: `lightmap`, `atlas`, `probe`, `smoke`, `smoke-network` or `ops`.
+        system: `scene`, `lightmap`, `atlas`, `probe`, `smoke`, `smoke-network` or `ops`.
         scene: Name of the measured data.
         method: Name of what was measured, such as "ours" or a rival's name.
         option: Profile or setting that tells rows of one method apart; may be empty.

@@ -25,20 +25,12 @@ _INTEGER_LENGTH = 80  # characters: 64 binary digits with signs between them
 
 
 def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settings:
-    """Reads a YAML file, one mapping, into a settings model and checks it, see `check_settings`.
-
-    Raises:
-        WlmError: One line with the file, the field, what was expected and what was found.
-    """
+    """Reads a YAML file, one mapping, into a settings model and checks it, see `check_settings`."""
     return check_settings(cls, read_yaml(path), f"{path}: ")
 
 
 def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
-    """Reads a YAML file that is one mapping.
-
-    Raises:
-        WlmError: The file cannot be read, or has other content.
-    """
+    """Reads a YAML file that is one mapping."""
     try:
         text = read_file(path, SETTINGS_BYTES, "the settings").decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -65,20 +57,11 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
 def check_settings(
     cls: type[_Settings], values: Any, prefix: str = "", extra: Literal["forbid", "ignore"] = "forbid"
 ) -> _Settings:
-    """Checks a mapping of settings, whatever the model's own configuration says about unknown keys.
+    """Checks a mapping of plain values as a settings model, whatever its own configuration says about unknown keys:
+    errors, or ignored with `extra`.
 
-    Args:
-        cls: The pydantic model.
-        values: Mapping of the model's fields to plain values.
-        prefix: Text before the field's name in an error, such as `"scene.yaml: "` or `"file: profile."`; `"--"` writes
-            the field as a command line option, with dashes.
-        extra: Whether unknown keys are errors ("forbid") or ignored.
-
-    Returns:
-        The checked settings.
-
-    Raises:
-        WlmError: One line with the field, the expectation and the value found, for the first of several problems.
+    `prefix` is the text before the field's name in an error, such as `"scene.yaml: "` or `"file: profile."`; `"--"`
+    writes the field as a command line option, with dashes.
     """
     try:
         return cls.model_validate(values, extra=extra)
@@ -87,11 +70,7 @@ def check_settings(
 
 
 def profile_path(system: str, name: str) -> Path:
-    """Finds the profile `configs/<system>-<name>.yaml`, in a checkout or in the installed package.
-
-    Raises:
-        WlmError: There is no such profile; the line lists the known ones.
-    """
+    """Finds the profile `configs/<system>-<name>.yaml`, in a checkout or in the installed package."""
     file_name = f"{system}-{name}.yaml"
     for folder in _profile_folders():
         # The name is compared with the listing and not joined to a path, so that `../x` cannot leave the folder.

@@ -34,9 +34,6 @@ def check_device(name: str) -> str:
 
     Returns:
         The name that both Warp and torch accept: "cpu" or "cuda:N".
-
-    Raises:
-        WlmError: No such device; the line lists the available devices.
     """
     full_name = "cuda:0" if name == "cuda" else name
     devices = available_devices()
@@ -54,11 +51,7 @@ def device_name(device: torch.device) -> str:
 
 
 def free_memory(device: wp.Device) -> int:
-    """Returns the number of bytes that can be allocated on a device.
-
-    Raises:
-        WlmError: The system doesn't report it.
-    """
+    """Returns the number of bytes that can be allocated on a device."""
     if device.is_cuda:
         return device.free_memory
     for line in Path("/proc/meminfo").read_text().splitlines():
@@ -68,20 +61,11 @@ def free_memory(device: wp.Device) -> int:
 
 
 def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
-    """Wraps a tensor as a Warp array, without a copy and without a gradient array.
+    """Wraps a tensor as a Warp array, without a copy and without a gradient array; it keeps the tensor's memory alive.
 
-    Wrap once and keep the array: a raw tensor as a launch argument makes every launch three times as expensive.
-    A gradient buffer is wrapped by a separate call, `to_warp(tensor.grad)`.
-
-    Args:
-        tensor: A tensor of any strides; trailing dimensions that become a vector or matrix must be contiguous.
-        dtype: The Warp type of an element, a vector or matrix type for example; default the tensor's number type.
-
-    Returns:
-        An array that shares the tensor's memory and keeps it alive.
-
-    Raises:
-        ValueError: The tensor doesn't fit the type.
+    Wrap once and keep the array: a raw tensor as a launch argument makes every launch three times as expensive. A
+    gradient buffer is wrapped by a separate call, `to_warp(tensor.grad)`. The tensor may have any strides, but trailing
+    dimensions that become a vector or matrix, by the Warp type `dtype` of an element, must be contiguous.
     """
     # Wrapping a tensor doesn't initialise Warp, unlike every other call.
     wp.init()
@@ -160,9 +144,6 @@ class StepGraph:
         step: The work, in torch and Warp, on `device`.
         device: A result of `check_device`.
         warmup: Number of eager calls before the capture, at least 1.
-
-    Raises:
-        ValueError: `warmup` is less than 1.
     """
 
     def __init__(self, step: Callable[[], None], device: str, warmup: int = 3) -> None:

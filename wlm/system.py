@@ -7,7 +7,6 @@ The mathematics is not shared. Each system, a package of `wlm`, has these module
     fit.py         training                        `compress` (smoke: `train`)
     codec.py       model to file parts and back    `encode`, `decode`
     decode.py      the runtime path                `Decoder`
-    exact.py       a float64 reference of the decoder
     evaluation.py  scores                          `evaluate`
     bundle.py      textures, buffers and shader    `bundle`
 """
@@ -69,9 +68,6 @@ class Settings(BaseModel):
     def load(cls, profile: str | os.PathLike[str] | Self) -> Self:
         """Loads a profile by its name (NAME in `configs/FILES-NAME.yaml`; `FILES` is the class's) or the path of a YAML
         file; an instance is returned unchanged.
-
-        Raises:
-            WlmError: Unknown profile, unreadable file, or a wrong setting.
         """
         if isinstance(profile, cls):
             return profile
@@ -82,9 +78,6 @@ class Settings(BaseModel):
         """Returns the settings with new values by name; None leaves a setting as it is.
 
         `prefix` is the text before the setting's name in an error; `"--"` writes the name as an option.
-
-        Raises:
-            WlmError: A setting is unknown or out of range.
         """
         changes = {name: value for name, value in values.items() if value is not None}
         return check_settings(type(self), self.model_dump() | changes, prefix) if changes else self
@@ -202,10 +195,6 @@ class Model:
 
         Returns:
             The file's size, bytes.
-
-        Raises:
-            WlmError: The content could not be read back, because of a NaN from a fit that diverged for example; or the
-                file cannot be written. An earlier file of that name then stays as it was.
         """
         try:
             settings, parts, source = self._encoded()
@@ -221,11 +210,7 @@ class Model:
         return sum(memoryview(part).nbytes for part in encode_artifact(self.SYSTEM, *self._encoded()))
 
     def decoder(self, device: str = "cpu", **options: Any) -> Any:
-        """Loads the model onto a device and returns the system's `Decoder`, which takes the options.
-
-        Raises:
-            WlmError: No such device.
-        """
+        """Loads the model onto a device and returns the system's `Decoder`, which takes the options."""
         module, name = self.DECODER
         return getattr(_module(self.SYSTEM, module), name)(self, device, **options)
 
@@ -234,18 +219,11 @@ class Model:
         values.
 
         `options` are passed to the function `bundle` of the system.
-
-        Raises:
-            WlmError: No such device.
         """
         return _module(self.SYSTEM, "bundle").bundle(self, device=device, **options)
 
     def check(self) -> None:
-        """Reads and checks what `wlm.load` has left in the file, which only lightmaps do.
-
-        Raises:
-            WlmError: A part of the file is damaged.
-        """
+        """Reads and checks what `wlm.load` has left in the file, which only lightmaps do."""
         return
 
     def _encoded(self) -> tuple[dict[str, Any], dict[str, Content], str]:
@@ -268,14 +246,8 @@ def load(path: str | os.PathLike[str], system: str | None = None) -> Any:
 
 
 def decode(path: str | os.PathLike[str], artifact: Artifact, make: Callable[[Artifact], Any]) -> Any:
-    """Makes an object from an artifact's parts and turns any error into one line that names the file.
-
-    Args:
-        path: The file, for messages.
-        artifact: Content of the file.
-        make: A codec's `decode`, which raises WlmError, ValueError, TypeError, LookupError or AttributeError on parts
-            that do not fit.
-    """
+    """Makes an object from an artifact's parts by a codec's `decode`, and turns any of its errors (WlmError,
+    ValueError, TypeError, LookupError or AttributeError) into one line that names the file."""
     try:
         return make(artifact)
     except WlmError as error:
@@ -285,11 +257,7 @@ def decode(path: str | os.PathLike[str], artifact: Artifact, make: Callable[[Art
 
 
 def system_of(path: str | os.PathLike[str]) -> str:
-    """Returns the name of the system that wrote a file, which is the name of its package in `wlm`.
-
-    Raises:
-        WlmError: The file is not a model.
-    """
+    """Returns the name of the system that wrote a file, which is the name of its package in `wlm`."""
     return _package(path, read_artifact(path)).split(".")[1]
 
 

@@ -73,14 +73,10 @@ class Workers(ABC):
 
     @abstractmethod
     def wait(self, seconds: float) -> tuple[int, Any] | None:
-        """Waits for the next result.
+        """Waits for the next result, at most some seconds; None if there was none in that time.
 
-        Args:
-            seconds: Maximum time to wait.
-
-        Returns:
-            The worker's number and the method's return value, the exception that it raised, or `Lost` if the worker
-            no longer exists; None if there was no result in that time.
+        Returns the worker's number and the method's return value, the exception that it raised, or `Lost` if the worker
+        no longer exists.
         """
 
     @abstractmethod
@@ -131,9 +127,6 @@ class Processes(Workers):
         Args:
             make: The class of the workers, from an importable module.
             arguments: Constructor arguments of each worker.
-
-        Raises:
-            WlmError: The system can't start that number of processes.
         """
         self.count = len(arguments)
         self._make, self._arguments = make, arguments
@@ -234,9 +227,6 @@ class Actors(Workers):
             most: Maximum number of workers.
             address: Address of the cluster, as for `ray.init`.
             share: Resources of one worker: `{"CPU": 2}` or `{"GPU": 1}`.
-
-        Raises:
-            WlmError: Ray is missing, there is no cluster at that address, or it lacks the resources.
         """
         try:
             import ray

@@ -2,7 +2,7 @@
 
 A plane is `[T, W, C]`: rows are times (or v), columns are u. A volume is `[T, H, W, C]`. Space is clamped to the
 border; the first axis is clamped, or wraps round when `periodic`, so that the first slice follows the last. Coordinates
-are in [0, 1], cell centres at (i + 1/2) / size. C is arbitrary. `wlm.ops.plain` computes the same in torch.
+are in [0, 1], cell centres at (i + 1/2) / size. C is arbitrary. `benchmarks.plain` computes the same in torch.
 """
 
 import warp as wp

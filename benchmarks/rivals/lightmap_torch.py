@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from torch.nn import functional
 
+from benchmarks import plain
 from benchmarks.rivals.rival import EXTRA
 from wlm.formats.hdr_blocks import need
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.tiles import TILE
 from wlm.lightmap.trainer import Targets
-from wlm.ops import plain
 
 _BLOCK = 4  # texels along a BC7 block's side
 _ENCODED = 4  # numbers of gamma(t)

@@ -10,8 +10,8 @@ from builders.atlas_meshes import charts, sheet
 from builders.atlas_models import KINDS, MIXED
 
 import wlm
+from benchmarks.atlas_exact import decode64
 from wlm.atlas.decode import Decoder
-from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress
 from wlm.atlas.model import AtlasModel, Profile, SheetPlace
 from wlm.atlas.stored import store

@@ -9,7 +9,7 @@ import pytest
 import torch
 from builders.atlas_meshes import sheet
 from builders.atlas_models import random_model
-from builders.lit_cube import DIRECTIONS, HEIGHT, WIDTH, corners, lit_cube, waves
+from builders.lit_cube import DIRECTIONS, HEIGHT, WIDTH, lit_cube, waves
 
 from wlm import metrics
 from wlm.atlas.data import from_arrays, join
@@ -247,30 +247,8 @@ def test_what_is_refused():
     broken = _reader(mesh, lambda c, uv, t: torch.where((uv[:, :1] < 0.2), torch.nan, c))
     with pytest.raises(WlmError, match="cube: decoder it gives NaN or infinity at"):
         _one(mesh, broken)
-    with pytest.raises(ValueError, match=r"it: expected colours \[\d+, 3\]"):
-        _one(mesh, _reader(mesh, lambda c, uv, t: c[:, :2]))
-    with pytest.raises(ValueError, match="labels: expected names that decoders has, got other"):
-        _one(mesh, _reader(mesh), labels={"other": _reader(mesh)})
-    with pytest.raises(ValueError, match="labels of it: expected integers"):
-        _one(mesh, _reader(mesh), labels={"it": lambda points: points.uv[:, 0]})
     with pytest.raises(WlmError, match="gpu"):
         _one(mesh, _reader(mesh), device="gpu")
-
-
-def test_threads_are_given_back():
-    mesh, before, inside = lit_cube(1), torch.get_num_threads(), []
-
-    def decoder(points, state):
-        inside.append(torch.get_num_threads())
-        return points.uv
-
-    try:
-        torch.set_num_threads(2)
-        with pytest.raises(ValueError, match="expected colours"):
-            _one(mesh, decoder)
-        assert inside == [1] and torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
 
 
 def test_states_are_scored_one_by_one(device):
@@ -329,18 +307,6 @@ def test_even_views_are_spread_all_around():
         sphere_views(-1)
 
 
-def test_random_views_by_their_seed():
-    first, again, second = (np.stack([v.axes for v in sphere_views(500, seed)]) for seed in (7, 7, 8))
-    np.testing.assert_array_equal(first, again)
-    assert (first != second).any(axis=(1, 2)).all()
-    eyes = first[:, 2]
-    # Uniform: mean 0, each coordinate squared 1/3; four deviations of 500 samples.
-    assert np.abs(eyes.mean(axis=0)).max() < 4.0 * (1 / 3 / 500) ** 0.5
-    assert np.abs((eyes**2).mean(axis=0) - 1 / 3).max() < 4.0 * (4 / 45 / 500) ** 0.5
-    generator = np.random.default_rng(7)
-    assert not np.array_equal(sphere_views(1, generator)[0].axes, sphere_views(1, generator)[0].axes)
-
-
 def test_axes_also_at_the_poles():
     for direction in ([0, 1, 0], [0, -1, 0], [1e-9, 1, 1e-9], [1, 2, 3], [0, 0, -1e-200], [1e300, 0, 0]):
         axes = View.of(direction).axes
@@ -368,15 +334,6 @@ def test_the_picture_just_holds_the_sphere():
         assert (np.hypot(x, y) <= w * (1 + 1e-6)).all() and (np.abs(z) <= w * (1 + 1e-6)).all()
     z, w = clip_positions(position, View.of([1, 1, 1]))[:, 2:].T
     assert (z / w).min() == pytest.approx(-1.0, abs=1e-6) and (z / w).max() == pytest.approx(1.0, abs=1e-6)
-
-
-def test_normalised_whatever_the_place_and_size():
-    position, triangle, uv = corners(1)
-    for scale, shift in ((1.0, 0.0), (1e-6, 0.0), (250.0, [3.0, -7.0, 1000.0])):
-        mesh = from_arrays(position * [1.0, 0.5, 0.25] * scale + shift, triangle, uv, waves())
-        np.testing.assert_allclose(
-            normalised(mesh.sheets[0].position, mesh.sheets[0].triangle), position * [1.0, 0.5, 0.25], atol=1e-6
-        )
 
 
 def test_each_face_from_its_own_side(device):
@@ -425,17 +382,3 @@ def test_visibility_counts_every_covered_pixel_once(device):
     fine = visibility(mesh, views, 64, 2 * HEIGHT, 2 * WIDTH, device).cpu().numpy()
     np.testing.assert_array_equal(fine.reshape(HEIGHT, 2, WIDTH, 2).sum(axis=(1, 3)), count)
     assert (count[mesh.sheets[0].mask] > 0).mean() > 0.7 and not count[~mesh.sheets[0].mask].any()
-
-
-def test_visibility_of_one_side_and_of_none_and_at_the_end():
-    mesh = lit_cube(1)
-    count = visibility(mesh, [View.of(DIRECTIONS[4])], 64, HEIGHT, WIDTH, "cpu").numpy()
-    chart = np.zeros((HEIGHT, WIDTH), bool)
-    chart[HEIGHT // 2 :, WIDTH // 3 : 2 * WIDTH // 3] = True
-    assert count[chart].sum() > 500 and not count[~chart].any()
-    assert not visibility(mesh, [], 64, 4, 4, "cpu").any()
-    # A UV of 1 is in the last cell.
-    position = np.array([[-1, -1, 0], [1, -1, 0], [-1, 1, 0]], np.float64)
-    mesh = from_arrays(position, np.array([[0, 1, 2]]), np.array([[1 - 1e-7, 1], [1, 1], [1, 1 - 1e-7]]), waves())
-    count = visibility(mesh, [View.of([0, 0, 1])], 32, 8, 8, "cpu").numpy()
-    assert count[7, 7] == count.sum() > 50

@@ -231,16 +231,6 @@ def test_a_budget_without_room_for_tiles():
         assert 1.0 - model.compression_ratio <= budget
 
 
-@pytest.mark.parametrize(
-    ("name", "texels"), [*((name, (1, 1)) for name in NAMES), ("standard", (4, 4)), ("standard", (2, 256))]
-)
-def test_little_lightmaps_at_the_profiles_budget(name: str, texels: tuple[int, int]):
-    """A texel or a block at least, whatever the budget; and long ones keep their resolution along the long side."""
-    model = compress(sheet(soft, *texels), name, views=2)
-    assert model.texels.shape[1] >= 1 and np.isfinite(Decoder(model).lightmap()).all()
-    assert model.method == "plain" or max(texels) >= 4
-
-
 @pytest.mark.parametrize("colour", ["half", "bc6h", "mixed"])
 def test_the_packed_texture_has_room(colour: str):
     """Gaps between tiles count too; where even the smallest tiles can't be packed there is nothing."""

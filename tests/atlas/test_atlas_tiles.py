@@ -55,18 +55,6 @@ def _places(tiles: grid.Tiles, rows: int, columns: int) -> tuple[np.ndarray, np.
     return x.reshape(len(row), -1), y.reshape(len(row), -1)
 
 
-@pytest.mark.parametrize(("samples", "points"), [(1, 6), (2, 6), (3, 14), (8, 14), (16, 30)])
-def test_linear(samples: int, points: int):
-    """Rows are weights of a mean, and reproduce any straight line."""
-    weight = grid._axis(samples, points, "cpu")[2].numpy()
-    assert weight.shape == (points, samples) and (weight >= 0).all()
-    np.testing.assert_allclose(weight.sum(1), 1.0, atol=1e-6)
-    assert ((weight > 0).sum(1) <= 2).all()
-    if samples > 1:
-        line = 3.0 * np.linspace(0, 1, samples) - 1.0
-        np.testing.assert_allclose(weight @ line, 3.0 * (np.arange(points) + 0.5) / points - 1.0, atol=2e-6)
-
-
 SIZES = [(29, 36), (30, 40), (7, 7), (3, 4), (1, 20), (20, 1), (1, 1), (8, 2)]
 
 
@@ -103,14 +91,6 @@ def test_cut_keeps_all_weight(height: int, width: int):
     rows, columns = (np.clip(np.arange(2 * n) - 1, 0, m - 1) for n, m in zip((height, width), total.shape, strict=True))
     np.add.at(expected, (rows[:, None], columns[None, :]), weight / weight.sum())
     np.testing.assert_allclose(total, expected, atol=1e-7)
-
-
-def test_cut_leaves_out_tiles_without_weight():
-    weight = np.zeros((60, 60))
-    weight[31, 45] = 5.0  # 15.25 and 22.25 texels from the first centre
-    tiles = grid.cut(_image(30, 30), weight, 7, "cpu")
-    assert tiles.index.tolist() == [2 * 5 + 3]
-    assert float(tiles.weight.sum()) == 1.0 and int((tiles.weight > 0).sum()) == 1
 
 
 def _tiles(count: int, size: int, weight: np.ndarray | None = None, seed: int = 0) -> grid.Tiles:
@@ -190,18 +170,6 @@ def test_solve_with_few_weights(nx: int, ny: int):
     low, high = light.min((1, 2)), light.max((1, 2))
     margin = high - low
     assert ((samples.min((1, 2, 3)) > low - margin) & (samples.max((1, 2, 3)) < high + margin)).all()
-
-
-@pytest.mark.parametrize("size", [3, 7, 15])
-def test_all_samples_are_the_texels(size: int):
-    height, width = 2 * size + 1, 3 * size + 1
-    image = _image(height, width)
-    tiles = grid.cut(image, _weight(height, width), size, "cpu")
-    samples = grid.solve(tiles, size + 1, size + 1).numpy()
-    for index, values in zip(tiles.index.tolist(), samples, strict=True):
-        row, column = (size * i for i in divmod(index, 3))
-        np.testing.assert_allclose(values, image[row : row + size + 1, column : column + size + 1], atol=2e-3)
-    assert float(grid.errors(tiles, torch.from_numpy(samples)).sum()) < 1e-7
 
 
 def test_errors_are_those_of_the_decoder():
@@ -392,19 +360,6 @@ def test_the_range_is_clamped(codec):
     assert np.isfinite(decoded).all() and not decoded[:, :4].any()
     np.testing.assert_allclose(decoded[:, 4:], 65504.0, rtol=0.01)
     assert not encode(np.full((4, 4, 3), -np.inf), codec)[1].any()
-
-
-def test_what_is_refused():
-    texels = _smooth(8, 8)
-    texels[3, 2, 1] = np.nan
-    with pytest.raises(ValueError, match="found 1 texels with NaN"):
-        encode(texels, "astc")
-    blocks, _ = encode(_smooth(8, 8), "astc")
-    for bad in (blocks[:3], blocks.astype(np.int32), blocks.ravel()):
-        with pytest.raises(ValueError, match=r"expected shape uint8 \[4, 16\]"):
-            decode(bad, 8, 8, "astc")
-    with pytest.raises(ValueError, match="uint8"):
-        decode(blocks[:0], 0, 8, "astc")
 
 
 def test_a_missing_package_names_the_extra(monkeypatch):

@@ -8,6 +8,7 @@ from builders.atlas_models import grouped
 from kernels.compare import close, exact
 from reference import cascade as reference
 
+from benchmarks import plain
 from wlm import interop
 from wlm.atlas.cascade import fit as cascade
 from wlm.atlas.cascade import pack as packing
@@ -16,7 +17,6 @@ from wlm.atlas.data import LightmappedScene, from_arrays
 from wlm.atlas.model import AtlasModel, Profile
 from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
-from wlm.ops import plain
 from wlm.ops import raster as ops_raster
 from wlm.ops.views import clip_positions, normalised, sphere_views
 
@@ -170,34 +170,6 @@ def test_the_unit_of_radiance_does_not_matter(space: str):
     close(brighter.lut, textures.lut, 1e-4)
     black = _box(0.0)
     assert not tune(black, uv, Textures(0 * start.colour, start.lut), profile).colour.any()
-
-
-def test_rates_that_fall():
-    """The first step is as long as at full rate, the last one as short as it is to be; less noise is left."""
-    mesh, profile = _box(), _profile(space="uv", steps=40, final_rate=0.1)
-    uv, start = _start(mesh, profile)
-    step = cascade._Step(mesh.sheets[0], uv, start, profile, 0, "cpu")
-    unit = mesh.sheets[0].lightmap[mesh.sheets[0].mask].mean()
-    before = step.textures().colour
-    step()
-    assert np.abs(step.textures().colour - before).max() / unit == pytest.approx(profile.colour_rate, rel=1e-3)
-    for _ in range(39):
-        step()
-    np.testing.assert_allclose([float(rate) for rate in step._rate], [1e-3, 2e-4], rtol=1e-5)
-    rough = _profile(space="uv", steps=60, colour_rate=0.03, lut_rate=5e-3)
-    constant, decayed = (tune(mesh, uv, start, rough.model_copy(update={"final_rate": share})) for share in (1.0, 0.01))
-    assert _error(mesh, uv, decayed.colour, decayed.lut) < 0.9 * _error(mesh, uv, constant.colour, constant.lut)
-
-
-def test_no_steps_and_progress():
-    mesh, profile = _box(), _profile(steps=0)
-    uv, start = _start(mesh, profile)
-    tuned = tune(mesh, uv, start, profile, progress=lambda *_: pytest.fail("nothing is done"))
-    close(tuned.colour, start.colour, 1e-6)
-    np.testing.assert_array_equal(tuned.lut, start.lut)
-    reports = []
-    tune(mesh, uv, start, _profile(steps=7), progress=reports.append)
-    assert (reports[-1].stage, reports[-1].done, reports[-1].total) == ("fit", 7, 7)
 
 
 def test_a_fit_that_diverged():

@@ -137,16 +137,6 @@ def test_permuted_copies(device: str):
     np.testing.assert_array_equal(clusters.distance, 0)
 
 
-def test_sizes_are_those_of_texels():
-    """R_s of a lightmap that isn't square takes texels along both axes; a length of 5 texels is size 5, more is 9."""
-    from wlm.atlas.cascade.cluster import _corners, _levels
-
-    lengths = [[5, 0], [0, 5], [5.01, 0], [0, 5.01], [3, 4], [0.2, 0.1], [0, 0], [60, 0]]
-    uv = _uv([[[1, 1], [1 + dx, 1 + dy], [1, 1]] for dx, dy in lengths])
-    level = _levels(_corners(uv, np.arange(24).reshape(-1, 3), (*SIDE, 3)), 33)
-    assert [SIZES[k] for k in level] == [5, 5, 9, 9, 5, 2, 2, 33]
-
-
 @pytest.mark.parametrize(("count", "active"), [(0, True), (1, True), (5, False)])
 def test_no_triangle_and_one_and_none_that_is_active(device: str, count: int, active: bool):
     clusters = cluster(*_mesh(count), _lightmap(), active=np.full(count, active), device=device)
@@ -205,16 +195,6 @@ def test_ties_go_to_the_lowest_number(device: str):
     dark, light = ([[x, 10], [x + 4, 10], [x, 14]] for x in (8, 50))
     clusters = cluster(_uv([light, dark, light, dark]), np.arange(12).reshape(-1, 3), lightmap, device=device)
     assert clusters.representative.tolist() == [0, 1] and clusters.group.tolist() == [0, 1, 0, 1]
-
-
-def test_largest(device: str):
-    """Texels between the samples of the largest size allowed aren't read: here all but the corners."""
-    lightmap = np.zeros((*SIDE, 3), np.float32)
-    lightmap[14:17, 14:17] = 1.9
-    spot, plain = ([[x, 10], [x + 14, 10], [x, 24]] for x in (10, 40))
-    inputs = (_uv([spot, plain]), np.arange(6).reshape(-1, 3), lightmap)
-    assert cluster(*inputs, device=device).group.tolist() == [0, 1]
-    assert cluster(*inputs, largest=2, device=device).group.tolist() == [0, 0]
 
 
 @pytest.mark.slow

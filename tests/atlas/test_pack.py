@@ -1,7 +1,6 @@
 """Packing: rigid charts, texels of their own, corners in their order, and the lightmap under the new UVs."""
 
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -223,24 +222,6 @@ def test_the_packer_is_missing(monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(WlmError, match=line):
         compress(mesh, "cascade", progress=begun.append)
     assert not begun
-
-
-def test_a_packer_that_stretches(monkeypatch: pytest.MonkeyPatch):
-    """The packer's result is checked."""
-    import uvunwrap
-
-    generate = uvunwrap.generate
-
-    def stretched(*args, **options):
-        atlas = generate(*args, **options)
-        out = atlas.meshes[0]
-        corner = np.array(out.corner_uvs).reshape(-1, 2) * [1.1, 1.0]
-        mesh = SimpleNamespace(corner_uvs=corner.reshape(-1), chart=out.chart, indices=out.indices)
-        return SimpleNamespace(meshes=[mesh], width=atlas.width, height=atlas.height)
-
-    monkeypatch.setattr(uvunwrap, "generate", stretched)
-    with pytest.raises(WlmError, match="array: the UV packer uvunwrap stretched a chart by .* texels, at most 0.01"):
-        pack(_mesh(_quad(5, 5, 20, 6)), None, 1.0)
 
 
 def test_a_packer_that_fails(monkeypatch: pytest.MonkeyPatch):

@@ -11,10 +11,10 @@ from builders.checks import error_of
 from builders.gltf_scene import Thing, box, write_scene
 
 import wlm
+from benchmarks.atlas_exact import decode64
 from wlm.atlas.data import LightmappedScene, from_arrays, join, load
 from wlm.atlas.decode import Decoder
 from wlm.atlas.evaluation import compare, evaluate
-from wlm.atlas.exact import decode64
 from wlm.atlas.fit import compress, open_checkpoint
 from wlm.atlas.listing import read_listing
 from wlm.atlas.model import FIRST_BLOCK_CODE, Profile, pack_tiles, unpack_tiles

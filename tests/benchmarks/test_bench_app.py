@@ -31,6 +31,7 @@ COMMANDS = [
         {"walked_path": Path("a/city"), "quick": True},
     ),
     (["shader-speed", "--quick"], "shader-speed --quick --device cpu", {"quick": True}),
+    (["scene", "--quick"], "scene --quick --device cpu", {"quick": True}),
     (["lightmap-file", "--quick"], "lightmap-file --quick --device cpu", {"quick": True}),
     (
         ["probe", "--no-rivals", "--probes", "a/room.npz", "--key", "sh", "--key", "sh_noon"],

@@ -1,7 +1,6 @@
 """The networks' benchmark on tiny grids: every row has its figures, and they agree with what they are of."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from builders.bench_rows import by_option, check_outputs
 import benchmarks.smoke_network as bench
 from benchmarks import path_tracer
 from benchmarks.path_tracer import PathTracer, denoise
-from benchmarks.runner import Bench
 from benchmarks.smoke_network import (
     PANELS,
     QUICK,
@@ -188,35 +186,3 @@ def test_a_path_tracer_finds_the_same_light():
 def _plume():
     volume = make_plume(24, hot=False, extinction=14.0)
     return volume, make_camera(CameraSettings(resolution=24).turned(20.0), volume.origin, (1.0, 1.0, 1.0))
-
-
-@pytest.mark.parametrize("denoiser", [True, False])
-def test_traced_rows(monkeypatch, denoiser):
-    """Two scenes of grey smoke, and a tracer that finds the same light everywhere."""
-    lines = []
-    traced = Bench("smoke-network", "cpu", lines.append, clock="time_ms")
-    traced.camera, traced.sizes = None, SimpleNamespace(frames=2, samples=(1, 4), few=1, resolution=16)
-    traced.frames = [SimpleNamespace(later=None) for _ in range(4)]
-    traced.references = [torch.full((8, 16, 16), 0.5) for _ in range(4)]
-
-    class Tracer:
-        variant = "scalar_rgb"
-
-        def __init__(self, volume, camera):
-            pass
-
-        def __call__(self, samples):
-            return np.full((6, 16, 16), 0.2, np.float32), np.ones((16, 16))
-
-    monkeypatch.setattr(bench, "PathTracer", Tracer)
-    monkeypatch.setattr(bench, "has_tracer", lambda: True)
-    monkeypatch.setattr(bench, "has_denoiser", lambda: denoiser)
-    monkeypatch.setattr(bench, "denoise", lambda images: images)
-    rows = bench.traced_rows(traced)
-    options = ["1 sample", "1 sample, denoised", "4 samples", "4 samples, denoised"]
-    assert [row.option for row in rows] == (options if denoiser else options[::2])
-    assert all(row.notes == "on the CPU, scalar_rgb" and row["time_ms"] > 0.0 for row in rows)
-    # 0.2 is 0.4845 in sRGB.
-    assert rows[0]["psnr"] == pytest.approx(-20.0 * np.log10(0.5 - 0.48453), abs=0.01)
-    monkeypatch.setattr(bench, "has_tracer", lambda: False)
-    assert bench.traced_rows(traced) == [] and "left out, because mitsuba is not installed" in lines[-1]

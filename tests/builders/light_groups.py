@@ -8,9 +8,9 @@ import numpy as np
 from builders.small_sets import HOURS, moving_light
 from builders.synthetic import random_sheet
 
+from benchmarks.lightmap_exact import decode_tile64
 from wlm.formats.exr import write_exr
 from wlm.lightmap.data import LightmapSet, from_arrays
-from wlm.lightmap.exact import decode_tile64
 from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import place

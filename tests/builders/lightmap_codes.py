@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wlm.lightmap.exact import bound64, colour_tile64
+from benchmarks.lightmap_exact import bound64, colour_tile64
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.runtime import RuntimeDecoder
 

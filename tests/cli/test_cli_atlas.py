@@ -107,14 +107,10 @@ def test_wrong_words_are_one_line(inputs, tmp_path):
         *words, "--colour", "png"
     )
     assert "budget: " in fails(*words, "--profile", "paper", "--budget", 0.1)
-    assert "'none'" in fails(*words, "--profile", "none")
     assert "TEXCOORD_3" in fails(*words, "--uv-set", 3)
-    assert "device 'tpu'" in fails(*words, "--device", "tpu")
     assert "cannot read the mask" in fails(*words, "--mask", tmp_path / "a.png")
     assert "gone.glb" in fails("compress", tmp_path / "gone.glb", inputs[1], *out)
     assert "gone.exr" in fails("compress", inputs[0], tmp_path / "gone.exr", *out)
-    assert "none does not exist" in fails("compress", *inputs, "-o", tmp_path / "none" / "a.wlm")
-    assert "expected a name that ends in .wlm" in fails("compress", *inputs, "-o", tmp_path / "out")
     assert os.listdir(tmp_path) == []
 
 
@@ -172,7 +168,6 @@ def test_decode_a_view(kind, request, tmp_path):
 def test_wrong_words_of_decode(tiles, tmp_path):
     words = ["decode", tiles, "-o"]
     assert "expected .exr for a lightmap" in fails(*words, tmp_path / "a.png")
-    assert "expected a name that ends in .exr or .png" in fails(*words, tmp_path / "a.dds")
     for option, value in (("--views", 50), ("--resolution", 512)):
         # Also where it is the default of a view.
         text = fails(*words, tmp_path / "a.exr", option, value)
@@ -180,8 +175,6 @@ def test_wrong_words_of_decode(tiles, tmp_path):
     assert "--view: expected 0 to 49, got 50" in fails(*words, tmp_path / "a.exr", "--view", 50)
     assert "--view: expected 0 to 4, got 5" in fails(*words, tmp_path / "a.png", "--view", 5, "--views", 5)
     assert "--sheet: expected 0 to 0, got 1" in fails(*words, tmp_path / "a.exr", "--sheet", 1)
-    assert "found a folder" in fails("decode", tmp_path, "-o", tmp_path / "a.exr")
-    assert "device 'tpu'" in fails(*words, tmp_path / "a.exr", "--device", "tpu")
     assert os.listdir(tmp_path) == []
 
 

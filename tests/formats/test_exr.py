@@ -301,13 +301,6 @@ def test_lines_of_others_on_stderr_pass(tmp_path, capfd, monkeypatch):
     assert capfd.readouterr() == ("", "a line of another thread\n")
 
 
-@pytest.mark.parametrize("shape", [(4, 4), (4, 4, 2), (4, 4, 5), (0, 4, 3), (2, 4, 4, 3)])
-def test_other_shapes_are_a_value_error(tmp_path, shape):
-    with pytest.raises(ValueError, match="expected pixels"):
-        write_exr(tmp_path / "a.exr", np.zeros(shape, np.float32))
-    assert os.listdir(tmp_path) == []
-
-
 def test_a_closed_stderr_does_no_harm(tmp_path):
     path = tmp_path / "a.exr"
     write_exr(path, _pixels(3))

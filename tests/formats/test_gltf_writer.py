@@ -251,25 +251,6 @@ def test_nothing_replaced_is_a_copy(tmp_path):
     assert json.loads(json.dumps(before.content))["nodes"] == read_gltf(tmp_path / "out.glb")[0].content["nodes"]
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"gather": GATHER + 3}, "gather: expected vertex numbers 0 to 3, got 3 to 6"),
-        ({"gather": GATHER - 1}, "gather: expected vertex numbers 0 to 3, got -1 to 2"),
-        ({"triangle": CORNERS + 1}, "triangle: expected vertex numbers 0 to 5, got 1 to 6"),
-        ({"triangle": CORNERS[:0]}, "expected uv"),
-        ({"uv": NEW_UV[:4]}, "expected uv"),
-    ],
-)
-def test_what_does_not_fit_is_a_value_error(tmp_path, change, words):
-    document = _document(tmp_path)
-    first, second = _replacements(tmp_path)
-    fields = {"gather": GATHER, "triangle": CORNERS, "uv": NEW_UV, **change}
-    with pytest.raises(ValueError, match=words):
-        write_glb(tmp_path / "out.glb", document, [Replacement(first.primitive, **fields), second], 1)
-    assert "out.glb" not in os.listdir(tmp_path)
-
-
 def test_a_set_that_is_there_and_a_primitive_twice_are_value_errors(tmp_path):
     document = _document(tmp_path)
     replacements = _replacements(tmp_path)

@@ -21,8 +21,7 @@ from wlm.formats.light import read_light
 
 RGB, RGBA = ("R", "G", "B"), ("R", "G", "B", "A")
 # Byte offsets, from the specifications.
-FORMAT, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, PAIRS_BYTES = 12, 20, 24, 28, 32, 36, 44, 48, 60
-LEVEL, LEVEL_BYTES, LEVEL_SIZE = 80, 88, 96
+FORMAT, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, LEVEL = 12, 20, 24, 28, 32, 36, 44, 48, 80
 DDS_SIZE, DDS_HEIGHT, DDS_FLAGS, DDS_CODE, DDS_CAPS2 = 4, 12, 80, 84, 112
 DXGI, DIMENSION, MISC, ARRAY = 128, 132, 136, 140
 
@@ -192,13 +191,9 @@ def test_kinds_are_told_by_content(tmp_path):
     ("at", "value", "words"),
     [
         (FORMAT, 37, "BC6H or ASTC SFLOAT, found 37"),
-        (FORMAT, 83, "BC6H or ASTC SFLOAT, found 83 (R16G16_SFLOAT)"),
-        (FORMAT, 9999, "found 9999"),
         (FORMAT, 97, "byteLength of level 0: expected 120 for 5 x 3 texels of R16G16B16A16_SFLOAT, found 90"),
         (WIDTH, 0, "expected at least one texel, at most 268435456 texels and 65536 along a side, found 0 x 3"),
         (HEIGHT, 0, "pixelHeight: expected at least 1 (2D), found 0"),
-        (HEIGHT, 2**31, "65536 along a side, found 5 x 2147483648"),
-        (WIDTH, 2**16, "byteLength of level 0: expected 1179648 for 65536 x 3 texels of R16G16B16_SFLOAT"),
         (DEPTH, 2, "pixelDepth: expected 0 (no volume), found 2"),
         (LAYERS, 3, "layerCount: expected 0 (no array), found 3"),
         (FACES, 6, "faceCount: expected 1 (no cube), found 6"),
@@ -207,7 +202,6 @@ def test_kinds_are_told_by_content(tmp_path):
         (SCHEME, 3, "level 0: cannot unpack: zlib: Error -3 while decompressing"),
         (LEVEL, 500, "level 0: the file is cut short: expected 590 bytes"),
         (DESCRIPTOR_AT, 2**31, "the data format descriptor: the file is cut short"),
-        (PAIRS_BYTES, 2**31, "the key/value data: the file is cut short"),
         (104 + 14, 2, "expected linear light (transfer function 1), found 2"),
     ],
 )
@@ -239,14 +233,11 @@ def test_other_orders_are_refused(tmp_path, pairs, words):
         (DDS_SIZE, 125, "header size: expected 124, found 125"),
         (DDS_HEIGHT, 4, "5 x 4 texels of R16G16B16A16_FLOAT: the file is cut short: expected 308 bytes, found 268"),
         (DDS_HEIGHT, 0, "65536 along a side, found 5 x 0"),
-        (DDS_HEIGHT, 2**24, "65536 along a side"),
         (DDS_FLAGS, 0x40, "pixel format: expected DX10, or FourCC 113 (A16B16G16R16F) or 116 (A32B32G32R32F), found"),
         (DDS_CODE, 0x31545844, "found FourCC DXT1"),
-        (DDS_CODE, 36, "found FourCC 36"),
         (DDS_CAPS2, 0xFE00, "expected a 2D texture, found a cube"),
         (DDS_CAPS2, 0x200000, "expected a 2D texture, found a volume"),
         (DXGI, 98, "found 98 (BC7_UNORM)"),
-        (DXGI, 1000, "DXGI format: expected R32G32B32A32_FLOAT, R32G32B32_FLOAT"),
         (DIMENSION, 4, "dimension: expected 3 (2D), found 4"),
         (MISC, 4, "DX10 flags: expected no cube, found 0x4"),
         (ARRAY, 6, "array size: expected 1 (no array), found 6"),
@@ -267,16 +258,6 @@ def test_a_shorter_file_is_refused(tmp_path, scheme):
     for length in range(0, len(whole), 3):
         path.write_bytes(whole[:length])
         assert error_of(read_light, path).startswith(f"{path}: ")
-
-
-@pytest.mark.parametrize("scheme", [2, 3])
-def test_supercompressed_data_of_another_size_is_refused(tmp_path, scheme):
-    path = tmp_path / "a.ktx2"
-    for size in (89, 91, 1 << 20):
-        content = bytearray(make_ktx2(90, 5, 3, [bytes(size)], scheme))
-        struct.pack_into("<Q", content, LEVEL_SIZE, 90)
-        path.write_bytes(content)
-        assert "a.ktx2: level 0: cannot unpack: z" in error_of(read_light, path)
 
 
 def test_a_missing_package_is_named_with_the_file(tmp_path, monkeypatch):
@@ -304,10 +285,8 @@ def test_pfm_of_either_byte_order_and_of_grey(tmp_path):
     [
         (b"PF\n2 2\n-1\n" + bytes(47), "the texels: the file is cut short: expected 58 bytes, found 57"),
         (b"PF\n2 2\n0\n" + bytes(48), "expected a PFM header"),
-        (b"PF\n2 2\n1e+e\n" + bytes(48), "expected a PFM header"),
         (b"PF\n0 2\n-1\n", "expected at least one texel"),
         (b"PF\n16384 16384\n-1\n" + bytes(48), "expected at most 2048 times"),
-        (b"PFa", "expected a PFM header"),
     ],
 )
 def test_a_damaged_pfm(tmp_path, content, words):

@@ -7,10 +7,10 @@ import torch
 import warp as wp
 from reference import temporal as reference
 
+from benchmarks import plain
 from wlm import interop
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.trainer import Targets, Trainer
-from wlm.ops import plain
 from wlm_kernels.lightmap.matrix_step import fits_matrix_units
 
 TILE = 128

@@ -316,13 +316,3 @@ def test_air_that_blew_up_does_no_harm(value: float, device: str):
         got = grid.carried(np.ones(grid.shape), 1.0, 2)
         finite = got[np.isfinite(got)]
         assert finite.size > 0 and finite.min() >= 0 and finite.max() <= 1
-
-
-def test_wrong_boxes():
-    for arguments, match in (
-        (((2, 2, 2), 0, SHUT), "refinement"),
-        (((2, 2, 2), 1, ((OPEN, PERIODIC), *SHUT[:2])), "both ends"),
-        (((2000, 2000, 2000), 1, SHUT), "2\\^31"),
-    ):
-        with pytest.raises(ValueError, match=match):
-            make_box(*arguments)

@@ -5,10 +5,10 @@ import torch
 import warp as wp
 from reference import blocks as reference
 
+from benchmarks import plain
 from kernels.compare import array
 from wlm import ops
 from wlm.formats.bc7 import decode_image
-from wlm.ops import plain
 from wlm_kernels.lightmap import blocks
 
 

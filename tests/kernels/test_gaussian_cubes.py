@@ -6,8 +6,8 @@ import torch
 import warp as wp
 from reference import gaussians as reference
 
+from benchmarks import plain
 from kernels.compare import array
-from wlm.ops import plain
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe.cubes import Cubes
@@ -161,22 +161,3 @@ def test_everything_is_one_list(device: str):
     cubes = probe_cubes.everything(5, device)
     assert [items.tolist() for items in _lists(cubes)] == [[0, 1, 2, 3, 4]]
     assert probe_cubes.everything(0, device).start.numpy().tolist() == [0, 0]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([0, 0, 0], [1, -1, 1]), "expected the lowest and the highest corner"),
-        (([0, 0, 0], [1, np.nan, 1]), "expected the lowest and the highest corner"),
-        (([0, 0], [1, 1]), "expected the lowest and the highest corner"),
-        (([0, 0, 0], [1, 1, 1], 0.0), "size: expected a positive number, got 0.0"),
-        (([0, 0, 0], [1, 1, 1], np.inf), "size: expected a positive number, got inf"),
-        (([0, 0, 0], [1, 1, 1], 1e-4), r"makes 10+ cubes, expected at most 1073741823"),
-        # Three Gaussians over half of what is allowed each.
-        (([0, 0, 0], [1, 1, 1], 1 / 800), r"makes 1536000000 pairs \(cube, Gaussian\), expected at most 1073741823"),
-    ],
-)
-def test_wrong_arguments(arguments: tuple, message: str):
-    rows = np.tile(np.array([0.5, 0.5, 0.5, 1, 1, 1, 1, 0, 0, 0, 1], np.float32), (3, 1))
-    with pytest.raises(ValueError, match=message):
-        probe_cubes.build(_shapes(rows, "cpu"), *arguments)

@@ -161,10 +161,3 @@ def test_empty_bricks(device: str):
     expected = reference.lit(scene, toward, 0.4, 0.0)
     assert expected.max() > 0.1
     close(_run(march_lit, (), scene, device, toward, March(step=0.4)), expected, LOOSE, "light")
-
-
-def test_wrong_camera():
-    density, out = (wp.zeros(shape, dtype=float, device="cpu") for shape in ((2, 2, 2), (8, 2, 2)))
-    view = make_view((0, 0, 5), (1, 0, 0), (0, 1, 0), (0, 0, -1), 0.1, 2, 2, perspective=True)
-    with pytest.raises(ValueError, match="need an orthographic camera"):
-        march_six.six_way(Medium(density, 1.0), view, March(), out)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import plain
 from kernels.compare import close, exact
 from wlm import ops
-from wlm.ops import plain
 from wlm_kernels import mlp
 
 NETWORKS, BATCH = 3, 37

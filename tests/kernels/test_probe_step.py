@@ -8,8 +8,8 @@ import torch
 import warp as wp
 from reference import gaussians as reference
 
+from benchmarks import plain
 from kernels.compare import array, close
-from wlm.ops import plain
 from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.probe.gaussians import SHAPE_NUMBERS, Shape

@@ -6,8 +6,8 @@ import torch
 import warp as wp
 from reference import raster as reference
 
+from benchmarks import plain
 from kernels.compare import array, close, exact
-from wlm.ops import plain
 from wlm_kernels.raster import gradient as raster_gradient
 from wlm_kernels.raster.edges import exact_sign
 from wlm_kernels.raster.rasterize import Raster, Rasterizer

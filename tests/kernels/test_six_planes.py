@@ -152,12 +152,3 @@ def test_decode(device):
     near = share > 0.99
     torch.testing.assert_close(result[LIGHTS + 1][~near], glow[~near], rtol=1e-4, atol=1e-7, equal_nan=True)
     assert (result[LIGHTS + 1][near] > 90).all() and result[LIGHTS + 1][share == 1].eq(65504.0).all()
-
-
-def test_wrong_edges_and_reaches_are_refused():
-    for edge in (0, 4, 17):
-        with pytest.raises(ValueError, match="edge: expected an odd number"):
-            kernels(edge, 8, False, False)
-    for reach in (2, 12, 64):
-        with pytest.raises(ValueError, match="reach: expected 4, 8, 16 or 32"):
-            kernels(5, reach, False, False)

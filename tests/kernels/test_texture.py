@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks import plain
 from kernels.compare import array, close, exact
-from wlm.ops import plain
 from wlm_kernels.raster import texture
 from wlm_kernels.raster.texture import BOUNDARIES, FILTERS
 

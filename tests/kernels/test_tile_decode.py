@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks.atlas_exact import decode64
 from kernels.compare import array, close
-from wlm.atlas.exact import decode64
 from wlm.atlas.model import AtlasModel, Profile, SheetPlace
 from wlm_kernels.atlas import decode
 

@@ -19,9 +19,9 @@ import wlm
 from wlm.formats import scratch
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import read_exr, write_exr, write_planes
+from wlm.formats.hours import hours_of_names
 from wlm.formats.light import read_light
 from wlm.lightmap.data import Layer, LightmapSet, from_layers, parse_times
-from wlm.lightmap.hours import hours_of_names
 
 HEIGHT, WIDTH = 5, 7
 TIMES = (0.0, 6.5, 18.55)
@@ -155,11 +155,6 @@ def test_what_a_frame_lacks_comes_from_the_nearest_in_time(period, taken):
     assert len(lightmaps.warnings) == 1 and lightmaps.source != from_arrays(lightmaps.frames, times).source
 
 
-def test_mask_from_alpha_without_alpha_names_the_file(tmp_path):
-    message = error_of(load, _write_set(tmp_path, _frames(), mask="alpha"))
-    assert "a.exr" in message and "channel A" in message
-
-
 def test_mask_errors(tmp_path):
     path = _write_set(tmp_path, _frames(), mask="mask.png")
     _save_mask(tmp_path / "mask.png", np.ones((HEIGHT, WIDTH + 1), bool))
@@ -280,13 +275,6 @@ def test_malformed_set_names_the_field(tmp_path, changes, expected):
     assert message.startswith(f"{path}: ") and expected in message
 
 
-@pytest.mark.parametrize("text", ["{", "", "[1]", '"set"', "null", "[" * 100_000, "\xff"])
-def test_set_that_is_no_json_object_names_the_file(tmp_path, text):
-    path = tmp_path / "set.json"
-    path.write_bytes(text.encode("latin-1"))
-    assert str(path) in error_of(load, path)
-
-
 def test_path_that_does_not_exist(tmp_path):
     assert "nowhere" in error_of(load, tmp_path / "nowhere")
     assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds, .pfm, .tif, .tiff), found none" in error_of(
@@ -328,14 +316,6 @@ def test_plain_folder_may_mix_formats(tmp_path):
     (tmp_path / "m_2h.hdr").unlink()
     (tmp_path / "m_4h.DDS").unlink()
     np.testing.assert_array_equal(load(tmp_path, mask="alpha").mask, alpha[..., 0] > 0)
-
-
-def test_plain_folder_uses_its_mask(tmp_path):
-    write_exr(tmp_path / "a.exr", _frames()[0])
-    mask = np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % 2 == 0
-    _save_mask(tmp_path / "mask.png", mask)
-    np.testing.assert_array_equal(load(tmp_path, times=[0]).mask, mask)
-    assert load(tmp_path, times=[0], mask="all").mask.all()
 
 
 def test_plain_folder_reads_hours_from_names(tmp_path):

@@ -15,6 +15,7 @@ from builders.small_sets import moving_light, static_light, tiny_profile
 from builders.synthetic import any_blocks, random_model, random_sheet
 
 import wlm
+from benchmarks.lightmap_exact import bound64, colour_tile64, decode_tile64
 from benchmarks.rivals.lightmap import encode_set
 from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
@@ -23,7 +24,6 @@ from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.frames import choose_frames, needed_blocks, round_half
 from wlm.lightmap.encodings.maps import tile_bytes
 from wlm.lightmap.evaluation import count_kinds
-from wlm.lightmap.exact import bound64, colour_tile64, decode_tile64
 from wlm.lightmap.fit import compress, open_checkpoint
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.runtime import ExactDecoder, FrameDecoder
@@ -192,20 +192,9 @@ def test_two_states_are_as_good_as_bc7_in_as_many_bytes(two_hours, tmp_path):
 def test_a_tile_is_frames_where_that_takes_no_more(lightmaps, settings, kind):
     profile, count = Profile.load("M").override(settings), len(lightmaps.times)
     kinds = classify(split(lightmaps.light, profile.gamma), profile.gamma)
-    chosen = choose_frames(kinds, [0], lightmaps.light.mask, count, profile)
+    chosen = choose_frames(kinds, count, profile)
     assert ("frames" if chosen[0] else TileKind(kinds[0]).name.lower()) == kind
     assert "frames" in settings or chosen[0] == (count * 16384 < tile_bytes(profile, kinds[0] == TileKind.DYNAMIC))
-
-
-def test_blocks_that_nothing_needs_count_for_neither():
-    profile, count = Profile.load("M"), 12
-    for width, chosen in ((6, True), (12, False)):
-        mask = np.zeros((128, 128), bool)
-        mask[:, :width] = True
-        needed = -(-(width + 2) // 4) / 32
-        assert (count * (needed * 16384 + 12) < tile_bytes(profile, True) - (1 - needed) * 16384) == chosen
-        assert choose_frames(np.array([TileKind.DYNAMIC]), [0], mask, count, profile)[0] == chosen
-        assert not choose_frames(np.array([TileKind.CONSTANT]), [0], mask, count, profile)[0]
 
 
 def test_without_the_encoder_a_network_is_fitted_and_that_is_said(monkeypatch, tmp_path):
@@ -213,7 +202,7 @@ def test_without_the_encoder_a_network_is_fitted_and_that_is_said(monkeypatch, t
     lightmaps = moving_light(hours=(6.0,))
     model = compress(lightmaps, tiny_profile(frames="auto"))
     assert count_kinds(model.sheets[LIGHT])["static"] == 1
-    assert len(model.warnings) == 1 and "1 tile would be" in model.warnings[0]
+    assert len(model.warnings) == 1 and "1 tile would take" in model.warnings[0]
     assert "pip install 'wlm[frames]'" in model.warnings[0] and "\n" not in model.warnings[0]
     with pytest.raises(WlmError, match=r"^frames: ispc_texcomp is missing; needs the extra"):
         compress(lightmaps, "frames")

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from builders.checks import error_of
 from builders.kept_files import lightmap_fit
 from builders.small_sets import HOURS, moving_light, static_light, tiny_profile
 
@@ -104,13 +103,6 @@ def test_one_valid_texel(tmp_path):
     assert report.light.scored == 0 and report.to_json()["psnr"] is None
 
 
-def test_two_valid_texels_are_fitted(tmp_path):
-    mask = np.zeros((128, 128), bool)
-    mask[0, 0] = mask[127, 127] = True
-    decoder = through_file(tmp_path, moving_light(mask=mask), tiny_profile(steps=30))
-    assert only(decoder, "dynamic")
-
-
 def test_one_time_only_is_static_and_the_same_at_any_hour(tmp_path):
     for period in (24.0, None):
         decoder = through_file(tmp_path, moving_light(hours=(6.0,), period=period))
@@ -205,12 +197,6 @@ def test_a_subset_of_the_tiles(tmp_path):
     assert not frame[:128, 128:].any() and not frame[128:, :128].any()
 
 
-@pytest.mark.parametrize("tiles", [[4], [-1], [0, 0], []])
-def test_tiles_that_are_not_there_are_one_line(tiles):
-    with pytest.raises(WlmError, match="tile"):
-        compress(moving_light(130, 130), PROFILE, tiles=tiles)
-
-
 @pytest.mark.parametrize("make", [moving_light, static_light])
 def test_a_tile_alone_is_the_tile_of_a_batch(make):
     narrow, lightmaps = make(128, 128), make(128, 256)
@@ -255,15 +241,3 @@ def test_times_outside_the_range_wrap_or_stop(tmp_path):
     for bad in (np.nan, np.inf):
         with pytest.raises(WlmError, match="time"):
             stopped.frame(bad)
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"steps": 1}, "steps: expected greater than or equal to 10"),
-        ({"quantise_from": 1.0, "freeze_from": 0.5}, "quantise_from must not be greater than freeze_from"),
-        ({"device": "tpu"}, "device 'tpu'"),
-    ],
-)
-def test_wrong_settings_are_one_line(options, says):
-    assert says in error_of(compress, moving_light(8, 8), PROFILE, **options)

@@ -7,11 +7,11 @@ from builders.light_groups import random_groups, sum64
 from builders.lightmap_codes import shares_of
 from builders.synthetic import random_sheet
 
+from benchmarks.lightmap_exact import bound64, colour_tile64
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
-from wlm.lightmap.exact import bound64, colour_tile64
 from wlm.lightmap.runtime import ExactDecoder, MapDecoder, MatrixDecoder, StripDecoder
 from wlm.lightmap.tiles import TileKind
 from wlm.texels import near_gaps

@@ -15,7 +15,7 @@ from builders.synthetic import random_model
 
 import wlm
 from wlm.errors import WlmError
-from wlm.formats.artifact import Pieces, read_artifact
+from wlm.formats.artifact import read_artifact
 from wlm.lightmap.loading import TileLoader
 from wlm.lightmap.model import PACKED
 from wlm.lightmap.sheet import LIGHT
@@ -123,21 +123,6 @@ def test_a_flipped_byte_is_an_error_of_its_tile(path, tmp_path, piece):
     assert message in error_of(model.save, tmp_path / "b.wlm") and not (tmp_path / "b.wlm").exists()
 
 
-def test_a_flipped_byte_of_the_index_refuses_the_file(path):
-    content = path.read_bytes()
-    for place in range(0, index_bytes(content), 5):
-        flip(path, place)
-        assert error_of(wlm.load, path).startswith(f"{path}: ")
-        path.write_bytes(content)
-
-
-def test_a_file_that_is_cut_anywhere_is_refused(path):
-    content = path.read_bytes()
-    for length in range(0, len(content), 97):
-        path.write_bytes(content[:length])
-        assert str(path) in error_of(wlm.load, path)
-
-
 def signed(path: Path, change) -> None:
     """Changes header and body of a file and gives it a right digest."""
     content = path.read_bytes()
@@ -213,18 +198,6 @@ def test_pieces_that_overlap_or_exceed_their_part_are_refused(path, change, word
         assert line == f"{path}: sheet random: tile 0: the file is damaged here: the bytes do not match their digest"
     else:
         assert words in error_of(wlm.load, path)
-
-
-@pytest.mark.parametrize("kinds", [(0, 0), (1, 0), (3,), (4,)])
-def test_sets_of_no_tile_and_of_one(tmp_path, kinds):
-    model = random_model(kinds, columns=1)
-    model.save(tmp_path / "a.wlm")
-    loaded = wlm.load(tmp_path / "a.wlm")
-    loaded.check()
-    time = float(loaded.times[0])
-    np.testing.assert_array_equal(loaded.decoder(tiles=[0]).frame(time), model.decoder().frame(time))
-    assert_same(loaded, model)
-    loaded.close()
 
 
 def test_a_file_that_is_replaced_while_it_is_open_stays_readable(path):
@@ -420,18 +393,3 @@ def test_a_loader_that_is_closed_ends_and_says_so(path, monkeypatch):
     with TileLoader(model) as other:
         assert "expected a tile of one of its sheets, got tile 6" in error_of(other.request, LIGHT, 6)
     assert "most: expected at least 1, got 0" in error_of(TileLoader, model, 0)
-
-
-def test_a_model_that_is_closed_is_an_error_of_each_tile(path):
-    with wlm.load(path) as model, TileLoader(model) as loader:
-        model.close()
-        loader.request(LIGHT, 0)
-        assert loader.wait(30.0)
-        (result,) = loader.take()
-        assert str(result.error).endswith("tile 0: the file was closed")
-
-
-def test_pieces_are_a_sequence(path):
-    pieces = read_artifact(path).pieces["0.tiles"]
-    assert isinstance(pieces, Pieces) and pieces[1:3] == [pieces[1], pieces[2]] and list(pieces) == pieces[:]
-    assert sum(map(len, pieces)) == int(pieces.sizes.sum())

@@ -5,8 +5,8 @@ import pytest
 import torch
 from kernels.compare import close
 
+from benchmarks import plain
 from wlm import ops
-from wlm.ops import plain
 
 TRIANGLE = torch.tensor([[0, 1, 2], [0, 2, 3], [3, 1, 4]])
 
@@ -84,7 +84,6 @@ def test_what_batches_refuse(device: str):
     raster, uv = ops.rasterize(clip, triangle, 5, 6), torch.zeros(3, 4, 2, device=device)
     for call, message in (
         (lambda: ops.rasterize(clip[:0], triangle, 5, 6), r"clip: expected at least one mesh, got \(0, 5, 4\)"),
-        (lambda: ops.rasterize(clip[None], triangle, 5, 6), r"clip: expected float32 \[any, 4\], got .*\(1, 3, 5, 4\)"),
         (
             lambda: ops.interpolate(clip[:2], triangle, raster),
             r"raster.barycentric: expected float32 \[2, any, any, 2\]",
@@ -92,14 +91,6 @@ def test_what_batches_refuse(device: str):
         (
             lambda: ops.interpolate(clip, triangle, raster, derivatives=True),
             "raster.derivative: expected derivatives, got None: use rasterize",
-        ),
-        (
-            lambda: ops.texture(_numbers(2, 4, 4, 1).to(device), uv),
-            r"uv: expected float32 \[2, \.\.\., 2\] for as many",
-        ),
-        (
-            lambda: ops.texture(_numbers(4, 4, 1).to(device), uv, derivatives=uv),
-            r"derivatives: expected float32 \[3, 4, 2, 2\], got .* \(3, 4, 2\)",
         ),
         (
             lambda: ops.texture(

@@ -15,8 +15,8 @@ import torch
 from builders.operation_cases import CASES, FIRST, Case, normal
 from kernels.compare import close
 
+from benchmarks import plain
 from wlm import ops
-from wlm.ops import plain
 
 # Values and gradients: of the largest number of a tensor; slope: of the derivative along a direction.
 EXACT = {"value": 1e-5, "gradient": 1e-4, "slope": 1e-3}

@@ -267,20 +267,6 @@ def test_what_has_no_gradient_is_refused(device: str):
         ops.texture(*(torch.tensor(v, device=device).requires_grad_() for v in texture.values()), filter="nearest")
 
 
-@pytest.mark.parametrize(
-    ("dtype", "message"),
-    [
-        (wp.float64, "values: expected float32 .*float64"),
-        (wp.float16, "values: expected float32 .*float16"),
-        (int, "values: expected float32 .*int32"),
-    ],
-)
-def test_wrong_types(device: str, dtype: Any, message: str):
-    values, points = wp.zeros((4, 5, 1), dtype=dtype, device=device, requires_grad=True), _array(normal(6, 2), device)
-    with pytest.raises(ValueError, match=message), wp.Tape():
-        ops.plane(values, points)
-
-
 def test_other_refusals(device: str):
     values, points = _array(normal(4, 5, 1), device), _array(normal(6, 2), device)
     record = wp.zeros(3, dtype=_Record, device=device)

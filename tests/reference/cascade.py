@@ -2,7 +2,7 @@
 
 import torch
 
-from wlm.ops.plain import texture
+from benchmarks.plain import texture
 
 
 def wave(x: torch.Tensor) -> torch.Tensor:

@@ -1,10 +1,10 @@
-"""3D Gaussians in float64: gradients by autograd, and what reaches what; the sum is `wlm.ops.plain`'s."""
+"""3D Gaussians in float64: gradients by autograd, and what reaches what; the sum is `benchmarks.plain`'s."""
 
 import numpy as np
 import torch
 from scipy.optimize import lsq_linear
 
-from wlm.ops import plain
+from benchmarks import plain
 
 
 def gradients(rows: np.ndarray, x: np.ndarray, grad_f: np.ndarray, cut: float, support: str = "ellipsoid"):

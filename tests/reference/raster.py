@@ -1,11 +1,11 @@
-"""Rasterizing by its definition, with how sure it is: `wlm.ops.plain` says how a pixel is weighed."""
+"""Rasterizing by its definition, with how sure it is: `benchmarks.plain` says how a pixel is weighed."""
 
 from fractions import Fraction
 
 import numpy as np
 import torch
 
-from wlm.ops.plain import corner_weights, pixel_centres
+from benchmarks.plain import corner_weights, pixel_centres
 
 
 def rasterize(

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from wlm.ops import plain
+from benchmarks import plain
 
 SIZE = 128
 

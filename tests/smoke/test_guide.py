@@ -56,10 +56,3 @@ def test_distance_of_an_orthographic_camera(device: str):
     hit = (near.depth > 0) & (far.depth > 0)
     np.testing.assert_allclose((far.depth - near.depth)[hit].cpu(), 29_970.0, atol=0.3)
     assert (far.depth[near.depth == 0] == 0).float().mean() > 0.99
-
-
-@pytest.mark.parametrize("name", ["spacing", "light_step"])
-def test_settings_of_the_coarse_march_are_refused(name: str):
-    volume = _ball("cpu", 4)
-    with pytest.raises(ValueError, match=f"{name}: expected None"):
-        guide(volume, _camera(volume), March(**{name: 2.0}))

@@ -134,15 +134,3 @@ def test_hard_cases(device: str):
     camera = facing(ball, (1.0, 0.2, 0.4), 20)
     first, second = (motion(ball, wind, camera, reach=1.0) for _ in range(2))
     assert torch.equal(first, second)
-
-
-def test_wrong_use(device: str):
-    ball = from_array(_ball(), device=device)
-    wind = _velocity(np.ones((2, 2, 2, 3)), device)
-    with pytest.raises(ValueError, match="orthographic"):
-        motion(ball, wind, facing(ball, perspective=True), reach=1.0)
-    for options, name in (({"reach": float("nan")}, "reach"), ({"reach": 1.0, "step": 0.0}, "step")):
-        with pytest.raises(ValueError, match=name):
-            motion(ball, wind, facing(ball), **options)
-    with pytest.raises(ValueError, match="velocity"):
-        motion(ball, wp.zeros((2, 2, 2), dtype=float, device=device), facing(ball), reach=1.0)

@@ -16,7 +16,6 @@ from pydantic import ValidationError
 from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
-from wlm.fluid.volume import save_volume
 from wlm.formats.exr import read_planes, write_planes
 from wlm.smoke import simulation
 from wlm.smoke.data import CHECKPOINT, NumberedFiles, load_frames, open_frames, read_six_way, spread, write_six_way
@@ -123,27 +122,17 @@ def test_scaling_keeps_one_cell(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"grid": {"cells": [4, 4], "cell": 0.1}}, "grid.cells"),
-        ({"grid": {"cells": [4, 4, 0], "cell": 0.1}}, "grid.cells.2: expected greater than or equal to 1, got 0"),
         ({"grid": GRID | {"cell": -1}}, "grid.cell: expected greater than or equal to 0.000000001, got -1"),
-        ({"grid": GRID | {"faces": {"up": "wall"}}}, "grid.faces.up"),
         ({"grid": GRID | {"faces": {"-x": "periodic"}}}, "both faces of an axis"),
-        ({"smoke": {"extinction": 0}}, "smoke.extinction: expected greater than 0"),
         ({"smoke": {"glow": [[0, 1, 1, 1]]}}, "smoke.glow: expected no stops, or at least two whose emission"),
         ({"air": {"viscosity": math.nan}}, "air.viscosity: expected a finite number, got nan"),
         ({"sources": [{"centre": [0, 0, 0], "radius": 1, "start": 2, "stop": 1}]}, "expected a time after start"),
-        ({"obstacles": [SPHERE | {"path": []}]}, "obstacles.0.path"),
         ({"obstacles": [SPHERE | {"path": [[0, 0, 0, 0], [0, 1, 1, 1]]}]}, "0.path: expected times that increase"),
         ({"obstacles": [SPHERE | {"shape": "box"}]}, "obstacles.0.radius: expected one number for a sphere, three"),
-        ({"inlets": [{"face": "up", "velocity": [0, 1, 0]}]}, "inlets.0.face"),
         ({"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]}, "inlets.0.velocity: expected a velocity that points"),
-        ({"inlets": [{"face": "-x", "velocity": [0, 1, 0]}]}, "inlets.0.velocity: expected a velocity that points"),
         ({"grid": GRID | {"faces": dict.fromkeys(FACES, "wall")}}, "expected an open face"),
         ({"grid": GRID | {"faces": dict.fromkeys(("-y", "+y"), "periodic")}}, "inlets on faces that aren't periodic"),
         ({"lights": [{"toward": [0, 0, 0]}]}, "lights.0.toward: expected a direction other than 0, 0, 0"),
-        ({"lights": [{"toward": [0, 1, 0], "irradiance": [1, -1, 1]}]}, "lights.0.irradiance.1"),
-        ({"camera": {"resolution": 0}}, "camera.resolution"),
-        ({"frames": 0}, "frames: expected greater than or equal to 1"),
         ({"camara": {}}, "unknown key 'camara'; did you mean 'camera'?"),
     ],
 )
@@ -273,7 +262,6 @@ def test_folders_that_are_none(tmp_path):
         load_frames(tmp_path / "a")
     for content, said in (
         ("{", "found other content"),
-        ("[]", "found other content"),
         ('{"format": "wlm-smoke-frames", "version": 9}', "version: expected 1, found 9"),
         ('{"format": "wlm-smoke-frames", "version": 1, "scene": {}}', "scene.name: expected a value, found none"),
     ):
@@ -282,8 +270,6 @@ def test_folders_that_are_none(tmp_path):
         (folder / "scene.json").write_text(content)
         with pytest.raises(WlmError, match=said):
             load_frames(folder)
-    with pytest.raises(WlmError, match="ends in .npz"):
-        save_volume(tmp_path / "a.vdb", plume())
 
 
 def test_numbered_files_replace_those_of_an_earlier_run(tmp_path):

@@ -1,7 +1,6 @@
 """Shading: weights, lights and emission."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,19 +73,3 @@ def test_background(device: str):
         result = six.shade([Light((0.0, 0.0, 1.0))], background=background)
         expected = light + six.transparency[..., None] * torch.as_tensor(background, device=device)
         np.testing.assert_allclose(result.cpu(), expected.cpu(), rtol=1e-6)
-
-
-def test_wrong_settings():
-    six = _six("cpu")
-    with pytest.raises(ValueError, match="irradiance"):
-        six.shade([Light((0, 0, 1), (-1, 0, 0))])
-    with pytest.raises(ValueError, match="directions"):
-        six.shade([Light((0, 0, 0))])
-    with pytest.raises(ValueError, match="camera: the lightmaps have no camera"):
-        replace(six, camera=None).shade([Light((0, 0, 1))])
-    with pytest.raises(ValueError, match="transparency: the lightmaps have no"):
-        replace(six, transparency=None).shade([], background=(0, 0, 0))
-    with pytest.raises(ValueError, match="camera: expected the height and width of the lightmaps, .8, 8."):
-        replace(six, camera=six.camera.finer(2))
-    with pytest.raises(ValueError, match="depth: expected"):
-        replace(six, depth=torch.ones(2, 2))

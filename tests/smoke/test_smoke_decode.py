@@ -88,10 +88,3 @@ def test_planes_repeat_and_the_network_is_left_alone():
     planes = decoder(guide).clone()
     assert not torch.equal(planes, decoder(1 - guide)) and torch.equal(planes, decoder(guide))
     assert all(torch.equal(value, before[name]) for name, value in model.network.state_dict().items())
-
-
-def test_wrong_sizes_are_refused():
-    with pytest.raises(ValueError, match="pixel"):
-        random_model().decoder(height=0, width=4)
-    with pytest.raises(ValueError, match=r"expected a guiding map \[3, 8, 8\]"):
-        random_model().decoder(height=8, width=8)(torch.zeros(3, 8, 9))

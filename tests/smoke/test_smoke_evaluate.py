@@ -11,7 +11,6 @@ from builders.smoke_plumes import plume
 from builders.smoke_samples import random_model, small_pool
 
 import wlm
-from wlm.errors import WlmError
 from wlm.fluid.volume import save_volume
 from wlm.metrics import psnr_from_mse
 from wlm.smoke.evaluation import COARSE, HALF, NETWORK, coarse, compare, evaluate, of_decoder, of_network, score
@@ -118,14 +117,6 @@ def test_all_methods_on_all_sets(tmp_path, device):
     assert report.psnr == pytest.approx(results["paper"][0].methods[NETWORK].psnr, abs=0.05)
     assert abs(report.psnr - validation.psnr) > 0.1
     assert {progress.stage for progress in reports} == {"dataset", "evaluate"}
-
-
-def test_smoke_is_required(device):
-    empty = FEW.model_copy(update={"least_coverage": 1.0, "kept_empty": 0.0, "views": 1, "warmup": 0.1})
-    with pytest.raises(WlmError, match="density x 2: expected frames with smoke"):
-        compare(_network(), empty, densities=(2.0,), device=device)
-    with pytest.raises(WlmError, match="test set: expected frames with smoke"):
-        evaluate(_network(), empty, device=device)
 
 
 def test_the_coarse_march_is_its_guide():

@@ -20,7 +20,6 @@ from wlm.smoke.codec import open_network, shipped
 from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.six_way import bake, bake_coarse
 from wlm.smoke.model import SmokeModel, parameter_count
-from wlm.smoke.network.onnx_file import export_onnx
 from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, encode_lightmaps
 from wlm.smoke.network.prediction import SmokePredictor, predict
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
@@ -242,9 +241,3 @@ def test_no_grid_makes_the_network_worse_than_the_march_that_it_reads(voxels):
         error, before = (float((planes[low:high] - target[low:high]).square().mean()) for planes in (made, coarse))
         assert error < 1.02 * before + 1e-9
     assert float(predictor.share) < 0.3
-
-
-def test_onnx_of_no_pixels_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="pixel"):
-        export_onnx(random_model(), tmp_path / "a.onnx", height=0, width=22)
-    assert not (tmp_path / "a.onnx").exists()

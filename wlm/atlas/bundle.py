@@ -46,10 +46,6 @@ def bundle(model: AtlasModel, *, device: str = "cpu") -> Bundle:
         A bundle with the texture `colour`; the textures `lut` and `blocks` where the model has them; for a model of
         several lightmaps the textures `sheets` and `factors`; the file `mesh.glb`; and, to test a renderer against, the
         first lightmap as decoded, `lightmap`, float32 [H, W, 3].
-
-    Raises:
-        WlmError: A texture has more texels along a side than GPUs take, there is no such device, or the stored
-            triangles are damaged.
     """
     shared = model.method == "shared"
     textures = {"colour": _colour(model, layered=shared)}

@@ -391,9 +391,6 @@ def place_objects(
 ) -> tuple[tuple[Sheet, ...], np.ndarray]:
     """Makes a model's sheets, without lightmaps, from the triangles in its file. Also returns the corners of all B
     triangles that no sheet lights, float64 [B, 3, 3].
-
-    Raises:
-        WlmError: A sheet has no triangle, or the triangles can't be read.
     """
     by_node: dict[int, list[GltfPrimitive]] = {}
     for each in primitives:

@@ -117,11 +117,7 @@ class Listing:
                 raise WlmError(str(error).replace(path, label)) from error
 
     def file(self, name: str, trust: bool) -> Path:
-        """Returns the path of a file that the list names.
-
-        Raises:
-            WlmError: The path lies outside the list's folder, and `trust` is false.
-        """
+        """Returns the path of a file that the list names."""
         if self.direct:
             return Path(name)
         return named_file(self.path, name, f"{self.path}: {name}", trust)
@@ -134,11 +130,7 @@ def is_listing(path: str | os.PathLike[str] | None) -> bool:
 
 
 def read_listing(path: str | os.PathLike[str]) -> Listing:
-    """Reads a list of lightmaps from a JSON file, a `.lmbake` file or a folder.
-
-    Raises:
-        WlmError: A field is wrong, which the message names with the file; or the folder has no lightmap.
-    """
+    """Reads a list of lightmaps from a JSON file, a `.lmbake` file or a folder."""
     if os.path.isdir(path):
         folder = Path(path).resolve()
         if not (folder / _SET_FILE).is_file():
@@ -197,11 +189,7 @@ def _object(entry: Any, convention: str, where: str) -> Any:
 
 
 def numbers(value: Any, where: str, keys: tuple[str, ...]) -> list[float]:
-    """Returns four numbers of a JSON document, written as a list or as an object with the four `keys`.
-
-    Raises:
-        WlmError: It is something else, or a number is not finite; `where` names its place.
-    """
+    """Returns four numbers of a JSON document, written as a list or as an object with the four `keys`."""
     if isinstance(value, dict) and set(keys) <= set(value):
         value = [value[key] for key in keys]
     if not (

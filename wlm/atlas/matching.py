@@ -62,9 +62,6 @@ def choose_mesh(
     Meshes that lie side by side in UV space share it. Where they overlap, the mesh in whose charts the lightmap is
     smoothest is chosen; a mesh that several nodes draw counts once. Where the light fits none clearly better, the name
     of the lightmap decides (`by_name`). `alone` is whether the lightmap is the only one, for the advice in messages.
-
-    Raises:
-        WlmError: The lightmap fits no mesh clearly better than all others, and has the name of none.
     """
     numbers = sorted({each.mesh for each in primitives})
     if len(numbers) == 1:
@@ -123,11 +120,7 @@ def _words(name: str) -> str:
 
 
 def named(where: str, primitives: list[GltfPrimitive], node: str) -> list[GltfPrimitive]:
-    """Selects the primitives of the node with the given name, mesh name or number.
-
-    Raises:
-        WlmError: There is no such node; the line lists the nodes that exist.
-    """
+    """Selects the primitives of the node with the given name, mesh name or number."""
     found = [each for each in primitives if node in (each.label, each.mesh_label, str(each.node))]
     if not found:
         labels = list(dict.fromkeys(each.label for each in primitives))
@@ -264,13 +257,8 @@ def misfits(
     or the lightmap turned or mirrored, make it clearly smoother in the charts, light and charts lie apart, or the
     charts leave nearly all of the light out.
 
-    Args:
-        name: The lightmap's name.
-        lightmap, position, triangle, uv: The light, and the mesh with the UVs in [0, 1] that are used.
-        chart: The chart at each texel with these UVs, see `chart_map`.
-        used: Words for these UVs.
-        alternatives: Words and UVs [V, 2] to compare with. The UVs that are used, stretched to the lit texels, are
-            compared too.
+    `chart` is the chart at each texel with the mesh's UVs in [0, 1], see `chart_map`, and `used` words for these UVs.
+    `alternatives` are words and UVs [V, 2] to compare with, besides the UVs that are used, stretched to the lit texels.
     """
     step = -(-max(lightmap.shape[:2]) // _EXAMINED)
     light = lightmap[::step, ::step]

@@ -332,10 +332,6 @@ class AtlasModel(Model):
 def check_area(size: tuple[int, int], texels: int, entries: int) -> None:
     """Checks that a lightmap's height and width are plausible for the numbers of texels of T_p and entries of T_c,
     since a file of a few bytes must not claim gigabytes.
-
-    Raises:
-        WlmError: The lightmap exceeds the limits of `wlm.formats.limits.check_sides`; or it has more than 2^24 texels
-            and also more than 65,536 for each texel of T_p and T_c.
     """
     check_sides("size", *size[::-1])
     stored = texels + entries
@@ -378,9 +374,6 @@ def pack_entries(
     Returns:
         uint16 [..., 2]: the first texel shifted left by 4, plus the size minus 1. For blocks, both are in blocks
         instead of texels, and `code` is added.
-
-    Raises:
-        ValueError: A number is out of range.
     """
     first, size, blocks = np.asarray(first), np.asarray(size), np.asarray(blocks)[..., None]
     most = np.where(blocks, 1 << SIDE_BITS, code)

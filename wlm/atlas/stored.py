@@ -31,11 +31,7 @@ class StoredScene:
 
 
 def store(scene: LightmappedScene) -> StoredScene:
-    """Encodes the triangles and masks of a scene.
-
-    Raises:
-        WlmError: A part of the glTF document is malformed.
-    """
+    """Encodes the triangles and masks of a scene."""
     content = copy.deepcopy(scene.document.content)
     for each in scene.objects:
         node = content["nodes"][each.node]

@@ -16,11 +16,7 @@ _INSTALL = "install LLVM 16 or later (apt install libllvm19, for example), or na
 
 
 def start(device: str = "cpu") -> ModuleType:
-    """Imports Mitsuba with its variant for "cpu" or "cuda" (the first GPU), and returns Mitsuba's module.
-
-    Raises:
-        WlmError: A package, LLVM or a GPU is missing; the line says what to install.
-    """
+    """Imports Mitsuba with its variant for "cpu" or "cuda" (the first GPU), and returns Mitsuba's module."""
     if device not in _VARIANTS:
         raise WlmError(f"device: expected cpu or cuda (the first GPU) for a bake, got {device}")
     # Dr.Jit's C library writes lines when it finds no LLVM.

@@ -107,12 +107,7 @@ class Geometry:
 
 
 def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = False) -> Geometry:
-    """Reads a glTF file; `settings` selects the lightmap UVs or how to unwrap them, None if no UVs are needed.
-
-    Raises:
-        WlmError: The file can't be read, has no triangle with area, is too small, too large or too far from the origin
-            for rays in float32, or lacks the lightmap's UVs.
-    """
+    """Reads a glTF file; `settings` selects the lightmap UVs or how to unwrap them, None if no UVs are needed."""
     document, primitives = read_gltf(path, trust)
     for each in primitives:
         if not np.isfinite(each.position).all():
@@ -161,11 +156,7 @@ def read_geometry(path: Path, settings: LightmapSettings | None, trust: bool = F
 
 
 def check_lamps(path: Path, scene: BakeScene, geometry: Geometry) -> None:
-    """Checks that the materials named by lamps exist; `path` is the scene file, for the message.
-
-    Raises:
-        WlmError: A material doesn't exist.
-    """
+    """Checks that the materials named by lamps exist; `path` is the scene file, for the message."""
     names = sorted({each.material.name for each in geometry.surfaces})
     for i, lamp in enumerate(scene.lamps):
         if lamp.material is not None and lamp.material not in names:
@@ -210,9 +201,6 @@ def unwrap(
 
     Returns:
         A replacement for each primitive that has a triangle with area, its UVs in [0, 1].
-
-    Raises:
-        WlmError: uvunwrap is missing, or fails.
     """
     uvunwrap = need("uvunwrap", "bake")
     meshes, kept = [], []
@@ -243,12 +231,7 @@ def unwrap(
         rows = np.column_stack([vertex.astype(np.float64), corner])
         unique, index = np.unique(rows, axis=0, return_inverse=True)
         replacements.append(
-            Replacement(
-                primitive,
-                unique[:, 0].astype(np.int64),
-                index.reshape(-1, 3).astype(np.int32),
-                unique[:, 1:],
-            )
+            Replacement(primitive, unique[:, 0].astype(np.int64), index.reshape(-1, 3).astype(np.int32), unique[:, 1:])
         )
     return replacements
 

@@ -46,11 +46,7 @@ class BakedProbes:
 
 
 def place_probes(settings: ProbeSettings, geometry: Geometry) -> np.ndarray:
-    """Computes the probes' positions, float32 [N, 3]: the middles of the cells of a lattice in the bounding box.
-
-    Raises:
-        WlmError: There would be more than a million probes.
-    """
+    """Computes the probes' positions, float32 [N, 3]: the middles of the cells of a lattice in the bounding box."""
     low, high = geometry.box
     # Each axis has the number of cells that fit, at least one.
     cells = np.maximum(1.0, np.floor((high - low) / settings.spacing + 1e-6))
@@ -64,11 +60,7 @@ def place_probes(settings: ProbeSettings, geometry: Geometry) -> np.ndarray:
 
 
 def bake_probes(
-    task: Task,
-    *,
-    device: str = "cpu",
-    checkpoint: Checkpoint | None = None,
-    progress: OnProgress | None = None,
+    task: Task, *, device: str = "cpu", checkpoint: Checkpoint | None = None, progress: OnProgress | None = None
 ) -> BakedProbes:
     """Bakes a scene's probes at each of its hours.
 

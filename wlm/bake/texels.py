@@ -48,9 +48,6 @@ def place_texels(where: str, surfaces: Sequence[Surface], resolution: int, super
     """Computes the sample positions of all texels: those points of a lattice in each texel that a triangle covers.
 
     Surfaces without lightmap UVs are skipped; `where` names the geometry in errors.
-
-    Raises:
-        WlmError: There are too many samples, no triangle covers any sample, or charts overlap.
     """
     used = [each for each in surfaces if each.uv is not None]
     side = resolution * supersample

@@ -32,9 +32,6 @@ def write_texture(folder: Path, name: str, texture: Texture, ending: str | None 
     """Writes a texture as DDS, or as KTX2 if DDS lacks its format, and returns its entry for the folder's index.
 
     `ending` replaces the usual ending of the file's name, ".dds" or ".ktx2".
-
-    Raises:
-        WlmError: The texture is larger than GPUs accept, or the file cannot be written.
     """
     if max(texture.width, texture.height) > MOST_SIDE:
         size = f"{texture.width}x{texture.height}"

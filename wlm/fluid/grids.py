@@ -78,19 +78,9 @@ def choose(
     """Chooses the grids of the density and of the temperature by their names and classes.
 
     The density is the grid `density`, else the only one with a name of smoke, else the only one whose name is that of
-    no other quantity. A level set is chosen only by its name.
-
-    Args:
-        where: Name of the file or folder in messages.
-        heads: Its grids.
-        density, temperature: Names that are given; None: chosen.
-
-    Returns:
-        The name of the density's grid, that of the temperature's if there is one, and warnings for grids that were
-        chosen by another name than `density`.
-
-    Raises:
-        WlmError: A given grid is missing, or it is not clear which grid is the density.
+    no other quantity. A level set is chosen only by its name. `where` names the file or folder in messages. Returns the
+    name of the density's grid, that of the temperature's if there is one, and warnings for grids that were chosen by
+    another name than `density`.
     """
     found = one_line(", ".join(map(str, heads[:_MOST_NAMES])), 400) or "no grid"
     first = {head.name: head for head in reversed(heads)}
@@ -133,9 +123,6 @@ def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lat
 
     Returns:
         The lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
-
-    Raises:
-        WlmError: A grid's transform cannot be inverted, or the lattice has too many voxels.
     """
     turned = [(grid, _turned(grid, up)) for grid in grids]
     first, matrix = turned[0]

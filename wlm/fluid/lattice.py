@@ -70,11 +70,7 @@ class Domain:
 
 
 def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp.Device, remedy: str) -> None:
-    """Checks that `needed` bytes for a grid are free; `name` and `remedy` are words for the error message.
-
-    Raises:
-        WlmError: There is not enough; the message names the grid, the required and free memory, and the remedy.
-    """
+    """Checks that `needed` bytes for a grid are free; `name` and `remedy` are words for the error message."""
     free = free_memory(device)
     if needed > free:
         cells = " x ".join(map(str, shape))

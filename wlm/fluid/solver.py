@@ -146,11 +146,7 @@ def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
 
 
 def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Device) -> None:
-    """Checks that a grid of smoke with `cell_bytes` bytes per cell can be indexed and allocated.
-
-    Raises:
-        WlmError: The grid has too many cells or does not fit into the memory.
-    """
+    """Checks that a grid of smoke with `cell_bytes` bytes per cell can be indexed and allocated."""
     x, y, z = shape
     if x * y * z >= 2**31:
         raise WlmError(f"smoke: {x} x {y} x {z} cells: expected fewer than 2^31 cells in all: use a lower refinement")

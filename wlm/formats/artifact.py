@@ -145,11 +145,7 @@ class Artifact:
 
 
 def write_artifact(
-    path: str | os.PathLike[str],
-    system: str,
-    settings: Mapping[str, Any],
-    parts: Mapping[str, Content],
-    source: str,
+    path: str | os.PathLike[str], system: str, settings: Mapping[str, Any], parts: Mapping[str, Content], source: str
 ) -> int:
     """Writes an artifact atomically and returns its size in bytes. Equal arguments give equal bytes; see
     `encode_artifact`.
@@ -236,10 +232,6 @@ def read_artifact(path: str | os.PathLike[str], system: str | None = None) -> Ar
     `system` is the system that must have written it; None accepts any. The tensors are views of the bytes read, which
     no later change of the file reaches. Bytes are copied, not mapped: a mapping would show what another process writes
     after a digest was checked, and end this process where the file is cut.
-
-    Raises:
-        WlmError: The file is missing, not an artifact, cut short, damaged outside its pieces, from a newer version or
-            from another system.
     """
     try:
         with open_file(path, "the artifact") as file:

@@ -17,9 +17,6 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     If the block raises, the temporary file is removed and `path` keeps its content. If the process is killed, `path`
     keeps its content too, and the next write to it removes the temporary file. A link is followed: its target is
     replaced.
-
-    Raises:
-        WlmError: The folder is missing, `path` is not a regular file, or the system refuses (a full disk).
     """
     # Links are resolved first: os.replace would replace the link itself.
     target = Path(os.path.realpath(path))

@@ -115,11 +115,7 @@ class Checkpoint:
             self.resumed = True
 
     def finished(self, number: int, table: Mapping[str, Part]) -> dict[str, np.ndarray] | None:
-        """Returns the stored parts of a finished batch, checked against `table`, or None if it is not finished.
-
-        Raises:
-            WlmError: The parts do not match the table.
-        """
+        """Returns the stored parts of a finished batch, checked against `table`, or None if it is not finished."""
         if (parts := self._finished.get(number)) is None:
             return None
         try:
@@ -135,9 +131,6 @@ class Checkpoint:
         """Restores the state of an unfinished batch, and returns whether the checkpoint has one.
 
         `load` restores a state; for an invalid one it raises ValueError before it changes anything.
-
-        Raises:
-            WlmError: The state is invalid.
         """
         if (state := self.running(number)) is None:
             return False
@@ -156,11 +149,7 @@ class Checkpoint:
         return self._pace.due()
 
     def save(self, states: Mapping[int, Mapping[str, np.ndarray]]) -> None:
-        """Writes the states of unfinished batches, by number, in place of their older states.
-
-        Raises:
-            WlmError: The file cannot be written; the old content stays.
-        """
+        """Writes the states of unfinished batches, by number, in place of their older states."""
         self._running |= {number: dict(state) for number, state in states.items()}
         self._write()
 
@@ -168,9 +157,6 @@ class Checkpoint:
         """Adds the results of a finished batch, by name, and removes the state of its unfinished work.
 
         The file is written at once if that takes at most a twentieth of the time, otherwise at the next save.
-
-        Raises:
-            WlmError: The file cannot be written; the old content stays.
         """
         self._finished[number] = dict(result)
         self._running.pop(number, None)
@@ -179,20 +165,12 @@ class Checkpoint:
             self._write()
 
     def flush(self) -> None:
-        """Writes finished batches that are not written yet.
-
-        Raises:
-            WlmError: The file cannot be written; the old content stays.
-        """
+        """Writes finished batches that are not written yet."""
         if self._unwritten:
             self._write()
 
     def remove(self) -> None:
-        """Removes the file, if it exists, once the output has been written.
-
-        Raises:
-            WlmError: The file cannot be removed.
-        """
+        """Removes the file, if it exists, once the output has been written."""
         try:
             self.path.unlink(missing_ok=True)
         except OSError as error:

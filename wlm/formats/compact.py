@@ -19,7 +19,7 @@ BODY = "body"
 """Name of the only part."""
 
 _MAGIC = b"wlm"
-_VERSION = 4
+_VERSION = 5
 _DIGEST = 4
 _START = 4 + _DIGEST
 
@@ -51,9 +51,6 @@ def parse_compact(where: object, mapped: bytes | memoryview) -> tuple[str, int, 
 
     Returns:
         System, version, parts as views, and the number of bytes before them.
-
-    Raises:
-        WlmError: The file is cut short, damaged, of another version or of a system without compact artifacts.
     """
     view = np.frombuffer(mapped, np.uint8)
     begin = view[:4].tobytes()

@@ -49,10 +49,6 @@ def read_exr(
 
     Returns:
         The pixels, float32 [H, W, 3 or 4], and the names of the channels, ("R", "G", "B") or ("R", "G", "B", "A").
-
-    Raises:
-        WlmError: The file is missing, is not an EXR file, is cut short or damaged, has deep data, or has no colour or
-            several layers of it.
     """
     notes = [] if notes is None else notes
     channels = _channels(path)
@@ -68,19 +64,11 @@ def read_exr(
 def read_every_channel(
     path: str | os.PathLike[str], notes: list[str] | None = None, light: bool = False
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads all channels of an EXR file, over its display window; `read_exr` explains `notes`.
+    """Reads all channels of an EXR file, over its display window; each conversion adds a line to `notes`.
 
-    Args:
-        path: The file.
-        notes: Each conversion adds a line.
-        light: Whether the colours of each layer are light, which is converted to the primaries of Rec. 709.
-
-    Returns:
-        The pixels, float32 [H, W, C], and the names of the channels: R, G, B and A first, others sorted. In a file of
-        several parts, a name begins with that of its part, such as "beauty.R".
-
-    Raises:
-        WlmError: See `read_exr`, but no layer of colour is needed.
+    With `light` the colours of each layer are light, which is converted to the primaries of Rec. 709. Returns the
+    pixels, float32 [H, W, C], and the names of the channels: R, G, B and A first, others sorted. In a file of several
+    parts, a name begins with that of its part, such as "beauty.R".
     """
     notes = [] if notes is None else notes
     channels, first = _channels(path), (*_COLOUR, _ALPHA)
@@ -103,11 +91,7 @@ _Channels = Mapping[str, tuple[OpenEXR.Part, Any]]  # the part and the channel o
 
 
 def _channels(path: str | os.PathLike[str]) -> _Channels:
-    """Reads all channels of an EXR file; in a file of several parts, a name begins with that of its part.
-
-    Raises:
-        WlmError: The file is missing, is not an EXR file, is cut short or damaged, or has deep data.
-    """
+    """Reads all channels of an EXR file; in a file of several parts, a name begins with that of its part."""
     check_header(path)
     parts, reason = [], "no pixels found"
     with _captured_chatter() as chatter:
@@ -226,11 +210,7 @@ def _window(part: OpenEXR.Part, name: str) -> tuple[int, int, int, int]:
 
 
 def _chromaticities(path: str | os.PathLike[str], header: Mapping[str, Any], notes: list[str]) -> Sequence[float]:
-    """Returns the chromaticities that a header states; those of Rec. 709, the format's default, if it states none.
-
-    Raises:
-        WlmError: The header says that the values are not linear.
-    """
+    """Returns the chromaticities that a header states; those of Rec. 709, the format's default, if it states none."""
     if "chromaticities" in header:
         return tuple(header["chromaticities"])
     space = str(header.get("colorInteropID", ""))
@@ -253,10 +233,6 @@ def write_exr(
 
     With `half` they are rounded to half floats: values beyond their range, infinity included, become +-65504; NaN
     stays. `note` is a JSON object for the header.
-
-    Raises:
-        ValueError: The pixels' shape is not [H, W, 3 or 4].
-        WlmError: The file cannot be written; the old content stays.
     """
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or 0 in pixels.shape:
         raise ValueError(f"expected pixels [H, W, 3 or 4], got {pixels.shape}")
@@ -278,10 +254,6 @@ def write_planes(
         planes: [H, W] each, linear, not empty; the keys name the channels.
         note: JSON object that is stored in the header.
         whole: Names of the planes that stay float32. The others become half floats, clamped to +-65504.
-
-    Raises:
-        ValueError: The planes differ in shape.
-        WlmError: The file cannot be written; the old content stays.
     """
     shapes = {np.shape(plane) for plane in planes.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):
@@ -315,10 +287,6 @@ def read_planes(path: str | os.PathLike[str]) -> tuple[dict[str, np.ndarray], di
 
     Returns:
         The planes by name, float32 [H, W], NaN included; and the note of the header, empty if the file has none.
-
-    Raises:
-        WlmError: The file is missing, is not an EXR file, is damaged, has several parts or deep data, or a channel is
-            neither half nor float.
     """
     header, *others = check_header(path)
     if others:
@@ -337,9 +305,6 @@ def read_header(path: str | os.PathLike[str]) -> tuple[int, int, tuple[str, ...]
     """Reads the size of the display window and the names of all channels of an EXR file, without its pixels.
 
     In a file of several parts, a name begins with that of its part.
-
-    Raises:
-        WlmError: See `wlm.formats.exr_header.check_header`.
     """
     parts = check_header(path)
     return *parts[0].size, tuple(name for part in parts for name in part.full_names(len(parts) > 1))

@@ -44,12 +44,7 @@ class ExrHeader:
 
 
 def check_header(path: str | os.PathLike[str]) -> list[ExrHeader]:
-    """Reads the headers of all parts of an EXR file, and checks what its pixels would take.
-
-    Raises:
-        WlmError: The file is missing, is not an EXR file, has deep data, or its header is damaged, has too many
-            attributes and channels, or claims more pixels than the limits or the size of the file allow.
-    """
+    """Reads the headers of all parts of an EXR file, and checks what its pixels would take."""
     with open_file(path, "the EXR file") as file:
         size = os.fstat(file.fileno()).st_size
         data = file.read(min(size, _HEADER_BYTES))

@@ -24,9 +24,6 @@ def film(path: str | os.PathLike[str], height: int, width: int, rate: float) -> 
 
     Yields a function that adds a frame, uint8 [height, width, 3] in sRGB. Sizes of an `.mp4` must be even, since chroma
     has half the resolution; frames of a `.webp` stay in memory until the end. `rate` is the number of frames a second.
-
-    Raises:
-        WlmError: The package is missing, a size is odd, or the file cannot be written.
     """
     if os.fspath(path).lower().endswith(".webp"):
         pictures: list[Image.Image] = []

@@ -67,9 +67,6 @@ def check_picture(path: str | os.PathLike[str], held: int, width: int, height: i
     """Checks the claimed size of a picture, in texels of `texel` decoded bytes, before memory is allocated.
 
     `held` is the size of the file in bytes, `path` names it in messages.
-
-    Raises:
-        WlmError: The picture has no texels, too many, or more than a file of this size may expand to.
     """
     check_sides(str(path), width, height)
     check_growth(str(path), held, width * height * texel, PICTURE_GROWTH, PICTURE_BYTES)
@@ -78,11 +75,7 @@ def check_picture(path: str | os.PathLike[str], held: int, width: int, height: i
 def decode_texels(
     path: str | os.PathLike[str], layout: Layout, data: bytes | memoryview, width: int, height: int
 ) -> np.ndarray:
-    """Decodes the bytes of a picture (`Layout.bytes_of`) to float32 [H, W, channels].
-
-    Raises:
-        WlmError: The package that decodes the format is missing, or refuses the data; the line names the file.
-    """
+    """Decodes the bytes of a picture (`Layout.bytes_of`) to float32 [H, W, channels]."""
     columns, rows = (-(-side // of) for side, of in zip((width, height), layout.block, strict=True))
     across, down = layout.block
     stride = columns * layout.size
@@ -101,11 +94,7 @@ def decode_texels(
 
 
 def check_fields(path: str | os.PathLike[str], *fields: tuple[str, object, bool, object]) -> None:
-    """Raises an error for the first wrong field of a header, each given as name, value, whether it fits, expectation.
-
-    Raises:
-        WlmError: A field doesn't fit; the line has its name, the expected and the found value.
-    """
+    """Refuses the first wrong field of a header, each given as name, value, whether it fits, expectation."""
     for field, found, fits, expected in fields:
         if not fits:
             raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
@@ -119,11 +108,7 @@ def layout_of(
     others: Mapping[str, int],
     expected: str,
 ) -> tuple[str, Layout]:
-    """Returns the name and the layout of a format by its number.
-
-    Raises:
-        WlmError: `layouts` lacks it; the line has field, expectation, number, and the format's name in `others`.
-    """
+    """Returns the name and the layout of a format by its number."""
     if number not in layouts:
         name = next((f" ({name})" for name, written in others.items() if written == number), "")
         raise WlmError(f"{path}: {field}: expected {expected}, found {number}{name}")
@@ -131,11 +116,7 @@ def layout_of(
 
 
 def read_part(path: str | os.PathLike[str], file: BinaryIO, start: int, size: int, part: str) -> bytes:
-    """Reads `size` bytes of an open file from `start` on; `path` and `part` name the file and the part in messages.
-
-    Raises:
-        WlmError: The file ends before.
-    """
+    """Reads `size` bytes of an open file from `start` on; `path` and `part` name the file and the part in messages."""
     held = os.fstat(file.fileno()).st_size
     if start + size > held:
         raise WlmError(f"{path}: {part}: the file is cut short: expected {start + size} bytes, found {held}")
@@ -162,9 +143,6 @@ def mip_bytes(fmt: str, width: int, height: int, mips: int, most: int | None = N
     """Returns the bytes of each mip level of a picture, the largest first.
 
     `mips` is the number of levels after the largest one, and `most` their largest number; None: down to one texel.
-
-    Raises:
-        ValueError: A side is not 1 to `MOST_SIDE`, or `mips` is out of range.
     """
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
         raise ValueError(f"expected a width and a height of 1 to {MOST_SIDE} texels, got {width}x{height}")

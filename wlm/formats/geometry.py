@@ -56,9 +56,6 @@ def read_geometry(path: str | os.PathLike[str], uv_set: int | None = None, *, wi
     Args:
         uv_set: n of `TEXCOORD_n`, the lightmap's UVs; None takes 1 if any primitive has it, else 0.
         with_uv: Whether UVs are needed: primitives without them are then left out.
-
-    Raises:
-        WlmError: The file is missing or damaged, or has no triangles, or none with these UVs.
     """
     path = Path(path)
     if path.suffix.lower() in SUFFIXES:

@@ -65,9 +65,7 @@ _OVERHEAD = 512  # cost of a primitive under a node, in corners
 _LARGEST_TRANSFORM = 1e9  # magnitude of the numbers of a texture transform
 _MOVES, _UNMOVED = {"matrix", "translation", "rotation", "scale"}, np.eye(4)
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
-_REFUSED = {
-    "EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance",
-}
+_REFUSED = {"EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +87,7 @@ class GltfDocument:
     most: int = CORNERS
 
     def item(self, kind: str, number: object) -> dict:
-        """Returns an entry of one of the lists of the tree, for example `accessors`.
-
-        Raises:
-            WlmError: The number is out of range.
-        """
+        """Returns an entry of one of the lists of the tree, for example `accessors`."""
         entries = self.content.get(kind, [])
         if not isinstance(number, int) or not 0 <= number < len(entries):
             raise WlmError(f"{self.path}: {kind}[{number}]: the file has {len(entries)} {kind}")
@@ -134,18 +128,10 @@ class GltfPrimitive:
 
 
 def read_gltf(path: str | os.PathLike[str], trust: bool = False) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Reads a `.glb` or `.gltf` file, recognised by its first bytes.
+    """Reads a `.glb` or `.gltf` file, recognised by its first bytes; `GltfDocument` explains `trust`.
 
-    Args:
-        path: The file.
-        trust: See `GltfDocument`.
-
-    Returns:
-        The document, and the primitives with triangles that its scene draws (the default scene, else the first scene,
-        else all nodes), in depth-first order of the nodes.
-
-    Raises:
-        WlmError: An error in the table of this module; the line names the file and the field.
+    Returns the document, and the primitives with triangles that its scene draws (the default scene, else the first
+    scene, else all nodes), in depth-first order of the nodes.
     """
     return parse_gltf(path, read_file(path, MESH_BYTES, "the glTF file"), trust)
 
@@ -193,16 +179,11 @@ def document_from_arrays(
 def document_from_meshes(
     meshes: Sequence[Arrays], name: str, uv_set: int = 0
 ) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Makes a glTF document of several meshes, each with its own node.
+    """Makes a glTF document of several meshes, at least one, each with its own node; returns it with its primitives,
+    one for each mesh.
 
-    Args:
-        meshes: At least one: name; positions [V, 3], stored as float32; triangles int [F, 3], at least one; and UVs
-            [V, 2], u right, v down, stored as float32 in all UV sets up to `uv_set`.
-        name: Name of the document.
-        uv_set: n of the last `TEXCOORD_n`.
-
-    Returns:
-        The document and its primitives, one for each mesh.
+    A mesh has a name; positions [V, 3], stored as float32; triangles int [F, 3], at least one; and UVs [V, 2], u right,
+    v down, stored as float32 in all UV sets up to `TEXCOORD_n` with n = `uv_set`.
     """
     views, accessors, data, primitives = [], [], [], []
     nodes, trees, start = [], [], 0
@@ -246,9 +227,6 @@ def elements(document: GltfDocument, number: int) -> np.ndarray:
     Returns:
         uint8 [count, bytes of an element], with the column padding that glTF requires for small matrices; it may be a
         view of the file's bytes.
-
-    Raises:
-        WlmError: The accessor exceeds its view or buffer, or has an unknown type.
     """
     accessor = document.item("accessors", number)
     where = f"{document.path}: accessors[{number}]"
@@ -286,11 +264,7 @@ def elements(document: GltfDocument, number: int) -> np.ndarray:
 
 
 def components(document: GltfDocument, number: int, kind: str) -> np.ndarray:
-    """Reads the numbers of an accessor in their stored type, [count, components].
-
-    Raises:
-        WlmError: The accessor is not of `kind`, for example "VEC3", or an error of `elements` occurs.
-    """
+    """Reads the numbers of an accessor in their stored type, [count, components]."""
     accessor = document.item("accessors", number)
     if accessor.get("type") != kind:
         raise WlmError(f"{document.path}: accessors[{number}].type: expected {kind}, found {accessor.get('type')}")
@@ -303,9 +277,6 @@ def vertex_normals(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
     Returns:
         For each primitive float64 [V, 3], of unit length, or 0 where the stored normal has no length; None for a
         primitive without `NORMAL`.
-
-    Raises:
-        WlmError: See `read_gltf`.
     """
     with reported(document.path):
         transforms = dict(_walk(document))
@@ -343,9 +314,6 @@ def vertex_colours(document: GltfDocument, primitives: Sequence[GltfPrimitive]) 
 
     Returns:
         For each primitive float32 [V, 3], linear, from 0 to 1.
-
-    Raises:
-        WlmError: The material reads its base colour from a texture, or see `read_gltf`.
     """
     with reported(document.path):
         colours = []
@@ -629,9 +597,6 @@ def _data_uri(where: str, uri: str) -> bytes:
 def texture_image(document: GltfDocument, number: object) -> int:
     """Returns the index of the image of a texture. Of several sources float pictures come first, then those that all
     readers know.
-
-    Raises:
-        WlmError: There is no such texture, or it names no image.
     """
     texture = document.item("textures", number)
     extensions = texture.get("extensions", {})
@@ -644,11 +609,7 @@ def texture_image(document: GltfDocument, number: object) -> int:
 
 
 def held_image(document: GltfDocument, number: int) -> bytes | memoryview | None:
-    """Returns the bytes of an image in a buffer view or a `data:` URI; None for an image in a file of its own.
-
-    Raises:
-        WlmError: There is no such image, or its buffer view or URI is malformed.
-    """
+    """Returns the bytes of an image in a buffer view or a `data:` URI; None for an image in a file of its own."""
     image = document.item("images", number)
     if "bufferView" in image:
         view = document.item("bufferViews", image["bufferView"])
@@ -662,9 +623,6 @@ def held_image(document: GltfDocument, number: int) -> bytes | memoryview | None
 def texture_transform(where: str, info: dict) -> tuple[int | None, np.ndarray]:
     """Returns how a texture slot reads UVs: n of its `TEXCOORD_n`, None if the slot does not state it; and its
     KHR_texture_transform, float64 [2, 3]: UV' = transform[:, :2] UV + transform[:, 2].
-
-    Raises:
-        WlmError: The transform or the UV set is malformed; `where` names the slot.
     """
     transform = info.get("extensions", {}).get("KHR_texture_transform", {})
     names = {"scale": [1.0, 1.0], "rotation": 0.0, "offset": [0.0, 0.0]}
@@ -684,22 +642,13 @@ def texture_transform(where: str, info: dict) -> tuple[int | None, np.ndarray]:
 
 
 def image_file(document: GltfDocument, number: int) -> Path:
-    """Returns the path of an image that is a file of its own.
-
-    Raises:
-        WlmError: There is no such image, or its URI is wrong, see `_local_file`.
-    """
+    """Returns the path of an image that is a file of its own."""
     where = f"{document.path}: images[{number}].uri"
     return _local_file(document.path, document.item("images", number)["uri"], where, document.trust)
 
 
 def _local_file(document_path: str, uri: str, where: str, trust: bool) -> Path:
-    """Returns the path of the file that a URI names, relative to the document.
-
-    Raises:
-        WlmError: The URI has a scheme or is an absolute path, or the file is outside the folder of a document that is
-            not trusted.
-    """
+    """Returns the path of the file that a URI names, relative to the document."""
     name = unquote(uri)
     if _URI_SCHEME.match(uri) or Path(name).is_absolute():
         raise WlmError(f"{where}: expected a path relative to the document, found {one_line(uri, _LABEL)}")

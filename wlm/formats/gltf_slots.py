@@ -35,18 +35,10 @@ def usual_set(primitives: Sequence[GltfPrimitive]) -> int:
 def lightmap_transform(
     document: GltfDocument, primitive: GltfPrimitive, uv_set: int, lightmap: str = ""
 ) -> tuple[str, tuple[float, ...]]:
-    """Finds the texture transform that applies to lightmap UVs.
+    """Finds the texture transform that applies to lightmap UVs, those of `TEXCOORD_n` with n = `uv_set`.
 
-    Args:
-        document, primitive: From `read_gltf`.
-        uv_set: n of `TEXCOORD_n`, which the primitive has.
-        lightmap: Name of the lightmap without its suffix; "" if it is not known.
-
-    Returns:
-        The name of the slot, "" for none; and the rows of the matrix [2, 3] that moves (u, v, 1).
-
-    Raises:
-        WlmError: The material is malformed.
+    `lightmap` is the name of the lightmap without its suffix, "" if it is not known. Returns the name of the slot, ""
+    for none, and the rows of the matrix [2, 3] that moves (u, v, 1).
     """
     attributes = document.item("meshes", primitive.mesh)["primitives"][primitive.primitive]["attributes"]
     quantised = document.item("accessors", attributes[f"TEXCOORD_{uv_set}"])["componentType"] != _FLOAT
@@ -67,11 +59,7 @@ def lightmap_transform(
 
 
 def lightmap_uv(document: GltfDocument, primitive: GltfPrimitive, uv_set: int) -> np.ndarray:
-    """Returns the lightmap UVs of a primitive, float32 [V, 2], with the transform that applies to them.
-
-    Raises:
-        WlmError: The material is malformed.
-    """
+    """Returns the lightmap UVs of a primitive, float32 [V, 2], with the transform that applies to them."""
     with reported(document.path):
         transform = lightmap_transform(document, primitive, uv_set)[1]
     if transform == IDENTITY:

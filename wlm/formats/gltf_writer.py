@@ -234,10 +234,7 @@ def _check(new: Replacement, uv_set: int) -> None:
         raise ValueError(
             f"{where}: expected uv [{count}, 2] and triangle [F, 3], F >= 1, got {new.uv.shape}, {new.triangle.shape}"
         )
-    for field, numbers, limit in (
-        ("gather", new.gather, len(new.primitive.row)),
-        ("triangle", new.triangle, count),
-    ):
+    for field, numbers, limit in (("gather", new.gather, len(new.primitive.row)), ("triangle", new.triangle, count)):
         if numbers.min() < 0 or numbers.max() >= limit:
             raise ValueError(
                 f"{where}: {field}: expected vertex numbers 0 to {limit - 1}, got {numbers.min()} to {numbers.max()}"

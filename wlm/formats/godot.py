@@ -93,11 +93,7 @@ class GodotUsers:
 
 
 def read_users(path: str | os.PathLike[str]) -> GodotUsers:
-    """Reads the meshes that use a bake's lightmaps, and their rectangles.
-
-    Raises:
-        WlmError: The file is missing, is not a bake, is damaged, or its list of meshes has values of other types.
-    """
+    """Reads the meshes that use a bake's lightmaps, and their rectangles."""
     reader = _reader(path)
     names, external = _open(reader)
     textures: list[str] = []
@@ -127,15 +123,10 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
 
 
 def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the light probes of a Godot 4 lightmap bake.
+    """Reads the light probes of a Godot 4 lightmap bake, at least one.
 
-    Returns:
-        The positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB (the module's
-        description defines them); N is at least 1.
-
-    Raises:
-        WlmError: The file is missing, is not a Godot resource, has another version or type, is cut short or damaged,
-            or has no probes.
+    Returns the positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB, which the
+    module's description defines.
     """
     points, colours, _, _ = _read(path)
     return points, colours.reshape(len(points), COEFFICIENTS, 4)[..., :3].copy()

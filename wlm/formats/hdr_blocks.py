@@ -26,11 +26,7 @@ _TEXELS_A_THREAD = 4096  # the least work of a thread, about 20 ms
 
 
 def need(package: str, extra: str) -> ModuleType:
-    """Imports an optional package.
-
-    Raises:
-        WlmError: The package is missing or broken; the line names the extra to install.
-    """
+    """Imports an optional package."""
     try:
         return importlib.import_module(package)
     except Exception as error:
@@ -43,11 +39,7 @@ def need(package: str, extra: str) -> ModuleType:
 
 
 def decode_bc6h(blocks: bytes, height: int, width: int, extra: str, signed: bool = False) -> np.ndarray:
-    """Decodes BC6H to half [H, W, 3], H and W multiples of 4; blocks of reserved modes become black.
-
-    Raises:
-        WlmError: The package is missing.
-    """
+    """Decodes BC6H to half [H, W, 3], H and W multiples of 4; blocks of reserved modes become black."""
     return need("imagecodecs", extra).bcn_decode(blocks, -6 if signed else 6, shape=(height, width, 3))
 
 
@@ -94,12 +86,11 @@ class Astc:
 
 
 def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
-    """Returns the ASTC codec of the HDR profile with the given settings; equal settings share one codec.
+    """Returns the ASTC codec of the HDR profile for blocks of one of `ASTC_BLOCKS` texels; equal settings share one
+    codec.
 
-    Args:
-        block: Width and height of a block in texels, one of `ASTC_BLOCKS`.
-        quality: Effort of the encoder, 0 (fastest) to 100 (exhaustive); decoding does not depend on it.
-        extra: Name of the optional extra of wlm that installs the encoder, for the error message.
+    `quality` is the effort of the encoder, 0 (fastest) to 100 (exhaustive), and `extra` names the extra of wlm that
+    installs it.
     """
     return _astc(need("astc_encoder", extra), block, quality)
 

@@ -106,11 +106,7 @@ NUMBERS = 4096
 
 
 def check_sides(where: str, width: int, height: int) -> None:
-    """Checks the claimed size of a picture.
-
-    Raises:
-        WlmError: The picture has no texel, more than `PICTURE_TEXELS`, or more than `PICTURE_SIDE` along a side.
-    """
+    """Checks the claimed size of a picture."""
     if not 0 < min(width, height) <= max(width, height) <= PICTURE_SIDE or width * height > PICTURE_TEXELS:
         raise WlmError(
             f"{where}: expected at least one texel, at most {PICTURE_TEXELS} texels and {PICTURE_SIDE} along a side, "
@@ -123,9 +119,6 @@ def check_growth(where: str, small: int, large: int, growth: int = GROWTH, sure:
 
     The claimed size may be `sure` bytes or `growth` times the compressed size, whichever is more. `where` names the
     file and the field in the message.
-
-    Raises:
-        WlmError: The claimed size is larger.
     """
     if large > max(sure, growth * small):
         raise WlmError(
@@ -142,11 +135,7 @@ class Budget:
         self._text = f"{where}: expected at most {most} {unit} for the size of the file, found more{hint}"
 
     def spend(self, amount: int) -> None:
-        """Takes an amount from what is left.
-
-        Raises:
-            WlmError: Less is left.
-        """
+        """Takes an amount from what is left."""
         self._left -= amount
         if self._left < 0:
             raise WlmError(self._text)

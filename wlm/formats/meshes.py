@@ -44,12 +44,7 @@ class MeshArrays:
 
 
 def read_mesh(path: str | os.PathLike[str]) -> MeshArrays:
-    """Reads all triangles of a file, whose name ends in one of `SUFFIXES`, as one mesh.
-
-    Raises:
-        WlmError: The file is missing, too large or malformed, a position or UV is NaN or infinite, or a triangle names
-            a vertex that is not there.
-    """
+    """Reads all triangles of a file, whose name ends in one of `SUFFIXES`, as one mesh."""
     import trimesh
 
     suffix = Path(path).suffix.lower()

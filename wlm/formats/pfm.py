@@ -21,11 +21,7 @@ _NUMBER = 4  # bytes
 
 
 def header_of(path: str | os.PathLike[str], head: bytes) -> tuple[int, int, int, float, int]:
-    """Returns the width, the height, the channels (1 or 3), the scale and the offset of the first number.
-
-    Raises:
-        WlmError: The header is damaged.
-    """
+    """Returns the width, the height, the channels (1 or 3), the scale and the offset of the first number."""
     match = _HEADER.match(head[:_HEADER_BYTES])
     try:
         scale = float(match[4]) if match else 0.0
@@ -37,16 +33,8 @@ def header_of(path: str | os.PathLike[str], head: bytes) -> tuple[int, int, int,
 
 
 def read_pfm(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a PFM picture.
-
-    `notes` gets a line if the picture is grey or states a unit.
-
-    Returns:
-        The pixels, float32 [H, W, 3], the top row first, and the names of the channels. Grey is repeated.
-
-    Raises:
-        WlmError: The file is missing, is not a PFM picture, or is cut short.
-    """
+    """Reads a PFM picture, float32 [H, W, 3], the top row first, grey repeated; returns it and the names of the
+    channels. `notes` gets a line if the picture is grey or states a unit."""
     with open_file(path, "the PFM picture") as file:
         held = os.fstat(file.fileno()).st_size
         width, height, channels, scale, start = header_of(path, file.read(_HEADER_BYTES))

@@ -28,9 +28,6 @@ def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
     """Opens a regular file; system errors inside the block become one-line errors that name it.
 
     Links are followed. `what` describes the file in messages, for example "the OBJ file".
-
-    Raises:
-        WlmError: The file is missing, is a folder, a device or a pipe, or cannot be read.
     """
     try:
         # Opened without blocking, since a pipe without a writer would never open.
@@ -57,11 +54,7 @@ def open_file(path: str | os.PathLike[str], what: str) -> Iterator[BinaryIO]:
 
 
 def read_file(path: str | os.PathLike[str], limit: int, what: str, first: int | None = None) -> bytes:
-    """Reads a regular file of at most `limit` bytes, or its first `first` bytes.
-
-    Raises:
-        WlmError: See `open_file`; or the file is larger than the limit, shorter than `first`, or changes meanwhile.
-    """
+    """Reads a regular file of at most `limit` bytes, or its first `first` bytes."""
     with open_file(path, what) as file:
         size = os.fstat(file.fileno()).st_size
         if first is not None and first > size:
@@ -77,20 +70,12 @@ def read_file(path: str | os.PathLike[str], limit: int, what: str, first: int | 
 
 
 def read_json_file(path: str | os.PathLike[str], what: str, limit: int = INDEX_BYTES) -> Any:
-    """Reads a JSON file in UTF-8 of at most `limit` bytes.
-
-    Raises:
-        WlmError: See `read_file`; or the content is not JSON.
-    """
+    """Reads a JSON file in UTF-8 of at most `limit` bytes."""
     return parse_json(str(path), read_file(path, limit, what))
 
 
 def parse_json(where: str, data: bytes) -> Any:
-    """Parses a JSON text in UTF-8, if its values take no more memory than its length makes likely.
-
-    Raises:
-        WlmError: The text is not JSON, has integers beyond 64 bits, or its values would take too much memory.
-    """
+    """Parses a JSON text in UTF-8, if its values take no more memory than its length makes likely."""
     check_json(where, data)
     # Python makes integers of any length, which no array holds.
     whole = _whole if _MANY_DIGITS.search(data) else None
@@ -99,11 +84,7 @@ def parse_json(where: str, data: bytes) -> Any:
 
 
 def check_json(where: str, data: bytes) -> None:
-    """Checks the memory that the values of a JSON text would take, before it is parsed.
-
-    Raises:
-        WlmError: They would take more than its length makes likely.
-    """
+    """Checks the memory that the values of a JSON text would take, before it is parsed."""
     budget = Budget(where, max(SURE_JSON, JSON_GROWTH * len(data)), "bytes of values in JSON")
     # Sizes in Python: an object with its table, a list with room for some items, an item with its number, half a text.
     for mark, size in ((b"{", 232), (b"[", 88), (b",", 40), (b'"', 32)):
@@ -175,11 +156,7 @@ class _Handle(io.FileIO):
 
 @contextmanager
 def damaged(message: str, *errors: type[Exception]) -> Iterator[None]:
-    """Turns the given exceptions, raised in the block by damaged data, into a one-line error: message and reason.
-
-    Raises:
-        WlmError: One of the exceptions was raised, or a WlmError, which is passed on unchanged.
-    """
+    """Turns the given exceptions, raised in the block by damaged data, into a one-line error: message and reason."""
     try:
         yield
     except WlmError:
@@ -189,18 +166,11 @@ def damaged(message: str, *errors: type[Exception]) -> Iterator[None]:
 
 
 def named_file(document: str | os.PathLike[str], name: str, where: str, trust: bool = False) -> Path:
-    """Returns the path of a file that a document names, which must be inside the document's folder, links resolved.
+    """Returns the path of a file that a document names, which must be inside the document's folder, links resolved,
+    unless the document is trusted.
 
-    An untrusted document could otherwise make this package read any file and copy it into an output.
-
-    Args:
-        document: The file that names another file.
-        name: Path relative to the folder of the document.
-        where: The document and its field, for messages.
-        trust: Whether the file may be outside the folder.
-
-    Raises:
-        WlmError: The file is outside the folder.
+    An untrusted document could otherwise make this package read any file and copy it into an output. `name` is relative
+    to the folder of the document; `where` names the document and its field in messages.
     """
     if len(name) > _LONGEST_NAME:
         raise WlmError(f"{where}: expected a name of at most {_LONGEST_NAME} characters, found {len(name)}")

@@ -38,11 +38,7 @@ _GREY, _RGB = 1, 2
 
 
 def tags_of(path: str | os.PathLike[str], data: bytes) -> dict[str, int]:
-    """Returns the tags of the first image that concern its layout, the first value of each.
-
-    Raises:
-        WlmError: The file is damaged.
-    """
+    """Returns the tags of the first image that concern its layout, the first value of each."""
     order = MAGIC.get(data[:4], "")
     found = {"bits": 1, "photometric": _RGB, "orientation": 1, "samples": 1, "planes": 1}
     with damaged(f"{path}: the TIFF is cut short or damaged", struct.error, KeyError, IndexError):
@@ -66,10 +62,6 @@ def read_tiff(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarra
     Returns:
         The pixels, [H, W, C], the top row first whatever the file's orientation: float32, or uint8 and uint16 as
         stored; and the names of the channels: L, or R, G and B, then A if there is alpha.
-
-    Raises:
-        WlmError: The file is missing, damaged, of another photometric interpretation or number format, or the package
-            imagecodecs is missing.
     """
     data = read_file(path, IMAGE_BYTES, "the TIFF")
     tags = tags_of(path, data)

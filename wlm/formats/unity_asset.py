@@ -69,11 +69,7 @@ class LightingData:
 
 
 def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
-    """Reads the light probes and lightmap rectangles of an asset.
-
-    Raises:
-        WlmError: UnityPy is missing; or the file is missing, damaged, YAML text, an asset bundle, or has no such data.
-    """
+    """Reads the light probes and lightmap rectangles of an asset."""
     data = read_file(path, _BYTES, "the asset")
     if data.startswith(_TEXT):
         return _read_text(path, data)

@@ -99,11 +99,7 @@ class GridFile(ABC):
     FORMAT: ClassVar[str]
 
     def __init__(self, data: bytes, where: str) -> None:
-        """Reads the list of grids from the content of a file, which `where` names in messages.
-
-        Raises:
-            WlmError: The content is not of the format, is of a version that is not read, or is damaged.
-        """
+        """Reads the list of grids from the content of a file, which `where` names in messages."""
         self._where, self._data = where, data
         with damaged(f"{where}: cannot read the {self.FORMAT} file", *DAMAGE):
             entries = list(self._list())
@@ -111,11 +107,7 @@ class GridFile(ABC):
         self.heads = tuple(entry.head for entry in entries)
 
     def read(self, name: str, trust: bool) -> VdbGrid:
-        """Reads a grid; `trust` tells whether it may be as large as it claims.
-
-        Raises:
-            WlmError: The grid is damaged, has no numbers, is a frustum, or is too large for the bytes that it takes.
-        """
+        """Reads a grid; `trust` tells whether it may be as large as it claims."""
         where = f"{self._where}: {name or 'grid 0'}"
         with (
             damaged(f"{where}: cannot read the {self.FORMAT} file", *DAMAGE),
@@ -382,9 +374,6 @@ def leaf_array(low: np.ndarray, high: np.ndarray, most: int, where: str) -> tupl
 
     Returns:
         Uninitialised values, float32 [X, Y, Z], and their first voxel [3].
-
-    Raises:
-        WlmError: They have more than `most` voxels.
     """
     first = low // LEAF * LEAF
     shape = -(-(high - first) // LEAF) * LEAF

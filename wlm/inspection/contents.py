@@ -13,19 +13,11 @@ _PROBES = ("probes", "godot bake", "unity asset")
 
 
 def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]]:
-    """Finds the kind of content of files.
+    """Finds the kind of content of one file or folder, or of six-way lightmaps of smoke, one EXR a frame.
 
-    Args:
-        files: One file or folder, or six-way lightmaps of smoke, one EXR a frame.
-
-    Returns:
-        The kind, and the files; a folder of six-way lightmaps is replaced by its files. The kind is the system of a
-        model ("lightmap", "atlas", "probe" or "smoke"); "six-way"; "set" of lightmaps over time; "probes"; "volume" of
-        smoke or frames of a simulation; or another kind of `wlm.inspection.files.kind_of`, such as "picture" or "mesh".
-
-    Raises:
-        WlmError: There is no file, a file is missing or cannot be read, or there are several of another kind than
-            six-way lightmaps.
+    Returns the kind, and the files; a folder of six-way lightmaps is replaced by its files. The kind is the system of a
+    model ("lightmap", "atlas", "probe" or "smoke"); "six-way"; "set" of lightmaps over time; "probes"; "volume" of
+    smoke or frames of a simulation; or another kind of `wlm.inspection.files.kind_of`, such as "picture" or "mesh".
     """
     paths = [Path(file) for file in files]
     if not paths:
@@ -49,11 +41,7 @@ def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]
 
 
 def check_options(path: Path, given: Sequence[str], known: Sequence[str]) -> None:
-    """Checks that the options `given` with a file are among those `known` for its kind.
-
-    Raises:
-        WlmError: An option has no meaning for this kind of file.
-    """
+    """Checks that the options `given` with a file are among those `known` for its kind."""
     for name in given:
         if name not in known:
             raise WlmError(f"{path}: --{name} has no meaning for this file; leave the option out")

@@ -71,11 +71,7 @@ class Picture:
 
 
 def picture_of(path: Path) -> Picture | None:
-    """Reads the header of a picture; returns None for other files.
-
-    Raises:
-        WlmError: The file cannot be read or is damaged.
-    """
+    """Reads the header of a picture; returns None for other files."""
     with open_file(path, "the file") as file:
         head = file.read(_FIRST)
     if head.startswith(EXR_MAGIC):
@@ -113,11 +109,7 @@ def size_of(path: Path, slices: int = 1) -> str:
 
 
 def inspect_picture(path: Path) -> Finding:
-    """Describes a single picture.
-
-    Raises:
-        WlmError: The file cannot be read.
-    """
+    """Describes a single picture."""
     picture, name = picture_of(path), path.name.lower()
     if picture is None:
         read_light(path)  # raises an error that names what it is
@@ -197,11 +189,7 @@ def problems_of(pixels: np.ndarray) -> tuple[str, ...]:
 
 
 def read_lit(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Finds the texels of a lightmap that are inside charts or not black, bool [H, W], and lists unusual values.
-
-    Raises:
-        WlmError: The file cannot be read.
-    """
+    """Finds the texels of a lightmap that are inside charts or not black, bool [H, W], and lists unusual values."""
     notes: list[str] = []
     pixels, names = read_light(path, notes)
     problems = (*notes, *problems_of(pixels))

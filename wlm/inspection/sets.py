@@ -76,9 +76,6 @@ def together(files: Sequence[Path], heads: Sequence[Picture | None]) -> tuple[li
 
     Returns:
         The problems, one line each, and the common size, such as "512x256"; "" if the pictures are not one lightmap.
-
-    Raises:
-        WlmError: One of the pictures cannot be read, or is no light.
     """
     for file, head in zip(files, heads, strict=True):
         if head is None or not head.is_light:

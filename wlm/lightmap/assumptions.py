@@ -22,9 +22,6 @@ def set_lines(listing: Listing, period: float | None = None) -> Iterator[str]:
     Args:
         listing: The set.
         period: The length of the day that the caller gives; None uses the set's.
-
-    Raises:
-        WlmError: A picture cannot be read.
     """
     times, period = listing.times, listing.period if period is None else period
     if len(times) > 1 and listing.origin:

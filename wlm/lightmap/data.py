@@ -238,7 +238,7 @@ def load(
 
     The files of a plain folder that end in `.exr`, `.hdr`, `.pfm`, `.tif`, `.ktx2` or `.dds` are read in natural order
     of their names ("2" before "10"). Without `times`, the hours are read from the names if every name ends in one
-    (`wlm.lightmap.hours`); if all are within a day, the period is 24. A `mask.png` among them is the mask unless `mask`
+    (`wlm.formats.hours`); if all are within a day, the period is 24. A `mask.png` among them is the mask unless `mask`
     says otherwise.
 
     A folder with `NAME_comp_light.exr`, as Unity writes it, is one state of light; a folder of such folders has a state
@@ -486,9 +486,6 @@ def parse_times(text: str) -> list[float]:
 
     Returns:
         The times in the order written, at least one.
-
-    Raises:
-        WlmError: A part is not a number or a range, a step never reaches the stop, or there are over 100,000 times.
     """
     times: list[float] = []
     for part in text.split(","):
@@ -513,11 +510,7 @@ def parse_times(text: str) -> list[float]:
 
 
 def check_times(where: str, labels: Sequence[str], times: np.ndarray, period: float | None) -> None:
-    """Checks the times [T] by the module's rules; `labels` names the lightmap of each time in messages.
-
-    Raises:
-        WlmError: A time or the period is wrong, or two times are equal.
-    """
+    """Checks the times [T] by the module's rules; `labels` names the lightmap of each time in messages."""
     if period is not None and not (math.isfinite(period) and period > 0):
         raise WlmError(f"{where}: expected a finite period above 0, got {period:g}")
     for label, time in zip(labels, times, strict=True):

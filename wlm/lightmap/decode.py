@@ -65,9 +65,6 @@ class SheetDecoder:
             device: "cpu", "cuda" or "cuda:N".
             gelu: GELU variant to use instead of the one that the model was trained with, for speed; None: the model's.
             tiles: Numbers of the tiles to upload; of a sheet of a file only these are read. None: all.
-
-        Raises:
-            WlmError: There is no such device, GELU variant or tile, or a tile of the file is damaged.
         """
         self.device, gelu = device_of(device), gelu_of(model, gelu)
         self.model = model if tiles is None else model.only(tiles)
@@ -86,11 +83,7 @@ class SheetDecoder:
         return sum(tiles.device_bytes for tiles in self._tiles)
 
     def tiles(self, numbers: Sequence[int], time: float) -> np.ndarray:
-        """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; gaps are not filled, empty tiles are 0.
-
-        Raises:
-            WlmError: A tile is not empty but was not uploaded, or there is no such time.
-        """
+        """Decodes tiles to linear radiance, float32 [n, 128, 128, 3]; gaps are not filled, empty tiles are 0."""
         self.model.axis.wrap(time)
         if len(wrong := np.intersect1d(numbers, self._left_out)):
             raise WlmError(f"{self.model.name}: tile {wrong[0]}: expected one of the decoder's tiles, got another")

@@ -58,9 +58,6 @@ def worker_devices(device: str, workers: int | None, cluster: str | None, sample
     """Returns the device of each worker; the first three arguments are those of `wlm.lightmap.compress`.
 
     A short fit gets fewer workers; `samples` is the number of training samples of the whole fit.
-
-    Raises:
-        WlmError: There is no such device, or the number of workers is below 1.
     """
     if workers is not None and workers < 1:
         raise WlmError(f"workers: expected at least 1, got {workers}")
@@ -78,11 +75,7 @@ def worker_devices(device: str, workers: int | None, cluster: str | None, sample
 def start_workers(
     devices: list[str], workers: int | None, cluster: str | None, batches: int, seed: int, track: bool
 ) -> Workers:
-    """Starts a `Fitter` for each device, or on a cluster at most one for each batch; with `track` they measure PSNR.
-
-    Raises:
-        WlmError: The cluster cannot be reached, or the system cannot start that many processes.
-    """
+    """Starts a `Fitter` for each device, or on a cluster at most one for each batch; with `track` they measure PSNR."""
     if cluster is not None:
         share = {"CPU": float(CPU_LANES)} if devices[0] == "cpu" else {"GPU": 1.0}
         return Actors(Fitter, (seed, devices[0], track), workers, batches, cluster, share)

@@ -189,12 +189,7 @@ class SheetFit:
         tiles: Sequence[int] | None = None,
         progress: OnProgress | None = None,
     ) -> None:
-        """Classifies the tiles (all, or those with the given numbers) and encodes the tiles that are stored as frames.
-
-        Raises:
-            WlmError: A tile's number is outside the grid or given twice, `tiles` is empty, or frames have no BC7
-                encoder.
-        """
+        """Classifies the tiles, all or those of the given numbers, and encodes those that are stored as frames."""
         # Frames are chosen by the sizes that the profile names, so that two states stay frames.
         fitted, self._lightmaps = profile.for_times(len(lightmaps.times)), lightmaps
         grid, times = TileGrid.of(*lightmaps.mask.shape), len(lightmaps.times)
@@ -203,7 +198,7 @@ class SheetFit:
         meter = Meter(progress, "tiles", len(self.index))
         facts = _classify(lightmaps, self.index, meter, profile.gamma, profile.peak, profile.static_budget_db)
         self.kinds = np.array([tile.kind for tile in facts])
-        framed = choose_frames(self.kinds, self.index, lightmaps.mask, times, profile)
+        framed = choose_frames(self.kinds, times, profile)
         self.warning = None
         if profile.frames == "auto" and framed.any() and (warning := missing_encoder(int(framed.sum()))):
             self.warning, framed[:] = f"{lightmaps.name}: {warning}", False

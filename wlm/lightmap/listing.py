@@ -16,11 +16,11 @@ from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings
 from wlm.errors import WlmError
+from wlm.formats.hours import DAY, hours_of_names
 from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
 from wlm.formats.reading import named_file, read_json_file
-from wlm.lightmap.hours import DAY, hours_of_names
 from wlm.lightmap.sheet import BASE, LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS, is_group, is_name
 
 SET_FILE = "set.json"
@@ -137,10 +137,6 @@ def list_set(
 
     Returns:
         A listing for each light group; for a set that names none, one of the name `BASE`.
-
-    Raises:
-        WlmError: The set cannot be read, a field is missing or wrong, a file lies outside the folder, there are too
-            many states, a state has no picture, or a group's name is wrong or given twice.
     """
     found = _listings(path, times, layers, trust, stored is not None)
     for name, own in (groups or {}).items():

@@ -42,10 +42,7 @@ class TileLoader:
     """
 
     def __init__(
-        self,
-        model: LightmapModel,
-        most: int = 64,
-        prepare: Callable[[Sheet, int, SheetModel], Any] | None = None,
+        self, model: LightmapModel, most: int = 64, prepare: Callable[[Sheet, int, SheetModel], Any] | None = None
     ) -> None:
         """Starts the thread.
 
@@ -67,18 +64,9 @@ class TileLoader:
         self._thread.start()
 
     def request(self, sheet: Sheet, number: int, priority: float = 0.0) -> bool:
-        """Asks for a tile, or changes the priority of a tile that waits.
-
-        Args:
-            sheet: The sheet.
-            number: Number of the tile in the sheet's grid.
-            priority: Tiles of higher priority come first, and of equal priority in the order of their requests.
-
-        Returns:
-            False if the request was dropped, since `most` requests wait that are at least as important.
-
-        Raises:
-            WlmError: The model has no such tile, or the loader is closed.
+        """Asks for a tile, or changes the priority of a tile that waits: higher ones come first, equal ones in the
+        order of their requests. Returns False if the request was dropped, since `most` requests wait that are at least
+        as important.
         """
         self._check(sheet, number)
         with self._change:
@@ -99,9 +87,6 @@ class TileLoader:
     def replace(self, requests: Iterable[tuple[Sheet, int, float]]) -> None:
         """Drops all waiting requests and asks for other tiles: sheet, number and priority of each. Of more than `most`
         the first ones count.
-
-        Raises:
-            WlmError: The model has no such tile, or the loader is closed; nothing is dropped.
         """
         asked = list(islice(requests, self._most))
         for sheet, number, _ in asked:
@@ -122,12 +107,9 @@ class TileLoader:
             raise WlmError(f"{self._model.name}: expected an open loader, got one that was closed")
 
     def cancel(self, sheet: Sheet | None = None, number: int | None = None) -> int:
-        """Drops waiting requests: of one tile, of all tiles of a sheet, or all.
+        """Drops waiting requests, of one tile, of all tiles of a sheet, or all, and returns their number.
 
         A tile that is being read, and results that nobody has taken, are not affected.
-
-        Returns:
-            The number of requests that were dropped.
         """
         with self._change:
             dropped = [tile for tile in self._waiting if sheet in (None, tile[0]) and number in (None, tile[1])]

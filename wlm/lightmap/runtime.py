@@ -55,15 +55,13 @@ class RuntimeDecoder:
         return wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.uint32, device=self.device)
 
     def set_time(self, time: float) -> None:
-        """Sets the time of the following decodes.
+        """Sets the time of the following decodes, in the unit of the set's times, stored or between; see
+        `wlm.lightmap.decode.SheetDecoder`.
 
         A CUDA graph that was captured before must be captured again, because the position on the time axis is an
         argument of the launches. Between two stored times, each decode decodes the light of both times and
         interpolates. A renderer that keeps the light of both and interpolates by itself only has to decode once for
         each stored time.
-
-        Args:
-            time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
         """
         raise NotImplementedError
 
@@ -145,9 +143,6 @@ class StripDecoder(_OneTimeDecoder):
             device: "cpu", "cuda" or "cuda:N".
             gelu: GELU variant to use instead of the model's, see `wlm_kernels.mlp`; None: the model's.
             shared: Whether texels are linear radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
-
-        Raises:
-            WlmError: There is no such device or GELU variant, or the sheet has no dynamic tile.
         """
         super().__init__(model, device, gelu, TileKind.DYNAMIC, shared)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
@@ -170,12 +165,7 @@ class MatrixDecoder(_MapDecoder):
     """
 
     def __init__(self, model: SheetModel, device: str = "cuda", shared: bool = False) -> None:
-        """Uploads the dynamic tiles of a sheet; for the arguments see `StripDecoder`.
-
-        Raises:
-            WlmError: The device is not a GPU, the networks' hidden width is not a multiple of 16, or the sheet has no
-                dynamic tile.
-        """
+        """Uploads the dynamic tiles of a sheet; for the arguments see `StripDecoder`."""
         name, profile = device_of(device), model.profile
         if name == "cpu":
             raise WlmError("device: expected cuda for MatrixDecoder, got cpu")
@@ -268,9 +258,6 @@ class MapDecoder:
                 and mask.
             device: "cpu", "cuda" or "cuda:N".
             mips: Number of mips besides the map itself; None: down to one texel.
-
-        Raises:
-            WlmError: There is no such device, the map does not have that many mips, or the groups differ in size.
         """
         self.device = device_of(device)
         self.groups = {BASE: model} if isinstance(model, SheetModel) else dict(model)

@@ -127,13 +127,11 @@ def first_light(sheets: Iterable[Sheet]) -> Sheet:
 
 
 def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: str | None) -> list[Sheet]:
-    """Returns the sheets of one layer of one atlas, in all groups that have it.
+    """Returns the sheets of one layer of one atlas, in all groups that have it; `where` names the collection in
+    messages.
 
-    Args:
-        where: Name of the collection, for messages.
-        sheets: The sheets to choose from.
-        layer: Name of the layer; None: the first layer of radiance, or the first layer if no layer is radiance.
-        atlas: Name of the atlas; None: the first atlas that has the layer.
+    Without a layer it is the first layer of radiance, or the first if none is radiance; without an atlas the first that
+    has the layer.
     """
     sheets = list(sheets)
     named = [sheet for sheet in sheets if atlas in (None, sheet.atlas) and layer in (None, sheet.layer)]
@@ -151,11 +149,6 @@ def check_sheets(where: str, sizes: Mapping[Sheet, tuple[int, int]]) -> None:
     Args:
         where: The set or the file, for messages.
         sizes: Height and width of each sheet.
-
-    Raises:
-        WlmError: There is no sheet; there are too many sheets, channels in an atlas, or texels in all sheets together;
-            a channel occurs twice; sheets of a layer of an atlas differ in size; or two groups have a layer that is not
-            light, or that has other channels in each of them.
     """
     if not 1 <= len(sizes) <= MOST_SHEETS:
         raise WlmError(f"{where}: expected 1 to {MOST_SHEETS} sheets of three channels, found {len(sizes)}")

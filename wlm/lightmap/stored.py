@@ -45,11 +45,7 @@ class PackedMask:
             zstd.check_frame(self.frame, -(-math.prod(self.shape) // 8), "part mask")
 
     def bits(self) -> np.ndarray | None:
-        """Unpacks the frame, uint8 [bytes]; None if all texels are valid.
-
-        Raises:
-            WlmError: The frame is damaged.
-        """
+        """Unpacks the frame, uint8 [bytes]; None if all texels are valid."""
         try:
             size = -(-math.prod(self.shape) // 8)
             data = None if self.frame is None else zstd.decompress(self.frame, size, "part mask")
@@ -86,9 +82,6 @@ class StoredTiles:
 
         Returns:
             The arrays in `PACKED`, by name.
-
-        Raises:
-            WlmError: A tile cannot be read, does not match its digest, or is not one of its kind.
         """
         table, filled = part_table(sheet.profile, sheet.kind, len(sheet.times)), copy(sheet)
         arrays = {name: np.zeros(table[name].shape, table[name].dtype) for name in PACKED}

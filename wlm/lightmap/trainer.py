@@ -262,11 +262,7 @@ class Trainer:
         vec = self._kernels.net.vec_hidden
         # CUDA stores whole tiles of scalars; the CPU adds whole columns.
         shaped = (
-            (
-                wrap(self._partial.view(-1, hidden)),
-                wrap(self._partial_out.view(-1, 3)),
-                wrap(self._loss_parts.view(-1)),
-            )
+            (wrap(self._partial.view(-1, hidden)), wrap(self._partial_out.view(-1, 3)), wrap(self._loss_parts.view(-1)))
             if self._cuda
             else (wrap(self._partial, vec), wrap(self._partial_out, wp.vec3), wrap(self._loss_parts))
         )
@@ -391,15 +387,7 @@ class Trainer:
         if on_levels:
             levels.put_on_levels(*self._levels_args)
         hidden, output = self._nets[on_levels]
-        args = (
-            self._maps,
-            self._offsets,
-            hidden,
-            output,
-            self.batch,
-            self._samples,
-            *self._launch_sums,
-        )
+        args = (self._maps, self._offsets, hidden, output, self.batch, self._samples, *self._launch_sums)
         rates = self._first_rates
         if self._cuda:
             self._kernels.launch(*args)
@@ -464,12 +452,7 @@ class Trainer:
         return pack_mode6(levels.numpy(), index)
 
     def check(self) -> None:
-        """Checks that the fit has not diverged.
-
-        Raises:
-            WlmError: It diverged: the loss or the maps of a tile are not finite, or its network exceeds the range of
-                half floats.
-        """
+        """Checks that the fit has not diverged."""
         broken = ~torch.isfinite(self.loss)
         for values in (*self.views.values(), self.hidden.detach().half(), self.output.detach().half()):
             broken |= ~torch.isfinite(values.reshape(self.tiles, -1)).all(1)

@@ -2,8 +2,8 @@
 
 The functions take torch tensors, with autograd, or Warp arrays, whose gradients they record on the active `wp.Tape`.
 They run on the device of their arguments and, on CUDA, queue work on the current stream of torch or of Warp. All floats
-are float32, and there is no second derivative. `plain` implements each of them in a few lines of torch, for any float
-type, as the reference for the kernels. The documentation is docs/ops.md.
+are float32, and there is no second derivative. `benchmarks/plain.py` implements each of them in a few lines of torch,
+for any float type, as the reference for the kernels. The documentation is docs/ops.md.
 
     bc7_map, bc7_texels, bc7_blocks     feature maps in BC7 blocks
     plane, triplane, volume             feature grids, sampled linearly
@@ -29,7 +29,6 @@ _PLACES = {
     "interpolate": "wlm.ops.raster",
     "march": "wlm.ops.marching",
     "mlp": "wlm.ops.networks",
-    "plain": "wlm.ops.plain",
     "plane": "wlm.ops.sampling",
     "rasterize": "wlm.ops.raster",
     "rasterize_uv": "wlm.ops.raster",

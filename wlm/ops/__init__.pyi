@@ -1,6 +1,5 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
 from wlm.ops import funcs as funcs
-from wlm.ops import plain as plain
 from wlm.ops.blocks import bc7_blocks as bc7_blocks
 from wlm.ops.blocks import bc7_map as bc7_map
 from wlm.ops.blocks import bc7_texels as bc7_texels

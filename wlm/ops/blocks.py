@@ -28,7 +28,7 @@ def bc7_map(
     layer: torch.Tensor | None = None,
     quantised: bool = False,
 ) -> torch.Tensor:
-    """Samples a map of blocks bilinearly, clamped at its border; the reference is `plain.bc7_map`.
+    """Samples a map of blocks bilinearly, clamped at its border; the reference is `benchmarks.plain.bc7_map`.
 
     Each call decodes all texels once, so it is inefficient for a few samples of a large map.
 
@@ -55,7 +55,7 @@ def bc7_map(
 
 @takes_arrays("endpoints", "weights")
 def bc7_texels(endpoints: torch.Tensor, weights: torch.Tensor, *, quantised: bool = False) -> torch.Tensor:
-    """Decodes whole maps; the reference is `plain.bc7_texels`. Gradients are bitwise reproducible.
+    """Decodes whole maps; the reference is `benchmarks.plain.bc7_texels`. Gradients are bitwise reproducible.
 
     Args:
         endpoints: float [H/4, W/4, 2, 4] or [L, H/4, W/4, 2, 4], see `bc7_map`.

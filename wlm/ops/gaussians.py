@@ -21,7 +21,7 @@ PAIRS_FOR_LISTS = 2**17
 def gaussian_sum(
     rows: torch.Tensor, points: torch.Tensor, *, cut: float = 3.0, support: str = "ellipsoid"
 ) -> torch.Tensor:
-    """Sums Gaussians at points: F(x) = sum_k F_k exp(-|u_k|^2 / 2); reference: `plain.gaussian_sum`.
+    """Sums Gaussians at points: F(x) = sum_k F_k exp(-|u_k|^2 / 2); reference: `benchmarks.plain.gaussian_sum`.
 
     u_k = S^-1 R^T (x - centre) with the scales S and the rotation R (gaussian-probe-compression, eq. 2 to 6, 11, 12),
     over the Gaussians that reach x; the gradients treat this set as constant. Sums and gradients are bitwise

@@ -49,12 +49,9 @@ class Indoors:
     height: float
 
     def views(self, count: int, seed: int = 0) -> list[Viewpoint]:
-        """Creates views from the eye positions in turn, with directions spread evenly around the horizon and slightly
-        up and down; the list is empty if there is no eye position.
-
-        Args:
-            count: Number of views.
-            seed: Selects a rotation of all directions and the first eye position.
+        """Creates `count` views from the eye positions in turn, with directions spread evenly around the horizon and
+        slightly up and down; none if there is no eye position. `seed` selects a rotation of all directions and the
+        first eye position.
         """
         if not len(self.eye):
             return []
@@ -72,9 +69,6 @@ def indoors(position: np.ndarray, triangle: np.ndarray, *, metres: bool, device:
     """Finds the valid eye positions in a scene of positions float [V, 3], y up, and at least one triangle, int [F, 3].
 
     The result is the same in every run. `metres` tells whether the unit is known to be the metre.
-
-    Raises:
-        WlmError: There is no such device.
     """
     device = check_device(device)
     corner = np.asarray(position, np.float64)[triangle]

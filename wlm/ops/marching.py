@@ -7,7 +7,6 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from wlm.interop import to_warp
-from wlm.ops.plain import henyey_greenstein
 from wlm.ops.tapes import NoGradientError, takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream, optional_array, zeros_for
 from wlm_kernels.smoke import single_scatter
@@ -28,7 +27,7 @@ def march(
     step: float = 1.0,
     g: float = 0.0,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Marches rays through a density grid; the reference is `plain.march`.
+    """Marches rays through a density grid; the reference is `benchmarks.plain.march`.
 
     Single scattering at albedo 1 (neural-six-way-lightmaps, eq. 1 to 3; for another albedo, scale the colours):
     each sample of a ray scatters light from directional lights towards the ray's origin, by the phase function of
@@ -99,7 +98,7 @@ def march(
     scattered, emitted, depth = _March.apply(density, emission, toward, origin, direction, float(step))
     # Autocast would multiply in half precision.
     with torch.autocast(device.type, enabled=False):
-        radiance = (scattered * henyey_greenstein(g, direction @ toward.T)) @ colour + emitted
+        radiance = (scattered * _henyey_greenstein(g, direction @ toward.T)) @ colour + emitted
     return radiance.reshape(*shape, 3), torch.exp(-depth).reshape(shape)
 
 
@@ -157,10 +156,7 @@ class _March(torch.autograd.Function):
                 on_density, on_nodes = zeros_for(density), zeros_for(nodes)
                 on_emission = zeros_for(emission) if needed[1] else None
                 single_scatter.march_backward(
-                    *arguments,
-                    to_warp(on_density),
-                    optional_array(on_emission, 3, wp.vec3, device),
-                    to_warp(on_nodes),
+                    *arguments, to_warp(on_density), optional_array(on_emission, 3, wp.vec3, device), to_warp(on_nodes)
                 )
                 lights = to_warp(toward, wp.vec3), ctx.step
                 single_scatter.depths_backward(*lights, to_warp(on_nodes), to_warp(on_density))
@@ -169,3 +165,8 @@ class _March(torch.autograd.Function):
                 rays = to_warp(on_origin, wp.vec3), to_warp(on_direction, wp.vec3)
                 single_scatter.rays_backward(*arguments, *rays)
         return on_density, on_emission, None, on_origin, on_direction, None
+
+
+def _henyey_greenstein(g: float, cosine: torch.Tensor) -> torch.Tensor:
+    """Returns the phase function times 4 pi; `cosine` is 1 for unscattered light."""
+    return (1.0 - g * g) / (1.0 + g * g - 2.0 * g * cosine) ** 1.5

@@ -14,7 +14,7 @@ WIDEST = 64
 
 @takes_arrays("x", "hidden", "output")
 def mlp(x: torch.Tensor, hidden: torch.Tensor, output: torch.Tensor, *, gelu: str = "exact") -> torch.Tensor:
-    """Evaluates networks with two hidden layers of H units and GELU activations; the reference is `plain.mlp`.
+    """Evaluates networks with two hidden layers of H units and GELU activations; reference: `benchmarks.plain.mlp`.
 
     y = gelu(gelu(x W1 + b1) W2 + b2) W3 + b3 (neural-dynamic-gi, section 3.3). The first use of a shape compiles its
     kernels, which takes several seconds.

@@ -22,7 +22,7 @@ REDUCTIONS = ("sum", "product", "concatenate")
 def plane(
     values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
 ) -> torch.Tensor:
-    """Samples a plane of features bilinearly; the reference is `plain.plane`.
+    """Samples a plane of features bilinearly; the reference is `benchmarks.plain.plane`.
 
     Args:
         values: float [H, W, C], or [L, H, W, C] with `layer`; with a gradient.
@@ -45,7 +45,7 @@ def plane(
 def volume(
     values: torch.Tensor, points: torch.Tensor, *, layer: torch.Tensor | None = None, periodic: bool = False
 ) -> torch.Tensor:
-    """Samples a volume of features trilinearly; the reference is `plain.volume`.
+    """Samples a volume of features trilinearly; the reference is `benchmarks.plain.volume`.
 
     Args:
         values: float [D, H, W, C], or [L, D, H, W, C] with `layer`; with a gradient.
@@ -66,7 +66,7 @@ def volume(
 def triplane(
     xy: torch.Tensor, xz: torch.Tensor, yz: torch.Tensor, points: torch.Tensor, *, reduce: str = "sum"
 ) -> torch.Tensor:
-    """Samples three planes at the projections of points in space; the reference is `plain.triplane`.
+    """Samples three planes at the projections of points in space; the reference is `benchmarks.plain.triplane`.
 
     Args:
         xy: float [H, W, C], u is x and v is y (the tri-plane of Chan et al. 2022, "Efficient Geometry-aware 3D

@@ -36,10 +36,6 @@ def read_mesh(path: str | os.PathLike[str], *, with_uv: bool = False) -> Mesh:
     Args:
         path: A `.glb` or `.gltf` file.
         with_uv: Whether every primitive must have lightmap UVs: `TEXCOORD_1` if the file has any, else `TEXCOORD_0`.
-
-    Raises:
-        WlmError: The file is missing or damaged; has no triangles; lacks UVs that are needed; has a base colour in a
-            texture; or a number is not finite.
     """
     document, primitives = read_gltf(path)
     if not primitives:

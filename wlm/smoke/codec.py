@@ -33,9 +33,6 @@ def encode(model: SmokeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
 
     Returns:
         The settings, the weights by name, and a hash of the weights, which the file stores as its source.
-
-    Raises:
-        WlmError: A weight is not finite, or too large for a half float.
     """
     parts = {}
     digest = hashlib.blake2b(digest_size=16)
@@ -71,11 +68,7 @@ def decode(artifact: Artifact) -> SmokeModel:
 
 
 def shipped() -> Path:
-    """Returns the file of the trained network that ships with wlm.
-
-    Raises:
-        WlmError: The file is missing.
-    """
+    """Returns the file of the trained network that ships with wlm."""
     if not _SHIPPED.is_file():
         raise WlmError(f"{_SHIPPED}: the network that comes with wlm is missing: install wlm again")
     return _SHIPPED
@@ -86,9 +79,6 @@ def open_network(path: str | os.PathLike[str] | None = None) -> SmokeModel:
 
     Args:
         path: The file; None: the network that ships with wlm.
-
-    Raises:
-        WlmError: The file is missing or damaged, or lacks the settings of the guiding maps.
     """
     path = shipped() if path is None else path
     model = load(path, SmokeModel.SYSTEM)

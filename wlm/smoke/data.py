@@ -89,11 +89,7 @@ class Frames:
         return CameraSettings() if self.scene is None else self.scene.camera
 
     def view(self, settings: CameraSettings, volume: DensityVolume) -> Camera:
-        """Places a camera in front of a frame; in a sequence it does not move, and looks at the box around all frames.
-
-        Raises:
-            WlmError: A frame is missing or damaged.
-        """
+        """Places a camera in front of a frame; in a sequence it rests, and looks at the box around all frames."""
         box = (volume.origin, volume.size) if self.scene is not None or self.single else self._box
         return make_camera(settings, *box)
 
@@ -135,11 +131,7 @@ class Frames:
         return None if self.scene is None else self.scene.looks(number)
 
     def load(self, number: int) -> DensityVolume:
-        """Reads the volume of a frame.
-
-        Raises:
-            WlmError: The file is missing or damaged.
-        """
+        """Reads the volume of a frame."""
         factors = self._factors
         options = dict(self.options)
         if self.scene is None and not self.single and (heads := grid_heads(self.file(number))):
@@ -154,11 +146,7 @@ class Frames:
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
     ) -> Iterator[tuple[int, DensityVolume]]:
-        """Yields the number and the volume of each frame; calls `progress` when the caller has processed a frame.
-
-        Raises:
-            WlmError: A frame is missing or damaged.
-        """
+        """Yields the number and the volume of each frame; calls `progress` when the caller has processed a frame."""
         numbers = self.numbers if numbers is None else numbers
         meter = Meter(progress, "frames", len(numbers))
         for done, number in enumerate(numbers, 1):
@@ -329,9 +317,6 @@ class NumberedFiles:
             others: Names of further files that a run may write into the folder.
             run: Settings on which the results depend, as JSON values; None: the run cannot be resumed.
             resume: Whether to keep the files of an interrupted run.
-
-        Raises:
-            WlmError: The folder contains other files, cannot be written, or belongs to a run with other settings.
         """
         self.folder, self._stem, self._suffix, self._others = Path(folder), stem, suffix, others
         self._cleared = False
@@ -364,11 +349,7 @@ class NumberedFiles:
             self.partial.unlink(missing_ok=True)
 
     def file(self, number: int) -> Path:
-        """Returns the path of a frame's result; the first call makes the folder or removes the files of an earlier run.
-
-        Raises:
-            WlmError: The earlier files cannot be removed.
-        """
+        """Returns the path of a frame's result; the first call makes the folder or removes an earlier run's files."""
         if not self._cleared:
             with _writing(self.folder):
                 self.folder.mkdir(exist_ok=True)
@@ -403,31 +384,19 @@ def write_six_way(path: str | os.PathLike[str], six: SixWay, looks: Looks | None
 
 
 def is_six_way(path: Path) -> bool:
-    """Returns whether a file is an EXR image with a channel, a layer or a part for each of the six directions.
-
-    Raises:
-        WlmError: The file is named .exr and cannot be read.
-    """
+    """Returns whether a file is an EXR image with a channel, a layer or a part for each of the six directions."""
     if path.suffix.lower() != ".exr" or not path.is_file():
         return False
     return bool(six_way_channels(read_header(path)[2]))
 
 
 def is_foreign(path: Path) -> bool:
-    """Returns whether a file is an EXR image of six-way lightmaps of another program.
-
-    Raises:
-        WlmError: As for `is_six_way`.
-    """
+    """Returns whether a file is an EXR image of six-way lightmaps of another program."""
     return is_six_way(path) and NOTE not in check_header(path)[0].attributes
 
 
 def six_way_files(folder: Path) -> dict[int, Path]:
-    """Returns the files of six-way lightmaps in a folder by frame number; empty if it has none.
-
-    Raises:
-        WlmError: An EXR file cannot be read, or the lightmaps are not those of one sequence.
-    """
+    """Returns the files of six-way lightmaps in a folder by frame number; empty if it has none."""
     if not folder.is_dir():
         return {}
     if files := numbered(folder, "six", ".exr"):
@@ -456,9 +425,6 @@ def read_shaded(
     """Reads the lightmaps that `write_six_way` wrote and, if present, the scene's lights, colours and obstacles.
 
     A file of another program is read as by `read_flipbook`, which adds its assumptions to `notes`.
-
-    Raises:
-        WlmError: As for `read_six_way`, or the lights, colours or obstacles are invalid.
     """
     if is_foreign(Path(path)):
         (six,) = read_flipbook([path], notes=notes, device=device)

@@ -119,12 +119,8 @@ class SixWay:
 
 
 def light_centres(planes: torch.Tensor) -> torch.Tensor:
-    """Returns where the light is in planes [N, C, H, W] of N frames.
-
-    Returns:
-        float64 [C, 3]: the mean place of the light to the right and upwards, 0 to 1, and the plane's share of the light
-        of all planes.
-    """
+    """Returns where the light is in planes [N, C, H, W] of N frames, float64 [C, 3]: the mean place of the light to the
+    right and upwards, 0 to 1, and the plane's share of the light of all planes."""
     height, width = planes.shape[2:]
     planes = planes.clamp(min=0.0)
     right = (torch.arange(width, device=planes.device) + 0.5) / width
@@ -143,11 +139,9 @@ def axis_faults(lightmaps: torch.Tensor) -> tuple[str, ...]:
     """Checks that lightmaps [..., 6, H, W] are bright where the light of their direction falls.
 
     A lightmap is brighter on the side from which its light comes, whatever the smoke, and smoke that scatters evenly is
-    brighter under a light from the front than from behind.
-
-    Returns:
-        A line for each pair of directions that may be exchanged, or one that names the black lightmaps if some are;
-        none if all six are black, or where the light shows no direction.
+    brighter under a light from the front than from behind. Returns a line for each pair of directions that may be
+    exchanged, or one that names the black lightmaps if some are; none if all six are black, or where the light shows no
+    direction.
     """
     maps = lightmaps.reshape(-1, *lightmaps.shape[-3:])
     dark = [name for name, light in zip(DIRECTIONS, maps.amax((0, 2, 3)).tolist(), strict=True) if not light > 0.0]

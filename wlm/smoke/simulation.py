@@ -28,12 +28,7 @@ _RAMP = 4
 
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
-    """Builds the solver of a scene on a device, which `wlm.interop.check_device` must have returned.
-
-    Raises:
-        WlmError: There is not enough memory for air and smoke, which is checked before the allocation, or an inlet is
-            too fast for the time step.
-    """
+    """Builds the solver of a scene on a device, which `wlm.interop.check_device` must have returned."""
     smoke = scene.smoke
     _require_memory(scene, device)
     try:
@@ -170,11 +165,7 @@ def simulate(
 
 
 def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
-    """Advances a solver from the previous frame to the frame with number `frame`; frames count from 1.
-
-    Raises:
-        WlmError: An obstacle is too fast.
-    """
+    """Advances a solver from the previous frame to the frame with number `frame`; frames count from 1."""
     per_frame, sources = scene.steps // scene.smoke.substeps, _sources(scene)
     for step in range(per_frame):
         _step(scene, solver, sources, frame - 1 + step / per_frame)

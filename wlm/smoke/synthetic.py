@@ -21,9 +21,6 @@ def make_plume(
         hot: Whether the smoke has a temperature, which is highest at the bottom.
         extinction: Optical depth of density 1 across the box.
         device: "cpu" or "cuda:N".
-
-    Raises:
-        WlmError: The device does not exist.
     """
     random = np.random.default_rng(seed)
     axis = (np.arange(n) + 0.5) / n

@@ -43,14 +43,8 @@ class Display:
         return _bytes(self.screen(light))
 
     def error(self, decoded: np.ndarray, original: np.ndarray) -> np.ndarray:
-        """Returns false colours (`heat`) of the displayed error: the largest difference of a channel times `gain`.
-
-        Args:
-            decoded, original: Linear light [..., 3].
-
-        Returns:
-            uint8 [..., 3].
-        """
+        """Returns false colours (`heat`), uint8 [..., 3], of the displayed error of linear light [..., 3]: the largest
+        difference of a channel times `gain`."""
         apart = np.abs(self.screen(decoded) - self.screen(original)).max(-1)
         return heat(apart * np.float32(self.gain))
 

@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from trimesh import Trimesh, creation
 
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
-from wlm.ops.plain import rotations
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import CENTRE, ROTATION, SCALE, Gaussians
 from wlm.probe.model import ProbeModel
@@ -54,13 +53,15 @@ class Probes:
     note: str
 
 
-def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None, title: str) -> Probes:
-    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`.
-
-    Raises:
-        WlmError: The numbers of a probe are not spherical harmonics, or the positions are unknown.
-    """
-    position, given, live, _ = probes_of(model, original, key)
+def model_probes(
+    model: ProbeModel,
+    original: str | os.PathLike[str] | None,
+    key: str | None,
+    title: str,
+    time: float | None = None,
+) -> Probes:
+    """Takes the probes of a model of one hour; the other arguments are those of `wlm.probe.places.probes_of`."""
+    position, given, live, _ = probes_of(model, original, key, time)
     count = _coefficients(model.outputs, title)
     decoder, places = model.decoder(position=position), position[live]
     values = {"decoded": decoder.decode_probes()[live].reshape(-1, count, 3)}
@@ -73,11 +74,7 @@ def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key
 
 
 def set_probes(probes: ProbeSet, title: str) -> Probes:
-    """Takes the probes of an input file; the light between probes is that of the nearest one.
-
-    Raises:
-        WlmError: The numbers of a probe are not spherical harmonics.
-    """
+    """Takes the probes of an input file; the light between probes is that of the nearest one."""
     count = _coefficients(probes.outputs, title)
     places, values = probes.position[probes.live], probes.values[probes.live]
     tree = cKDTree(places)
@@ -99,18 +96,10 @@ def probe_scene(
     block: float | None = None,
     up: int = 1,
 ) -> Scene:
-    """Makes the scene of probes.
+    """Makes the scene of probes, with a mesh that is lit at its vertices.
 
-    Args:
-        probes: The probes.
-        title: Title of the window.
-        geometry: Mesh of the scene, lit at its vertices; or None.
-        walk: [F, 3], viewpoints of the cascaded volume; None for a loop through the scene.
-        block: Side of the volume's finest blocks; None to derive it from the probes' spacing.
-        up: The axis that points up.
-
-    Raises:
-        WlmError: The side is not above 0.
+    `walk`, [F, 3], are viewpoints of the cascaded volume, None for a loop through the scene, and `block` the side of
+    its finest blocks, None to derive it from the probes' spacing.
     """
     light = StoredLight(next(iter(probes.values.values())))  # the decoded light, or else the original
     volume = Volume(probes.position, light, block=block)
@@ -148,14 +137,14 @@ class _ProbeScene(Scene):
         points = probes.position[:, None] + self._radius * self._ball
         faces = self._ball_faces + len(self._ball) * np.arange(len(probes.position))[:, None, None]
         self._balls = points.reshape(-1, 3), faces.reshape(-1, 3)
-        self._light = {name: irradiance(values, self._ball) / math.pi for name, values in probes.values.items()}
+        self._light = {name: _diffuse(values, self._ball) for name, values in probes.values.items()}
         self._brightness = ball_exposure(probes.values.get("original", next(iter(probes.values.values()))))
         self._surface: np.ndarray | None = None
         if self.geometry is not None:
             at_vertices = probes.decode(self.geometry.position.astype(np.float64))
             at_vertices = at_vertices.reshape(len(at_vertices), -1, 3)
             weights = irradiance_weights(_normals(self.geometry), at_vertices.shape[1])
-            self._surface = np.einsum("vc,vcd->vd", weights, at_vertices) / math.pi
+            self._surface = np.maximum(np.einsum("vc,vcd->vd", weights, at_vertices), 0.0) / math.pi
 
     def draw(self, canvas: Canvas, state: State) -> None:
         display = state.display(self._brightness)
@@ -192,7 +181,7 @@ class _ProbeScene(Scene):
     def caption(self, state: State) -> str:
         text = self.probes.note
         if state.view == "volume" and self._stats is not None:
-            held, waiting = self.volume.unscroll()[1].sum(), self._stats.left
+            held, waiting = sum(valid.sum() for valid in self.volume.unscroll()[1]), self._stats.left
             size = self.volume.sizes[0]
             text += f"; {held:,} blocks, the finest {size:.3g} wide, {self._stats.updated} new, {waiting:,} waiting"
         return text
@@ -200,7 +189,7 @@ class _ProbeScene(Scene):
     def _draw_gaussians(self, canvas: Canvas, state: State) -> None:
         model = self.probes.model
         rows = model.content.rows().astype(np.float64)
-        turn = rotations(torch.from_numpy(rows[:, ROTATION])).numpy()
+        turn = Rotation.from_quat(np.roll(rows[:, ROTATION], -1, axis=1)).as_matrix()  # scipy has w last
         shape = turn * np.exp(rows[:, SCALE])[:, None, :]
         centre = model.origin + model.extent * rows[:, CENTRE]
         ball, faces = _icosphere(1)
@@ -222,7 +211,7 @@ class _ProbeScene(Scene):
             self._frame = frame
         values, valid = self.volume.unscroll()
         centres, sides, light = [], [], []
-        side, inner = self.volume.side, None
+        inner = None
         for level, size in enumerate(self.volume.sizes):
             place = np.argwhere(valid[level])
             centre = (self.volume.base[level] + place + 0.5) * size
@@ -231,7 +220,7 @@ class _ProbeScene(Scene):
             if inner is not None:
                 seen = ((centre < inner[0]) | (centre > inner[1])).any(1)
             low = self.volume.base[level] * size
-            inner = low, low + side * size
+            inner = low, low + self.volume.sides[level] * size
             canvas.box(0, windows[level], *inner, _WINDOWS[level % len(_WINDOWS)])
             centres.append(centre[seen])
             sides.append(np.full(seen.sum(), _SHRUNK * size))
@@ -239,7 +228,7 @@ class _ProbeScene(Scene):
         centre, size, values = np.concatenate(centres), np.concatenate(sides), np.concatenate(light)
         cube = creation.box()  # of side 1; its triangles share no corners, so that each face has its own colour
         points = centre[:, None] + size[:, None, None] * cube.triangles.reshape(-1, 3)
-        shown = irradiance(values.reshape(len(values), -1, 3), cube.face_normals.repeat(3, 0)) / math.pi
+        shown = _diffuse(values.reshape(len(values), -1, 3), cube.face_normals.repeat(3, 0))
         colours = state.display(self._brightness).picture(shown).reshape(-1, 3)
         canvas.coloured(0, _BLOCKS, points.reshape(-1, 3), np.arange(len(colours)).reshape(-1, 3), colours)
         if len(self.path) > 1:
@@ -259,6 +248,11 @@ def _coefficients(outputs: int, title: str) -> int:
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     sphere = creation.icosphere(subdivisions=subdivisions)
     return np.array(sphere.vertices), np.array(sphere.faces)
+
+
+def _diffuse(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Returns the radiance of white diffuse surfaces with normals [M, 3] under SH [..., C, 3], float64 [..., M, 3]."""
+    return np.maximum(irradiance(values, normals), 0.0) / math.pi
 
 
 def _normals(geometry: Geometry) -> np.ndarray:

@@ -20,11 +20,7 @@ _TRIAL_SECONDS = 60.0
 
 @functools.cache
 def require_opengl() -> None:
-    """Checks in a child process that VTK can render: it crashes its process if no OpenGL works.
-
-    Raises:
-        WlmError: The child process failed.
-    """
+    """Checks in a child process that VTK can render: it crashes its process if no OpenGL works."""
     try:
         trial = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, timeout=_TRIAL_SECONDS, check=False)
         works = trial.returncode == 0

@@ -66,9 +66,6 @@ def run(
         of the points on the mesh that show their own page and time, `mean` and `least`; `memory`, bytes on the device
         by part; `views`, PSNR and FLIP of the pixels of the mesh at each hour of the originals, compared with a picture
         under the original lightmap.
-
-    Raises:
-        WlmError: An argument is wrong, a file is damaged, or the folder cannot be written.
     """
     folder = Path(folder)
     frames = round(RATE * scene.day.seconds) if frames is None else frames

@@ -45,17 +45,8 @@ class Window:
     def __init__(
         self, scene: Scene, *, size: tuple[int, int] = (1280, 720), rate: float = 24.0, off_screen: bool = True
     ) -> None:
-        """Makes the window and draws the scene.
-
-        Args:
-            scene: The scene.
-            size: Width and height, pixels.
-            rate: Frames a second of scenes with frames.
-            off_screen: Whether the window stays hidden.
-
-        Raises:
-            WlmError: pyvista is missing, VTK finds no OpenGL, there is no display, or the scene cannot be drawn.
-        """
+        """Makes the window, of a width and height in pixels, and draws the scene, whose frames change at `rate` a
+        second; it stays hidden if `off_screen`."""
         pyvista = need("pyvista", "view")
         require_opengl()
         self.scene, self.playing, self._rate = scene, False, rate
@@ -79,11 +70,7 @@ class Window:
         self.look()
 
     def set(self, name: str, value: float) -> None:
-        """Moves a slider; values outside its range are clamped.
-
-        Raises:
-            WlmError: The scene has no such slider, or the value is not finite.
-        """
+        """Moves a slider; values outside its range are clamped."""
         if name not in self.sliders:
             raise WlmError(f"{self.scene.title}: {name} has no meaning for this file; it has {', '.join(self.sliders)}")
         if not np.isfinite(value):
@@ -92,33 +79,21 @@ class Window:
         self.draw()
 
     def choose(self, view: str) -> None:
-        """Changes the view.
-
-        Raises:
-            WlmError: The scene has no such view.
-        """
+        """Changes the view."""
         if view not in self.scene.views:
             raise WlmError(f"{self.scene.title}: --view: expected {' or '.join(self.scene.views)}, got {view}")
         self.state.view = view
         self.draw()
 
     def tone(self, name: str) -> None:
-        """Changes the tone mapping.
-
-        Raises:
-            WlmError: Unknown tone mapping.
-        """
+        """Changes the tone mapping."""
         if name not in TONES:
             raise WlmError(f"--tone: expected {' or '.join(TONES)}, got {name}")
         self.state.tone = name
         self.draw()
 
     def turn(self, degrees: float) -> None:
-        """Turns the camera about the scene's upward axis.
-
-        Raises:
-            WlmError: The angle is not finite.
-        """
+        """Turns the camera about the scene's upward axis."""
         if not np.isfinite(degrees):
             raise WlmError(f"turn: expected a finite number of degrees, got {degrees}")
         camera, axis = self.canvas.renderers[0].camera, np.eye(3)[self.scene.up]
@@ -160,11 +135,7 @@ class Window:
         return np.array(self._plotter.screenshot(return_img=True)[..., :3])
 
     def screenshot(self, path: str | os.PathLike[str]) -> None:
-        """Writes the content of the window as a PNG, atomically.
-
-        Raises:
-            WlmError: The file cannot be written.
-        """
+        """Writes the content of the window as a PNG, atomically."""
         save_png(path, self.picture())
 
     def show(self) -> None:

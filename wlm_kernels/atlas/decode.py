@@ -8,7 +8,7 @@ texture that consists of blocks of 4 x 4 texels. The rectangle's outermost sampl
 light is a sum of components, each times a factor of the lighting state, and the rectangles of a tile's components lie
 beside each other (`wlm.atlas.model`).
 
-`wlm/atlas/exact.py` computes the same in float64 NumPy and is easier to read.
+`benchmarks/atlas_exact.py` computes the same in float64 NumPy and is easier to read.
 """
 
 import warp as wp

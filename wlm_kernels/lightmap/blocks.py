@@ -6,7 +6,7 @@ endpoints with 7 bits a channel plus one lowest bit shared by the four channels,
 
 With `quantised`, endpoints and weights are rounded to these levels, so that training sees the texels of the file. The
 adjoint is straight-through: each rounding has derivative 1, and values outside [0, 1] keep their gradient, so that Adam
-can bring them back. `wlm.ops.plain.bc7_texels` is the same in a few lines of torch.
+can bring them back. `benchmarks.plain.bc7_texels` is the same in a few lines of torch.
 
 Arrays: endpoints `[S, H/4, W/4, 2]` of vec4, weights `[S, H, W]`, where S counts slices (tiles, or tiles x
 times). Blocks of the file are `[S, H/4, W/4, 2]` of uint64, the low and the high half of 16 little-endian bytes.

@@ -5,7 +5,7 @@ for use at run time: it computes once what all texels of a frame share (F_uvt in
 each column the contribution of F_ut and the encoded time to the first layer), and a thread decodes four texels, so that
 each weight is loaded once for four texels.
 
-Read `wlm/lightmap/exact.py` first; it contains the same decode in NumPy. `features` describes the maps F_uv to F_vt.
+Read `benchmarks/lightmap_exact.py` first; it has the same decode in NumPy. `features` describes the maps F_uv to F_vt.
 """
 
 import functools

@@ -4,7 +4,7 @@ With `cubes` a point only evaluates the Gaussians that its cube lists, with the 
 `backward` computes the gradient with respect to the Gaussians: a thread adds up one Gaussian's gradient over the points
 of all cubes within the Gaussian's reach. `backward_points` computes the gradient with respect to the points, one per
 thread. There are no atomic additions. The gradients treat the set of Gaussians that reach a point as constant. The
-reference is `wlm.ops.plain.gaussian_sum`; for probes that do not move, `step` trains faster.
+reference is `benchmarks.plain.gaussian_sum`; for probes that do not move, `step` trains faster.
 """
 
 import functools

@@ -2,7 +2,7 @@
 
 `wlm_kernels.raster.rasterize` defines barycentrics. Gradients take the visible triangle of each pixel as fixed.
 
-Read `wlm/ops/plain.py` first (`corner_weights`), which computes barycentrics in torch, differentiated by autograd.
+Read `benchmarks/plain.py` first (`corner_weights`), which computes barycentrics in torch, differentiated by autograd.
 """
 
 import warp as wp

@@ -7,7 +7,7 @@ levels and mixes them linearly; a level outside reads the first or the last one.
 Addressing is that of `wlm_kernels.raster.texture`. A point whose coordinate or level reads NaN has no gradient and adds
 none to the texture.
 
-Read `wlm/ops/plain.py` first (`texture`), which reads all levels at all points.
+Read `benchmarks/plain.py` first (`texture`), which reads all levels at all points.
 """
 
 import warp as wp

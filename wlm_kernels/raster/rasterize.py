@@ -18,8 +18,8 @@ as in glTF, the centre is u = (i + 1/2) / W, v = (j + 1/2) / H, and the triangle
 
 A triangle covers nothing if a corner isn't finite or doesn't exist, or if it has no area.
 
-Edge functions are in `edges`; interpolation and gradients in `gradient`. Read `wlm/ops/plain.py` first (`rasterize`),
-which solves for the corners' weights at each pixel instead.
+Edge functions are in `edges`; interpolation and gradients in `gradient`. `rasterize` of `benchmarks/plain.py`
+is to be read first: it solves for the corners' weights at each pixel instead.
 """
 
 import math
@@ -300,9 +300,6 @@ class Rasterizer:
 
     Attributes:
         raster: `Raster`, the output of `run`.
-
-    Raises:
-        ValueError: The height or width is out of range, or there are too many triangles for an image of this size.
     """
 
     def __init__(

@@ -14,7 +14,6 @@ from wlm.atlas.evaluation import compare
 from wlm.atlas.resize import resized
 from wlm.atlas.views import Points
 from wlm.errors import WlmError
-from wlm.formats.hdr_blocks import ASTC_BLOCKS
 from wlm.formats.shared_exponent import pack_rgb9e5, unpack_rgb9e5
 from wlm.ops import raster
 
@@ -143,7 +142,7 @@ def test_downsampling_keeps_the_shape_and_never_enlarges():
     assert errors == sorted(errors, reverse=True)
 
 
-@pytest.mark.parametrize("codec", ["bc6h", *(f"astc{w}x{h}" for w, h in ASTC_BLOCKS)])
+@pytest.mark.parametrize("codec", ["bc6h", "astc4x4", "astc8x5", "astc12x12"])
 def test_blocks(codec):
     light = waves()[..., :1] * np.array([1.0, 0.8, 0.5], np.float32)
     mesh = _sheet(light)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from builders.checks import psnr
 from builders.small_sets import moving_light
-from builders.small_sets import sheet_from_arrays as from_arrays
 
 from benchmarks.rivals.lightmap import encode_set
 from benchmarks.rivals.rival import disk_size, measure
@@ -33,16 +32,6 @@ def test_a_set_goes_through_a_method_time_by_time():
         assert part.encode_seconds > 0.0
     with pytest.raises(WlmError, match="unknown method 'jpeg'"):
         encode_set("jpeg", moving, visit)
-
-
-def test_the_profiles_that_astc_chose_are_told():
-    """One hour that LDR holds better, one that HDR does."""
-    plain = moving_light(48, 48, hours=(1.0, 2.0)).light
-    frames = plain.frames.copy()
-    frames[1] = (10.0 ** (np.arange(48) / 12.0))[None, :, None] * [1.0, 0.8, 0.5]
-    mixed = from_arrays(frames, plain.times, period=24.0)
-    assert encode_set("astc12", plain, lambda i, decoded: None)[0].option == "LDR"
-    assert encode_set("astc12", mixed, lambda i, decoded: None)[0].option == "HDR and LDR"
 
 
 def test_disk_size_is_the_shorter_of_two():

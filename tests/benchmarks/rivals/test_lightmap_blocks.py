@@ -1,15 +1,12 @@
 """The block codecs on small lightmaps with known answers."""
 
-import astc_encoder
 import numpy as np
 import pytest
 from builders.checks import psnr
 from builders.lightmaps import smooth_light
 
-from benchmarks.rivals import lightmap_blocks
 from benchmarks.rivals.lightmap import RIVALS
-from benchmarks.rivals.lightmap_blocks import encode_astc, encode_bc6h, encode_bc7
-from wlm.errors import WlmError
+from benchmarks.rivals.lightmap_blocks import encode_astc, encode_bc7
 
 BLOCKS = {name: method.encode for name, method in RIVALS.items() if method.alone}
 BITS = {f"astc{side}": 128.0 / side**2 for side in (4, 5, 6, 8, 10, 12)}
@@ -43,19 +40,6 @@ def test_a_range_for_each_tile():
         assert dim == pytest.approx(bright, abs=0.6)
 
 
-def test_ldr_is_not_stopped_at_the_presets_decibels():
-    """Smooth light in 12x12 blocks: with astcenc's own limit the search ends early."""
-    image, mask = smooth_light(), np.ones((120, 120), bool)
-    free = psnr(image, encode_astc(image, mask, 12, profile="ldr").decoded)
-    config = astc_encoder.ASTCConfig(astc_encoder.ASTCProfile.LDR, 12, 12, 1, lightmap_blocks._ASTC_THOROUGH)
-    lightmap_blocks._astc_codec.cache_clear()
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(lightmap_blocks, "_NO_LIMIT_DB", config.tune_db_limit)
-        stopped = psnr(image, encode_astc(image, mask, 12, profile="ldr").decoded)
-    lightmap_blocks._astc_codec.cache_clear()
-    assert stopped < free - 1.0, (stopped, config.tune_db_limit)
-
-
 def test_astc_takes_the_better_profile():
     mask = np.ones((48, 48), bool)
     assert encode_astc(smooth_light(48, 48), mask).option == "LDR"
@@ -84,19 +68,6 @@ def test_the_ends_of_half_floats_range(name):
     decoded = BLOCKS[name](bright * 1e6, mask).decoded  # becomes 65,504, not infinity
     np.testing.assert_allclose(decoded, 65504.0, rtol=0.01)
     assert not BLOCKS[name](np.full((24, 24, 3), -5.0), mask).decoded.any()
-
-
-def test_shapes_and_settings_are_checked():
-    image, mask = smooth_light(16, 16), np.ones((16, 16), bool)
-    for bad in (image[..., :2], image[..., 0], np.zeros((0, 16, 3))):
-        with pytest.raises(WlmError, match=r"\[..., H, W, 3\]"):
-            encode_bc6h(bad, np.ones(bad.shape[:2], bool))
-    with pytest.raises(WlmError, match="mask"):
-        encode_bc7(image, mask[:8])
-    with pytest.raises(WlmError, match="got 7"):
-        encode_astc(image, mask, block=7)
-    with pytest.raises(WlmError, match="'sdr'"):
-        encode_astc(image, mask, profile="sdr")
 
 
 @pytest.mark.parametrize("profile", ["ldr", "hdr"])

@@ -7,7 +7,6 @@ from builders.small_sets import moving_light
 
 from benchmarks.rivals.lightmap import FEW, RIVALS, encode_set, usual
 from benchmarks.rivals.lightmap_ntc import LADDER, Latents, encode_ntc
-from wlm.errors import WlmError
 
 SMALL = Latents(2, 4, 4, 4)
 NETWORK = 28 * 64 + 64 + 64 * 64 + 64  # weights and biases of two layers, of 4 * 4 + 4 + 8 inputs
@@ -84,17 +83,3 @@ def test_it_is_a_method_that_takes_a_device(monkeypatch):
     monkeypatch.setitem(RIVALS, "ntc-medium", type(method)("NTC", "medium", fake, alone=False, fitted=True))
     rival, visits = encode_set("ntc-medium", moving, lambda i, decoded: decoded.shape, [1, 3], device="cuda:1")
     assert calls == [{"device": "cuda:1"}] and visits == [(24, 24, 3)] * 2 and rival.decoded is None
-
-
-def test_settings_are_checked():
-    frames = moving_light(8, 8).light.frames
-    bad = frames.copy()
-    bad[1, 3, 3, 1] = np.nan
-    for call, words in (
-        (lambda: encode(frames, latents="huge"), "unknown latents 'huge', expected one of low, medium"),
-        (lambda: encode(frames, steps=0), "at least 1 step and 1 sample, got 0 and 256"),
-        (lambda: encode(frames, device="tpu"), "device 'tpu'"),
-        (lambda: encode(bad), "NaN or infinite"),
-    ):
-        with pytest.raises(WlmError, match=words):
-            call()

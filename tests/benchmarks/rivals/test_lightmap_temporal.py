@@ -7,8 +7,7 @@ from builders.lightmaps import smooth_light
 
 from benchmarks.rivals.lightmap import RIVALS
 from benchmarks.rivals.lightmap_pca import encode_pca_bc4
-from benchmarks.rivals.lightmap_video import encode_av1, fill_smoothly
-from wlm.errors import WlmError
+from benchmarks.rivals.lightmap_video import fill_smoothly
 
 # One of each kind; the rest differ in a number.
 KINDS = ("pca-bc4-4", "av1-85")
@@ -61,15 +60,3 @@ def test_gaps_are_filled_smoothly():
     assert image[mask].min() <= gap.min() and gap.max() <= image[mask].max() + 1e-5
     assert np.abs(np.diff(filled[17, 5:45], axis=0)).mean() < 0.1
     assert not fill_smoothly(image, np.zeros((37, 50), bool)).any()
-
-
-def test_settings_are_checked():
-    frames, mask = day(8, 8), np.ones((8, 8), bool)
-    for call, words in (
-        (lambda: encode_pca_bc4(frames, mask, 0), "at least 1 component, got 0"),
-        (lambda: encode_av1(frames, mask, 101), "quality from 0 to 100, got 101"),
-        (lambda: encode_av1(frames[..., :2], mask), r"lightmaps \[..., H, W, 3\]"),
-        (lambda: encode_pca_bc4(frames, mask[:4]), "mask"),
-    ):
-        with pytest.raises(WlmError, match=words):
-            call()

@@ -7,8 +7,8 @@ from builders.small_sets import moving_light, tiny_profile
 from builders.small_sets import sheet_from_arrays as from_arrays
 
 from benchmarks.lightmap_ablation import VARIANTS
+from benchmarks.lightmap_exact import decode_tile64
 from benchmarks.rivals.lightmap_torch import Features, PlainFit
-from wlm.lightmap.exact import decode_tile64
 from wlm.lightmap.fit import compress, dynamic_targets
 from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.sheet import LIGHT

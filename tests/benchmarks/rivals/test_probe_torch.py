@@ -107,13 +107,3 @@ def test_one_probe_and_probes_at_one_place():
         assert np.isfinite(losses).all() and len(fit.parameters[0]) == count
         # Where all is one place, or one value, the best there is, is the mean.
         np.testing.assert_allclose(fit.decoded(), values.mean(0)[None].repeat(len(x), 0), atol=1e-2)
-
-
-def test_what_is_refused():
-    x, values = np.zeros((4, 3)), np.zeros((4, 2))
-    for bad in ((x[:3], values), (x[:, :2], values), (x, values[:, 0]), (x[:0], values[:0])):
-        with pytest.raises(ValueError, match="expected positions"):
-            dense(*bad)
-    for changes in ({"count": 0}, {"steps": 0}, {"latent": 0}, {"hidden": 0}):
-        with pytest.raises(ValueError, match="numbers of at least 1"):
-            dense(x, values, **changes)

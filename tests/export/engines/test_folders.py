@@ -19,7 +19,7 @@ from builders.light_groups import random_groups
 from builders.shader_runs import run_glsl, run_hlsl
 from builders.synthetic import random_model as random_lightmap
 
-from wlm.atlas.exact import decode64
+from benchmarks.atlas_exact import decode64
 from wlm.export import ENGINES, export
 from wlm.export.engines import kit
 from wlm.export.engines.kit import asset_name

@@ -100,16 +100,13 @@ def test_what_has_no_page_is_said_in_one_line(tmp_path):
     write_exr(tmp_path / "day.exr", np.ones((4, 4, 3), np.float32))
     for files, options, said in (
         ([], {}, "found none"),
-        ([tmp_path / "absent.wlm"], {}, "absent.wlm"),
         ([FILES / "smoke.wlm"], {}, "no picture of its own"),
         ([FILES / "lightmap.wlm", FILES / "lightmap.wlm"], {}, "expected one file"),
         ([FILES / "lightmap.wlm"], {"key": "sh"}, "--key"),
-        ([FILES / "lightmap.wlm"], {"mesh": tmp_path / "absent.glb"}, "absent.glb"),
         ([tmp_path / "probe.wlm"], {}, "--original"),
         ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
         ([tmp_path], {}, "wlm view shows inputs"),
         ([tmp_path / "day.exr"], {}, "day.exr: expected a .wlm"),
-        ([probes], {}, "probes.npz: expected a .wlm"),
         ([FILES / "lightmap.wlm"], {"original": probes}, "probes.npz: expected a set.json or a folder"),
         ([tmp_path / "absent.exr"], {}, "absent.exr: no such file or folder"),
     ):

@@ -16,7 +16,7 @@ from builders.scene_folders import expected_picture, scene_folder
 from builders.smoke_books import IRRADIANCE, SKY, TOWARD, random_book, random_frames, shown
 from builders.synthetic import random_model as random_lightmap
 
-from wlm.atlas.exact import decode64
+from benchmarks.atlas_exact import decode64
 from wlm.export import export
 from wlm.probe.sphere import irradiance
 from wlm.smoke.bundle import bundle

@@ -50,11 +50,7 @@ class Allocated:
 
 
 def allocated(tried: list[Candidate], bits: float, profile: Profile) -> Allocated:
-    """Chooses the number and size of all tiles' components, and places them; `bits` is the budget of tiles and factors.
-
-    Raises:
-        WlmError: The budget is less than the smallest tiles take, or all pages together are too small.
-    """
+    """Chooses number and size of all tiles' components, and places them; `bits` is the budget of tiles and factors."""
     error, cost = np.concatenate([each.error for each in tried]), costs(tried)
     states, tiles = tried[0].mixtures.factor.shape[1], np.arange(error.shape[1])
     ranks, number = np.array([each.rank for each in tried]), np.stack([each.number for each in tried])
@@ -140,9 +136,6 @@ def _worth(
 def _on_pages(size: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Packs rectangles, int [T, 2] texels along x and y, on as few pages of equal size as possible. Returns the first
     texel of each, int64 [T, 2]; its page, int64 [T]; and rows and columns of a page.
-
-    Raises:
-        WlmError: All pages together are too small.
     """
     order, page = np.lexsort((size[:, 0], size[:, 1])), np.empty(len(size), np.int64)
     for pages in range(max(1, -(-int(size.prod(1).sum()) // MOST_SIZE**2)), MOST_PAGES + 1):

@@ -18,13 +18,7 @@ import numpy as np
 import torch
 
 from wlm.atlas.colour import stored
-from wlm.atlas.model import (
-    BLOCK_SIDE,
-    COLOUR_BITS,
-    FACTOR_BITS,
-    MOST_COARSE,
-    extent,
-)
+from wlm.atlas.model import BLOCK_SIDE, COLOUR_BITS, FACTOR_BITS, MOST_COARSE, extent
 from wlm.atlas.shared.mixture import Mixtures, find_mixtures, moments
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import Tiles, errors, sample_weights, solve, tile_light

@@ -16,16 +16,7 @@ import torch
 
 from wlm.atlas.colour import encode
 from wlm.atlas.data import LightmappedScene
-from wlm.atlas.model import (
-    BLOCK_SIDE,
-    BLOCKS,
-    TEXELS,
-    AtlasModel,
-    Profile,
-    coarse_place,
-    extent,
-    pack_tiles,
-)
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS, AtlasModel, Profile, coarse_place, extent, pack_tiles
 from wlm.atlas.shared.allocation import Allocated
 from wlm.atlas.shared.curves import Candidate, SceneTiles
 from wlm.atlas.shared.sharing import Cut, fitted, planes_of
@@ -44,9 +35,6 @@ def fit_shared(scene: LightmappedScene, profile: Profile, seed: int, stages: Sta
 
     The model's report has the numbers of tiles, samples and components of each sheet, and the error for each number of
     components that was tried.
-
-    Raises:
-        WlmError: The budget is less than the smallest model takes.
     """
     device = stages.device
     with stages("weights"):

@@ -76,11 +76,7 @@ class Tiles:
 def fit_tiles(
     scene: LightmappedScene, grid: FineGrid, profile: Profile, seed: int, stages: Stages
 ) -> AtlasModel | None:
-    """Compresses a scene of one sheet and state to tiles; None if even the smallest tiles exceed the budget.
-
-    Raises:
-        WlmError: The package that encodes the blocks of T_p isn't installed, or T_p has too many texels along a side.
-    """
+    """Compresses a scene of one sheet and state to tiles; None if even the smallest tiles exceed the budget."""
     (sheet,) = scene.sheets
     with stages("weights"):
         tiles = cut(sheet.lightmap, weights(scene, grid, profile, seed), profile.tile, grid.device)

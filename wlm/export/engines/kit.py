@@ -48,11 +48,7 @@ def write_texts(folder: Path, texts: dict[str, str]) -> None:
 
 
 def check_sides(name: str, engine: str, file: str, pixels: np.ndarray) -> None:
-    """Checks that an engine accepts the size of a picture [H, W, C]; `name` is the model's name for messages.
-
-    Raises:
-        WlmError: The picture is too large.
-    """
+    """Checks that an engine accepts the size of a picture [H, W, C]; `name` is the model's name for messages."""
     height, width = pixels.shape[:2]
     if max(height, width) > _MOST_SIDE[engine]:
         most = f"expected at most {_MOST_SIDE[engine]} texels along a side"

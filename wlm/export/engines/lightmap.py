@@ -41,9 +41,6 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
     Returns:
         Entries for the folder's index: shader, textures and buffers.
-
-    Raises:
-        WlmError: A texture is larger than the engine accepts.
     """
     if engine == "unreal":
         return {"textures": _write_unreal(bundle, folder)}
@@ -58,11 +55,7 @@ def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
 
 
 def write_collection(bundle: Bundle, folder: Path, engine: str) -> None:
-    """Writes what the kits of a collection's parts need together: the script that adds the light groups.
-
-    Raises:
-        WlmError: The collection has several light groups, and the engine's kit does not add them.
-    """
+    """Writes what the kits of a collection's parts need together: the script that adds the light groups."""
     if len({sheet["group"] for sheet in bundle.document["sheets"]}) == 1:
         return
     if engine != "three":

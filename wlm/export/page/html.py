@@ -50,9 +50,6 @@ class Page:
 
         Returns:
             Size of the file in bytes.
-
-        Raises:
-            WlmError: A number of the manifest is not finite, or the file cannot be written.
         """
         content, places, held = bytearray(), {}, dict[bytes, list[int]]()
         for name, values in self.arrays.items():

@@ -18,16 +18,8 @@ _WHITE = 0.8  # screen value of the brightest lightmap
 
 
 def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgress | None = None) -> Page:
-    """Makes the HTML page that plays six-way lightmaps of smoke.
-
-    Args:
-        paths: One EXR per frame, written by `wlm smoke bake` or `predict`, all of one size.
-        rate: Playback speed in frames per second.
-        progress: Called about twice a second while the frames are read.
-
-    Raises:
-        WlmError: A file cannot be read or has another size, or the rate is not above 0.
-    """
+    """Makes the HTML page that plays six-way lightmaps of smoke, an EXR per frame of `wlm smoke bake` or `predict`, all
+    of one size, at `rate` frames per second."""
     if not 0 < rate < float("inf"):
         raise WlmError(f"--rate: expected a number above 0, got {rate}")
     codes, most, hot = pack_frames(paths, progress)
@@ -60,9 +52,6 @@ def pack_frames(paths: Sequence[Path], progress: OnProgress | None) -> tuple[np.
         Codes uint8 [N, H, W, 8] of the six lightmaps, the opacity and the emission: square roots, whose steps are
         perceptually more even. The largest number of each frame's lightmaps, opacity and emission, which its codes are
         relative to. And whether any frame has emission.
-
-    Raises:
-        WlmError: A file cannot be read or has another size.
     """
     codes, most, hot = list[np.ndarray](), list[list[float]](), False
     meter = Meter(progress, "read", len(paths))

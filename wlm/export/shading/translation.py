@@ -23,11 +23,7 @@ _PRECISIONS = "".join(
 
 
 def check_language(language: str) -> None:
-    """Checks the name of a shading language.
-
-    Raises:
-        WlmError: It is not in `LANGUAGES`.
-    """
+    """Checks the name of a shading language."""
     if language not in LANGUAGES:
         raise WlmError(f"shader: expected one of {', '.join(LANGUAGES)}, got {language!r}")
 

@@ -67,13 +67,8 @@ class Encoding(ABC):
 
     @abstractmethod
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
-        """Uploads a sheet's tiles of this encoding to a device; returns an empty list if the sheet has none.
-
-        Args:
-            sheet: The arrays of the sheet.
-            device: As `wlm.interop.check_device` returns it.
-            gelu: GELU variant of the networks, see `wlm_kernels.mlp`.
-        """
+        """Uploads a sheet's tiles of this encoding to a device; returns an empty list if the sheet has none. `gelu` is
+        the GELU variant of the networks, see `wlm_kernels.mlp`."""
 
     def textures(self, sheet: SheetModel) -> dict[str, Texture]:
         """Returns the textures that the shader reads for tiles of this encoding, by name."""
@@ -103,16 +98,8 @@ def columns(count: int, height: int, width: int) -> int:
 
 
 def side_by_side(images: np.ndarray, fmt: str, height: int, width: int) -> dict[str, Any]:
-    """Arranges images side by side, in several rows, in one texture.
-
-    Args:
-        images: [n, rows, columns, bytes] of texels or blocks.
-        fmt: Pixel format.
-        height, width: Size of an image in texels.
-
-    Returns:
-        The keyword arguments of `Texture`.
-    """
+    """Arranges images, [n, rows, columns, bytes] of texels or blocks, side by side in several rows of one texture;
+    returns the keyword arguments of `Texture`. `height` and `width` are the size of an image in texels."""
     across = columns(len(images), height, width)
     missing = -len(images) % across
     padded = np.concatenate([images, np.zeros((missing, *images.shape[1:]), images.dtype)])

@@ -7,6 +7,7 @@ of the maps that no valid texel of the lightmap reads at a stored time to zero, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,7 +20,6 @@ from wlm.errors import WlmError
 from wlm.formats.bc7 import BLOCK_BYTES, pack_mode6, unpack_mode6
 from wlm.formats.folder import rounded
 from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, side_by_side
-from wlm.lightmap.exact import SQRT_12
 from wlm.lightmap.model import SheetModel, decode_scale
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.tiles import TILE, TileKind
@@ -28,6 +28,7 @@ from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap.levels import LEVELS
 
 _SLACK = 1e-4  # of a texel: float32 may round a position to either side of a texel's middle
+_SQRT_12 = math.sqrt(12.0)  # features in [0, 1] enter the network as (f - 1/2) sqrt(12)
 _MODE_6 = np.uint64(1 << 6)
 _LOW_7 = np.uint64(127)
 _END_SHIFTS = (7 + 7 * np.arange(8)).astype(np.uint64)  # R0 R1 G0 G1 B0 B1 A0 A1 in the low half of a block
@@ -296,13 +297,11 @@ class MapTiles(DeviceTiles):
         return state
 
     def launch(self, state: decode_kernels.TimeState, rows: wp.array, form: int, out: wp.array) -> None:
-        """Decodes tiles with the same order of operations as the training, one thread per texel.
+        """Decodes the tiles `rows`, int [k], indices into `numbers`, in the training's order of operations, one thread
+        per texel.
 
-        Args:
-            state: From `state`.
-            rows: int [k], indices into `numbers`.
-            form: Output: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for RGB9E5 (uint32).
-            out: [k, 128, 128], written.
+        `form` is the output written to `out`, [k, 128, 128]: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for
+        RGB9E5 (uint32).
         """
         inputs = [*self.arguments, state, self.places, rows]
         wp.launch(self._kernels[form], out.shape, inputs=inputs, outputs=[out], device=self._device)
@@ -329,14 +328,12 @@ def fours(profile: Profile) -> int:
 
 
 def shader_networks(sheet: SheetModel) -> np.ndarray:
-    """Returns all networks as the shader reads them: weights W and bias b of layers 1 to 3, one row of W per input.
+    """Returns all networks as the shader reads them, float32 [n, 4]: weights W and bias b of layers 1 to 3, one row of
+    W per input; `network_starts` says where each network begins.
 
     Dynamic tiles come first, then static ones. Rows are padded with zeros to groups of four, and so are the inputs of
     the next layer. The shader passes features f as the textures hold them: their centring, (f - 1/2) sqrt(12), is part
     of W1 and b1.
-
-    Returns:
-        float32 [n, 4]; `network_starts` says where each network begins.
     """
     hidden, wide = sheet.profile.hidden, 4 * fours(sheet.profile)
     made = [np.zeros((0, 4), np.float32)]
@@ -346,7 +343,7 @@ def shader_networks(sheet: SheetModel) -> np.ndarray:
             layers, output = net[:count].astype(np.float64).reshape(-1, hidden), net[count:].reshape(-1, 3)
             inputs = len(layers) - hidden - 2
             # W (f - 1/2) sqrt(12) + b = (sqrt(12) W) f + (b - sqrt(12)/2 W 1).
-            layers[:centred] *= SQRT_12
+            layers[:centred] *= _SQRT_12
             layers[inputs] -= 0.5 * layers[:centred].sum(0)
             added = wide - hidden
             layers = np.insert(layers, np.full(added, len(layers) - 1), 0.0, axis=0)

@@ -55,18 +55,8 @@ def read_shots(
     progress: OnProgress | None = None,
     notes: list[str] | None = None,
 ) -> Iterator[Shot]:
-    """Yields the frames of lightmaps that `bake` or `predict` wrote, one after the other.
-
-    Args:
-        files: EXR files by frame number.
-        device: Device of the lightmaps.
-        count: Largest number of frames, which are evenly spread over all; None: all frames.
-        progress: Called after each frame.
-        notes: As for `read_shaded`.
-
-    Raises:
-        WlmError: A file is damaged or of another kind.
-    """
+    """Yields the frames of the EXR files, by number, that `bake` or `predict` wrote, at most `count`, evenly spread
+    over all; `read_shaded` explains `notes`."""
     numbers = spread(tuple(files), count)
     meter = Meter(progress, "read", len(numbers))
     for done, number in enumerate(numbers, 1):
@@ -143,9 +133,6 @@ def pack_book(
         gain: Factor of the light; None: the largest with which no light is above 1.
         padding: Pixels around each frame that repeat its border, so that filters and mips do not mix frames.
         rate: Frames per second; None: that of the scene, or `RATE`.
-
-    Raises:
-        ValueError: The frames have several sizes, the layout is unknown, or a number is out of its range.
     """
     frames = [shot.six for shot in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
@@ -225,9 +212,6 @@ def mip_padding(height: int, width: int, levels: int) -> int:
 
     A texel of the coarsest level must not span two cells, and the half texel that a filter reads beyond a frame's edge
     must be within its padding.
-
-    Raises:
-        WlmError: No padding makes both sides of a cell multiples of a texel of the coarsest level.
     """
     part = 2**levels
     for padding in range(part // 2, part // 2 + part):
@@ -250,15 +234,8 @@ def mip_levels(height: int, width: int, padding: int) -> int:
 def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, tuple[str, ...]], int]:
     """Writes the textures of a flip book to files NAME_1 and NAME_2, atomically: all of them or none.
 
-    Args:
-        book: The flip book.
-        output: Path in an existing folder: NAME with the suffix .exr, .png or .tga of all files.
-
-    Returns:
-        The names of the channels of each file, and the number of values that were clipped to the range of the files.
-
-    Raises:
-        WlmError: The suffix is wrong, a number is not finite, or a file cannot be written.
+    `output` is NAME with the suffix .exr, .png or .tga of all files, in an existing folder. Returns the names of the
+    channels of each file, and the number of values that were clipped to the range of the files.
     """
     output = Path(output)
     paths = {name: output.with_name(f"{output.stem}_{i}{output.suffix}") for i, name in enumerate(book.pages, 1)}

@@ -78,10 +78,6 @@ def read_flipbook(
 
     Returns:
         The frames, float32; transparency and emission are None if no channel stores them.
-
-    Raises:
-        WlmError: There are not one to three files; one is missing, damaged, of another kind or size, has numbers that
-            are not finite, or lacks a channel; the cells are unknown; or alpha is straight and there is no opacity.
     """
     where, lines, said = ", ".join(map(str, paths)), [] if notes is None else notes, []
     if not (len(paths) in (2, 3) or (len(paths) == 1 and Path(paths[0]).suffix.lower() == ".exr")):
@@ -151,9 +147,6 @@ def read_layers(path: str | os.PathLike[str], notes: list[str]) -> dict[str, np.
 
     Returns:
         float32 [H, W] per direction, and `ALPHA` and `EMISSION` if there are channels for them.
-
-    Raises:
-        WlmError: The file cannot be read, a direction has no channel or several, or a number is not finite.
     """
     pixels, names = read_every_channel(path, notes)
     roles = six_way_channels(names)
@@ -177,11 +170,7 @@ def read_layers(path: str | os.PathLike[str], notes: list[str]) -> dict[str, np.
 
 
 def guess_book(first: Path, second: Path) -> str | None:
-    """Returns the layout of two textures if their light is that of six directions; None otherwise.
-
-    Raises:
-        WlmError: A texture cannot be read.
-    """
+    """Returns the layout of two textures if their light is that of six directions; None otherwise."""
     pages = [_read(path)[0] for path in (first, second)]
     if pages[0].shape[:2] != pages[1].shape[:2]:
         return None
@@ -376,11 +365,7 @@ def _read(path: Path, *, grey: bool = False) -> tuple[np.ndarray, bytes | str]:
 
 
 def suffix_of(path: str | os.PathLike[str]) -> str:
-    """Returns the suffix of a texture in lower case.
-
-    Raises:
-        WlmError: It is not one of `SUFFIXES`.
-    """
+    """Returns the suffix of a texture in lower case."""
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise WlmError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, found {suffix or 'none'}")

@@ -56,9 +56,6 @@ def make_pool(
     Returns:
         At most sequences x frames x views_a_frame samples, on the device. The same arguments give the same bits on one
         device.
-
-    Raises:
-        WlmError: There is not enough memory, or too many scenes in a row are unstable.
     """
     return _Maker(settings, seed, False, device).pool(round * settings.sequences, settings.sequences, progress)
 
@@ -71,17 +68,10 @@ def make_validation(
     scale: float = 1.0,
     progress: OnProgress | None = None,
 ) -> Pool:
-    """Makes the samples of the validation or the test set; each pair of frames is rendered from all fixed views.
+    """Makes the samples of the validation or, with `test_seed`, the test set; each pair of frames is rendered from all
+    fixed views. No training round uses the sequences of these sets.
 
-    No training round uses the sequences of these sets.
-
-    Args:
-        settings, device, progress: As for `make_pool`.
-        test: Whether to make the test set, by `test_seed`, instead of the validation set.
-        scale: Factor by which the extinction of the smoke is multiplied; 0.5 and 2 in the paper's ablation.
-
-    Raises:
-        WlmError: As for `make_pool`.
+    The extinction of the smoke is multiplied by `scale`; 0.5 and 2 in the paper's ablation.
     """
     seed = settings.test_seed if test else settings.validation_seed
     return _Maker(settings, seed, True, device, scale).pool(0, settings.validation_sequences, progress)
@@ -106,9 +96,6 @@ def pool_of_volume(
 
     Returns:
         The samples. The two frames of a sample are the same, and their motion and sequence number are 0.
-
-    Raises:
-        WlmError: As for `load_volume`; or the volume is empty and no extinction is given.
     """
     volume = load_volume(path, extinction=1.0, emission=emission, device=check_device(device))
     if extinction is None:

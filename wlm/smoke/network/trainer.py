@@ -213,16 +213,8 @@ class Plan:
 
 
 def plan_round(settings: TrainSettings, pool: Pool, *, seed: int, round: int) -> Plan:
-    """Draws the samples of all steps of a round in random order; each is used once before any is used again.
-
-    Args:
-        settings: Settings of the training.
-        pool: The samples.
-        seed, round: Numbers on which the random order depends.
-
-    Raises:
-        ValueError: The samples are smaller than the crops.
-    """
+    """Draws the samples of all steps of a round in a random order of `seed` and `round`; each is used once before any
+    is used again. Raises a ValueError if the samples are smaller than the crops."""
     count, size = len(pool), settings.batch // 2 if settings.temporal else settings.batch
     random = np.random.default_rng([seed, round])
     total = settings.steps * size

@@ -9,9 +9,6 @@ from wlm.formats.bc7 import decode_image
 from wlm.lightmap.model import SheetModel, decode_scale
 from wlm.lightmap.tiles import TILE, TileKind
 
-SQRT_12 = math.sqrt(12.0)
-"""Features in [0, 1] enter the network as (f - 1/2) sqrt(12), with mean 0 and deviation 1 if they are uniform."""
-
 
 def decode_tile64(model: SheetModel, number: int, time: float) -> np.ndarray:
     """Decodes one tile in float64: evaluates its network (neural-dynamic-gi, eq. 4) and undoes the scale of section 4.
@@ -108,7 +105,7 @@ def _network_output(model: SheetModel, number: int, place: int, time: float) -> 
         for plane, shape in ((model.ut, (1, TILE, 2)), (model.vt, (TILE, 1, 2))):
             line = _along(_along(plane[row] / 255.0, np.array([tau]), periodic)[0], centres)
             maps.append(np.broadcast_to(line.reshape(shape), (TILE, TILE, 2)))
-    features = (np.concatenate(maps, axis=2) - 0.5) * SQRT_12
+    features = (np.concatenate(maps, axis=2) - 0.5) * math.sqrt(12.0)  # mean 0 and deviation 1 if they are uniform
     if dynamic:
         turn = (2.0 if model.axis.periodic else 1.0) * math.pi * model.axis.place(time)
         encoded = [math.sin(turn), math.cos(turn), math.sin(2.0 * turn), math.cos(2.0 * turn)]
