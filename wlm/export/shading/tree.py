@@ -48,7 +48,8 @@ class Variable:
         type: GLSL type.
         name: Name.
         size: Length of an array; None for other types.
-        way: `in`, `out` or `inout` for a parameter or local variable; `const`, `uniform` or `buffer`.
+        way: `in`, `out` or `inout` for a parameter or local variable; `const`, `uniform`, `buffer`, or `storage` for a
+            buffer that is written.
         value: Initial value, or None.
     """
 
@@ -110,7 +111,11 @@ class Shader:
     @property
     def bound(self) -> dict[str, Variable]:
         """Returns the shader's textures, uniforms and buffers by name."""
-        found = [item for item, _ in self.items if isinstance(item, Variable) and item.way in ("uniform", "buffer")]
+        found = [
+            item
+            for item, _ in self.items
+            if isinstance(item, Variable) and item.way in ("uniform", "buffer", "storage")
+        ]
         return {item.name: item for item in found}
 
 
@@ -165,14 +170,14 @@ class _Reader:
             self.at += 1
 
     def _buffer(self) -> Variable:
-        self.take("readonly")
+        way = "buffer" if self.taken("readonly") else "storage"
         self.take("buffer")
         self.take()
         self.take("{")
         kind, name = self.take().text, self.take().text
         for mark in ("[", "]", ";", "}", ";"):
             self.take(mark)
-        return Variable(kind, name, way="buffer")
+        return Variable(kind, name, way=way)
 
     def _variable(self, way: str) -> Variable:
         kind, name = self.take().text, self.take().text
