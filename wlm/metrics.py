@@ -65,14 +65,8 @@ BRIGHTER = 10.0
 def check_pair(
     ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None, where: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Checks a reference, a test image and a mask, and returns them as float64, float64 and bool.
-
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, or None for all texels.
-        where: Name of this pair in error messages ("city 12 h").
-    """
+    """Checks a reference and a test image, [H, W, C], and a mask [H, W], None for all texels, and returns them as
+    float64, float64 and bool; `where` names the pair in messages ("city 12 h")."""
     ref = np.asarray(ref, np.float64)
     test = np.asarray(test, np.float64)
     if ref.ndim != 3 or ref.shape != test.shape:
@@ -103,20 +97,11 @@ def psnr_from_mse(error: float, peak: float) -> float:
 
 
 def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray, data_range: float) -> float:
-    """Returns the mean SSIM over the valid texels whose window lies inside the image.
+    """Returns the mean SSIM, for a signal of the given range, of images [H, W, C] over the texels of a mask [H, W]
+    whose window lies inside the image; NaN if there is none or the range is zero.
 
-    Outside the mask both images take the reference's nearest valid value, so that decoded values there do not
-    affect windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
-
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, true where a texel counts.
-        data_range: The signal's range in the images' units.
-
-    Returns:
-        The mean; NaN where the image is smaller than the window, no valid texel has its window inside, or the
-        range is zero.
+    Outside the mask both images take the reference's nearest valid value, so that decoded values there do not affect
+    windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
     """
     ref, test, valid = check_pair(ref, test, mask, "ssim")
     filled = fill_gaps(ref, valid)
@@ -146,17 +131,11 @@ def _ssim_filled(ref: np.ndarray, test: np.ndarray, valid: np.ndarray, data_rang
 
 
 def flip_exposures(ref: np.ndarray, valid: np.ndarray) -> tuple[float, float] | None:
-    """Chooses the first and last exposure for HDR-FLIP, from percentiles of the valid reference's luminance.
+    """Chooses the first and last exposure for HDR-FLIP, `(start, stop)` in stops (log2), from the reference's luminance
+    where `valid`; None where no valid texel is above zero.
 
-    HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of
-    the texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
-
-    Args:
-        ref: `[H, W, 3]`, linear RGB, finite where valid.
-        valid: bool `[H, W]`, true where a texel counts.
-
-    Returns:
-        `(start, stop)` in stops (log2), start <= stop; None where no valid texel is above zero.
+    HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of the
+    texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
     """
     _check_rgb(ref)
     luminance = np.maximum(ref[valid], 0.0) @ _LUMINANCE
@@ -177,18 +156,12 @@ def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
 
 
 def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None) -> np.ndarray:
-    """Computes the HDR-FLIP error at every texel, at flip_evaluator's default of 67 pixels per degree.
+    """Computes the HDR-FLIP error at every texel, float64 [H, W] in [0, 1], at flip_evaluator's default of 67 pixels
+    per degree.
 
-    Negative values count as zero. If no valid texel of the reference is above zero, no exposure can be chosen: the
-    error is zero if the test is black too, else LDR-FLIP between black and the test clipped to [0, 1].
-
-    Args:
-        ref: `[H, W, 3]`, linear RGB, finite; texels outside the mask hold the nearest valid value.
-        test: `[H, W, 3]`, linear RGB, equal to `ref` outside the mask.
-        span: Result of `flip_exposures`.
-
-    Returns:
-        `[H, W]` float64 in [0, 1], 0 where no difference is visible.
+    Both images are linear RGB [H, W, 3]; texels outside the mask hold the nearest valid value in both. Negative values
+    count as zero. If no valid texel of the reference is above zero, `flip_exposures` gives no `span`: the error is zero
+    if the test is black too, else LDR-FLIP between black and the test clipped to [0, 1].
     """
     import flip_evaluator  # imported here because the import is slow
 

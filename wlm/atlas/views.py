@@ -48,22 +48,11 @@ def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) ->
 def visible_uv(
     scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, device: str
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Renders the visible triangle and its UVs from each camera.
+    """Renders the visible triangle and its UVs from each camera, square pictures of `resolution` pixels along a side.
 
-    Args:
-        scene: The scene.
-        views: The cameras.
-        resolution: Width and height of a camera's picture in pixels, 1 to 16,384.
-        device: "cpu" or "cuda:N".
-
-    Yields:
-        For each camera, on the device: int32 [h, w], number of the visible triangle, -1 for none or one without a
-            lightmap; float32 [h, w, 2], barycentric weights of the triangle's corners 0 and 1 (all three add up to 1);
-            float32 [h, w, 2], UVs. Weights and UVs are 0 in uncovered pixels.
-
-    Raises:
-        WlmError: There is no such device.
-        ValueError: The resolution is out of range.
+    Yields for each camera, on the device: int32 [h, w], number of the visible triangle, -1 for none or one without a
+    lightmap; float32 [h, w, 2], barycentric weights of the triangle's corners 0 and 1 (all three add up to 1); float32
+    [h, w, 2], UVs. Weights and UVs are 0 in uncovered pixels.
     """
     all_of = scene.triangles
     lit = torch.tensor(all_of.sheet >= 0, device=check_device(device))
@@ -102,22 +91,10 @@ def cells_at(uv: torch.Tensor, height: int | torch.Tensor, width: int | torch.Te
 def visibility(
     scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, height: int, width: int, device: str
 ) -> torch.Tensor:
-    """Counts the pixels that show each cell of a grid over the UV space of a scene with one sheet.
+    """Counts the pixels that show each cell of a grid over the UV space of a scene with one sheet, in square pictures
+    of all cameras; returns float64 [height, width] on the device, row 0 at v = 0.
 
-    Args:
-        scene: The scene.
-        views: The cameras.
-        resolution: Width and height, in pixels, of the square picture of each camera.
-        height, width: Rows and columns of the grid's cells, row 0 at v = 0. They may be smaller than texels.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        float64 [height, width] on the device: for each cell the number of pixels, in the pictures of all cameras, whose
-        UV lies in it; a UV of 1 lies in the last cell.
-
-    Raises:
-        WlmError: There is no such device.
-        ValueError: A size is out of range.
+    Cells may be smaller than texels. A pixel belongs to the cell in which its UV lies; a UV of 1 lies in the last cell.
     """
     if height < 1 or width < 1:
         raise ValueError(f"height, width: expected at least 1 cell each, got {height} and {width}")

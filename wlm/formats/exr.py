@@ -233,10 +233,6 @@ def write_exr(
 
     With `half` they are rounded to half floats: values beyond their range, infinity included, become +-65504; NaN
     stays. `note` is a JSON object for the header.
-
-    Raises:
-        ValueError: The pixels' shape is not [H, W, 3 or 4].
-        WlmError: The file cannot be written; the old content stays.
     """
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or 0 in pixels.shape:
         raise ValueError(f"expected pixels [H, W, 3 or 4], got {pixels.shape}")
@@ -258,10 +254,6 @@ def write_planes(
         planes: [H, W] each, linear, not empty; the keys name the channels.
         note: JSON object that is stored in the header.
         whole: Names of the planes that stay float32. The others become half floats, clamped to +-65504.
-
-    Raises:
-        ValueError: The planes differ in shape.
-        WlmError: The file cannot be written; the old content stays.
     """
     shapes = {np.shape(plane) for plane in planes.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):

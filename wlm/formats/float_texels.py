@@ -143,9 +143,6 @@ def mip_bytes(fmt: str, width: int, height: int, mips: int, most: int | None = N
     """Returns the bytes of each mip level of a picture, the largest first.
 
     `mips` is the number of levels after the largest one, and `most` their largest number; None: down to one texel.
-
-    Raises:
-        ValueError: A side is not 1 to `MOST_SIDE`, or `mips` is out of range.
     """
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
         raise ValueError(f"expected a width and a height of 1 to {MOST_SIDE} texels, got {width}x{height}")

@@ -91,11 +91,6 @@ def write_ktx2(
 
     Returns:
         The number of bytes written.
-
-    Raises:
-        ValueError: The format is unknown, a size or the number of mips is out of range, a 3D texture has mips, or the
-            data does not fill the texture.
-        WlmError: The file cannot be written; the old content stays.
     """
     if fmt not in VK_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")

@@ -64,15 +64,9 @@ class TileLoader:
         self._thread.start()
 
     def request(self, sheet: Sheet, number: int, priority: float = 0.0) -> bool:
-        """Asks for a tile, or changes the priority of a tile that waits.
-
-        Args:
-            sheet: The sheet.
-            number: Number of the tile in the sheet's grid.
-            priority: Tiles of higher priority come first, and of equal priority in the order of their requests.
-
-        Returns:
-            False if the request was dropped, since `most` requests wait that are at least as important.
+        """Asks for a tile, or changes the priority of a tile that waits: higher ones come first, equal ones in the
+        order of their requests. Returns False if the request was dropped, since `most` requests wait that are at least
+        as important.
         """
         self._check(sheet, number)
         with self._change:

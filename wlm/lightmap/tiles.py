@@ -148,16 +148,8 @@ class TileKind(IntEnum):
 
 
 def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = None) -> TileData:
-    """Cuts a sheet into tiles of gamma-encoded colour (neural-dynamic-gi, section 4).
-
-    Args:
-        lightmaps: The sheet, frames `[T, H, W, 3]`.
-        gamma: Above 0; colours become `x ** (1 / gamma)`, which gives dark values more precision.
-        tiles: Numbers of the tiles, in the order of the result; None for all. N tiles take N * T * 192 KiB of memory.
-
-    Returns:
-        The N tiles.
-    """
+    """Cuts a sheet, or the tiles of it with the given numbers, into tiles of gamma-encoded colour, `x ** (1 / gamma)`,
+    which gives dark values more precision (neural-dynamic-gi, section 4). N tiles take N * T * 192 KiB of memory."""
     grid = TileGrid.of(*lightmaps.mask.shape)
     return cut(lightmaps, np.arange(grid.count) if tiles is None else np.array(list(tiles), np.int64)).encoded(gamma)
 

@@ -82,16 +82,8 @@ class Viewpoint:
 
 
 def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> list[View]:
-    """Creates cameras on the sphere.
-
-    Args:
-        count: Number of cameras, at least 0.
-        seed: None spreads them evenly (a Fibonacci sphere); otherwise they are random, independent and uniform. A
-            generator continues from its current state.
-
-    Raises:
-        ValueError: A negative count.
-    """
+    """Creates cameras on the sphere: spread evenly without a seed (a Fibonacci sphere), otherwise random, independent
+    and uniform; a generator continues from its current state."""
     if count < 0:
         raise ValueError(f"count: expected at least 0, got {count}")
     if seed is None:
@@ -159,25 +151,12 @@ def visible_points(
     *,
     cull: bool = False,
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Draws a mesh from each camera.
+    """Draws a mesh from each camera, square pictures of `resolution` pixels along a side; positions, float [V, 3] in
+    any unit, are scaled here.
 
-    Args:
-        position: float [V, 3], in any unit; scaled here.
-        triangle: int [F, 3].
-        uv: float [V, 2].
-        views: The cameras.
-        resolution: Pixels along a side, 1 to 16,384.
-        device: "cpu" or "cuda:N".
-        cull: Whether to skip back faces, so that an interior is visible through its walls.
-
-    Yields:
-        For each camera, on the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights
-        of its corners 0 and 1; float32 [h, w, 2], the UVs at the visible point. The latter two are 0 in uncovered
-        pixels.
-
-    Raises:
-        WlmError: There is no such device.
-        ValueError: The resolution is out of range.
+    With `cull`, back faces are skipped, so that an interior is visible through its walls. Yields for each camera, on
+    the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights of its corners 0 and 1;
+    float32 [h, w, 2], the UVs at the visible point. The latter two are 0 in uncovered pixels.
     """
     device = check_device(device)
     if not 1 <= resolution <= MOST_PIXELS:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wlm.lightmap.hours import DAY
+from wlm.formats.hours import DAY
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.virtual.clock import Clock
 from wlm.probe.model import ProbeModel
@@ -57,19 +57,14 @@ class DayProbes:
 
 
 def six_lights(coefficients: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Returns the lights of six-way lightmaps that stand for the light of all directions.
+    """Returns the lights of six-way lightmaps that stand for the light of all directions, from the SH of radiance [9,
+    3]: float64 [6, 3] in the order of `wlm.smoke.camera.DIRECTIONS`, at least 0. Divided by 4 pi they are the factors
+    of the lightmaps.
 
     A light from direction w takes the map of direction d times max(w . d, 0)^2 (`wlm.smoke.camera.weights`), so the
     light of map d is the integral of radiance times that square. Its factors for the bands of SH are 2 pi / 3, pi / 2
-    and 4 pi / 15; irradiance, with pi, 2 pi / 3 and pi / 4, would be 1.5 times too bright under even light.
-
-    Args:
-        coefficients: [9, 3], SH of radiance.
-        axes: [3, 3], rows right, up and toward the camera.
-
-    Returns:
-        float64 [6, 3] in the order of `wlm.smoke.camera.DIRECTIONS`, at least 0. Divided by 4 pi they are the factors
-        of the lightmaps.
+    and 4 pi / 15; irradiance, with pi, 2 pi / 3 and pi / 4, would be 1.5 times too bright under even light. The rows of
+    `axes`, [3, 3], are right, up and toward the camera.
     """
     factors = basis(VECTORS @ axes, 9) * _SQUARED[coefficient_bands(9)]
     return np.maximum(factors @ np.asarray(coefficients, np.float64), 0.0)

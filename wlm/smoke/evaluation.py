@@ -267,11 +267,7 @@ def compare(
 
 
 def coarse(pool: Pool, part: slice) -> torch.Tensor:
-    """Predicts the guiding maps themselves, for `score`; they must be of kind "six", a coarse march of six lights.
-
-    Raises:
-        ValueError: The pool's guides are of another kind.
-    """
+    """Predicts the guiding maps themselves, for `score`; they must be of kind "six", a coarse march of six lights."""
     six = GUIDES["six"]
     if pool.guides.shape[2] != len(six):
         raise ValueError(f"pool: expected guiding maps of kind six with {len(six)} planes, got {pool.guides.shape[2]}")

@@ -28,14 +28,11 @@ class Canvas:
         nearest: bool = False,
         one_sided: bool = False,
     ) -> None:
-        """Draws triangles with a texture; later calls only change the texture.
+        """Draws triangles, with v of their UVs down, under a texture uint8 [H, W, 3]; later calls only change the
+        texture.
 
-        Args:
-            panel, name: Index of the panel, and name of the mesh.
-            position, triangle, uv: Vertices [V, 3], triangles int [F, 3] and UVs [V, 2], with v down.
-            picture: uint8 [H, W, 3].
-            nearest: Whether the texture is read without a filter.
-            one_sided: Whether triangles that face away from the camera are hidden.
+        With `nearest` it is read without a filter; with `one_sided`, triangles that face away from the camera are
+        hidden.
         """
         drawn = self._drawn.get((panel, name))
         if drawn is None:

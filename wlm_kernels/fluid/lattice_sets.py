@@ -64,11 +64,7 @@ LATTICES = {
 
 
 def lattice(name: str) -> VelocitySet:
-    """Returns the velocity set of a name in `LATTICES`, such as "D3Q19".
-
-    Raises:
-        ValueError: The name is unknown.
-    """
+    """Returns the velocity set of a name in `LATTICES`, such as "D3Q19"."""
     if name not in LATTICES:
         raise ValueError(f"lattice: expected one of {', '.join(LATTICES)}, got {name!r}")
     return LATTICES[name]

@@ -143,13 +143,12 @@ class FrameTiles(DeviceTiles):
         return self._greatest[:, before] if share == 0 else self._greatest[:, [before, after]].max(1)
 
     def decode(self, time: float, rows: wp.array, out: wp.array, inverse_bounds: wp.array | None = None) -> None:
-        """Decodes tiles with one kernel launch, which a CUDA graph can capture.
+        """Decodes the tiles `rows`, int [k], indices into `numbers`, with one kernel launch, which a CUDA graph can
+        capture.
 
-        Args:
-            time: A stored time, or a time between two, whose radiance is then interpolated (neural-dynamic-gi, eq. 2).
-            rows: int [k], indices into `numbers`.
-            out: [k, 128, 128]: radiance, vec3 or uint32 (RGB9E5); with `inverse_bounds` 8-bit colour, uint32 (RGBA).
-            inverse_bounds: float [n], 1 / the bound of each tile.
+        Between two stored times the radiance is interpolated (neural-dynamic-gi, eq. 2). `out`, [k, 128, 128], receives
+        radiance, vec3 or uint32 (RGB9E5); with `inverse_bounds`, float [n], 1 / the bound of each tile, 8-bit colour,
+        uint32 (RGBA).
         """
         frame_kernels.decode(self._stored, *self._axis.neighbours(time), rows, out, inverse_bounds)
 

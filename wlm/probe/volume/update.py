@@ -52,7 +52,7 @@ _HEAD = """\
 //
 // Buffer head, as the buffer volume of the shader that reads the volume. Buffers pages and pool, as there.
 // Buffer index, 32-bit words: the Morton keys of the blocks near probes, low and high word, level after level, sorted;
-//        then {record} words for each probe, sorted by cell: Morton key of the cell, low and high word; number among the
+//        then {record} words for each probe, sorted by cell: Morton key of the cell, two words; number among the
 //        live probes; 3 floats, place in the cell, 0 to 1; 3 floats, normal; 3 floats, place in the probes' box
 // Buffer tables, integers: row of each block near probes, or -1; then, if the pool has fewer rows than that, the last
 //        frame in which each row was in a window, or -1, and its block

@@ -55,15 +55,8 @@ def read_shots(
     progress: OnProgress | None = None,
     notes: list[str] | None = None,
 ) -> Iterator[Shot]:
-    """Yields the frames of lightmaps that `bake` or `predict` wrote, one after the other.
-
-    Args:
-        files: EXR files by frame number.
-        device: Device of the lightmaps.
-        count: Largest number of frames, which are evenly spread over all; None: all frames.
-        progress: Called after each frame.
-        notes: As for `read_shaded`.
-    """
+    """Yields the frames of the EXR files, by number, that `bake` or `predict` wrote, at most `count`, evenly spread
+    over all; `read_shaded` explains `notes`."""
     numbers = spread(tuple(files), count)
     meter = Meter(progress, "read", len(numbers))
     for done, number in enumerate(numbers, 1):
@@ -140,9 +133,6 @@ def pack_book(
         gain: Factor of the light; None: the largest with which no light is above 1.
         padding: Pixels around each frame that repeat its border, so that filters and mips do not mix frames.
         rate: Frames per second; None: that of the scene, or `RATE`.
-
-    Raises:
-        ValueError: The frames have several sizes, the layout is unknown, or a number is out of its range.
     """
     frames = [shot.six for shot in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):

@@ -90,17 +90,12 @@ def residual(frames: torch.Tensor, motion: torch.Tensor, opacity: torch.Tensor) 
 
 
 def temporal(predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor) -> torch.Tensor:
-    """Computes the temporal loss (in place of eq. 9): how differently prediction and target change along the motion.
+    """Computes the temporal loss (in place of eq. 9): how differently prediction and target, [N, 2, P, H, W], pairs of
+    frames of the first P of `PLANES`, which include the opacity, change along the motion.
 
-    It is the mean absolute difference of the two changes. Since warping is linear, this equals the change of the error,
-    prediction minus target, which takes only one warp.
-
-    Args:
-        predicted, target: [N, 2, P, H, W]: N pairs of frames of the first P of `PLANES`, which include the opacity.
-        motion: [N, 2, H, W], as `Pool.motion`.
-
-    Returns:
-        The mean over visible smoke that was inside the earlier image; 0 if there is none.
+    It is the mean absolute difference of the two changes, over visible smoke that was inside the earlier image; 0 if
+    there is none. Since warping is linear, this equals the change of the error, prediction minus target, which takes
+    only one warp.
     """
     total, count = residual(predicted.float() - target.float(), motion, target[:, 1, OPACITY_PLANE])
     return total / count.clamp(min=1.0)

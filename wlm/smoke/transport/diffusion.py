@@ -55,15 +55,11 @@ class Spreading:
             self._coarse.lit(self._scene, depths, out)
 
     def render(self, albedos: Sequence[float]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Computes the light that was scattered more than once and reaches the camera.
+        """Computes the light that was scattered more than once and reaches the camera, for A albedos.
 
-        Args:
-            albedos: A albedos, any number.
-
-        Returns:
-            The light divided by the squared albedo, float32 [2, L, A, H, W], for L lights of irradiance 4 pi (point
-            lights: intensity): all light, and its part from thin smoke. Also the opacity of thin smoke, float32 [H, W];
-            see `CoarseSmoke.render`.
+        Returns the light divided by the squared albedo, float32 [2, L, A, H, W], for L lights of irradiance 4 pi (point
+        lights: intensity): all light, and its part from thin smoke. Also the opacity of thin smoke, float32 [H, W]; see
+        `CoarseSmoke.render`.
         """
         size = (self._scene.view.height, self._scene.view.width)
         made = torch.empty(2, len(self._lights), len(albedos), *size, device=self._source.device)
@@ -130,15 +126,11 @@ class CoarseSmoke:
         return light
 
     def render(self, scene: Marching, light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Computes the light that smoke of albedo 1 sends to the camera of a march.
+        """Computes the light that smoke of albedo 1 sends to the camera of a march, for N fluences from `spread`, [N,
+        X, Y, Z].
 
-        Args:
-            scene: The march.
-            light: float32 tensor [N, X, Y, Z], N fluences from `spread`.
-
-        Returns:
-            All light and the light from thin smoke, float32 [2, N, H, W], and the opacity of thin smoke, float32 [H,
-            W]. For thin smoke each sample is weighted by the transparency of a whole cell of its density.
+        Returns all light and the light from thin smoke, float32 [2, N, H, W], and the opacity of thin smoke, float32
+        [H, W]. For thin smoke each sample is weighted by the transparency of a whole cell of its density.
         """
         size = (scene.view.height, scene.view.width)
         out, thin = torch.empty(2, len(light), *size, device=light.device), torch.zeros(size, device=light.device)
