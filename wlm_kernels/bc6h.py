@@ -98,12 +98,8 @@ class _Texels:
 
 @wp.struct
 class _Sums:
-    """The normal equations of a line's two ends, for each channel.
-
-    Attributes:
-        aa, ab, bb: Weighted sums of products of the texels' interpolation weights a (first end) and b (second end).
-        ay, by: Weighted sums of the texels' colours (`place`) times a, and times b.
-    """
+    """The normal equations of a line's two ends, for each channel: sums over the texels, weighted, of products of their
+    interpolation weights a (first end) and b (second end), and of their colours (`place`) times a and b."""
 
     aa: wp.vec3
     ab: wp.vec3

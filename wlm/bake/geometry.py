@@ -62,15 +62,12 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles of one material.
+    """Triangles of one material, int32 [F, 3], counter-clockwise as seen from the front, of vertices float64 [V, 3] in
+    the world.
 
-    Attributes:
-        position: float64 [V, 3], in the world.
-        triangle: int32 [F, 3]; counter-clockwise as seen from the front.
-        normal: float64 [V, 3], unit shading normals; 0 where the file has none.
-        uv: float64 [V, 2], lightmap UVs; None if the surface has none and isn't baked.
-        texture_uv: float32 [V, 2], UVs of the material's texture, or None.
-        material: The material.
+    `normal`, float64 [V, 3], are unit shading normals, 0 where the file has none; `uv`, float64 [V, 2], are lightmap
+    UVs, None if the surface has none and isn't baked; `texture_uv`, float32 [V, 2] or None, are for the material's
+    texture.
     """
 
     position: np.ndarray

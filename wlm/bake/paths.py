@@ -34,12 +34,8 @@ _COEFFICIENTS = 9
 
 @dataclass(frozen=True)
 class Sun:
-    """The sun as a distant light.
-
-    Attributes:
-        direction: Direction to the sun, [3], of unit length.
-        irradiance: R, G, B on a surface that faces the sun.
-    """
+    """The sun as a distant light: the direction to it, [3], of unit length, and its irradiance R, G, B on a surface
+    that faces it."""
 
     direction: tuple[float, float, float]
     irradiance: tuple[float, float, float]
@@ -68,13 +64,9 @@ class Tracing:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Estimated incident light at N points.
-
-    Attributes:
-        mean: float32 [N, C], estimates.
-        noise: float32 [N, C], the standard error of each estimate.
-        back: float32 [N], the share of first rays that hit the back of a single-sided surface, which indicates a point
-            inside an object.
+    """Estimated incident light at N points, float32 [N, C], with the standard error of each estimate; `back`, float32
+    [N], is the share of first rays that hit the back of a single-sided surface, which indicates a point inside an
+    object.
     """
 
     mean: np.ndarray

@@ -32,13 +32,8 @@ _APART = 1e-4  # offset in voxels up to which the voxels of two grids coincide
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The values of a file's grid in the box of its active voxels.
-
-    Attributes:
-        name: Name in error messages.
-        values: float32 tensor [X, Y, Z].
-        matrix: float64 [4, 4], transform of an index of `values` to the centre of this voxel in the world.
-    """
+    """The values of a file's grid in the box of its active voxels, float32 tensor [X, Y, Z]; `matrix`, float64 [4, 4],
+    transforms an index of them to the centre of this voxel in the world, and `name` is for error messages."""
 
     name: str
     values: torch.Tensor

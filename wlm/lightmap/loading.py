@@ -15,13 +15,10 @@ from wlm.lightmap.sheet import Sheet
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """A tile that was loaded, or the reason why it was not.
+    """A tile that was loaded, by sheet and number, or the line of the error of a damaged file.
 
-    Attributes:
-        sheet, number: The sheet and the number of the tile in its grid.
-        tile: The sheet with this tile alone: its arrays have one row, as they are uploaded. None after an error.
-        error: The error of a damaged file in one line; None of a tile.
-        prepared: The result of the loader's `prepare`; None without it.
+    `tile` is the sheet with this tile alone: its arrays have one row, as they are uploaded. `prepared` is the result of
+    the loader's `prepare`, None without it.
     """
 
     sheet: Sheet

@@ -17,13 +17,8 @@ _FAR = wp.constant(1.0e30)
 
 @dataclass(frozen=True)
 class Solids:
-    """Obstacles on a device.
-
-    Attributes:
-        mesh: Their surfaces, in the coordinates of the camera `view` of the functions below.
-        owner: int32 [F], index of each triangle's obstacle.
-        colours: vec3 [obstacles], albedo of each obstacle.
-    """
+    """Obstacles on a device: their surfaces, in the coordinates of the camera `view` of the functions below, the index
+    of each triangle's obstacle, int32 [F], and each obstacle's albedo, vec3."""
 
     mesh: wp.Mesh
     owner: wp.array

@@ -95,14 +95,8 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """Sheets and mip levels, cut into tiles.
-
-    Attributes:
-        planes, places: Sheets and mip levels, from `planes_of`, and the place of each in the lookup texture T_c.
-        shape: Rows and columns of T_c.
-        tiles: The tiles of all planes.
-        bits: The budget of bits of the whole model.
-    """
+    """Sheets and mip levels (`planes_of`), cut into tiles, with the place of each in the lookup texture T_c; rows and
+    columns of T_c; and the budget of bits of the whole model."""
 
     planes: list[Plane]
     places: list[SheetPlace]
