@@ -163,23 +163,6 @@ def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatc
     assert load_frames(out).numbers == (1, 2, 3, 4) and not (out / CHECKPOINT).exists()
 
 
-def test_fewer_frames_leave_the_state_that_is_past_them(tmp_path):
-    scene, out = Scene.model_validate(JET), tmp_path / "out"
-
-    def stopped(progress):
-        if progress.done == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        simulate(open_frames(out, scene), progress=stopped)
-    kept = (out / CHECKPOINT).read_bytes()
-    fewer = scene.model_copy(update={"frames": 2})
-    assert simulate(open_frames(out, fewer, resume=True), resume=True) == 3
-    assert (out / CHECKPOINT).read_bytes() == kept
-    assert simulate(open_frames(out, scene, resume=True), resume=True) == 4
-    assert load_frames(out).numbers == (1, 2, 3, 4) and not (out / CHECKPOINT).exists()
-
-
 @pytest.mark.parametrize("case", ["empty", "covered", "one cell", "hot", "bricks of halves"])
 def test_hard_scenes(case, tmp_path):
     changed = {

@@ -340,15 +340,6 @@ def test_uniform_smoke(device: str, step: float):
     close(radiance, torch.tensor([[reflected, 0.5 * reflected, 0.0]] * 3), {0.3: 2e-3, 1.0: 5e-3, 4.0: 0.06}[step])
 
 
-def test_uniform_glow(device: str):
-    """Emission e of uniform smoke of extinction s comes as e / s (1 - exp(-tau)); without smoke, as e times the way."""
-    emission = torch.full((8, 8, 16, 3), 0.2, device=device)
-    for s, want in ((0.1, 2.0 * (1.0 - math.exp(-1.6))), (0.0, 3.2)):
-        density = torch.full((8, 8, 16), s, device=device)
-        radiance, _ = ops.march(density, **_middle_rays(device), emission=emission, step=0.1)
-        close(radiance, torch.full((3, 3), want), 2e-3)
-
-
 @pytest.mark.parametrize("g", [0.0, 0.7, -0.4])
 def test_phase_function(device: str, g: float):
     """Light from behind, from the side and from the front, in smoke so thin that all of it gets through."""

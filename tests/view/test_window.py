@@ -177,15 +177,6 @@ def test_atlases_of_each_method(kind, tmp_path, show):
     assert np.abs(np.split(scene_of(window)[40:], 3, axis=1)[0] - decoded).max() > 20
 
 
-def test_the_input_of_an_atlas(tmp_path, show):
-    mesh, light = atlas_meshes.write_files(tmp_path, atlas_meshes.sheet())
-    window = show(light, mesh=mesh)
-    assert window.scene.panels == ("original",) and np.ptp(scene_of(window)) > 100
-    before = scene_of(window)
-    window.advance(3.0)
-    assert changed(window, before)  # the camera turned
-
-
 def test_probes_as_balls_gaussians_and_a_volume(tmp_path, show):
     model = probe_models.whole_model(probes=60, positions=True)
     model.save(tmp_path / "room.wlm")

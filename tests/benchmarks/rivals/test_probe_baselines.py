@@ -99,16 +99,10 @@ def test_bytes_and_positions_are_all_that_decoding_needs(bits):
         if partition.kind == probe_pca.PLACE:
             elsewhere = probe_pca.decode(payload, position[:, ::-1])
             assert _error(values, elsewhere) > 2 * _error(values, decoded)
-        for wrong in (payload[:-1], payload + b"\0", payload[:5], b"", b"\xff" * 20):
-            with pytest.raises(WlmError, match="payload of|compressed by PCA|expected .* bytes"):
-                probe_pca.decode(wrong, position)
     payload = probe_mbd.encode(position, wide, 2, 3, 3, bits)
     assert len(payload) == probe_mbd.payload_bytes(400, 12, 2, probe_mbd.grid_parts(position, 3), bits)
     shown = moving_basis(position, values, 2, 3, 3, bits=bits).decoded
     np.testing.assert_array_equal(probe_mbd.decode(payload, position), shown)
-    for wrong in (payload[:-1], payload[:5]):
-        with pytest.raises(WlmError, match="payload of|compressed by PCA|expected .* bytes"):
-            probe_mbd.decode(wrong, position)
 
 
 def test_clusters_by_signal_find_lines_that_share_one_place():
