@@ -76,14 +76,6 @@ def test_doctor_reads_a_cache_that_others_change(tmp_path, monkeypatch):
     assert "3.0 MB" in call("doctor")
 
 
-def test_doctor_says_which_extra_lacks_what(monkeypatch):
-    stated = ["numpy", "typer; extra == 'one'", 'no-such-package>=2; extra == "two"']
-    monkeypatch.setattr("importlib.metadata.requires", lambda name: stated)
-    text = call("doctor")
-    assert re.search(r"extra one +│ complete", text)
-    assert "missing: no-such-package; pip install 'wlm[two]'" in text
-
-
 def test_compress_prints_one_table(folder, profile, tmp_path):
     out = tmp_path / "a.wlm"
     text = call("compress", folder, "-o", out, "--profile", profile, "--steps", 10, "--seed", 4)

@@ -168,20 +168,6 @@ def test_views(device: str):
     close(points.grad, at.grad, 1e-5)
 
 
-def test_nothing_in(device: str):
-    """Empty arrays give empty results, and gradients of 0 to the others."""
-    values = _array(normal(5, 7, 2), device, True)
-    nowhere, rows = (wp.zeros((0, n), dtype=float, device=device, requires_grad=True) for n in (2, 12))
-    tape = wp.Tape()
-    with tape:
-        result = ops.plane(values, nowhere)
-        total = ops.gaussian_sum(rows, wp.zeros(0, dtype=wp.vec3, device=device, requires_grad=True))
-    assert result.shape == (0, 2) and total.shape == (0, 2) and result.requires_grad
-    tape.backward()
-    tape.zero()
-    assert not values.grad.numpy().any()
-
-
 def test_drawing_to_the_end(device: str):
     """A `Raster` of arrays goes from one operation to the next."""
     clip = np.array([[-0.8, -0.7, 0.1, 1.0], [0.9, -0.8, 0.2, 1.5], [0.7, 0.9, 0.3, 1.2]], np.float32)
@@ -243,28 +229,6 @@ def test_what_has_no_gradient_is_refused(device: str):
             assert "\n" not in str(error.value) and not tape.launches
     with pytest.raises(WlmError, match="^uv: expected an argument that requires no gradient; "):
         ops.texture(*(torch.tensor(v, device=device).requires_grad_() for v in texture.values()), filter="nearest")
-
-
-def test_other_refusals(device: str):
-    values, points = _array(normal(4, 5, 1), device), _array(normal(6, 2), device)
-    record = wp.zeros(3, dtype=_Record, device=device)
-    for call, message in (
-        (lambda: ops.plane(values, wp.to_torch(points)), "points: expected a Warp array as for other arguments, got a"),
-        (
-            lambda: ops.plane(wp.to_torch(values), points),
-            "points: expected a torch tensor, float32 .*, got warp.*array",
-        ),
-        (lambda: ops.plane(record, points), "values: cannot use an array of _Record here: "),
-        (lambda: ops.plane(values, points.numpy()), "points: expected a torch tensor, float32 .*, got numpy.ndarray"),
-        (lambda: ops.plane(values, points, reduce=3), "unexpected keyword argument 'reduce'"),
-    ):
-        with pytest.raises((ValueError, TypeError), match=message):
-            call()
-
-
-@wp.struct
-class _Record:
-    a: float
 
 
 def test_a_capture_by_warp_alone_is_refused():

@@ -1,7 +1,6 @@
 """Scenes from YAML, cameras, moving obstacles, folders of frames, and files of lightmaps."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -113,8 +112,6 @@ def test_scaling_keeps_one_cell(tmp_path):
     small = scene.scaled(0.25)
     assert small.grid.cells == (2, 1, 1) and small.grid.cell == 4.0
     assert _scene(tmp_path, grid={"cells": [1, 1, 1], "cell": 1.0}).scaled(0.01).grid.cells == (1, 1, 1)
-    with pytest.raises(ValueError, match="factor"):
-        scene.scaled(0)
     with pytest.raises(WlmError, match="plume: grid.cells.0: expected less than or equal to 4096, got 8000"):
         scene.scaled(1000)
 
@@ -312,8 +309,6 @@ def test_files_that_are_no_lightmaps(tmp_path):
     volume = plume()
     camera = make_camera(CameraSettings(resolution=8), volume.origin, (1, 1.2, 1))
     six = bake(volume, camera, step=2.0, estimate=False)
-    with pytest.raises(ValueError, match="the lightmaps have no camera"):
-        write_six_way(tmp_path / "a.exr", replace(six, camera=None))
     path = tmp_path / "a.exr"
     write_six_way(path, six)
     planes, note = read_planes(path)
