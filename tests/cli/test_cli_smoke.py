@@ -47,7 +47,12 @@ def camera_of(volume, **settings):
     ("words", "place", "other"),
     [
         (["bake", "--step", 1], "wlm.smoke.march.six_way.bake", ["--step", 2]),
-        (["predict", "--coarse"], "wlm.smoke.march.six_way.bake_coarse", ["--seed", 7]),
+        pytest.param(
+            ["predict", "--coarse"],
+            "wlm.smoke.march.six_way.bake_coarse",
+            ["--seed", 7],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_frames_that_were_made_are_not_made_again(words, place, other, frames, tmp_path, monkeypatch):

@@ -387,13 +387,6 @@ def test_refusals():
             fluid.DifferentiableSolver(Solver(lattice, refinement=1, **settings))
     model, _, _ = _smoke("channel", "cpu", "maccormack", sources=SOURCES)
     state, air = model.state(), model.air
-    for call, words in (
-        (lambda: air.advance(state.populations, inlet=torch.full((3,), 0.5)), "inlet: expected numbers from -0.3"),
-        (lambda: model.carry(-1.0 - state.density, torch.zeros(9, 8, 1, 3), state.temperature), "density: .* from 0"),
-        (lambda: model.advance(state, sources=torch.full((2, 2), math.nan)), "sources: expected finite"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            call()
     with pytest.raises(WlmError, match=r"blew up in step \d+ at cell .*not a number"):
         air.advance(torch.full_like(state.populations, math.nan), 2)
     assert torch.equal(air.advance(state.populations, 0), state.populations)

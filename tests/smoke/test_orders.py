@@ -222,16 +222,11 @@ def test_a_light_and_a_camera_in_the_smoke(device: str, within: str):
 
 
 def test_files_of_models(tmp_path):
-    """A saved model is read back; each wrong file is an error that names the part."""
+    """A saved model is read back; a part that is missing is named."""
     model = load_orders()
     save_orders(model, tmp_path / "a.npz")
     again = load_orders(tmp_path / "a.npz")
     assert torch.equal(model.weights, again.weights) and torch.equal(model.known, again.known)
-    wrong = {"weights": (torch.zeros(3, 3), model.known), "range": (model.weights, torch.tensor([2.0, 1.0]))}
-    for name, arrays in wrong.items():
-        save_orders(OrdersModel(*arrays), tmp_path / "b.npz")
-        with pytest.raises(WlmError, match=rf"b.npz: {name}: expected"):
-            load_orders(tmp_path / "b.npz")
     np.savez(tmp_path / "b.npz", weights=model.weights.numpy())
     with pytest.raises(WlmError, match="range is missing"):
         load_orders(tmp_path / "b.npz")
