@@ -15,15 +15,7 @@ from wlm.errors import WlmError
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.zstd import compress
 
-MODELS = (
-    "lightmap",
-    "lightmap-frames",
-    "lightmap-layers",
-    "atlas-tiles",
-    "atlas-cascade",
-    "atlas-bc6h",
-    "smoke",
-)
+MODELS = ("lightmap", "lightmap-frames", "lightmap-layers", "atlas-tiles", "atlas-cascade", "atlas-bc6h", "smoke")
 MOST = 6  # parts of a file that are tried: a network's weights are all alike
 
 # What is a good value after all.

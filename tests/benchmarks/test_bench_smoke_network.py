@@ -9,15 +9,7 @@ from builders.bench_rows import by_option, check_outputs
 
 import benchmarks.smoke_network as bench
 from benchmarks.path_tracer import PathTracer, denoise
-from benchmarks.smoke_network import (
-    PANELS,
-    QUICK,
-    Subject,
-    open_subjects,
-    plotted,
-    run_rows,
-    score,
-)
+from benchmarks.smoke_network import PANELS, QUICK, Subject, open_subjects, plotted, run_rows, score
 from wlm.smoke.march.six_way import bake
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings

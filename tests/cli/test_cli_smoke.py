@@ -48,10 +48,7 @@ def camera_of(volume, **settings):
     [
         (["bake", "--step", 1], "wlm.smoke.march.six_way.bake", ["--step", 2]),
         pytest.param(
-            ["predict", "--coarse"],
-            "wlm.smoke.march.six_way.bake_coarse",
-            ["--seed", 7],
-            marks=pytest.mark.slow,
+            ["predict", "--coarse"], "wlm.smoke.march.six_way.bake_coarse", ["--seed", 7], marks=pytest.mark.slow
         ),
     ],
 )

@@ -175,10 +175,7 @@ def test_wrong_nvdb(tmp_path: Path):
     ("arrays", "message"),
     [
         ({"smoke": np.ones((2, 2, 2))}, "the array density is missing; found smoke"),
-        (
-            {"density": np.ones((2, 2))},
-            r"density: expected \[X, Y, Z\], 1 to 2147483647 voxels, found \(2, 2\)",
-        ),
+        ({"density": np.ones((2, 2))}, r"density: expected \[X, Y, Z\], 1 to 2147483647 voxels, found \(2, 2\)"),
         ({"density": np.ones((2, 2, 2)), "temperature": np.ones((2, 2, 1))}, "temperature: expected"),
         ({"density": np.ones((1, 1, 1)), "origin": [0.0, np.nan, 0.0]}, "origin: expected 3 finite numbers"),
     ],

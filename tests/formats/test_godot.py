@@ -27,12 +27,7 @@ def message(tmp_path, data, name="a.lmbake"):
 @pytest.mark.parametrize("double", [False, True])
 @pytest.mark.parametrize(
     "options",
-    [
-        {},
-        {"version": (4, 0, 4), "flags": 1},
-        {"version": (4, 2, 5), "script": "Baked"},
-        {"inner": ("one", "two")},
-    ],
+    [{}, {"version": (4, 0, 4), "flags": 1}, {"version": (4, 2, 5), "script": "Baked"}, {"inner": ("one", "two")}],
 )
 def test_probes_are_found_among_everything_else(tmp_path, order, double, options):
     writer = Writer(order, double)

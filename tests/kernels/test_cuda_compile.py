@@ -119,19 +119,12 @@ FACTORIES = [
     *_cases("smoke", _smoke, [], FLOATS),
     *_cases("lattice_step", lambda settings: [lattice.step_kernel(lattice.Spec(**settings))], [], LATTICE_STEPS),
     *_cases(
-        "lattice_boundaries",
-        _boundaries,
-        [],
-        (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")),
-        BOTH,
+        "lattice_boundaries", _boundaries, [], (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")), BOTH
     ),
     *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
     *_cases("planes", _planes, [], BOTH),
     *_cases(
-        "naf_block",
-        lambda of: naf_block.kernels(*of, True),
-        [((128, True),)],
-        ((24, False), (24, True), (128, True)),
+        "naf_block", lambda of: naf_block.kernels(*of, True), [((128, True),)], ((24, False), (24, True), (128, True))
     ),
 ]
 

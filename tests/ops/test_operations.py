@@ -202,11 +202,7 @@ REFUSED = [
     ("march", {"direction": torch.ones(39, 3)}, "direction: expected float32 [40, 3], got"),
     ("march", {"toward": torch.zeros(2, 3)}, "length of toward: expected numbers from 0.999 to 1.001, found 0"),
     ("march", {"toward": None}, "toward, colour: expected both arguments or neither"),
-    (
-        "march",
-        {"toward": torch.zeros(2, 3).requires_grad_()},
-        "toward: expected an argument that requires no gradient",
-    ),
+    ("march", {"toward": torch.zeros(2, 3).requires_grad_()}, "toward: expected an argument that requires no gradient"),
     ("march", {"emission": torch.zeros(6, 7, 8)}, "emission: expected float32 [6, 7, 8, 3], got"),
     ("march", {"step": 0.0}, "step: expected a number above 0, got 0.0"),
     ("march", {"density": torch.zeros(6, 7, 8).half()}, "density: expected float32 [any, any, any], got torch.float16"),
@@ -249,10 +245,7 @@ def test_function_transforms_are_refused(transform: str):
         points.requires_grad_()
         return torch.autograd.grad(read(points), points, torch.ones(3, 5, 1), is_grads_batched=True)
 
-    calls = {
-        "grad": lambda: torch.func.grad(lambda each: read(each).sum())(points),
-        "batched": batched,
-    }
+    calls = {"grad": lambda: torch.func.grad(lambda each: read(each).sum())(points), "batched": batched}
     with pytest.raises(
         ValueError, match=r"^torch\.func: wlm.ops supports no grad|vmap and batched gradients do not"
     ) as error:

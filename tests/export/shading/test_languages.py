@@ -306,8 +306,7 @@ def shown(subject: Subject, language: str, exact: bool, folder) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("name", "language"),
-    [(name, language) for name in SUBJECTS for language in (*HEADS, "hlsl", "wgsl")],
+    ("name", "language"), [(name, language) for name in SUBJECTS for language in (*HEADS, "hlsl", "wgsl")]
 )
 def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
     subject = SUBJECTS[name](tmp_path)
