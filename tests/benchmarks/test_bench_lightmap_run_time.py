@@ -1,7 +1,5 @@
 """The benchmark of the virtual texture: its cameras, its large set, its mips, and rows that are of what they name."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from builders.bench_rows import check_outputs, keys
@@ -127,9 +125,3 @@ def test_rivals_read_the_light_of_an_hour(room, model):
             np.testing.assert_allclose(rival.light(hour), light, rtol=0, atol=light.max() / 256)
     assert work == [True, False, True, True, True, False, True]
     assert stored.memory["texture"] == 2 * each.memory["texture"] and stored.memory["tiles"] == model.memory_bytes
-
-
-def test_a_set_without_a_mesh_is_refused(monkeypatch):
-    monkeypatch.setattr(bench, "load", lambda path: SimpleNamespace(name="set", light=SimpleNamespace(mesh=None)))
-    with pytest.raises(bench.WlmError, match="set: expected a set that names its mesh"):
-        bench.run(walked_path="a", quick=True, device="cpu")

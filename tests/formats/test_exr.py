@@ -9,9 +9,8 @@ from builders.checks import error_of
 
 from wlm.errors import WlmError
 from wlm.formats.channels import read_channels, read_encoded
-from wlm.formats.exr import HALF_MAX, read_every_channel, read_exr, read_header, read_planes, write_exr, write_planes
+from wlm.formats.exr import HALF_MAX, read_every_channel, read_exr, read_header, read_planes, write_exr
 
-PLANES = {"depth": np.ones((3, 4)), "top": np.zeros((3, 4))}
 SCANLINES = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 
 
@@ -246,21 +245,6 @@ def test_a_missing_file_or_other_content_is_refused(tmp_path, capfd, read):
     with pytest.raises(WlmError, match="cut short or damaged"):
         read(path)
     assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("write", [lambda path: write_exr(path, _pixels(3)), lambda path: write_planes(path, PLANES)])
-def test_what_cannot_be_written_leaves_what_was_there(tmp_path, monkeypatch, write):
-    path = tmp_path / "a.exr"
-    path.write_bytes(b"what was there")
-
-    def full(self, name):
-        raise RuntimeError(f"{name}: no room\nat all")
-
-    monkeypatch.setattr(OpenEXR.File, "write", full)
-    with pytest.raises(WlmError) as caught:
-        write(path)
-    assert str(caught.value) == f"{path}: cannot write: {path}: no room at all"
-    assert path.read_bytes() == b"what was there" and os.listdir(tmp_path) == ["a.exr"]
 
 
 @pytest.mark.parametrize("kind", [OpenEXR.scanlineimage, OpenEXR.tiledimage])

@@ -319,11 +319,9 @@ def test_without_resume_an_old_checkpoint_is_left_out_and_replaced(tmp_path):
     ("change", "says"),
     [
         ({"seed": 1}, "seed 0, not 1"),
-        ({"tiles": [0]}, "tiles None, not [0]"),
         ({"device": "cuda:0"}, "device cpu, not cuda"),
         ({"profile": tiny_profile(steps=41)}, "profile steps=40, not 41"),
         ({"lightmaps": moving_light(40, 24, seed=9)}, "input"),
-        ({"lightmaps": moving_light(40, 24, period=None)}, "period 24.0, not None"),
     ],
 )
 def test_another_fit_is_refused_by_name(tmp_path, change, says):
