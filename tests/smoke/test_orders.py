@@ -88,7 +88,8 @@ def gains(volume: DensityVolume, camera: Camera, lights: list[Light], samples: i
     return [psnr(mixed(load_orders(), each, 1.0), light) - psnr(diffused(each, 1.0), light) for light, each in pairs]
 
 
-@pytest.mark.parametrize("cells", [32, pytest.param(64, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("cells", [32, 64])
 def test_on_no_grid_is_the_mix_worse_than_its_input(cells: int):
     """Other smoke and a plume, at both ends of the fitted thickness, on coarse and fine grids."""
     found = []
