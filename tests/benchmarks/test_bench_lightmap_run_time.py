@@ -30,21 +30,6 @@ def room(patch):
     return moving_light(hours=(0.0, 12.0, 18.45, 18.55))
 
 
-@pytest.mark.parametrize("kind", ["room", "plain"])
-def test_derivatives_are_differences_of_neighbours(kind, room):
-    camera = bench._RoomCamera(room, SIZE, "cpu") if kind == "room" else bench._PlainCamera(512, SIZE, "cpu")
-    sheet, uv, slope = (array.numpy() for array in camera(0.1))
-    assert sheet.max() == (0 if kind == "room" else 3) and (sheet >= 0).mean() > 0.5
-    inside = sheet >= 0
-    for axis, own in ((1, (0, 2)), (0, (1, 3))):
-        step = np.diff(uv, axis=axis)
-        first = np.s_[:, :-1] if axis else np.s_[:-1]
-        near = inside[first] & (np.abs(step) < 0.05).all(2)
-        error = np.abs(step - slope[first][..., own])[near]
-        # A step is the mean slope of both pixels, and a few steps cross an edge.
-        assert np.median(error) < 0.2 * np.median(np.abs(step[near])) + 1e-4
-
-
 def test_the_large_set_changes_as_a_real_one():
     model = bench.large_model(256)
     assert len(model.sheets) == 4 and len(model.times) == 26 and model.period == 24.0
