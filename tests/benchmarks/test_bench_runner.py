@@ -10,7 +10,6 @@ import pytest
 from builders.bench_rows import ENVIRONMENT
 
 from benchmarks import Row, Run, Timing, pages, read_json, read_runs, tables, write_json
-from benchmarks.figures import FIGURES, Figure
 from benchmarks.runner import Bench, exact_errors
 from wlm.errors import WlmError
 
@@ -123,21 +122,6 @@ def test_errors_against_float64():
     decoded = np.full((2000, 2), 0.25)
     decoded[7] = 3.0
     assert exact_errors(decoded, exact) == {"max_error": 3.0, "error_999": 0.25}
-
-
-def test_figures_have_units_and_formats():
-    cases = {
-        ("mlups", 23825.4): "23,825",
-        ("mlups", 6.036): "6.04",
-        ("of_copy", 0.90961): "91",
-        ("bytes", 1e6): "1,000,000",
-    }
-    cases |= {("bias", 0.031): "+3.1", ("psnr", 42.456): "42.46", ("rms", 6.3e-5): "0.0063"}
-    for (name, value), text in cases.items():
-        assert FIGURES[name].text(value) == text
-    assert FIGURES["psnr"].text(42.456, ".0f") == "42"
-    assert Figure("size", "bpp").heading == "size, bpp" and Figure("size", "bpp").label == "size (bpp)"
-    assert Figure("SSIM").heading == Figure("SSIM").label == "SSIM"
 
 
 def test_a_wide_table_is_parted_and_has_footnotes():

@@ -333,9 +333,7 @@ def test_what_is_no_shader_of_ours():
         translate("", "cg")
     for text, words in (
         ("#pragma once\n", "expected ifdef"),
-        ("mat4 f() { return x; }", "expected"),
         ("float f() { return 1.0 $ 2.0; }", "expected a token"),
-        ("float f() { return ; ", "expected"),
     ):
         with pytest.raises(ValueError, match=words):
             translate(text, "wgsl")
