@@ -46,7 +46,7 @@ def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
             start = time.perf_counter()
             report = run_scene(scene, folder, frames=_QUICK_FRAMES if quick else None, **settings)
             seconds = time.perf_counter() - start
-            option = f"{width} x {height}, {samples * samples} samples a pixel"
+            option = f"{width} x {height}, {samples} x {samples} samples a pixel"
             frames, memory = report["film"]["frames"], sum(report["memory"].values()) / _MIB
             figures = _times(report["frame_ms"]["total"])
             figures |= {name: np.mean([view[score] for view in report["views"]]) for name, score in _SCORES.items()}

@@ -78,14 +78,8 @@ class Texture:
 
     @classmethod
     def from_texels(cls, texels: np.ndarray, fmt: str, *, layered: bool = False) -> Self:
-        """Makes a texture of an uncompressed format.
-
-        Args:
-            texels: [H, W] or [H, W, C], or with `layered` [L, H, W] or [L, H, W, C]; little-endian numbers of the
-                format's own type.
-            fmt: Pixel format, see the class.
-            layered: Whether the first axis counts the layers of a texture array.
-        """
+        """Makes a texture of an uncompressed format from texels, [H, W] or [H, W, C], little-endian numbers of the
+        format's own type; with `layered` the first axis, before these, counts the layers of a texture array."""
         height, width = texels.shape[layered : layered + 2]
         return cls(np.ascontiguousarray(texels), fmt, width, height, len(texels) if layered else 0)
 
@@ -137,13 +131,10 @@ class Bundle:
 
 
 def sampler(name: str, kind: str) -> str:
-    """Declares a texture in GLSL so that the including shader can replace or bind it.
+    """Declares a texture, of the kind `sampler2D`, `usampler2D` or `sampler2DArray`, so that the including shader can
+    replace or bind it.
 
-    If a macro with the name in capitals is defined before, its value names the texture to read instead. If that macro's
-    name followed by `_BINDING` is defined, as Vulkan needs it, it gives the texture's binding number.
-
-    Args:
-        name: Name of the uniform, `wlm_atlas_colour` for example.
-        kind: `sampler2D`, `usampler2D` or `sampler2DArray`.
+    If a macro with the uniform's name in capitals is defined before, its value names the texture to read instead. If
+    that macro's name followed by `_BINDING` is defined, as Vulkan needs it, it gives the texture's binding number.
     """
     return _SAMPLER.format(macro=name.upper(), name=name, kind=kind)

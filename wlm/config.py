@@ -57,17 +57,11 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
 def check_settings(
     cls: type[_Settings], values: Any, prefix: str = "", extra: Literal["forbid", "ignore"] = "forbid"
 ) -> _Settings:
-    """Checks a mapping of settings, whatever the model's own configuration says about unknown keys.
+    """Checks a mapping of plain values as a settings model, whatever its own configuration says about unknown keys:
+    errors, or ignored with `extra`.
 
-    Args:
-        cls: The pydantic model.
-        values: Mapping of the model's fields to plain values.
-        prefix: Text before the field's name in an error, such as `"scene.yaml: "` or `"file: profile."`; `"--"` writes
-            the field as a command line option, with dashes.
-        extra: Whether unknown keys are errors ("forbid") or ignored.
-
-    Returns:
-        The checked settings.
+    `prefix` is the text before the field's name in an error, such as `"scene.yaml: "` or `"file: profile."`; `"--"`
+    writes the field as a command line option, with dashes.
     """
     try:
         return cls.model_validate(values, extra=extra)

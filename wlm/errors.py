@@ -14,14 +14,8 @@ _ESCAPES[ord("\t")] = " "
 
 
 def printable(text: str) -> str:
-    r"""Escapes control characters and lone surrogates, because names can come from untrusted files.
-
-    Args:
-        text: One line.
-
-    Returns:
-        The text with `\x1b` in place of an escape character, for example.
-    """
+    r"""Escapes control characters and lone surrogates in a line, because names can come from untrusted files; an escape
+    character becomes `\x1b`, for example."""
     return text.translate(_ESCAPES).encode("utf-8", "backslashreplace").decode()
 
 

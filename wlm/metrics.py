@@ -65,14 +65,8 @@ BRIGHTER = 10.0
 def check_pair(
     ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None, where: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Checks a reference, a test image and a mask, and returns them as float64, float64 and bool.
-
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, or None for all texels.
-        where: Name of this pair in error messages ("city 12 h").
-    """
+    """Checks a reference and a test image, [H, W, C], and a mask [H, W], None for all texels, and returns them as
+    float64, float64 and bool; `where` names the pair in messages ("city 12 h")."""
     ref = np.asarray(ref, np.float64)
     test = np.asarray(test, np.float64)
     if ref.ndim != 3 or ref.shape != test.shape:
@@ -103,20 +97,11 @@ def psnr_from_mse(error: float, peak: float) -> float:
 
 
 def ssim(ref: np.ndarray, test: np.ndarray, mask: np.ndarray, data_range: float) -> float:
-    """Returns the mean SSIM over the valid texels whose window lies inside the image.
+    """Returns the mean SSIM, for a signal of the given range, of images [H, W, C] over the texels of a mask [H, W]
+    whose window lies inside the image; NaN if there is none or the range is zero.
 
-    Outside the mask both images take the reference's nearest valid value, so that decoded values there do not
-    affect windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
-
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, true where a texel counts.
-        data_range: The signal's range in the images' units.
-
-    Returns:
-        The mean; NaN where the image is smaller than the window, no valid texel has its window inside, or the
-        range is zero.
+    Outside the mask both images take the reference's nearest valid value, so that decoded values there do not affect
+    windows that cross a chart's edge. With a full mask the result equals scikit-image's mean.
     """
     ref, test, valid = check_pair(ref, test, mask, "ssim")
     filled = fill_gaps(ref, valid)
@@ -146,17 +131,11 @@ def _ssim_filled(ref: np.ndarray, test: np.ndarray, valid: np.ndarray, data_rang
 
 
 def flip_exposures(ref: np.ndarray, valid: np.ndarray) -> tuple[float, float] | None:
-    """Chooses the first and last exposure for HDR-FLIP, from percentiles of the valid reference's luminance.
+    """Chooses the first and last exposure for HDR-FLIP, `(start, stop)` in stops (log2), from the reference's luminance
+    where `valid`; None where no valid texel is above zero.
 
-    HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of
-    the texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
-
-    Args:
-        ref: `[H, W, 3]`, linear RGB, finite where valid.
-        valid: bool `[H, W]`, true where a texel counts.
-
-    Returns:
-        `(start, stop)` in stops (log2), start <= stop; None where no valid texel is above zero.
+    HDR-FLIP uses the maximum and the median of all texels; this function uses the 99th percentile and the median of the
+    texels above zero, because most of a lightmap is black at night and a median of zero has no exposure.
     """
     _check_rgb(ref)
     luminance = np.maximum(ref[valid], 0.0) @ _LUMINANCE
@@ -169,30 +148,20 @@ def flip_exposures(ref: np.ndarray, valid: np.ndarray) -> tuple[float, float] | 
 
 
 def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """LDR-FLIP between two display images, sRGB in [0, 1], [H, W, 3], at flip_evaluator's default of 67 pixels per
-    degree.
-
-    Returns:
-        `[H, W]` float64 in [0, 1].
-    """
+    """Computes LDR-FLIP, float64 [H, W] in [0, 1], between two display images, sRGB in [0, 1], [H, W, 3], at
+    flip_evaluator's default of 67 pixels per degree."""
     ref, test, _ = check_pair(ref, test, None, "flip")
     _check_rgb(ref)
     return _ldr_flip(ref, test, srgb=True)
 
 
 def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None) -> np.ndarray:
-    """Computes the HDR-FLIP error at every texel, at flip_evaluator's default of 67 pixels per degree.
+    """Computes the HDR-FLIP error at every texel, float64 [H, W] in [0, 1], at flip_evaluator's default of 67 pixels
+    per degree.
 
-    Negative values count as zero. If no valid texel of the reference is above zero, no exposure can be chosen: the
-    error is zero if the test is black too, else LDR-FLIP between black and the test clipped to [0, 1].
-
-    Args:
-        ref: `[H, W, 3]`, linear RGB, finite; texels outside the mask hold the nearest valid value.
-        test: `[H, W, 3]`, linear RGB, equal to `ref` outside the mask.
-        span: Result of `flip_exposures`.
-
-    Returns:
-        `[H, W]` float64 in [0, 1], 0 where no difference is visible.
+    Both images are linear RGB [H, W, 3]; texels outside the mask hold the nearest valid value in both. Negative values
+    count as zero. If no valid texel of the reference is above zero, `flip_exposures` gives no `span`: the error is zero
+    if the test is black too, else LDR-FLIP between black and the test clipped to [0, 1].
     """
     import flip_evaluator  # imported here because the import is slow
 
@@ -233,16 +202,11 @@ def _check_rgb(image: np.ndarray) -> None:
 
 
 def picture_error(reference: np.ndarray, test: np.ndarray, seen: np.ndarray, flip: bool = True) -> tuple[float, float]:
-    """Computes the error of a test picture against a reference picture.
+    """Returns the mean squared error and the mean LDR-FLIP, or NaN without `flip`, of the covered pixels of a test
+    picture.
 
-    Args:
-        reference: [H, W, 3], sRGB in [0, 1]; uncovered pixels have the same value in both images.
-        test: [H, W, 3], sRGB in [0, 1].
-        seen: bool [H, W], true for covered pixels, at least one.
-        flip: Whether FLIP is computed too.
-
-    Returns:
-        The mean squared error and the mean LDR-FLIP, or NaN, of the covered pixels.
+    Both pictures are [H, W, 3], sRGB in [0, 1]; `seen`, bool [H, W], is true for covered pixels, at least one; all
+    others have the same value in both.
     """
     error = float(np.square(reference - test, dtype=np.float64)[seen].mean())
     if not flip:
@@ -477,9 +441,7 @@ def evaluate_frame(
     height, width = valid.shape
     shape = (-(-height // tile), -(-width // tile))
     result = FrameMetrics(
-        *(np.full(shape, math.nan) for _ in range(5)),
-        valid=np.zeros(shape, np.int64),
-        metrics=tuple(metrics),
+        *(np.full(shape, math.nan) for _ in range(5)), valid=np.zeros(shape, np.int64), metrics=tuple(metrics)
     )
     error = None
     if "flip" in metrics and valid.any():
@@ -544,14 +506,10 @@ def summarise(frames: Sequence[FrameMetrics], times: Sequence[float] | np.ndarra
 
 
 def lowest(psnr: np.ndarray, times: Sequence[float] | np.ndarray) -> dict[str, float | int] | None:
-    """Returns the lowest PSNR of tiles and its place.
+    """Returns the lowest PSNR of tiles, [T, ny, nx] in dB, NaN for tiles without a score, and its place; None if all
+    are NaN.
 
-    Args:
-        psnr: [T, ny, nx], in dB; NaN for tiles without a score.
-        times: The T times.
-
-    Returns:
-        `psnr`; `time`; `tile`, the number of the tile, row by row; its `row` and `column`. None if all are NaN.
+    The keys are `psnr`; `time`; `tile`, the number of the tile, row by row; its `row` and `column`.
     """
     if np.isnan(psnr).all():
         return None

@@ -246,14 +246,8 @@ def load(path: str | os.PathLike[str], system: str | None = None) -> Any:
 
 
 def decode(path: str | os.PathLike[str], artifact: Artifact, make: Callable[[Artifact], Any]) -> Any:
-    """Makes an object from an artifact's parts and turns any error into one line that names the file.
-
-    Args:
-        path: The file, for messages.
-        artifact: Content of the file.
-        make: A codec's `decode`, which raises WlmError, ValueError, TypeError, LookupError or AttributeError on parts
-            that do not fit.
-    """
+    """Makes an object from an artifact's parts by a codec's `decode`, and turns any of its errors (WlmError,
+    ValueError, TypeError, LookupError or AttributeError) into one line that names the file."""
     try:
         return make(artifact)
     except WlmError as error:

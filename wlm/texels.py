@@ -49,18 +49,12 @@ def to_srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def fill_gaps(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Gives every texel outside the mask the value of the nearest texel inside it (Euclidean distance).
+    """Gives every texel of images [..., H, W, C] outside a mask [H, W] the value of the nearest texel inside it
+    (Euclidean distance); returns a new array, zero everywhere if the mask is empty.
 
     The gaps between a lightmap's charts are never visible but share codec blocks and filter windows with visible
-    texels; zeros there cost a block codec 10 dB and more at chart edges.
-
-    Args:
-        image: `[..., H, W, C]`, any dtype; leading axes (time) are filled with one distance transform.
-        mask: `[H, W]`, true (non-zero) where a texel is valid.
-
-    Returns:
-        A new array of the image's shape and dtype. Valid texels are copied unchanged. With an empty mask
-        the result is zero everywhere.
+    texels; zeros there cost a block codec 10 dB and more at chart edges. Leading axes (time) are filled with one
+    distance transform.
     """
     image = np.asarray(image)
     valid = np.asarray(mask).astype(bool)
@@ -81,10 +75,8 @@ def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Finds the invalid texels within `REACH` texels of a valid one, and the valid texel that is nearest to each.
 
     `mask` is bool [H, W], true where a texel is valid. Of several equally near texels the first in reading order is
-    taken, so that all decoders (Python, shader, web page) take the same one.
-
-    Returns:
-        Row and column of each such texel, int [G, 2], in reading order, and row and column of its nearest valid texel.
+    taken, so that all decoders (Python, shader, web page) take the same one. Returns row and column of each such texel,
+    int [G, 2], in reading order, and those of its nearest valid texel.
     """
     height, width = mask.shape
     found = np.zeros(mask.shape, np.int8)  # 1 + the index in `OFFSETS`
@@ -99,16 +91,11 @@ def near_gaps(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def nearest_valid(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Finds the valid texel that is nearest to each texel of a lightmap (Euclidean distance), itself where it is valid.
+    """Finds the texel that is nearest (Euclidean distance) to each texel of a lightmap among those of a mask [H, W],
+    which has one: row and column, int32 [H, W] each, so that `image[rows, columns]` has its gaps filled.
 
     Up to a distance of `REACH` texels the result equals that of `near_gaps`; at larger distances any of several equally
     near texels is chosen.
-
-    Args:
-        mask: bool [H, W], true where a texel is valid; at least one is.
-
-    Returns:
-        Row and column of the nearest valid texel, int32 [H, W] each: `image[rows, columns]` has its gaps filled.
     """
     rows, columns = _nearest_in_strips(mask) or _nearest(mask)
     target, source = near_gaps(mask)
@@ -178,16 +165,8 @@ def doubts(light: np.ndarray) -> list[str]:
 
 
 def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
-    """Replaces non-finite values and clamps a lightmap to [0, 65504], half float's range, in place.
-
-    Args:
-        frame: [H, W, 3], linear.
-        mask: bool [H, W], the valid texels; changes to other texels aren't reported.
-        where: Name of the lightmap in the error.
-
-    Returns:
-        One line with the count for each kind of change to valid texels.
-    """
+    """Replaces non-finite values of a lightmap [H, W, 3], in place, and clamps it to [0, 65504], half float's range;
+    returns one line with the count for each kind of change to the valid texels of the mask."""
     notes, good = [], mask
     with np.errstate(invalid="ignore"):
         least, greatest = float(frame.min()), float(frame.max())  # NaN if there is one

@@ -73,14 +73,10 @@ class Workers(ABC):
 
     @abstractmethod
     def wait(self, seconds: float) -> tuple[int, Any] | None:
-        """Waits for the next result.
+        """Waits for the next result, at most some seconds; None if there was none in that time.
 
-        Args:
-            seconds: Maximum time to wait.
-
-        Returns:
-            The worker's number and the method's return value, the exception that it raised, or `Lost` if the worker
-            no longer exists; None if there was no result in that time.
+        Returns the worker's number and the method's return value, the exception that it raised, or `Lost` if the worker
+        no longer exists.
         """
 
     @abstractmethod

@@ -107,13 +107,9 @@ class MlpKernels:
     _backward: Any
 
     def forward(self, hidden, output, x, y) -> None:
-        """Evaluates N networks on B inputs each.
+        """Evaluates N networks on B inputs each, `x`, vecI [N, B]; writes the outputs `y`, vecO [N, B].
 
-        Args:
-            hidden: vecH [N, I + H + 2], the hidden layers, see the module.
-            output: vecO [N, H + 1], the output layers.
-            x: vecI [N, B], the inputs.
-            y: vecO [N, B], written: the outputs.
+        The layers are `hidden`, vecH [N, I + H + 2], see the module, and `output`, vecO [N, H + 1].
         """
         wp.launch(self._forward, x.shape, inputs=[hidden, output, x], outputs=[y], device=x.device)
 
@@ -148,9 +144,6 @@ def kernels(inputs: int, hidden: int, gelu: str = "exact", outputs: int = 3) -> 
         hidden: H >= 1, width of the two hidden layers.
         gelu: One of `GELUS`.
         outputs: O >= 1, number of outputs.
-
-    Raises:
-        ValueError: A size is below 1, or the activation is unknown.
     """
     if min(inputs, hidden, outputs) < 1 or gelu not in GELUS:
         raise ValueError(f"MLP: expected sizes above 0 and GELU {GELUS}, got {inputs, hidden, outputs, gelu}")

@@ -10,6 +10,7 @@ from reference import volume as reference
 from kernels.compare import array, close
 from wlm_kernels.probe import volume
 
+SIDES = np.array([[4, 4, 4], [3, 5, 4], [4, 4, 4]], np.int32)
 SIDE = 4
 SIZES = (0.5, 1.0, 4.0)
 # Windows on both sides of 0, one across it, and one far out.
@@ -19,52 +20,57 @@ BASES = np.array([[-9, 3, -2], [-6, 0, -1], [1000000, -1000000, -2]], np.int32)
 class Grid:
     """A volume on a device, and the same blocks by name."""
 
-    def __init__(self, bases: np.ndarray, sizes: tuple[float, ...], side: int, channels: int, device: str):
-        self.bases, self.sizes, self.side, self.device = bases, np.array(sizes), side, device
+    def __init__(self, bases: np.ndarray, sizes: tuple[float, ...], sides: np.ndarray, channels: int, device: str):
+        self.bases, self.sizes, self.sides, self.device = bases, np.array(sizes), sides, device
         self.blocks: dict[tuple[int, int, int, int], np.ndarray] = {}
-        slots = len(sizes) * side**3
+        slots = int(sides.prod(1).sum())
+        self.starts = np.cumsum(sides.prod(1)) - sides.prod(1)
         # Rows that no page names must not matter.
-        self.pool = np.full((slots, channels), np.nan, np.float32)
-        self.pages = np.full(slots, -1, np.int32)
+        self.pool, self.factor = np.zeros((slots, channels), np.int16), np.full(slots, np.nan, np.float32)
+        self.pages = np.full(slots, -1, np.int16)
 
     def window(self, level: int) -> list[tuple[int, int, int, int]]:
-        ranges = [range(first, first + self.side) for first in self.bases[level]]
+        ranges = [range(first, first + side) for first, side in zip(self.bases[level], self.sides[level], strict=True)]
         return [(level, *block) for block in itertools.product(*ranges)]
 
-    def slot(self, level: int, x: int, y: int, z: int) -> int:
-        return ((level * self.side + x % self.side) * self.side + y % self.side) * self.side + z % self.side
+    def slot(self, level: int, *block: int) -> int:
+        x, y, z = np.array(block) % self.sides[level]
+        return self.starts[level] + (x * self.sides[level][1] + y) * self.sides[level][2] + z
 
     def write(self, blocks: dict[tuple[int, int, int, int], np.ndarray]) -> None:
         """In rows of no order; a slot stands for the block of its level's window."""
-        self.blocks.update(blocks)
         rows = np.random.default_rng(0).permutation(len(self.pool))
         for name, values in blocks.items():
             slot = self.slot(*name)
-            self.pool[rows[slot]], self.pages[slot] = values, rows[slot]
+            row = self.pages[slot] = rows[slot]
+            self.factor[row] = np.abs(values).max() / 1000
+            halves = (values / max(self.factor[row], 1e-9)).astype(np.float16)
+            self.pool[row] = halves.view(np.int16)
+            self.blocks[name] = halves * np.float64(self.factor[row])
 
-    def _arrays(self) -> tuple[wp.array, wp.array, wp.array]:
-        pool, pages = array(self.pool, float, self.device), array(self.pages, int, self.device)
-        return pool, pages, array(self.bases, wp.vec3i, self.device)
+    def _arrays(self) -> list[wp.array]:
+        kinds = {"pool": wp.int16, "factor": float, "pages": wp.int16, "starts": int, "sides": wp.vec3i}
+        kinds |= {"bases": wp.vec3i}
+        return [array(getattr(self, name), kind, self.device) for name, kind in kinds.items()]
 
     def read(self, points: np.ndarray, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """At points in float64."""
-        place = origin / self.sizes[:, None] - (self.bases + self.side // 2) - 0.5
+        place = origin / self.sizes[:, None] - self.bases - 0.5
         views = np.concatenate([place, 1.0 / self.sizes[:, None]], 1).astype(np.float32)
-        pool, pages, bases = self._arrays()
         out = array(np.full((len(points), self.pool.shape[1]), np.nan), float, self.device)
         level = wp.empty(len(points), dtype=int, device=self.device)
         weight = wp.empty(len(points), dtype=float, device=self.device)
         where = array((points - origin).astype(np.float32), wp.vec3, self.device)
         views = array(views, wp.vec4, self.device)
         ahead = wp.empty(0, dtype=wp.vec3, device=self.device)
-        volume.read(pool, pages, bases, views, self.side, where, ahead, out, level, weight)
+        volume.read(*self._arrays(), views, where, ahead, out, level, weight)
         return out.numpy(), level.numpy(), weight.numpy()
 
 
 def _filled(channels: int, device: str, share: float = 0.6, bases: np.ndarray = BASES) -> Grid:
     """A grid with a random share of its blocks."""
     random = np.random.default_rng(channels)
-    grid = Grid(bases, SIZES, SIDE, channels, device)
+    grid = Grid(bases, SIZES, SIDES, channels, device)
     blocks = {}
     for level in range(len(SIZES)):
         for name in grid.window(level):
@@ -90,7 +96,7 @@ def test_read_against_reference(device: str, channels: int):
     for level in range(len(SIZES)):
         points, origin = _near(grid, level, 200)
         got, answered, weight = grid.read(points, origin)
-        want, shares = reference.read(grid.blocks, BASES, SIZES, SIDE, points, channels)
+        want, shares = reference.read(grid.blocks, BASES, SIZES, SIDES, points, channels)
         covered = shares.sum(1)
         assert (covered > 0.0).any() and (covered == 0.0).any()
         close(weight, covered, 2e-6, "weight")

@@ -54,15 +54,24 @@ def _names(position: np.ndarray, volume: Volume) -> set[tuple[int, ...]]:
         (level, *block)
         for level, size in enumerate(volume.sizes)
         for block in volume_blocks.blocks(position, size)
-        if all(0 <= b - base < volume.side for b, base in zip(block, volume.base[level], strict=True))
+        if ((block - volume.base[level] >= 0) & (block - volume.base[level] < volume.sides[level])).all()
     }
 
 
 def _there(volume: Volume) -> dict[tuple[int, ...], np.ndarray]:
     """The blocks that can be read, by name."""
-    values, valid = volume.unscroll()
-    assert not values[~valid].any()
-    return {(int(i[0]), *(i[1:] + volume.base[i[0]]).tolist()): values[tuple(i)] for i in np.argwhere(valid)}
+    there = {}
+    for level, (values, valid) in enumerate(zip(*volume.unscroll(), strict=True)):
+        assert not values[~valid].any()
+        there |= {(level, *(i + volume.base[level]).tolist()): values[tuple(i)] for i in np.argwhere(valid)}
+    return there
+
+
+def _same(volume: Volume, other: Volume) -> None:
+    """Both have the same blocks with the same light."""
+    for got, want in zip(volume.unscroll(), other.unscroll(), strict=True):
+        for level, expected in zip(got, want, strict=True):
+            np.testing.assert_array_equal(level, expected)
 
 
 def _settle(volume: Volume, viewpoint: object) -> list[FrameStats]:
@@ -126,10 +135,11 @@ def test_blocks_have_the_stated_light(device: str):
         low, high = low - 0.5 * (high - low), high + 0.5 * (high - low)
         if len(near) <= 16:
             want = volume_blocks.weights(position[near], tuple(block), size) @ values[near]
-            np.testing.assert_allclose(got, np.clip(want, low, high), atol=2e-5)
+            np.testing.assert_allclose(got, np.clip(want, low, high), rtol=5e-4, atol=2e-5)
         else:
             full += 1
-            assert (got > low - 1e-5).all() and (got < high + 1e-5).all()
+            room = 5e-4 * np.maximum(np.abs(low), np.abs(high)) + 1e-5
+            assert (got > low - room).all() and (got < high + room).all()
     assert 0 < full < len(there) / 2
     assert sum(s.probes for s in stats) == sum(
         min(16, len(volume_blocks.near(position, tuple(block), volume.sizes[level]))) for level, *block in there
@@ -186,8 +196,7 @@ def test_any_way_leads_to_the_same_volume(device: str):
     settle(walked, viewpoint)
     fresh = _volume(position, device)
     settle(fresh, viewpoint)
-    for got, want in zip(walked.unscroll(), fresh.unscroll(), strict=True):
-        np.testing.assert_array_equal(got, want)
+    _same(walked, fresh)
     points = viewpoint + random.uniform(-70, 70, (500, 3))
     np.testing.assert_array_equal(walked.read(points).values, fresh.read(points).values)
 
@@ -215,7 +224,7 @@ def test_no_read_of_a_block_that_is_not_there(device: str):
                 np.testing.assert_array_equal(value, truth[name])
         points = viewpoint + random.uniform(-1, 1, (20, 3)) * np.repeat([3.0, 20.0], 10)[:, None]
         reading = volume.read(points)
-        want, shares = reference.read(there, volume.base, volume.sizes, SIDE, points, 5)
+        want, shares = reference.read(there, volume.base, volume.sizes, volume.sides, points, 5)
         np.testing.assert_allclose(reading.weight, shares.sum(1), atol=1e-5)
         np.testing.assert_allclose(reading.values * reading.weight[:, None], want * shares.sum(1)[:, None], atol=1e-4)
     assert dropped > 0 and cached > 0
@@ -256,8 +265,7 @@ def test_far_from_the_origin(device: str):
     viewpoint = np.array([2.125, 1.5, -3.25])
     settle(near, viewpoint)
     settle(far, viewpoint + FAR)
-    for got, want in zip(far.unscroll(), near.unscroll(), strict=True):
-        np.testing.assert_array_equal(got, want)
+    _same(far, near)
     np.testing.assert_array_equal(far.base - near.base, FAR / np.array(near.sizes)[:, None])
     points = viewpoint + np.random.default_rng(7).integers(-4096, 4096, (300, 3)) / 128
     got, want = far.read(points + FAR), near.read(points)
@@ -278,19 +286,53 @@ def test_one_probe(device: str):
     reading = volume.read(points)
     assert volume.update([10.3, 0.2, -0.4]).entered == 0
     np.testing.assert_allclose(volume.read(points).weight, reading.weight, atol=1e-6)  # seen from elsewhere
-    np.testing.assert_allclose(reading.values[:2], np.repeat(_field(place), 2, 0), atol=1e-6)
+    np.testing.assert_allclose(reading.values[:2], np.repeat(_field(place), 2, 0), rtol=5e-4)
+    assert volume.memory_bytes == sum(volume.memory.values()) <= 64_000
     assert reading.level.tolist() == [0, 3, -1] and reading.weight[0] == 1.0 and 0.0 < reading.weight[1] < 1.0
     assert reading.weight[2] == 0.0 and not reading.values[2].any()
 
 
-@pytest.mark.parametrize("kind", ["outside", "dead", "none"])
+def test_memory_follows_the_scene(device: str):
+    """At most 1 MB for 2,001 probes of 216 kB on a floor, and windows as flat as the floor."""
+    position = np.random.default_rng(0).uniform(0, 50, (2001, 3)) * [1, 0, 1]
+    volume = Volume(position, StoredLight(np.ones((2001, 27)), device), normal=np.tile([0.0, 1.0, 0.0], (2001, 1)))
+    assert volume.memory_bytes <= 1_000_000 and volume.sides[:, 1].tolist() == [2, 2, 2, 2]
+    assert volume.memory.keys() == {"index", "page table", "pool", "work"}
+
+
+def test_light_of_any_range(device: str):
+    """Numbers keep 11 bits, however bright or dark their block is; a light that is NaN reads as NaN."""
+    for scale in (0.0, 1e-30, 1.0, 1e30):
+        place = np.array([[1.0, 1.0, 1.0]])
+        light = np.array([[1.0, -0.3, 1e-6]]) * scale
+        volume = Volume(place, StoredLight(light, device))
+        volume.update(place[0])
+        np.testing.assert_allclose(volume.read(place).values, light, rtol=5e-4)
+    volume.light._values.fill_(float("nan"))
+    fresh = Volume(place, volume.light)
+    fresh.update(place[0])
+    assert np.isnan(fresh.read(place).values).all()
+
+
+def test_outside_the_scene_the_windows_stay_on_it(device: str):
+    """A viewer above or beside the probes has the blocks nearest to the viewer, and far from all the coarsest."""
+    position = _surface()
+    volume = _volume(position, device)
+    for viewpoint in ([0.0, 500.0, 0.0], [-1e5, 4.0, 1e5]):
+        settle(volume, viewpoint)
+        assert set(_there(volume)) == _names(position, volume)
+        reading = volume.read(position)
+        assert (reading.level >= 0).all() and {0, 3} <= set(reading.level.tolist())
+
+
+@pytest.mark.parametrize("kind", ["dead", "none"])
 def test_nothing_to_see(device: str, kind: str):
-    """A viewer outside of the scene, a scene of dead probes, and one without any."""
+    """A scene of dead probes, and one without any."""
     position = np.zeros((0, 3)) if kind == "none" else _surface(50)
     live = np.zeros(len(position), bool) if kind == "dead" else None
     volume = _volume(position, device, live=live)
-    stats = volume.update([1e5, 0.0, 0.0] if kind == "outside" else [0.0, 0.0, 0.0])
-    assert stats.entered == 4 * SIDE**3
+    stats = volume.update([0.0, 0.0, 0.0])
+    assert stats.entered == 4
     assert (stats.queued, stats.updated, stats.left, stats.probes) == (0, 0, 0, 0)
     reading = volume.read(_surface(50))
     assert not reading.values.any() and not reading.weight.any() and (reading.level == -1).all()
@@ -302,8 +344,7 @@ def test_dead_probes_are_left_out(device: str):
     volumes = [_volume(position, device, live=live), _volume(position[live], device)]
     for volume in volumes:
         settle(volume, np.zeros(3))
-    for got, want in zip(volumes[0].unscroll(), volumes[1].unscroll(), strict=True):
-        np.testing.assert_array_equal(got, want)
+    _same(*volumes)
 
 
 def test_a_model_is_decoded_where_it_is_asked(device: str):
@@ -319,10 +360,10 @@ def test_a_model_is_decoded_where_it_is_asked(device: str):
     volumes = [Volume(position, source, side=16) for source in (light, stored)]
     for volume in volumes:
         settle(volume, position.mean(0))
-    (got, there), (want, also) = (volume.unscroll() for volume in volumes)
-    np.testing.assert_array_equal(there, also)
-    assert there.any()
-    np.testing.assert_allclose(got, want, atol=1e-5 * np.abs(want).max())
+    got, want = (_there(volume) for volume in volumes)
+    assert got.keys() == want.keys() and got
+    for name, values in want.items():
+        np.testing.assert_allclose(got[name], values, atol=1e-3 * np.abs(values).max())
 
 
 @pytest.mark.parametrize(
@@ -395,13 +436,17 @@ def test_export_of_nothing_and_over_another(volume, tmp_path):
     paths = export(volume_bundle(volume), tmp_path / "out")
     assert [path.exists() for path in paths] == [True] * 8 and export(volume_bundle(volume), tmp_path / "out") == paths
     document, arrays = read_export(tmp_path / "out")
-    pages, pool = arrays["pages"].reshape(4, 8, 8, 8), arrays["pool"].reshape(-1, 27)
+    pages, rows = arrays["pages"].view("<i2"), arrays["pool"].reshape(-1, 15)
+    pool = rows[:, :1].view("<f4") * rows[:, 1:].copy().view("<f2")[:, :27]
     values, valid = volume.unscroll()
+    first = 0
     for level, described in enumerate(document["levels"]):
-        place = np.argwhere(valid[level])
-        block = place + np.array(described["base"]) - np.array(described["start"], int)
-        np.testing.assert_array_equal(pool[pages[level][tuple((block % 8).T)]], values[level][tuple(place.T)])
-    assert (pages >= 0).sum() == valid.sum() == len(pool)
+        place, sides = np.argwhere(valid[level]), np.array(described["sides"])
+        block = (place + np.array(described["base"]) - np.array(described["start"], int)) % sides
+        own = pages[first + np.ravel_multi_index(tuple(block.T), tuple(sides))]
+        np.testing.assert_array_equal(pool[own], values[level][tuple(place.T)])
+        first += sides.prod()
+    assert (pages >= 0).sum() == sum(level.sum() for level in valid) == len(pool)
     (tmp_path / "out" / "bundle.json").write_text("{}")
     with pytest.raises(WlmError):
         export(volume_bundle(volume), tmp_path / "out")
@@ -479,7 +524,8 @@ def test_figures_are_those_of_the_readings(device: str):
     assert 0.0 < figures["coverage"]["min"] <= figures["coverage"]["mean"] <= 1.0
     # The last frame again, with all probes as samples.
     last = walk(volume, path[-1:], original, samples=10**6)
-    inside = (np.abs(position - path[-1]) < 16.0).all(1)
+    low = 2.0 * volume.base[0]
+    inside = ((position > low) & (position < low + 2.0 * volume.sides[0])).all(1)
     near, far = np.flatnonzero(live & inside), np.flatnonzero(live & ~inside)
     reading, light, peak = volume.read(position[near]), _field(position[near]), np.ptp(original)
 
@@ -503,14 +549,16 @@ def test_a_second_lap_decodes_nothing():
     assert second["left"]["max"] == 0 and second["light_psnr"] == first["light_psnr"] == 120.0
 
 
-def test_a_walk_outside_of_the_scene():
-    """Frames without a near sample have no coverage and no error."""
-    volume, light = _volume(_hills(), side=16, budget=1024), _field(_hills())
-    figures = walk(volume, _line(2, 1.0) + 1e6, light)
+def test_a_walk_where_no_probe_is():
+    """Frames without a near sample have no coverage and no error: here between two hills."""
+    position = np.concatenate([_hills(), _hills() + [1000.0, 0.0, 0.0]])
+    volume, light = _volume(position, side=16, budget=1024), _field(position)
+    between = _line(2, 1.0) + [500.0, 0.0, 0.0]
+    figures = walk(volume, between, light)
     assert json.loads(json.dumps(figures, allow_nan=False)) == figures
     assert all(figures[key] is None for key in ("coverage", "rmse", "rms", "psnr", "light_psnr"))
     there = walk(volume, _line(1, 0.0), light)
-    again = walk(volume, np.concatenate([_line(2, 1.0) + 1e6, _line(1, 0.0)]), light)
+    again = walk(volume, np.concatenate([between, _line(1, 0.0)]), light)
     assert again["rmse"]["mean"] == there["rmse"]["mean"]
 
 
@@ -549,14 +597,15 @@ def test_places_and_blocks_by_brute_force(scale: float, origin: float, side: flo
     index = BlockIndex(position, side, (1, 2, 16))
     assert index.sizes[0] >= side and index.sizes[2] == 16 * index.sizes[0]
     assert (np.diff(index.key) >= 0).all() and sorted(index.number) == list(range(60))
-    np.testing.assert_array_equal(_cells(index.key), index.cell)
     cell = index.sizes[0] / 2
-    place = (index.start[0] * 2 + index.cell + index.place) * cell
+    place = (index.start[0] * 2 + _cells(index.key) + index.place) * cell
     np.testing.assert_allclose(place, position[index.number], atol=1e-6 * cell + 1e-15 * abs(origin))
     for level, size in enumerate(index.sizes):
         keys = index.block[index.level_start[level] : index.level_start[level + 1]]
         assert (np.diff(keys) > 0).all()
-        got = {tuple(b) for b in (_cells(keys) + index.start[level]).astype(int).tolist()}
+        cells = _cells(keys)
+        assert (cells.min(0) == index.low[level]).all() and (cells.max(0) == index.high[level]).all()
+        got = {tuple(b) for b in (cells + index.start[level]).astype(int).tolist()}
         want = volume_blocks.blocks(position, size)
         # Rounded in another order, a share may be a tenth or not.
         assert len(got ^ want) <= 0.01 * len(want)

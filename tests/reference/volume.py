@@ -10,7 +10,7 @@ Blocks = Mapping[tuple[int, int, int, int], np.ndarray]  # (level, x, y, z) -> [
 
 
 def read(
-    blocks: Blocks, bases: np.ndarray, sizes: Sequence[float], side: int, points: np.ndarray, channels: int
+    blocks: Blocks, bases: np.ndarray, sizes: Sequence[float], sides: np.ndarray, points: np.ndarray, channels: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """The light at points, and how much of it each level answered.
 
@@ -18,7 +18,7 @@ def read(
         blocks: Those that are there; ones outside their level's window don't count.
         bases: int [L, 3], the first block of each window.
         sizes: [L], side of a block.
-        side: Blocks along an axis of a window.
+        sides: int [L, 3], blocks along the axes of each window.
         points: [M, 3].
         channels: D.
 
@@ -36,7 +36,8 @@ def read(
             for corner in itertools.product((0, 1), repeat=3):
                 block = [math.floor(x) + c for x, c in zip(place, corner, strict=True)]
                 weight = math.prod(1.0 - abs(x - b) for x, b in zip(place, block, strict=True))
-                inside = all(b in range(first, first + side) for b, first in zip(block, bases[level], strict=True))
+                local = np.array(block) - bases[level]
+                inside = ((local >= 0) & (local < sides[level])).all()
                 if inside and (level, *block) in blocks:
                     values[i] += left * weight * blocks[level, *block]
                     found += weight

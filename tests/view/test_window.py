@@ -14,7 +14,6 @@ from typer.testing import CliRunner
 import wlm
 from wlm.cli.app import app
 from wlm.errors import WlmError
-from wlm.fluid.volume import save_volume
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
@@ -23,11 +22,10 @@ from wlm.probe.sphere import basis
 from wlm.smoke.camera import Camera
 from wlm.smoke.data import write_six_way
 from wlm.smoke.lightmaps import SixWay
-from wlm.view import rendering, smoke_scene
+from wlm.view import rendering
 from wlm.view.display import Display, heat
 from wlm.view.opening import open_scene
 from wlm.view.scene_window import day_scene
-from wlm.view.smoke_scene import transmittance
 from wlm.view.window import Window
 
 SIZE = (480, 300)
@@ -284,47 +282,6 @@ def test_six_way_lightmaps_turn_with_the_light(tmp_path, show):
     assert scene_of(window).mean() < before.mean()
 
 
-@pytest.mark.parametrize("hot", [False, True])
-def test_a_volume_of_smoke_under_a_light(hot, tmp_path, show):
-    save_volume(tmp_path / "plume.npz", smoke_plumes.plume(hot=hot))
-    window = show(tmp_path / "plume.npz", extinction=20.0)
-    before = scene_of(window)
-    assert "extinction 20" in window._texts["caption"].GetInput()
-    red = (before[..., 0] - before[..., 2]).max()
-    assert red > 30 if hot else red < 5
-    drag(window, "turn", -140.0)
-    assert changed(window, before)
-    thick, thin = before, scene_of(show(tmp_path / "plume.npz", extinction=0.01))
-    assert np.abs(thick - thin).max() > 60
-
-
-def test_the_frames_of_a_simulation_are_played(tmp_path, show):
-    smoke_plumes.write_frames(tmp_path / "jet")
-    window = show(tmp_path / "jet")
-    assert window.scene.plays == "frame" and "frame 1 at 0.10 s" in window._texts["caption"].GetInput()
-    before = scene_of(window)
-    window.advance(2 / 24)  # two frames of 24 a second
-    assert "frame 3 at 0.30 s" in window._texts["caption"].GetInput() and changed(window, before)
-    window.advance(1 / 24)
-    assert window.state.values["frame"] == 1.0  # from the beginning
-
-
-def test_a_large_volume_is_drawn_coarser(tmp_path, show, monkeypatch):
-    monkeypatch.setattr(smoke_scene, "_MOST_VOXELS", 2500)
-    save_volume(tmp_path / "plume.npz", smoke_plumes.plume())
-    window = show(tmp_path / "plume.npz", extinction=20.0)
-    assert "20 × 24 × 20 voxels, drawn as 10 × 12 × 10" in window._texts["caption"].GetInput()
-    assert np.ptp(scene_of(window)) > 60
-
-
-def test_light_falls_off_through_smoke_as_it_should():
-    volume = wlm.fluid.from_array(np.ones((6, 5, 4)), extinction=0.5, voxel=0.2)
-    light = transmittance(volume, np.array([1.0, 0.0, 0.0]))
-    # A voxel's centre has half a voxel and all those behind it between itself and the light.
-    expected = np.exp(-0.5 * 0.2 * (np.arange(6)[::-1] + 0.5))
-    np.testing.assert_allclose(light[:, 2, 2], expected, rtol=0.06)
-
-
 def test_the_error_is_that_of_the_charts_and_has_the_score_of_evaluate(lightmaps, tmp_path, show):
     given = wlm.lightmap.load(lightmaps / "set")
     mask = given.light.mask.copy()
@@ -371,6 +328,7 @@ def test_what_has_no_picture_is_said_in_one_line(lightmaps, tmp_path):
     probe_models.whole_model(positions=False).save(tmp_path / "probe.wlm")
     probe_models.whole_model(outputs=5, positions=True).save(tmp_path / "five.wlm")
     small_sets.write_set(tmp_path / "half", small_sets.moving_light(height=64))
+    smoke_plumes.write_frames(tmp_path / "jet")
     (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 no archive")
     six_way(tmp_path / "a.exr", size=8)
     six_way(tmp_path / "b.exr", size=4)
@@ -384,6 +342,7 @@ def test_what_has_no_picture_is_said_in_one_line(lightmaps, tmp_path):
         ([tmp_path / "probe.wlm"], {}, "--original"),
         ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
         ([tmp_path / "a.exr", tmp_path / "b.exr"], {}, "expected 8x8 pixels as the first frame, found 4x4"),
+        ([tmp_path / "jet"], {}, "drawn by wlm smoke light"),
         ([lightmaps / "quad.glb"], {}, "quad.glb: a mesh has no light of its own"),
         ([__file__], {}, "expected a .wlm, a lightmap"),
     ):

@@ -34,10 +34,7 @@ def block_grid(height: int, width: int) -> tuple[int, int]:
 
 
 def quantise(
-    texels: np.ndarray | torch.Tensor,
-    colour: str,
-    weight: np.ndarray | torch.Tensor | None = None,
-    device: str = "cpu",
+    texels: np.ndarray | torch.Tensor, colour: str, weight: np.ndarray | torch.Tensor | None = None, device: str = "cpu"
 ) -> dict[str, np.ndarray]:
     """Encodes the colour texture T_p, [H, W, 3] on any device. Returns the arrays `texels` and, for a block format,
     `blocks` of `AtlasModel`. BC6H weights the squared errors of texels with `weight` [H, W].
@@ -91,19 +88,12 @@ def _of_blocks(texels: torch.Tensor, count: int, ny: int, nx: int) -> torch.Tens
 
 
 def encode(
-    texels: np.ndarray | torch.Tensor,
-    codec: str,
-    weight: np.ndarray | torch.Tensor | None = None,
-    device: str = "cpu",
+    texels: np.ndarray | torch.Tensor, codec: str, weight: np.ndarray | torch.Tensor | None = None, device: str = "cpu"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Encodes a linear texture, [H, W, 3] on any device, as "bc6h" or "astc". Values, also infinite ones, are clamped
     to [0, 65504]. If H or W is no multiple of 4, the last row or column is repeated.
 
     Returns blocks, uint8 [B, 16], row by row; and their decoded texels, float32 [H, W, 3].
-
-    Raises:
-        ValueError: A texel is NaN.
-        WlmError: An optional package isn't installed; the message names the extra.
     """
     light = _on(texels, device)
     if count := int(light.isnan().any(2).sum()):
@@ -124,12 +114,7 @@ def encode(
 
 
 def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarray:
-    """Decodes a texture of blocks, uint8 [B, 16], to float32 [height, width, 3], finite, in [0, 65504].
-
-    Raises:
-        ValueError: The number of blocks does not fit height and width.
-        WlmError: A block's bits are invalid in the format, or an optional package isn't installed.
-    """
+    """Decodes a texture of blocks, uint8 [B, 16], to float32 [height, width, 3], finite, in [0, 65504]."""
     rows, columns = block_grid(height, width)
     if blocks.dtype != np.uint8 or blocks.shape != (rows * columns, 16) or not blocks.size:
         raise ValueError(f"blocks: expected shape uint8 [{rows * columns}, 16], got {blocks.dtype} {blocks.shape}")

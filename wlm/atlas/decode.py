@@ -66,11 +66,7 @@ class Decoder:
         return (near + np.float32(state - low) * (far - near)).astype(np.float32)
 
     def read(
-        self,
-        uv: torch.Tensor,
-        sheet: torch.Tensor | int = 0,
-        state: float = 0.0,
-        lod: torch.Tensor | None = None,
+        self, uv: torch.Tensor, sheet: torch.Tensor | int = 0, state: float = 0.0, lod: torch.Tensor | None = None
     ) -> torch.Tensor:
         """Returns light at UVs, the same that the model's shader returns.
 

@@ -32,15 +32,7 @@ from wlm.atlas.data import LightmappedScene
 from wlm.atlas.decode import Decoder
 from wlm.atlas.model import AtlasModel
 from wlm.atlas.stages import one_thread
-from wlm.atlas.views import (
-    Points,
-    corner_weights,
-    points_at,
-    scene_views,
-    sheet_charts,
-    texel_triangles,
-    visible_uv,
-)
+from wlm.atlas.views import Points, corner_weights, points_at, scene_views, sheet_charts, texel_triangles, visible_uv
 from wlm.errors import WlmError
 from wlm.interop import check_device
 from wlm.metrics import SSIM_WINDOW, picture_error, psnr_from_mse, ssim
@@ -312,11 +304,7 @@ class _Reference:
 
 
 def _peaks(
-    scene: LightmappedScene,
-    reference: _Reference,
-    cameras: Sequence[View | Viewpoint],
-    resolution: int,
-    device: str,
+    scene: LightmappedScene, reference: _Reference, cameras: Sequence[View | Viewpoint], resolution: int, device: str
 ) -> tuple[list[float], float]:
     """Returns the range of the original light over all views for each state, as the module's docstring defines it, and
     the maximum over all states. Rendering each view twice is cheaper than storing all views."""

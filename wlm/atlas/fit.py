@@ -18,16 +18,7 @@ from wlm.atlas import colour
 from wlm.atlas.cascade.fit import fit_cascade, group_triangles
 from wlm.atlas.data import LightmappedScene
 from wlm.atlas.decode import Decoder
-from wlm.atlas.model import (
-    BLOCK_SIDE,
-    BLOCKS,
-    COLOUR_BITS,
-    SOURCE_BITS,
-    AtlasModel,
-    Profile,
-    SheetPlace,
-    check_area,
-)
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, COLOUR_BITS, SOURCE_BITS, AtlasModel, Profile, SheetPlace, check_area
 from wlm.atlas.resize import fitting_size, resized
 from wlm.atlas.shared.fit import fit_shared
 from wlm.atlas.stages import Stages, one_thread

@@ -112,16 +112,11 @@ def own_lightmaps(
     encoding: str | None = None,
     uv_set: int | None = None,
 ) -> tuple[Listing, Readings]:
-    """Lists the lightmaps that a file names.
+    """Lists the lightmaps that a file names, read by `read_gltf`.
 
-    Args:
-        document, primitives: From `read_gltf`.
-        slot: One of `SLOTS`, to read it instead of an extension.
-        encoding: Encoding of images of 8 bits; None: that of the table.
-        uv_set: Replaces the stated UV set of all slots.
-
-    Returns:
-        The list, without objects and with a note for each assumption; and the readings.
+    `slot`, one of `SLOTS`, is read instead of an extension, `encoding` is that of images of 8 bits (None: the table's),
+    and `uv_set` replaces the stated UV set of all slots. Returns the list, without objects and with a note for each
+    assumption, and the readings.
     """
     with reported(document.path):
         name = slot or own_extension(document)
@@ -309,18 +304,11 @@ def _picture(
 def slot_readings(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], uv_set: int, lightmap: str
 ) -> tuple[Readings, tuple[str, ...]]:
-    """Finds the texture transforms that apply to lightmap UVs which no extension describes.
+    """Finds the texture transforms that apply to lightmap UVs which no extension describes, see
+    `wlm.formats.gltf_slots`.
 
-    See `wlm.formats.gltf_slots`.
-
-    Args:
-        document, primitives: From `read_gltf`.
-        uv_set: n of `TEXCOORD_n`, the lightmap's UVs.
-        lightmap: Name of the lightmap without its suffix.
-
-    Returns:
-        The readings of all primitives that have these UVs, all of sheet 0; empty if no transform applies. And one line
-        about the transforms.
+    `uv_set` is n of the lightmap's `TEXCOORD_n`, `lightmap` its name without suffix. Returns the readings of all
+    primitives that have these UVs, all of sheet 0, empty if no transform applies; and one line about the transforms.
     """
     readings: Readings = {}
     used: dict[str, None] = {}
@@ -341,13 +329,11 @@ def slot_readings(
 def settle(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], readings: Readings
 ) -> tuple[GltfDocument, list[GltfPrimitive], int, dict[int, tuple[int, Rectangle]]]:
-    """Makes all readings of a node one rectangle of one UV set.
+    """Makes all readings of a node one rectangle of one UV set; returns the document, its primitives, n of the UV set,
+    and by node the number of its sheet and its rectangle.
 
     Where they are not, because a transform turns, a node's materials have different transforms, or slots read different
     sets, the moved UVs are added to a copy of the document as a new UV set.
-
-    Returns:
-        The document, its primitives, n of the UV set, and by node the number of its sheet and its rectangle.
     """
     by_node: dict[int, set[Reading | None]] = {}
     for each in primitives:

@@ -374,9 +374,6 @@ def pack_entries(
     Returns:
         uint16 [..., 2]: the first texel shifted left by 4, plus the size minus 1. For blocks, both are in blocks
         instead of texels, and `code` is added.
-
-    Raises:
-        ValueError: A number is out of range.
     """
     first, size, blocks = np.asarray(first), np.asarray(size), np.asarray(blocks)[..., None]
     most = np.where(blocks, 1 << SIDE_BITS, code)

@@ -320,11 +320,9 @@ def _shared(model: AtlasModel) -> str:
 
 
 def glsl(model: AtlasModel) -> str:
-    """Returns the GLSL for a model: only functions, to be included below `#version`.
+    """Returns the GLSL 3.30 for a model: only functions, to be included below `#version`.
 
-    Returns:
-        GLSL 3.30, which is also valid Vulkan GLSL if the bindings are defined: `wlm_atlas(uv)` for one lightmap,
-        `wlm_scene(uv, sheet, state)` and `wlm_object(uv, place, sheet, state)` for several; with mips also
-        `wlm_scene_grad`.
+    It is also valid Vulkan GLSL if the bindings are defined: `wlm_atlas(uv)` for one lightmap, `wlm_scene(uv, sheet,
+    state)` and `wlm_object(uv, place, sheet, state)` for several; with mips also `wlm_scene_grad`.
     """
     return _shared(model) + _OBJECT if model.method == "shared" else _one_lightmap(model)

@@ -38,12 +38,9 @@ class Points:
 
 
 def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) -> list[View | Viewpoint]:
-    """Makes cameras around a scene and, where viewers can stand in it, as many cameras inside.
+    """Makes `count` cameras around a scene and, where viewers can stand in it, as many inside.
 
-    Args:
-        scene: The scene.
-        count: Number of cameras around it, at least 0.
-        seed: None spreads the cameras evenly; a number places all cameras, also inside ones, at random.
+    Without a seed they are spread evenly; a seed places all, also those inside, at random.
     """
     return [*sphere_views(count, seed), *scene.indoors.views(count, 0 if seed is None else seed)]
 
@@ -51,22 +48,11 @@ def scene_views(scene: LightmappedScene, count: int, seed: int | None = None) ->
 def visible_uv(
     scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, device: str
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Renders the visible triangle and its UVs from each camera.
+    """Renders the visible triangle and its UVs from each camera, square pictures of `resolution` pixels along a side.
 
-    Args:
-        scene: The scene.
-        views: The cameras.
-        resolution: Width and height of a camera's picture in pixels, 1 to 16,384.
-        device: "cpu" or "cuda:N".
-
-    Yields:
-        For each camera, on the device: int32 [h, w], number of the visible triangle, -1 for none or one without a
-            lightmap; float32 [h, w, 2], barycentric weights of the triangle's corners 0 and 1 (all three add up to 1);
-            float32 [h, w, 2], UVs. Weights and UVs are 0 in uncovered pixels.
-
-    Raises:
-        WlmError: There is no such device.
-        ValueError: The resolution is out of range.
+    Yields for each camera, on the device: int32 [h, w], number of the visible triangle, -1 for none or one without a
+    lightmap; float32 [h, w, 2], barycentric weights of the triangle's corners 0 and 1 (all three add up to 1); float32
+    [h, w, 2], UVs. Weights and UVs are 0 in uncovered pixels.
     """
     all_of = scene.triangles
     lit = torch.tensor(all_of.sheet >= 0, device=check_device(device))
@@ -105,22 +91,10 @@ def cells_at(uv: torch.Tensor, height: int | torch.Tensor, width: int | torch.Te
 def visibility(
     scene: LightmappedScene, views: Sequence[View | Viewpoint], resolution: int, height: int, width: int, device: str
 ) -> torch.Tensor:
-    """Counts the pixels that show each cell of a grid over the UV space of a scene with one sheet.
+    """Counts the pixels that show each cell of a grid over the UV space of a scene with one sheet, in square pictures
+    of all cameras; returns float64 [height, width] on the device, row 0 at v = 0.
 
-    Args:
-        scene: The scene.
-        views: The cameras.
-        resolution: Width and height, in pixels, of the square picture of each camera.
-        height, width: Rows and columns of the grid's cells, row 0 at v = 0. They may be smaller than texels.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        float64 [height, width] on the device: for each cell the number of pixels, in the pictures of all cameras, whose
-        UV lies in it; a UV of 1 lies in the last cell.
-
-    Raises:
-        WlmError: There is no such device.
-        ValueError: A size is out of range.
+    Cells may be smaller than texels. A pixel belongs to the cell in which its UV lies; a UV of 1 lies in the last cell.
     """
     if height < 1 or width < 1:
         raise ValueError(f"height, width: expected at least 1 cell each, got {height} and {width}")
@@ -134,16 +108,11 @@ def visibility(
 
 
 def texel_triangles(sheet: Sheet, height: int, width: int, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Finds the active triangle that contains the centre of each cell of a grid over UV space.
+    """Finds the active triangle that contains the centre of each cell of a grid [height, width] over UV space, row 0 at
+    v = 0.
 
-    Args:
-        sheet: The sheet.
-        height, width: Size of the grid, row 0 at v = 0.
-        device: "cpu" or "cuda:N".
-
-    Returns:
-        On the device: int64 [height, width], the number of the triangle in the sheet (the first if there are several,
-        -1 for none); float32 [height, width, 2], the barycentric weights of its corners 0 and 1.
+    Returns on the device: int64 [height, width], the number of the triangle in the sheet (the first if there are
+    several, -1 for none); float32 [height, width, 2], the barycentric weights of its corners 0 and 1.
     """
     active = torch.tensor(np.flatnonzero(sheet.active), device=device)
     raster = ops_raster.rasterize_uv(
@@ -156,10 +125,6 @@ def texel_triangles(sheet: Sheet, height: int, width: int, device: str) -> tuple
 
 
 def sheet_charts(sheet: Sheet) -> np.ndarray:
-    """Numbers the charts of a sheet.
-
-    Returns:
-        int32 [F]: active triangles connected by edges whose ends coincide in space and in UV space have the same
-        number; -1 for triangles that aren't active.
-    """
+    """Numbers the charts of a sheet, int32 [F]: active triangles connected by edges whose ends coincide in space and in
+    UV space have the same number; -1 for triangles that aren't active."""
     return charts(welded(sheet.position, sheet.uv, sheet.triangle), sheet.active)

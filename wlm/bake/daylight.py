@@ -12,14 +12,9 @@ _YEAR = 365.25
 def sun_direction(hour: float, latitude: float, day: int, north: float = 0.0, period: float = 24.0) -> np.ndarray:
     """Returns the direction to the sun, float64 [3], of unit length, y up; y < 0 at night.
 
-    The model is a circular orbit with the sun highest at noon; its error is at most 2 degrees.
-
-    Args:
-        hour: Solar time; the sun is highest at half the period.
-        latitude: Latitude in degrees, north positive.
-        day: Day of the year.
-        north: Degrees by which north is turned from -z towards -x.
-        period: Hours of a day.
+    The model is a circular orbit with the sun highest at half the period; its error is at most 2 degrees. `hour` is
+    solar time, `latitude` in degrees, north positive, `day` that of the year; north is turned by `north` degrees from
+    -z towards -x.
     """
     declination = math.asin(-math.sin(_OBLIQUITY) * math.cos(2.0 * math.pi * (day + _SOLSTICE) / _YEAR))
     angle = 2.0 * math.pi * hour / period - math.pi  # 0 at noon, negative before it

@@ -62,15 +62,12 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles of one material.
+    """Triangles of one material, int32 [F, 3], counter-clockwise as seen from the front, of vertices float64 [V, 3] in
+    the world.
 
-    Attributes:
-        position: float64 [V, 3], in the world.
-        triangle: int32 [F, 3]; counter-clockwise as seen from the front.
-        normal: float64 [V, 3], unit shading normals; 0 where the file has none.
-        uv: float64 [V, 2], lightmap UVs; None if the surface has none and isn't baked.
-        texture_uv: float32 [V, 2], UVs of the material's texture, or None.
-        material: The material.
+    `normal`, float64 [V, 3], are unit shading normals, 0 where the file has none; `uv`, float64 [V, 2], are lightmap
+    UVs, None if the surface has none and isn't baked; `texture_uv`, float32 [V, 2] or None, are for the material's
+    texture.
     """
 
     position: np.ndarray
@@ -231,12 +228,7 @@ def unwrap(
         rows = np.column_stack([vertex.astype(np.float64), corner])
         unique, index = np.unique(rows, axis=0, return_inverse=True)
         replacements.append(
-            Replacement(
-                primitive,
-                unique[:, 0].astype(np.int64),
-                index.reshape(-1, 3).astype(np.int32),
-                unique[:, 1:],
-            )
+            Replacement(primitive, unique[:, 0].astype(np.int64), index.reshape(-1, 3).astype(np.int32), unique[:, 1:])
         )
     return replacements
 

@@ -66,11 +66,7 @@ class BakedLightmaps:
 
 
 def bake_lightmaps(
-    task: Task,
-    *,
-    device: str = "cpu",
-    checkpoint: Checkpoint | None = None,
-    progress: OnProgress | None = None,
+    task: Task, *, device: str = "cpu", checkpoint: Checkpoint | None = None, progress: OnProgress | None = None
 ) -> BakedLightmaps:
     """Bakes the lightmap of a scene at each of its hours.
 
@@ -121,13 +117,7 @@ def bake_lightmaps(
     light = np.stack([_finished(texels, each["light"], mask, denoise).astype(np.float16) for each in results])
     noise = np.stack([texels.image(each["noise"]).astype(np.float16) for each in results])
     return BakedLightmaps(
-        tuple(hours),
-        light,
-        noise,
-        mask,
-        texels.image(texels.coverage),
-        texels.image(back.astype(np.float32)),
-        geometry,
+        tuple(hours), light, noise, mask, texels.image(texels.coverage), texels.image(back.astype(np.float32)), geometry
     )
 
 

@@ -34,12 +34,8 @@ _COEFFICIENTS = 9
 
 @dataclass(frozen=True)
 class Sun:
-    """The sun as a distant light.
-
-    Attributes:
-        direction: Direction to the sun, [3], of unit length.
-        irradiance: R, G, B on a surface that faces the sun.
-    """
+    """The sun as a distant light: the direction to it, [3], of unit length, and its irradiance R, G, B on a surface
+    that faces it."""
 
     direction: tuple[float, float, float]
     irradiance: tuple[float, float, float]
@@ -68,13 +64,9 @@ class Tracing:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Estimated incident light at N points.
-
-    Attributes:
-        mean: float32 [N, C], estimates.
-        noise: float32 [N, C], the standard error of each estimate.
-        back: float32 [N], the share of first rays that hit the back of a single-sided surface, which indicates a point
-            inside an object.
+    """Estimated incident light at N points, float32 [N, C], with the standard error of each estimate; `back`, float32
+    [N], is the share of first rays that hit the back of a single-sided surface, which indicates a point inside an
+    object.
     """
 
     mean: np.ndarray
@@ -100,13 +92,8 @@ class _Outside:
 
 
 def irradiance(scene: Any, texels: Any, tracing: Tracing, *, report: Any = None) -> Gathered:
-    """Computes irradiance at the texels of a lightmap, as the mean over their sample positions.
-
-    `report` is called with the finished share of the work.
-
-    Returns:
-        Estimates with three channels, RGB.
-    """
+    """Computes irradiance, RGB, at the texels of a lightmap, as the mean over their sample positions; `report` is
+    called with the finished share of the work."""
     places = [mi.Point3f(texels.position.T), mi.Vector3f(texels.normal.T), mi.Vector3f(texels.face.T)]
     first = mi.UInt32(texels.first[:-1].astype(np.uint32))
     count = mi.UInt32(np.diff(texels.first).astype(np.uint32))

@@ -65,11 +65,9 @@ def show(content: Table) -> None:
 def show_figures(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str | float]], text: Sequence[str] = ()
 ) -> None:
-    """Prints a table of texts and numbers to stdout.
+    """Prints a table of texts and numbers, a cell for each column; `table` explains the other arguments.
 
-    Args:
-        title, columns, text: Arguments of `table`.
-        rows: A cell for each column. Integers are written in full, floats with four digits.
+    Integers are written in full, floats with four digits.
     """
     content = table(title, columns, text)
     for row in rows:
@@ -88,12 +86,9 @@ def _figure(value: Any) -> str:
 
 
 def show_facts(title: str, facts: Mapping[str, Any]) -> None:
-    """Prints facts as a table of two columns.
+    """Prints facts, JSON values by name, as a table of two columns; underscores in names become spaces.
 
-    Args:
-        title: Title of the table.
-        facts: JSON values by name; underscores in names become spaces. A mapping becomes a section of the table, in
-            which each line has the name of the mapping and that of an entry.
+    A mapping becomes a section of the table, in which each line has the name of the mapping and that of an entry.
     """
     rows = table(title, ["", "value"])
     for name, value in facts.items():
@@ -249,12 +244,7 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
         yield line
         return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.fields[note]}"),
-    )
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
     with Bar(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=None, note="")
 
@@ -272,16 +262,10 @@ def running(
     """Shows the progress of long work and, if it has a checkpoint, lets a signal stop it between two steps.
 
     The output of the work must be written inside the block, so that a signal cannot interrupt it. A stage whose name
-    differs from `what` gets its own bar, named `what: stage`.
-
-    Args:
-        what: Name of the work in a word or two.
-        checkpoint: The file that keeps an interrupted run; None: Ctrl-C and SIGTERM end the work at once.
-        unit: Name of a step, for messages, such as "frame".
-        whole: Whether a signal waits for the end of a step; False for steps that write their results by themselves.
-
-    Yields:
-        A function to call with a `Progress`. If a signal stops the work later, a line says how to continue.
+    differs from `what` gets its own bar, named `what: stage`. Without a checkpoint Ctrl-C and SIGTERM end the work at
+    once; `unit` is the name of a step, such as "frame", and `whole` tells whether a signal waits for its end, not so
+    for steps that write their results by themselves. Yields a function to call with a `Progress`. If a signal stops the
+    work later, a line says how to continue.
     """
     last: Any = None
     hold = checkpoint is not None and whole

@@ -42,8 +42,7 @@ Encoding = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Trust = Annotated[
-    bool,
-    typer.Option("--trust", help="Trust the input file: it may name files in other folders and have any size."),
+    bool, typer.Option("--trust", help="Trust the input file: it may name files in other folders and have any size.")
 ]
 Profile = Annotated[str, typer.Option(metavar="NAME|FILE.yaml", help="Name of a settings profile, or a YAML file.")]
 Engine = Annotated[
@@ -67,7 +66,10 @@ Key = Annotated[
     str | None,
     typer.Option(help="Name of the array of light to read from a probe file with several, such as one an hour."),
 ]
-
+Time = Annotated[
+    float | None,
+    typer.Option(metavar="HOUR", help="Hour of the day of light probes that have several; may be between two of them."),
+]
 
 Weights = Annotated[
     list[str] | None,

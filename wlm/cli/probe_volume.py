@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from wlm.cli.console import number, quiet_warp, running, show, show_files, table
-from wlm.cli.options import Device, Key, ModelFile, output_option
+from wlm.cli.options import Device, Key, ModelFile, Time, output_option
 
 if TYPE_CHECKING:
     from wlm.probe import ProbeModel, ProbeSet
@@ -42,6 +42,7 @@ def volume(
         float | None, typer.Option(help="Side of the finest blocks in world units; default by the probes' spacing.")
     ] = None,
     key: Key = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write a volume of light around a viewer, coarser farther away: buffers, an index, and a shader that reads them.
@@ -58,13 +59,17 @@ def volume(
     from wlm.probe.volume.walk import settle
     from wlm.system import load
 
-    model = load(file, "probe")
-    known = probes_of(model, probes_path, key)
+    model = load(file, "probe").at(time)
+    known = probes_of(model, probes_path, key, time)
     light = model.decoder(device).light(known.position)
     made = Volume(known.position, light, live=known.live, normal=known.normal, block=block)
     lit = known.position[known.live]
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else np.array(at))
     show_files(output, export(volume_bundle(made), output))
+    rows = table("the volume on the device", ["part", "bytes"])
+    for part, size in (made.memory | {"in all": made.memory_bytes}).items():
+        rows.add_row(part, f"{size:,}")
+    show(rows)
 
 
 def score_walks(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[str, dict[str, Any]]:
@@ -73,10 +78,7 @@ def score_walks(model: "ProbeModel", probes: "ProbeSet", device: str) -> dict[st
     from wlm.probe.volume.walk import score_volume
 
     decoder = model.decoder(device, position=probes.position)
-    lights = {
-        "original": StoredLight(probes.values, decoder.device),
-        "decoded": decoder.light(probes.position),
-    }
+    lights = {"original": StoredLight(probes.values, decoder.device), "decoded": decoder.light(probes.position)}
     with running("walk") as progress:
         return {name: score_volume(probes, light, progress=progress) for name, light in lights.items()}
 
@@ -90,6 +92,8 @@ def show_walks(walks: dict[str, dict[str, Any]]) -> None:
         rows.add_row(name, *(number(figures[key], ".2f") for figures in walks.values()))
     for name, key in _COSTS.items():
         rows.add_row(name, *(number(figures[key]["mean"], ".3g") for figures in walks.values()))
+    for part in next(iter(walks.values()))["memory"]:
+        rows.add_row(f"bytes of the {part}", *(f"{figures['memory'][part]:,}" for figures in walks.values()))
     rows.add_row("bytes of the volume", *(f"{figures['memory_bytes']:,}" for figures in walks.values()))
     show(rows)
 

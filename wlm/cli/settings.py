@@ -40,9 +40,8 @@ class _Field(NamedTuple):
 def with_settings(place: str, into: str = "settings") -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Marks a command as having an option for each field of a settings model.
 
-    Args:
-        place: The model, as `module:name`. It is imported when the command is built, by `command_of`.
-        into: The parameter of the command that receives the given options, nested as the model is.
+    `place` names the model as `module:name`, which is imported when `command_of` builds the command. The parameter
+    `into` of the command receives the given options, nested as the model is.
     """
 
     def mark(command: Callable[..., None]) -> Callable[..., None]:

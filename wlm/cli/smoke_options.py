@@ -161,9 +161,7 @@ def vectors(option: str, text: str) -> list[tuple[float, float, float]]:
 
 
 def parse_lights(
-    directions: Sequence[str] | None,
-    places: Sequence[str] | None = None,
-    sky: tuple[float, float, float] | None = None,
+    directions: Sequence[str] | None, places: Sequence[str] | None = None, sky: tuple[float, float, float] | None = None
 ) -> "tuple[list[AnyLight], tuple[Light, ...]]":
     """Parses the texts of `--light` and `--point`; returns these lights, and those that stand for a sky."""
     from wlm.config import check_settings

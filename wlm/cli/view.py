@@ -8,11 +8,10 @@ import typer
 from rich.markup import escape
 
 from wlm.cli.console import check_output, quiet_warp, running, show, table
-from wlm.cli.options import Key, Original, SceneFile, Up
+from wlm.cli.options import Key, Original, SceneFile, Time, Up
 from wlm.errors import WlmError
 
 _SLIDERS = ("hour", "frame", "turn", "height", "sigma", "exposure", "error")
-_SETTINGS = ("extinction", "block")
 
 
 def view(
@@ -20,12 +19,13 @@ def view(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="A .wlm, an input of wlm compress, smoke, or six-way lightmaps (one .exr a frame).",
+            help="A .wlm, an input of wlm compress, or six-way lightmaps (one .exr a frame).",
         ),
     ],
     mesh: SceneFile = None,
     original: Original = None,
     key: Key = None,
+    time: Time = None,
     view: Annotated[
         str | None,
         typer.Option(help="Picture to show: light or tiles of lightmaps; balls, gaussians or volume of probes."),
@@ -38,7 +38,7 @@ def view(
             metavar="NAME=VALUE",
             help="Slider or setting, repeatable: hour=18.5 of lightmaps; frame=1 of smoke or of --walk; turn=DEGREES "
             "and height=DEGREES of the light of smoke, else turn of the camera; sigma=SIZE of Gaussians in standard "
-            "deviations; exposure=STOPS; error=FACTOR, 1 to 64; extinction=PER_LENGTH of smoke at density 1; "
+            "deviations; exposure=STOPS; error=FACTOR, 1 to 64; "
             "block=SIDE of the finest blocks of the volume of probes.",
         ),
     ] = None,
@@ -61,7 +61,7 @@ def view(
         typer.Option(metavar="OUT.png", help="Write a picture instead of opening a window; needs no display."),
     ] = None,
 ) -> None:
-    """Show lightmaps, probes or smoke in a window; with --original, beside the original and the error."""
+    """Show lightmaps, probes or six-way lightmaps in a window; with --original, beside the original and the error."""
     pixels = _size(size)
     values = _values(sliders or ())
     if not 0 < rate <= 1000:
@@ -74,8 +74,8 @@ def view(
     from wlm.view.window import Window
 
     need("pyvista", "view")
-    options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "flat": flat, "up": up}
-    options |= {name: values.pop(name) for name in _SETTINGS if name in values}
+    options = {"mesh": mesh, "original": original, "key": key, "time": time, "walk": walk, "flat": flat, "up": up}
+    options["block"] = values.pop("block", None)
     with running("view") as progress:
         many = len(files) > 1 or files[0].is_dir()
         scene = open_scene(files, **options, progress=progress if many else None)
@@ -108,7 +108,7 @@ def _values(texts: Sequence[str]) -> dict[str, float]:
             values[name] = float(number)
         except ValueError:
             name = ""
-        if name not in (known := (*_SLIDERS, *_SETTINGS)):
+        if name not in (known := (*_SLIDERS, "block")):
             raise WlmError(f"--set: expected NAME=NUMBER with a name of {', '.join(known)}, got {text!r}")
     return values
 

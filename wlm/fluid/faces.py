@@ -19,13 +19,10 @@ _STILL = 0  # a wall at rest
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """The boundary condition on a face of A x B cells, along the two axes of the face in the order x, y, z.
-
-    Attributes:
-        rank: int [A, B], precedence at the edges of the box, where two faces meet: the lower rank decides.
-        kind: int [A, B], kind of boundary of each cell, such as `lattice_links.BOUNCE`.
-        velocity: float64 [A, B, 3], velocity of a wall or an inlet, cells per step.
-        excess: Density minus 1 to which an outlet with a given density relaxes.
+    """The boundary condition on a face of A x B cells, along the two axes of the face in the order x, y, z: for each
+    cell the kind of boundary, such as `lattice_links.BOUNCE`; the velocity of a wall or an inlet, float64 [A, B, 3],
+    cells per step; and its rank: where two faces meet at the edges of the box, the lower decides. `excess` is the
+    density minus 1 to which an outlet with a given density relaxes.
     """
 
     rank: np.ndarray
@@ -37,15 +34,11 @@ class Face:
 def make_face(
     shape: tuple[int, int, int], name: str, kind: int, velocity=(0.0, 0.0, 0.0), density=None, where=None
 ) -> Face:
-    """Makes the condition of kind `kind`, such as `lattice_links.BOUNCE`, on a face of a box of `shape` cells.
+    """Makes the condition of kind `kind`, such as `lattice_links.BOUNCE`, on the face `name` of `FACES` of a box of
+    `shape` cells.
 
-    Args:
-        shape: Cells of the box along x, y and z.
-        name: One of `FACES`.
-        kind: The kind of boundary.
-        velocity: Velocity of a wall or an inlet in cells per step, (3,) or [A, B, 3].
-        density: Density to which an outlet relaxes, above 0; None for the other kinds.
-        where: bool [A, B], false where the face is a wall at rest instead; None: true everywhere.
+    `velocity` is that of a wall or an inlet in cells per step, (3,) or [A, B, 3]; `density`, above 0, that to which an
+    outlet relaxes; `where`, bool [A, B], is false where the face is a wall at rest instead.
     """
     if name not in FACES:
         raise ValueError(f"face: expected one of {', '.join(FACES)}, got {name!r}")
@@ -67,11 +60,7 @@ def make_face(
 
 
 def bounded_axes(faces: Mapping[str, Face]) -> tuple[int, int, int]:
-    """Returns 1 for each axis that has faces and 0 for each periodic axis.
-
-    Raises:
-        ValueError: Only one end of an axis has a face.
-    """
+    """Returns 1 for each axis that has faces and 0 for each periodic axis."""
     bounded = []
     for low, high in zip(FACES[::2], FACES[1::2], strict=True):
         if (low in faces) != (high in faces):

@@ -16,16 +16,11 @@ G = TypeVar("G")
 
 
 def run(stored: list[tuple[int, S]], steps: int, most: int, advance: Callable[[int, S], S]) -> S:
-    """Runs steps from a start, and stores the states that the backward pass needs first.
+    """Runs `steps` steps from a start, and stores the states that the backward pass needs first; returns the last
+    state.
 
-    Args:
-        stored: The start as (0, state); the stored states are appended with the number of steps before them.
-        steps: Number of steps.
-        most: Most states to store, including the start; at least 1.
-        advance: Computes the state after a step from the number of steps before it and the state then.
-
-    Returns:
-        The state after the steps.
+    `stored` begins as the start, (0, state); stored states are appended with the number of steps before them, at most
+    `most` in all. `advance` computes the state after a step from the number of steps before it and the state then.
     """
     if steps == 0:
         return stored[0][1]
@@ -40,17 +35,10 @@ def reverse(
     backward: Callable[[int, S, G], G],
     gradient: G,
 ) -> G:
-    """Runs steps backwards.
+    """Runs steps backwards, from states as `run` left them, and returns the gradient at the start.
 
-    Args:
-        stored: States as `run` left them; only the start is left in the list.
-        steps, most, advance: As for `run`.
-        backward: Computes the gradient before a step from the number of steps before it, the state then, and the
-            gradient after it.
-        gradient: The gradient after the steps.
-
-    Returns:
-        The gradient at the start.
+    `backward` computes the gradient before a step from the number of steps before it, the state then, and the gradient
+    after it; `gradient` is that after the last step. Only the start is left in `stored`.
     """
     for before in reversed(range(steps)):
         gradient = backward(before, _reach(stored, before, most, advance), gradient)

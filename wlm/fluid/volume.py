@@ -35,9 +35,8 @@ EDGE = 8
 def gather(fields: Sequence[torch.Tensor]) -> tuple[torch.Tensor, list[torch.Tensor]]:
     """Extracts the bricks of 8^3 voxels in which any of several fields [X, Y, Z] of one shape is not 0.
 
-    Returns:
-        Indices of the bricks, int32 [N], increasing, with x the slowest axis; and each field's values in them,
-        [N, 8, 8, 8], 0 in the parts of bricks outside the field.
+    Returns the bricks' indices, int32 [N], increasing, with x the slowest axis; and each field's values in them, [N, 8,
+    8, 8], 0 in the parts of bricks outside the field.
     """
     margins = [part for n in reversed(fields[0].shape) for part in (0, -n % EDGE)]
     cut = []
@@ -247,9 +246,7 @@ def load_volume(
 def thickness_hint(thickness: float, extinction: float) -> str | None:
     """Returns a line for smoke so thin that it can hardly be seen, or so thick that it looks solid; None otherwise.
 
-    Args:
-        thickness: `DensityVolume.thickness`, of several frames the largest.
-        extinction: The extinction per unit of length at density 1 that it has.
+    `thickness` is `DensityVolume.thickness`, of several frames the largest, at an `extinction` per length at density 1.
     """
     if not 0 < thickness < _THIN and not thickness > _THICK:
         return None

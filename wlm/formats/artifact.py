@@ -145,11 +145,7 @@ class Artifact:
 
 
 def write_artifact(
-    path: str | os.PathLike[str],
-    system: str,
-    settings: Mapping[str, Any],
-    parts: Mapping[str, Content],
-    source: str,
+    path: str | os.PathLike[str], system: str, settings: Mapping[str, Any], parts: Mapping[str, Content], source: str
 ) -> int:
     """Writes an artifact atomically and returns its size in bytes. Equal arguments give equal bytes; see
     `encode_artifact`.

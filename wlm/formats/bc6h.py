@@ -132,9 +132,6 @@ def decode_bc6h(blocks: np.ndarray) -> np.ndarray:
     """Decodes unsigned BC6H blocks, uint8 [B, 16], bit-exactly to half [B, 16, 3], texels row by row.
 
     Blocks of a reserved mode are black.
-
-    Raises:
-        ValueError: Wrong shape or type.
     """
     if blocks.dtype != np.uint8 or blocks.ndim != 2 or blocks.shape[1] != BLOCK_BYTES:
         raise ValueError(f"blocks: expected uint8 [B, 16], got {blocks.dtype} {blocks.shape}")

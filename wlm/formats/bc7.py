@@ -99,20 +99,11 @@ SHARES.flags.writeable = False
 
 
 def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Packs endpoints and indices into blocks.
+    """Packs endpoints, uint8 [..., 2, 4], RGBA, and indices, uint8 [..., 16] in 0..15, row-major, into blocks, uint8
+    [..., 16]; the four bytes of an endpoint share their lowest bit.
 
-    The file requires an index below 8 for texel 0. Where it is larger, the endpoints are swapped and the indices
-    become 15 - index, which decodes to the same texels.
-
-    Args:
-        endpoints: uint8 [..., 2, 4], RGBA; the four bytes of an endpoint share their lowest bit.
-        indices: uint8 [..., 16] in 0..15, row-major.
-
-    Returns:
-        The blocks, uint8 [..., 16].
-
-    Raises:
-        ValueError: Wrong shapes or types, an index above 15, or an endpoint without a shared lowest bit.
+    The file requires an index below 8 for texel 0. Where it is larger, the endpoints are swapped and the indices become
+    15 - index, which decodes to the same texels.
     """
     if endpoints.dtype != np.uint8 or indices.dtype != np.uint8:
         raise ValueError(f"endpoints, indices: expected uint8, got {endpoints.dtype} and {indices.dtype}")
@@ -134,12 +125,7 @@ def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
 
 
 def unpack_mode6(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the endpoints, uint8 [..., 2, 4], and indices, uint8 [..., 16], of blocks; the inverse of `pack_mode6`.
-
-    Raises:
-        ValueError: Wrong shape or type.
-        WlmError: A block is of another mode.
-    """
+    """Reads the endpoints, uint8 [..., 2, 4], and indices, uint8 [..., 16], of blocks; the inverse of `pack_mode6`."""
     if blocks.dtype != np.uint8 or blocks.shape[-1:] != (BLOCK_BYTES,):
         raise ValueError(f"blocks: expected uint8 [..., 16], got {blocks.dtype} {blocks.shape}")
     words = np.ascontiguousarray(blocks).view("<u8").astype(np.uint64)
@@ -160,9 +146,6 @@ def decode_image(blocks: np.ndarray) -> np.ndarray:
     """Decodes images of blocks of any mode, uint8 [..., R, C, 16], bit-exactly to RGBA, uint8 [..., 4 R, 4 C, 4].
 
     Blocks whose first byte is 0, which the format reserves, become black.
-
-    Raises:
-        ValueError: Wrong shape or type.
     """
     if blocks.dtype != np.uint8 or blocks.ndim < 3 or blocks.shape[-1] != BLOCK_BYTES:
         raise ValueError(f"blocks: expected uint8 [..., H/4, W/4, 16], got {blocks.dtype} {blocks.shape}")
@@ -174,14 +157,10 @@ def decode_image(blocks: np.ndarray) -> np.ndarray:
 
 def encode_image(picture: np.ndarray, extra: str, profile: str = "slow") -> np.ndarray:
     """Encodes an opaque image, uint8 [H, W, 3] with sizes in multiples of 4, by Intel's ISPC texture compressor, in one
-    thread.
+    thread; returns blocks, uint8 [H/4, W/4, 16].
 
-    Args:
-        extra: Name of the optional extra of wlm that installs the compressor, for the error message.
-        profile: Quality of the compressor: "ultrafast", "veryfast", "fast", "basic" or "slow".
-
-    Returns:
-        The blocks, uint8 [H/4, W/4, 16].
+    `extra` names the extra of wlm that installs the compressor, `profile` its quality: "ultrafast", "veryfast", "fast",
+    "basic" or "slow".
     """
     texcomp = need("ispc_texcomp", extra)
     height, width = picture.shape[:2]

@@ -34,14 +34,9 @@ def read_channels(
 ) -> tuple[np.ndarray, tuple[str, ...], bool]:
     """Reads all channels of an EXR file, a picture of integers, or another picture of light.
 
-    Args:
-        path: The file.
-        notes: Each assumption and conversion adds a line.
-        light: Whether the colours are light, which is converted to the primaries of Rec. 709.
-
-    Returns:
-        The pixels, float32 [H, W, C], the top row first; the channel names, R, G, B and A first; and whether the values
-        are integers, scaled to [0, 1].
+    Each assumption and conversion adds a line to `notes`; with `light` the colours are light, which is converted to the
+    primaries of Rec. 709. Returns the pixels, float32 [H, W, C], the top row first; the channel names, R, G, B and A
+    first; and whether the values are integers, scaled to [0, 1].
     """
     notes = [] if notes is None else notes
     with open_file(path, "the picture") as file:
@@ -53,13 +48,8 @@ def read_channels(
 
 
 def read_encoded(path: str | os.PathLike[str], encoding: str, notes: list[str] | None = None) -> np.ndarray:
-    """Reads the light of a picture by an encoding of the module's table: linear, float32 [H, W, 3], the top row first.
-
-    Args:
-        path: The file.
-        encoding: The encoding, such as "srgb" or "rgbm:16:1".
-        notes: Each assumption, and each doubt about the encoding, adds a line.
-    """
+    """Reads the light of a picture by an encoding of the module's table, such as "srgb" or "rgbm:16:1": linear, float32
+    [H, W, 3], the top row first. Each assumption, and each doubt about the encoding, adds a line to `notes`."""
     notes = [] if notes is None else notes
     name, largest, gamma = parse_encoding(encoding)
     if name == _LAYER:

@@ -88,11 +88,6 @@ def write_dds(
         depth: Slices of a volume, 1 to 2048, slice by slice in `data`; 0: a 2D texture.
         mips: Number of mip levels after the full-size one, each of half the size rounded down; they follow in `data`.
         layers: Number of layers of an array of 2D textures, 1 to 2048, layer by layer in `data`; 0: no array.
-
-    Raises:
-        ValueError: The format is unknown; a size, the mips or the layers are out of range; slices, mips and layers are
-            combined; or the data does not fill the texture.
-        WlmError: The file cannot be written; the old content stays.
     """
     if fmt not in DXGI_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(DXGI_FORMATS)}, got {fmt}")

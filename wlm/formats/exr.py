@@ -64,16 +64,11 @@ def read_exr(
 def read_every_channel(
     path: str | os.PathLike[str], notes: list[str] | None = None, light: bool = False
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads all channels of an EXR file, over its display window; `read_exr` explains `notes`.
+    """Reads all channels of an EXR file, over its display window; each conversion adds a line to `notes`.
 
-    Args:
-        path: The file.
-        notes: Each conversion adds a line.
-        light: Whether the colours of each layer are light, which is converted to the primaries of Rec. 709.
-
-    Returns:
-        The pixels, float32 [H, W, C], and the names of the channels: R, G, B and A first, others sorted. In a file of
-        several parts, a name begins with that of its part, such as "beauty.R".
+    With `light` the colours of each layer are light, which is converted to the primaries of Rec. 709. Returns the
+    pixels, float32 [H, W, C], and the names of the channels: R, G, B and A first, others sorted. In a file of several
+    parts, a name begins with that of its part, such as "beauty.R".
     """
     notes = [] if notes is None else notes
     channels, first = _channels(path), (*_COLOUR, _ALPHA)
@@ -238,10 +233,6 @@ def write_exr(
 
     With `half` they are rounded to half floats: values beyond their range, infinity included, become +-65504; NaN
     stays. `note` is a JSON object for the header.
-
-    Raises:
-        ValueError: The pixels' shape is not [H, W, 3 or 4].
-        WlmError: The file cannot be written; the old content stays.
     """
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or 0 in pixels.shape:
         raise ValueError(f"expected pixels [H, W, 3 or 4], got {pixels.shape}")
@@ -263,10 +254,6 @@ def write_planes(
         planes: [H, W] each, linear, not empty; the keys name the channels.
         note: JSON object that is stored in the header.
         whole: Names of the planes that stay float32. The others become half floats, clamped to +-65504.
-
-    Raises:
-        ValueError: The planes differ in shape.
-        WlmError: The file cannot be written; the old content stays.
     """
     shapes = {np.shape(plane) for plane in planes.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):

@@ -34,11 +34,8 @@ MOST_SLICES = 2048
 class Layout:
     """Memory layout of a texel format.
 
-    Attributes:
-        channels: Channels of a decoded texel: 3, or 4 with alpha.
-        size: Bytes of a texel, or of a block.
-        decode: Decodes whole rows of whole blocks to half or float [rows, columns, channels].
-        block: Width and height of a block in texels.
+    It states the channels of a decoded texel, 3, or 4 with alpha; the bytes of a texel or of a block, and a block's
+    width and height in texels. `decode` decodes whole rows of whole blocks to half or float [rows, columns, channels].
     """
 
     channels: int
@@ -143,9 +140,6 @@ def mip_bytes(fmt: str, width: int, height: int, mips: int, most: int | None = N
     """Returns the bytes of each mip level of a picture, the largest first.
 
     `mips` is the number of levels after the largest one, and `most` their largest number; None: down to one texel.
-
-    Raises:
-        ValueError: A side is not 1 to `MOST_SIDE`, or `mips` is out of range.
     """
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE):
         raise ValueError(f"expected a width and a height of 1 to {MOST_SIDE} texels, got {width}x{height}")

@@ -66,16 +66,13 @@ def made_parents(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def staged(folder: Path, index: str, format_name: str) -> Iterator[Path]:
-    """Yields a temporary folder beside the real one, and moves its files into the real one if nothing went wrong.
+    """Yields a temporary folder beside the real one, which is made if it does not exist, and moves its files into the
+    real one if nothing went wrong.
 
-    The files may lie in subfolders. The index is moved last, with their names as its entry "files"; files that the
-    index of an earlier output lists and the new one lacks are removed. If the move is interrupted, the folder's index
-    is marked `UNFINISHED`: it cannot be read, but it can be written again.
-
-    Args:
-        folder: The folder; made if it does not exist.
-        index: Name of the index file, which the block has to write.
-        format_name: The index's `format`.
+    The files may lie in subfolders. The block has to write the index, whose `format` is `format_name`. It is moved
+    last, with the files' names as its entry "files"; files that the index of an earlier output lists and the new one
+    lacks are removed. If the move is interrupted, the folder's index is marked `UNFINISHED`: it cannot be read, but it
+    can be written again.
     """
     with locked(folder):
         claim(folder, index, format_name)
@@ -138,11 +135,7 @@ def write_index(path: Path, content: dict[str, Any]) -> int:
 
 
 def compact_json(content: Any) -> str:
-    """Returns JSON text with one key per line, and each list of numbers on one line.
-
-    Raises:
-        ValueError: A number is NaN or infinite.
-    """
+    """Returns JSON text with one key per line, and each list of numbers on one line."""
     text = json.dumps(content, indent=1, allow_nan=False)
     # Otherwise each number would have its own line. JSON strings hold no raw line break, so they are not changed.
     return _NUMBERS.sub(lambda match: "[" + " ".join(match[1].split()) + "]", text) + "\n"

@@ -65,9 +65,7 @@ _OVERHEAD = 512  # cost of a primitive under a node, in corners
 _LARGEST_TRANSFORM = 1e9  # magnitude of the numbers of a texture transform
 _MOVES, _UNMOVED = {"matrix", "translation", "rotation", "scale"}, np.eye(4)
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
-_REFUSED = {
-    "EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance",
-}
+_REFUSED = {"EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,15 +128,10 @@ class GltfPrimitive:
 
 
 def read_gltf(path: str | os.PathLike[str], trust: bool = False) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Reads a `.glb` or `.gltf` file, recognised by its first bytes.
+    """Reads a `.glb` or `.gltf` file, recognised by its first bytes; `GltfDocument` explains `trust`.
 
-    Args:
-        path: The file.
-        trust: See `GltfDocument`.
-
-    Returns:
-        The document, and the primitives with triangles that its scene draws (the default scene, else the first scene,
-        else all nodes), in depth-first order of the nodes.
+    Returns the document, and the primitives with triangles that its scene draws (the default scene, else the first
+    scene, else all nodes), in depth-first order of the nodes.
     """
     return parse_gltf(path, read_file(path, MESH_BYTES, "the glTF file"), trust)
 
@@ -186,16 +179,11 @@ def document_from_arrays(
 def document_from_meshes(
     meshes: Sequence[Arrays], name: str, uv_set: int = 0
 ) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Makes a glTF document of several meshes, each with its own node.
+    """Makes a glTF document of several meshes, at least one, each with its own node; returns it with its primitives,
+    one for each mesh.
 
-    Args:
-        meshes: At least one: name; positions [V, 3], stored as float32; triangles int [F, 3], at least one; and UVs
-            [V, 2], u right, v down, stored as float32 in all UV sets up to `uv_set`.
-        name: Name of the document.
-        uv_set: n of the last `TEXCOORD_n`.
-
-    Returns:
-        The document and its primitives, one for each mesh.
+    A mesh has a name; positions [V, 3], stored as float32; triangles int [F, 3], at least one; and UVs [V, 2], u right,
+    v down, stored as float32 in all UV sets up to `TEXCOORD_n` with n = `uv_set`.
     """
     views, accessors, data, primitives = [], [], [], []
     nodes, trees, start = [], [], 0

@@ -35,15 +35,10 @@ def usual_set(primitives: Sequence[GltfPrimitive]) -> int:
 def lightmap_transform(
     document: GltfDocument, primitive: GltfPrimitive, uv_set: int, lightmap: str = ""
 ) -> tuple[str, tuple[float, ...]]:
-    """Finds the texture transform that applies to lightmap UVs.
+    """Finds the texture transform that applies to lightmap UVs, those of `TEXCOORD_n` with n = `uv_set`.
 
-    Args:
-        document, primitive: From `read_gltf`.
-        uv_set: n of `TEXCOORD_n`, which the primitive has.
-        lightmap: Name of the lightmap without its suffix; "" if it is not known.
-
-    Returns:
-        The name of the slot, "" for none; and the rows of the matrix [2, 3] that moves (u, v, 1).
+    `lightmap` is the name of the lightmap without its suffix, "" if it is not known. Returns the name of the slot, ""
+    for none, and the rows of the matrix [2, 3] that moves (u, v, 1).
     """
     attributes = document.item("meshes", primitive.mesh)["primitives"][primitive.primitive]["attributes"]
     quantised = document.item("accessors", attributes[f"TEXCOORD_{uv_set}"])["componentType"] != _FLOAT

@@ -64,12 +64,9 @@ _DEEPEST = 32
 
 @dataclass(frozen=True)
 class GodotUser:
-    """A mesh that uses a lightmap.
-
-    Attributes:
-        node: Path of its node, with "/" between names.
-        rectangle: x, y, width, height: UV2 is scaled by the last two and offset by the first two, v down.
-        slice: Index of the slice, counted through all textures.
+    """A mesh that uses a lightmap: path of its node with "/" between names; the rectangle x, y, width, height, by whose
+    last two UV2 is scaled and by whose first two it is offset, v down; index of the slice, counted through all
+    textures.
     """
 
     node: str
@@ -79,13 +76,8 @@ class GodotUser:
 
 @dataclass(frozen=True)
 class GodotUsers:
-    """The lightmaps of a bake and their users.
-
-    Attributes:
-        textures: Godot's names of the pictures (res://...).
-        users: The users in the order of the file.
-        directional: Whether each slice has four parts: one of light and three of directions.
-    """
+    """The lightmaps of a bake, by Godot's names of the pictures (res://...), and their users in the order of the file.
+    If they are directional, each slice has four parts: one of light and three of directions."""
 
     textures: tuple[str, ...]
     users: tuple[GodotUser, ...]
@@ -123,11 +115,10 @@ def read_users(path: str | os.PathLike[str]) -> GodotUsers:
 
 
 def read_lmbake(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the light probes of a Godot 4 lightmap bake.
+    """Reads the light probes of a Godot 4 lightmap bake, at least one.
 
-    Returns:
-        The positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB (the module's
-        description defines them); N is at least 1.
+    Returns the positions, float64 [N, 3] in metres, and the stored coefficients, float32 [N, 9, 3] in RGB, which the
+    module's description defines.
     """
     points, colours, _, _ = _read(path)
     return points, colours.reshape(len(points), COEFFICIENTS, 4)[..., :3].copy()

@@ -86,12 +86,11 @@ class Astc:
 
 
 def astc(block: tuple[int, int], quality: float, extra: str) -> Astc:
-    """Returns the ASTC codec of the HDR profile with the given settings; equal settings share one codec.
+    """Returns the ASTC codec of the HDR profile for blocks of one of `ASTC_BLOCKS` texels; equal settings share one
+    codec.
 
-    Args:
-        block: Width and height of a block in texels, one of `ASTC_BLOCKS`.
-        quality: Effort of the encoder, 0 (fastest) to 100 (exhaustive); decoding does not depend on it.
-        extra: Name of the optional extra of wlm that installs the encoder, for the error message.
+    `quality` is the effort of the encoder, 0 (fastest) to 100 (exhaustive), and `extra` names the extra of wlm that
+    installs it.
     """
     return _astc(need("astc_encoder", extra), block, quality)
 

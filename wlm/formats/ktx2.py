@@ -91,11 +91,6 @@ def write_ktx2(
 
     Returns:
         The number of bytes written.
-
-    Raises:
-        ValueError: The format is unknown, a size or the number of mips is out of range, a 3D texture has mips, or the
-            data does not fill the texture.
-        WlmError: The file cannot be written; the old content stays.
     """
     if fmt not in VK_FORMATS:
         raise ValueError(f"fmt: expected one of {', '.join(VK_FORMATS)}, got {fmt}")
@@ -175,13 +170,11 @@ def _basic_block(model: int, side: int, texel_bytes: int, samples: list[bytes]) 
 
 
 def read_ktx2(path: str | os.PathLike[str], notes: list[str] | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the largest mip of a KTX2 texture of light, plain or compressed by zstd or zlib.
+    """Reads the largest mip of a KTX2 texture of light, plain or compressed by zstd or zlib; returns the pixels,
+    float32 [H, W, 3 or 4], and the channel names.
 
     The first row of the result is the top one, whatever `KTXorientation` states. The alpha of ASTC is ignored. Other
     primaries are converted to Rec. 709, which adds a line to `notes`.
-
-    Returns:
-        The pixels, float32 [H, W, 3 or 4], and the channel names.
     """
     pixels, layout, right, down = _read(path, False, [] if notes is None else notes)
     return np.ascontiguousarray(pixels[0, :: 1 if down else -1, :: 1 if right else -1]), layout.names

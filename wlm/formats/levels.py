@@ -60,18 +60,12 @@ def read_levels(
     entries: dict[Any, Any] | None = None,
     sure: int = PICTURE_BYTES,
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a picture of integers.
+    """Reads a picture of integers of a kind of `level_kind`.
 
-    Args:
-        path: The file.
-        kind: Its kind, of `level_kind`.
-        notes: A line is added if the file states an orientation, which is ignored.
-        entries: Receives what Pillow finds in the file besides the pixels, such as the texts of a PNG by name.
-        sure: Decoded bytes that are allowed for any size of file.
-
-    Returns:
-        The levels, float32 [H, W, C] in [0, 1], the top row first, and the names of the channels: L, or R, G and B,
-        then A if there is alpha.
+    `notes` gets a line if the file states an orientation, which is ignored; `entries` receives what Pillow finds
+    besides the pixels, such as the texts of a PNG by name; `sure` are decoded bytes that are allowed for any size of
+    file. Returns the levels, float32 [H, W, C] in [0, 1], the top row first, and the names of the channels: L, or R, G
+    and B, then A if there is alpha.
     """
     if kind == "TIFF":
         pixels, names = tiff.read_tiff(path, notes)

@@ -59,14 +59,11 @@ _FIRST = 12  # bytes that identify a format
 
 
 def read_light(path: str | os.PathLike[str], notes: _Notes | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a picture of linear light in the primaries of Rec. 709, whatever its suffix.
+    """Reads a picture of linear light in the primaries of Rec. 709, whatever its suffix, float32 [H, W, 3 or 4], the
+    top row first; returns it and the names of the channels, ("R", "G", "B") or ("R", "G", "B", "A").
 
     NaN, infinity and negative values are kept: the caller checks them. Each assumption and each conversion adds a line
     to `notes`.
-
-    Returns:
-        The pixels, float32 [H, W, 3 or 4], the top row first, and the names of the channels, ("R", "G", "B") or ("R",
-        "G", "B", "A").
     """
     with open_file(path, "the lightmap") as file:
         first = file.read(_FIRST)
@@ -88,12 +85,8 @@ def read_light(path: str | os.PathLike[str], notes: _Notes | None = None) -> tup
 
 
 def noted(labels: Sequence[str], notes: Sequence[Sequence[str]]) -> list[str]:
-    """Returns the notes about several files, one line for each text: the first file that has it, and how many more do.
-
-    Args:
-        labels: The name of each file.
-        notes: The lines about each file, as `read_light` adds them.
-    """
+    """Returns the notes about several files, the lines that `read_light` adds, one line for each text: the label of the
+    first file that has it, and how many more do."""
     found: dict[str, list[str]] = {}
     for label, lines in zip(labels, notes, strict=True):
         for line in lines:

@@ -31,16 +31,10 @@ def read_npz(
     numbers: int,
     sure: int = SURE_BYTES,
 ) -> dict[str, np.ndarray]:
-    """Reads arrays of a `.npz` file.
+    """Reads arrays of a `.npz` file by name; none of them contains Python objects.
 
-    Args:
-        path: The file.
-        choose: Gets the names of all arrays and returns those to read; may raise WlmError.
-        numbers: Largest allowed number of values in an array.
-        sure: Size in bytes that an array may have however small its compressed data is; see `check_growth`.
-
-    Returns:
-        The selected arrays by name. None of them contains Python objects.
+    `choose` gets the names of all arrays and returns those to read. An array has at most `numbers` values; `sure` is
+    its size in bytes that is allowed however small its compressed data is, see `check_growth`.
     """
     # A malicious file can make zipfile and NumPy raise nearly any exception: NumPy parses the header as Python.
     with damaged(f"{path}: cannot read the arrays", Exception), open_file(path, "the arrays") as file:

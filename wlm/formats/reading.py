@@ -166,15 +166,11 @@ def damaged(message: str, *errors: type[Exception]) -> Iterator[None]:
 
 
 def named_file(document: str | os.PathLike[str], name: str, where: str, trust: bool = False) -> Path:
-    """Returns the path of a file that a document names, which must be inside the document's folder, links resolved.
+    """Returns the path of a file that a document names, which must be inside the document's folder, links resolved,
+    unless the document is trusted.
 
-    An untrusted document could otherwise make this package read any file and copy it into an output.
-
-    Args:
-        document: The file that names another file.
-        name: Path relative to the folder of the document.
-        where: The document and its field, for messages.
-        trust: Whether the file may be outside the folder.
+    An untrusted document could otherwise make this package read any file and copy it into an output. `name` is relative
+    to the folder of the document; `where` names the document and its field in messages.
     """
     if len(name) > _LONGEST_NAME:
         raise WlmError(f"{where}: expected a name of at most {_LONGEST_NAME} characters, found {len(name)}")

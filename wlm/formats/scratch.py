@@ -16,20 +16,12 @@ _PIECE = 1 << 24
 
 
 def room(shape: tuple[int, ...], dtype: type[np.generic] | np.dtype, where: str, beside: int = 0) -> np.ndarray:
-    """Makes an array of zeros, in memory or mapped from a file.
+    """Makes an array of zeros, in memory or mapped from a file; `where` is its purpose for messages, and `beside` are
+    bytes of other arrays, which count towards the limit of memory, `IN_MEMORY`.
 
     The system moves parts of a mapped array to the disk when memory is short. The file has no name, so that nothing
     remains however the process ends. All of its space is allocated at once, since a disk that fills up later would end
     the process without a message.
-
-    Args:
-        shape: Shape of the array.
-        dtype: Type of its values.
-        where: Purpose of the array for messages.
-        beside: Bytes of other arrays, which count towards the limit of memory, `IN_MEMORY`.
-
-    Returns:
-        An ordinary array.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     try:

@@ -13,14 +13,8 @@ _SCALE = np.ldexp(np.float32(1), np.arange(32) - 24)
 
 
 def pack_rgb9e5(light: np.ndarray) -> np.ndarray:
-    """Packs linear RGB into RGB9E5 words.
-
-    Args:
-        light: [..., 3], finite; clamped to [0, `LARGEST`].
-
-    Returns:
-        uint32 [...]; the error is at most 1/512 of the largest channel of a texel.
-    """
+    """Packs linear RGB [..., 3], finite, clamped to [0, `LARGEST`], into RGB9E5 words, uint32 [...]; the error is at
+    most 1/512 of the largest channel of a texel."""
     light = np.clip(np.asarray(light, np.float64), 0.0, LARGEST)
     largest = light.max(-1)
     # The mantissa largest / 2 ** (exponent - 24) must be below 512.

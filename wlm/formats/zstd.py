@@ -82,9 +82,8 @@ def inflate(data: bytes, size: int, name: str) -> bytes:
 def pack_parts(parts: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], Shapes]:
     """Compresses each part of an artifact, unless that would make it larger.
 
-    Returns:
-        The parts, compressed ones as frames, uint8 [bytes], and the shapes of the compressed parts. A part that
-        compresses so well that `unpack_parts` would refuse it stays uncompressed too.
+    Returns the parts, compressed ones as frames, uint8 [bytes], and the shapes of the compressed parts. A part that
+    compresses so well that `unpack_parts` would refuse it stays uncompressed too.
     """
     result, shapes = dict(parts), {}
     for name, part in parts.items():

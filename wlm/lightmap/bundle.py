@@ -103,14 +103,7 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
     holds F_ut and F_vt side by side (neural-dynamic-gi, table 1), `frames` (BC7) has a layer for each stored time, and
     `valid` is 255 inside charts. BC7 blocks are copied from the model without re-encoding. The buffer `networks`,
     float32 [n, 4], holds the weights, and `hours` the result of `hour_tables`. The reference image `frame` is the map
-    at the first stored time.
-
-    Args:
-        sheet: The sheet.
-        model: Its model.
-        name: Name of the bundle.
-        source: Hash of the input.
-        device: Device that decodes the reference image.
+    at the first stored time, decoded on `device`.
     """
     textures = {key: texture for encoding in ENCODINGS for key, texture in encoding.textures(model).items()}
     for key, texture in textures.items():
@@ -136,20 +129,12 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
 
 
 def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:
-    """Computes the tables that the shader reads, one for each given hour.
+    """Computes the tables that the shader reads for stored times, or for any times if the model interpolates with the
+    network (`Profile.interpolation`): float32 [times, rows, 4], two rows, then `record_fours` rows for each tile.
 
     The bundle's JSON document describes the content of a table under "about" and "hours". In addition, the fourth
-    number of a table is the number of tile columns of the grid.
-
-    Args:
-        model: The sheet.
-        times: Stored times, or any times if the model interpolates with the network (`Profile.interpolation`).
-
-    Returns:
-        float32 [times, rows, 4]: two rows, then `record_fours` rows for each tile.
-
-    Raises:
-        ValueError: A time lies between two stored times, and the model blends their radiance, which needs two tables.
+    number of a table is the number of tile columns of the grid. Raises a ValueError for a time between two stored times
+    if the model blends their radiance, which needs two tables.
     """
     axis, profile, size = model.axis, model.profile, record_fours(model)
     tables = np.zeros((len(times), HEAD + model.kind.size * size, 4), np.float32)

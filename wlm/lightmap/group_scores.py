@@ -41,11 +41,7 @@ class SumScore(Summary):
 
 
 def score_sums(
-    model: LightmapModel,
-    lightmaps: LightmapSet,
-    all_lights: LightmapSet | None,
-    device: str,
-    metrics: Sequence[str],
+    model: LightmapModel, lightmaps: LightmapSet, all_lights: LightmapSet | None, device: str, metrics: Sequence[str]
 ) -> list[SumScore]:
     """Scores the sum of the groups of each sheet of light.
 
@@ -92,12 +88,8 @@ def score_sums(
 
 
 def sum_of(lightmaps: LightmapSet, sheet: Sheet) -> SheetFrames:
-    """Returns the sum of the light groups of an input as one sheet, at the times of all of them.
-
-    Args:
-        lightmaps: The input.
-        sheet: The sheet of any of its groups.
-    """
+    """Returns the sum of the light groups of an input as one sheet, at the times of all of them; `sheet` is that of any
+    of its groups."""
     groups = in_groups(lightmaps.sheets, sheet)
     first, times = next(iter(groups.values())), times_of(groups)
     if len(groups) == 1:

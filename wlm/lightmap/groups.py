@@ -48,12 +48,7 @@ def groups_of(sheets: Iterable[Sheet]) -> tuple[str, ...]:
 
 
 def in_groups(sheets: Mapping[Sheet, T], sheet: Sheet) -> dict[Sheet, T]:
-    """Returns the entries of one sheet in all groups that have it.
-
-    Args:
-        sheets: Sheets of a set or a model.
-        sheet: The sheet of any of the groups.
-    """
+    """Returns the entries of one sheet, given as that of any group, in all groups that have it."""
     return {one: own for one, own in sheets.items() if one.plain == sheet.plain}
 
 
@@ -70,13 +65,7 @@ def times_of(sheets: Mapping[Sheet, Timed]) -> np.ndarray:
 def changed_weights(
     where: str, weights: Mapping[str, np.ndarray], changes: Mapping[str, Weight]
 ) -> dict[str, np.ndarray]:
-    """Returns weights by group, float32 [3], with some of them replaced.
-
-    Args:
-        where: Name of the model, for messages.
-        weights: The weights of all groups.
-        changes: The new weights by group.
-    """
+    """Returns weights by group, float32 [3], with some of them replaced; `where` names the model in messages."""
     result = dict(weights)
     for group, given in changes.items():
         if group not in result:

@@ -51,12 +51,8 @@ def score_held_out(
 ) -> HeldOut | None:
     """Scores a sheet at the times that its model does not store; None if there are none.
 
-    Args:
-        model: The sheet.
-        stored: Its input at the stored times, from `stored_part`.
-        whole: The whole input.
-        device: Device that decodes.
-        metrics: Any of `wlm.metrics.METRICS`.
+    `stored` is its input at the stored times, from `stored_part`, and `whole` the whole input; `metrics` are any of
+    `wlm.metrics.METRICS`.
     """
     held = np.setdiff1d(np.arange(len(whole.times)), at_times(whole.times, stored.times))
     if not len(held):

@@ -21,15 +21,11 @@ _COINCIDE = 0.2  # share of a border that coincides beyond chance in frames of o
 
 
 def odd_layout(count: int, lit: Callable[[int], np.ndarray]) -> tuple[int, int] | None:
-    """Finds two frames that belong to different atlases.
+    """Finds two of `count` frames that belong to different atlases; returns their indices, or None if all may belong to
+    one atlas, or if too few texels are dark to tell.
 
-    Args:
-        count: Number of frames.
-        lit: Returns the texels of a frame that have light or belong to a chart, bool [H, W]; called for at most 8
-            evenly spaced frames.
-
-    Returns:
-        The indices of the two frames; None if all may belong to one atlas, or if too few texels are dark to tell.
+    `lit` returns the texels of a frame that have light or belong to a chart, bool [H, W]; it is called for at most 8
+    evenly spaced frames.
     """
     chosen = spread(count, PICTURES)
     pictures = [lit(i) for i in chosen]

@@ -15,13 +15,10 @@ from wlm.lightmap.sheet import Sheet
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """A tile that was loaded, or the reason why it was not.
+    """A tile that was loaded, by sheet and number, or the line of the error of a damaged file.
 
-    Attributes:
-        sheet, number: The sheet and the number of the tile in its grid.
-        tile: The sheet with this tile alone: its arrays have one row, as they are uploaded. None after an error.
-        error: The error of a damaged file in one line; None of a tile.
-        prepared: The result of the loader's `prepare`; None without it.
+    `tile` is the sheet with this tile alone: its arrays have one row, as they are uploaded. `prepared` is the result of
+    the loader's `prepare`, None without it.
     """
 
     sheet: Sheet
@@ -42,10 +39,7 @@ class TileLoader:
     """
 
     def __init__(
-        self,
-        model: LightmapModel,
-        most: int = 64,
-        prepare: Callable[[Sheet, int, SheetModel], Any] | None = None,
+        self, model: LightmapModel, most: int = 64, prepare: Callable[[Sheet, int, SheetModel], Any] | None = None
     ) -> None:
         """Starts the thread.
 
@@ -67,15 +61,9 @@ class TileLoader:
         self._thread.start()
 
     def request(self, sheet: Sheet, number: int, priority: float = 0.0) -> bool:
-        """Asks for a tile, or changes the priority of a tile that waits.
-
-        Args:
-            sheet: The sheet.
-            number: Number of the tile in the sheet's grid.
-            priority: Tiles of higher priority come first, and of equal priority in the order of their requests.
-
-        Returns:
-            False if the request was dropped, since `most` requests wait that are at least as important.
+        """Asks for a tile, or changes the priority of a tile that waits: higher ones come first, equal ones in the
+        order of their requests. Returns False if the request was dropped, since `most` requests wait that are at least
+        as important.
         """
         self._check(sheet, number)
         with self._change:
@@ -116,12 +104,9 @@ class TileLoader:
             raise WlmError(f"{self._model.name}: expected an open loader, got one that was closed")
 
     def cancel(self, sheet: Sheet | None = None, number: int | None = None) -> int:
-        """Drops waiting requests: of one tile, of all tiles of a sheet, or all.
+        """Drops waiting requests, of one tile, of all tiles of a sheet, or all, and returns their number.
 
         A tile that is being read, and results that nobody has taken, are not affected.
-
-        Returns:
-            The number of requests that were dropped.
         """
         with self._change:
             dropped = [tile for tile in self._waiting if sheet in (None, tile[0]) and number in (None, tile[1])]

@@ -62,15 +62,11 @@ _KINDS = {
 
 
 def encode_scale(values: np.ndarray, gamma: float, up: bool = False) -> np.ndarray:
-    """Encodes values >= 0 as 8-bit logarithmic codes: code 0 is 0, codes 1 to 255 divide `SCALE_SPAN` evenly.
+    """Encodes values >= 0 in gamma space, of any shape, as 8-bit logarithmic codes: code 0 is 0, codes 1 to 255 divide
+    `SCALE_SPAN` evenly; `up` rounds up, for upper bounds.
 
     At gamma 2.2 one step is 4.7%. The span is fixed, so that the bytes of a tile do not depend on other tiles. Values
     above 0 but below the span take code 1.
-
-    Args:
-        values: Any shape, in gamma space.
-        gamma: Gamma of that space.
-        up: Whether to round up, for upper bounds, instead of to the nearest code.
     """
     low, high = (bound / gamma for bound in SCALE_SPAN)
     with np.errstate(divide="ignore"):
@@ -95,15 +91,11 @@ def tiles_of(kind: np.ndarray, kinds: Iterable[TileKind]) -> np.ndarray:
 
 
 def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part]:
-    """Returns the types and shapes of the arrays of a sheet.
+    """Returns the types and shapes of the arrays of a sheet with tiles of the given `TileKind`s, uint8 [tiles], at T =
+    `times` times.
 
     N_m tiles have feature maps (static and dynamic tiles, by rising number) and N_d of them are dynamic, with temporal
     maps; N_c tiles are constant and N_f are stored as frames.
-
-    Args:
-        profile: The settings.
-        kind: uint8 [tiles], `TileKind` of each tile of the grid.
-        times: T, the number of stored times.
     """
     _, constant, static, dynamic, framed = np.bincount(kind, minlength=len(TileKind)).tolist()
     mapped, r = dynamic + static, profile.uvt_resolution // 4

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from wlm.errors import WlmError
+from wlm.formats.hours import neighbours
 from wlm.lightmap.sheet import Sheet
 from wlm.system import Settings
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
@@ -110,13 +111,10 @@ class Profile(Settings):
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """Converts times to positions on the time axis of the feature maps; see `Profile.time_axis`.
+    """Converts times, float64 [T], increasing, to positions on the time axis of the feature maps.
 
-    Attributes:
-        times: float64 [T], increasing.
-        period: Length of the day in the unit of the times; None if the set is not periodic.
-        kind: "paper" or "frames", see `Profile.time_axis`.
-        interpolation: "radiance" or "network", see `Profile.interpolation`.
+    `period` is the length of the day, None if the set is not periodic; for `kind` see `Profile.time_axis`, for
+    `interpolation` the setting of this name.
     """
 
     times: np.ndarray
@@ -144,19 +142,7 @@ class TimeAxis:
 
     def neighbours(self, t: float) -> tuple[int, int, float]:
         """Returns the indices of the stored times before and after t, and the weight of the later one, 0 to 1."""
-        t = self.wrap(t)
-        n = len(self.times)
-        if n == 1:
-            return 0, 0, 0.0
-        after = int(np.searchsorted(self.times, t, side="right"))
-        before = after - 1
-        if self.period is None:
-            before, after = max(before, 0), min(after, n - 1)
-            gap = self.times[after] - self.times[before]
-            return before, after, float((t - self.times[before]) / gap) if gap > 0 else 0.0
-        before, after = before % n, after % n
-        gap = (self.times[after] - self.times[before]) % self.period or self.period
-        return before, after, float(((t - self.times[before]) % self.period) / gap)
+        return neighbours(self.times, self.period, self.wrap(t))
 
     def place(self, t: float) -> float:
         """Returns tau in [0, 1], the position on the time axis at which the feature maps are read for time t."""

@@ -35,10 +35,8 @@ from wlm_kernels.lightmap import matrix_decode, output, texture
 class RuntimeDecoder:
     """Base class: decodes all tiles of one kind on a device at a time that `set_time` chooses.
 
-    Attributes:
-        numbers: int [n], numbers of the tiles in the grid, in the order of `out`.
-        out: `wp.array` uint32 [n, 128, 128], written by `decode`: 8-bit RGBA with R in the lowest byte and alpha 255;
-            or RGB9E5.
+    `decode` writes `out`, `wp.array` uint32 [n, 128, 128], in the order of the tiles' `numbers`: 8-bit RGBA with R in
+    the lowest byte and alpha 255; or RGB9E5.
     """
 
     _tiles: MapTiles | FrameTiles
@@ -55,15 +53,13 @@ class RuntimeDecoder:
         return wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.uint32, device=self.device)
 
     def set_time(self, time: float) -> None:
-        """Sets the time of the following decodes.
+        """Sets the time of the following decodes, in the unit of the set's times, stored or between; see
+        `wlm.lightmap.decode.SheetDecoder`.
 
         A CUDA graph that was captured before must be captured again, because the position on the time axis is an
         argument of the launches. Between two stored times, each decode decodes the light of both times and
         interpolates. A renderer that keeps the light of both and interpolates by itself only has to decode once for
         each stored time.
-
-        Args:
-            time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
         """
         raise NotImplementedError
 
@@ -131,11 +127,8 @@ class _OneTimeDecoder(_MapDecoder):
 
 
 class StripDecoder(_OneTimeDecoder):
-    """Fast decoder of dynamic tiles: one thread decodes four texels (neural-dynamic-gi, section 3.5).
-
-    Attributes:
-        gelu: The GELU variant in use.
-    """
+    """Fast decoder of dynamic tiles, with one of the variants of GELU: one thread decodes four texels
+    (neural-dynamic-gi, section 3.5)."""
 
     def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None, shared: bool = False) -> None:
         """Uploads the dynamic tiles of a sheet and allocates all buffers; the time is initially the first stored one.

@@ -127,13 +127,11 @@ def first_light(sheets: Iterable[Sheet]) -> Sheet:
 
 
 def layer_sheets(where: str, sheets: Iterable[Sheet], layer: str | None, atlas: str | None) -> list[Sheet]:
-    """Returns the sheets of one layer of one atlas, in all groups that have it.
+    """Returns the sheets of one layer of one atlas, in all groups that have it; `where` names the collection in
+    messages.
 
-    Args:
-        where: Name of the collection, for messages.
-        sheets: The sheets to choose from.
-        layer: Name of the layer; None: the first layer of radiance, or the first layer if no layer is radiance.
-        atlas: Name of the atlas; None: the first atlas that has the layer.
+    Without a layer it is the first layer of radiance, or the first if none is radiance; without an atlas the first that
+    has the layer.
     """
     sheets = list(sheets)
     named = [sheet for sheet in sheets if atlas in (None, sheet.atlas) and layer in (None, sheet.layer)]

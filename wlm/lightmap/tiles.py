@@ -32,14 +32,8 @@ _HALF_MANTISSA_BITS = 10
 
 @dataclass(frozen=True)
 class TileGrid:
-    """The grid of 128 x 128 tiles that covers a map, numbered row by row; tiles may reach past the map's edges.
-
-    Attributes:
-        height: Height of the map in texels.
-        width: Width of the map in texels.
-        rows: Number of tiles from top to bottom.
-        cols: Number of tiles from left to right.
-    """
+    """The grid of 128 x 128 tiles that covers a map of `height` x `width` texels, numbered row by row; tiles may reach
+    past the map's edges."""
 
     height: int
     width: int
@@ -99,12 +93,8 @@ class TileData:
 
 @dataclass(frozen=True, eq=False)
 class TileCut:
-    """N tiles as array views into their lightmaps, without a copy.
-
-    Attributes:
-        index: `[N]` int64, number of each tile in its grid, row-major.
-        light: For each tile `[T, h, w, 3]` float32, irradiance at T times; h and w are 128, or less at the map's end.
-        mask: For each tile `[h, w]` bool, true where a texel is valid.
+    """N tiles as array views into their lightmaps, without a copy: numbers int64 [N] in the grid, and for each tile the
+    irradiance at T times, float32 [T, h, w, 3], and the mask, bool [h, w]; h and w are 128, or less at the map's end.
     """
 
     index: np.ndarray
@@ -148,16 +138,8 @@ class TileKind(IntEnum):
 
 
 def split(lightmaps: SheetFrames, gamma: float, tiles: Sequence[int] | None = None) -> TileData:
-    """Cuts a sheet into tiles of gamma-encoded colour (neural-dynamic-gi, section 4).
-
-    Args:
-        lightmaps: The sheet, frames `[T, H, W, 3]`.
-        gamma: Above 0; colours become `x ** (1 / gamma)`, which gives dark values more precision.
-        tiles: Numbers of the tiles, in the order of the result; None for all. N tiles take N * T * 192 KiB of memory.
-
-    Returns:
-        The N tiles.
-    """
+    """Cuts a sheet, or the tiles of it with the given numbers, into tiles of gamma-encoded colour, `x ** (1 / gamma)`,
+    which gives dark values more precision (neural-dynamic-gi, section 4). N tiles take N * T * 192 KiB of memory."""
     grid = TileGrid.of(*lightmaps.mask.shape)
     return cut(lightmaps, np.arange(grid.count) if tiles is None else np.array(list(tiles), np.int64)).encoded(gamma)
 
@@ -176,15 +158,8 @@ def valid_texels(mask: np.ndarray, number: int) -> np.ndarray:
 
 
 def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Computes the mean of each channel of each tile at each time over the valid texels (section 4).
-
-    Args:
-        colour: `[N, T, 128, 128, 3]`, as in `TileData`.
-        mask: `[N, 128, 128]` bool.
-
-    Returns:
-        `[N, T, 3]` float64, summed in float64; 0 for an empty tile.
-    """
+    """Computes the mean of each channel of each tile at each time over the valid texels (section 4), float64 [N, T, 3],
+    0 for an empty tile; `colour` and `mask` are those of `TileData`."""
     means = np.zeros((*colour.shape[:2], 3))
     for n, valid in enumerate(mask):
         if valid.any():
@@ -196,17 +171,10 @@ def channel_means(colour: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def static_pattern(colour: np.ndarray, means: np.ndarray) -> np.ndarray:
     """Computes each tile's mean pattern, whose product with the means fits a tile that only changes in brightness.
 
-    It is the sum of the colours over time divided by the sum of the means, so that a nearly black time hardly counts
-    and nothing is divided by 0. `means * pattern` is exact if the tile is the product of a colour per time and a
-    pattern.
-
-    Args:
-        colour: `[N, T, 128, 128, 3]`, as in `TileData`.
-        means: `[N, T, 3]`, from `channel_means`.
-
-    Returns:
-        `[N, 128, 128, 3]` float64 with a mean of 1 over the valid texels; 0 in a channel that is black at
-        every time.
+    It is the sum of the colours over time divided by the sum of the means (from `channel_means`), so that a nearly
+    black time hardly counts and nothing is divided by 0. `means * pattern` is exact if the tile is the product of a
+    colour per time and a pattern. Returns float64 [N, 128, 128, 3] with a mean of 1 over the valid texels; 0 in a
+    channel that is black at every time.
     """
     total = means.sum(axis=1)[:, None, None, :]
     pattern = np.zeros((len(colour), *colour.shape[2:]))
@@ -267,14 +235,8 @@ def check_index(index: np.ndarray, grid: TileGrid) -> None:
 
 
 def place(image: np.ndarray, tiles: np.ndarray, index: np.ndarray, grid: TileGrid) -> None:
-    """Writes tiles into a map.
-
-    Args:
-        image: `[H, W, C]`, written.
-        tiles: `[N, 128, 128, C]`. Texels past the map's end are dropped.
-        index: `[N]`, number of each tile in the grid.
-        grid: The grid of the map.
-    """
+    """Writes tiles [N, 128, 128, C], of the given numbers [N] in the grid, into a map [H, W, C]; texels past the map's
+    end are dropped."""
     for tile, number in zip(tiles, index, strict=True):
         part = image[grid.window(number)]
         part[...] = tile[: part.shape[0], : part.shape[1]]

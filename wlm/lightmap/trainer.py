@@ -118,14 +118,9 @@ class Targets:
 
 @dataclass(frozen=True, eq=False)
 class TileJob:
-    """A batch of N tiles of one kind, sent to a worker, which computes the training data from it.
-
-    Attributes:
-        tiles: Light and masks of the tiles.
-        dynamic: Whether the tiles are dynamic instead of static.
-        scale, affine: See `Targets`.
-        profile: The settings.
-        axis: The time axis.
+    """A batch of N tiles of one kind, sent to a worker, which computes the training data from it: light and masks of
+    the tiles, whether they are dynamic instead of static, `scale` and `affine` (see `Targets`), the settings and the
+    time axis.
     """
 
     tiles: TileCut
@@ -262,11 +257,7 @@ class Trainer:
         vec = self._kernels.net.vec_hidden
         # CUDA stores whole tiles of scalars; the CPU adds whole columns.
         shaped = (
-            (
-                wrap(self._partial.view(-1, hidden)),
-                wrap(self._partial_out.view(-1, 3)),
-                wrap(self._loss_parts.view(-1)),
-            )
+            (wrap(self._partial.view(-1, hidden)), wrap(self._partial_out.view(-1, 3)), wrap(self._loss_parts.view(-1)))
             if self._cuda
             else (wrap(self._partial, vec), wrap(self._partial_out, wp.vec3), wrap(self._loss_parts))
         )
@@ -391,15 +382,7 @@ class Trainer:
         if on_levels:
             levels.put_on_levels(*self._levels_args)
         hidden, output = self._nets[on_levels]
-        args = (
-            self._maps,
-            self._offsets,
-            hidden,
-            output,
-            self.batch,
-            self._samples,
-            *self._launch_sums,
-        )
+        args = (self._maps, self._offsets, hidden, output, self.batch, self._samples, *self._launch_sums)
         rates = self._first_rates
         if self._cuda:
             self._kernels.launch(*args)

@@ -77,15 +77,8 @@ class Views:
         indices: Sequence[int] | np.ndarray | None = None,
         device: str = "cpu",
     ) -> None:
-        """Places the cameras.
-
-        Args:
-            lightmaps: The sheet, whose times, mask and exposures are used.
-            geometry: The mesh, with UVs.
-            count: Number of cameras.
-            indices: Indices of the times that will be added; None: all.
-            device: Device that draws: "cpu", "cuda" or "cuda:N".
-        """
+        """Places `count` cameras for the times of a sheet that will be added, all or those with the given indices;
+        `geometry` has UVs."""
         self._lightmaps, self._geometry, self._device = lightmaps, geometry, check_device(device)
         low, high = geometry.box
         if not (high > low).any():
@@ -99,13 +92,8 @@ class Views:
         self._pictures = Pictures()
 
     def add(self, index: int, original: np.ndarray, decoded: np.ndarray) -> None:
-        """Draws the views of one time from the original and the decoded map, and adds their errors.
-
-        Args:
-            index: Index of the time.
-            original: Linear radiance, float32 [H, W, 3], with gaps filled.
-            decoded: The decoded map, in the same form.
-        """
+        """Draws the views of the time of an index from the original and the decoded map, linear radiance float32 [H, W,
+        3] with gaps filled, and adds their errors."""
         numbers = self._cameras[index]
         if not numbers:
             return
@@ -136,12 +124,8 @@ def views_of(
 ) -> tuple[Views | None, list[str]]:
     """Makes the `Views` of a sheet, from the mesh that the sheet names.
 
-    Args:
-        lightmaps, count, indices, device: As for `Views`.
-
-    Returns:
-        The views, or None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh
-        cannot be read, else none.
+    Returns None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh cannot be
+    read, else none.
     """
     if count < 0:
         raise WlmError(f"views: expected at least 0, got {count}")
@@ -235,12 +219,11 @@ class Tally:
         self._added: dict[int, np.ndarray | None] = {}
 
     def add(self, index: int, decoded: np.ndarray, metrics: FrameMetrics) -> None:
-        """Adds the decoded map of a stored time; an interval is scored once both of its ends are added.
+        """Adds the decoded map of a stored time, linear radiance [H, W, 3]; an interval is scored once both of its ends
+        are added.
 
-        Args:
-            index: Index of the time, above that of the last call.
-            decoded: The map at that time, linear radiance [H, W, 3].
-            metrics: Its metrics from `evaluate_frame` with the same mask: the scored tiles and their ranges.
+        `index` rises from call to call. `metrics` are from `evaluate_frame` with the same mask: the scored tiles and
+        their ranges.
         """
         filled = self._lightmaps.frames[index][self._nearest]
         decoded = np.asarray(decoded, np.float32)

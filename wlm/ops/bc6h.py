@@ -15,17 +15,10 @@ _FINITE = 0x7C00  # bits of the first half float that isn't finite
 
 
 def bc6h_blocks(light: torch.Tensor, weight: torch.Tensor | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Encodes blocks of 4 x 4 texels as unsigned BC6H, see `wlm_kernels.bc6h`.
+    """Encodes blocks of 4 x 4 texels, float32 [N, 16, 3], linear, row by row, as unsigned BC6H, see `wlm_kernels.bc6h`.
 
-    Args:
-        light: float32 [N, 16, 3], linear, texels row by row; clamped to [0, 65504].
-        weight: float32 [N, 16], weight of each texel's squared error; None weights all texels equally.
-
-    Returns:
-        The blocks, uint8 [N, 16], and their decoded texels, float32 [N, 16, 3].
-
-    Raises:
-        ValueError: A tensor's shape, type or device doesn't fit.
+    `weight`, float32 [N, 16], is that of each texel's squared error; None: all equal. Returns the blocks, uint8 [N,
+    16], and their decoded texels, float32 [N, 16, 3].
     """
     count = len(light)
     weight = torch.ones_like(light[..., 0]) if weight is None else weight

@@ -192,9 +192,6 @@ def network(inputs: int, hidden: int, outputs: int, gelu: str = "exact") -> Netw
     Args:
         inputs, hidden, outputs: I, H and O, at least 1; H up to 64 is tested.
         gelu: "exact", "tanh" or "fast", see `wlm.ops.mlp`.
-
-    Raises:
-        ValueError: A size is below 1, or there is no such GELU.
     """
     made = mlp_kernels.kernels(inputs, hidden, gelu, outputs)
     vec_in, vec_hidden, vec_out = made.vec_in, made.vec_hidden, made.vec_out

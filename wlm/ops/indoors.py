@@ -38,23 +38,16 @@ _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 @dataclass(frozen=True, eq=False)
 class Indoors:
-    """Valid eye positions inside a scene.
-
-    Attributes:
-        eye: float64 [P, 3], eye positions in random order; empty if there is none.
-        height: Height of the eyes above the floor, in the scene's unit.
-    """
+    """Valid eye positions inside a scene, float64 [P, 3], in random order, maybe none, and their height above the
+    floor, in the scene's unit."""
 
     eye: np.ndarray
     height: float
 
     def views(self, count: int, seed: int = 0) -> list[Viewpoint]:
-        """Creates views from the eye positions in turn, with directions spread evenly around the horizon and slightly
-        up and down; the list is empty if there is no eye position.
-
-        Args:
-            count: Number of views.
-            seed: Selects a rotation of all directions and the first eye position.
+        """Creates `count` views from the eye positions in turn, with directions spread evenly around the horizon and
+        slightly up and down; none if there is no eye position. `seed` selects a rotation of all directions and the
+        first eye position.
         """
         if not len(self.eye):
             return []

@@ -156,10 +156,7 @@ class _March(torch.autograd.Function):
                 on_density, on_nodes = zeros_for(density), zeros_for(nodes)
                 on_emission = zeros_for(emission) if needed[1] else None
                 single_scatter.march_backward(
-                    *arguments,
-                    to_warp(on_density),
-                    optional_array(on_emission, 3, wp.vec3, device),
-                    to_warp(on_nodes),
+                    *arguments, to_warp(on_density), optional_array(on_emission, 3, wp.vec3, device), to_warp(on_nodes)
                 )
                 lights = to_warp(toward, wp.vec3), ctx.step
                 single_scatter.depths_backward(*lights, to_warp(on_nodes), to_warp(on_density))

@@ -70,28 +70,16 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A camera inside the scene with a field of view of 90 degrees in both directions.
-
-    Attributes:
-        eye: float64 [3], the camera's position in the mesh's space and unit.
-        forward: float64 [3], the viewing direction; not straight up or down.
-    """
+    """A camera inside the scene with a field of view of 90 degrees in both directions: its position, float64 [3], in
+    the mesh's space and unit, and its direction, float64 [3], not straight up or down."""
 
     eye: np.ndarray
     forward: np.ndarray
 
 
 def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> list[View]:
-    """Creates cameras on the sphere.
-
-    Args:
-        count: Number of cameras, at least 0.
-        seed: None spreads them evenly (a Fibonacci sphere); otherwise they are random, independent and uniform. A
-            generator continues from its current state.
-
-    Raises:
-        ValueError: A negative count.
-    """
+    """Creates cameras on the sphere: spread evenly without a seed (a Fibonacci sphere), otherwise random, independent
+    and uniform; a generator continues from its current state."""
     if count < 0:
         raise ValueError(f"count: expected at least 0, got {count}")
     if seed is None:
@@ -108,30 +96,19 @@ def sphere_views(count: int, seed: int | np.random.Generator | None = None) -> l
 
 
 def normalised(position: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Scales a mesh into [-1, 1]³.
-
-    Args:
-        position: float [V, 3].
-        triangle: int [F, 3], at least one; the bounding box of all triangles must not be empty.
-
-    Returns:
-        The positions, float64 [V, 3].
-    """
+    """Scales a mesh, float [V, 3] and triangles int [F, 3], whose bounding box must not be empty, into [-1, 1]³;
+    returns the positions, float64 [V, 3]."""
     used = position[triangle.reshape(-1)].astype(np.float64)
     low, high = used.min(axis=0), used.max(axis=0)
     return (position - (low + high) / 2.0) * (2.0 / (high - low).max())
 
 
 def clip_positions(position: np.ndarray, view: View) -> np.ndarray:
-    """Transforms vertices into a camera's clip space, for `wlm.ops.rasterize`.
+    """Transforms vertices, float64 [V, 3] and `normalised`, into a camera's clip space, float32 [V, 4], for
+    `wlm.ops.rasterize`.
 
-    Args:
-        position: float64 [V, 3], `normalised`.
-        view: The camera.
-
-    Returns:
-        float32 [V, 4]: x, y, z, w; w is the distance along the camera's axis, z / w is -1 and 1 where the sphere
-        around the cube is nearest and farthest. Vertices at equal positions have equal results.
+    w is the distance along the camera's axis, z / w is -1 and 1 where the sphere around the cube is nearest and
+    farthest. Vertices at equal positions have equal results.
     """
     # A matrix product may round rows differently, which would open cracks along shared edges.
     x, y, back = (position[:, 0] * a + position[:, 1] * b + position[:, 2] * c for a, b, c in view.axes)
@@ -141,16 +118,12 @@ def clip_positions(position: np.ndarray, view: View) -> np.ndarray:
 
 
 def clip_from(position: np.ndarray, eye: np.ndarray, forward: np.ndarray, up: int = 1) -> np.ndarray:
-    """Transforms vertices into the clip space of a camera inside the scene, 90 degrees wide and high.
+    """Transforms vertices [V, 3], in any unit, into the clip space of a camera inside the scene, 90 degrees wide and
+    high.
 
-    Args:
-        position: [V, 3], in any unit.
-        eye: [3], the camera's position.
-        forward: [3], the viewing direction, of any length except 0, and not along `up`.
-        up: The axis that points up, 0 to 2.
-
-    Returns:
-        float32 [V, 4]: x, y, z, w, as `clip_positions`; z / w rises from -infinity at the eye to 1 far away.
+    `eye` is its position, `forward` its direction, of any length except 0 and not along `up`, the axis that points up,
+    0 to 2. Returns float32 [V, 4], x, y, z, w, as `clip_positions`; z / w rises from -infinity at the eye to 1 far
+    away.
     """
     forward = np.asarray(forward, np.float64) / np.linalg.norm(forward)
     right = np.cross(forward, np.eye(3)[up])
@@ -174,25 +147,12 @@ def visible_points(
     *,
     cull: bool = False,
 ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Draws a mesh from each camera.
+    """Draws a mesh from each camera, square pictures of `resolution` pixels along a side; positions, float [V, 3] in
+    any unit, are scaled here.
 
-    Args:
-        position: float [V, 3], in any unit; scaled here.
-        triangle: int [F, 3].
-        uv: float [V, 2].
-        views: The cameras.
-        resolution: Pixels along a side, 1 to 16,384.
-        device: "cpu" or "cuda:N".
-        cull: Whether to skip back faces, so that an interior is visible through its walls.
-
-    Yields:
-        For each camera, on the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights
-        of its corners 0 and 1; float32 [h, w, 2], the UVs at the visible point. The latter two are 0 in uncovered
-        pixels.
-
-    Raises:
-        WlmError: There is no such device.
-        ValueError: The resolution is out of range.
+    With `cull`, back faces are skipped, so that an interior is visible through its walls. Yields for each camera, on
+    the device: int32 [h, w], the visible triangle, -1 for none; float32 [h, w, 2], the weights of its corners 0 and 1;
+    float32 [h, w, 2], the UVs at the visible point. The latter two are 0 in uncovered pixels.
     """
     device = check_device(device)
     if not 1 <= resolution <= MOST_PIXELS:

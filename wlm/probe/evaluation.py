@@ -12,11 +12,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
-from wlm.metrics import LostLight, psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
+from wlm.probe.hours import listed_times
 from wlm.probe.model import ProbeModel
 from wlm.probe.places import nearest_weights
+from wlm.probe.relative import norms, relative_errors
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
 from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
@@ -24,6 +26,22 @@ from wlm.system import Report as BaseReport
 NORMALS = 32
 """Number of normals: the mean square of any L2 irradiance over them is within 6% of that over the sphere, 0.3 dB."""
 
+OFF = 0.5
+"""Relative error above which a probe is counted as off."""
+
+MANY_OFF = 0.01
+"""Share of the live probes that may be off without a warning."""
+
+_OF_HOUR = (
+    "psnr",
+    "psnr_live",
+    "irradiance_psnr",
+    "relative_error",
+    "relative_median",
+    "relative_p95",
+    "off",
+    "between_psnr",
+)
 _NEAREST = 8  # probes that are weighted by the inverse square of their distance
 _ROWS = 32768  # probes per piece, so that float64 copies stay at some tens of MB
 
@@ -42,16 +60,22 @@ class Report(BaseReport):
         bits_per_probe: `bytes * 8 / N`, over all probes; the paper's bpp.
         ratio: Bytes of the file divided by `N * D * 4`, the bytes of the input in float32.
         gpu_bytes: Bytes of the buffers that a GPU holds; 0 if unknown.
+        hours: For each of several hours its `time`, `psnr`, `psnr_live`, `irradiance_psnr` and `between_psnr`; other
+            figures are those of the hour with the lowest PSNR.
         peak: Range of the input's coefficients.
         psnr: PSNR over all coefficients of all probes.
         psnr_live: PSNR over the live probes; dead probes decode exactly to zero.
         mse, max_abs_error: Errors over all coefficients of all probes.
-        worst_probe: The probe with the largest mean squared error: `probe` (index), `psnr`, `position`; None if all are
-            exact.
+        relative_error: Root mean square of the live probes' relative errors, see `wlm.probe.relative`; NaN if no probe
+            is live.
+        relative_median, relative_p95: Median and 95th percentile of these errors.
+        off: Share of the live probes whose relative error exceeds `OFF`.
+        worst_probe: The live probe with the largest relative error: `probe` (index), `error`, `position`, and the norms
+            of its numbers, `light`, and of the decoded ones, `decoded`; None if all are exact.
         psnr_by_band: PSNR of each band of spherical harmonics, over all probes and colours.
-        irradiance_psnr: PSNR of the irradiance on `NORMALS` fixed normals of every live probe in RGB; its peak is the
-            range of the input's irradiance.
-        warnings: Sentences about light that probes lost, which the mean errors do not show.
+        irradiance_psnr: PSNR of the irradiance, clamped at 0, on `NORMALS` fixed normals of every live probe in RGB;
+            its peak is the range of the input's irradiance.
+        warnings: A sentence that names the worst probe, if more than a share `MANY_OFF` of the live probes is off.
         between_psnr: PSNR between the probes, see the function `between_psnr`; None if it was not computed.
     """
 
@@ -67,12 +91,17 @@ class Report(BaseReport):
     psnr_live: float
     mse: float
     max_abs_error: float
+    relative_error: float
+    relative_median: float
+    relative_p95: float
+    off: float
     worst_probe: dict[str, Any] | None
     psnr_by_band: list[float] | None
     irradiance_psnr: float | None
     warnings: list[str] = field(default_factory=list)
     between_psnr: float | None = None
     gpu_bytes: int = 0
+    hours: list[dict[str, Any]] = field(default_factory=list)
 
 
 def evaluate(
@@ -89,32 +118,58 @@ def evaluate(
         model: The model.
         probes: The input, in the order of the fit.
         device: Where the model is decoded.
-        progress: Called after the decode and at the end.
+        progress: Called after each hour.
         file_bytes: Size of the model's file; None: the size that `model.save` would write.
 
     Returns:
         The report.
 
     Raises:
-        WlmError: The device does not exist, the set has other probes, or a decoded number is not finite.
+        WlmError: The device does not exist, the set has other probes or hours, or a decoded number is not finite.
     """
-    meter = Meter(progress, "evaluate", 2)
     if len(probes.position) != model.probes:
         raise WlmError(f"{probes.name}: has {probes.probes} probes, but {model.probes} were compressed")
+    if not np.array_equal(probes.times, model.times):
+        found, expected = (listed_times(times) or "one" for times in (probes.times, model.times))
+        raise WlmError(f"{probes.name}: has the hours {found}, but {expected} were compressed; choose with --key")
     decoder = model.decoder(device, position=probes.position)
-    decoded = decoder.decode_probes()
-    meter.report(1)
-    report = score(decoded, probes, model.file_bytes() if file_bytes is None else file_bytes)
-    lost = LostLight()
-    lost.add(probes.values, decoded)
-    report = replace(
-        report,
-        warnings=lost.warnings(probes.name, "probe", "the set"),
-        between_psnr=between_psnr(decoder, probes),
+    size = model.file_bytes() if file_bytes is None else file_bytes
+    times = probes.times.tolist() or [None]
+    meter = Meter(progress, "evaluate", len(times))
+    reports = []
+    for done, time in enumerate(times, 1):
+        if time is not None:
+            decoder.set_time(time)
+        reports.append(_evaluate(decoder, probes.at(time), size))
+        meter.report(done, PSNR_dB=reports[-1].psnr)
+    worst = min(reports, key=lambda report: report.psnr)
+    hours = [
+        {"time": time} | {name: getattr(each, name) for name in _OF_HOUR}
+        for time, each in zip(times, reports, strict=True)
+    ]
+    return replace(
+        worst,
         gpu_bytes=model.content.nbytes,
+        ratio=worst.ratio / len(times),
+        warnings=[
+            at_hour(time) + text for time, report in zip(times, reports, strict=True) for text in report.warnings
+        ],
+        hours=hours if len(times) > 1 else [],
     )
-    meter.report(2, PSNR_dB=report.psnr)
-    return report
+
+
+def at_hour(time: float | None) -> str:
+    """Returns the beginning of a sentence about one of several hours."""
+    return "" if time is None else f"at {time:g} h, "
+
+
+def _evaluate(decoder: Decoder, probes: ProbeSet, file_bytes: int) -> Report:
+    """Compares the light that a decoder has at its present time with that of one hour."""
+    decoded = decoder.decode_probes()
+    return replace(
+        score(decoded, probes, file_bytes),
+        between_psnr=between_psnr(decoder, probes),
+    )
 
 
 def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
@@ -130,11 +185,13 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         no probe is live. The PSNRs of bands and irradiance are None if D is not 3 (l + 1)² for any band l.
 
     Raises:
-        WlmError: The number of probes or of their numbers differs, or a number is NaN or infinite.
+        WlmError: The number of probes or of their numbers differs, a number is NaN or infinite, or the input has
+            several hours.
         ValueError: `file_bytes` is not positive, or `decoded` is no matrix.
     """
     if file_bytes <= 0:
         raise ValueError(f"file_bytes: expected a positive number, got {file_bytes}")
+    probes = probes.at()
     decoded, values, live = np.asarray(decoded), probes.values, probes.live
     if decoded.ndim != 2:
         raise ValueError(f"decoded: expected an array [N, D], got {decoded.shape}")
@@ -151,15 +208,14 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
             f"infinity, first probe {int(np.argmax(broken))}"
         )
 
-    by_probe = np.empty(count)  # mean squared error
     by_coefficient = np.zeros(outputs)  # sum of squares
-    largest = 0.0
+    largest = of_live = 0.0
     for start in range(0, count, _ROWS):
         rows = slice(start, start + _ROWS)
         error = np.abs(decoded[rows].astype(np.float64) - values[rows])
         largest = max(largest, float(error.max()))
         error *= error
-        by_probe[rows] = error.mean(axis=1)
+        of_live += float(error[live[rows]].sum())
         by_coefficient += error.sum(axis=0)
 
     peak = float(values.max()) - float(values.min())
@@ -170,8 +226,6 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
     if coefficients is not None:
         band = np.repeat(coefficient_bands(coefficients), 3)
         by_band = [psnr_from_mse(by_coefficient[band == i].mean(), peak) for i in range(band[-1] + 1)]
-    worst = int(np.argmax(by_probe))
-    found = {"probe": worst, "psnr": psnr_from_mse(by_probe[worst], peak), "position": probes.position[worst].tolist()}
     return Report(
         name=probes.name,
         probes=count,
@@ -182,13 +236,44 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         ratio=file_bytes / (count * outputs * 4),
         peak=peak,
         psnr=psnr_from_mse(mse, peak),
-        psnr_live=psnr_from_mse(by_probe[live].mean(), peak) if live.any() else math.nan,
+        psnr_live=psnr_from_mse(of_live / (live.sum() * outputs), peak) if live.any() else math.nan,
         mse=mse,
         max_abs_error=largest,
-        worst_probe=found if by_probe[worst] else None,
+        **relative_figures(decoded, probes),
         psnr_by_band=by_band,
         irradiance_psnr=None if coefficients is None else _irradiance_psnr(decoded[live], values[live], coefficients),
     )
+
+
+def relative_figures(decoded: np.ndarray, probes: ProbeSet) -> dict[str, Any]:
+    """Returns the entries of a `Report` that are about relative errors, and `warnings`, by name; arguments as for
+    `score`."""
+    index = np.flatnonzero(probes.live)
+    if not len(index):
+        none = dict.fromkeys(("relative_error", "relative_median", "relative_p95", "off"), math.nan)
+        return none | {"worst_probe": None, "warnings": []}
+    decoded, values = decoded[index], probes.values[index]
+    error = relative_errors(decoded, values)
+    worst, off = int(error.argmax()), float((error > OFF).mean())
+    probe = int(index[worst])
+    light, found = (float(norms(each[worst : worst + 1])[0]) for each in (values, decoded))
+    place = probes.position[probe].tolist()
+    warnings = []
+    if off > MANY_OFF:
+        at = ", ".join(f"{x:.4g}" for x in place)
+        warnings.append(
+            f"{probes.name}: {off:.1%} of the live probes are off by more than {OFF:.0%} of their light; the worst is "
+            f"probe {probe} at ({at}), whose light of {light:.4g} decodes to {found:.4g}"
+        )
+    named = {"probe": probe, "error": float(error[worst]), "position": place, "light": light, "decoded": found}
+    return {
+        "relative_error": float(np.sqrt(np.square(error).mean())),
+        "relative_median": float(np.median(error)),
+        "relative_p95": float(np.percentile(error, 95)),
+        "off": off,
+        "worst_probe": named if error[worst] else None,
+        "warnings": warnings,
+    }
 
 
 def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int) -> float:
@@ -200,7 +285,7 @@ def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int)
     rows = max(1, _ROWS // NORMALS)
     for start in range(0, len(values), rows):
         pair = np.stack([values[start : start + rows], decoded[start : start + rows]])
-        exact, predicted = irradiance(pair.reshape(2, -1, coefficients, 3), normals)
+        exact, predicted = np.maximum(irradiance(pair.reshape(2, -1, coefficients, 3), normals), 0.0)
         low, high = min(low, float(exact.min())), max(high, float(exact.max()))
         total += float(np.square(predicted - exact).sum())
     return psnr_from_mse(total / (len(values) * NORMALS * 3), high - low)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wlm.lightmap.hours import DAY
+from wlm.formats.hours import DAY
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.virtual.clock import Clock
 from wlm.probe.model import ProbeModel
@@ -30,12 +30,7 @@ class DayProbes:
     """
 
     def __init__(self, probes: Sequence[tuple[float, ProbeModel]], device: str = "cpu") -> None:
-        """Decodes all probes.
-
-        Args:
-            probes: Rising hours and probes of 27 numbers, all at the same positions.
-            device: "cpu" or "cuda:N".
-        """
+        """Decodes all probes: rising hours with models of 27 numbers a probe, all at the same positions."""
         decoders = [model.decoder(device) for _, model in probes]
         light = StoredLight(np.concatenate([decoder.decode_probes() for decoder in decoders], 1), device)
         live = np.logical_and.reduce([model.live for _, model in probes])
@@ -44,15 +39,11 @@ class DayProbes:
         self._settled = False
 
     def at(self, points: np.ndarray, hour: float, viewpoint: np.ndarray) -> np.ndarray:
-        """Returns SH coefficients of radiance at points, float32 [M, 9, 3].
+        """Returns SH coefficients of radiance at points [M, 3] and any hour, float32 [M, 9, 3].
 
         Between the hours of two files they are mixed linearly, except across a switch of a lamp
-        (`wlm.lightmap.virtual.clock`): until its end, the light is that before it.
-
-        Args:
-            points: [M, 3].
-            hour: Any hour; 24 is 0.
-            viewpoint: [3], the viewer, around whom the volume is finest.
+        (`wlm.lightmap.virtual.clock`): until its end, the light is that before it. The volume is finest around
+        `viewpoint`, [3].
         """
         if self._settled:
             self.volume.update(viewpoint)
@@ -66,19 +57,14 @@ class DayProbes:
 
 
 def six_lights(coefficients: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Returns the lights of six-way lightmaps that stand for the light of all directions.
+    """Returns the lights of six-way lightmaps that stand for the light of all directions, from the SH of radiance [9,
+    3]: float64 [6, 3] in the order of `wlm.smoke.camera.DIRECTIONS`, at least 0. Divided by 4 pi they are the factors
+    of the lightmaps.
 
     A light from direction w takes the map of direction d times max(w . d, 0)^2 (`wlm.smoke.camera.weights`), so the
     light of map d is the integral of radiance times that square. Its factors for the bands of SH are 2 pi / 3, pi / 2
-    and 4 pi / 15; irradiance, with pi, 2 pi / 3 and pi / 4, would be 1.5 times too bright under even light.
-
-    Args:
-        coefficients: [9, 3], SH of radiance.
-        axes: [3, 3], rows right, up and toward the camera.
-
-    Returns:
-        float64 [6, 3] in the order of `wlm.smoke.camera.DIRECTIONS`, at least 0. Divided by 4 pi they are the factors
-        of the lightmaps.
+    and 4 pi / 15; irradiance, with pi, 2 pi / 3 and pi / 4, would be 1.5 times too bright under even light. The rows of
+    `axes`, [3, 3], are right, up and toward the camera.
     """
     factors = basis(VECTORS @ axes, 9) * _SQUARED[coefficient_bands(9)]
     return np.maximum(factors @ np.asarray(coefficients, np.float64), 0.0)

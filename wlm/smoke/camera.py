@@ -44,11 +44,7 @@ _MARGIN = 1.05  # image height over box height, so that no smoke touches the edg
 
 
 def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarray:
-    """Returns a direction scaled to length 1, float64 [3].
-
-    Raises:
-        ValueError: The direction has length 0, or is not three finite numbers.
-    """
+    """Returns a direction scaled to length 1, float64 [3]."""
     vector = np.asarray(vector, np.float64)
     length = np.linalg.norm(vector)
     if vector.shape != (3,) or not _SHORTEST < length < np.inf:
@@ -57,20 +53,11 @@ def unit(vector: Sequence[float] | np.ndarray, name: str = "toward") -> np.ndarr
 
 
 def weights(toward: Sequence[float] | np.ndarray, rule: str = "squared") -> np.ndarray:
-    """Returns the weights of the lightmaps under a light, in the order of `DIRECTIONS`.
+    """Returns the weights of the lightmaps, float64 [..., 6] in the order of `DIRECTIONS`, under lights from directions
+    [..., 3] in the camera's axes, of any length except 0, by one of `RULES`.
 
     The paper's weights (eq. 5) are the absolute components of the unit direction; their sum is up to 1.73, for a light
     along a diagonal. Their squares, which engines use, always sum to 1.
-
-    Args:
-        toward: [..., 3], directions to the lights in the camera's axes, of any length except 0.
-        rule: Name of the formula for the weights, one of `RULES`.
-
-    Returns:
-        float64 [..., 6], not negative.
-
-    Raises:
-        ValueError: The rule is unknown, or a direction has length 0 or is not finite.
     """
     if rule not in RULES:
         raise ValueError(f"rule: expected one of {', '.join(RULES)}, got {rule!r}")

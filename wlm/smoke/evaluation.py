@@ -188,13 +188,7 @@ def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgre
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Scores of several methods on one test set.
-
-    Attributes:
-        name: Name of the test set.
-        samples: Number of samples, each a pair of frames in one view.
-        methods: Scores by name of the method.
-    """
+    """Scores of several methods, by name, on one test set of a number of samples, each a pair of frames in one view."""
 
     name: str
     samples: int
@@ -267,11 +261,7 @@ def compare(
 
 
 def coarse(pool: Pool, part: slice) -> torch.Tensor:
-    """Predicts the guiding maps themselves, for `score`; they must be of kind "six", a coarse march of six lights.
-
-    Raises:
-        ValueError: The pool's guides are of another kind.
-    """
+    """Predicts the guiding maps themselves, for `score`; they must be of kind "six", a coarse march of six lights."""
     six = GUIDES["six"]
     if pool.guides.shape[2] != len(six):
         raise ValueError(f"pool: expected guiding maps of kind six with {len(six)} planes, got {pool.guides.shape[2]}")

@@ -21,14 +21,11 @@ _LEAST_SHIFT = 1e-3  # of the image, between the centres of light of opposite li
 
 @dataclass(frozen=True)
 class StepError:
-    """Difference between the lightmaps of two marches, of which the finer has half the step.
+    """Difference between the lightmaps of two marches, of which the finer has half the step: the largest difference of
+    a pixel in any lightmap, and in its transparency; and the root mean square of the differences divided by that of the
+    lightmaps, 0 if these are black.
 
     The error falls with the square of the step, so that the error of the finer one is about a third of the difference.
-
-    Attributes:
-        largest: Largest difference of a pixel in any lightmap.
-        rms: Root mean square of the differences, divided by that of the lightmaps; 0 if the lightmaps are black.
-        transparency: Largest difference of a pixel's transparency.
     """
 
     largest: float
@@ -119,12 +116,8 @@ class SixWay:
 
 
 def light_centres(planes: torch.Tensor) -> torch.Tensor:
-    """Returns where the light is in planes [N, C, H, W] of N frames.
-
-    Returns:
-        float64 [C, 3]: the mean place of the light to the right and upwards, 0 to 1, and the plane's share of the light
-        of all planes.
-    """
+    """Returns where the light is in planes [N, C, H, W] of N frames, float64 [C, 3]: the mean place of the light to the
+    right and upwards, 0 to 1, and the plane's share of the light of all planes."""
     height, width = planes.shape[2:]
     planes = planes.clamp(min=0.0)
     right = (torch.arange(width, device=planes.device) + 0.5) / width
@@ -143,11 +136,9 @@ def axis_faults(lightmaps: torch.Tensor) -> tuple[str, ...]:
     """Checks that lightmaps [..., 6, H, W] are bright where the light of their direction falls.
 
     A lightmap is brighter on the side from which its light comes, whatever the smoke, and smoke that scatters evenly is
-    brighter under a light from the front than from behind.
-
-    Returns:
-        A line for each pair of directions that may be exchanged, or one that names the black lightmaps if some are;
-        none if all six are black, or where the light shows no direction.
+    brighter under a light from the front than from behind. Returns a line for each pair of directions that may be
+    exchanged, or one that names the black lightmaps if some are; none if all six are black, or where the light shows no
+    direction.
     """
     maps = lightmaps.reshape(-1, *lightmaps.shape[-3:])
     dark = [name for name, light in zip(DIRECTIONS, maps.amax((0, 2, 3)).tolist(), strict=True) if not light > 0.0]

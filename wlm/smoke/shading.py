@@ -60,12 +60,10 @@ def _on_device(ramp: Ramp, dtype: torch.dtype, device: torch.device) -> tuple[to
 
 
 def glow_of(emission: torch.Tensor, ramp: Ramp | None, thrown: torch.Tensor | None = None) -> torch.Tensor:
-    """Returns the light of fire, [H, W, 3], or [H, W, 1] if it is grey.
+    """Returns the light of fire, [H, W, 3], or [H, W, 1] if it is grey (without a ramp), from the light [H, W] that
+    smoke emits.
 
-    Args:
-        emission: [H, W], light that the smoke emits.
-        ramp: Colour of the emission; None: grey.
-        thrown: [H, W, 3], emitted light that the smoke scatters, which gets the mean colour of the visible fire.
+    `thrown`, [H, W, 3], is emitted light that the smoke scatters, which gets the mean colour of the visible fire.
     """
     glow = emission[..., None] if ramp is None else ramp(emission)
     if thrown is None:
@@ -124,11 +122,7 @@ def half_sphere(count: int) -> np.ndarray:
 
 
 def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
-    """Checks that a colour is three numbers of at least 0 and returns it as float64 [3].
-
-    Raises:
-        ValueError: The colour has a negative number, a number above 1e12, or another shape.
-    """
+    """Checks that a colour is three numbers of at least 0 and returns it as float64 [3]."""
     values = np.asarray(colour, np.float64)
     if values.shape != (3,) or not ((values >= 0) & (values <= _BRIGHTEST)).all():
         raise ValueError(f"{name}: expected three numbers from 0 to {_BRIGHTEST:g}, got {colour}")
@@ -136,11 +130,7 @@ def checked_colour(name: str, colour: Sequence[float]) -> np.ndarray:
 
 
 def checked_albedo(albedo: Sequence[float]) -> np.ndarray:
-    """Checks that an albedo is three numbers from 0 to 1 and returns it as float64 [3].
-
-    Raises:
-        ValueError: The albedo has a number outside 0 to 1, or another shape.
-    """
+    """Checks that an albedo is three numbers from 0 to 1 and returns it as float64 [3]."""
     colour = checked_colour("albedo", albedo)
     if not (colour <= 1).all():
         raise ValueError(f"albedo: expected three numbers from 0 to 1, got {tuple(albedo)}")
@@ -151,9 +141,6 @@ def in_voxels(light: AnyLight, volume: DensityVolume) -> tuple[np.ndarray, np.nd
     """Returns a light in a volume's voxel coordinates: direction or position, irradiance / (4 pi), and radius.
 
     The irradiance of a point light is that at a distance of one voxel. The radius of a directional light is None.
-
-    Raises:
-        ValueError: A direction has length 0, or a colour is not three numbers of at least 0.
     """
     if isinstance(light, Light):
         return unit(light.toward), checked_colour("irradiance", light.irradiance) / (4.0 * math.pi), None

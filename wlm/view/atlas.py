@@ -19,19 +19,10 @@ def draw(
     device: str = "cpu",
     state: int = 0,
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Draws a scene from one camera, as `wlm.atlas.evaluation` does.
+    """Draws a scene from one camera, as `wlm.atlas.evaluation` does, in one state, by decoders on `device`.
 
-    Args:
-        scene: The scene.
-        samplers: Decoders by name.
-        view: The camera.
-        resolution: Width and height of the picture in pixels.
-        device: "cpu" or "cuda:N", the device of the decoders.
-        state: The index of the lighting state.
-
-    Returns:
-        For each decoder float32 [resolution, resolution, 3], linear light, 0 where no lightmap is visible; and bool
-        [resolution, resolution], true where one is visible.
+    Returns for each decoder float32 [resolution, resolution, 3], linear light, 0 where no lightmap is visible; and bool
+    [resolution, resolution], true where one is visible.
     """
     hit, points = points_at(scene, *next(iter(visible_uv(scene, [view], resolution, device))))
     pictures = {}

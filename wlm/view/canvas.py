@@ -1,13 +1,10 @@
-"""Draws named meshes, lines and volumes in the panels of a window; drawing a name again updates it."""
+"""Draws named meshes and lines in the panels of a window; drawing a name again updates it."""
 
 from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-
-_LEVELS = 256  # of the opacity table of smoke
-_STEP = 0.5  # voxels between two samples of smoke; 1 shows stripes, and much smaller steps lose colour to rounding
 
 
 class Canvas:
@@ -31,14 +28,11 @@ class Canvas:
         nearest: bool = False,
         one_sided: bool = False,
     ) -> None:
-        """Draws triangles with a texture; later calls only change the texture.
+        """Draws triangles, with v of their UVs down, under a texture uint8 [H, W, 3]; later calls only change the
+        texture.
 
-        Args:
-            panel, name: Index of the panel, and name of the mesh.
-            position, triangle, uv: Vertices [V, 3], triangles int [F, 3] and UVs [V, 2], with v down.
-            picture: uint8 [H, W, 3].
-            nearest: Whether the texture is read without a filter.
-            one_sided: Whether triangles that face away from the camera are hidden.
+        With `nearest` it is read without a filter; with `one_sided`, triangles that face away from the camera are
+        hidden.
         """
         drawn = self._drawn.get((panel, name))
         if drawn is None:
@@ -87,48 +81,6 @@ class Canvas:
         """Draws the edges of a box between two corners [3]."""
         mesh = self._pyvista.Box(np.stack([low, high], 1).ravel())
         self._add(panel, name, mesh, color=colour, style="wireframe", line_width=1.5)
-
-    def smoke(
-        self,
-        panel: int,
-        name: str,
-        colour: np.ndarray,
-        density: np.ndarray,
-        depth: float,
-        voxel: float,
-        origin: np.ndarray,
-    ) -> None:
-        """Draws a volume.
-
-        Args:
-            panel: Index of the panel.
-            name: Name of the volume.
-            colour: uint8 [X, Y, Z, 3].
-            density: float [X, Y, Z] in [0, 1].
-            depth: Optical depth along a voxel's edge at density 1.
-            voxel: Length of a voxel's edge.
-            origin: [3], corner of the first voxel.
-        """
-        codes = np.concatenate([colour, (density[..., None] * 255.0 + 0.5).astype(np.uint8)], -1)
-        codes = np.ascontiguousarray(codes.transpose(2, 1, 0, 3).reshape(-1, 4))
-        grid = self._pyvista.ImageData(
-            dimensions=density.shape, spacing=(voxel,) * 3, origin=np.asarray(origin) + 0.5 * voxel
-        )
-        grid.point_data["smoke"] = codes
-        self._plotter.subplot(0, panel)
-        options = {"name": f"{panel} {name}", "render": False, "reset_camera": False, "show_scalar_bar": False}
-        # The volume is made anew, since this mapper does not notice changed voxels. The GPU mapper of VTK 9.7 reads the
-        # opacities of coloured voxels as much smaller, and ignores their unit of length.
-        actor = self._plotter.add_volume(grid, scalars="smoke", mapper="fixed_point", **options)
-        actor.mapper.SetAutoAdjustSampleDistances(False)
-        actor.mapper.SetSampleDistance(_STEP * voxel)
-        actor.mapper.SetImageSampleDistance(1.0 if self._plotter.off_screen else 2.0)
-        opacity = actor.prop.GetScalarOpacity(0)
-        opacity.RemoveAllPoints()
-        for level in range(_LEVELS):
-            opacity.AddPoint(level, 1.0 - np.exp(-depth * level / (_LEVELS - 1)))
-        actor.prop.SetScalarOpacityUnitDistance(voxel)
-        self._drawn[panel, name] = actor, grid
 
     def background(self, panel: int, colour: np.ndarray) -> None:
         """Fills a panel behind the meshes with a colour [3] in [0, 1]."""

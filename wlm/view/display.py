@@ -19,13 +19,8 @@ _HEAT_AT = (0.0, 0.33, 0.66, 1.0)
 
 @dataclass(frozen=True)
 class Display:
-    """How linear light is converted to screen colours.
-
-    Attributes:
-        exposure: Factor on linear light; a product of 1 is white.
-        tone: One of `TONES`.
-        gain: Factor on errors.
-    """
+    """How linear light is converted to screen colours: by a factor `exposure`, after which 1 is white, and one of
+    `TONES`; `gain` is a factor on errors."""
 
     exposure: float = 1.0
     tone: str = "clamped"
@@ -43,14 +38,8 @@ class Display:
         return _bytes(self.screen(light))
 
     def error(self, decoded: np.ndarray, original: np.ndarray) -> np.ndarray:
-        """Returns false colours (`heat`) of the displayed error: the largest difference of a channel times `gain`.
-
-        Args:
-            decoded, original: Linear light [..., 3].
-
-        Returns:
-            uint8 [..., 3].
-        """
+        """Returns false colours (`heat`), uint8 [..., 3], of the displayed error of linear light [..., 3]: the largest
+        difference of a channel times `gain`."""
         apart = np.abs(self.screen(decoded) - self.screen(original)).max(-1)
         return heat(apart * np.float32(self.gain))
 

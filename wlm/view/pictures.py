@@ -22,9 +22,6 @@ _MARGIN, _FONT = 4, 14  # pixels
 def to_bytes(light: torch.Tensor | np.ndarray, white: float = 1.0) -> np.ndarray:
     """Converts linear light, [H, W, 3], or [H, W] for grey, to sRGB bytes, uint8 [H, W, 3]; light above `white` is
     clipped.
-
-    Raises:
-        ValueError: `white` is not above 0.
     """
     if not 0 < white < math.inf:
         raise ValueError(f"white: expected a number above 0, got {white}")
@@ -63,10 +60,6 @@ def contact_sheet(
 
     Returns:
         The places in a row of the chosen pictures, from 0.
-
-    Raises:
-        ValueError: There is no picture, or they differ in size or number.
-        WlmError: The file cannot be written.
     """
     counts = {len(row) for row in rows.values()}
     uneven = any(len({cell.shape for cell in row}) > 1 for row in rows.values())

@@ -53,9 +53,15 @@ class Probes:
     note: str
 
 
-def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None, title: str) -> Probes:
-    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`."""
-    position, given, live, _ = probes_of(model, original, key)
+def model_probes(
+    model: ProbeModel,
+    original: str | os.PathLike[str] | None,
+    key: str | None,
+    title: str,
+    time: float | None = None,
+) -> Probes:
+    """Takes the probes of a model of one hour; the other arguments are those of `wlm.probe.places.probes_of`."""
+    position, given, live, _ = probes_of(model, original, key, time)
     count = _coefficients(model.outputs, title)
     decoder, places = model.decoder(position=position), position[live]
     values = {"decoded": decoder.decode_probes()[live].reshape(-1, count, 3)}
@@ -90,15 +96,10 @@ def probe_scene(
     block: float | None = None,
     up: int = 1,
 ) -> Scene:
-    """Makes the scene of probes.
+    """Makes the scene of probes, with a mesh that is lit at its vertices.
 
-    Args:
-        probes: The probes.
-        title: Title of the window.
-        geometry: Mesh of the scene, lit at its vertices; or None.
-        walk: [F, 3], viewpoints of the cascaded volume; None for a loop through the scene.
-        block: Side of the volume's finest blocks; None to derive it from the probes' spacing.
-        up: The axis that points up.
+    `walk`, [F, 3], are viewpoints of the cascaded volume, None for a loop through the scene, and `block` the side of
+    its finest blocks, None to derive it from the probes' spacing.
     """
     light = StoredLight(next(iter(probes.values.values())))  # the decoded light, or else the original
     volume = Volume(probes.position, light, block=block)
@@ -136,14 +137,14 @@ class _ProbeScene(Scene):
         points = probes.position[:, None] + self._radius * self._ball
         faces = self._ball_faces + len(self._ball) * np.arange(len(probes.position))[:, None, None]
         self._balls = points.reshape(-1, 3), faces.reshape(-1, 3)
-        self._light = {name: irradiance(values, self._ball) / math.pi for name, values in probes.values.items()}
+        self._light = {name: _diffuse(values, self._ball) for name, values in probes.values.items()}
         self._brightness = ball_exposure(probes.values.get("original", next(iter(probes.values.values()))))
         self._surface: np.ndarray | None = None
         if self.geometry is not None:
             at_vertices = probes.decode(self.geometry.position.astype(np.float64))
             at_vertices = at_vertices.reshape(len(at_vertices), -1, 3)
             weights = irradiance_weights(_normals(self.geometry), at_vertices.shape[1])
-            self._surface = np.einsum("vc,vcd->vd", weights, at_vertices) / math.pi
+            self._surface = np.maximum(np.einsum("vc,vcd->vd", weights, at_vertices), 0.0) / math.pi
 
     def draw(self, canvas: Canvas, state: State) -> None:
         display = state.display(self._brightness)
@@ -180,7 +181,7 @@ class _ProbeScene(Scene):
     def caption(self, state: State) -> str:
         text = self.probes.note
         if state.view == "volume" and self._stats is not None:
-            held, waiting = self.volume.unscroll()[1].sum(), self._stats.left
+            held, waiting = sum(valid.sum() for valid in self.volume.unscroll()[1]), self._stats.left
             size = self.volume.sizes[0]
             text += f"; {held:,} blocks, the finest {size:.3g} wide, {self._stats.updated} new, {waiting:,} waiting"
         return text
@@ -210,7 +211,7 @@ class _ProbeScene(Scene):
             self._frame = frame
         values, valid = self.volume.unscroll()
         centres, sides, light = [], [], []
-        side, inner = self.volume.side, None
+        inner = None
         for level, size in enumerate(self.volume.sizes):
             place = np.argwhere(valid[level])
             centre = (self.volume.base[level] + place + 0.5) * size
@@ -219,7 +220,7 @@ class _ProbeScene(Scene):
             if inner is not None:
                 seen = ((centre < inner[0]) | (centre > inner[1])).any(1)
             low = self.volume.base[level] * size
-            inner = low, low + side * size
+            inner = low, low + self.volume.sides[level] * size
             canvas.box(0, windows[level], *inner, _WINDOWS[level % len(_WINDOWS)])
             centres.append(centre[seen])
             sides.append(np.full(seen.sum(), _SHRUNK * size))
@@ -227,7 +228,7 @@ class _ProbeScene(Scene):
         centre, size, values = np.concatenate(centres), np.concatenate(sides), np.concatenate(light)
         cube = creation.box()  # of side 1; its triangles share no corners, so that each face has its own colour
         points = centre[:, None] + size[:, None, None] * cube.triangles.reshape(-1, 3)
-        shown = irradiance(values.reshape(len(values), -1, 3), cube.face_normals.repeat(3, 0)) / math.pi
+        shown = _diffuse(values.reshape(len(values), -1, 3), cube.face_normals.repeat(3, 0))
         colours = state.display(self._brightness).picture(shown).reshape(-1, 3)
         canvas.coloured(0, _BLOCKS, points.reshape(-1, 3), np.arange(len(colours)).reshape(-1, 3), colours)
         if len(self.path) > 1:
@@ -247,6 +248,11 @@ def _coefficients(outputs: int, title: str) -> int:
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     sphere = creation.icosphere(subdivisions=subdivisions)
     return np.array(sphere.vertices), np.array(sphere.faces)
+
+
+def _diffuse(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Returns the radiance of white diffuse surfaces with normals [M, 3] under SH [..., C, 3], float64 [..., M, 3]."""
+    return np.maximum(irradiance(values, normals), 0.0) / math.pi
 
 
 def _normals(geometry: Geometry) -> np.ndarray:

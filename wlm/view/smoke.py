@@ -59,10 +59,6 @@ class Drawing:
             obstacles: Obstacles that are drawn and cast shadows on the smoke's surface.
             rule: How the lightmaps are weighted by a light's direction, one of `wlm.smoke.camera.RULES`.
             device: A device as `wlm.interop.check_device` returns it.
-
-        Raises:
-            ValueError: A light has no direction or a negative irradiance; the albedo is out of range; or the rule is
-                unknown.
         """
         self._camera, self._obstacles, self._device = camera, tuple(obstacles), device
         self._albedo, self._background = tuple(map(float, checked_albedo(albedo))), tuple(map(float, background))
@@ -129,17 +125,10 @@ class Drawing:
                 kernels.shadow(self._solids, self._as_lamps(), view, to_warp(surface.contiguous()))
 
     def __call__(self, smoke: SixWay | LitSmoke | ScatteredSmoke) -> torch.Tensor:
-        """Draws a frame.
+        """Draws a frame, and returns `image`.
 
-        Args:
-            smoke: On the device: lightmaps with transparency and, if there are obstacles, with depth; or smoke that was
-                lit by the drawing's lights. `ScatteredSmoke` already includes the albedo.
-
-        Returns:
-            `image`.
-
-        Raises:
-            ValueError: Transparency or depth is missing, or six-way lightmaps are drawn under a point light.
+        `smoke`, on the device, are lightmaps with transparency and, if there are obstacles, with depth; or smoke that
+        was lit by the drawing's lights. `ScatteredSmoke` already includes the albedo.
         """
         six = smoke if isinstance(smoke, SixWay) else None
         seen = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
@@ -189,20 +178,12 @@ def picture(
     time: float = 0.0,
     rule: str = "squared",
 ) -> torch.Tensor:
-    """Draws lit smoke and a scene's obstacles, as one call of `Drawing` does.
+    """Draws lit smoke and a scene's obstacles, as one call of `Drawing` does, which explains the other options: float32
+    [H, W, 3], linear.
 
-    Args:
-        smoke: Lightmaps with their camera and transparency, and with their depth if there are obstacles; or smoke that
-            was lit before, by single or multiple scattering.
-        lights: Lights of the lightmaps; None for smoke that was lit already.
-        albedo, background, ramp, obstacles, rule: As of `Drawing`.
-        time: Time of the obstacles, seconds.
-
-    Returns:
-        float32 [H, W, 3], linear.
-
-    Raises:
-        ValueError: The lightmaps lack their camera, transparency or, with obstacles, depth.
+    `smoke` are lightmaps with their camera and transparency, and with their depth if there are obstacles; or smoke that
+    was lit before, by single or multiple scattering, which needs no lights. `time` is that of the obstacles, in
+    seconds.
     """
     lit = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke
     if lit.camera is None:

@@ -35,13 +35,8 @@ _SURFACE = March(step=2.0, jitter=0.0)  # march to the surface on which shadows 
 
 @dataclass(frozen=True)
 class Lighting:
-    """A way to light the smoke of a frame.
-
-    Attributes:
-        albedo: R, G, B albedo for multiple scattering of all lights and of fire; None: single scattering by six-way
-            lightmaps, as engines show it.
-        network: Network that makes the lightmaps; None: a coarse march.
-    """
+    """A way to light the smoke of a frame. With an `albedo`, multiple scattering of all lights and of fire; else single
+    scattering by six-way lightmaps, as engines show it, made by a network or, without one, by a coarse march."""
 
     albedo: Sequence[float] | None = (1.0, 1.0, 1.0)
     network: SmokePredictor | None = None
@@ -86,21 +81,10 @@ def run(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> Iterator[Frame]:
-    """Simulates a scene and draws each of its frames.
+    """Simulates a scene and draws each of its frames; six-way lighting needs an orthographic camera.
 
-    Args:
-        scene: The scene; six-way lighting needs an orthographic camera.
-        lighting: The lighting; None: light of all orders with the scene's albedo.
-        white: Radiance that becomes white.
-        device: Result of `wlm.interop.check_device`.
-        progress: Called after each frame.
-
-    Yields:
-        The frames. Each stage waits for the device, so that its duration is measured separately.
-
-    Raises:
-        ValueError: Six-way lighting with a perspective camera.
-        WlmError: As `wlm.smoke.simulation.make_solver`; an obstacle is too fast; or the simulation diverged.
+    Without `lighting` it is light of all orders with the scene's albedo; `white` is the radiance that becomes white.
+    Each stage waits for the device, so that its duration is measured separately.
     """
     lighting = Lighting(scene.smoke.albedo) if lighting is None else lighting
     solver = make_solver(scene, device=device)
@@ -153,15 +137,10 @@ class _Clock:
 
 
 def write_all(frames: Iterator[Frame], write: Callable[[int, np.ndarray], None]) -> tuple[dict[str, list[float]], bool]:
-    """Writes frames as they are made.
+    """Passes each frame of `run` to `write`, a function of its number and its pixels.
 
-    Args:
-        frames: Frames of `run`.
-        write: Function of a frame's number and its pixels.
-
-    Returns:
-        The durations of each stage, "writing" among them, one for each frame that had the stage; and whether any frame
-        has smoke.
+    Returns the durations of each stage, "writing" among them, one for each frame that had the stage; and whether any
+    frame has smoke.
     """
     smoke = False
     seconds: dict[str, list[float]] = {}

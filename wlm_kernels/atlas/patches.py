@@ -337,9 +337,6 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
     Returns:
         The samples of all patches, int; the patches, Patch [F], still without dominant colours; and uint8 [F], 1 for
         patches that read a texel that is too bright.
-
-    Raises:
-        ValueError: The patches have more samples than a signed 32-bit integer can count.
     """
     start = np.concatenate([[0], np.cumsum(samples_of(np.array(SIZES, np.int64))[level])])
     if start[-1] > np.iinfo(np.int32).max:

@@ -70,12 +70,9 @@ class Links:
 
 @dataclass(frozen=True)
 class LinkKernels:
-    """Kernels for one lattice and storage type; each has one thread per link.
-
-    Attributes:
-        values: First pass: computes the value of each link; the number of threads is a multiple of `BLOCK`.
-        write: Second pass: writes these values into the populations.
-        force: Sums the force of the fluid on each body.
+    """Kernels for one lattice and storage type, with one thread per link: `values` computes the value of each link (its
+    number of threads is a multiple of `BLOCK`), then `write` writes these into the populations; `force` sums the force
+    of the fluid on each body.
     """
 
     values: wp.Kernel

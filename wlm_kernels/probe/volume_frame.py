@@ -7,18 +7,19 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
    the pool still has its light. The blocks near probes that the pool lacks wait, counted by distance to the viewer.
 2. `select` then finds the distance within which enough blocks wait, gathers these blocks and ranks them. The nearest
    are decoded, by distances in units of their own edge; at equal distances first the finer block, then the lower slot.
-3. Each chosen block gets a row of the pool: the least recently used row of a group of rows; each block takes from
-   another group, and groups take turns. A row whose block is in a window is never given away.
+3. Each chosen block gets a row of the pool: its own, if there is one for every block near a probe; else the least
+   recently used row of a group of rows: each block takes from another group, and groups take turns. A row whose block
+   is in a window is never given away.
 4. `search` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell; `volume_weights`
    computes weights of at most 16 of these probes.
 5. `combine` computes a block's light as the weighted sum of these probes, clamped to the range of their values, which
-   is extended by half its width on both sides.
+   is extended by half its width on both sides, and stores it in half floats, with a factor for each row.
 """
 
 import numpy as np
 import warp as wp
 
-from wlm_kernels.probe.volume import wrap
+from wlm_kernels.probe.volume import inside, wrap
 
 PROBES = 16  # most probes that contribute to a block
 HALVES = 64  # cells of a block's reach: four half sides along each axis
@@ -28,11 +29,15 @@ GROUP = 64  # rows of the pool from which one is chosen
 MOST = 4096  # most blocks that are ranked
 QUEUED, DROPPED, CACHED, LEFT, UPDATED, DECODED, GATHERED = range(7)
 """Counters of a frame; the last is that of the gathered blocks."""
+WAITING = -2
+"""Entry of the page table for a block near probes whose light is missing; -1 for a block without a probe."""
 
 _PROBES = wp.constant(PROBES)
 _QUEUED, _DROPPED, _CACHED, _LEFT, _UPDATED, _GATHERED = (
     wp.constant(i) for i in (QUEUED, DROPPED, CACHED, LEFT, UPDATED, GATHERED)
 )
+_WAITING = wp.constant(WAITING)
+_LARGEST = wp.constant(16384.0)  # of the numbers in a row of the pool: half floats hold it
 _BINS = wp.constant(BINS)
 _SIXTEENS = wp.constant(BINS + BINS // 16)
 _BEYOND = wp.constant(0.5)  # share of the probes' range by which light is extrapolated at most
@@ -58,9 +63,8 @@ class Index:
     Attributes:
         key: [N], Morton keys of the probes' cells, rising.
         number: [N], index of each probe in the input.
-        cell: [N], cell of each probe.
         place: [N], position of each probe in its cell, 0 to 1 along each axis.
-        normal: [N], unit normal of the surface on which each probe lies; 0 if there is none or it is unknown.
+        normal: [N], unit normal of the surface on which each probe lies, 0 if there is none; or [0]: none is known.
         block: [W], Morton keys of the blocks, rising within a level.
         level_start: [L + 1], index in `block` at which each level begins.
         ratios: [L], edge of a block of each level divided by that of the finest level.
@@ -68,7 +72,6 @@ class Index:
 
     key: wp.array1d[wp.int64]
     number: wp.array1d[int]
-    cell: wp.array1d[wp.vec3i]
     place: wp.array1d[wp.vec3]
     normal: wp.array1d[wp.vec3]
     block: wp.array1d[wp.int64]
@@ -81,32 +84,34 @@ class Windows:
     """The windows of all L levels, with S slots in all, each of which holds one block.
 
     Attributes:
-        bases, views: [L], see `wlm_kernels.probe.volume`.
-        held: [S], coordinates of the block of each slot.
-        wanted: [S], index of this block in `Index.block`, or -1 if no probe is near.
-        pages: [S], row of this block's light in the pool, or -1.
-        away: [S], squared distance from the viewer of a block that waits to be decoded, in units of the block's edge;
-            -1 for other blocks.
+        starts, sides, bases, views: [L], see `wlm_kernels.probe.volume`.
+        before: [L], the bases of the frame before.
+        pages: [S], row of the light of each slot's block in the pool; -1 or `WAITING` where it is missing.
     """
 
+    starts: wp.array1d[int]
+    sides: wp.array1d[wp.vec3i]
     bases: wp.array1d[wp.vec3i]
+    before: wp.array1d[wp.vec3i]
     views: wp.array1d[wp.vec4]
-    held: wp.array1d[wp.vec3i]
-    wanted: wp.array1d[int]
-    pages: wp.array1d[int]
-    away: wp.array1d[float]
+    pages: wp.array1d[wp.int16]
 
 
 @wp.struct
 class Pool:
-    """Which blocks have their light in the R rows of the array `pool`, because they are in a window or were lately.
+    """Which blocks have their light in the R rows of the pool, because they are in a window or were lately.
 
     Attributes:
-        stamp: [R], last frame in which the row's block was in a window; -1 for an empty row.
-        owner: [R], index in `Index.block` of the row's block, or -1.
+        light: [R, D], half floats, the blocks' light in units of `factor`.
+        factor: [R].
         rows: [W], row of the light of each block in `Index.block`, or -1.
+        stamp: [R], last frame in which the row's block was in a window; -1 for an empty row. [0] where R = W: row w is
+            that of block w, and no row is given away.
+        owner: [R] or [0], as `stamp`: index in `Index.block` of the row's block, or -1.
     """
 
+    light: wp.array2d[wp.int16]
+    factor: wp.array1d[float]
     stamp: wp.array1d[int]
     owner: wp.array1d[int]
     rows: wp.array1d[int]
@@ -114,26 +119,27 @@ class Pool:
 
 @wp.struct
 class Work:
-    """Data that the launches of a frame pass on; a frame decodes at most B blocks.
+    """Data that the launches of a frame pass on; a frame decodes at most B blocks, from at most P <= 16 probes each.
 
     Attributes:
         clock: [1], the frame's number.
         counters: [7], counts of blocks and probes in this frame.
         histogram: [TOTALS], number of blocks that wait to be decoded, by distance.
         limit: [1], the last bin of the histogram whose blocks are gathered.
-        gathered: [MOST], slots of the gathered blocks.
-        distance: [MOST], distance of each gathered block, as in `Windows.away`.
+        gathered: [G], slots of the gathered blocks.
+        distance: [G], squared distance of each gathered block from the viewer, in units of the block's edge.
         chosen: [B], slots of the chosen blocks, or -1.
         taken: [B], row of the pool for each chosen block, or -1.
+        blocks: [B], coordinates of each chosen block, and its level.
         begin, count: [B, 64], first index and length of each range of probes in `Index` near a chosen block.
-        picked: [B], number of probes that contribute to a block, 16 at most.
+        picked: [B], number of probes that contribute to a block, P at most.
         noise: [B], variance of the noise of each contributing probe.
-        places: [B, 16], position of each contributing probe relative to the block's centre, in units of the block's
+        places: [B, P], position of each contributing probe relative to the block's centre, in units of the block's
             edge, and the probe's additional variance of noise.
-        rows: [B, 16], covariance of each probe with the probes before it and with itself, then 0.
-        hats: [B, 16], covariance of each probe with the block.
-        numbers: [B * 16], index of each contributing probe in the input.
-        weights: [B, 16], weight of each contributing probe.
+        rows: [B, P], covariance of each probe with the probes before it and with itself, then 0.
+        hats: [B, P], covariance of each probe with the block.
+        numbers: [B * P], index of each contributing probe in the input.
+        weights: [B, P], weight of each contributing probe.
     """
 
     clock: wp.array1d[int]
@@ -144,6 +150,7 @@ class Work:
     distance: wp.array1d[float]
     chosen: wp.array1d[int]
     taken: wp.array1d[int]
+    blocks: wp.array1d[wp.vec4i]
     begin: wp.array2d[int]
     count: wp.array2d[int]
     picked: wp.array1d[int]
@@ -168,6 +175,22 @@ def _spread(i: int) -> wp.int64:
 @wp.func
 def morton(cell: wp.vec3i) -> wp.int64:
     return _spread(cell[0]) | _spread(cell[1]) << wp.int64(1) | _spread(cell[2]) << wp.int64(2)
+
+
+@wp.func
+def _gather_bits(key: wp.int64) -> int:
+    b = key & _M4
+    b = (b | b >> wp.int64(2)) & _M3
+    b = (b | b >> wp.int64(4)) & _M2
+    b = (b | b >> wp.int64(8)) & _M1
+    b = (b | b >> wp.int64(16)) & _M0
+    return int((b | b >> wp.int64(32)) & wp.int64(0x1FFFFF))
+
+
+@wp.func
+def cell_of(key: wp.int64) -> wp.vec3i:
+    """Returns the cell of a Morton key."""
+    return wp.vec3i(_gather_bits(key), _gather_bits(key >> wp.int64(1)), _gather_bits(key >> wp.int64(2)))
 
 
 @wp.func
@@ -198,16 +221,43 @@ def _find(index: Index, level: int, block: wp.vec3i) -> int:
 
 
 @wp.func
+def _locate(windows: Windows, s: int):
+    """Returns the level of slot s, and the place of its block in the window, from 0 along each axis."""
+    level = int(0)
+    for i in range(1, windows.starts.shape[0]):
+        if s >= windows.starts[i]:
+            level = i
+    n = windows.sides[level]
+    base = windows.bases[level]
+    at = s - windows.starts[level]
+    x = wrap(at // (n[1] * n[2]) - base[0], n[0])
+    y = wrap(at // n[2] % n[1] - base[1], n[1])
+    z = wrap(at % n[2] - base[2], n[2])
+    return level, wp.vec3i(x, y, z)
+
+
+@wp.func
+def _distance(windows: Windows, level: int, local: wp.vec3i) -> float:
+    """Returns the squared distance of a block from the viewer, who is moved into the window if outside of it."""
+    view = windows.views[level]
+    n = windows.sides[level]
+    x = float(local[0]) - wp.clamp(view[0], 0.0, float(n[0] - 1))
+    y = float(local[1]) - wp.clamp(view[1], 0.0, float(n[1] - 1))
+    z = float(local[2]) - wp.clamp(view[2], 0.0, float(n[2] - 1))
+    return x * x + y * y + z * z
+
+
+@wp.func
 def _bin(away: float, side: int) -> int:
-    half = 0.5 * float(side) + 1.0
-    return wp.min(int(away * float(_BINS) / (3.0 * half * half)), _BINS - 1)
+    return wp.min(int(away * float(_BINS) / (3.0 * float(side * side))), _BINS - 1)
 
 
 @wp.kernel(enable_backward=False)
-def _look(bases: Bases, views: Views, frame: int, windows: Windows, work: Work):
+def _look(bases: Bases, before: Bases, views: Views, frame: int, windows: Windows, work: Work):
     i = wp.tid()
     if i < windows.bases.shape[0]:
         windows.bases[i] = wp.vec3i(bases[i, 0], bases[i, 1], bases[i, 2])
+        windows.before[i] = wp.vec3i(before[i, 0], before[i, 1], before[i, 2])
         windows.views[i] = wp.vec4(views[i, 0], views[i, 1], views[i, 2], views[i, 3])
     if i == 0:
         work.clock[0] = frame
@@ -220,44 +270,28 @@ def _look(bases: Bases, views: Views, frame: int, windows: Windows, work: Work):
 @wp.kernel(enable_backward=False)
 def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
     s = wp.tid()
-    plane = side * side
-    level = s // (plane * side)
-    base = windows.bases[level]
-    local = wp.vec3i(
-        wrap(s // plane % side - base[0], side), wrap(s // side % side - base[1], side), wrap(s % side - base[2], side)
-    )
-    block = base + local
-    held = windows.held[s]
-    wanted = windows.wanted[s]
-    if block[0] != held[0] or block[1] != held[1] or block[2] != held[2]:
-        if wanted >= 0 and windows.pages[s] < 0:
+    level, local = _locate(windows, s)
+    block = windows.bases[level] + local
+    row = int(windows.pages[s])
+    if not inside(block - windows.before[level], windows.sides[level]):
+        if row == _WAITING:
             wp.atomic_add(work.counters, _DROPPED, 1)
-        windows.held[s] = block
+        row = int(-1)
         wanted = _find(index, level, block)
-        windows.wanted[s] = wanted
         if wanted >= 0:
-            wp.atomic_add(work.counters, wp.where(pool.rows[wanted] >= 0, _CACHED, _QUEUED), 1)
-    row = int(-1)
-    away = float(-1.0)
-    if wanted >= 0:
-        row = pool.rows[wanted]
-        if row >= 0:
+            row = pool.rows[wanted]
+            wp.atomic_add(work.counters, wp.where(row >= 0, _CACHED, _QUEUED), 1)
+            if row < 0:
+                row = _WAITING
+        windows.pages[s] = wp.int16(row)
+    if row >= 0:
+        if pool.stamp.shape[0] > 0:
             pool.stamp[row] = work.clock[0]
-        else:
-            view = windows.views[level]
-            # The viewer is at -view of the window's middle.
-            d = wp.vec3(
-                float(local[0] - side // 2) - view[0],
-                float(local[1] - side // 2) - view[1],
-                float(local[2] - side // 2) - view[2],
-            )
-            away = wp.length_sq(d)
-            bin = _bin(away, side)
-            wp.atomic_add(work.histogram, bin, 1)
-            wp.atomic_add(work.histogram, _BINS + bin // 16, 1)
-            wp.atomic_add(work.histogram, _SIXTEENS + bin // 256, 1)
-    windows.pages[s] = row
-    windows.away[s] = away
+    elif row == _WAITING:
+        bin = _bin(_distance(windows, level, local), side)
+        wp.atomic_add(work.histogram, bin, 1)
+        wp.atomic_add(work.histogram, _BINS + bin // 16, 1)
+        wp.atomic_add(work.histogram, _SIXTEENS + bin // 256, 1)
 
 
 @wp.func
@@ -296,8 +330,9 @@ def _find_limit(work: Work):
 @wp.kernel(enable_backward=False)
 def _gather(windows: Windows, side: int, work: Work):
     s = wp.tid()
-    away = windows.away[s]
-    if away >= 0.0:
+    if int(windows.pages[s]) == _WAITING:
+        level, local = _locate(windows, s)
+        away = _distance(windows, level, local)
         if _bin(away, side) <= work.limit[0]:
             i = wp.atomic_add(work.counters, _GATHERED, 1)
             if i < work.gathered.shape[0]:
@@ -324,44 +359,52 @@ def _rank(work: Work):
 
 
 @wp.kernel(enable_backward=False)
-def _allocate(windows: Windows, pool: Pool, size: int, work: Work):
+def _allocate(index: Index, windows: Windows, pool: Pool, size: int, work: Work):
     k = wp.tid()
     taken = int(-1)
     slot = work.chosen[k]
     if slot >= 0:
-        frame = work.clock[0]
-        groups = pool.stamp.shape[0] // size
-        # There are at least as many groups as blocks, so that no two blocks of a frame take from one group.
-        first = (frame % groups * work.chosen.shape[0] + k) % groups * size
-        oldest = frame
-        for i in range(size):
-            stamp = pool.stamp[first + i]
-            if stamp < oldest:
-                oldest = stamp
-                taken = first + i
+        level, local = _locate(windows, slot)
+        block = windows.bases[level] + local
+        wanted = _find(index, level, block)
+        work.blocks[k] = wp.vec4i(block[0], block[1], block[2], level)
+        rows = pool.stamp.shape[0]
+        if rows == 0:
+            taken = wanted
+        else:
+            frame = work.clock[0]
+            groups = (rows + size - 1) // size
+            # There are at least as many groups as blocks, so that no two blocks of a frame take from one group.
+            first = (frame % groups * work.chosen.shape[0] + k) % groups * size
+            oldest = frame
+            for i in range(first, wp.min(first + size, rows)):
+                stamp = pool.stamp[i]
+                if stamp < oldest:
+                    oldest = stamp
+                    taken = i
+            if taken >= 0:
+                before = pool.owner[taken]
+                if before >= 0:
+                    pool.rows[before] = -1
+                pool.owner[taken] = wanted
+                pool.stamp[taken] = frame
         if taken >= 0:
-            before = pool.owner[taken]
-            if before >= 0:
-                pool.rows[before] = -1
-            wanted = windows.wanted[slot]
-            pool.owner[taken] = wanted
             pool.rows[wanted] = taken
-            pool.stamp[taken] = frame
-            windows.pages[slot] = taken
+            windows.pages[slot] = wp.int16(taken)
             wp.atomic_add(work.counters, _UPDATED, 1)
             wp.atomic_sub(work.counters, _LEFT, 1)
     work.taken[k] = taken
 
 
 @wp.kernel(enable_backward=False)
-def _find_ranges(index: Index, windows: Windows, side: int, work: Work):
+def _find_ranges(index: Index, work: Work):
     k, j = wp.tid()
     count = int(0)
     if work.taken[k] >= 0:
-        slot = work.chosen[k]
-        ratio = index.ratios[slot // (side * side * side)]
+        block = work.blocks[k]
+        ratio = index.ratios[block[3]]
         # Coordinates in half sides of the block; a half side is `ratio` cells wide, and a cell of the octree.
-        half = 2 * windows.held[slot] + wp.vec3i(j // 16 - 1, j // 4 % 4 - 1, j % 4 - 1)
+        half = 2 * wp.vec3i(block[0], block[1], block[2]) + wp.vec3i(j // 16 - 1, j // 4 % 4 - 1, j % 4 - 1)
         if wp.min(wp.min(half[0], half[1]), half[2]) >= 0:
             last = index.key.shape[0]
             begin = _lower(index.key, 0, last, morton(ratio * half))
@@ -373,22 +416,49 @@ def _find_ranges(index: Index, windows: Windows, side: int, work: Work):
 
 
 @wp.kernel(enable_backward=False)
-def _combine(work: Work, light: wp.array2d[float], pool: wp.array2d[float]):
+def _combine(work: Work, light: wp.array2d[float]):
+    """Writes the light of block k over that of its first probe, light[k * P]."""
     k, c = wp.tid()
-    row = work.taken[k]
-    if row >= 0:
+    many = work.weights.shape[1]
+    if work.taken[k] >= 0:
         s = float(0.0)
         low = float(wp.inf)
         high = -float(wp.inf)
         for i in range(_PROBES):
-            w = work.weights[k, i]
+            w = float(0.0)
+            if i < many:
+                w = work.weights[k, i]
             if w != 0.0:
-                value = light[k * _PROBES + i, c]
+                value = light[k * many + i, c]
                 s += w * value
                 low = wp.min(low, value)
                 high = wp.max(high, value)
         room = _BEYOND * (high - low)
-        pool[row, c] = wp.clamp(s, low - room, high + room)
+        light[k * many, c] = wp.clamp(s, low - room, high + room)
+
+
+@wp.kernel(enable_backward=False)
+def _store(work: Work, light: wp.array2d[float], pool: Pool):
+    k, c = wp.tid()
+    row = work.taken[k]
+    if row >= 0:
+        at = k * work.weights.shape[1]
+        most = float(0.0)
+        finite = int(1)
+        for j in range(light.shape[1]):
+            value = light[at, j]
+            most = wp.max(most, wp.abs(value))
+            if not wp.isfinite(value):
+                finite = 0
+        factor = most / _LARGEST
+        number = float(0.0)
+        if finite == 0:
+            factor = wp.nan  # whoever reads the block is told
+        elif factor > 0.0:
+            number = light[at, c] / factor
+        pool.light[row, c] = wp.cast(wp.float16(number), wp.int16)
+        if c == 0:
+            pool.factor[row] = factor
 
 
 @wp.kernel(enable_backward=False)
@@ -409,59 +479,65 @@ class Look:
     A volume makes one such object, since packing all arguments again takes longer than the launch.
 
     Args:
-        windows, work: Every launch writes `windows.bases`, `windows.views` and `work.clock`, and resets `work.counters`
+        windows, work: Every launch writes the bases and views of `windows` and `work.clock`, and resets `work.counters`
             and `work.chosen`.
     """
 
     def __init__(self, windows: Windows, work: Work) -> None:
         count = max(LEVELS, work.counters.shape[0], work.chosen.shape[0])
-        self._bases, self._views = np.zeros((LEVELS, 3), np.int32), np.zeros((LEVELS, 4), np.float32)
-        # The launch's arguments use these arrays' memory: building them from 56 numbers takes 20 microseconds a frame.
-        first = [Bases.from_buffer(self._bases), Views.from_buffer(self._views), 0]
+        self._bases, self._before = np.zeros((2, LEVELS, 3), np.int32)
+        self._views = np.zeros((LEVELS, 4), np.float32)
+        # The launch's arguments use these arrays' memory: building them from 80 numbers takes 20 microseconds a frame.
+        first = [Bases.from_buffer(self._bases), Bases.from_buffer(self._before), Views.from_buffer(self._views), 0]
         self._launch = wp.launch(_look, count, [*first, windows, work], device=work.clock.device, record_cmd=True)
 
-    def __call__(self, bases: np.ndarray, views: np.ndarray, frame: int) -> None:
+    def __call__(self, bases: np.ndarray, before: np.ndarray, views: np.ndarray, frame: int) -> None:
         """Launches the kernel on the current stream.
 
         Args:
             bases: Integers [L, 3], coordinates of the first block of each level's window.
-            views: [L, 4], origin of the points in each grid and 1 / edge of a block; see `wlm_kernels.probe.volume`.
+            before: Integers [L, 3], the same of the frame before.
+            views: [L, 4], origin of the points in each window and 1 / edge of a block; see `wlm_kernels.probe.volume`.
             frame: Number of the frame, higher than in the frame before.
         """
-        self._bases[: len(bases)], self._views[: len(views)] = bases, views
+        count = len(bases)
+        self._bases[:count], self._before[:count], self._views[:count] = bases, before, views
         self._launch.set_param_at_index(0, Bases.from_buffer(self._bases))
-        self._launch.set_param_at_index(1, Views.from_buffer(self._views))
-        self._launch.set_param_at_index(2, frame)
+        self._launch.set_param_at_index(1, Bases.from_buffer(self._before))
+        self._launch.set_param_at_index(2, Views.from_buffer(self._views))
+        self._launch.set_param_at_index(3, frame)
         self._launch.launch()
 
 
 def select(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:
     """Finds the block of each slot of the windows, chooses the blocks to decode in this frame, and gives each a row of
-    the pool, from a group of rows of its own; a block whose group has no free row waits for a later frame."""
-    device, slots = work.clock.device, windows.held.shape
+    the pool; a block whose group of rows has no free one waits for a later frame. `side` is the longest side of the
+    windows in blocks."""
+    device, slots = work.clock.device, windows.pages.shape
     wp.launch(_scroll, slots, inputs=[index, windows, pool, side, work], device=device)
     wp.launch(_find_limit, 1, inputs=[work], device=device)
     wp.launch(_gather, slots, inputs=[windows, side, work], device=device)
-    wp.launch(_rank, max(MOST, work.histogram.shape[0]), inputs=[work], device=device)
+    wp.launch(_rank, max(work.gathered.shape[0], work.histogram.shape[0]), inputs=[work], device=device)
     size = max(1, min(GROUP, pool.stamp.shape[0] // work.chosen.shape[0]))
-    wp.launch(_allocate, work.chosen.shape, inputs=[windows, pool, size, work], device=device)
+    wp.launch(_allocate, work.chosen.shape, inputs=[index, windows, pool, size, work], device=device)
 
 
-def search(index: Index, windows: Windows, side: int, work: Work) -> None:
+def search(index: Index, work: Work) -> None:
     """Finds the probes within reach of each chosen block, as 64 ranges of the sorted probes of `index`."""
-    inputs = [index, windows, side, work]
-    wp.launch(_find_ranges, work.count.shape, inputs=inputs, device=work.clock.device)
+    wp.launch(_find_ranges, work.count.shape, inputs=[index, work], device=work.clock.device)
 
 
-def combine(work: Work, light: wp.array, pool: wp.array) -> None:
+def combine(work: Work, light: wp.array, pool: Pool) -> None:
     """Writes the light of the chosen blocks to their rows of the pool.
 
     Args:
         work: Data of the frame, after `volume_weights.weigh`.
-        light: float [B * 16, D], light of the probes `work.numbers`.
-        pool: float [R, D], the light of blocks, written.
+        light: float [B * P, D], light of the probes `work.numbers`, overwritten.
+        pool: The light of blocks, written.
     """
-    wp.launch(_combine, (work.chosen.shape[0], pool.shape[1]), inputs=[work, light, pool], device=pool.device)
+    shape = (work.chosen.shape[0], light.shape[1])
+    wp.launch(_combine, shape, inputs=[work, light], device=light.device)
+    wp.launch(_store, shape, inputs=[work, light, pool], device=light.device)
 
 
 def take_rows(values: wp.array, numbers: wp.array, out: wp.array) -> None:

@@ -17,11 +17,11 @@ probe's noise. A block thus takes its light from probes on its own side of a wal
 
 import warp as wp
 
-from wlm_kernels.probe.volume_frame import DECODED, HALVES, PROBES, Index, Row, Windows, Work
+from wlm_kernels.probe.volume_frame import DECODED, HALVES, PROBES, Index, Row, Work, cell_of
 
 wp.set_module_options({"max_unroll": 1})  # a system of 16 unrolled would take minutes to compile
 
-_PROBES = wp.constant(PROBES)
+_PROBES = wp.constant(float(PROBES))
 _HALVES = wp.constant(HALVES)
 _DECODED = wp.constant(DECODED)
 _DOUBT = wp.constant(3.0)
@@ -50,16 +50,17 @@ def _overlap(x: float, y: float) -> float:
 
 
 @wp.kernel(enable_backward=False)
-def _pick(index: Index, windows: Windows, side: int, work: Work):
+def _pick(index: Index, work: Work):
     k, i = wp.tid()
+    most = work.weights.shape[1]
     total = int(0)
     for j in range(_HALVES):
         total += work.count[k, j]
-    count = wp.min(total, _PROBES)
+    count = wp.min(total, most)
     if i == 0:
         wp.atomic_add(work.counters, _DECODED, count)
         work.picked[k] = count
-        work.noise[k] = _NOISE * wp.clamp(float(total) / float(_PROBES), 1.0, _MOST_NOISE)
+        work.noise[k] = _NOISE * wp.clamp(float(total) / _PROBES, 1.0, _MOST_NOISE)
     number = int(0)
     if i < count:
         # Every n-th probe is taken, so that they are spread over the whole block.
@@ -71,17 +72,20 @@ def _pick(index: Index, windows: Windows, side: int, work: Work):
             if p < 0 and at < passed + here:
                 p = work.begin[k, j] + at - passed
             passed += here
-        slot = work.chosen[k]
-        ratio = index.ratios[slot // (side * side * side)]
-        cell = index.cell[p] - ratio * (2 * windows.held[slot] + wp.vec3i(1, 1, 1))
+        block = work.blocks[k]
+        ratio = index.ratios[block[3]]
+        middle = ratio * (2 * wp.vec3i(block[0], block[1], block[2]) + wp.vec3i(1, 1, 1))
+        cell = cell_of(index.key[p]) - middle
         place = index.place[p]
         x = wp.vec3(float(cell[0]) + place[0], float(cell[1]) + place[1], float(cell[2]) + place[2]) * (
             0.5 / float(ratio)
         )
-        behind = wp.max(wp.dot(index.normal[p], x), 0.0)
+        behind = float(0.0)
+        if index.normal.shape[0] > 0:
+            behind = wp.max(wp.dot(index.normal[p], x), 0.0)
         work.places[k, i] = wp.vec4(x[0], x[1], x[2], _DOUBT * behind * behind)
         number = index.number[p]
-    work.numbers[k * _PROBES + i] = number
+    work.numbers[k * most + i] = number
 
 
 @wp.kernel(enable_backward=False)
@@ -136,17 +140,17 @@ def _weigh(work: Work):
         v[i] = b
         sum_u += a
         sum_v += b
-    for i in range(_PROBES):
+    for i in range(work.weights.shape[1]):
         weight = float(0.0)
         if i < count:
             weight = u[i] + (1.0 - sum_u) / sum_v * v[i]
         work.weights[k, i] = weight
 
 
-def weigh(index: Index, windows: Windows, side: int, work: Work) -> None:
+def weigh(index: Index, work: Work) -> None:
     """Chooses, for each block, at most 16 of the probes that `volume_frame.search` found, and computes their weights.
     There are three launches, since only the last one, the longest, is limited to one thread per block."""
     device = work.clock.device
-    wp.launch(_pick, work.weights.shape, inputs=[index, windows, side, work], block_dim=32, device=device)
+    wp.launch(_pick, work.weights.shape, inputs=[index, work], block_dim=32, device=device)
     wp.launch(_relate, work.weights.shape, inputs=[work], block_dim=32, device=device)
     wp.launch(_weigh, work.chosen.shape, inputs=[work], block_dim=32, device=device)

@@ -290,11 +290,7 @@ def total_of(v: wp.vec3d) -> wp.float64:
 
 
 def frame(height: int, width: int, space: str) -> Frame:
-    """Creates the `Frame` of an image of the given size in pixels, for positions in the space "clip" or "uv".
-
-    Raises:
-        ValueError: The height or the width is not from 1 to `MOST_PIXELS`.
-    """
+    """Creates the `Frame` of an image of the given size in pixels, for positions in the space "clip" or "uv"."""
     for name, size in (("height", height), ("width", width)):
         if not 1 <= size <= MOST_PIXELS:
             raise ValueError(f"{name}: expected 1 to {MOST_PIXELS} pixels, got {size}")

@@ -300,9 +300,6 @@ class Rasterizer:
 
     Attributes:
         raster: `Raster`, the output of `run`.
-
-    Raises:
-        ValueError: The height or width is out of range, or there are too many triangles for an image of this size.
     """
 
     def __init__(

@@ -217,9 +217,6 @@ def six_way(medium: Medium, view: View, march: March, out: wp.array) -> None:
             middles of the steps. The error falls with the square of the step where the density is smooth.
         out: float [8, H, W], written: light that reaches the camera from smoke lit from the right, left, top, bottom,
             front and back, each light of irradiance 4 pi; the transparency; the emission.
-
-    Raises:
-        ValueError: The camera is in perspective.
     """
     require_orthographic(view, "six-way lightmaps")
     medium = medium.in_bricks()

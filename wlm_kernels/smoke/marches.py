@@ -116,16 +116,11 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
 
 
 def guide_nodes(medium: Medium, up: Sequence[float], step: float) -> wp.array:
-    """Computes optical depths towards the top and the bottom at the nodes of a lattice over the grid's box.
+    """Computes optical depths towards the top, a direction of length 1, and the bottom at the nodes of a lattice over
+    the grid's box: vec2 [A, B, C], see `march.node_position`.
 
-    Args:
-        medium: The smoke.
-        up: Direction to the top, of length 1.
-        step: Largest distance between nodes (at least a voxel is used) and longest step of a march from a node, both
-            in voxels.
-
-    Returns:
-        vec2 [A, B, C], the depths to the top and to the bottom at each node; see `march.node_position`.
+    `step` is the largest distance between nodes (at least a voxel is used) and longest step of a march from a node, in
+    voxels.
     """
     nodes = medium.buffer(nodes_along(medium.density.shape, step), wp.vec2)
     _guide_nodes(medium, nodes.shape, [wp.vec3(*map(float, up)), step], [nodes])
@@ -241,9 +236,6 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
         view: An orthographic camera, [H, W] pixels.
         march: Settings. The default cutoff causes an error below 1e-3 in every plane.
         out: float [9, H, W], written: the images `PLANES`, each light of irradiance 4 pi.
-
-    Raises:
-        ValueError: The camera is in perspective.
     """
     require_orthographic(view, "six-way lightmaps")
     if march.step < BRICK:
@@ -408,9 +400,6 @@ def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: 
         reach: Distance in voxels that smoke with a velocity of 1 moves between the frames.
         march: Only its step and cutoff are used; samples lie in the middles of the steps.
         out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.
-
-    Raises:
-        ValueError: The camera is in perspective.
     """
     require_orthographic(view, "motion vectors")
     _motion(medium.in_bricks(), out.shape[1:], [velocity, reach, view, parameters(march)], [out])

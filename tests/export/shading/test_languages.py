@@ -150,9 +150,9 @@ def volume(folder) -> Subject:
     normals = random.normal(size=points.shape)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     ahead = made.read(points, normals)
-    head, pages, pool = (np.fromfile(folder / f"{name}.bin", kind) for name, kind in KINDS_OF_BUFFERS)
+    head, pages, pool = (np.fromfile(folder / f"{name}.bin", "<u4") for name in ("volume", "pages", "pool"))
     shown = [irradiance(each.reshape(9, 3), n[None])[0, 1] for each, n in zip(ahead.values, normals, strict=True)]
-    light = np.column_stack([ahead.values[:, [0, 26]], np.array(shown) / np.pi])
+    light = np.column_stack([ahead.values[:, [0, 26]], np.maximum(shown, 0.0) / np.pi])
     expected = np.column_stack([ahead.weight, light * ahead.weight[:, None]])
     main = (
         POINTS
@@ -169,7 +169,7 @@ vec4 shown(ivec2 pixel)
     )
     bound = {"u_points": points_of(points - document["viewpoint"]), "u_normals": points_of(normals)}
     bound |= {"wlm_volume_head": head, "wlm_volume_page": pages, "wlm_volume_pool": pool}
-    return Subject(volume_glsl(27), main, expected[None], bound, "", 3e-5, as_textures=VOLUME)
+    return Subject(volume_glsl(27), main, expected[None], bound, "", 3e-5, as_textures=VOLUME, version=430)
 
 
 def virtual(folder) -> Subject:
@@ -207,15 +207,10 @@ vec4 shown(ivec2 pixel)
     return Subject(virtual_glsl(), main, expected.light[None], bound, "", 5e-3 * float(light.max()))
 
 
-KINDS_OF_BUFFERS = (("volume", "<u4"), ("pages", "<i4"), ("pool", "<f4"))
 VOLUME = "".join(
-    f"uniform {kind} u_{name};\n#define WLM_VOLUME_{name.upper()}(i) {before}texelFetch(u_{name}, ivec2((i) & 1023, "
-    f"(i) >> 10), 0).r{after}\n"
-    for name, kind, before, after in (
-        ("head", "usampler2D", "", ""),
-        ("page", "usampler2D", "int(", ")"),
-        ("pool", "sampler2D", "", ""),
-    )
+    f"uniform usampler2D u_{name};\n#define WLM_VOLUME_{name.upper()}(i) texelFetch(u_{name}, ivec2((i) & 1023, "
+    f"(i) >> 10), 0).r\n"
+    for name in ("head", "page", "pool")
 )
 
 

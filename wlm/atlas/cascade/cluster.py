@@ -75,23 +75,19 @@ def cluster(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> Clusters:
-    """Groups triangles over which the lightmap looks alike, so that one of them can stand for its whole group.
+    """Groups triangles over which the lightmap looks alike, so that one of them can stand for its whole group; the
+    result is the same on all devices.
 
     Args:
         uv: [V, 2], lightmap UVs of the vertices, finite; v = 0 is the top of row 0. Beyond [0, 1], border texels are
             read.
-        triangle: int [F, 3], vertex numbers.
+        triangle, active: int [F, 3], vertex numbers; bool [F], which triangles take part, None for all.
         lightmap: [H, W, 3], linear RGB, finite.
         threshold, colour_threshold: lambda of eq. 4 and lambda_h of section 3.2.1, fractions of `max_radiance`.
         max_radiance: Above 0. A triangle with a brighter texel shares texels with no other (section 4.1.1). It stands
             for the paper's 8-bit colour 255.
-        active: bool [F], which triangles take part; None for all.
         largest: Largest number of samples along a side of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
-        device: "cpu" or "cuda:N"; the result is the same on all.
         progress: Called with the triangles done in the stages "compare patches" and "cluster", in turn.
-
-    Raises:
-        ValueError: There are more samples of the lightmap in all than 32 bits can count.
     """
     count = len(triangle)
     excluded = np.zeros(count, bool) if active is None else ~active

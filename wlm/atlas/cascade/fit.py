@@ -102,17 +102,12 @@ def fit_cascade(
     *,
     repack: bool = True,
 ) -> AtlasModel:
-    """Compresses a lightmap to a cascade of two textures.
+    """Compresses a lightmap, of a scene of one sheet and one state, to a cascade of two textures; the groups of its
+    triangles share texels.
 
-    Args:
-        scene: A scene of one sheet and one state.
-        clusters: The groups of its triangles that share texels; None: no triangles share any.
-        profile, seed, stages: As for `wlm.atlas.fit.compress`.
-        repack: Whether charts are packed anew (section 3.3.1). If false, the mesh keeps its UVs, tuning starts from the
-            original lightmap, and `clusters` and the profile's `scale` are ignored (section 4.5.2).
-
-    Returns:
-        A model of method "cascade"; or "plain", with the colour texture T_p alone, if `lut_scale` is 0.
+    Without `repack`, charts are not packed anew (section 3.3.1): the mesh keeps its UVs, tuning starts from the
+    original lightmap, and `clusters` and the profile's `scale` are ignored (section 4.5.2). Returns a model of method
+    "cascade"; or "plain", with the colour texture T_p alone, if `lut_scale` is 0.
     """
     (sheet,), facts = scene.sheets, {}
     count = len(sheet.triangle)
@@ -221,13 +216,7 @@ class _Step:
     """One step of tuning, as a callable. Its buffers are allocated once, so that a CUDA graph may capture the step."""
 
     def __init__(
-        self,
-        sheet: Sheet,
-        uv: np.ndarray,
-        textures: Textures,
-        profile: Profile,
-        seed: int,
-        device: str,
+        self, sheet: Sheet, uv: np.ndarray, textures: Textures, profile: Profile, seed: int, device: str
     ) -> None:
         self._weight = profile.gradient
         # A black lightmap has no mean to divide by, and needs none.
@@ -297,11 +286,7 @@ class _Step:
 
     @torch.no_grad()
     def load(self, state: dict[str, np.ndarray]) -> None:
-        """Restores the arrays that `state` returned.
-
-        Raises:
-            ValueError: The state belongs to another fit; nothing has changed.
-        """
+        """Restores the arrays that `state` returned."""
         table = {"step": Part(np.int32, (1,), least=0, most=len(self._rates))}
         for name, parameter in self._tuned.items():
             shapes = {name: parameter.shape} | {f"{name}.{key}": parameter.shape for key in _MOMENTS[1:]}

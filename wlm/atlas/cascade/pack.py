@@ -65,10 +65,6 @@ class Packed:
 def pack(sheet: Sheet, clusters: Clusters | None, scale: float) -> Packed:
     """Gives the mesh new UVs in which the triangles of a group share texels; `scale` is epsilon, texels of the atlas
     per texel of the lightmap along a side.
-
-    Raises:
-        WlmError: `uvunwrap` isn't installed or fails, or the atlas gets too large.
-        ValueError: `scale` isn't above 0, or the groups belong to another mesh.
     """
     if not 0.0 < scale < math.inf:
         raise ValueError(f"scale: expected a number above 0, got {scale}")

@@ -18,13 +18,7 @@ import numpy as np
 import torch
 
 from wlm.atlas.colour import stored
-from wlm.atlas.model import (
-    BLOCK_SIDE,
-    COLOUR_BITS,
-    FACTOR_BITS,
-    MOST_COARSE,
-    extent,
-)
+from wlm.atlas.model import BLOCK_SIDE, COLOUR_BITS, FACTOR_BITS, MOST_COARSE, extent
 from wlm.atlas.shared.mixture import Mixtures, find_mixtures, moments
 from wlm.atlas.stages import Stages
 from wlm.atlas.tiles.fit import Tiles, errors, sample_weights, solve, tile_light
@@ -105,13 +99,10 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """The errors of all T tiles with a certain number of components.
-
-    Attributes:
-        mixtures, number: The mixtures (sets of factors that tiles share), and each tile's mixture, int [T].
-        choices: The sizes of the components.
-        error: float64 [choices, T], squared error of each tile for each choice, mean over the states.
-        left: Estimated error of the whole scene if tiles may have up to this number of components.
+    """The errors of all T tiles with a certain number of components: the mixtures (sets of factors that tiles share)
+    and each tile's mixture, int [T]; the sizes of the components, and the squared error of each tile for each choice of
+    them, float64 [choices, T], mean over the states; `left` estimates the error of the whole scene if tiles may have up
+    to this number of components.
     """
 
     mixtures: Mixtures

@@ -16,16 +16,7 @@ import torch
 
 from wlm.atlas.colour import encode
 from wlm.atlas.data import LightmappedScene
-from wlm.atlas.model import (
-    BLOCK_SIDE,
-    BLOCKS,
-    TEXELS,
-    AtlasModel,
-    Profile,
-    coarse_place,
-    extent,
-    pack_tiles,
-)
+from wlm.atlas.model import BLOCK_SIDE, BLOCKS, TEXELS, AtlasModel, Profile, coarse_place, extent, pack_tiles
 from wlm.atlas.shared.allocation import Allocated
 from wlm.atlas.shared.curves import Candidate, SceneTiles
 from wlm.atlas.shared.sharing import Cut, fitted, planes_of

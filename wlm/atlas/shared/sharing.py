@@ -95,14 +95,8 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """Sheets and mip levels, cut into tiles.
-
-    Attributes:
-        planes, places: Sheets and mip levels, from `planes_of`, and the place of each in the lookup texture T_c.
-        shape: Rows and columns of T_c.
-        tiles: The tiles of all planes.
-        bits: The budget of bits of the whole model.
-    """
+    """Sheets and mip levels (`planes_of`), cut into tiles, with the place of each in the lookup texture T_c; rows and
+    columns of T_c; and the budget of bits of the whole model."""
 
     planes: list[Plane]
     places: list[SheetPlace]
@@ -146,16 +140,11 @@ def fitted(
     seed: int,
     stages: Stages,
 ) -> Fitted:
-    """Chooses components and sizes for the tiles of all planes. Tiles are shared by the states or separate for each.
+    """Chooses components and sizes for the tiles of all planes, from `planes_of`. Tiles are shared by the states or
+    separate for each.
 
-    Args:
-        scene: The scene.
-        planes: Sheets and mip levels, from `planes_of`.
-        unit: float64 [M], the divisor of each state's light.
-        varies: Variation of each sheet's light, from `variation`.
-        profile: The settings.
-        seed: Seed of all random choices.
-        stages: Reports and times the stages.
+    `unit`, float64 [M], is the divisor of each state's light, and `varies` the variation of each sheet's light, from
+    `variation`.
     """
     states = len(scene.states)
     # One state has one component.

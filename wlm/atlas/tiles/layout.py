@@ -143,15 +143,12 @@ def allocate(error: torch.Tensor | np.ndarray, cost: np.ndarray, budget: float, 
 def packed(
     size: np.ndarray, pages: Sequence[np.ndarray] | None = None, step: int = 1
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """Packs rectangles, int [R, 2] texels along x and y, on pages of equal size, with the width of least area.
+    """Packs rectangles, int [R, 2] texels along x and y, multiples of `step`, on pages of equal size, with the width of
+    least area.
 
-    Args:
-        size: Width and height of each rectangle; multiples of `step`.
-        pages: For each page the numbers of its rectangles; None: all are on one page.
-        step: The width that the shelves (rows) may take is a multiple of this.
-
-    Returns:
-        The first texel (x, y) of each rectangle on its page, int64 [R, 2]; and the rows and columns of a page.
+    `pages` has for each page the numbers of its rectangles (None: all are on one page); the width that the shelves
+    (rows) may take is a multiple of `step`. Returns the first texel (x, y) of each rectangle on its page, int64 [R, 2],
+    and the rows and columns of a page.
     """
     first = np.zeros((len(size), 2), np.int64)
     if not len(size):

@@ -31,16 +31,8 @@ from wlm.formats.exr import write_exr
 
 
 def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes the kit of compressed lightmaps.
-
-    Args:
-        bundle: The bundle.
-        folder: The kit's folder, which must exist.
-        engine: One of `wlm.export.ENGINES`.
-
-    Returns:
-        Entries for the folder's index: shader and textures.
-    """
+    """Writes the kit of compressed lightmaps for one of `wlm.export.ENGINES` into an existing folder; returns the
+    entries of the folder's index: shader and textures."""
     if bundle.model.levels:
         bundle = make_bundle(bundle.model.without_mips())
     pictures = engine in ("godot", "unreal")

@@ -27,16 +27,8 @@ _NO_MIPS = "The shader reads no mips of the textures; `--mips 3` of the export m
 
 
 def write_kit(bundle: Bundle, folder: Path, engine: str) -> dict[str, Any]:
-    """Writes the kit of a flip book, with its textures as PNGs.
-
-    Args:
-        bundle: The bundle of a flip book in the layout "unity".
-        folder: The kit's folder, which must exist.
-        engine: One of `wlm.export.ENGINES`.
-
-    Returns:
-        Entries for the folder's index: shader and textures.
-    """
+    """Writes the kit of a flip book in the layout "unity", with its textures as PNGs, for one of `wlm.export.ENGINES`
+    into an existing folder; returns the entries of the folder's index: shader and textures."""
     if bundle.document["layout"] != _LAYOUT:
         raise WlmError(f"layout: expected {_LAYOUT} for {engine}, got {bundle.document['layout']}")
     textures = {}

@@ -14,12 +14,12 @@ from wlm.export.engines.kit import filled
 from wlm.export.page.html import Page, asset
 from wlm.export.page.lightmap import pack_groups, pack_originals
 from wlm.export.page.smoke import pack_frames
+from wlm.formats.hours import DAY
 from wlm.formats.light import read_light
 from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.groups import times_of
-from wlm.lightmap.hours import DAY
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.sheet import first_light
@@ -38,13 +38,8 @@ _FILMIC = 1  # of the tones of the script
 
 
 def scene_page(paths: Sequence[Path], *, progress: OnProgress | None = None) -> Page:
-    """Makes the HTML page of a scene: its lightmaps are decoded by the page, and the light of its probes is stored at
-    the smoke and along the paths of moving objects.
-
-    Args:
-        paths: The YAML file.
-        progress: Called about twice a second while smoke and originals are read.
-    """
+    """Makes the HTML page of a scene's YAML file: its lightmaps are decoded by the page, and the light of its probes is
+    stored at the smoke and along the paths of moving objects."""
     with load(paths[0]) as scene:
         return _page(scene, progress)
 

@@ -27,13 +27,8 @@ _ASSIGN = ("=", "+=", "-=", "*=", "/=", "%=", "&=", "|=", "^=")
 
 @dataclass(frozen=True)
 class Node:
-    """A node of an expression tree.
-
-    Attributes:
-        kind: `number`, `name`, `call`, `member`, `index`, `unary`, `binary`, `choice` (?:), `assign` or `step` (++).
-        text: The number, name, member or operator.
-        parts: Operands.
-    """
+    """A node of an expression tree: its kind (`number`, `name`, `call`, `member`, `index`, `unary`, `binary`, `choice`
+    (?:), `assign` or `step` (++)); the text of the number, name, member or operator; and its operands."""
 
     kind: str
     text: str
@@ -42,14 +37,9 @@ class Node:
 
 @dataclass(frozen=True)
 class Variable:
-    """A parameter, constant, local variable, texture, uniform or buffer.
-
-    Attributes:
-        type: GLSL type.
-        name: Name.
-        size: Length of an array; None for other types.
-        way: `in`, `out` or `inout` for a parameter or local variable; `const`, `uniform` or `buffer`.
-        value: Initial value, or None.
+    """A parameter, constant, local variable, texture, uniform or buffer of a GLSL type. `size` is the length of an
+    array, else None; `way` is `in`, `out` or `inout` of a parameter or local variable, or `const`, `uniform` or
+    `buffer`; `value` is the initial value, or None.
     """
 
     type: str
@@ -94,11 +84,8 @@ class Function:
 
 @dataclass
 class Shader:
-    """The declarations of a shader.
-
-    Attributes:
-        items: Comments (text), variables and functions in order, each with a flag: whether a blank line precedes it.
-    """
+    """The declarations of a shader: comments (text), variables and functions in order, each with a flag, whether a
+    blank line precedes it."""
 
     items: list[tuple[str | Variable | Function, bool]] = field(default_factory=list)
 

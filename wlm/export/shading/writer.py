@@ -32,12 +32,8 @@ def nodes_of(body: tuple[Statement, ...]) -> Iterator[Node]:
 
 
 class Writer(ABC):
-    """Writes a parsed shader in a C-like language; subclasses override the differences.
-
-    Attributes:
-        shader: The parsed shader.
-        linear: Name of the sampler that reads all filtered textures.
-    """
+    """Writes a parsed shader in a C-like language; subclasses override the differences. `linear` is the name of the
+    sampler that reads all filtered textures."""
 
     names: dict[str, str] = {}
     """Names of types and functions that differ from GLSL."""

@@ -14,12 +14,8 @@ from wlm.lightmap.tiles import TileKind
 
 
 class DeviceTiles(ABC):
-    """All tiles of a sheet that are stored with the same encoding, uploaded to a device.
-
-    Attributes:
-        numbers: int [n], numbers of the tiles in the grid, rising.
-        device_bytes: Memory that they take on the device, bytes.
-    """
+    """All tiles of a sheet that are stored with the same encoding, uploaded to a device, where they take
+    `device_bytes`; `numbers`, int [n], are their numbers in the grid, rising."""
 
     device_bytes = 0
 
@@ -40,12 +36,8 @@ class DeviceTiles(ABC):
 
 
 class Encoding(ABC):
-    """One way to store tiles.
-
-    Attributes:
-        kinds: The kinds of tiles that are stored in this way.
-        codes: The number of each of these kinds in the shader's tables, see `wlm.lightmap.bundle.hour_tables`.
-    """
+    """One way to store tiles of some kinds; `codes` has the number of each of these kinds in the shader's tables, see
+    `wlm.lightmap.bundle.hour_tables`."""
 
     kinds: ClassVar[tuple[TileKind, ...]]
     codes: ClassVar[tuple[int, ...]]
@@ -67,13 +59,8 @@ class Encoding(ABC):
 
     @abstractmethod
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
-        """Uploads a sheet's tiles of this encoding to a device; returns an empty list if the sheet has none.
-
-        Args:
-            sheet: The arrays of the sheet.
-            device: As `wlm.interop.check_device` returns it.
-            gelu: GELU variant of the networks, see `wlm_kernels.mlp`.
-        """
+        """Uploads a sheet's tiles of this encoding to a device; returns an empty list if the sheet has none. `gelu` is
+        the GELU variant of the networks, see `wlm_kernels.mlp`."""
 
     def textures(self, sheet: SheetModel) -> dict[str, Texture]:
         """Returns the textures that the shader reads for tiles of this encoding, by name."""
@@ -103,16 +90,8 @@ def columns(count: int, height: int, width: int) -> int:
 
 
 def side_by_side(images: np.ndarray, fmt: str, height: int, width: int) -> dict[str, Any]:
-    """Arranges images side by side, in several rows, in one texture.
-
-    Args:
-        images: [n, rows, columns, bytes] of texels or blocks.
-        fmt: Pixel format.
-        height, width: Size of an image in texels.
-
-    Returns:
-        The keyword arguments of `Texture`.
-    """
+    """Arranges images, [n, rows, columns, bytes] of texels or blocks, side by side in several rows of one texture;
+    returns the keyword arguments of `Texture`. `height` and `width` are the size of an image in texels."""
     across = columns(len(images), height, width)
     missing = -len(images) % across
     padded = np.concatenate([images, np.zeros((missing, *images.shape[1:]), images.dtype)])

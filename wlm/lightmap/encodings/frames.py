@@ -51,13 +51,8 @@ def missing_encoder(count: int) -> str | None:
 
 
 def choose_frames(kinds: np.ndarray, times: int, profile: Profile) -> np.ndarray:
-    """Returns which of N tiles are stored as frames, see `Profile.frames`, bool [N].
-
-    Args:
-        kinds: `TileKind` of each of the N tiles.
-        times: Number of stored times.
-        profile: The settings.
-    """
+    """Returns which of N tiles, of the given `TileKind`s and number of stored times, are stored as frames, see
+    `Profile.frames`, bool [N]."""
     chosen = np.isin(kinds, (TileKind.STATIC, TileKind.DYNAMIC))
     if profile.frames == "auto":
         for kind in (TileKind.STATIC, TileKind.DYNAMIC):
@@ -88,15 +83,11 @@ def clear_unneeded(blocks: np.ndarray, needed: np.ndarray) -> np.ndarray:
 
 
 def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Encodes the frames of a tile at T times.
+    """Encodes the frames of a tile at T times: colour float32 [T, 128, 128, 3], in gamma space, gaps filled.
 
-    Args:
-        colour: float32 [T, 128, 128, 3], in gamma space, gaps filled.
-        valid: bool [128, 128], true where a texel of the tile is valid.
-        needed: bool [32, 32], from `needed_blocks`.
-
-    Returns:
-        BC7 blocks, uint8 [T, 32, 32, 16], and the least and greatest colour of each frame, float16 [T, 2, 3].
+    `valid`, bool [128, 128], is true where a texel of the tile is valid; `needed`, bool [32, 32], is from
+    `needed_blocks`. Returns BC7 blocks, uint8 [T, 32, 32, 16], and the least and greatest colour of each frame, float16
+    [T, 2, 3].
     """
     texels = colour[:, valid]
     ranges = np.stack([round_half(texels.min(1), -np.inf), round_half(texels.max(1), np.inf)], 1)
@@ -152,13 +143,12 @@ class FrameTiles(DeviceTiles):
         return self._greatest[:, before] if share == 0 else self._greatest[:, [before, after]].max(1)
 
     def decode(self, time: float, rows: wp.array, out: wp.array, inverse_bounds: wp.array | None = None) -> None:
-        """Decodes tiles with one kernel launch, which a CUDA graph can capture.
+        """Decodes the tiles `rows`, int [k], indices into `numbers`, with one kernel launch, which a CUDA graph can
+        capture.
 
-        Args:
-            time: A stored time, or a time between two, whose radiance is then interpolated (neural-dynamic-gi, eq. 2).
-            rows: int [k], indices into `numbers`.
-            out: [k, 128, 128]: radiance, vec3 or uint32 (RGB9E5); with `inverse_bounds` 8-bit colour, uint32 (RGBA).
-            inverse_bounds: float [n], 1 / the bound of each tile.
+        Between two stored times the radiance is interpolated (neural-dynamic-gi, eq. 2). `out`, [k, 128, 128], receives
+        radiance, vec3 or uint32 (RGB9E5); with `inverse_bounds`, float [n], 1 / the bound of each tile, 8-bit colour,
+        uint32 (RGBA).
         """
         frame_kernels.decode(self._stored, *self._axis.neighbours(time), rows, out, inverse_bounds)
 

@@ -56,13 +56,9 @@ def tile_bytes(profile: Profile, temporal: bool) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Reads:
-    """Which texels of a dynamic tile's temporal maps are read when its valid texels are decoded at the evaluated times.
-
-    Attributes:
-        slices: bool [S], slices of F_uvt that are read.
-        texels: bool [R, R], texels that are read in each of these slices.
-        rows: bool [rows], rows of F_ut and F_vt that are read.
-        columns: bool [2, columns], columns of F_ut and of F_vt that are read.
+    """Which texels of a dynamic tile's temporal maps are read when its valid texels are decoded at the evaluated times:
+    slices of F_uvt, bool [S], and texels in each of them, bool [R, R]; rows of F_ut and F_vt, bool [rows], and columns
+    of each, bool [2, columns].
     """
 
     slices: np.ndarray
@@ -233,10 +229,8 @@ def _together(data: np.ndarray) -> np.ndarray:
 class MapTiles(DeviceTiles):
     """The static or the dynamic tiles of a sheet on a device.
 
-    Attributes:
-        model: The sheet.
-        places: int [n] on the device, 0 to n - 1: indices of the tiles in the arrays of a `TimeState`.
-        arguments: First arguments of each decode kernel: `Stored` and the networks, see `wlm_kernels.mlp`.
+    `places`, int [n] on the device, 0 to n - 1, are indices of the tiles in the arrays of a `TimeState`; `arguments`
+    are the first arguments of each decode kernel: `Stored` and the networks, see `wlm_kernels.mlp`.
     """
 
     def __init__(self, sheet: SheetModel, kind: TileKind, device: str, gelu: str) -> None:
@@ -297,13 +291,11 @@ class MapTiles(DeviceTiles):
         return state
 
     def launch(self, state: decode_kernels.TimeState, rows: wp.array, form: int, out: wp.array) -> None:
-        """Decodes tiles with the same order of operations as the training, one thread per texel.
+        """Decodes the tiles `rows`, int [k], indices into `numbers`, in the training's order of operations, one thread
+        per texel.
 
-        Args:
-            state: From `state`.
-            rows: int [k], indices into `numbers`.
-            form: Output: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for RGB9E5 (uint32).
-            out: [k, 128, 128], written.
+        `form` is the output written to `out`, [k, 128, 128]: 0 for radiance (vec3), 1 for 8-bit RGBA (uint32), 2 for
+        RGB9E5 (uint32).
         """
         inputs = [*self.arguments, state, self.places, rows]
         wp.launch(self._kernels[form], out.shape, inputs=inputs, outputs=[out], device=self._device)
@@ -330,14 +322,12 @@ def fours(profile: Profile) -> int:
 
 
 def shader_networks(sheet: SheetModel) -> np.ndarray:
-    """Returns all networks as the shader reads them: weights W and bias b of layers 1 to 3, one row of W per input.
+    """Returns all networks as the shader reads them, float32 [n, 4]: weights W and bias b of layers 1 to 3, one row of
+    W per input; `network_starts` says where each network begins.
 
     Dynamic tiles come first, then static ones. Rows are padded with zeros to groups of four, and so are the inputs of
     the next layer. The shader passes features f as the textures hold them: their centring, (f - 1/2) sqrt(12), is part
     of W1 and b1.
-
-    Returns:
-        float32 [n, 4]; `network_starts` says where each network begins.
     """
     hidden, wide = sheet.profile.hidden, 4 * fours(sheet.profile)
     made = [np.zeros((0, 4), np.float32)]

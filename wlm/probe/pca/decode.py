@@ -7,7 +7,8 @@ from scipy.spatial import cKDTree
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel, check_points
 from wlm.probe.pca.model import Components
-from wlm.probe.volume.cascade import Volume
+from wlm.probe.sphere import ambient_numbers
+from wlm.probe.volume.cascade import SIDE, Volume
 from wlm.probe.volume.light import at_probes
 from wlm.probe.volume.walk import settle
 from wlm_kernels.probe.components import decode_components
@@ -30,12 +31,18 @@ class ComponentDecoder(Decoder):
         assert isinstance(content, Components)
         self._code = self._put(content.code, wp.uint8)
         self._bounds = self._put(content.bounds, float)
-        self._basis = self._put(content.basis, wp.float16)
+        bases = [each.basis for each in self._contents()]
+        self._basis = self._put(bases[0], wp.float16)
+        self._keep_hours(np.stack(bases).reshape(len(bases), -1), self._basis.flatten())
         live = model.live
         row = np.where(live, np.cumsum(live) - 1, -1)
         self._row = self._put(row.astype(np.int32), int)
         self.count, self.channels = model.probes, model.outputs
         self._volume: Volume | None = None
+
+    def set_time(self, time: float) -> None:
+        super().set_time(time)
+        self._volume = None
 
     def decode(self, position: np.ndarray) -> np.ndarray:
         """Returns the light at any points as a renderer reads it: from the cascaded volume around a nearby viewer.
@@ -49,7 +56,7 @@ class ComponentDecoder(Decoder):
         values = np.empty((len(points), model.outputs), np.float32)
         covered = np.empty(len(points), bool)
         # One viewpoint for each cube of points; the finest window reaches beyond the cube on all sides.
-        side = 0.5 * volume.side * volume.sizes[0]
+        side = 0.5 * SIDE * volume.sizes[0]
         cube = np.floor((points - own.min(0)) / side)
         for viewpoint in np.unique(cube, axis=0):
             here = (cube == viewpoint).all(1)
@@ -70,4 +77,5 @@ class ComponentDecoder(Decoder):
         return self
 
     def read(self, numbers: wp.array, values: wp.array) -> None:
-        decode_components(self._code, self._bounds, self._basis, self._row, numbers, values)
+        ambient = ambient_numbers(self.channels)
+        decode_components(self._code, self._bounds, self._basis, self._row, numbers, ambient, values)

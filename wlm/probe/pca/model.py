@@ -5,18 +5,19 @@ coefficients.
 
 The magnitude of a probe is about the norm of its numbers, so that the precision follows the light of each probe. The
 directions b_k are the right singular vectors of all probes' numbers; with as many directions as numbers they are the
-unit vectors, which take no memory. This is the method of Sloan et al., Clustered Principal Components for Precomputed
-Radiance Transfer, 2003, with one cluster.
+unit vectors, which take no memory. Ambient light, the first three numbers of spherical harmonics, is clamped at 0. This
+is the method of Sloan et al., Clustered Principal Components for Precomputed Radiance Transfer, 2003, with one cluster.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from wlm.formats.parts import Part
 from wlm.probe.model import Content, Profile
+from wlm.probe.relative import norms
 
 ENOUGH = 0.02
 """Relative error at which no component is added: RMS over all probes of the error divided by the probe's norm."""
@@ -27,13 +28,14 @@ _MOST_LOG = 88.0  # largest logarithm in a file: the exponential still fits floa
 
 @dataclass(frozen=True, eq=False)
 class Components(Content):
-    """V live probes of D numbers, each a sum of K components.
+    """V live probes of D numbers at each of T hours, a sum of K components.
 
     Attributes:
-        outputs: Numbers per probe, D.
+        outputs: Numbers per probe at one hour, D.
         code: uint8 [V, 1 + K], codes of the logarithm of the magnitude and of the coefficients.
         bounds: float16 [2, 1 + K], lowest value and step of each column of `code`.
-        basis: float16 [K, D]; empty where the directions are the unit vectors, K = D.
+        basis: float16 [K, T D]; empty where the directions are the unit vectors, K = T D.
+        hours: T, number of hours.
     """
 
     METHOD: ClassVar[str] = "pca"
@@ -44,6 +46,7 @@ class Components(Content):
     code: np.ndarray
     bounds: np.ndarray
     basis: np.ndarray
+    hours: int = 1
 
     @property
     def count(self) -> int:
@@ -52,7 +55,14 @@ class Components(Content):
 
     @property
     def nbytes(self) -> int:
-        return component_bytes(len(self.code), self.outputs, self.count, identity=not len(self.basis))
+        live, several = len(self.code), self.hours > 1
+        one = component_bytes(live, self.outputs, self.count, identity=not (several or len(self.basis)))
+        return one + (4 * self.hours * self.count * -(-self.outputs // 2) if several else 0)
+
+    def at(self, factors: np.ndarray) -> Self:
+        basis = self.basis.astype(np.float64) if len(self.basis) else np.eye(self.count)
+        mixed = factors @ basis.reshape(self.count, self.hours, -1)
+        return replace(self, basis=np.clip(mixed, -65504, 65504).astype(np.float16), hours=1)
 
     def facts(self) -> dict[str, Any]:
         return {"components": self.count, "basis": "principal components" if len(self.basis) else "unit vectors"}
@@ -74,7 +84,9 @@ class Components(Content):
         return {"code": self.code.T, "bounds": self.bounds, "basis": self.basis}
 
     @classmethod
-    def from_parts(cls, profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Self:
+    def from_parts(
+        cls, profile: Profile, outputs: int, hours: int, stored: Mapping[str, np.ndarray], dropped: int
+    ) -> Self:
         bounds = stored["bounds"].astype(np.float64)
         most = np.maximum(np.abs(bounds[0]), np.abs(bounds[0] + 255.0 * bounds[1]))
         largest = float(np.abs(stored["basis"].astype(np.float64)).max(initial=0.0)) if stored["basis"].size else 1.0
@@ -82,7 +94,8 @@ class Components(Content):
             raise ValueError(f"part bounds: expected steps of at least 0, and log magnitudes within {_MOST_LOG:g}")
         if not np.exp(most[0]) * most[1:].sum() * largest <= np.finfo(np.float32).max:
             raise ValueError("parts bounds and basis: expected light within the range of float32")
-        return cls(outputs, np.ascontiguousarray(stored["code"].T), stored["bounds"], stored["basis"])
+        code = np.ascontiguousarray(stored["code"].T)
+        return cls(outputs // hours, code, stored["bounds"], stored["basis"], hours)
 
 
 def component_bytes(live: int, outputs: int, count: int, *, identity: bool) -> int:
@@ -104,7 +117,7 @@ def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[C
     """
     values = values.astype(np.float64)
     live, outputs = values.shape
-    norm = _norm(values)
+    norm = norms(values)
     directions = np.linalg.svd(np.linalg.qr(values / norm.max(), mode="r"))[2]
     identity = component_bytes(live, outputs, outputs, identity=True)
     best, error = _coded(values, norm, directions[:1].astype(np.float16))
@@ -138,7 +151,7 @@ def _coded(values: np.ndarray, norm: np.ndarray, basis: np.ndarray) -> tuple[Com
         bounds=np.concatenate([bounds, ranges], 1),
         basis=basis,
     )
-    return components, float(np.sqrt(np.square(_norm(error) / norm).mean()))
+    return components, float(np.sqrt(np.square(norms(error) / norm).mean()))
 
 
 def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -154,11 +167,3 @@ def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def _half_above(numbers: np.ndarray) -> np.ndarray:
     near = numbers.astype(np.float16)
     return np.where(near < numbers, np.nextafter(near, np.float16(np.inf)), near).astype(np.float64)
-
-
-def _norm(values: np.ndarray) -> np.ndarray:
-    """Returns the norms of rows; rows are scaled first, since squares of the smallest and largest floats would not
-    fit."""
-    largest = np.abs(values).max(1)
-    scaled = values / np.where(largest > 0, largest, 1.0)[:, None]
-    return largest * np.linalg.norm(scaled, axis=1)

@@ -15,7 +15,8 @@ _ABOUT = {
     "buffers": "The buffers volume, pages and pool are laid out as described at the head of the shader. The pool has "
     "the blocks of the windows only, without cached ones.",
     "block": "Block b of a level, three integers, spans [b, b + 1) * block; its numbers are the light at its centre. "
-    "base is the first block of the level's window; the buffer volume counts it from start.",
+    "base is the first block of the level's window, which has `sides` blocks along the axes; the buffer volume counts "
+    "it from start.",
     "viewpoint": "Points are given to the shader relative to this: position - viewpoint, computed in doubles where the "
     "scene is large.",
     "values": "A block has `outputs` numbers. Spherical harmonics: coefficient after coefficient, each red, green and "
@@ -35,19 +36,22 @@ def volume_bundle(volume: Volume) -> Bundle:
     rows, pages = np.unique(state.pages[state.pages >= 0]), state.pages
     if not len(rows):
         raise WlmError("volume: cannot export: no block of light is near the viewpoint; choose one near the probes")
-    head = [np.array([len(volume.sizes), volume.side, volume.channels, len(rows)], "<u4")]
-    for view, base in zip(state.views, state.bases, strict=True):
-        head += [view.astype("<f4").view("<u4"), np.append(base, 0).astype("<i4").view("<u4")]
+    starts = np.cumsum(volume.sides.prod(1)) - volume.sides.prod(1)
+    head = [np.array([len(volume.sizes), len(pages), volume.channels, len(rows)], "<u4")]
+    for view, base, start, sides in zip(state.views, state.bases, starts, volume.sides, strict=True):
+        whole = np.concatenate([base, [start], sides, [0]])
+        head += [view.astype("<f4").view("<u4"), whole.astype("<i4").view("<u4")]
     document = {
         "about": _ABOUT,
         "outputs": volume.channels,
         "coefficients": sh_count(volume.channels),
         "convention": CANONICAL,
         "viewpoint": volume.viewpoint.tolist(),
-        "side": volume.side,
         "levels": [
-            {"block": size, "base": base.tolist(), "start": start.tolist()}
-            for size, base, start in zip(volume.sizes, volume.base, volume.index.start, strict=True)
+            {"block": size, "base": base.tolist(), "start": start.tolist(), "sides": sides.tolist()}
+            for size, base, start, sides in zip(
+                volume.sizes, volume.base, volume.index.start, volume.sides, strict=True
+            )
         ],
     }
     return Bundle(
@@ -57,18 +61,29 @@ def volume_bundle(volume: Volume) -> Bundle:
         document=document,
         buffers={
             "volume": np.concatenate(head),
-            "pages": np.where(pages >= 0, np.searchsorted(rows, pages), -1).astype("<i4"),
-            "pool": state.pool[rows].astype("<f4"),
+            "pages": pack_words(np.where(pages >= 0, np.searchsorted(rows, pages), -1).astype("<i2")),
+            "pool": pool_words(state.pool[rows], state.factor[rows]),
         },
         reference=_reference(volume),
     )
 
 
+def pack_words(numbers: np.ndarray) -> np.ndarray:
+    """Returns 16-bit numbers [..., M] as 32-bit words [..., ceil(M / 2)], the first in the lower half."""
+    padded = np.pad(numbers, [(0, 0)] * (numbers.ndim - 1) + [(0, numbers.shape[-1] % 2)])
+    return padded.view("<u4")
+
+
+def pool_words(light: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Returns rows of the pool, half floats [R, D] and float [R], as the shader reads them: 1 + ceil(D / 2) words."""
+    return np.column_stack([factor.astype("<f4").view("<u4"), pack_words(light)])
+
+
 def _reference(volume: Volume) -> dict[str, np.ndarray]:
     """Returns random points around the viewer and positions of probes, and the volume's light and weight at them."""
     random = np.random.default_rng(0)
-    reach = np.repeat(np.array(volume.sizes) * volume.side / 2, _REFERENCES // len(volume.sizes))
-    near = volume.viewpoint + random.uniform(-1.1, 1.1, (len(reach), 3)) * reach[:, None]
+    reach = np.repeat(volume.sides * np.array(volume.sizes)[:, None] / 2, _REFERENCES // len(volume.sizes), 0)
+    near = volume.viewpoint + random.uniform(-1.1, 1.1, reach.shape) * reach
     lit = volume.position[volume.numbers]
     points = np.concatenate([near, lit[:: max(1, len(lit) // _REFERENCES)]])
     reading = volume.read(points)

@@ -2,16 +2,15 @@
 
 It implements gaussian-probe-compression, section 3.4; docs/probe.md lists the departures. Blocks are stored in the rows
 of one array, the pool, which is also a cache: a block that left its window stays until its row is needed. A block
-without a probe near it is never decoded, takes no memory and is missing when light is read. Light is read from the
-finest level that has a block there, as `wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights`
-describes the light of a block.
+without a probe near it is never decoded, takes no memory and is missing when light is read. A window covers no more
+blocks than the scene has along each axis, and stays on the scene. Light is read from the finest level that has a block
+there, as `wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights` describes the light of a block.
 
 Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is one
 CUDA graph.
 """
 
 import itertools
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,13 +33,13 @@ RATIOS = (1, 2, 4, 16)
 """Side of the blocks of each level, divided by the side of the finest blocks."""
 
 SIDE = 32
-"""Blocks along an axis of a window, the cube of blocks around the viewer at each level."""
+"""Most blocks along an axis of a window, the box of blocks around the viewer at each level."""
 
 BUDGET = 64
 """Largest number of blocks decoded per frame."""
 
 ROWS = 32768
-"""Number of blocks that memory is allocated for."""
+"""Largest number of blocks that memory is allocated for: rows of the pool have 16-bit numbers."""
 
 _LONGEST = 64  # largest side of a window: 262,144 blocks per level
 _SMALLEST = 1e-30  # smallest side of a block: float32 holds it and its inverse
@@ -52,7 +51,7 @@ class FrameStats:
     """The work that one frame did, in numbers of blocks and probes.
 
     Attributes:
-        entered: Blocks that entered a window, the cube of blocks around the viewer at each level, empty ones included.
+        entered: Blocks that entered a window, the box of blocks around the viewer at each level, empty ones included.
         queued: Entered blocks that have to be decoded.
         dropped: Queued blocks that left their window before they were decoded.
         updated: Blocks decoded and written, at most `Volume.budget`.
@@ -88,9 +87,10 @@ class Reading:
 
 
 class State(NamedTuple):
-    """Copies in host memory of the arrays from which a shader reads a volume: light, page table, bases and views."""
+    """Copies in host memory of the arrays from which a shader reads a volume; see `wlm_kernels.probe.volume`."""
 
     pool: np.ndarray
+    factor: np.ndarray
     pages: np.ndarray
     bases: np.ndarray
     views: np.ndarray
@@ -106,7 +106,7 @@ class Volume:
         numbers: int64 [V], indices of the live probes.
         normal: float32 [N, 3], unit surface normals of all probes, 0 for a probe on no surface; None if unknown.
         sizes: Side of a block at each level, in the unit of the positions.
-        side: Blocks along an axis of a window, the cube of blocks around the viewer at each level.
+        sides: int64 [L, 3], blocks along the axes of each level's window.
         budget: Largest number of blocks decoded per frame.
         channels: Numbers per probe, D.
         device: "cpu" or "cuda:N".
@@ -136,9 +136,9 @@ class Volume:
             block: Side of the finest blocks, in the unit of the positions; None: derived from the probes' spacing.
             ratios: Side of each level's blocks divided by the finest side: rising powers of two from 1, at most 8
                 levels.
-            side: Blocks along an axis of a window, even, 2 to 64.
+            side: Most blocks along an axis of a window, even, 2 to 64; a smaller scene has smaller windows.
             budget: Largest number of blocks decoded per frame, 1 to 1024.
-            rows: Number of blocks that memory is allocated for, at least the budget. If the windows have more blocks
+            rows: Most blocks that memory is allocated for, from the budget to 32,768. If the windows have more blocks
                 near probes, the farthest ones are never decoded.
 
         Raises:
@@ -162,60 +162,87 @@ class Volume:
             limits = f"{_SMALLEST:g} to {1.0 / _SMALLEST:g}"
             raise WlmError(f"volume block: expected sides of all levels from {limits}, got {list(self.sizes)}")
         self.position, self.light = position, light
-        self.side, self.budget, self.channels = side, budget, light.channels
+        self.sides = np.minimum(side, self.index.high - self.index.low + 1)
+        self.budget, self.channels = budget, light.channels
         self.device = light.device
         self._size = np.array(self.sizes)
         self._viewpoint: np.ndarray | None = None
         self._base = np.zeros((len(ratios), 3), np.int64)
         self._frame = 0
         self.normal = None if normal is None else _unit(normal, position.shape)
-        self._make(rows, _unit(normal, position.shape)[self.numbers])
+        self._make(rows, self.normal)
         self._step = interop.StepGraph(self._work, self.device)
 
-    def _make(self, rows: int, normal: np.ndarray) -> None:
+    def _make(self, rows: int, normal: np.ndarray | None) -> None:
         """Allocates all arrays on the device."""
-        host, levels = self.index, len(self.sizes)
-        slots, block = levels * self.side**3, (self.budget, frame_kernels.PROBES)
-        self._arrays: list[wp.array] = []
+        host, probes = self.index, max(1, min(frame_kernels.PROBES, self.index.count))
+        slots, blocks = self.sides.prod(1), max(1, len(host.block))
+        rows, budget = min(rows, blocks), min(self.budget, blocks)
+        self._bytes: dict[str, int] = {}
 
-        def struct(kind: Any, value: int, **contents: Any) -> Any:
+        def struct(part: str, kind: Any, value: int, **contents: Any) -> Any:
             """Makes a Warp struct of copies of NumPy arrays, or of arrays of given shapes, filled with a value."""
             made = kind()
             for name, content in contents.items():
-                copied, dtype = isinstance(content, np.ndarray), kind.vars[name].type.dtype
-                allocate = wp.array if copied else partial(wp.full, value=value)
-                setattr(made, name, allocate(content, dtype=dtype, device=self.device))
-                self._arrays.append(getattr(made, name))
+                if not isinstance(content, wp.array):
+                    dtype = kind.vars[name].type.dtype
+                    allocate = wp.array if isinstance(content, np.ndarray) else partial(wp.full, value=value)
+                    content = allocate(content, dtype=dtype, device=self.device)
+                    self._bytes[part] = self._bytes.get(part, 0) + content.capacity
+                setattr(made, name, content)
             return made
 
         self._index = struct(
+            "index",
             frame_kernels.Index,
             0,
-            **{name: getattr(host, name) for name in ("key", "cell", "place", "block", "level_start")},
+            **{name: getattr(host, name) for name in ("key", "place", "block", "level_start")},
             number=self.numbers[host.number].astype(np.int32),
-            normal=normal[host.number],
+            normal=np.zeros((0, 3), np.float32) if normal is None else normal[self.numbers][host.number],
             ratios=np.array(host.ratios, np.int32),
         )
-        by_slot = dict.fromkeys(("held", "wanted", "pages", "away"), slots)
-        self._windows = struct(frame_kernels.Windows, -1, bases=levels, views=levels, **by_slot)
-        self._windows.held.fill_(kernels.NOTHING)
-        self._pool_rows = struct(frame_kernels.Pool, -1, stamp=rows, owner=rows, rows=len(host.block))
-        by_block = dict.fromkeys(("chosen", "taken", "picked", "noise"), self.budget)
-        by_probe = dict.fromkeys(("places", "hats", "rows", "weights"), block)
-        ranges = dict.fromkeys(("begin", "count"), (self.budget, frame_kernels.HALVES))
-        ranked = dict.fromkeys(("gathered", "distance"), frame_kernels.MOST)
-        frame = {"clock": 1, "counters": 7, "limit": 1, "histogram": frame_kernels.TOTALS, "numbers": math.prod(block)}
-        self._frame_work = struct(frame_kernels.Work, 0, **frame, **ranked, **ranges, **by_block, **by_probe)
+        self._windows = struct(
+            "page table",
+            frame_kernels.Windows,
+            -1,
+            starts=(np.cumsum(slots) - slots).astype(np.int32),
+            sides=self.sides.astype(np.int32),
+            **dict.fromkeys(("bases", "before", "views"), len(slots)),
+            pages=int(slots.sum()),
+        )
+        given = 0 if rows == blocks else rows
+        tables = {"rows": blocks, "stamp": given, "owner": given}
+        self._pool = struct("pool", frame_kernels.Pool, -1, light=(rows, self.channels), factor=rows, **tables)
+        # The light of the probes takes the place of their covariances, which are not used any more.
+        shared = wp.zeros(budget * probes * max(self.channels, frame_kernels.PROBES), dtype=float, device=self.device)
+
+        def view(shape: tuple[int, ...], dtype: Any) -> wp.array:
+            return wp.array(ptr=shared.ptr, shape=shape, dtype=dtype, device=self.device)
+
+        self._read_light = view((budget * probes, self.channels), float)
+        frame = {"clock": 1, "counters": 7, "limit": 1, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
+        ranked = dict.fromkeys(("gathered", "distance"), min(frame_kernels.MOST, blocks))
+        ranges = dict.fromkeys(("begin", "count"), (budget, frame_kernels.HALVES))
+        by_block = dict.fromkeys(("chosen", "taken", "blocks", "picked", "noise"), budget)
+        by_probe = dict.fromkeys(("places", "hats", "weights"), (budget, probes))
+        covariances = view((budget, probes), frame_kernels.Row)
+        contents = {**frame, **ranked, **ranges, **by_block, **by_probe, "rows": covariances}
+        self._frame_work = struct("work", frame_kernels.Work, 0, **contents)
+        self._bytes["work"] += shared.capacity
         self._look = frame_kernels.Look(self._windows, self._frame_work)
         self._nowhere = wp.zeros(0, dtype=wp.vec3, device=self.device)
-        self._read_light = wp.zeros((math.prod(block), self.channels), dtype=float, device=self.device)
-        self._pool = wp.zeros((rows, self.channels), dtype=float, device=self.device)
-        self._arrays += [self._read_light, self._pool]
+        self._shared = shared  # the views of it do not keep it alive
+
+    @property
+    def memory(self) -> dict[str, int]:
+        """The bytes of device memory of the index, the page table, the pool and the work of a frame, by part. They
+        never change; the light source is not included."""
+        return dict(self._bytes)
 
     @property
     def memory_bytes(self) -> int:
-        """The bytes of device memory of the volume and its index, without its light source; they never change."""
-        return sum(array.capacity for array in self._arrays)
+        """The bytes of device memory of the volume and its index, without its light source."""
+        return sum(self._bytes.values())
 
     @property
     def viewpoint(self) -> np.ndarray:
@@ -256,27 +283,30 @@ class Volume:
         if np.abs(at).max() > _FARTHEST:
             limit = _FARTHEST * self.sizes[0]
             raise WlmError(f"viewpoint: expected a point within {limit:g} of the probes, got {viewpoint.tolist()}")
-        base = np.floor(at + 0.5).astype(np.int64) - self.side // 2
-        kept = np.maximum(self.side - np.abs(base - self._base), 0).prod(1).sum() if self._viewpoint is not None else 0
+        low, high = self.index.low, self.index.high
+        base = np.clip(np.floor(at + 0.5).astype(np.int64) - self.sides // 2, low, high + 1 - self.sides)
+        # Before the first frame the windows are where they share no block with those of the frame.
+        before = self._base if self._viewpoint is not None else base + self.sides
+        kept = np.maximum(self.sides - np.abs(base - before), 0).prod(1).sum()
         self._viewpoint, self._base = viewpoint, base
         self._frame += 1
-        views = np.column_stack([at - (base + self.side // 2) - 0.5, 1.0 / self._size])
+        views = np.column_stack([at - base - 0.5, 1.0 / self._size])
         with interop.stream(self.device):
-            self._look(base, views, self._frame)
+            self._look(base, before, views, self._frame)
             self._step()
         counters = self._frame_work.counters.numpy()
         queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
-        entered = len(self.sizes) * self.side**3 - int(kept)
+        entered = int(self.sides.prod(1).sum() - kept)
         return FrameStats(entered, queued, dropped, updated, cached, left, probes, time.perf_counter() - start)
 
     def _work(self) -> None:
         """Chooses missing blocks, finds and weights the probes near them, and writes the blocks' light to the pool."""
         work, windows = self._frame_work, self._windows
-        frame_kernels.select(self._index, windows, self._pool_rows, self.side, work)
+        frame_kernels.select(self._index, windows, self._pool, int(self.sides.max()), work)
         if self.index.count == 0 or (self.device == "cpu" and not (work.taken.numpy() >= 0).any()):
             return
-        frame_kernels.search(self._index, windows, self.side, work)
-        volume_weights.weigh(self._index, windows, self.side, work)
+        frame_kernels.search(self._index, work)
+        volume_weights.weigh(self._index, work)
         self.light.read(work.numbers, self._read_light)
         frame_kernels.combine(work, self._read_light, self._pool)
 
@@ -308,30 +338,34 @@ class Volume:
             ahead = self._nowhere
             if normals is not None:
                 ahead = wp.array(_unit(normals, points.shape), dtype=wp.vec3, device=self.device)
-            windows = self._windows
-            place = (windows.pages, windows.bases, windows.views, self.side, on_device)
-            kernels.read(self._pool, *place, ahead, values, level, weight)
+            windows, pool = self._windows, self._pool
+            where = (windows.pages, windows.starts, windows.sides, windows.bases, windows.views)
+            kernels.read(pool.light, pool.factor, *where, on_device, ahead, values, level, weight)
             return Reading(values.numpy(), level.numpy(), weight.numpy())
 
     def state(self) -> State:
         """Copies the arrays that a shader reads from the device to the host."""
-        windows = self._windows
+        windows, pool = self._windows, self._pool
+        parts = (pool.light, pool.factor, windows.pages, windows.bases, windows.views)
         with interop.stream(self.device):
-            return State(*(part.numpy() for part in (self._pool, windows.pages, windows.bases, windows.views)))
+            return State(*(part.numpy() for part in parts))
 
-    def unscroll(self) -> tuple[np.ndarray, np.ndarray]:
+    def unscroll(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Returns the windows' blocks in spatial order, as one texture for each level (the last step of section 3.4).
 
         Returns:
-            The light, float32 [L, side, side, side, D], by level, x, y and z, 0 for missing blocks; and bool [L, side,
-            side, side], true for blocks that are present. The first block of each level is that of `base`.
+            The light of each level, float32 [*sides, D], by x, y and z, 0 for missing blocks; and bool [*sides], true
+            for blocks that are present. The first block of each level is that of `base`.
         """
-        state, side = self.state(), self.side
-        pages = state.pages.reshape(-1, side, side, side)
-        # A block's slot is its coordinates modulo the side of the window.
-        rows = np.stack([np.roll(page, -base, (0, 1, 2)) for page, base in zip(pages, state.bases, strict=True)])
-        valid = rows >= 0
-        return np.where(valid[..., None], state.pool[rows], np.float32(0.0)), valid
+        state, ends = self.state(), np.cumsum(self.sides.prod(1))
+        values, valid = [], []
+        for base, sides, page in zip(state.bases, self.sides, np.split(state.pages, ends[:-1]), strict=True):
+            # A block's slot is its coordinates modulo the sides of the window.
+            rows = np.roll(page.reshape(sides), -base, (0, 1, 2))
+            valid.append(rows >= 0)
+            light = state.pool[rows].view(np.float16) * state.factor[rows, None]
+            values.append(np.where(valid[-1][..., None], light, np.float32(0.0)))
+        return values, valid
 
 
 def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
@@ -363,5 +397,5 @@ def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, r
         raise WlmError(f"volume side: expected an even number of blocks from 2 to {_LONGEST}, got {side}")
     if not 1 <= budget <= 1024:
         raise WlmError(f"volume budget: expected 1 to 1024 blocks a frame, got {budget}")
-    if rows < budget:
-        raise WlmError(f"volume rows: expected at least as many blocks as the budget of {budget}, got {rows}")
+    if not budget <= rows <= ROWS:
+        raise WlmError(f"volume rows: expected from the budget of {budget} to {ROWS} blocks, got {rows}")

@@ -39,10 +39,10 @@ class BlockIndex:
         start: float64 [L, 3], coordinates of the first block of each level, whole numbers.
         key: int64 [N], Morton keys of the cells, rising.
         number: int32 [N], index of each probe in the input.
-        cell: int32 [N, 3], cell of each probe.
         place: float32 [N, 3], position within the cell, 0 to 1.
         block: int64 [W], Morton keys of the blocks near probes, level after level, rising within each.
         level_start: int32 [L + 1], index in `block` at which each level begins.
+        low, high: int64 [L, 3], least and greatest coordinates of the blocks of each level, counted from `start`.
     """
 
     def __init__(self, position: np.ndarray, side: float, ratios: Sequence[int]) -> None:
@@ -83,11 +83,11 @@ class BlockIndex:
         order = np.argsort(key, kind="stable")
         self.key = key[order]
         self.number = order.astype(np.int32)
-        self.cell = cell[order].astype(np.int32)
         self.place = (place - whole)[order].astype(np.float32)
         levels = [_near(cell, place - whole, ratio) for ratio in self.ratios]
-        self.block = np.concatenate(levels)
-        self.level_start = np.cumsum([0, *map(len, levels)]).astype(np.int32)
+        self.block = np.concatenate([keys for keys, _, _ in levels])
+        self.level_start = np.cumsum([0, *(len(keys) for keys, _, _ in levels)]).astype(np.int32)
+        self.low, self.high = (np.stack([level[i] for level in levels]) for i in (1, 2))
 
 
 def finest_side(position: np.ndarray) -> float:
@@ -122,15 +122,18 @@ def finest_side(position: np.ndarray) -> float:
     return side
 
 
-def _near(cell: np.ndarray, place: np.ndarray, ratio: int) -> np.ndarray:
-    """Returns the Morton keys of a level's blocks whose weight at some probe is at least `_LEAST`."""
+def _near(cell: np.ndarray, place: np.ndarray, ratio: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the Morton keys of a level's blocks whose weight at some probe is at least `_LEAST`, and the least and
+    greatest of their coordinates, [3]; 0 where there is no probe."""
     # Distances in sides from the centre of block 0, as integer and fraction; the index of a cell is exact.
     half = cell // ratio - 1
     whole = half >> 1
     rest = ((half & 1) + (cell % ratio + place) / ratio) / 2
-    keys = []
+    near = []
     for i in range(8):
         corner = np.array([i & 1, i >> 1 & 1, i >> 2])
         read = np.where(corner == 1, rest, 1.0 - rest).prod(1) >= _LEAST
-        keys.append(morton_keys(whole[read] + corner))
-    return np.unique(np.concatenate(keys)).astype(np.int64)
+        near.append(whole[read] + corner)
+    blocks = np.concatenate(near)
+    bounds = (blocks.min(0), blocks.max(0)) if len(blocks) else (np.zeros(3, np.int64),) * 2
+    return np.unique(morton_keys(blocks)).astype(np.int64), *bounds

@@ -4,7 +4,7 @@ from wlm.probe.glsl import buffer_glsl
 from wlm.probe.sphere import sh_count
 
 _HEAD_WORDS = 4  # words of the buffer `volume` before the levels
-_LEVEL_WORDS = 8
+_LEVEL_WORDS = 12
 
 _TEMPLATE = """\
 // Reads the light of a cascaded lighting volume (Gaussian Compression for Precomputed Indirect Illumination, section
@@ -12,16 +12,18 @@ _TEMPLATE = """\
 // it below #version. It fits every volume of {outputs} numbers per block.
 //
 // Buffer volume, 32-bit words, little-endian:
-//   0    levels L, blocks along an axis of a window, numbers per block, rows of the pool: integers
-//   4    L times 8 words, the finest level first: 4 floats, position of the viewer in the window and 1 / side of a
-//        block; 3 integers, the first block of the window; 0
-// Buffer pages, integers: for each level side * side * side entries; block b has entry ((b.x mod side) * side +
-//        (b.y mod side)) * side + (b.z mod side): its row of the pool, or -1 where the block is missing.
-// Buffer pool, floats: {outputs} in a row.
+//   0    levels L, slots of all windows, numbers per block, rows of the pool: integers
+//   4    L times 12 words, the finest level first: 4 floats, position of the viewer in the window in blocks, from the
+//        centre of the first block, and 1 / side of a block; 3 integers, the first block of the window; 1, the first
+//        slot of the level; 3, the blocks along the axes of the window; 0
+// Buffer pages, two signed 16-bit integers a word, the first in the lower half, one for each slot. Block b of a level
+//        has slot first + ((b.x mod sides.x) * sides.y + (b.y mod sides.y)) * sides.z + (b.z mod sides.z). Its entry is
+//        its row of the pool, or negative where the block is missing.
+// Buffer pool, rows of {row_words} words: a float, the factor of the row, then {outputs} half floats, two a word.
 //
 // Moving the viewer changes the buffer volume; a new block changes one entry of pages and one row of the pool. The
 // buffers are storage buffers, unless WLM_VOLUME_HEAD(i), WLM_VOLUME_PAGE(i) and WLM_VOLUME_POOL(i) are defined before
-// this file as other ways to read entry i.
+// this file as other ways to read word i.
 {buffers}
 const int WLM_VOLUME_OUTPUTS = {outputs};
 
@@ -29,6 +31,12 @@ int wlm_volume_wrap(int i, int side)
 {{
     int r = i % side;
     return r < 0 ? r + side : r;
+}}
+
+int wlm_volume_row(int slot)
+{{
+    uint word = WLM_VOLUME_PAGE(slot / 2);
+    return slot % 2 == 0 ? int(word << 16u) >> 16 : int(word) >> 16;
 }}
 
 // The light at a point relative to the viewer: scene position less viewpoint. With the unit normal of its surface the
@@ -39,25 +47,26 @@ int wlm_volume_wrap(int i, int side)
 float wlm_volume_read(vec3 p, vec3 normal, out float values[{outputs}])
 {{
     int levels = int(WLM_VOLUME_HEAD(0));
-    int side = int(WLM_VOLUME_HEAD(1));
     for (int c = 0; c < WLM_VOLUME_OUTPUTS; ++c)
         values[c] = 0.0;
     float left = 1.0;
     float covered = 0.0;
-    float edge = 0.5 * float(side);
     for (int level = 0; level < levels && left > 0.0; ++level) {{
         int at = {head} + {level_words} * level;
         float scale = uintBitsToFloat(WLM_VOLUME_HEAD(at + 3));
         float x = p.x * scale + uintBitsToFloat(WLM_VOLUME_HEAD(at)) + 0.5 * normal.x;
         float y = p.y * scale + uintBitsToFloat(WLM_VOLUME_HEAD(at + 1)) + 0.5 * normal.y;
         float z = p.z * scale + uintBitsToFloat(WLM_VOLUME_HEAD(at + 2)) + 0.5 * normal.z;
-        if (min(x, min(y, z)) >= -edge - 1.0 && max(x, max(y, z)) < edge) {{
+        int sx = int(WLM_VOLUME_HEAD(at + 8));
+        int sy = int(WLM_VOLUME_HEAD(at + 9));
+        int sz = int(WLM_VOLUME_HEAD(at + 10));
+        if (min(x, min(y, z)) >= -1.0 && x < float(sx) && y < float(sy) && z < float(sz)) {{
             float fx = x - floor(x);
             float fy = y - floor(y);
             float fz = z - floor(z);
-            int i = int(floor(x)) + side / 2;
-            int j = int(floor(y)) + side / 2;
-            int k = int(floor(z)) + side / 2;
+            int i = int(floor(x));
+            int j = int(floor(y));
+            int k = int(floor(z));
             float missing = 0.0;
             float here = 0.0;
             for (int corner = 0; corner < 8; ++corner) {{
@@ -67,18 +76,23 @@ float wlm_volume_read(vec3 p, vec3 normal, out float values[{outputs}])
                 float share = (corner % 2 == 1 ? fx : 1.0 - fx) * (corner / 2 % 2 == 1 ? fy : 1.0 - fy)
                     * (corner / 4 == 1 ? fz : 1.0 - fz);
                 int row = -1;
-                if (min(u, min(v, w)) >= 0 && max(u, max(v, w)) < side) {{
-                    u = wlm_volume_wrap(u + int(WLM_VOLUME_HEAD(at + 4)), side);
-                    v = wlm_volume_wrap(v + int(WLM_VOLUME_HEAD(at + 5)), side);
-                    w = wlm_volume_wrap(w + int(WLM_VOLUME_HEAD(at + 6)), side);
-                    row = WLM_VOLUME_PAGE(((level * side + u) * side + v) * side + w);
+                if (min(u, min(v, w)) >= 0 && u < sx && v < sy && w < sz) {{
+                    u = wlm_volume_wrap(u + int(WLM_VOLUME_HEAD(at + 4)), sx);
+                    v = wlm_volume_wrap(v + int(WLM_VOLUME_HEAD(at + 5)), sy);
+                    w = wlm_volume_wrap(w + int(WLM_VOLUME_HEAD(at + 6)), sz);
+                    int slot = int(WLM_VOLUME_HEAD(at + 7)) + (u * sy + v) * sz + w;
+                    row = wlm_volume_row(slot);
                 }}
                 if (row < 0) {{
                     missing += share;
                 }} else if (share > 0.0) {{
                     here += share;
-                    for (int c = 0; c < WLM_VOLUME_OUTPUTS; ++c)
-                        values[c] += left * share * WLM_VOLUME_POOL(row * WLM_VOLUME_OUTPUTS + c);
+                    int first = row * {row_words};
+                    float factor = left * share * uintBitsToFloat(WLM_VOLUME_POOL(first));
+                    for (int c = 0; c < WLM_VOLUME_OUTPUTS; ++c) {{
+                        vec2 pair = unpackHalf2x16(WLM_VOLUME_POOL(first + 1 + c / 2));
+                        values[c] += factor * (c % 2 == 0 ? pair.x : pair.y);
+                    }}
                 }}
             }}
             if (here > 0.0) {{
@@ -113,11 +127,11 @@ vec3 wlm_volume_diffuse(vec3 p, vec3 n)
     vec3 sum = vec3(0.0, 0.0, 0.0);
     for (int c = 0; c < {coefficients}; ++c)
         sum += weight[c] * vec3(values[3 * c], values[3 * c + 1], values[3 * c + 2]);
-    return sum;
+    return max(sum, vec3(0.0, 0.0, 0.0)); // few bands ring below 0
 }}
 """
 
-_BUFFERS = (("HEAD", "uint"), ("PAGE", "int"), ("POOL", "float"))
+_BUFFERS = ("HEAD", "PAGE", "POOL")  # in the order of their bindings
 
 
 def volume_glsl(outputs: int) -> str:
@@ -130,8 +144,9 @@ def volume_glsl(outputs: int) -> str:
     Returns:
         GLSL 4.30, which is also valid Vulkan GLSL.
     """
-    buffers = [buffer_glsl("volume", name, number, kind) for number, (name, kind) in enumerate(_BUFFERS)]
-    text = _TEMPLATE.format(head=_HEAD_WORDS, level_words=_LEVEL_WORDS, buffers="".join(buffers), outputs=outputs)
+    buffers = [buffer_glsl("volume", name, number) for number, name in enumerate(_BUFFERS)]
+    words = {"head": _HEAD_WORDS, "level_words": _LEVEL_WORDS, "row_words": 1 + (outputs + 1) // 2}
+    text = _TEMPLATE.format(buffers="".join(buffers), outputs=outputs, **words)
     coefficients = sh_count(outputs)
     if coefficients in (1, 4, 9):
         text += _IRRADIANCE.format(coefficients=coefficients, outputs=outputs)

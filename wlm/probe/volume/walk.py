@@ -68,7 +68,6 @@ def walk(
     position, truth = volume.position[volume.numbers], original[volume.numbers].astype(np.float64)
     normal = None if volume.normal is None else volume.normal[volume.numbers]
     light = at_probes(volume.light, volume.numbers).astype(np.float64)
-    reach = volume.sizes[0] * volume.side / 2
     costs: dict[str, list[float]] = {name: [] for name in ("updated", "probes", "left", "update_ms")}
     near_figures: dict[str, list[float]] = {name: [] for name in ("coverage", "rmse", "rms")}
     errors = {name: np.zeros(2) for name in ("psnr", "light_psnr", "far_psnr")}  # sums of squares and of numbers
@@ -78,7 +77,8 @@ def walk(
         for name in ("updated", "probes", "left"):
             costs[name].append(getattr(stats, name))
         costs["update_ms"].append(1e3 * stats.seconds)
-        inside = (np.abs(position - viewpoint) < reach).all(1)
+        low = volume.sizes[0] * volume.base[0]
+        inside = ((position > low) & (position < low + volume.sizes[0] * volume.sides[0])).all(1)
         random = np.random.default_rng(0)  # the same samples whenever the viewer is here
         near, far = (_draw(np.flatnonzero(part), samples, random) for part in (inside, ~inside))
         reading = volume.read(position[near], None if normal is None else normal[near])
@@ -132,7 +132,8 @@ def score_volume(
 
     Returns:
         The result of `walk`, with `block`, the side of the finest blocks; `first_ms`, the duration of the first frame;
-        `first_frames`, the number of frames until no block waits; and `memory_bytes`.
+        `first_frames`, the number of frames until no block waits; `memory`, the bytes of the volume by part, and
+        `memory_bytes`, their sum.
     """
     volume = Volume(probes.position, light, live=probes.live, normal=probes.normal)
     lit = probes.position[probes.live]
@@ -143,6 +144,7 @@ def score_volume(
         "block": volume.sizes[0],
         "first_ms": 1e3 * first.seconds,
         "first_frames": count,
+        "memory": volume.memory,
         "memory_bytes": volume.memory_bytes,
     }
 

@@ -35,13 +35,8 @@ RATE = 25.0
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame of six-way lightmaps, and the scene's settings for its picture.
-
-    Attributes:
-        number: Number of the frame.
-        six: Lightmaps with their camera; if there are obstacles, also with their depth.
-        looks: Lights, colours and obstacles of the scene; None: unknown.
-    """
+    """A frame of six-way lightmaps with their camera, and if there are obstacles also with their depth; and the scene's
+    settings for its picture, None if unknown."""
 
     number: int
     six: SixWay
@@ -55,15 +50,8 @@ def read_shots(
     progress: OnProgress | None = None,
     notes: list[str] | None = None,
 ) -> Iterator[Shot]:
-    """Yields the frames of lightmaps that `bake` or `predict` wrote, one after the other.
-
-    Args:
-        files: EXR files by frame number.
-        device: Device of the lightmaps.
-        count: Largest number of frames, which are evenly spread over all; None: all frames.
-        progress: Called after each frame.
-        notes: As for `read_shaded`.
-    """
+    """Yields the frames of the EXR files, by number, that `bake` or `predict` wrote, at most `count`, evenly spread
+    over all; `read_shaded` explains `notes`."""
     numbers = spread(tuple(files), count)
     meter = Meter(progress, "read", len(numbers))
     for done, number in enumerate(numbers, 1):
@@ -140,9 +128,6 @@ def pack_book(
         gain: Factor of the light; None: the largest with which no light is above 1.
         padding: Pixels around each frame that repeat its border, so that filters and mips do not mix frames.
         rate: Frames per second; None: that of the scene, or `RATE`.
-
-    Raises:
-        ValueError: The frames have several sizes, the layout is unknown, or a number is out of its range.
     """
     frames = [shot.six for shot in shots]
     if any(frame.lightmaps.shape != frames[0].lightmaps.shape for frame in frames):
@@ -244,12 +229,8 @@ def mip_levels(height: int, width: int, padding: int) -> int:
 def write_book(book: Book, output: str | os.PathLike[str]) -> tuple[dict[Path, tuple[str, ...]], int]:
     """Writes the textures of a flip book to files NAME_1 and NAME_2, atomically: all of them or none.
 
-    Args:
-        book: The flip book.
-        output: Path in an existing folder: NAME with the suffix .exr, .png or .tga of all files.
-
-    Returns:
-        The names of the channels of each file, and the number of values that were clipped to the range of the files.
+    `output` is NAME with the suffix .exr, .png or .tga of all files, in an existing folder. Returns the names of the
+    channels of each file, and the number of values that were clipped to the range of the files.
     """
     output = Path(output)
     paths = {name: output.with_name(f"{output.stem}_{i}{output.suffix}") for i, name in enumerate(book.pages, 1)}

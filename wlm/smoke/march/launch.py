@@ -58,11 +58,7 @@ class VolumeGraph(Generic[_Made]):
         self._step = StepGraph(self._make, device, warmup=warmup)
 
     def __call__(self, volume: DensityVolume) -> _Made:
-        """Returns the function's result for a volume.
-
-        Raises:
-            ValueError: The volume's shape, type, position, extinction or emission differs from the first call's.
-        """
+        """Returns the function's result for a volume."""
         with stream(self._device):
             if self._volume is None:
                 heat = None if volume.temperature is None else torch.empty_like(volume.temperature)

@@ -37,9 +37,6 @@ def motion(
     Returns:
         float32 [2, H, W]: pixels to the right and down by which the smoke of a pixel has moved since the earlier frame;
         0 where there is no smoke. The earlier frame, read at the pixel minus this motion, shows the same smoke.
-
-    Raises:
-        ValueError: The camera is in perspective, the velocity is not vec3 [A, B, C], or a number is out of its range.
     """
     march = March(step=step, cutoff=_CUTOFF)
     if not math.isfinite(reach):

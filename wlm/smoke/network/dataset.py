@@ -68,14 +68,10 @@ def make_validation(
     scale: float = 1.0,
     progress: OnProgress | None = None,
 ) -> Pool:
-    """Makes the samples of the validation or the test set; each pair of frames is rendered from all fixed views.
+    """Makes the samples of the validation or, with `test_seed`, the test set; each pair of frames is rendered from all
+    fixed views. No training round uses the sequences of these sets.
 
-    No training round uses the sequences of these sets.
-
-    Args:
-        settings, device, progress: As for `make_pool`.
-        test: Whether to make the test set, by `test_seed`, instead of the validation set.
-        scale: Factor by which the extinction of the smoke is multiplied; 0.5 and 2 in the paper's ablation.
+    The extinction of the smoke is multiplied by `scale`; 0.5 and 2 in the paper's ablation.
     """
     seed = settings.test_seed if test else settings.validation_seed
     return _Maker(settings, seed, True, device, scale).pool(0, settings.validation_sequences, progress)

@@ -17,14 +17,10 @@ _VISIBLE = 0.01  # opacity above which a change counts
 
 
 def warp(earlier: torch.Tensor, motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Moves the pixels of earlier frames along a motion, so that they are comparable with the later frames.
+    """Moves the pixels of earlier frames [N, C, H, W] along a `Pool.motion` [N, 2, H, W], so that they are comparable
+    with the later frames.
 
-    Args:
-        earlier: Frames [N, C, H, W].
-        motion: [N, 2, H, W], as `Pool.motion`.
-
-    Returns:
-        The moved frames [N, C, H, W], and a mask [N, 1, H, W]: 1 where the motion starts inside the image, else 0.
+    Returns the moved frames, and a mask [N, 1, H, W]: 1 where the motion starts inside the image, else 0.
     """
     height, width = earlier.shape[-2:]
     motion = motion.to(earlier.dtype)
@@ -82,15 +78,11 @@ def _spread(index: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
 
 
 def residual(frames: torch.Tensor, motion: torch.Tensor, opacity: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Sums the absolute change between two frames that the motion does not explain.
+    """Sums the absolute change between N pairs of frames, [N, 2, P, H, W], the earlier first, that a `Pool.motion` [N,
+    2, H, W] does not explain; returns the sum and the number of values in it.
 
-    Args:
-        frames: [N, 2, P, H, W]: N pairs of frames, the earlier first, of P planes.
-        motion: [N, 2, H, W], as `Pool.motion`.
-        opacity: [N, H, W] of the later frame. Only visible smoke that was inside the earlier image is counted.
-
-    Returns:
-        The sum of the absolute change, and the number of values summed.
+    Only smoke that is visible in the later frame by its `opacity`, [N, H, W], and was inside the earlier image is
+    counted.
     """
     warped, inside = warp(frames[:, 0], motion.to(frames.dtype))
     mask = inside * (opacity[:, None] > _VISIBLE)
@@ -98,17 +90,12 @@ def residual(frames: torch.Tensor, motion: torch.Tensor, opacity: torch.Tensor) 
 
 
 def temporal(predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor) -> torch.Tensor:
-    """Computes the temporal loss (in place of eq. 9): how differently prediction and target change along the motion.
+    """Computes the temporal loss (in place of eq. 9): how differently prediction and target, [N, 2, P, H, W], pairs of
+    frames of the first P of `PLANES`, which include the opacity, change along the motion.
 
-    It is the mean absolute difference of the two changes. Since warping is linear, this equals the change of the error,
-    prediction minus target, which takes only one warp.
-
-    Args:
-        predicted, target: [N, 2, P, H, W]: N pairs of frames of the first P of `PLANES`, which include the opacity.
-        motion: [N, 2, H, W], as `Pool.motion`.
-
-    Returns:
-        The mean over visible smoke that was inside the earlier image; 0 if there is none.
+    It is the mean absolute difference of the two changes, over visible smoke that was inside the earlier image; 0 if
+    there is none. Since warping is linear, this equals the change of the error, prediction minus target, which takes
+    only one warp.
     """
     total, count = residual(predicted.float() - target.float(), motion, target[:, 1, OPACITY_PLANE])
     return total / count.clamp(min=1.0)
@@ -117,15 +104,11 @@ def temporal(predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor
 def losses(
     predicted: torch.Tensor, target: torch.Tensor, motion: torch.Tensor, weight: float
 ) -> dict[str, torch.Tensor]:
-    """Computes the training losses (eq. 10).
+    """Computes the training losses (eq. 10) of K encoded frames of N samples, [N, K, 8, H, W]; the temporal loss needs
+    K = 2.
 
-    Args:
-        predicted, target: [N, K, 8, H, W], encoded: K frames of N samples; the temporal loss needs K = 2.
-        motion: [N, 2, H, W], as `Pool.motion`; only for the temporal loss.
-        weight: Weight of the temporal loss; 0: the temporal loss is not computed.
-
-    Returns:
-        The weighted sum `loss`, and its unweighted parts `mse` and, unless the weight is 0, `temporal`.
+    `motion` is `Pool.motion`, [N, 2, H, W], and `weight` that of the temporal loss, which 0 leaves out. Returns the
+    weighted sum `loss`, and its unweighted parts `mse` and, unless the weight is 0, `temporal`.
     """
     predicted, target = predicted.float(), target.float()
     parts = {"mse": F.mse_loss(predicted, target)}

@@ -39,13 +39,11 @@ def to_srgb(linear: torch.Tensor) -> torch.Tensor:
 
 
 def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
-    """Returns the distances from the camera at which the bounding sphere of the volume's box begins and ends.
+    """Returns the distances from the camera, in world units, at which the bounding sphere of the volume's box begins
+    and ends; the near one is negative if the camera is inside the sphere.
 
     A camera that turns about the box's centre has the same distances in all positions, so that depths are comparable.
     Distances are measured along the axis of an orthographic camera, or from the eye of a perspective camera.
-
-    Returns:
-        Near and far distance in world units; the near distance is negative if the camera is inside the sphere.
     """
     away = torch.as_tensor(camera.position, dtype=torch.float64) - torch.as_tensor(volume.centre)
     if camera.perspective:
@@ -57,17 +55,11 @@ def span(volume: DensityVolume, camera: Camera) -> tuple[float, float]:
 
 
 def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
-    """Encodes a guiding map of the paper's kind for the network; all planes are 0 where there is no smoke.
+    """Encodes a guiding map of the paper's kind, [..., 3, H, W] of light, transparency and depth, for the network; all
+    planes are 0 where there is no smoke.
 
-    Args:
-        maps: [..., 3, H, W]: light, transparency, depth, as `guide` gives them.
-        near, far: Distances from `span`.
-
-    Returns:
-        [..., 3, H, W]: light in sRGB; opacity; depth, from 1 at `near` to 0 at `far`, and 0 without a surface.
-
-    Raises:
-        ValueError: The number of planes is wrong.
+    Returns [..., 3, H, W]: light in sRGB; opacity; depth, from 1 at `near` to 0 at `far`, the distances of `span`, and
+    0 without a surface.
     """
     if maps.ndim < 3 or maps.shape[-3] != 3:
         raise ValueError(f"maps: expected shape [..., 3, H, W], got {tuple(maps.shape)}")
@@ -77,20 +69,11 @@ def encode_guide(maps: torch.Tensor, near: float, far: float) -> torch.Tensor:
 
 
 def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March) -> torch.Tensor:
-    """Renders a guiding map of smoke and encodes it for the network.
+    """Renders a guiding map of smoke, of a kind of `GUIDES`, from an orthographic camera, and encodes it for the
+    network.
 
-    Args:
-        volume: The smoke.
-        camera: Orthographic.
-        kind: Kind of the guiding map, a key of `GUIDES`.
-        march: Settings, as for `guide` if the kind is "paper", else as for `bake_coarse`.
-
-    Returns:
-        float32 [C, H, W], the planes that `GUIDES` lists; 0 where there is no smoke, except emission of fire without
-        smoke.
-
-    Raises:
-        ValueError: The kind is unknown, or the camera is in perspective or too far away for float64.
+    `march` are settings as for `guide` if the kind is "paper", else as for `bake_coarse`. Returns float32 [C, H, W],
+    the planes that `GUIDES` lists; 0 where there is no smoke, except emission of fire without smoke.
     """
     near, far = span(volume, camera)
     if not near < far:
@@ -107,15 +90,8 @@ def render_guide(volume: DensityVolume, camera: Camera, kind: str, march: March)
 
 
 def encode_lightmaps(six: SixWay) -> torch.Tensor:
-    """Encodes six-way lightmaps, opacity and emission as planes for the network.
-
-    Returns:
-        [8, H, W] in the order of `PLANES`: six lightmaps in sRGB, opacity, and emission e as e / (1 + e) in sRGB, 0
-        where the smoke is cold.
-
-    Raises:
-        ValueError: The lightmaps have no transparency.
-    """
+    """Encodes six-way lightmaps, which have transparency, as planes [8, H, W] for the network, in the order of
+    `PLANES`: six lightmaps in sRGB, opacity, and emission e as e / (1 + e) in sRGB, 0 where the smoke is cold."""
     if six.transparency is None:
         raise ValueError("six: expected lightmaps with transparency, got lightmaps without it")
     transparency = six.transparency
@@ -124,16 +100,8 @@ def encode_lightmaps(six: SixWay) -> torch.Tensor:
 
 
 def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera | None = None) -> SixWay:
-    """Converts planes of `encode_lightmaps` back to lightmaps, in float32 without a gradient, clamped to their ranges.
-
-    Args:
-        planes: [8, H, W] in the order of `PLANES`.
-        hot: Whether the smoke emits light; False: the result has no emission.
-        camera: Camera of the lightmaps; None: unknown.
-
-    Raises:
-        ValueError: The number of planes is wrong.
-    """
+    """Converts planes [8, H, W] of `encode_lightmaps` back to lightmaps, in float32 without a gradient, clamped to
+    their ranges; without `hot` the result has no emission."""
     if planes.ndim != 3 or planes.shape[0] != len(PLANES):
         raise ValueError(f"planes: expected shape [{len(PLANES)}, H, W], got {tuple(planes.shape)}")
     with stream(device_name(planes.device)):

@@ -116,14 +116,8 @@ class NafBlock(nn.Module):
 
 
 def support(opacity: torch.Tensor) -> torch.Tensor:
-    """Returns the mask of pixels whose planes may differ from 0: within 8 to 16 pixels of smoke in the guiding map.
-
-    Args:
-        opacity: [N, 1, H, W], opacity of the guiding map.
-
-    Returns:
-        [N, 1, H, W], 0 or 1, in the type of `opacity`.
-    """
+    """Returns the mask [N, 1, H, W] of pixels whose planes may differ from 0, in the type of the guiding map's
+    `opacity`: 1 within 8 to 16 pixels of its smoke, else 0."""
     height, width = opacity.shape[-2:]
     coarse = F.max_pool2d(opacity, REACH, ceil_mode=True)
     near = (F.max_pool2d(coarse, 3, stride=1, padding=1) > 0).to(opacity.dtype)
@@ -131,13 +125,10 @@ def support(opacity: torch.Tensor) -> torch.Tensor:
 
 
 class SixWayNetwork(nn.Module):
-    """Maps encoded guiding maps to encoded lightmaps, at any resolution.
+    """Maps encoded guiding maps to encoded lightmaps, at any resolution: the planes `names`, of which each adapter
+    computes one of `groups`.
 
     Outputs are not clamped to their ranges, so that there is a gradient everywhere; `decode_lightmaps` clamps them.
-
-    Attributes:
-        groups: Names of the planes that each adapter computes.
-        names: Names of the planes of all adapters, in order.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:
@@ -179,14 +170,8 @@ class SixWayNetwork(nn.Module):
         return x
 
     def forward(self, guide: torch.Tensor) -> torch.Tensor:
-        """Predicts encoded lightmaps, opacity and emission.
-
-        Args:
-            guide: [N, C, H, W], encoded guiding maps of the kind that the settings name.
-
-        Returns:
-            [N, 8, H, W] in the order of `PLANES`, in the type of `guide`.
-        """
+        """Predicts encoded lightmaps, opacity and emission, [N, 8, H, W] in the order of `PLANES`, from encoded guiding
+        maps [N, C, H, W] of the kind that the settings name, in their type."""
         height, width = guide.shape[-2:]
         multiple = self.settings.multiple
         padded = F.pad(guide, (0, -width % multiple, 0, -height % multiple))

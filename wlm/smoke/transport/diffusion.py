@@ -55,15 +55,11 @@ class Spreading:
             self._coarse.lit(self._scene, depths, out)
 
     def render(self, albedos: Sequence[float]) -> tuple[torch.Tensor, torch.Tensor]:
-        """Computes the light that was scattered more than once and reaches the camera.
+        """Computes the light that was scattered more than once and reaches the camera, for A albedos.
 
-        Args:
-            albedos: A albedos, any number.
-
-        Returns:
-            The light divided by the squared albedo, float32 [2, L, A, H, W], for L lights of irradiance 4 pi (point
-            lights: intensity): all light, and its part from thin smoke. Also the opacity of thin smoke, float32 [H, W];
-            see `CoarseSmoke.render`.
+        Returns the light divided by the squared albedo, float32 [2, L, A, H, W], for L lights of irradiance 4 pi (point
+        lights: intensity): all light, and its part from thin smoke. Also the opacity of thin smoke, float32 [H, W]; see
+        `CoarseSmoke.render`.
         """
         size = (self._scene.view.height, self._scene.view.width)
         made = torch.empty(2, len(self._lights), len(albedos), *size, device=self._source.device)
@@ -81,13 +77,8 @@ class Spreading:
 
 
 def thrown_by_fire(scene: Marching, volume: DensityVolume, albedos: Sequence[float]) -> torch.Tensor:
-    """Computes the light that hot smoke emits and scatters to a camera, [A, H, W] for A albedos.
-
-    Args:
-        scene: A march through the smoke.
-        volume: The smoke.
-        albedos: A albedos, one to three.
-    """
+    """Computes the light that hot smoke emits and scatters to the camera of a march, [A, H, W] for one to three
+    albedos."""
     coarse = CoarseSmoke(volume)
     source = coarse.mean(volume.temperature).mul_(4.0 * math.pi * volume.emission * volume.voxel)
     # Emitted light has not been scattered yet: `spread` multiplies it by the albedo.
@@ -95,13 +86,8 @@ def thrown_by_fire(scene: Marching, volume: DensityVolume, albedos: Sequence[flo
 
 
 class CoarseSmoke:
-    """Smoke on the coarse grid of the diffusion.
-
-    Attributes:
-        medium: The smoke at full resolution.
-        extinction: float32 tensor [X, Y, Z], mean extinction per voxel of each cell.
-        edges: Edges of a cell along x, y and z in voxels.
-    """
+    """Smoke on the coarse grid of the diffusion: the smoke at full resolution, the mean extinction per voxel of each
+    cell, float32 tensor [X, Y, Z], and the edges of a cell along x, y and z in voxels."""
 
     def __init__(self, volume: DensityVolume, cells: int = CELLS) -> None:
         """Averages the smoke over `cells` cells along its longest edge; to be called inside `wlm.interop.stream`."""
@@ -122,12 +108,9 @@ class CoarseSmoke:
     def spread(self, source: torch.Tensor, albedos: Sequence[float]) -> torch.Tensor:
         """Computes the fluence, the light from all directions, of light that was scattered at least once, by diffusion.
 
-        Args:
-            source: float32 tensor [L, X, Y, Z], direct light of L lights that each cell extinguishes, per volume.
-            albedos: A albedos, one to three.
-
-        Returns:
-            float32 tensor [L * A, X, Y, Z]: all albedos of the first light, then all of the second, and so on.
+        `source`, float32 [L, X, Y, Z], is the direct light of L lights that each cell extinguishes, per volume. Returns
+        float32 [L * A, X, Y, Z] for one to three albedos: all albedos of the first light, then all of the second, and
+        so on.
         """
         light = torch.empty(len(source) * len(albedos), *self.extinction.shape, device=source.device)
         if not len(light):
@@ -138,15 +121,11 @@ class CoarseSmoke:
         return light
 
     def render(self, scene: Marching, light: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Computes the light that smoke of albedo 1 sends to the camera of a march.
+        """Computes the light that smoke of albedo 1 sends to the camera of a march, for N fluences from `spread`, [N,
+        X, Y, Z].
 
-        Args:
-            scene: The march.
-            light: float32 tensor [N, X, Y, Z], N fluences from `spread`.
-
-        Returns:
-            All light and the light from thin smoke, float32 [2, N, H, W], and the opacity of thin smoke, float32 [H,
-            W]. For thin smoke each sample is weighted by the transparency of a whole cell of its density.
+        Returns all light and the light from thin smoke, float32 [2, N, H, W], and the opacity of thin smoke, float32
+        [H, W]. For thin smoke each sample is weighted by the transparency of a whole cell of its density.
         """
         size = (scene.view.height, scene.view.width)
         out, thin = torch.empty(2, len(light), *size, device=light.device), torch.zeros(size, device=light.device)
@@ -156,25 +135,14 @@ class CoarseSmoke:
         return out, thin
 
     def lit(self, scene: Marching, depths: Depths, out: torch.Tensor) -> None:
-        """Computes the direct light that each cell extinguishes from a light at infinity of irradiance 4 pi.
-
-        Args:
-            scene: A march through the smoke.
-            depths: Optical depths to the light, from `scene.reach`.
-            out: float32 tensor [X, Y, Z] for the result.
-        """
+        """Computes the direct light that each cell extinguishes from a light at infinity of irradiance 4 pi, float32
+        [X, Y, Z], into `out`; `depths` are those to the light, from `scene.reach`."""
         cell = wp.vec3(*self.edges)
         diffusion.stop(scene.medium, depths, cell, scene.march.step, to_warp(out))
 
     def around(self, scene: Marching, place: Sequence[float], radius: float, out: torch.Tensor) -> None:
-        """Adds to `out` the direct light that each cell extinguishes from a point light.
-
-        Args:
-            scene: A march through the smoke.
-            place, radius: Position and radius of the light in voxels; its irradiance is 4 pi at a distance of one
-                voxel.
-            out: float32 tensor [X, Y, Z].
-        """
+        """Adds to `out`, float32 [X, Y, Z], the direct light that each cell extinguishes from a point light at a place
+        in voxels; its irradiance is 4 pi at a distance of one voxel."""
         step = max(0.5, min(self.edges) / 8)
         power = 16.0 * math.pi**2 / math.prod(self.edges)
         cell = wp.vec3(*self.edges)

@@ -20,12 +20,7 @@ _ROUNDS = 100  # iterations of the non-negative descent, after which it is withi
 
 
 def bake_sphere(
-    volume: DensityVolume,
-    camera: Camera,
-    *,
-    lights: int = 32,
-    march: March | None = None,
-    albedo: float | None = None,
+    volume: DensityVolume, camera: Camera, *, lights: int = 32, march: March | None = None, albedo: float | None = None
 ) -> SixWay:
     """Computes the lightmaps with the least squared error over lights spread over the sphere.
 
