@@ -26,12 +26,9 @@ ORIGINALS, BAKE = "originals of the groups", "bake of all lights"
 class SumScore(Summary):
     """Error of the sum of all groups of a sheet over tiles and times; the scores are those of `Summary`.
 
-    Attributes:
-        sheet: Label of the sheet, without a group.
-        reference: `ORIGINALS` or `BAKE`.
-        times: float64 [T], the times that are scored.
-        between_inputs: PSNR of the sum of the originals against the reference, in dB: the noise of the bakes, which no
-            compression can undo. NaN if the reference is that sum itself.
+    `sheet` is the sheet's label, without a group; `reference` is `ORIGINALS` or `BAKE`. `between_inputs` is the PSNR of
+    the sum of the originals against the reference, in dB: the noise of the bakes, which no compression can undo; NaN if
+    the reference is that sum itself.
     """
 
     sheet: str

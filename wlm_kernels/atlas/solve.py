@@ -20,13 +20,10 @@ _TINY = wp.constant(1e-30)
 
 @wp.struct
 class Grid:
-    """The grids of samples and points of a tile.
+    """The grids of a tile: m points along an axis, and nx x ny samples, at most `MOST` along each.
 
-    Attributes:
-        points: m, number of points along an axis.
-        nx, ny: Number of samples along x and y, at most `MOST`.
-        first_x, first_y: int [m], index of the sample before each point along the axis; 0 if there is only one sample.
-        share_x, share_y: float [m], weight of the next sample at each point; 0 if there is only one sample.
+    `first_x` and `first_y`, int [m], have the index of the sample before each point along the axis, `share_x` and
+    `share_y`, float [m], the weight of the next sample there; both are 0 if there is only one sample.
     """
 
     points: int
@@ -40,14 +37,11 @@ class Grid:
 
 @wp.struct
 class System:
-    """The normal equations of T tiles; the S = nx * ny samples of a tile are stored row by row.
+    """The normal equations of T tiles, [T, S] each; the S = nx * ny samples of a tile are stored row by row.
 
-    Attributes:
-        own: [T, S], coefficient of a sample with itself.
-        right, down: [T, S], coefficients with the next sample along x and y; 0 for the last sample.
-        cross: [T, S], coefficient with the sample to the lower right. The right and the lower neighbour have the same
-            coefficient with each other.
-        diagonal: [T, S], sum of a sample's coefficients with itself and all neighbours: the preconditioner.
+    They are coefficients of a sample with itself and with its neighbours to the right, below and to the lower right, 0
+    beyond the last sample; the right and the lower neighbour have the last of these with each other. `diagonal` is the
+    sum of a sample's coefficients with itself and all neighbours: the preconditioner.
     """
 
     own: wp.array2d[float]

@@ -49,15 +49,12 @@ HOLD = wp.constant(0.3)
 
 @wp.struct
 class Links:
-    """The links of the domain's faces, followed by the links of solids, on a device; arrays have room for L links.
+    """The links of the domain's faces, followed by the links of solids, on a device; arrays have room for L links, of
+    which `used`, int [1], are in use, `faces` of them links of faces.
 
-    Attributes:
-        cell: int [L], index of the fluid cell a.
-        code: uint8 [L], the direction q + 32 times the kind of boundary.
-        term: float [L], the term of the boundary condition, see the module.
-        value: float [L], the population that the boundary returns, result of the first pass.
-        used: int [1], number of links.
-        faces: Number of links of faces.
+    `cell`, int [L], is the fluid cell a; `code`, uint8 [L], the direction q + 32 times the kind of boundary; `term`,
+    float [L], the term of the boundary condition, see the module; `value`, float [L], the population that the boundary
+    returns, result of the first pass.
     """
 
     cell: wp.array1d[int]

@@ -51,16 +51,11 @@ class Variable:
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement.
+    """A statement: `comment`, `declare`, `expression`, `return`, `if`, `for` or `block`.
 
-    Attributes:
-        kind: `comment`, `declare`, `expression`, `return`, `if`, `for` or `block`.
-        text: Text of a comment.
-        parts: Expressions.
-        variable: Variable of a declaration or a loop.
-        bodies: Blocks: one or two of `if`, one of `for` and `block`.
-        tail: Comment at the end of the statement's line.
-        blank: Whether a blank line precedes the statement.
+    It has the text of a comment, expressions, the variable of a declaration or a loop, and blocks: one or two of `if`,
+    one of `for` and `block`. `tail` is the comment at the end of its line; `blank` tells whether a blank line precedes
+    it.
     """
 
     kind: str
