@@ -32,7 +32,8 @@ OFF = 0.5
 MANY_OFF = 0.01
 """Share of the live probes that may be off without a warning."""
 
-_OF_HOUR = ("psnr", "psnr_live", "irradiance_psnr", "between_psnr", "relative_error", "off")
+_RELATIVE = ("relative_error", "relative_median", "relative_p95", "off")
+_OF_HOUR = ("psnr", "psnr_live", "irradiance_psnr", "between_psnr", *_RELATIVE)
 _NEAREST = 8  # probes that are weighted by the inverse square of their distance
 _ROWS = 32768  # probes per piece, so that float64 copies stay at some tens of MB
 
@@ -142,9 +143,14 @@ def evaluate(
         worst,
         gpu_bytes=model.content.nbytes,
         ratio=worst.ratio / len(times),
-        warnings=[text for report in reports for text in report.warnings],
+        warnings=[at_hour(time) + text for time, each in zip(times, reports, strict=True) for text in each.warnings],
         hours=hours if len(times) > 1 else [],
     )
+
+
+def at_hour(time: float | None) -> str:
+    """Returns the beginning of a sentence about one of several hours."""
+    return "" if time is None else f"at {time:g} h, "
 
 
 def _evaluate(decoder: Decoder, probes: ProbeSet, file_bytes: int) -> Report:
@@ -234,7 +240,7 @@ def relative_figures(decoded: np.ndarray, probes: ProbeSet) -> dict[str, Any]:
     `score`."""
     index = np.flatnonzero(probes.live)
     if not len(index):
-        none = dict.fromkeys(("relative_error", "relative_median", "relative_p95", "off"), math.nan)
+        none = dict.fromkeys(_RELATIVE, math.nan)
         return none | {"worst_probe": None, "warnings": []}
     decoded, values = decoded[index], probes.values[index]
     error = relative_errors(decoded, values)

@@ -14,7 +14,7 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
-from wlm.probe.evaluation import relative_figures
+from wlm.probe.evaluation import at_hour, relative_figures
 from wlm.probe.gaussian.model import check_outputs, gaussian_bytes, gaussian_count
 from wlm.probe.gaussian.packing import pack_model
 from wlm.probe.gaussian.trainer import Trainer
@@ -171,7 +171,7 @@ def _measured(model: ProbeModel, probes: ProbeSet, device: str) -> tuple[ProbeMo
     for time in probes.times.tolist() or [None]:
         decoder.set_time(time or 0.0)
         figures = relative_figures(decoder.decode_probes(), probes.at(time))
-        warnings += figures["warnings"]
+        warnings += [at_hour(time) + line for line in figures["warnings"]]
         squares.append(figures["relative_error"] ** 2)
     return replace(model, warnings=tuple(warnings)), math.sqrt(np.nanmean(squares))
 
