@@ -164,14 +164,11 @@ def _moments(texels: _Texels, mask: int) -> _Moments:
 
 @wp.func
 def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, moments: _Moments, steps: int) -> _Ends:
-    """Fits a line to the texels in `mask`: the extremes along their principal axis, refined twice by least squares.
+    """Fits a line to the texels in `mask`, a bit each: the extremes along their principal axis, refined twice by least
+    squares.
 
-    Args:
-        texels: The block.
-        mask: The line's texels, one bit each.
-        ends: The endpoints of both lines; rows 2 `line` and 2 `line` + 1 are replaced.
-        moments: The moments of these texels.
-        steps: The largest index, which selects the line's second end.
+    Of the endpoints of both lines, rows 2 `line` and 2 `line` + 1 are replaced. `moments` are those of these texels;
+    `steps` is the largest index, which selects the line's second end.
     """
     principal = _axis_of(moments, _AXIS_ROUNDS)
     axis = wp.vec3(principal[0], principal[1], principal[2])

@@ -33,18 +33,10 @@ class Part:
 
 
 def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) -> dict[str, np.ndarray]:
-    """Checks the tensors of a file against its table of parts.
+    """Checks the tensors of a file against its table of parts, which has all parts that the file may have.
 
-    Args:
-        tensors: The tensors by name.
-        table: All parts that the file may have, by name.
-
-    Returns:
-        Every part of the table; parts that the file leaves out are empty.
-
-    Raises:
-        ValueError: A part is unknown, is missing, has another type or shape, contains NaN or infinity, or is out of
-            range.
+    Returns every part of the table; parts that the file leaves out are empty. A ValueError means that a part is unknown
+    or missing, has another type or shape, contains NaN or infinity, or is out of range.
     """
     if extra := tensors.keys() - table.keys():
         raise ValueError(f"part {one_line(min(extra), 60)} is unknown")

@@ -301,14 +301,11 @@ class NumberedFiles:
         run: Mapping[str, Any] | None = None,
         resume: bool = False,
     ) -> None:
-        """Checks that the folder can be made, or that an existing one contains only files of an earlier run.
+        """Checks that the folder, whose parent must exist, can be made, or that an existing one contains only files of
+        an earlier run. It is made for the first file; `stem` and `suffix` are as for `numbered`.
 
-        Args:
-            folder: The folder, whose parent must exist; it is made for the first file.
-            stem, suffix: Stem and suffix of the files, as for `numbered`.
-            others: Names of further files that a run may write into the folder.
-            run: Settings on which the results depend, as JSON values; None: the run cannot be resumed.
-            resume: Whether to keep the files of an interrupted run.
+        A run may also write `others` into the folder. `run` are settings on which the results depend, as JSON values;
+        None: the run cannot be resumed. `resume` keeps the files of an interrupted run.
         """
         self.folder, self._stem, self._suffix, self._others = Path(folder), stem, suffix, others
         self._cleared = False

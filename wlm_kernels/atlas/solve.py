@@ -230,16 +230,11 @@ def solve(
     work: list[wp.array],
     out: wp.array,
 ) -> None:
-    """Solves the normal equations of T tiles by conjugate gradients.
+    """Solves the normal equations of T tiles, which `gather_system` has written, by conjugate gradients.
 
-    Args:
-        light: float [T, 3, m * m], the light that the samples should reproduce at the points.
-        weight, scale, grid, system: As for `gather_system`, which has written `system`.
-        ridge: Weight of the squared difference of a sample from `start`.
-        rounds: Number of iterations.
-        start: float [T, 3, S], the samples at which the iterations begin.
-        work: Three arrays of the shape of `start`, scratch memory.
-        out: float [T, 3, S], written: the samples.
+    `light`, float [T, 3, m * m], is what the samples `out`, float [T, 3, S], written, should reproduce at the points.
+    The iterations, `rounds` of them, begin at `start`, from which the squared difference of a sample has the weight
+    `ridge`. `work` are three arrays of the same shape, scratch memory.
     """
     inputs = [light, weight, scale, grid, system, ridge, rounds, start, *work, out]
     wp.launch(_solve, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)
