@@ -24,7 +24,7 @@ _Axes = Annotated[
     str | None,
     typer.Option(
         metavar="X,Y,Z",
-        help="Change the axes of positions and light: the old axes that become x, y and z, such as x,z,-y from z up to y "
+        help="Change the axes of positions and light: the old axes that become x, y, z, such as x,z,-y from z up to y "
         "up, or, with an equals sign, --axes=-x,y,z to mirror x for a left-handed engine.",
     ),
 ]
