@@ -55,7 +55,7 @@ def test_compress_prints_one_table(room, profile, tmp_path):
         assert word in text
     assert re.search(rf"gaussians +│ +{model.content.count} │", text)
     assert model.content.count + model.content.dropped == round(0.1 * (PROBES - DEAD))
-    assert re.search(r"fit: 30 of 30, PSNR \d+\.\d+ dB", call.stderr)
+    assert re.search(r"fit: 30 of 30, error \d+\.\d+", call.stderr)
     assert f"{room}: {data.load(room).reading}" in call.stderr
     assert (model.profile.name, model.profile.steps, len(model.positions)) == ("tiny", 30, 0)
     assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"], "no checkpoint is left"
@@ -146,7 +146,7 @@ def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path):
     for word in (f"{report.psnr:.2f}", f"{report.irradiance_psnr:.2f}", f"{size:,}", "wlm tiny", "SH band 2"):
         assert word in text
     said = [line.removeprefix("warning: ") for line in call.stderr.splitlines() if line.startswith("warning: ")]
-    assert "worst probe:" in call.stderr and said == report.warnings
+    assert f"at the worst, probe {report.worst_probe['probe']} at (" in call.stderr and said == report.warnings
 
 
 def test_evaluate_reads_numbers_channel_by_channel(fitted, room, tmp_path):
@@ -232,7 +232,9 @@ def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path)
     assert len(files) == 8 and all(file.name in text and f"{file.stat().st_size:,}" in text for file in files)
     document = json.loads((tmp_path / "out" / "bundle.json").read_text())
     assert document["viewpoint"] == [1.0, 2.5, -3.0]
-    call("probe", "volume", carrying, "-o", tmp_path / "out", "--block", 0.5)
+    call("probe", "volume", carrying, "-o", tmp_path / "out", "--block", 0.5, "--update", "--shader", "wgsl")
+    assert "fn wlm_update_scroll" in (tmp_path / "out" / "update" / "probe.wgsl").read_text()
+    assert json.loads((tmp_path / "out" / "update" / "bundle.json").read_text())["dispatches"][0]["threads"] > 100
     assert json.loads((tmp_path / "out" / "bundle.json").read_text())["levels"][0]["block"] == 0.5
     assert "viewpoint: expected" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", 1, 2, "nan")
 

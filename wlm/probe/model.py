@@ -36,6 +36,8 @@ class Profile(Settings):
     """Length of the latent vector of a Gaussian."""
     hidden: int = Field(64, ge=8, le=128, multiple_of=8)
     """Width of both hidden layers of the network."""
+    error: Literal["relative", "absolute"] = "relative"
+    """Error that is minimised: relative to each probe's light, or absolute (eq. 8), which neglects dark probes."""
     support: Literal["ellipsoid", "sphere"] = "ellipsoid"
     """Support of a Gaussian: ellipsoid, at three standard deviations, or sphere, of its longest half axis (eq. 6)."""
     optimiser: Literal["adam", "adan"] = "adam"
@@ -58,6 +60,11 @@ class Profile(Settings):
     """Initial scale of a Gaussian as a share of the distance to the nearest other centre."""
     gain: float = Field(3.0, gt=0.0, le=10.0)
     """Magnitude of the hidden layers' initial weights; 1: uniform random numbers of variance 1 / (3 * inputs)."""
+
+    def columns(self, outputs: int, hours: int = 1) -> int:
+        """Returns the number of outputs of the network for D numbers per probe at each hour: one more each if the error
+        is relative."""
+        return hours * (outputs + (self.error == "relative"))
 
 
 class Content(ABC):
@@ -84,8 +91,9 @@ class Content(ABC):
         """The bytes of the content's GPU buffers, as `wlm.probe.bundle` makes them."""
 
     @abstractmethod
-    def at(self, factors: np.ndarray) -> Self:
-        """Returns the content of one hour whose light is the sum of that of T hours times factors, float64 [T]."""
+    def at(self, factors: np.ndarray, scales: np.ndarray) -> Self:
+        """Returns the content of one hour that is the mix of T hours, with factors, float64 [T], which add up to 1, and
+        `scales` of their light, float64 [T]. The logarithms of magnitudes are mixed, where there are such."""
 
     @abstractmethod
     def facts(self) -> dict[str, Any]:
@@ -105,9 +113,9 @@ class Content(ABC):
 
     @classmethod
     @abstractmethod
-    def table(cls, profile: Profile, outputs: int, count: int, live: int) -> dict[str, Part]:
+    def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int) -> dict[str, Part]:
         """Returns the types and shapes of these arrays, by name, for `count` Gaussians or components, `live` probes,
-        and `outputs` numbers of a probe at all hours.
+        and `outputs` numbers of a probe at each hour.
 
         Raises:
             ValueError: There are more components than numbers of a probe.
@@ -143,9 +151,10 @@ class ProbeModel(Model):
         positions: uint16 [N, 3], positions in 1/65535 of the box, if they are stored with the model; else empty.
         content: The compressed light, in the form of the method.
         choice: Sentence that says why the fit used this method. Files do not store it.
+        warnings: Sentences about light that the fit lost, as in `wlm.probe.Report`. Files do not store them.
         times: float64 [T], increasing hours of the day in [0, 24), if there are several; else empty.
         scales: float64 [T], factor of the light of each hour of `content`, by which the fit divided it, so that the
-            precision of an hour follows its own light.
+            precision of an hour follows its own light; 1 where `content` has magnitudes for each hour.
     """
 
     SYSTEM: ClassVar[str] = "probe"
@@ -162,6 +171,7 @@ class ProbeModel(Model):
     positions: np.ndarray
     content: Content
     choice: str = ""
+    warnings: tuple[str, ...] = ()
     times: np.ndarray = field(default_factory=lambda: np.zeros(0))
     scales: np.ndarray = field(default_factory=lambda: np.ones(1))
 
@@ -192,7 +202,7 @@ class ProbeModel(Model):
         factors = hour_factors(self.name, self.times, time)
         if factors is None:
             return self
-        return replace(self, content=self.content.at(factors * self.scales), times=np.zeros(0), scales=np.ones(1))
+        return replace(self, content=self.content.at(factors, self.scales), times=np.zeros(0), scales=np.ones(1))
 
     def decoder(self, device: str = "cpu", **options: Any) -> Any:
         """Loads the model onto a device and returns its decoder.

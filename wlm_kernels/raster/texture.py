@@ -65,13 +65,8 @@ def triangle_wave_slope(x: float) -> float:
 
 @wp.func
 def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
-    """Finds the two texels next to a coordinate along one axis, and their weights.
-
-    Args:
-        x: u or v.
-        size: Texels along the axis, at least 1.
-        filter, boundary: Integer codes, returned by `codes`.
-    """
+    """Finds the two texels next to a coordinate u or v along an axis of `size` texels, at least 1, and their weights;
+    `filter` and `boundary` are integer codes, returned by `codes`."""
     out = Axis()
     n = wp.float64(size)
     t = wp.float64(x)
@@ -199,12 +194,8 @@ def _sample_backward(
 
 
 def codes(filter: str, boundary: str) -> tuple[int, int]:
-    """Returns the integer codes by which kernels know a filter and a boundary mode.
-
-    Args:
-        filter: "linear" interpolates between the four nearest texels; "nearest" reads the nearest one.
-        boundary: "clamp", "wrap" or "mirror", see the module.
-    """
+    """Returns the integer codes by which kernels know a filter and a boundary mode: "linear" interpolates between the
+    four nearest texels, "nearest" reads the nearest one; the module describes "clamp", "wrap" and "mirror"."""
     for name, value, names in (("filter", filter, FILTERS), ("boundary", boundary, BOUNDARIES)):
         if value not in names:
             raise ValueError(f"{name}: expected {' or '.join(names)}, got {value!r}")
@@ -212,14 +203,8 @@ def codes(filter: str, boundary: str) -> tuple[int, int]:
 
 
 def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp") -> None:
-    """Reads a texture at N points with any coordinates.
-
-    Args:
-        texture: float [H, W, C].
-        uv: vec2 [N], coordinates (u, v).
-        out: float [N, C], written.
-        filter, boundary: Names, see `codes`.
-    """
+    """Reads a texture, float [H, W, C], at N points with any coordinates, vec2 [N]; writes `out`, float [N, C]. `codes`
+    explains filter and boundary."""
     inputs = [texture, uv, *codes(filter, boundary)]
     wp.launch(_sample, uv.shape, inputs=inputs, outputs=[out], device=texture.device)
 
@@ -227,16 +212,12 @@ def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp")
 def sample_backward(
     texture, uv, grad_out, grad_texture, grad_uv, *, filter: str = "linear", boundary: str = "clamp"
 ) -> None:
-    """Computes the gradients of the texture and of uv from the gradient of a result of `sample`.
+    """Computes the gradients of the texture and of uv from `grad_out`, float [N, C], the gradient of a result of
+    `sample`, and its arguments.
 
+    `grad_texture`, float [H, W, C], is added to, `grad_uv`, vec2 [N], is written; with no elements they are not wanted.
     The gradient of a coordinate is the slope between the texels that it reads, 0 at a clamped border. On CUDA samples
-    are added to `grad_texture` in any order, so that the last bits change from run to run.
-
-    Args:
-        texture, uv, filter, boundary: Arguments of `sample`.
-        grad_out: float [N, C], gradient of the result.
-        grad_texture: float [H, W, C], to which the gradient is added; of shape [0, 0, 0] if it is not wanted.
-        grad_uv: vec2 [N], written; of shape [0] if it is not wanted.
+    are added in any order, so that the last bits of `grad_texture` change from run to run.
     """
     inputs = [texture, uv, *codes(filter, boundary), grad_out]
     wp.launch(_sample_backward, uv.shape, inputs=inputs, outputs=[grad_texture, grad_uv], device=texture.device)

@@ -17,13 +17,8 @@ _FAR = wp.constant(1.0e30)
 
 @dataclass(frozen=True)
 class Solids:
-    """Obstacles on a device.
-
-    Attributes:
-        mesh: Their surfaces, in the coordinates of the camera `view` of the functions below.
-        owner: int32 [F], index of each triangle's obstacle.
-        colours: vec3 [obstacles], albedo of each obstacle.
-    """
+    """Obstacles on a device: their surfaces, in the coordinates of the camera `view` of the functions below, the index
+    of each triangle's obstacle, int32 [F], and each obstacle's albedo, vec3."""
 
     mesh: wp.Mesh
     owner: wp.array
@@ -34,12 +29,9 @@ class Solids:
 class Lamps:
     """L lights on a device; without lights the arrays have one unused element.
 
-    Attributes:
-        count: Number of lights.
-        toward: vec3 [L], directions to the lights in the world, of length 1; 0 for a point light, which does not light
-            obstacles.
-        irradiance: vec3 [L], irradiance of each light in R, G, B; of a point light its intensity.
-        visibility: float [L, H, W], share of each light that reaches the smoke.
+    `toward`, vec3 [L], are directions to the lights in the world, of length 1; 0 for a point light, which does not
+    light obstacles. `irradiance`, vec3 [L], is of a point light its intensity. `visibility`, float [L, H, W], is the
+    share of each light that reaches the smoke.
     """
 
     count: int
@@ -133,28 +125,22 @@ def _compose(
 
 
 def light_solids(solids: Solids, lamps: Lamps, ambient: float, view: View, light: wp.array, depth: wp.array) -> None:
-    """Computes the light that obstacles reflect to each pixel; obstacles cast no shadows on each other.
+    """Computes the light that obstacles reflect to each pixel, vec3 [H, W], 0 where there is none, and their distance
+    along the rays, float [H, W], infinite there; obstacles cast no shadows on each other.
 
-    Args:
-        solids: The obstacles.
-        lamps: The lights.
-        ambient: Ambient light, added to each colour channel before the albedo is applied.
-        view: The camera; its `voxel` and `moved` are not used.
-        light: vec3 [H, W], written; 0 where there is no obstacle.
-        depth: float [H, W], written: distance along the rays, infinite where there is no obstacle.
+    `ambient` is added to each colour channel before the albedo is applied. The camera's `voxel` and `moved` are not
+    used.
     """
     inputs = [solids.mesh.id, solids.owner, solids.colours, lamps.count, lamps.toward, lamps.irradiance, ambient, view]
     wp.launch(_light_solids, depth.shape, inputs, [light, depth], device=depth.device)
 
 
 def shadow(solids: Solids, lamps: Lamps, view: View, surface: wp.array) -> None:
-    """Computes which lights reach the surface of the smoke, by a ray from each pixel's surface to each light.
+    """Computes which lights reach the surface of the smoke, by a ray from each pixel's surface to each light:
+    `visibility` of the lamps is written, 0 where an obstacle is on the way to a directional light.
 
-    Args:
-        solids: The obstacles.
-        lamps: The lights; their `visibility` is written, 0 where an obstacle is on the way to a directional light.
-        view: The camera; its `voxel` and `moved` are not used.
-        surface: float [H, W], distance along the rays to the surface; 0: no surface, which counts as lit.
+    `surface`, float [H, W], is the distance along the rays to the surface; 0: no surface, which counts as lit. The
+    camera's `voxel` and `moved` are not used.
     """
     size = (lamps.count, *surface.shape)
     inputs = [solids.mesh.id, lamps.toward, view, surface]

@@ -386,27 +386,19 @@ def _rays_backward(
 
 
 def depths(density, toward, step: float, nodes) -> None:
-    """Computes optical depths towards lights at the nodes of a lattice.
+    """Computes optical depths towards L lights at the nodes of a lattice.
 
-    Args:
-        density: float [X, Y, Z], extinction per voxel, at least 0.
-        toward: vec3 [L], the directions to the lights, of length 1.
-        step: The longest step, in voxels.
-        nodes: float [L, A, B, C], written; `march.nodes_along` gives the numbers of nodes and `march.node_position`
-            their positions.
+    `density`, float [X, Y, Z], is extinction per voxel, at least 0; `toward`, vec3 [L], are directions of length 1;
+    `step` is the longest step, in voxels. `nodes`, float [L, A, B, C], is written; `march.nodes_along` gives the
+    numbers of nodes and `march.node_position` their positions.
     """
     inputs = [density, toward, step * _SLACK]
     wp.launch(_depths, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)
 
 
 def depths_backward(toward, step: float, grad_nodes, grad_density) -> None:
-    """Computes the gradient of the density from that of the optical depths towards lights, the result of `depths`.
-
-    Args:
-        toward, step: Arguments of `depths`.
-        grad_nodes: float [L, A, B, C], gradient of the loss with respect to the nodes.
-        grad_density: float [X, Y, Z], the gradient with respect to the density is added to it.
-    """
+    """Adds the gradient of the density, float [X, Y, Z], from that of the optical depths towards lights, float [L, A,
+    B, C], the result of `depths`."""
     inputs = [toward, step * _SLACK, grad_nodes]
     wp.launch(_depths_backward, grad_nodes.shape, inputs=inputs, outputs=[grad_density], device=grad_density.device)
 
@@ -476,13 +468,8 @@ def rays_backward(
     grad_origin,
     grad_direction,
 ) -> None:
-    """Computes the gradients of the rays of `march`; the number of a ray's steps is constant.
-
-    Args:
-        density, emission, nodes, origin, direction, step, depth, count: Arguments and results of `march`.
-        grad_scattered, grad_emitted, grad_depth: Arguments of `march_backward`.
-        grad_origin, grad_direction: vec3 [R], written. The three numbers of a direction count as independent.
-    """
+    """Computes the gradients of the rays of `march`, vec3 [R], from the arguments of `march_backward`; the number of a
+    ray's steps is constant, and the three numbers of a direction count as independent."""
     inputs = [density, emission, nodes, origin, direction, step * _SLACK, depth, count]
     inputs += [grad_scattered, grad_emitted, grad_depth]
     outputs = [grad_origin, grad_direction]

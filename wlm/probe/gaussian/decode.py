@@ -7,9 +7,9 @@ from wlm.probe.decode import Decoder
 from wlm.probe.gaussian.model import CUT, Gaussians, check_outputs
 from wlm.probe.model import ProbeModel, check_points
 from wlm.probe.morton import morton_order
+from wlm.probe.sphere import ambient_numbers
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
-from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import volume_frame as frame_kernels
 from wlm_kernels.probe.decode import decode_kernels
 
@@ -48,7 +48,7 @@ class GaussianDecoder(Decoder):
         super().__init__(model, device, position=position)
         content = model.content
         assert isinstance(content, Gaussians)
-        check_outputs(model.name, content.latent, content.hidden, model.outputs, self.device)
+        check_outputs(model.name, content.latent, content.hidden, model.outputs, content.relative, self.device)
         self._gain = content.gain
         self._rows = self._put(content.rows(), float)
         self._shapes = gaussian_sum.shapes(self._rows, CUT, content.support)
@@ -56,13 +56,14 @@ class GaussianDecoder(Decoder):
         self.pairs = self._cubes.item.shape[0]
         shared = np.concatenate([layer.ravel() for layer in content.layers()[:2]])
         last = np.stack([each.layers()[2] for each in self._contents()])
-        last = np.pad(last, ((0, 0), (0, 0), (0, probe_network.padded(model.outputs) - model.outputs)))
+        last = np.pad(last, ((0, 0), (0, 0), (0, -last.shape[2] % 4)))
         last = last.reshape(len(last), -1).astype(np.float32)
         self._net = self._put(np.concatenate([shared.astype(np.float32), last[0]]), float)
         self._keep_hours(last, self._net[len(shared) :])
         self._arrays += [self._shapes, self._cubes.start, self._cubes.item]
         kind = "cpu" if self.device == "cpu" else "cuda"
-        self._kernels = decode_kernels(content.latent, content.hidden, model.outputs, kind)
+        sizes = content.latent, content.hidden, model.outputs, content.relative, ambient_numbers(model.outputs)
+        self._kernels = decode_kernels(*sizes, kind)
 
     def points(self, position: np.ndarray) -> Points:
         """Uploads points that will be decoded often; arguments and errors are those of `decode`."""
