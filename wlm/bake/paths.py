@@ -45,13 +45,9 @@ class Sun:
 class Tracing:
     """Settings of the path tracer, and the lights outside Mitsuba's scene, which need no random light selection.
 
-    Attributes:
-        sun: The sun; None if there is none or if it is below the horizon.
-        ambient: Radiance of rays that hit no surface, R, G, B.
-        sun_direct: Whether the sun's direct light is included.
-        samples: Number of paths per texel or probe, rounded up to a multiple of 8.
-        bounces: Maximum number of reflections.
-        seed: Seed of the random numbers.
+    There is no `sun` if it is below the horizon; `sun_direct` tells whether its direct light is included. `ambient` is
+    the radiance R, G, B of rays that hit no surface. `samples` counts paths per texel or probe, rounded up to a
+    multiple of 8; `bounces` is the largest number of reflections.
     """
 
     sun: Sun | None

@@ -113,11 +113,9 @@ def is_level_set(grid: VdbGrid, group: str) -> bool:
 
 def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lattice, list[torch.Tensor]]:
     """Brings grids to one lattice, which covers all of them and has the voxels of the first grid, if these are cubic.
-
     `most` is the largest number of voxels; `up` is "x", "y" or "z", the axis of the grids' world that becomes +y.
 
-    Returns:
-        The lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
+    Returns the lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
     """
     turned = [(grid, _turned(grid, up)) for grid in grids]
     first, matrix = turned[0]

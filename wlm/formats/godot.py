@@ -398,13 +398,10 @@ def lmbake_bytes(
 ) -> bytes:
     """Returns the content of a new bake in format 4, with a `LightmapGIData` that sets only `probe_data`.
 
-    Args:
-        points: [N, 3], metres.
-        sh: [N, 9, 3], the numbers that the module's description defines.
-        tetrahedra: int [T, 4], indices of points.
-        planes: [M, 4], planes n x = d of a BSP tree.
-        children: int [M, 2], two children per node: on the side n x > d, and on the other side; each is the index of a
-            node, or -1 - t for tetrahedron t.
+    `points`, [N, 3], are in metres; `sh`, [N, 9, 3], are the numbers that the module's description defines;
+    `tetrahedra`, int [T, 4], are indices of points. `planes`, [M, 4], n x = d, are those of a BSP tree; `children`, int
+    [M, 2], its two children per node, on the side n x > d and on the other: each is the index of a node, or -1 - t for
+    tetrahedron t.
     """
     low, high = points.min(0), points.max(0)
     node = np.zeros((len(planes), 6), "<u4")

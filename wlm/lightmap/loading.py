@@ -41,13 +41,11 @@ class TileLoader:
     def __init__(
         self, model: LightmapModel, most: int = 64, prepare: Callable[[Sheet, int, SheetModel], Any] | None = None
     ) -> None:
-        """Starts the thread.
+        """Starts the thread for a model, usually from `wlm.load`.
 
-        Args:
-            model: The model, usually from `wlm.load`.
-            most: Largest number of waiting requests, and of results that nobody has taken; at least 1.
-            prepare: Called in the thread with the sheet, the number and the content of each tile, for work that no
-                frame should wait for.
+        `most`, at least 1, is the largest number of waiting requests, and of results that nobody has taken. `prepare`
+        is called in the thread with the sheet, the number and the content of each tile, for work that no frame should
+        wait for.
         """
         if most < 1:
             raise WlmError(f"most: expected at least 1, got {most}")

@@ -133,11 +133,8 @@ class StripDecoder(_OneTimeDecoder):
     def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None, shared: bool = False) -> None:
         """Uploads the dynamic tiles of a sheet and allocates all buffers; the time is initially the first stored one.
 
-        Args:
-            model: The sheet.
-            device: "cpu", "cuda" or "cuda:N".
-            gelu: GELU variant to use instead of the model's, see `wlm_kernels.mlp`; None: the model's.
-            shared: Whether texels are linear radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
+        `gelu` is a variant to use instead of the model's, see `wlm_kernels.mlp`; with `shared`, texels are linear
+        radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
         """
         super().__init__(model, device, gelu, TileKind.DYNAMIC, shared)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
@@ -248,11 +245,8 @@ class MapDecoder:
     ) -> None:
         """Uploads a map and allocates all buffers; the time is initially the first stored one.
 
-        Args:
-            model: The sheet; or the sheet of each light group, as `LightmapModel.maps` returns them, which share size
-                and mask.
-            device: "cpu", "cuda" or "cuda:N".
-            mips: Number of mips besides the map itself; None: down to one texel.
+        `model` is the sheet, or the sheet of each light group, as `LightmapModel.maps` returns them, which share size
+        and mask. `mips` counts the mips besides the map itself; None: down to one texel.
         """
         self.device = device_of(device)
         self.groups = {BASE: model} if isinstance(model, SheetModel) else dict(model)

@@ -76,14 +76,11 @@ class TileGrid:
 
 @dataclass(frozen=True, eq=False)
 class TileData:
-    """N tiles as gamma-space colours, padded to 128 x 128 texels.
+    """N tiles as gamma-space colours, padded to 128 x 128 texels, with their numbers in the grid, int64 [N], row-major.
 
-    Attributes:
-        index: `[N]` int64, number of each tile in its grid, row-major.
-        colour: `[N, T, 128, 128, 3]` float32, `irradiance ** (1 / gamma)`. Texels outside the mask repeat the
-            nearest valid one of the tile; past the map's end its last row and column repeat. All zero in an empty
-            tile.
-        mask: `[N, 128, 128]` bool, true where a texel is valid; false past the map's end.
+    `colour`, float32 [N, T, 128, 128, 3], is `irradiance ** (1 / gamma)`: texels outside the mask repeat the nearest
+    valid one of the tile; past the map's end its last row and column repeat; all is 0 in an empty tile. `mask`, bool
+    [N, 128, 128], is true where a texel is valid; false past the map's end.
     """
 
     index: np.ndarray

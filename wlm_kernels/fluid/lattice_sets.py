@@ -170,14 +170,11 @@ class MemoryFunctions:
 def memory_functions(
     lattice_name: str, storage: str, walls: tuple[bool, bool, bool], wide: bool = True
 ) -> MemoryFunctions:
-    """Builds (once) the functions for a lattice and a storage type.
+    """Builds (once) the functions for a lattice of `LATTICES` and a storage type of `STORAGES`, by whose scale numbers
+    are multiplied, with walls at rest that close some axes.
 
-    Args:
-        lattice_name: One of `LATTICES`.
-        storage: One of `STORAGES`; scaled numbers are multiplied by its scale.
-        walls: For each axis whether walls at rest close it.
-        wide: Whether populations are indexed in 64 bits, which adds a sixth to a step's instructions; otherwise there
-            may be at most `NARROW` of them.
+    `wide` indexes populations in 64 bits, which adds a sixth to a step's instructions; otherwise there may be at most
+    `NARROW` of them.
     """
     c = lattice(lattice_name).c
     count = len(c)

@@ -114,13 +114,10 @@ class Cut:
 class Fitted:
     """The components, sizes and places chosen for all tiles.
 
-    Attributes:
-        cut: Sheets and levels with their tiles; separate tiles are listed state by state.
-        tried: The errors of all tiles for each number of components, weighted by `balance`.
-        given: Components, sizes and places of the tiles.
-        numbers: Number of integers per entry of T_c.
-        states: Number of states with separate tiles; 1: all share tiles.
-        gain: Estimated advantage of separate tiles in views, in dB; None if it wasn't computed to the end.
+    Separate tiles are listed state by state in `cut`; `states` is the number of states with separate tiles, 1 if all
+    share tiles. `tried` are the errors of all tiles for each number of components, weighted by `balance`; `given` has
+    what the tiles got; an entry of T_c has `numbers` integers. `gain` estimates the advantage of separate tiles in
+    views, in dB; None if it wasn't computed to the end.
     """
 
     cut: Cut

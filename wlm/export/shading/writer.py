@@ -11,6 +11,9 @@ _PLAIN = {("+", "*"), ("+", "/"), ("-", "*"), ("-", "/"), ("+", "%"), ("-", "%")
 FILTERS = {"textureLod", "textureGrad"}
 """Functions that read a texture through its filter."""
 
+ATOMICS = ("atomicAdd", "atomicXor")
+"""Functions that change an entry of a buffer of uint in one step, and return its value before."""
+
 _COMPARED = ("<", ">", "<=", ">=", "==", "!=")
 
 
@@ -216,6 +219,13 @@ class Writer(ABC):
     def textures(self) -> list[Variable]:
         """Returns the variables of all textures that the shader declares."""
         return [each for each in self.bound.values() if each.type in SAMPLERS]
+
+    @property
+    def atomics(self) -> set[tuple[str, str]]:
+        """Returns the function and the buffer of the calls of atomic functions."""
+        nodes = (node for function in self.functions.values() for node in nodes_of(function.body))
+        calls = (node for node in nodes if node.kind == "call" and node.text in ATOMICS)
+        return {(node.text, node.parts[0].parts[0].text) for node in calls}
 
     @property
     def filters(self) -> list[str]:
