@@ -68,8 +68,8 @@ _DRAWN = """\
 """
 _COMPUTED = """\
 // A compute shader for GLSL 4.30 and GLSL ES 3.10 and later. For each stored hour that is needed: bind the table of the
-// hour, and dispatch a group of {columns} x {rows} invocations for each {columns} x {tall} texels of the map. A group keeps the network
-// of its tile in {kilobytes} KB of shared memory.
+// hour, and dispatch a group of {columns} x {rows} invocations for each {columns} x {tall} texels of the map.
+// A group keeps the network of its tile in {kilobytes} KB of shared memory.
 """
 
 _TEXTURES = {
@@ -260,9 +260,9 @@ void wlm_lightmap_begin(ivec2 texel, int index)
 }}
 
 // Colours of two texels of a tile of maps, {below} rows apart: `record` is the position of its record, `inner` the
-// upper texel in the tile. G of eq. 4 has two hidden layers of {hidden} units. Each weight that is read serves both texels.
-// Four units of the first layer at a time are added to the second, whose array has constant indices, so that it is in
-// registers.
+// upper texel in the tile. G of eq. 4 has two hidden layers of {hidden} units. Each weight that is read serves both
+// texels. Four units of the first layer at a time are added to the second, whose array has constant indices, so that it
+// is in registers.
 void wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner, out vec3 colour[2])
 {{
     int row = int(tile.y);
