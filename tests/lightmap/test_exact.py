@@ -169,9 +169,7 @@ def test_two_states_are_as_good_as_bc7_in_as_many_bytes(two_hours, tmp_path):
     model.save(tmp_path / "a.wlm")
     found = wlm.lightmap.evaluate(wlm.load(tmp_path / "a.wlm"), two_hours, metrics=("psnr",))
     rival, frames = encode_set(
-        "bc7",
-        light,
-        lambda i, decoded: evaluate_frame(light.frames[i], decoded, light.mask, 128, ("psnr",)),
+        "bc7", light, lambda i, decoded: evaluate_frame(light.frames[i], decoded, light.mask, 128, ("psnr",))
     )
     assert found.psnr > summarise(frames).psnr and found.bytes < 1.04 * rival.disk_bytes
 
