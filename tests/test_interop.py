@@ -124,6 +124,7 @@ def test_a_step_graph_passes_an_error_on_and_wants_a_warm_up(device):
         StepGraph(broken, device, warmup=0)
 
 
+@pytest.mark.slow
 def test_a_tensor_is_wrapped_before_anything_has_started_warp():
     """A new process makes its first call of Warp here."""
     program = "import torch; from wlm.interop import to_warp; print(to_warp(torch.arange(3.0)).numpy().sum())"

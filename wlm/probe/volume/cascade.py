@@ -166,6 +166,11 @@ class Volume:
             raise WlmError(f"volume block: expected sides of all levels from {limits}, got {list(self.sizes)}")
         self.position, self.light = position, light
         self.sides = np.minimum(side, self.index.high - self.index.low + 1)
+        self._half, self._last, self._slots = (
+            self.sides // 2,
+            self.index.high + 1 - self.sides,
+            int(self.sides.prod(1).sum()),
+        )
         self.budget, self.channels = budget, light.channels
         self.device = light.device
         self._size = np.array(self.sizes)
@@ -286,8 +291,8 @@ class Volume:
         if np.abs(at).max() > _FARTHEST:
             limit = _FARTHEST * self.sizes[0]
             raise WlmError(f"viewpoint: expected a point within {limit:g} of the probes, got {viewpoint.tolist()}")
-        low, high = self.index.low, self.index.high
-        base = np.clip(np.floor(at + 0.5).astype(np.int64) - self.sides // 2, low, high + 1 - self.sides)
+        base = np.floor(at + 0.5).astype(np.int64) - self._half
+        base = np.minimum(np.maximum(base, self.index.low), self._last)
         # Before the first frame the windows are where they share no block with those of the frame.
         before = self._base if self._viewpoint is not None else base + self.sides
         kept = np.maximum(self.sides - np.abs(base - before), 0).prod(1).sum()
@@ -299,7 +304,7 @@ class Volume:
             self._step()
         counters = self._frame_work.counters.numpy()
         queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
-        entered = int(self.sides.prod(1).sum() - kept)
+        entered = self._slots - int(kept)
         return FrameStats(entered, queued, dropped, updated, cached, left, probes, time.perf_counter() - start)
 
     def _work(self) -> None:
