@@ -15,7 +15,7 @@ from wlm.probe import Profile, compress, evaluate, from_arrays, load, open_check
 from wlm.probe.hours import hour_factors
 
 TIMES = (2.0, 5.0, 6.5, 9.0, 12.0, 15.0, 17.0, 18.5, 21.0)
-TINY = Profile(name="tiny", method="gaussians", ratio=0.1, latent=1, hidden=16, steps=60)
+TINY = Profile(name="tiny", method="gaussians", ratio=0.1, latent=1, hidden=8, steps=60)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,8 @@ unit vectors, which take no memory. Ambient light, the first three numbers of sp
 is the method of Sloan et al., Clustered Principal Components for Precomputed Radiance Transfer, 2003, with one cluster.
 """
 
+import math
+from bisect import bisect
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
@@ -124,20 +126,28 @@ def fit_components(values: np.ndarray, most_bytes: int | None = None, hours: int
     unit = norm[:, None] if hours == 1 else np.where(lit, magnitudes(values, hours), np.inf)
     directions = np.linalg.svd(np.linalg.qr(values / norm.max(), mode="r"))[2]
     identity = component_bytes(live, outputs, numbers, hours, identity=True)
-    best, error = _coded(values, norm, unit, directions[:1].astype(np.float16))
-    for count in range(1, min(live, numbers) + 1):
-        size = component_bytes(live, outputs, count, hours, identity=False)
-        if size >= identity:
-            if most_bytes is None or identity <= most_bytes:
-                best, error = _coded(values, norm, unit, np.zeros((0, numbers), np.float16))
-            break
-        if count > 1:
-            if most_bytes is not None and size > most_bytes:
-                break
-            best, error = _coded(values, norm, unit, directions[:count].astype(np.float16))
-        if error <= ENOUGH:
-            break
-    return best, error
+    most = math.inf if most_bytes is None else most_bytes
+
+    def size(count: int) -> int:
+        return component_bytes(live, outputs, count, hours, identity=False)
+
+    def coded(count: int) -> tuple[Components, float]:
+        return _coded(values, norm, unit, directions[:count].astype(np.float16))
+
+    largest = min(live, numbers)
+    high = bisect(range(1, largest + 1), False, key=lambda count: size(count) >= identity or size(count) > most)
+    best, low = coded(max(high, 1)), 1
+    if not high or best[1] > ENOUGH:
+        unit_vectors = high < largest and size(high + 1) >= identity and identity <= most
+        return _coded(values, norm, unit, np.zeros((0, numbers), np.float16)) if unit_vectors else best
+    while low < high:
+        middle = (low + high) // 2
+        tried = coded(middle)
+        if tried[1] <= ENOUGH:
+            best, high = tried, middle
+        else:
+            low = middle + 1
+    return best
 
 
 def _coded(values: np.ndarray, norm: np.ndarray, unit: np.ndarray, basis: np.ndarray) -> tuple[Components, float]:
