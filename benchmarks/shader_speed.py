@@ -52,6 +52,7 @@ _LEAST_SIDE = 512  # of a sheet of the view, whose camera walks in a circle of 6
 _VIEW, _QUICK_VIEW = (720, 1280), (90, 160)
 _HOURS = (0.0, 6.0, 12.0, 18.0)
 _FRAMES = 64  # of a virtual texture until its view is there
+_CELL = GROUP_SIZE[0], 2 * GROUP_SIZE[1]  # texels of a group of the exported compute shader
 _ROW = 1024  # groups of four floats in a row of a texture of numbers
 _DISPATCHES = (10, 110)  # of the two runs of WGSL
 _BUFFERS = {"networks": ("NET", 0), "hours": ("HOUR_AT", 1)}  # macro and binding of each buffer
@@ -199,7 +200,7 @@ class _ShaderBench(Bench):
             else:
                 rows = _rows_of_fours(numbers[name])
                 textures[_uniform(name)] = screen.texture([rows], "R32G32B32A32_FLOAT", _ROW, len(rows))
-        picture = screen.picture(text, (self._side, self._side), textures, stored, GROUP_SIZE if groups else None)
+        picture = screen.picture(text, (self._side, self._side), textures, stored, _CELL if groups else None)
         return picture.read(), picture.time(self._repeats), screen.name
 
     @cached_property
@@ -248,7 +249,7 @@ class _ShaderBench(Bench):
             for i, each in enumerate((entries, [{"binding": 0, "resource": out.create_view()}]))
         ]
 
-        columns, rows = GROUP_SIZE if groups else (8, 8)
+        columns, rows = _CELL if groups else (8, 8)
 
         def dispatch(count: int) -> float:
             encoder = gpu.create_command_encoder()
