@@ -15,11 +15,11 @@ from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.evaluation import at_hour, relative_figures
-from wlm.probe.gaussian.model import check_outputs, gaussian_bytes, gaussian_count
+from wlm.probe.gaussian.model import check_outputs
 from wlm.probe.gaussian.packing import pack_model
 from wlm.probe.gaussian.trainer import Trainer
 from wlm.probe.model import CODES, ProbeModel, Profile, box_of
-from wlm.probe.pca.model import ENOUGH, fit_components
+from wlm.probe.selection import Candidates
 from wlm.system import Meter, OnProgress
 
 _MOST_LATENT = 32
@@ -72,6 +72,8 @@ def compress(
 
     A profile of the method "auto", as all shipped Gaussian profiles are, yields Gaussians unless principal components
     have less error in no more GPU memory, which is the case for a few hundred probes; `ProbeModel.choice` says why.
+    With `target` the result is the smallest model found that reaches it, after up to seven fits; with `max_bytes` the
+    one with the least error within them.
     Dead probes take no part in the fit: the model stores one bit per probe if any probe is dead.
 
     Several hours are fitted as one, with probes that have the numbers of all hours; those of each hour are divided by
@@ -111,10 +113,12 @@ def compress(
     even = [light / np.float32(scale or 1.0) for light, scale in zip(by_hour, scales, strict=True)]
     joint = replace(probes, values=np.concatenate(even, 1), times=np.zeros(0))
     longer = profile.model_copy(update={"latent": min(_MOST_LATENT, round(profile.latent * _longer(hours)))})
-    model = _compress(joint, longer, seed, *rest)
-    content: Any = model.content
-    content = replace(content, outputs=outputs, hours=hours)
-    model = replace(model, outputs=outputs, content=content, times=probes.times, scales=scales)
+
+    def of_hours(content: Any) -> Any:
+        return replace(content, outputs=outputs, hours=hours)
+
+    model = _compress(joint, longer, seed, *rest, of_hours)
+    model = replace(model, outputs=outputs, content=of_hours(model.content), times=probes.times, scales=scales)
     return _with_warnings(model, probes, device)
 
 
@@ -126,7 +130,7 @@ def _with_warnings(model: ProbeModel, probes: ProbeSet, device: str) -> ProbeMod
             decoder.set_time(time)
         found = relative_figures(decoder.decode_probes(), probes.at(time))["warnings"]
         lines += [at_hour(time) + line for line in found]
-    return replace(model, warnings=tuple(lines))
+    return replace(model, warnings=(*model.warnings, *lines))
 
 
 def _compress(
@@ -137,8 +141,9 @@ def _compress(
     progress: OnProgress | None,
     checkpoint: Checkpoint | None,
     positions: bool,
+    of_hours: Callable[[Any], Any] = lambda content: content,
 ) -> ProbeModel:
-    """Compresses a set of one hour."""
+    """Compresses a set of one hour, whose content `of_hours` turns into that of several hours."""
     box = box_of(probes.position)
     stored = np.zeros((0, 3), np.uint16)
     if positions:
@@ -155,39 +160,9 @@ def _compress(
         positions=stored,
         **box,
     )
-    values = probes.values[probes.live]
-    pca = Profile(name=profile.name, method="pca")
-    if profile.method == "pca":
-        return make(profile=pca, content=fit_components(values)[0], choice="PCA, as the profile asks")
-    if profile.method == "auto":
-        count = gaussian_count(profile.ratio, len(values))
-        budget = gaussian_bytes(count, profile.latent, profile.hidden, profile.columns(probes.outputs))
-        components, error = fit_components(values, budget)
-        if error <= ENOUGH and components.nbytes <= budget:
-            took = (
-                f"{components.count} components reach {error:.1%} of each probe's light in {components.nbytes:,} bytes"
-            )
-            return make(profile=pca, content=components, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
-    relative = profile.error == "relative"
-    check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, relative, device)
-    gaussians = _fit_gaussians(make, probes, profile, seed, device, progress, checkpoint)
-    if profile.method == "gaussians":
-        return gaussians
-
-    def error_of(model: ProbeModel) -> float:
-        decoded = model.decoder(device, position=probes.position).decode_probes()
-        return relative_figures(decoded, probes)["relative_error"]
-
-    error, most = error_of(gaussians), gaussians.content.nbytes
-    told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
-    components, _ = fit_components(values, most)
-    if components.nbytes > most:
-        return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
-    rival = make(profile=pca, content=components)
-    possible = error_of(rival)
-    if possible < error:
-        return replace(rival, choice=f"PCA: {components.count} components reach {possible:.1%}, {told}")
-    return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1%}")
+    trained = partial(_fit_gaussians, make, probes, seed=seed, device=device, progress=progress, checkpoint=checkpoint)
+    candidates = Candidates(make, probes, profile, device, trained, checkpoint, of_hours)
+    return candidates.selected() if profile.target or profile.max_bytes else candidates.usual()
 
 
 def _longer(hours: int) -> float:
@@ -199,20 +174,23 @@ def _fit_gaussians(
     make: Callable[..., ProbeModel],
     probes: ProbeSet,
     profile: Profile,
+    *,
     seed: int,
     device: str,
     progress: OnProgress | None,
     checkpoint: Checkpoint | None,
+    number: int = 0,
 ) -> ProbeModel:
     """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3)."""
-    box = box_of(probes.position)
+    relative, box = profile.error == "relative", box_of(probes.position)
+    check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, relative, device)
     position, values = probes.position[probes.live], probes.values[probes.live]
     x = ((position - box["origin"]) / box["extent"]).astype(np.float32)
     trainer = Trainer(x, values, profile, seed, device)
     try:
         if checkpoint is not None:
-            checkpoint.restore(0, trainer.load)
-        _train(trainer, probes, progress, checkpoint)
+            checkpoint.restore(number, trainer.load)
+        _train(trainer, probes, progress, checkpoint, number)
         trainer.finish()
         mse = trainer.mse()
         content = trainer.quantised()
@@ -228,7 +206,9 @@ def _fit_gaussians(
     return pack_model(fitted, position, values, device)
 
 
-def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, checkpoint: Checkpoint | None) -> None:
+def _train(
+    trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, checkpoint: Checkpoint | None, number: int
+) -> None:
     steps, chunk = trainer.steps, _CHUNK["cpu" if trainer.device == "cpu" else "cuda"]
     meter = Meter(progress, "fit", steps)
     peak, live = float(np.ptp(probes.values)), probes.live.mean()  # dead probes decode exactly, and count
@@ -247,7 +227,7 @@ def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, chec
                 meter.report(step, **figures())
             except KeyboardInterrupt:
                 if checkpoint is not None:
-                    checkpoint.save({0: trainer.state()})
+                    checkpoint.save({number: trainer.state()})
                 raise
         if checkpoint is not None and checkpoint.due():
-            checkpoint.save({0: trainer.state()})
+            checkpoint.save({number: trainer.state()})

@@ -104,15 +104,18 @@ def component_bytes(live: int, outputs: int, count: int, *, identity: bool) -> i
     return 4 * (2 + count + basis + -(-live * (1 + count) // 4))
 
 
-def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[Components, float]:
-    """Compresses live probes with the fewest components whose relative error is at most `ENOUGH`.
+def fit_components(
+    values: np.ndarray, most_bytes: int | None = None, enough: float = ENOUGH
+) -> tuple[Components, float]:
+    """Compresses live probes with the fewest components whose relative error is at most `enough`.
 
     Args:
         values: float32 [V, D], numbers of live probes; no row is zero.
         most_bytes: Largest number of GPU bytes; None: no limit. At least one component is fitted.
+        enough: Relative error at which no component is added.
 
     Returns:
-        The components and their relative error, which exceeds `ENOUGH` only if `most_bytes` does not allow more
+        The components and their relative error, which exceeds `enough` only if `most_bytes` does not allow more
         components.
     """
     values = values.astype(np.float64)
@@ -131,7 +134,7 @@ def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[C
             if most_bytes is not None and size > most_bytes:
                 break
             best, error = _coded(values, norm, directions[:count].astype(np.float16))
-        if error <= ENOUGH:
+        if error <= enough:
             break
     return best, error
 
