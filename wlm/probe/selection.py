@@ -55,12 +55,12 @@ class Candidates:
         """Returns the model for a profile that names neither a target nor a number of bytes."""
         profile = self._profile
         if profile.method == "pca":
-            return self._components(None, ENOUGH, "PCA, as the profile asks")
+            return self._components(None, ENOUGH, "PCA, as the profile asks")[0]
         count = gaussian_count(profile.ratio, self._live)
         if profile.method == "auto":
             budget = self._bytes(count)
-            model = self._components(budget, ENOUGH)
-            size, error = self._size_of(model.content), self._error_of(model)
+            model, error = self._components(budget, ENOUGH)
+            size = self._size_of(model.content)
             if size <= budget and error <= ENOUGH:
                 took = f"{model.content.count} components reach {error:.1%} of each probe's light in {size:,} bytes"
                 return replace(model, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
@@ -69,7 +69,7 @@ class Candidates:
             return gaussians
         error, most = self._error_of(gaussians), self._size_of(gaussians.content)
         told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
-        rival = self._components(most, ENOUGH)
+        rival, _ = self._components(most, ENOUGH)
         if self._size_of(rival.content) > most:
             return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
         possible = self._error_of(rival)
@@ -84,7 +84,7 @@ class Candidates:
         found: list[tuple[float, int, str, ProbeModel]] = []  # error, bytes, a sentence, the model
         most = limit
         if profile.method != "gaussians":
-            model = self._components(profile.max_bytes, target)
+            model, _ = self._components(profile.max_bytes, target)
             size, error = self._size_of(model.content), self._error_of(model)
             if size <= limit:
                 found.append(
@@ -114,16 +114,17 @@ class Candidates:
             warnings = (f"{name}: target: the relative error is {least:.1%}, more than the {target:.1%} asked for",)
         return replace(model, choice=f"{kind}: {told} bytes of GPU memory", warnings=warnings)
 
-    def _components(self, most: int | None, enough: float, choice: str = "") -> ProbeModel:
-        """Returns the fewest principal components with an error of at most `enough`, or as many as fit `most` bytes."""
+    def _components(self, most: int | None, enough: float, choice: str = "") -> tuple[ProbeModel, float]:
+        """Returns the fewest principal components with an error of at most `enough`, or as many as fit `most` bytes;
+        and their error before ambient light is clamped."""
         values, room = self._probes.values[self._probes.live], most
         while True:
-            content, _ = fit_components(values, room, enough)
+            content, error = fit_components(values, room, enough)
             # Several hours take some more bytes than one.
             over = 0 if most is None else self._size_of(content) - most
             if over <= 0 or content.count == 1 or room is None:
                 profile = Profile(name=self._profile.name, method="pca")
-                return self._make(profile=profile, content=content, choice=choice)
+                return self._make(profile=profile, content=content, choice=choice), error
             room -= over
 
     def _bytes(self, count: int) -> int:
