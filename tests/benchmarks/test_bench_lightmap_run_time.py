@@ -1,6 +1,4 @@
-"""The benchmark of the virtual texture: its cameras, its large set, its mips, and rows that are of what they name."""
-
-from types import SimpleNamespace
+"""The benchmark of the virtual texture: its cameras, its large set, and rows that are of what they name."""
 
 import numpy as np
 import pytest
@@ -32,21 +30,6 @@ def room(patch):
     return moving_light(hours=(0.0, 12.0, 18.45, 18.55))
 
 
-@pytest.mark.parametrize("kind", ["room", "plain"])
-def test_derivatives_are_differences_of_neighbours(kind, room):
-    camera = bench._RoomCamera(room, SIZE, "cpu") if kind == "room" else bench._PlainCamera(512, SIZE, "cpu")
-    sheet, uv, slope = (array.numpy() for array in camera(0.1))
-    assert sheet.max() == (0 if kind == "room" else 3) and (sheet >= 0).mean() > 0.5
-    inside = sheet >= 0
-    for axis, own in ((1, (0, 2)), (0, (1, 3))):
-        step = np.diff(uv, axis=axis)
-        first = np.s_[:, :-1] if axis else np.s_[:-1]
-        near = inside[first] & (np.abs(step) < 0.05).all(2)
-        error = np.abs(step - slope[first][..., own])[near]
-        # A step is the mean slope of both pixels, and a few steps cross an edge.
-        assert np.median(error) < 0.2 * np.median(np.abs(step[near])) + 1e-4
-
-
 def test_the_large_set_changes_as_a_real_one():
     model = bench.large_model(256)
     assert len(model.sheets) == 4 and len(model.times) == 26 and model.period == 24.0
@@ -57,14 +40,9 @@ def test_the_large_set_changes_as_a_real_one():
     assert 0.005 < np.abs(later - noon).mean() / noon.mean() < 0.2 < np.abs(night - noon).mean() / noon.mean()
 
 
-def test_mips_and_formats():
+def test_formats():
     random = np.random.default_rng(0)
     frames, mask = random.uniform(0.0, 2.0, (2, 40, 24, 3)).astype(np.float32), random.random((40, 24)) < 0.7
-    mean, covered = bench._mip(frames, mask, 2, 4)
-    blocks = np.where(mask[..., None], frames, np.nan).reshape(2, 10, 4, 6, 4, 3)
-    np.testing.assert_allclose(mean[:, covered], np.nanmean(blocks, (2, 4))[:, covered], rtol=1e-5)
-    sampled, met = bench._mip(frames, mask, 3, 4)
-    assert sampled.shape == (2, 5, 3, 3) and met.all() and np.abs(sampled - 1.0).max() < 0.7
     error = bench._differences(np.stack([bench._as_bytes(frame) for frame in frames]), frames, mask)
     assert 45.0 < error["psnr"] < 60.0
 
@@ -96,7 +74,6 @@ def test_every_row_has_its_figures(rows, tmp_path):
         *(("virtual texture", path) for path in paths),
         *((name, path) for name in others for path in ("walk", "day")),
         *(("format", name) for name in ("RGB9E5", "RGBA8")),
-        *(("mips", f"level {level}") for level in (3, 4)),
     ]
     for row in own:
         assert 0.0 < row["current"] <= row["nearly_current"] <= 1.0 and row["cached_psnr"] > 30.0
@@ -127,9 +104,3 @@ def test_rivals_read_the_light_of_an_hour(room, model):
             np.testing.assert_allclose(rival.light(hour), light, rtol=0, atol=light.max() / 256)
     assert work == [True, False, True, True, True, False, True]
     assert stored.memory["texture"] == 2 * each.memory["texture"] and stored.memory["tiles"] == model.memory_bytes
-
-
-def test_a_set_without_a_mesh_is_refused(monkeypatch):
-    monkeypatch.setattr(bench, "load", lambda path: SimpleNamespace(name="set", light=SimpleNamespace(mesh=None)))
-    with pytest.raises(bench.WlmError, match="set: expected a set that names its mesh"):
-        bench.run(walked_path="a", quick=True, device="cpu")

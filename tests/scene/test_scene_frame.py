@@ -181,7 +181,7 @@ def test_a_lamp_is_on_in_the_first_frame_after_its_switch(changed, tmp_path):
             shown += [red] * film.info["duration"]
     assert len(shown) == 1000
     dark, lit = shown[(1000 * after - 500) // FRAMES], shown[(1000 * after + 500) // FRAMES]
-    assert abs(dark - floor[0]) < 0.04 and abs(lit - floor[-1]) < 0.04
+    assert abs(dark - floor[after - 1]) < 0.04 and abs(lit - floor[after]) < 0.04
 
 
 def test_six_lights_are_integrals_of_the_weights():
@@ -202,10 +202,7 @@ def test_six_lights_are_integrals_of_the_weights():
     ("options", "line"),
     [
         ({"height": 0}, "size: expected 1 to"),
-        ({"samples": 5}, "samples: expected 1 to 4"),
-        ({"device": "tpu"}, "device 'tpu'"),
         ({"hours": [48.0]}, "hours: expected 0 to 48, got 48"),
-        ({"frames": -1}, "frames: expected 0 to"),
         ({"frames": 10**6, "height": 64, "width": 64}, "for an animated WebP"),
         ({"weights": {"lamp": 1.0}}, "expected a group among sky, sun"),
     ],

@@ -129,7 +129,7 @@ def decode(artifact: Artifact) -> ProbeModel:
     times, scales = stored.get("times", np.zeros(0)), stored.get("scales", np.ones(1))
     if not ((np.diff(times) > 0).all() and (times < DAY).all()):
         raise ValueError("part times: expected increasing hours of the day, from 0 to less than 24")
-    content = _METHODS[profile.method].from_parts(profile, header.hours * outputs, header.hours, stored, header.dropped)
+    content = _METHODS[profile.method].from_parts(profile, outputs, header.hours, stored, header.dropped)
     known = {"times": times, "scales": scales}
     place = {"origin": origin, "extent": extent, "size": size, "positions": positions}
     return ProbeModel(
@@ -148,10 +148,11 @@ def _table(header: _Header) -> dict[str, Part]:
     if header.hours > 1:
         table["times"] = Part(np.float64, (header.hours,), least=0.0)
         table["scales"] = Part(np.float64, (header.hours,), least=0.0, most=1.0)
-    numbers = header.hours * header.outputs
-    if numbers > NUMBERS:
+    if (numbers := header.hours * header.outputs) > NUMBERS:
         raise ValueError(f"setting hours: expected at most {NUMBERS} numbers of a probe at all hours, found {numbers}")
-    return table | _METHODS[header.profile.method].table(header.profile, numbers, header.count, live)
+    return table | _METHODS[header.profile.method].table(
+        header.profile, header.outputs, header.hours, header.count, live
+    )
 
 
 def _planes(part: np.ndarray) -> bytes:

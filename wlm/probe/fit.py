@@ -14,7 +14,6 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
-from wlm.probe.evaluation import at_hour, relative_figures
 from wlm.probe.gaussian.model import check_outputs
 from wlm.probe.gaussian.packing import pack_model
 from wlm.probe.gaussian.trainer import Trainer
@@ -22,7 +21,7 @@ from wlm.probe.model import CODES, ProbeModel, Profile, box_of
 from wlm.probe.selection import Candidates
 from wlm.system import Meter, OnProgress
 
-_MOST_LATENT = 32
+_MOST_LATENT, _MOST_HIDDEN = 32, 128  # of a fit of several hours
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps after which progress and checkpoint may be due
 
 
@@ -103,47 +102,17 @@ def compress(
     device = interop.check_device(device)
     if not probes.live.any():
         raise WlmError(f"{probes.name}: every probe is dark: there is nothing to fit")
-    rest = device, progress, checkpoint, positions
-    if not len(probes.times):
-        return _with_warnings(_compress(probes, profile, seed, *rest), probes, device)
-    hours, outputs = len(probes.times), probes.outputs
-    by_hour = np.split(probes.values, hours, axis=1)
-    scales = np.sqrt([np.einsum("nd,nd->", light, light, dtype=np.float64) for light in by_hour])
-    scales /= scales.max()
-    even = [light / np.float32(scale or 1.0) for light, scale in zip(by_hour, scales, strict=True)]
-    joint = replace(probes, values=np.concatenate(even, 1), times=np.zeros(0))
-    longer = profile.model_copy(update={"latent": min(_MOST_LATENT, round(profile.latent * _longer(hours)))})
-
-    def of_hours(content: Any) -> Any:
-        return replace(content, outputs=outputs, hours=hours)
-
-    model = _compress(joint, longer, seed, *rest, of_hours)
-    model = replace(model, outputs=outputs, content=of_hours(model.content), times=probes.times, scales=scales)
-    return _with_warnings(model, probes, device)
-
-
-def _with_warnings(model: ProbeModel, probes: ProbeSet, device: str) -> ProbeModel:
-    decoder = model.decoder(device, position=probes.position)
-    lines: list[str] = []
-    for time in model.times.tolist() or [None]:
-        if time is not None:
-            decoder.set_time(time)
-        found = relative_figures(decoder.decode_probes(), probes.at(time))["warnings"]
-        lines += [at_hour(time) + line for line in found]
-    return replace(model, warnings=(*model.warnings, *lines))
-
-
-def _compress(
-    probes: ProbeSet,
-    profile: Profile,
-    seed: int,
-    device: str,
-    progress: OnProgress | None,
-    checkpoint: Checkpoint | None,
-    positions: bool,
-    of_hours: Callable[[Any], Any] = lambda content: content,
-) -> ProbeModel:
-    """Compresses a set of one hour, whose content `of_hours` turns into that of several hours."""
+    hours = max(len(probes.times), 1)
+    values, scales = probes.values, np.ones(hours)
+    if hours > 1:
+        by_hour = np.split(values, hours, axis=1)
+        scales = np.sqrt([np.einsum("nd,nd->", light, light, dtype=np.float64) for light in by_hour])
+        scales /= scales.max()
+        even = [light / np.float32(scale or 1.0) for light, scale in zip(by_hour, scales, strict=True)]
+        values = np.concatenate(even, 1)
+        latent = min(_MOST_LATENT, round(profile.latent * (1.0 + 0.5 * math.log2(hours))))
+        hidden = min(_MOST_HIDDEN, 8 * round(profile.hidden * (1.0 + 0.25 * math.log2(hours)) / 8))
+        profile = profile.model_copy(update={"latent": latent, "hidden": hidden})
     box = box_of(probes.position)
     stored = np.zeros((0, 3), np.uint16)
     if positions:
@@ -158,16 +127,16 @@ def _compress(
         outputs=probes.outputs,
         dead=np.zeros(0, bool) if probes.live.all() else ~probes.live,
         positions=stored,
+        times=probes.times,
+        scales=scales,
         **box,
     )
-    trained = partial(_fit_gaussians, make, probes, seed=seed, device=device, progress=progress, checkpoint=checkpoint)
-    candidates = Candidates(make, probes, profile, device, trained, checkpoint, of_hours)
+    even = replace(probes, values=values)
+    # Magnitudes follow each probe at each hour by themselves, and half floats would round a scale's logarithm.
+    of_fit = (partial(make, scales=np.ones(hours)), probes) if profile.error == "relative" else (make, even)
+    trained = partial(_fit_gaussians, *of_fit, seed=seed, device=device, progress=progress, checkpoint=checkpoint)
+    candidates = Candidates(make, probes, values[probes.live], profile, device, trained, checkpoint)
     return candidates.selected() if profile.target or profile.max_bytes else candidates.usual()
-
-
-def _longer(hours: int) -> float:
-    """Returns how much longer the latents of a fit of several hours are than those of one hour."""
-    return 1.0 + 0.5 * math.log2(hours)
 
 
 def _fit_gaussians(
@@ -182,11 +151,12 @@ def _fit_gaussians(
     number: int = 0,
 ) -> ProbeModel:
     """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3)."""
-    relative, box = profile.error == "relative", box_of(probes.position)
-    check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, relative, device)
+    hours, box = max(len(probes.times), 1), box_of(probes.position)
+    relative = hours * (profile.error == "relative")
+    check_outputs(probes.name, profile.latent, profile.hidden, hours * probes.outputs, relative, device)
     position, values = probes.position[probes.live], probes.values[probes.live]
     x = ((position - box["origin"]) / box["extent"]).astype(np.float32)
-    trainer = Trainer(x, values, profile, seed, device)
+    trainer = Trainer(x, values, profile, seed, device, hours)
     try:
         if checkpoint is not None:
             checkpoint.restore(number, trainer.load)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -11,8 +10,8 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.parts import Part
 from wlm.probe.data import ProbeSet
-from wlm.probe.evaluation import relative_figures
-from wlm.probe.gaussian.model import Gaussians, gaussian_count
+from wlm.probe.evaluation import at_hour, relative_figures
+from wlm.probe.gaussian.model import gaussian_bytes, gaussian_count
 from wlm.probe.model import ProbeModel, Profile
 from wlm.probe.pca.model import ENOUGH, fit_components
 
@@ -30,24 +29,25 @@ class Candidates:
         self,
         make: Callable[..., ProbeModel],
         probes: ProbeSet,
+        values: np.ndarray,
         profile: Profile,
         device: str,
         trained: Callable[..., ProbeModel],
         checkpoint: Checkpoint | None,
-        of_hours: Callable[[Any], Any],
     ) -> None:
         """Keeps the arguments.
 
         Args:
             make: Makes a model of a profile, a content and a `choice`.
-            probes, profile, device: The set of one hour, the settings, and where errors are measured.
+            probes: The set.
+            values: float32 [V, T D], the numbers of its live probes for principal components.
+            profile, device: The settings, and where errors are measured.
             trained: Fits Gaussians with a profile; `number` is that of the fit in the checkpoint.
             checkpoint: Keeps the errors of finished fits of a search; None: nothing is kept.
-            of_hours: Turns a content into that of several hours, whose bytes count.
         """
         self._make, self._probes, self._profile, self._device = make, probes, profile, device
-        self._trained, self._checkpoint, self._of_hours = trained, checkpoint, of_hours
-        self._live = int(probes.live.sum())
+        self._trained, self._checkpoint, self._values = trained, checkpoint, values
+        self._live, self._hours = len(values), max(len(probes.times), 1)
         self._models: dict[int, ProbeModel] = {}
         self._errors: dict[int, float] = {}
 
@@ -55,24 +55,25 @@ class Candidates:
         """Returns the model for a profile that names neither a target nor a number of bytes."""
         profile = self._profile
         if profile.method == "pca":
-            return self._components(None, ENOUGH, "PCA, as the profile asks")[0]
+            return self._measured(self._components(None, ENOUGH, "PCA, as the profile asks")[0])[0]
         count = gaussian_count(profile.ratio, self._live)
         if profile.method == "auto":
             budget = self._bytes(count)
             model, error = self._components(budget, ENOUGH)
-            size = self._size_of(model.content)
+            size = model.content.nbytes
             if size <= budget and error <= ENOUGH:
                 took = f"{model.content.count} components reach {error:.1%} of each probe's light in {size:,} bytes"
+                model, _ = self._measured(model)
                 return replace(model, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
-        gaussians = self._trained(profile)
+        gaussians, error = self._measured(self._trained(profile))
         if profile.method == "gaussians":
             return gaussians
-        error, most = self._error_of(gaussians), self._size_of(gaussians.content)
+        most = gaussians.content.nbytes
         told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
         rival, _ = self._components(most, ENOUGH)
-        if self._size_of(rival.content) > most:
+        if rival.content.nbytes > most:
             return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
-        possible = self._error_of(rival)
+        rival, possible = self._measured(rival)
         if possible < error:
             return replace(rival, choice=f"PCA: {rival.content.count} components reach {possible:.1%}, {told}")
         return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1%}")
@@ -84,8 +85,8 @@ class Candidates:
         found: list[tuple[float, int, str, ProbeModel]] = []  # error, bytes, a sentence, the model
         most = limit
         if profile.method != "gaussians":
-            model, _ = self._components(profile.max_bytes, target)
-            size, error = self._size_of(model.content), self._error_of(model)
+            model, error = self._measured(self._components(profile.max_bytes, target)[0])
+            size = model.content.nbytes
             if size <= limit:
                 found.append(
                     (error, size, f"{model.content.count} PCA components reach {error:.1%} in {size:,}", model)
@@ -100,7 +101,7 @@ class Candidates:
                 count = least_count(self._error, first, count, target) or count
             if count:
                 error, model = self._error(count), self._gaussians(count)
-                size = self._size_of(model.content)
+                size = model.content.nbytes
                 found.append((error, size, f"{model.content.count} Gaussians reach {error:.1%} in {size:,}", model))
         if not found:
             raise WlmError(f"{name}: max_bytes: expected more bytes, as no model of {self._live} probes fits {limit:,}")
@@ -108,33 +109,25 @@ class Candidates:
         _, _, _, model = min(reached, key=lambda each: each[1]) if reached else min(found, key=lambda each: each[0])
         told = "; ".join(sentence for *_, sentence, _ in found)
         kind = "PCA" if model.method == "pca" else "Gaussians"
-        warnings: tuple[str, ...] = ()
+        warnings = model.warnings
         if target and not reached:
             least = min(error for error, *_ in found)
-            warnings = (f"{name}: target: the relative error is {least:.1%}, more than the {target:.1%} asked for",)
+            missed = f"{name}: target: the relative error is {least:.1%}, more than the {target:.1%} asked for"
+            warnings = (missed, *warnings)
         return replace(model, choice=f"{kind}: {told} bytes of GPU memory", warnings=warnings)
 
     def _components(self, most: int | None, enough: float, choice: str = "") -> tuple[ProbeModel, float]:
         """Returns the fewest principal components with an error of at most `enough`, or as many as fit `most` bytes;
         and their error before ambient light is clamped."""
-        values, room = self._probes.values[self._probes.live], most
-        while True:
-            content, error = fit_components(values, room, enough)
-            # Several hours take some more bytes than one.
-            over = 0 if most is None else self._size_of(content) - most
-            if over <= 0 or content.count == 1 or room is None:
-                profile = Profile(name=self._profile.name, method="pca")
-                return self._make(profile=profile, content=content, choice=choice), error
-            room -= over
+        content, error = fit_components(self._values, most, self._hours, enough)
+        profile = Profile(name=self._profile.name, method="pca")
+        return self._make(profile=profile, content=content, choice=choice), error
 
     def _bytes(self, count: int) -> int:
         """Returns the bytes of GPU memory of `count` Gaussians."""
-        profile, none = self._profile, np.zeros(0)
-        sizes = profile.latent, profile.hidden, self._probes.outputs, profile.support, profile.error == "relative"
-        return self._size_of(Gaussians(*sizes, 1.0, np.zeros((count, 0), np.uint16), none, none, none, 0))
-
-    def _size_of(self, content: Any) -> int:
-        return self._of_hours(content).nbytes
+        profile = self._profile
+        columns = profile.columns(self._probes.outputs)
+        return gaussian_bytes(count, profile.latent, profile.hidden, columns, self._hours)
 
     def _error(self, count: int) -> float:
         """Returns the relative error of a fit of `count` Gaussians; a checkpoint keeps it."""
@@ -144,8 +137,8 @@ class Candidates:
             if stored:
                 self._errors[count] = float(stored["error"][0])
             else:
-                error = self._error_of(self._gaussians(count, number))
-                self._errors[count] = error
+                self._gaussians(count, number)
+                error = self._errors[count]
                 if kept is not None:
                     kept.add_finished(number, {"error": np.array([error])})
         return self._errors[count]
@@ -153,13 +146,20 @@ class Candidates:
     def _gaussians(self, count: int, number: int = _REPEATED) -> ProbeModel:
         if count not in self._models:
             sized = {"ratio": count / self._live, "target": None, "max_bytes": None}
-            profile = self._profile.model_copy(update=sized)
-            self._models[count] = self._trained(profile, number=number)
+            model = self._trained(self._profile.model_copy(update=sized), number=number)
+            self._models[count], self._errors[count] = self._measured(model)
         return self._models[count]
 
-    def _error_of(self, model: ProbeModel) -> float:
-        decoded = model.decoder(self._device, position=self._probes.position).decode_probes()
-        return relative_figures(decoded, self._probes)["relative_error"]
+    def _measured(self, model: ProbeModel) -> tuple[ProbeModel, float]:
+        """Returns the model with its warnings, and its relative error, the root mean square over all hours."""
+        decoder = model.decoder(self._device, position=self._probes.position)
+        warnings, squares = [], []
+        for time in self._probes.times.tolist() or [None]:
+            decoder.set_time(time or 0.0)
+            figures = relative_figures(decoder.decode_probes(), self._probes.at(time))
+            warnings += [at_hour(time) + line for line in figures["warnings"]]
+            squares.append(figures["relative_error"] ** 2)
+        return replace(model, warnings=tuple(warnings)), math.sqrt(np.nanmean(squares))
 
 
 def least_count(error_of: Callable[[int], float], first: int, most: int, target: float) -> int | None:

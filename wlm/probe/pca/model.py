@@ -9,6 +9,8 @@ unit vectors, which take no memory. Ambient light, the first three numbers of sp
 is the method of Sloan et al., Clustered Principal Components for Precomputed Radiance Transfer, 2003, with one cluster.
 """
 
+import math
+from bisect import bisect
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
@@ -55,13 +57,11 @@ class Components(Content):
 
     @property
     def nbytes(self) -> int:
-        live, several = len(self.code), self.hours > 1
-        one = component_bytes(live, self.outputs, self.count, identity=not (several or len(self.basis)))
-        return one + (4 * self.hours * self.count * -(-self.outputs // 2) if several else 0)
+        return component_bytes(len(self.code), self.outputs, self.count, self.hours, identity=not len(self.basis))
 
-    def at(self, factors: np.ndarray) -> Self:
+    def at(self, factors: np.ndarray, scales: np.ndarray) -> Self:
         basis = self.basis.astype(np.float64) if len(self.basis) else np.eye(self.count)
-        mixed = factors @ basis.reshape(self.count, self.hours, -1)
+        mixed = (factors * scales) @ basis.reshape(self.count, self.hours, -1)
         return replace(self, basis=np.clip(mixed, -65504, 65504).astype(np.float16), hours=1)
 
     def facts(self) -> dict[str, Any]:
@@ -71,7 +71,8 @@ class Components(Content):
         return {"count": self.count}
 
     @classmethod
-    def table(cls, profile: Profile, outputs: int, count: int, live: int) -> dict[str, Part]:
+    def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int) -> dict[str, Part]:
+        outputs *= hours
         if count > outputs:
             raise ValueError(f"setting count: expected at most {outputs} components, found {count}")
         return {
@@ -95,23 +96,25 @@ class Components(Content):
         if not np.exp(most[0]) * most[1:].sum() * largest <= np.finfo(np.float32).max:
             raise ValueError("parts bounds and basis: expected light within the range of float32")
         code = np.ascontiguousarray(stored["code"].T)
-        return cls(outputs // hours, code, stored["bounds"], stored["basis"], hours)
+        return cls(outputs, code, stored["bounds"], stored["basis"], hours)
 
 
-def component_bytes(live: int, outputs: int, count: int, *, identity: bool) -> int:
-    """Returns the bytes of the GPU buffer of V = `live` probes in `count` components; see `wlm.probe.pca.bundle`."""
-    basis = 0 if identity else count * -(-outputs // 2)
+def component_bytes(live: int, outputs: int, count: int, hours: int = 1, *, identity: bool) -> int:
+    """Returns the bytes of the GPU buffers of V = `live` probes in `count` components; see `wlm.probe.pca.bundle`, and
+    for several hours `wlm.probe.bundle`."""
+    basis = count * -(-outputs // 2) * (hours + 1 if hours > 1 else int(not identity))
     return 4 * (2 + count + basis + -(-live * (1 + count) // 4))
 
 
 def fit_components(
-    values: np.ndarray, most_bytes: int | None = None, enough: float = ENOUGH
+    values: np.ndarray, most_bytes: int | None = None, hours: int = 1, enough: float = ENOUGH
 ) -> tuple[Components, float]:
-    """Compresses live probes with the fewest components whose relative error is at most `enough`.
+    """Compresses live probes with the fewest components whose relative error is at most `enough`, over all hours.
 
     Args:
-        values: float32 [V, D], numbers of live probes; no row is zero.
+        values: float32 [V, T D], numbers of live probes at T hours; no row is zero.
         most_bytes: Largest number of GPU bytes; None: no limit. At least one component is fitted.
+        hours: T.
         enough: Relative error at which no component is added.
 
     Returns:
@@ -119,28 +122,36 @@ def fit_components(
         components.
     """
     values = values.astype(np.float64)
-    live, outputs = values.shape
-    norm = norms(values)
+    live, numbers = values.shape
+    outputs, norm = numbers // hours, norms(values)
     directions = np.linalg.svd(np.linalg.qr(values / norm.max(), mode="r"))[2]
-    identity = component_bytes(live, outputs, outputs, identity=True)
-    best, error = _coded(values, norm, directions[:1].astype(np.float16))
-    for count in range(1, min(live, outputs) + 1):
-        size = component_bytes(live, outputs, count, identity=False)
-        if size >= identity:
-            if most_bytes is None or identity <= most_bytes:
-                best, error = _coded(values, norm, np.zeros((0, outputs), np.float16))
-            break
-        if count > 1:
-            if most_bytes is not None and size > most_bytes:
-                break
-            best, error = _coded(values, norm, directions[:count].astype(np.float16))
-        if error <= enough:
-            break
-    return best, error
+    identity = component_bytes(live, outputs, numbers, hours, identity=True)
+    most = math.inf if most_bytes is None else most_bytes
+
+    def size(count: int) -> int:
+        return component_bytes(live, outputs, count, hours, identity=False)
+
+    def coded(count: int) -> tuple[Components, float]:
+        return _coded(values, norm, hours, directions[:count].astype(np.float16))
+
+    largest = min(live, numbers)
+    high = bisect(range(1, largest + 1), False, key=lambda count: size(count) >= identity or size(count) > most)
+    best, low = coded(max(high, 1)), 1
+    if not high or best[1] > enough:
+        unit_vectors = high < largest and size(high + 1) >= identity and identity <= most
+        return _coded(values, norm, hours, np.zeros((0, numbers), np.float16)) if unit_vectors else best
+    while low < high:
+        middle = (low + high) // 2
+        tried = coded(middle)
+        if tried[1] <= enough:
+            best, high = tried, middle
+        else:
+            low = middle + 1
+    return best
 
 
-def _coded(values: np.ndarray, norm: np.ndarray, basis: np.ndarray) -> tuple[Components, float]:
-    """Codes probes [V, D] in a basis, given their norms; returns the components and their relative error."""
+def _coded(values: np.ndarray, norm: np.ndarray, hours: int, basis: np.ndarray) -> tuple[Components, float]:
+    """Codes probes [V, T D] in a basis, given their norms; returns the components and their relative error."""
     logarithm, code, bounds = _quantised(np.log(norm)[:, None])
     magnitude = np.exp(logarithm)
     # Coefficients for the basis as it is stored: its rounding causes no error of its own.
@@ -149,10 +160,11 @@ def _coded(values: np.ndarray, norm: np.ndarray, basis: np.ndarray) -> tuple[Com
     decoded, codes, ranges = _quantised((values / magnitude) @ inverse)
     error = magnitude * (decoded @ directions) - values
     components = Components(
-        outputs=values.shape[1],
+        outputs=values.shape[1] // hours,
         code=np.concatenate([code, codes], 1),
         bounds=np.concatenate([bounds, ranges], 1),
         basis=basis,
+        hours=hours,
     )
     return components, float(np.sqrt(np.square(norms(error) / norm).mean()))
 
