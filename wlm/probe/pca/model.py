@@ -19,7 +19,7 @@ import numpy as np
 
 from wlm.formats.parts import Part
 from wlm.probe.model import Content, Profile
-from wlm.probe.relative import magnitudes, norms
+from wlm.probe.relative import norms
 
 ENOUGH = 0.02
 """Relative error at which no component is added: RMS over all probes of the error divided by the probe's norm."""
@@ -106,24 +106,24 @@ def component_bytes(live: int, outputs: int, count: int, hours: int = 1, *, iden
     return 4 * (2 + count + basis + -(-live * (1 + count) // 4))
 
 
-def fit_components(values: np.ndarray, most_bytes: int | None = None, hours: int = 1) -> tuple[Components, float]:
-    """Compresses live probes with the fewest components whose relative error is at most `ENOUGH` at each hour.
+def fit_components(
+    values: np.ndarray, most_bytes: int | None = None, hours: int = 1, enough: float = ENOUGH
+) -> tuple[Components, float]:
+    """Compresses live probes with the fewest components whose relative error is at most `enough`, over all hours.
 
     Args:
         values: float32 [V, T D], numbers of live probes at T hours; no row is zero.
         most_bytes: Largest number of GPU bytes; None: no limit. At least one component is fitted.
         hours: T.
+        enough: Relative error at which no component is added.
 
     Returns:
-        The components and their relative error, which exceeds `ENOUGH` only if `most_bytes` does not allow more
+        The components and their relative error, which exceeds `enough` only if `most_bytes` does not allow more
         components.
     """
     values = values.astype(np.float64)
     live, numbers = values.shape
     outputs, norm = numbers // hours, norms(values)
-    # A probe that is dark at an hour has no error relative to its light then.
-    lit = norms(values.reshape(live, hours, -1)) > 0
-    unit = norm[:, None] if hours == 1 else np.where(lit, magnitudes(values, hours), np.inf)
     directions = np.linalg.svd(np.linalg.qr(values / norm.max(), mode="r"))[2]
     identity = component_bytes(live, outputs, numbers, hours, identity=True)
     most = math.inf if most_bytes is None else most_bytes
@@ -132,27 +132,26 @@ def fit_components(values: np.ndarray, most_bytes: int | None = None, hours: int
         return component_bytes(live, outputs, count, hours, identity=False)
 
     def coded(count: int) -> tuple[Components, float]:
-        return _coded(values, norm, unit, directions[:count].astype(np.float16))
+        return _coded(values, norm, hours, directions[:count].astype(np.float16))
 
     largest = min(live, numbers)
     high = bisect(range(1, largest + 1), False, key=lambda count: size(count) >= identity or size(count) > most)
     best, low = coded(max(high, 1)), 1
-    if not high or best[1] > ENOUGH:
+    if not high or best[1] > enough:
         unit_vectors = high < largest and size(high + 1) >= identity and identity <= most
-        return _coded(values, norm, unit, np.zeros((0, numbers), np.float16)) if unit_vectors else best
+        return _coded(values, norm, hours, np.zeros((0, numbers), np.float16)) if unit_vectors else best
     while low < high:
         middle = (low + high) // 2
         tried = coded(middle)
-        if tried[1] <= ENOUGH:
+        if tried[1] <= enough:
             best, high = tried, middle
         else:
             low = middle + 1
     return best
 
 
-def _coded(values: np.ndarray, norm: np.ndarray, unit: np.ndarray, basis: np.ndarray) -> tuple[Components, float]:
-    """Codes probes [V, T D] in a basis, given their norms; returns the components, and the largest error of an hour, in
-    `unit` [V, T]."""
+def _coded(values: np.ndarray, norm: np.ndarray, hours: int, basis: np.ndarray) -> tuple[Components, float]:
+    """Codes probes [V, T D] in a basis, given their norms; returns the components and their relative error."""
     logarithm, code, bounds = _quantised(np.log(norm)[:, None])
     magnitude = np.exp(logarithm)
     # Coefficients for the basis as it is stored: its rounding causes no error of its own.
@@ -160,7 +159,6 @@ def _coded(values: np.ndarray, norm: np.ndarray, unit: np.ndarray, basis: np.nda
     inverse = np.linalg.pinv(directions) if len(basis) else directions
     decoded, codes, ranges = _quantised((values / magnitude) @ inverse)
     error = magnitude * (decoded @ directions) - values
-    hours = unit.shape[1]
     components = Components(
         outputs=values.shape[1] // hours,
         code=np.concatenate([code, codes], 1),
@@ -168,8 +166,7 @@ def _coded(values: np.ndarray, norm: np.ndarray, unit: np.ndarray, basis: np.nda
         basis=basis,
         hours=hours,
     )
-    error = norms(error.reshape(len(values), hours, -1)) / unit
-    return components, float(np.sqrt(np.square(error).mean(0).max()))
+    return components, float(np.sqrt(np.square(norms(error) / norm).mean()))
 
 
 def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
