@@ -106,16 +106,19 @@ def component_bytes(live: int, outputs: int, count: int, hours: int = 1, *, iden
     return 4 * (2 + count + basis + -(-live * (1 + count) // 4))
 
 
-def fit_components(values: np.ndarray, most_bytes: int | None = None, hours: int = 1) -> tuple[Components, float]:
-    """Compresses live probes with the fewest components whose relative error is at most `ENOUGH`, over all hours.
+def fit_components(
+    values: np.ndarray, most_bytes: int | None = None, hours: int = 1, enough: float = ENOUGH
+) -> tuple[Components, float]:
+    """Compresses live probes with the fewest components whose relative error is at most `enough`, over all hours.
 
     Args:
         values: float32 [V, T D], numbers of live probes at T hours; no row is zero.
         most_bytes: Largest number of GPU bytes; None: no limit. At least one component is fitted.
         hours: T.
+        enough: Relative error at which no component is added.
 
     Returns:
-        The components and their relative error, which exceeds `ENOUGH` only if `most_bytes` does not allow more
+        The components and their relative error, which exceeds `enough` only if `most_bytes` does not allow more
         components.
     """
     values = values.astype(np.float64)
@@ -134,13 +137,13 @@ def fit_components(values: np.ndarray, most_bytes: int | None = None, hours: int
     largest = min(live, numbers)
     high = bisect(range(1, largest + 1), False, key=lambda count: size(count) >= identity or size(count) > most)
     best, low = coded(max(high, 1)), 1
-    if not high or best[1] > ENOUGH:
+    if not high or best[1] > enough:
         unit_vectors = high < largest and size(high + 1) >= identity and identity <= most
         return _coded(values, norm, hours, np.zeros((0, numbers), np.float16)) if unit_vectors else best
     while low < high:
         middle = (low + high) // 2
         tried = coded(middle)
-        if tried[1] <= ENOUGH:
+        if tried[1] <= enough:
             best, high = tried, middle
         else:
             low = middle + 1
