@@ -7,6 +7,7 @@ from scipy.special import expit
 from benchmarks.plain import gaussian_sum
 from wlm.probe.gaussian.model import CUT
 from wlm.probe.model import ProbeModel
+from wlm.probe.sphere import ambient_numbers
 
 _PAIRS = 1 << 20  # points times Gaussians per piece: about 100 MB
 
@@ -30,7 +31,7 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
     low, high = content.bounds.astype(np.float64)
     rows = low + content.code * ((high - low) / np.maximum(content.levels, 1))  # eq. 14
     net = [(layer[:-1], layer[-1]) for layer in (layer.astype(np.float64) for layer in content.layers())]
-    out = np.empty((len(x), model.outputs))
+    out = np.empty((len(x), content.columns))
     piece = max(1, _PAIRS // content.count)
     for start in range(0, len(x), piece):
         part = x[start : start + piece]
@@ -39,4 +40,8 @@ def decode64(model: ProbeModel, position: np.ndarray) -> np.ndarray:
         for weight, bias in net[:2]:
             h = expit(h @ weight + bias)
         out[start : start + piece] = h @ net[2][0] + net[2][1]
+    if content.relative:
+        out = np.exp(np.minimum(out[:, -1:], 0.0)) * out[:, :-1]
+    ambient = ambient_numbers(model.outputs)
+    out[:, :ambient] = np.maximum(out[:, :ambient], 0.0)
     return content.gain * out

@@ -23,7 +23,7 @@ def random_model(
     high = np.concatenate([SIZE, np.full(3, scales[1]), np.full(4, turn), np.full(latent, 2.0)])
     levels = np.array([CODES] * 3 + [2**bits - 1] * (7 + latent))
     code = rng.integers(0, 2**bits, (count, 7 + latent)).astype(np.uint16)
-    shapes = layer_shapes(latent, hidden, outputs)
+    shapes = layer_shapes(latent, hidden, profile.columns(outputs))
     inputs = np.repeat([latent + 3, hidden, hidden], [rows * columns for rows, columns in shapes])
     zero = np.zeros(probes if dead else 0, bool)
     zero[np.linspace(0, probes - 1, dead).astype(int)] = dead > 0
@@ -34,6 +34,7 @@ def random_model(
         hidden=hidden,
         outputs=outputs,
         support=profile.support,
+        relative=profile.error == "relative",
         gain=2.5,
         code=np.concatenate([rng.integers(0, 2**16, (count, 3)).astype(np.uint16), code], 1),
         levels=levels,

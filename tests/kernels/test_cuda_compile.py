@@ -66,7 +66,9 @@ def _members(*built: object) -> list:
 
 
 def _probe_network(shape: tuple[int, int, int]) -> list:
-    return _members(probe_network.network_kernels(*shape, "cuda"), probe_decode.decode_kernels(*shape, "cuda"))
+    latent, hidden, outputs = shape
+    decoder = probe_decode.decode_kernels(latent, hidden, outputs, True, 3, "cuda")
+    return _members(probe_network.network_kernels(latent, hidden, outputs + 1, "cuda"), decoder)
 
 
 def _smoke(dtype: type) -> list:

@@ -53,10 +53,23 @@ def test_the_scores_are_those_of_plain_sums(pair):
     assert report.psnr_live < report.psnr, "the dead are exact"
     assert report.mse == pytest.approx(np.mean(error**2))
     assert report.max_abs_error == np.abs(error).max()
-    worst = int(np.argmax((error**2).mean(1)))
-    assert report.worst_probe["probe"] == worst
-    assert report.worst_probe["psnr"] == pytest.approx(decibels(error[worst], peak))
-    assert report.worst_probe["position"] == probes.position[worst].tolist()
+    lengths = [math.dist(row, [0.0] * 27) for row in probes.values.tolist()]
+    typical = math.exp(sum(math.log(length) for length in lengths if length) / 48)
+    relative = [
+        math.dist(a, b) / math.hypot(c, 1e-3 * typical) for a, b, c in zip(decoded, probes.values, lengths, strict=True)
+    ]
+    worst = int(np.argmax(relative))
+    assert report.worst_probe == {
+        "probe": worst,
+        "error": pytest.approx(relative[worst]),
+        "position": probes.position[worst].tolist(),
+        "light": pytest.approx(lengths[worst]),
+        "decoded": pytest.approx(math.dist(decoded[worst], [0.0] * 27)),
+    }
+    relative = np.array(relative)[probes.live]
+    assert report.relative_error == pytest.approx(math.sqrt((relative**2).mean()))
+    assert report.relative_median == pytest.approx(np.median(relative))
+    assert report.relative_p95 == pytest.approx(np.quantile(relative, 0.95))
     for band, part in enumerate((slice(0, 3), slice(3, 12), slice(12, 27))):
         assert report.psnr_by_band[band] == pytest.approx(decibels(error[:, part], peak))
     assert (report.name, report.probes, report.live, report.outputs) == ("room", 50, 48, 27)
@@ -64,6 +77,7 @@ def test_the_scores_are_those_of_plain_sums(pair):
     normals, live = fibonacci_sphere(NORMALS), probes.live
     exact = irradiance(probes.values[live].reshape(-1, 9, 3), normals)
     predicted = irradiance(decoded[live].reshape(-1, 9, 3), normals)
+    exact, predicted = np.maximum(exact, 0.0), np.maximum(predicted, 0.0)
     assert report.irradiance_psnr == pytest.approx(decibels(predicted - exact, np.ptp(exact)))
 
 
@@ -118,10 +132,12 @@ def test_numbers_that_are_no_bands_have_no_irradiance(outputs):
 
 def test_one_probe_and_none():
     report = score(np.ones((1, 1), np.float32), probe_set([[3.0]]), 10)
-    assert math.isnan(report.psnr) and report.mse == 4.0 and report.worst_probe["probe"] == 0
+    assert math.isnan(report.psnr) and report.mse == 4.0
+    assert report.worst_probe["light"] == 3.0 and report.worst_probe["decoded"] == 1.0 and report.off == 1.0
     probes = probe_set(np.zeros((2, 27)), live=[False, False])
     report = score(probes.values, probes, 10)
     assert math.isnan(report.psnr_live) and math.isnan(report.irradiance_psnr) and report.live == 0
+    assert math.isnan(report.off) and report.worst_probe is None and report.warnings == []
 
 
 def test_many_probes_are_scored_in_pieces(pair, monkeypatch):

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 
-def decode(code: np.ndarray, bounds: np.ndarray, basis: np.ndarray) -> np.ndarray:
-    """Decodes live probes.
+def decode(code: np.ndarray, bounds: np.ndarray, basis: np.ndarray, ambient: int) -> np.ndarray:
+    """Decodes live probes; the first `ambient` numbers of each are clamped at 0.
 
     Args:
         code: uint8 [V, 1 + K].
@@ -22,5 +22,6 @@ def decode(code: np.ndarray, bounds: np.ndarray, basis: np.ndarray) -> np.ndarra
     for codes in code.tolist():
         magnitude, *coefficients = (first + unit * c for first, unit, c in zip(low, step, codes, strict=True))
         sums = [math.fsum(c * row[d] for c, row in zip(coefficients, rows, strict=True)) for d in range(len(rows[0]))]
-        result.append([math.exp(magnitude) * value for value in sums])
+        light = [math.exp(magnitude) * value for value in sums]
+        result.append([max(value, 0.0) if d < ambient else value for d, value in enumerate(light)])
     return np.array(result)

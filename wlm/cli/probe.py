@@ -103,6 +103,7 @@ def compress(
     note(f"{probes}: {data.reading}")
     if model.choice:
         note(model.choice)
+    note_warnings(model.warnings)
 
 
 def evaluate(
@@ -256,5 +257,9 @@ def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
     if report.worst_probe is not None:
         worst = report.worst_probe
         place = ", ".join(f"{x:.4g}" for x in worst["position"])
-        note(f"worst probe: {number(worst['psnr'], '.2f')} dB, probe {worst['probe']} at ({place})")
+        note(
+            f"relative error: {report.relative_median:.1%} in the median, {report.relative_p95:.1%} at 95% of the live "
+            f"probes; {report.off:.2%} are off by more than half; {worst['error']:.1%} at the worst, probe "
+            f"{worst['probe']} at ({place})"
+        )
     note_warnings(report.warnings)

@@ -12,17 +12,24 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from wlm.errors import WlmError
-from wlm.metrics import LostLight, psnr_from_mse
+from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel
 from wlm.probe.places import nearest_weights
+from wlm.probe.relative import norms, relative_errors
 from wlm.probe.sphere import coefficient_bands, fibonacci_sphere, irradiance, sh_count
 from wlm.system import Meter, OnProgress
 from wlm.system import Report as BaseReport
 
 NORMALS = 32
 """Number of normals: the mean square of any L2 irradiance over them is within 6% of that over the sphere, 0.3 dB."""
+
+OFF = 0.5
+"""Relative error above which a probe is counted as off."""
+
+MANY_OFF = 0.01
+"""Share of the live probes that may be off without a warning."""
 
 _NEAREST = 8  # probes that are weighted by the inverse square of their distance
 _ROWS = 32768  # probes per piece, so that float64 copies stay at some tens of MB
@@ -46,12 +53,16 @@ class Report(BaseReport):
         psnr: PSNR over all coefficients of all probes.
         psnr_live: PSNR over the live probes; dead probes decode exactly to zero.
         mse, max_abs_error: Errors over all coefficients of all probes.
-        worst_probe: The probe with the largest mean squared error: `probe` (index), `psnr`, `position`; None if all are
-            exact.
+        relative_error: Root mean square of the live probes' relative errors, see `wlm.probe.relative`; NaN if no probe
+            is live.
+        relative_median, relative_p95: Median and 95th percentile of these errors.
+        off: Share of the live probes whose relative error exceeds `OFF`.
+        worst_probe: The live probe with the largest relative error: `probe` (index), `error`, `position`, and the norms
+            of its numbers, `light`, and of the decoded ones, `decoded`; None if all are exact.
         psnr_by_band: PSNR of each band of spherical harmonics, over all probes and colours.
-        irradiance_psnr: PSNR of the irradiance on `NORMALS` fixed normals of every live probe in RGB; its peak is the
+        irradiance_psnr: PSNR of the irradiance, at least 0, on `NORMALS` fixed normals of every live probe in RGB; its peak is the
             range of the input's irradiance.
-        warnings: Sentences about light that probes lost, which the mean errors do not show.
+        warnings: A sentence that names the worst probe, if more than a share `MANY_OFF` of the live probes is off.
         between_psnr: PSNR between the probes, see the function `between_psnr`; None if it was not computed.
     """
 
@@ -67,6 +78,10 @@ class Report(BaseReport):
     psnr_live: float
     mse: float
     max_abs_error: float
+    relative_error: float
+    relative_median: float
+    relative_p95: float
+    off: float
     worst_probe: dict[str, Any] | None
     psnr_by_band: list[float] | None
     irradiance_psnr: float | None
@@ -105,11 +120,8 @@ def evaluate(
     decoded = decoder.decode_probes()
     meter.report(1)
     report = score(decoded, probes, model.file_bytes() if file_bytes is None else file_bytes)
-    lost = LostLight()
-    lost.add(probes.values, decoded)
     report = replace(
         report,
-        warnings=lost.warnings(probes.name, "probe", "the set"),
         between_psnr=between_psnr(decoder, probes),
         gpu_bytes=model.content.nbytes,
     )
@@ -151,15 +163,14 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
             f"infinity, first probe {int(np.argmax(broken))}"
         )
 
-    by_probe = np.empty(count)  # mean squared error
     by_coefficient = np.zeros(outputs)  # sum of squares
-    largest = 0.0
+    largest = of_live = 0.0
     for start in range(0, count, _ROWS):
         rows = slice(start, start + _ROWS)
         error = np.abs(decoded[rows].astype(np.float64) - values[rows])
         largest = max(largest, float(error.max()))
         error *= error
-        by_probe[rows] = error.mean(axis=1)
+        of_live += float(error[live[rows]].sum())
         by_coefficient += error.sum(axis=0)
 
     peak = float(values.max()) - float(values.min())
@@ -170,8 +181,6 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
     if coefficients is not None:
         band = np.repeat(coefficient_bands(coefficients), 3)
         by_band = [psnr_from_mse(by_coefficient[band == i].mean(), peak) for i in range(band[-1] + 1)]
-    worst = int(np.argmax(by_probe))
-    found = {"probe": worst, "psnr": psnr_from_mse(by_probe[worst], peak), "position": probes.position[worst].tolist()}
     return Report(
         name=probes.name,
         probes=count,
@@ -182,13 +191,44 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         ratio=file_bytes / (count * outputs * 4),
         peak=peak,
         psnr=psnr_from_mse(mse, peak),
-        psnr_live=psnr_from_mse(by_probe[live].mean(), peak) if live.any() else math.nan,
+        psnr_live=psnr_from_mse(of_live / (live.sum() * outputs), peak) if live.any() else math.nan,
         mse=mse,
         max_abs_error=largest,
-        worst_probe=found if by_probe[worst] else None,
+        **relative_figures(decoded, probes),
         psnr_by_band=by_band,
         irradiance_psnr=None if coefficients is None else _irradiance_psnr(decoded[live], values[live], coefficients),
     )
+
+
+def relative_figures(decoded: np.ndarray, probes: ProbeSet) -> dict[str, Any]:
+    """Returns the entries of a `Report` that are about relative errors, and `warnings`, by name; arguments as for
+    `score`."""
+    index = np.flatnonzero(probes.live)
+    if not len(index):
+        none = dict.fromkeys(("relative_error", "relative_median", "relative_p95", "off"), math.nan)
+        return none | {"worst_probe": None, "warnings": []}
+    decoded, values = decoded[index], probes.values[index]
+    error = relative_errors(decoded, values)
+    worst, off = int(error.argmax()), float((error > OFF).mean())
+    probe = int(index[worst])
+    light, found = (float(norms(each[worst : worst + 1])[0]) for each in (values, decoded))
+    place = probes.position[probe].tolist()
+    warnings = []
+    if off > MANY_OFF:
+        at = ", ".join(f"{x:.4g}" for x in place)
+        warnings.append(
+            f"{probes.name}: {off:.1%} of the live probes are off by more than {OFF:.0%} of their light; the worst is "
+            f"probe {probe} at ({at}), whose light of {light:.4g} decodes to {found:.4g}"
+        )
+    named = {"probe": probe, "error": float(error[worst]), "position": place, "light": light, "decoded": found}
+    return {
+        "relative_error": float(np.sqrt(np.square(error).mean())),
+        "relative_median": float(np.median(error)),
+        "relative_p95": float(np.percentile(error, 95)),
+        "off": off,
+        "worst_probe": named if error[worst] else None,
+        "warnings": warnings,
+    }
 
 
 def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int) -> float:
@@ -200,7 +240,7 @@ def _irradiance_psnr(decoded: np.ndarray, values: np.ndarray, coefficients: int)
     rows = max(1, _ROWS // NORMALS)
     for start in range(0, len(values), rows):
         pair = np.stack([values[start : start + rows], decoded[start : start + rows]])
-        exact, predicted = irradiance(pair.reshape(2, -1, coefficients, 3), normals)
+        exact, predicted = np.maximum(irradiance(pair.reshape(2, -1, coefficients, 3), normals), 0.0)
         low, high = min(low, float(exact.min())), max(high, float(exact.max()))
         total += float(np.square(predicted - exact).sum())
     return psnr_from_mse(total / (len(values) * NORMALS * 3), high - low)

@@ -14,7 +14,7 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
-from wlm.probe.gaussian.decode import GaussianDecoder
+from wlm.probe.evaluation import relative_figures
 from wlm.probe.gaussian.model import check_outputs, gaussian_bytes, gaussian_count
 from wlm.probe.gaussian.packing import pack_model
 from wlm.probe.gaussian.trainer import Trainer
@@ -78,14 +78,15 @@ def compress(
         profile: The settings: a name, a YAML file, or a `Profile`.
         seed: Seed of the fit; the same seed gives the same result on one kind of device.
         device: "cpu" or "cuda:N".
-        progress: Called about twice a second, with the PSNR over all numbers of all probes.
+        progress: Called about twice a second, with the relative error of the live probes, or with the PSNR over all
+            numbers of all probes if the profile asks for the absolute error.
         checkpoint: From `open_checkpoint` for the same settings, or None. A running fit is saved there, and an
             interrupted one is resumed from there.
         positions: Whether the model stores the probes' positions, 16 bits per axis; not needed if the engine has them.
         overrides: Settings that replace the profile's, such as `steps=500`.
 
     Returns:
-        The model.
+        The model; its `warnings` say whether many probes are off, and which most.
 
     Raises:
         WlmError: The profile, a setting or the device does not exist, there are too many numbers per probe, the
@@ -113,21 +114,39 @@ def compress(
     values = probes.values[probes.live]
     pca = Profile(name=profile.name, method="pca")
     if profile.method == "pca":
-        return make(profile=pca, content=fit_components(values)[0], choice="PCA, as the profile asks")
+        model = make(profile=pca, content=fit_components(values)[0], choice="PCA, as the profile asks")
+        return _measured(model, probes, device)[0]
     if profile.method == "auto":
         count = gaussian_count(profile.ratio, len(values))
-        budget = gaussian_bytes(count, profile.latent, profile.hidden, probes.outputs)
+        budget = gaussian_bytes(count, profile.latent, profile.hidden, profile.columns(probes.outputs))
         components, error = fit_components(values, budget)
         if error <= ENOUGH and components.nbytes <= budget:
             took = (
                 f"{components.count} components reach {error:.1%} of each probe's light in {components.nbytes:,} bytes"
             )
-            return make(profile=pca, content=components, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
-    check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, device)
+            choice = f"PCA: {took} of GPU memory, Gaussians take {budget:,}"
+            return _measured(make(profile=pca, content=components, choice=choice), probes, device)[0]
+    relative = profile.error == "relative"
+    check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, relative, device)
     gaussians = _fit_gaussians(make, probes, profile, seed, device, progress, checkpoint)
+    gaussians, error = _measured(gaussians, probes, device)
     if profile.method == "gaussians":
         return gaussians
-    return _better(gaussians, partial(make, profile=pca), probes, device)
+    most = gaussians.content.nbytes
+    told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
+    components, _ = fit_components(values, most)
+    if components.nbytes > most:
+        return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
+    rival, possible = _measured(make(profile=pca, content=components), probes, device)
+    if possible < error:
+        return replace(rival, choice=f"PCA: {components.count} components reach {possible:.1%}, {told}")
+    return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1%}")
+
+
+def _measured(model: ProbeModel, probes: ProbeSet, device: str) -> tuple[ProbeModel, float]:
+    """Returns the model with its warnings, and its relative error."""
+    figures = relative_figures(model.decoder(device, position=probes.position).decode_probes(), probes)
+    return replace(model, warnings=tuple(figures["warnings"])), figures["relative_error"]
 
 
 def _fit_gaussians(
@@ -163,37 +182,23 @@ def _fit_gaussians(
     return pack_model(fitted, position, values, device)
 
 
-def _better(gaussians: ProbeModel, make: Callable[..., ProbeModel], probes: ProbeSet, device: str) -> ProbeModel:
-    """Returns the Gaussians, or principal components if they have less error in no more GPU memory."""
-    values, most = probes.values[probes.live], gaussians.content.nbytes
-    peak = float(np.ptp(probes.values))
-
-    def psnr(decoded: np.ndarray) -> float:
-        return psnr_from_mse(float(np.square(decoded.astype(np.float64) - values).mean()), peak)
-
-    reached = psnr(GaussianDecoder(gaussians, device).decode(probes.position[probes.live]))
-    told = f"Gaussians reach {reached:.1f} dB in {most:,} bytes of GPU memory"
-    components, _ = fit_components(values, most)
-    if components.nbytes > most:
-        return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
-    rival = make(content=components)
-    possible = psnr(rival.decoder(device).decode_probes()[probes.live])
-    if possible > reached:
-        return replace(rival, choice=f"PCA: {components.count} components reach {possible:.1f} dB, {told}")
-    return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1f} dB")
-
-
 def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, checkpoint: Checkpoint | None) -> None:
     steps, chunk = trainer.steps, _CHUNK["cpu" if trainer.device == "cpu" else "cuda"]
     meter = Meter(progress, "fit", steps)
-    peak = float(np.ptp(probes.values))
-    live = probes.live.mean()  # dead probes decode exactly, and count
+    peak, live = float(np.ptp(probes.values)), probes.live.mean()  # dead probes decode exactly, and count
+
+    def figures() -> dict[str, float]:
+        error = trainer.mse()
+        if trainer.relative:
+            return {"relative_error": math.sqrt(error * (probes.outputs + 1))}
+        return {"PSNR_dB": psnr_from_mse(error * live, peak)}
+
     for start in range(trainer.step, steps, chunk):
         step = min(start + chunk, steps)
         trainer.run(step - start)
         if meter.due(step):
             try:
-                meter.report(step, PSNR_dB=psnr_from_mse(trainer.mse() * live, peak))
+                meter.report(step, **figures())
             except KeyboardInterrupt:
                 if checkpoint is not None:
                     checkpoint.save({0: trainer.state()})

@@ -1,5 +1,7 @@
 """Generates GLSL that all shaders of probes share: storage buffers, and macros that read them."""
 
+from wlm.probe.sphere import ambient_numbers
+
 _BUFFER = """\
 #ifndef WLM_{PART}_{NAME}
 #ifndef WLM_{PART}_{NAME}_BINDING
@@ -35,6 +37,12 @@ def buffer_glsl(part: str, name: str, number: int, kind: str = "uint") -> str:
     part, name = part.lower(), name.lower()
     words = {"part": part, "name": name, "Part": part.title(), "Name": name.title()}
     return _BUFFER.format(number=number, kind=kind, PART=part.upper(), NAME=name.upper(), **words)
+
+
+def clamp_glsl(outputs: int) -> str:
+    """Returns the GLSL statements that clamp the ambient light among D numbers, `values`, at 0."""
+    lines = ["for (int i = 0; i < 3; ++i)", "    values[i] = max(values[i], 0.0);"] if ambient_numbers(outputs) else []
+    return "".join(f"\n    {line}" for line in lines)
 
 
 def sh_glsl(name: str, arguments: str, call: str, coefficients: int) -> str:

@@ -35,6 +35,8 @@ class Profile(Settings):
     """Length of the latent vector of a Gaussian."""
     hidden: int = Field(64, ge=8, le=128, multiple_of=8)
     """Width of both hidden layers of the network."""
+    error: Literal["relative", "absolute"] = "relative"
+    """Error that is minimised: relative to each probe's light, or absolute (eq. 8), which neglects dark probes."""
     support: Literal["ellipsoid", "sphere"] = "ellipsoid"
     """Support of a Gaussian: ellipsoid, at three standard deviations, or sphere, of its longest half axis (eq. 6)."""
     optimiser: Literal["adam", "adan"] = "adam"
@@ -57,6 +59,10 @@ class Profile(Settings):
     """Initial scale of a Gaussian as a share of the distance to the nearest other centre."""
     gain: float = Field(3.0, gt=0.0, le=10.0)
     """Magnitude of the hidden layers' initial weights; 1: uniform random numbers of variance 1 / (3 * inputs)."""
+
+    def columns(self, outputs: int) -> int:
+        """Returns the number of outputs of the network for D numbers per probe: one more if the error is relative."""
+        return outputs + (self.error == "relative")
 
 
 class Content(ABC):
@@ -131,6 +137,7 @@ class ProbeModel(Model):
         positions: uint16 [N, 3], positions in 1/65535 of the box, if they are stored with the model; else empty.
         content: The compressed light, in the form of the method.
         choice: Sentence that says why the fit used this method. Files do not store it.
+        warnings: Sentences about light that the fit lost, as in `wlm.probe.Report`. Files do not store them.
     """
 
     SYSTEM: ClassVar[str] = "probe"
@@ -147,6 +154,7 @@ class ProbeModel(Model):
     positions: np.ndarray
     content: Content
     choice: str = ""
+    warnings: tuple[str, ...] = ()
 
     @property
     def method(self) -> str:

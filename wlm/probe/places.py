@@ -86,7 +86,7 @@ def nearest_weights(tree: cKDTree, points: np.ndarray, count: int) -> tuple[np.n
 
 def ball_exposure(values: np.ndarray) -> float:
     """Returns the exposure at which white diffuse balls, lit by SH radiance [N, C, 3], are hardly anywhere clipped."""
-    return exposure(irradiance(values, fibonacci_sphere(_NORMALS)) / np.pi)
+    return exposure(np.maximum(irradiance(values, fibonacci_sphere(_NORMALS)), 0.0) / np.pi)
 
 
 def ball_radius(position: np.ndarray) -> float:

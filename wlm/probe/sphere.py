@@ -18,6 +18,12 @@ def sh_count(outputs: int) -> int | None:
     return count if count > 0 and outputs == 3 * count and math.isqrt(count) ** 2 == count else None
 
 
+def ambient_numbers(outputs: int) -> int:
+    """Returns how many of a probe's first numbers are ambient light, which is never negative: 3 if a probe with
+    `outputs` numbers holds spherical harmonics, else 0."""
+    return 0 if sh_count(outputs) is None else 3
+
+
 def coefficient_bands(coefficients: int) -> np.ndarray:
     """Returns the band l of each coefficient, int64 [C]: 0, 1, 1, 1, 2, ...
 
@@ -93,7 +99,7 @@ def irradiance(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
         normals: [M, 3], of unit length.
 
     Returns:
-        float64 [..., M, 3], pi times the radiance if that is constant.
+        float64 [..., M, 3], pi times the radiance if that is constant. Few bands ring below 0: clamp what is shown.
 
     Raises:
         ValueError: A shape is different, a normal's length is not 1, or C is not a square.

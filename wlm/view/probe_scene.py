@@ -136,14 +136,14 @@ class _ProbeScene(Scene):
         points = probes.position[:, None] + self._radius * self._ball
         faces = self._ball_faces + len(self._ball) * np.arange(len(probes.position))[:, None, None]
         self._balls = points.reshape(-1, 3), faces.reshape(-1, 3)
-        self._light = {name: irradiance(values, self._ball) / math.pi for name, values in probes.values.items()}
+        self._light = {name: _diffuse(values, self._ball) for name, values in probes.values.items()}
         self._brightness = ball_exposure(probes.values.get("original", next(iter(probes.values.values()))))
         self._surface: np.ndarray | None = None
         if self.geometry is not None:
             at_vertices = probes.decode(self.geometry.position.astype(np.float64))
             at_vertices = at_vertices.reshape(len(at_vertices), -1, 3)
             weights = irradiance_weights(_normals(self.geometry), at_vertices.shape[1])
-            self._surface = np.einsum("vc,vcd->vd", weights, at_vertices) / math.pi
+            self._surface = np.maximum(np.einsum("vc,vcd->vd", weights, at_vertices), 0.0) / math.pi
 
     def draw(self, canvas: Canvas, state: State) -> None:
         display = state.display(self._brightness)
@@ -227,7 +227,7 @@ class _ProbeScene(Scene):
         centre, size, values = np.concatenate(centres), np.concatenate(sides), np.concatenate(light)
         cube = creation.box()  # of side 1; its triangles share no corners, so that each face has its own colour
         points = centre[:, None] + size[:, None, None] * cube.triangles.reshape(-1, 3)
-        shown = irradiance(values.reshape(len(values), -1, 3), cube.face_normals.repeat(3, 0)) / math.pi
+        shown = _diffuse(values.reshape(len(values), -1, 3), cube.face_normals.repeat(3, 0))
         colours = state.display(self._brightness).picture(shown).reshape(-1, 3)
         canvas.coloured(0, _BLOCKS, points.reshape(-1, 3), np.arange(len(colours)).reshape(-1, 3), colours)
         if len(self.path) > 1:
@@ -247,6 +247,11 @@ def _coefficients(outputs: int, title: str) -> int:
 def _icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     sphere = creation.icosphere(subdivisions=subdivisions)
     return np.array(sphere.vertices), np.array(sphere.faces)
+
+
+def _diffuse(values: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Returns the radiance of white diffuse surfaces with normals [M, 3] under SH [..., C, 3], float64 [..., M, 3]."""
+    return np.maximum(irradiance(values, normals), 0.0) / math.pi
 
 
 def _normals(geometry: Geometry) -> np.ndarray:

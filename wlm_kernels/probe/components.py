@@ -11,6 +11,7 @@ def _decode_components(
     basis: wp.array2d[wp.float16],
     row: wp.array1d[int],
     numbers: wp.array1d[int],
+    ambient: int,
     # out:
     out: wp.array2d[float],
 ):
@@ -24,11 +25,19 @@ def _decode_components(
             coefficient = bounds[0, 1 + k] + bounds[1, 1 + k] * float(code[probe, 1 + k])
             total += coefficient * float(basis[k, d])
         total *= wp.exp(bounds[0, 0] + bounds[1, 0] * float(code[probe, 0]))
+    if d < ambient:
+        total = wp.max(total, 0.0)
     out[i, d] = total
 
 
 def decode_components(
-    code: wp.array, bounds: wp.array, basis: wp.array, row: wp.array, numbers: wp.array, out: wp.array
+    code: wp.array,
+    bounds: wp.array,
+    basis: wp.array,
+    row: wp.array,
+    numbers: wp.array,
+    ambient: int,
+    out: wp.array,
 ) -> None:
     """Decodes light probes to their D numbers (light coefficients).
 
@@ -38,8 +47,8 @@ def decode_components(
         basis: float16 [K, D], the principal components; empty: the coefficients are the probe's numbers, K = D.
         row: int [N], row of each probe in `code`; -1 for a dead probe (without light), which decodes to 0.
         numbers: int [M], indices of the probes to decode, below N.
+        ambient: Number of the first numbers of a probe that are clamped at 0.
         out: float [M, D], the probes' numbers, written.
     """
-    wp.launch(
-        _decode_components, out.shape, inputs=[code, bounds, basis, row, numbers], outputs=[out], device=out.device
-    )
+    inputs = [code, bounds, basis, row, numbers, ambient]
+    wp.launch(_decode_components, out.shape, inputs=inputs, outputs=[out], device=out.device)

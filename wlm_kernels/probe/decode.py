@@ -50,23 +50,29 @@ class DecodeKernels:
 
 
 @functools.cache
-def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> DecodeKernels:
+def decode_kernels(
+    latent: int, hidden: int, outputs: int, relative: bool, ambient: int, device_kind: str
+) -> DecodeKernels:
     """Builds the kernel for one size of network; later calls return the same kernel.
 
     Args:
         latent: Length L of a latent vector, at least 1.
         hidden: Units of a hidden layer, H, a multiple of 8.
         outputs: Numbers D at a point, at least 1.
+        relative: Whether the network has an output y_D for the magnitude; exp(min(y_D, 0)) multiplies the others.
+        ambient: Number of the first numbers that are clamped at 0.
         device_kind: "cpu" or "cuda".
     """
     fn = functions(latent)
     add, vec_latent = fn.add, fn.vec_latent
-    points = probes_at_once(latent, hidden, outputs)
+    columns = outputs + relative
+    points = probes_at_once(latent, hidden, columns)
     cuda = device_kind == "cuda"
     options = {"enable_backward": False, "max_unroll": 32 if cuda else 1}
-    network = cpu_network(latent, hidden, outputs)
+    network = cpu_network(latent, hidden, columns)
     forward, vec_in = network.forward, network.vec_in
-    finish = _finish(latent, hidden, outputs, points, vec_latent)
+    code = layer_code(latent, hidden, columns, points)
+    finish = _finish(code + native_source(__package__, "decode", OUT=outputs, AMBIENT=ambient), vec_latent)
 
     @wp.func
     def sum_at(
@@ -123,16 +129,20 @@ def decode_kernels(latent: int, hidden: int, outputs: int, device_kind: str) -> 
             for c in range(3):
                 v[wp.static(latent) + c] = x[i][c]
             _h1, _h2, y = forward(net, v)
+            light = float(gain)
+            if wp.static(relative):
+                light *= wp.exp(wp.min(y[wp.static(columns - 1)], 0.0))
             for c in range(wp.static(outputs)):
-                out[i, c] = gain * y[c]
+                value = light * y[c]
+                if c < wp.static(ambient):
+                    value = wp.max(value, 0.0)
+                out[i, c] = value
 
     return DecodeKernels(device_kind, points, kernel)
 
 
-def _finish(latent: int, hidden: int, outputs: int, points: int, vec_latent):
-    snippet = layer_code(latent, hidden, outputs, points) + native_source(__package__, "decode")
-
-    @wp.func_native(snippet)
+def _finish(code: str, vec_latent):
+    @wp.func_native(code)
     def finish(
         f: vec_latent,
         x: wp.vec3,

@@ -152,7 +152,7 @@ def volume(folder) -> Subject:
     ahead = made.read(points, normals)
     head, pages, pool = (np.fromfile(folder / f"{name}.bin", "<u4") for name in ("volume", "pages", "pool"))
     shown = [irradiance(each.reshape(9, 3), n[None])[0, 1] for each, n in zip(ahead.values, normals, strict=True)]
-    light = np.column_stack([ahead.values[:, [0, 26]], np.array(shown) / np.pi])
+    light = np.column_stack([ahead.values[:, [0, 26]], np.maximum(shown, 0.0) / np.pi])
     expected = np.column_stack([ahead.weight, light * ahead.weight[:, None]])
     main = (
         POINTS

@@ -24,7 +24,9 @@ _ABOUT = {
     "quaternion q = w x y z of any length (length zero is no rotation), latent. u = R(q)^T (x - centre) / s; the "
     "weight at x is exp(-|u|^2 / 2). The support is |u| < cut, or |x - centre| < cut * max(s) for the support "
     "'sphere'. F is the sum of weight * latent over the Gaussians whose support contains x.",
-    "network": "h1 = sigmoid(W1 [F, x] + b1), h2 = sigmoid(W2 h1 + b2), values = gain * (W3 h2 + b3).",
+    "network": "h1 = sigmoid(W1 [F, x] + b1), h2 = sigmoid(W2 h1 + b2), y = W3 h2 + b3, values = gain * y. If "
+    "magnitude is true, y has one number more, the last, and values = gain * exp(min(last, 0)) * y. Of spherical "
+    "harmonics the first three values are clamped at 0.",
     "lists": "To skip Gaussians that do not reach x, build lists of them at loading time: cut the box 0 ... size into "
     "cubes, 4 to 16 along its longest side, and list a Gaussian with each cube that meets centre +- reach, where reach "
     "along axis a is cut * sqrt(sum over b of (R_ab s_b)^2), or cut * max(s) for the support 'sphere'. Widen the cubes "
@@ -51,6 +53,7 @@ def gaussian_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
         "latent": content.latent,
         "hidden": content.hidden,
         "support": content.support,
+        "magnitude": content.relative,
         "cut": CUT,
         "gain": content.gain,
         "low": rounded(content.bounds[0]),

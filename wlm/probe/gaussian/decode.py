@@ -7,6 +7,7 @@ from wlm.probe.decode import Decoder
 from wlm.probe.gaussian.model import CUT, Gaussians, check_outputs
 from wlm.probe.model import ProbeModel, check_points
 from wlm.probe.morton import morton_order
+from wlm.probe.sphere import ambient_numbers
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import network as probe_network
@@ -48,19 +49,20 @@ class GaussianDecoder(Decoder):
         super().__init__(model, device, position=position)
         content = model.content
         assert isinstance(content, Gaussians)
-        check_outputs(model.name, content.latent, content.hidden, model.outputs, self.device)
+        check_outputs(model.name, content.latent, content.hidden, model.outputs, content.relative, self.device)
         self._gain = content.gain
         self._rows = self._put(content.rows(), float)
         self._shapes = gaussian_sum.shapes(self._rows, CUT, content.support)
         self._cubes = probe_cubes.build(self._shapes, np.zeros(3, np.float32), model.size.astype(np.float32))
         self.pairs = self._cubes.item.shape[0]
         first, second, third = (layer.astype(np.float32) for layer in content.layers())
-        third = np.pad(third, ((0, 0), (0, probe_network.padded(model.outputs) - model.outputs)))
+        third = np.pad(third, ((0, 0), (0, probe_network.padded(content.columns) - content.columns)))
         net = np.concatenate([first.ravel(), second.ravel(), third.ravel()])
         self._net = self._put(net, float)
         self._arrays += [self._shapes, self._cubes.start, self._cubes.item]
         kind = "cpu" if self.device == "cpu" else "cuda"
-        self._kernels = decode_kernels(content.latent, content.hidden, model.outputs, kind)
+        sizes = content.latent, content.hidden, model.outputs, content.relative, ambient_numbers(model.outputs)
+        self._kernels = decode_kernels(*sizes, kind)
 
     def points(self, position: np.ndarray) -> Points:
         """Uploads points that will be decoded often; arguments and errors are those of `decode`."""

@@ -5,7 +5,13 @@ The light at a position p follows from the sum of the Gaussians' latents at p an
 
     x = (p - origin) / extent                        in [0, 1]^3
     F(x) = sum_j F_j exp(-d_j^2 / 2),  d_j = |S_j^-1 R_j^T (x - mu_j)|,  over the Gaussians j that reach x
-    sh(p) = gain * MLP([F(x), x])
+    y = MLP([F(x), x])
+    sh(p) = gain * y                                                       if the fit minimised the absolute error
+    sh(p)_d = gain * exp(min(y_D, 0)) * y_d,  d < D                        if it minimised the relative error
+
+In the second form the network has one more output than a probe has numbers, the logarithm of the probe's magnitude. The
+paper has only the first form, whose error is as large in dark places as in bright ones. The first three numbers of
+spherical harmonics, the ambient light, are clamped at 0 in both.
 
 A file stores whole numbers, each with a step (`WholeNumbers`). A GPU holds a 16-bit code for every number of a Gaussian
 and half floats for the network; both follow from the whole numbers.
@@ -112,6 +118,7 @@ class Gaussians(Content):
         hidden: Width of both hidden layers.
         outputs: D, numbers per probe.
         support: Support of a Gaussian, "ellipsoid" or "sphere".
+        relative: Whether the network has an output for the magnitude, D + 1 outputs in all.
         gain: Factor of the network's outputs.
         code: uint16 [K, 10 + L], codes of centre, logarithm of the scale, quaternion and latent.
         levels: int64 [10 + L], largest code of each channel.
@@ -129,6 +136,7 @@ class Gaussians(Content):
     hidden: int
     outputs: int
     support: str
+    relative: bool
     gain: float
     code: np.ndarray
     levels: np.ndarray
@@ -144,7 +152,12 @@ class Gaussians(Content):
 
     @property
     def nbytes(self) -> int:
-        return gaussian_bytes(self.count, self.latent, self.hidden, self.outputs)
+        return gaussian_bytes(self.count, self.latent, self.hidden, self.columns)
+
+    @property
+    def columns(self) -> int:
+        """The number of outputs of the network."""
+        return self.outputs + self.relative
 
     @property
     def steps(self) -> np.ndarray:
@@ -159,7 +172,7 @@ class Gaussians(Content):
 
     def layers(self) -> list[np.ndarray]:
         """Returns the three layers of `net`, float16, as `layer_shapes` describes them."""
-        return split_layers(self.net, layer_shapes(self.latent, self.hidden, self.outputs))
+        return split_layers(self.net, layer_shapes(self.latent, self.hidden, self.columns))
 
     def facts(self) -> dict[str, Any]:
         return {"gaussians": self.count, "dropped": self.dropped, "latent": self.latent, "hidden": self.hidden}
@@ -170,7 +183,8 @@ class Gaussians(Content):
     @classmethod
     def table(cls, profile: Profile, outputs: int, count: int, live: int) -> dict[str, Part]:
         channels = STORED_LATENT.start + profile.latent
-        weights = sum(rows * columns for rows, columns in layer_shapes(profile.latent, profile.hidden, outputs))
+        shapes = layer_shapes(profile.latent, profile.hidden, profile.columns(outputs))
+        weights = sum(rows * columns for rows, columns in shapes)
         return {
             "gain": Part(np.float64, (1,), least=0.0, most=float(np.finfo(np.float32).max)),
             "lowest": Part(np.int32, (channels,)),
@@ -200,15 +214,17 @@ class Gaussians(Content):
         steps = (stored["steps"].astype(np.uint32) << 16).view(np.float32).astype(np.float64)
         if not (np.isfinite(steps).all() and (steps > 0).all()):
             raise ValueError("part steps: expected finite quantisation steps above 0")
-        first, second, third = split_layers(stored["network"].astype(np.int64), layer_shapes(latent, hidden, outputs))
+        shapes = layer_shapes(latent, hidden, profile.columns(outputs))
+        first, second, third = split_layers(stored["network"].astype(np.int64), shapes)
         whole = WholeNumbers(
             gaussians=stored["gaussians"].T.astype(np.int64) + stored["lowest"],
             step=steps[: STORED_LATENT.start + latent],
             net=(first, second, third),
             net_step=steps[STORED_LATENT.start + latent :],
         )
-        gain, support = float(stored["gain"][0]), profile.support
-        content = cls(latent, hidden, outputs, support, gain, dropped=dropped, whole=whole, **whole.codes())
+        gain, relative = float(stored["gain"][0]), profile.error == "relative"
+        sizes = latent, hidden, outputs, profile.support, relative, gain
+        content = cls(*sizes, dropped=dropped, whole=whole, **whole.codes())
         content._check_range()
         return content
 
@@ -224,7 +240,7 @@ class Gaussians(Content):
         first, _, third = (np.abs(layer.astype(np.float64)) for layer in self.layers())
         sums = self.count * np.abs(self.bounds[:, LATENT].astype(np.float64)).max(0)
         first *= np.concatenate([np.maximum(sums, 1.0), np.ones(4)])[:, None]
-        most = max(first.sum(0).max(), self.gain * third.sum(0).max())
+        most = max(first.sum(0).max(), third.sum(0).max(), self.gain * third[:, : self.outputs].sum(0).max())
         if not most <= np.finfo(np.float32).max:
             raise ValueError("parts network, gaussians and gain: expected light within the range of float32")
 
@@ -236,7 +252,8 @@ def split_layers(net: Any, shapes: list[tuple[int, int]]) -> list[Any]:
 
 
 def gaussian_bytes(count: int, latent: int, hidden: int, outputs: int) -> int:
-    """Returns the bytes of the GPU buffers of `count` Gaussians and their network; see `wlm.probe.gaussian.bundle`."""
+    """Returns the bytes of the GPU buffers of `count` Gaussians and a network with `outputs` outputs; see
+    `wlm.probe.gaussian.bundle`."""
     channels = LATENT.start + latent
     padded = [
         (1 + -(-(rows - 1) // 4) * 4, -(-columns // 4) * 4) for rows, columns in layer_shapes(latent, hidden, outputs)
@@ -250,13 +267,13 @@ def layer_shapes(latent: int, hidden: int, outputs: int) -> list[tuple[int, int]
     return [(latent + 4, hidden), (hidden + 1, hidden), (hidden + 1, outputs)]
 
 
-def check_outputs(name: str, latent: int, hidden: int, outputs: int, device: str) -> None:
+def check_outputs(name: str, latent: int, hidden: int, outputs: int, relative: bool, device: str) -> None:
     """Checks that kernels can be compiled for `outputs` numbers per probe; on the CPU there is no limit.
 
     Raises:
         WlmError: There are too many numbers per probe for CUDA.
     """
-    most = most_outputs(latent, hidden)
+    most = most_outputs(latent, hidden) - relative
     if device != "cpu" and outputs > most:
         raise WlmError(
             f"{name}: expected at most {most} numbers a probe on CUDA with latent {latent} and hidden "

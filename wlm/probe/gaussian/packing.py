@@ -31,9 +31,10 @@ from wlm.probe.gaussian.model import (
 )
 from wlm.probe.model import CODES, ProbeModel
 from wlm.probe.morton import morton_keys
+from wlm.probe.relative import magnitudes, with_magnitude
 
 DROP = 0.05
-"""PSNR in dB that quantising may cost at the probes."""
+"""Growth in dB of the error that the fit minimised by quantising."""
 
 _MANY = 20_000  # most probes that numbers are fitted to; fitting to few probes would favour them over the rest
 _TOGETHER = 1024  # most Gaussians whose latents are fitted together: the matrix has as many rows and columns
@@ -64,24 +65,29 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
     content = model.content
     assert isinstance(content, Gaussians)
     many = slice(None, None, -(-len(position) // _MANY))
-    faint = _FAINT * max(float(np.ptp(values)), float(np.abs(values).max())) ** 2
-    search = _Search(content, model.normalise(position[many]), values[many], faint, device)
+    if content.relative:
+        unit, wanted, faint = magnitudes(values)[:, None], with_magnitude(values), _FAINT
+    else:
+        unit, wanted = np.full((1, 1), content.gain), values.astype(np.float64) / content.gain
+        faint = _FAINT * max(float(np.ptp(wanted)), float(np.abs(wanted).max())) ** 2
+
+    def error(tried: ProbeModel) -> float:
+        decoded = GaussianDecoder(tried, device).decode(position).astype(np.float64)
+        return float(np.square((decoded - values) / unit).mean())
+
+    search = _Search(content, model.normalise(position[many]), wanted[many], faint, device)
     growth = 10.0 ** (DROP / 10.0) - 1.0
-    most = (1.0 + growth) * (_error(model, position, values, device) + faint)
+    most = (1.0 + growth) * (error(model) + faint)
     for _ in range(_AGAIN):
         whole = search.within(growth)
         if whole is None:
             break
         found = replace(model, content=replace(content, whole=whole, **whole.codes()))
-        if _error(found, position, values, device) <= most:
+        if error(found) <= most:
             return found
         growth *= _LESS
     whole = search.finest()
     return replace(model, content=replace(content, whole=whole, **whole.codes()))
-
-
-def _error(model: ProbeModel, position: np.ndarray, values: np.ndarray, device: str) -> float:
-    return float(np.square(GaussianDecoder(model, device).decode(position).astype(np.float64) - values).mean())
 
 
 class _Steps(NamedTuple):
@@ -108,10 +114,10 @@ class _Steps(NamedTuple):
 class _Search:
     """Finds the integers of a model for given steps, and the error that they cause."""
 
-    def __init__(self, content: Gaussians, x: np.ndarray, values: np.ndarray, faint: float, device: str) -> None:
-        self._gain, self._sphere = content.gain, content.support == "sphere"
+    def __init__(self, content: Gaussians, x: np.ndarray, wanted: np.ndarray, faint: float, device: str) -> None:
+        self._sphere = content.support == "sphere"
         self._x = torch.from_numpy(x.astype(np.float64)).to(device)
-        self._wanted = self._put(values.astype(np.float64) / self._gain)
+        self._wanted = self._put(wanted)
         rows = least_turned(content.rows())
         centre = rows[:, STORED_CENTRE]
         order = np.argsort(morton_keys(np.rint((centre - centre.min(0)) * CODES / 4).astype(np.int64)))
@@ -123,7 +129,7 @@ class _Search:
         for layer in self._layers[:2]:
             self._inside.append(inputs @ self._put(layer))
             inputs = _with_one(self._inside[-1].sigmoid())
-        self._faint = faint / self._gain**2
+        self._faint = faint
         self._base = self._error(inputs @ self._put(self._layers[2]))
         # Change of the first layer's sums by one unit of each latent, and by one unit of its weight.
         first = self._layers[0][: self._latent.shape[1]]
@@ -163,7 +169,7 @@ class _Search:
         return np.array(units) * _SHARES
 
     def _rounded(self, steps: _Steps) -> tuple[WholeNumbers, float]:
-        """Returns the integers for given steps, and their mean squared error divided by the square of the gain."""
+        """Returns the integers for given steps, and the mean squared error of the network's outputs."""
         rows, latents, start = self._rows, self._latent.shape[1], STORED_LATENT.start
         step = np.concatenate([np.repeat(steps[:3], 3), steps.latent * self._of_latent])
         least = np.ptp(rows, axis=0) * (1.01 / CODES)

@@ -1,7 +1,7 @@
 """Generates the GLSL that decodes Gaussians from the buffers of `wlm.probe.gaussian.bundle`."""
 
 from wlm.probe.gaussian.model import LATENT, Gaussians
-from wlm.probe.glsl import buffer_glsl, sh_glsl
+from wlm.probe.glsl import buffer_glsl, clamp_glsl, sh_glsl
 from wlm.probe.sphere import sh_count
 
 HEAD_WORDS = 10  # words of the buffer `gaussians` before the bounds: see _TEMPLATE
@@ -23,7 +23,7 @@ _TEMPLATE = """\
 // Decodes light probes: 3D Gaussians with latents, summed at a point, and a small network
 // (Gaussian Compression for Precomputed Indirect Illumination, eq. 2 to 7). For GLSL 4.30 and later, with or without
 // Vulkan; include it below #version. It fits every model of this shape: latents of length {latent}, {hidden} units,
-// {outputs} numbers per probe, support {reach}. The document explains the rest; see "about" there.
+// {outputs} numbers per probe{form}, support {reach}. The document explains the rest; see "about" there.
 //
 // Buffer gaussians, 32-bit words, little-endian:
 //   0    origin, 3 floats, and extent; 4 size, 3 floats, and gain; 8 cut, a float; 9 count K, an integer
@@ -150,13 +150,15 @@ void wlm_probe_decode(float f[WLM_PROBE_LATENT], vec3 x, out float values[WLM_PR
         a[i] = wlm_probe_sigmoid(wlm_probe_outputs(b, WLM_PROBE_HIDDEN_FOURS, at));
         at += 1 + 4 * WLM_PROBE_HIDDEN_FOURS;
     }}
-    float gain = wlm_probe_float(7);
-    for (int i = 0; i < WLM_PROBE_OUTPUTS; i += 4) {{
+    float light = wlm_probe_float(7);
+    for (int i = 0; i < {columns}; i += 4) {{
         vec4 y = wlm_probe_outputs(a, WLM_PROBE_HIDDEN_FOURS, at);
         at += 1 + 4 * WLM_PROBE_HIDDEN_FOURS;
         for (int c = 0; c < 4 && i + c < WLM_PROBE_OUTPUTS; ++c)
-            values[i + c] = gain * y[c];
+            values[i + c] = y[c];{magnitude}
     }}
+    for (int i = 0; i < WLM_PROBE_OUTPUTS; ++i)
+        values[i] *= light;{clamp}
 }}
 
 // The numbers of a probe at x, from all Gaussians.
@@ -185,6 +187,11 @@ void wlm_probe_values_listed(vec3 x, int first, int count, out float values[WLM_
 #endif
 """
 
+_MAGNITUDE = """
+        // The last output is the logarithm of the magnitude.
+        if (i + 4 > WLM_PROBE_OUTPUTS)
+            light *= exp(min(y[{place}], 0.0));"""
+
 _LONGEST = """
     float longest = max(s.x, max(s.y, s.z));"""
 
@@ -193,7 +200,8 @@ def probe_glsl(content: Gaussians) -> str:
     """Returns the GLSL for models with the sizes of `content`: functions to be included below `#version`.
 
     Args:
-        content: Gaussians, of which only the latent, the hidden units, the outputs and the support matter.
+        content: Gaussians, of which only the latent, the hidden units, the outputs and their form, and the support
+            matter.
 
     Returns:
         GLSL 4.30, which is also valid Vulkan GLSL.
@@ -208,6 +216,10 @@ def probe_glsl(content: Gaussians) -> str:
         latent=latent,
         hidden=hidden,
         outputs=content.outputs,
+        columns=content.columns,
+        form=" and their magnitude" if content.relative else "",
+        magnitude=_MAGNITUDE.format(place=content.outputs % 4) if content.relative else "",
+        clamp=clamp_glsl(content.outputs),
         reach="a sphere" if sphere else "an ellipsoid",
         channels=channels,
         head=HEAD_WORDS,

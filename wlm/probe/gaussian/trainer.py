@@ -24,6 +24,7 @@ from wlm.probe.gaussian.model import (
 )
 from wlm.probe.model import Profile
 from wlm.probe.morton import morton_order
+from wlm.probe.relative import magnitudes, with_magnitude
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
 from wlm_kernels.probe.gaussians import SHAPE_NUMBERS, Shape
@@ -52,12 +53,13 @@ _BOX_MARGIN = 1e-6  # of the unit cube, so that rounding does not lose a probe a
 class Trainer:
     """A running fit of Gaussians and a network.
 
-    A step runs over all probes (eq. 8). There are three stages: first the Gaussians are trained freely; then their
-    numbers are rounded to codes in each step (section 3.3); then the Gaussians are fixed, and only the network is
-    trained.
+    A step runs over all probes (eq. 8); for a relative error, the loss is of the numbers of `with_magnitude`, one more
+    than a probe has. There are three stages: first the Gaussians are trained freely; then their numbers are rounded to
+    codes in each step (section 3.3); then the Gaussians are fixed, and only the network is trained.
 
     Attributes:
         device: "cpu" or "cuda:N".
+        relative: Whether the error is relative.
         steps: Number of steps of the whole fit.
         count: K, number of Gaussians.
         needed: bool [K], false where a Gaussian is dropped; all true before the last stage.
@@ -76,6 +78,9 @@ class Trainer:
         """
         self.device, self._cuda = device, device != "cpu"
         self.steps, self._name, self._support = profile.steps, profile.name, profile.support
+        self.relative, self._gain = profile.error == "relative", float(magnitudes(values).max())
+        if self.relative:
+            values = with_magnitude(values)
         self._probes, self._outputs = values.shape
         self._latent, self._hidden = profile.latent, profile.hidden
         self._layers = layer_shapes(self._latent, self._hidden, probe_network.padded(self._outputs))
@@ -285,12 +290,13 @@ class Trainer:
         return (h @ third[:-1] + third[-1])[:, : self._outputs]
 
     def mse(self) -> float:
-        """Returns the mean squared error of the live probes' numbers at the last step; NaN before the first."""
+        """Returns the mean squared error of the network's outputs at the last step; NaN before the first."""
         return float(self._tensors["loss"].sum()) * self._unit if self.step else math.nan
 
     def quantised(self) -> Gaussians:
         """Returns the fit with 16-bit codes, but without the integers for a file. The network's last layer yields the
-        probes' numbers divided by `gain`, the largest weight of this layer."""
+        probes' numbers divided by `gain`, the largest weight of this layer. Where the error is relative, it yields the
+        numbers of `with_magnitude`, and `gain` is the magnitude of the brightest probe."""
         d = self._outputs
         t = {key: self._tensors[key].cpu().numpy().astype(np.float64) for key in ("used", "bounds", "net")}
         low, high = t["bounds"]
@@ -300,13 +306,17 @@ class Trainer:
         first, second, third = split_layers(t["net"], self._layers)
         third = third[:, :d] * self.spread
         third[-1] += self.mean
-        gain = float(np.abs(third).max()) or 1.0
-        net = np.concatenate([first.ravel(), second.ravel(), third.ravel() / gain])
+        gain = self._gain
+        if not self.relative:
+            gain = float(np.abs(third).max()) or 1.0
+            third = third / gain
+        net = np.concatenate([first.ravel(), second.ravel(), third.ravel()])
         return Gaussians(
             latent=self._latent,
             hidden=self._hidden,
-            outputs=d,
+            outputs=d - self.relative,
             support=self._support,
+            relative=self.relative,
             gain=gain,
             code=code,
             levels=self._codes,

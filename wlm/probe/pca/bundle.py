@@ -4,7 +4,7 @@ import numpy as np
 
 from wlm.bundle import Bundle
 from wlm.probe.decode import Decoder
-from wlm.probe.glsl import buffer_glsl, sh_glsl
+from wlm.probe.glsl import buffer_glsl, clamp_glsl, sh_glsl
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import sh_count
 
@@ -12,8 +12,9 @@ _REFERENCES = 64
 
 _ABOUT = {
     "probe": "values = m * sum over k of c_k * b_k, with the magnitude m = exp(low_0 + step_0 * code_0) and the "
-    "coefficients c_k = low_k + step_k * code_k for k from 1 to the number of components. Codes are bytes. The basis "
-    "vectors b_k are half floats, or the unit vectors where basis is false.",
+    "coefficients c_k = low_k + step_k * code_k for k from 1 to the number of components. Of spherical harmonics the "
+    "first three values are clamped at 0. Codes are bytes. The basis vectors b_k are half floats, or the unit vectors "
+    "where basis is false.",
     "live": "The buffer probes holds live probes only, in the order of compression: live probe i is probe i of the set "
     "less the dead probes before it.",
     "between": "To read light between probes, fill a volume from them, or take the nearest probes.",
@@ -55,7 +56,8 @@ float wlm_probe_number(int probe, int column)
 void wlm_probe_values(int probe, out float values[WLM_PROBE_OUTPUTS])
 {{
     float magnitude = exp(wlm_probe_number(probe, 0));
-{body}}}
+{body}{clamp}
+}}
 """
 
 _BASIS = """\
@@ -67,13 +69,11 @@ _BASIS = """\
             vec2 pair = unpackHalf2x16(WLM_PROBE_PROBES({first} + k * {words} + d / 2));
             values[d] += coefficient * (d % 2 == 0 ? pair.x : pair.y);
         }}
-    }}
-"""
+    }}"""
 
 _UNIT = """\
     for (int d = 0; d < WLM_PROBE_OUTPUTS; ++d)
-        values[d] = magnitude * wlm_probe_number(probe, 1 + d);
-"""
+        values[d] = magnitude * wlm_probe_number(probe, 1 + d);"""
 
 
 def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
@@ -120,6 +120,7 @@ def component_glsl(count: int, outputs: int, basis: bool) -> str:
         columns=columns,
         count_basis=count if basis else 0,
         unit="" if basis else ", without a basis",
+        clamp=clamp_glsl(outputs),
         body=_BASIS.format(**layout) if basis else _UNIT,
         **layout,
     )

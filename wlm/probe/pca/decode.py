@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel, check_points
 from wlm.probe.pca.model import Components
+from wlm.probe.sphere import ambient_numbers
 from wlm.probe.volume.cascade import SIDE, Volume
 from wlm.probe.volume.light import at_probes
 from wlm.probe.volume.walk import settle
@@ -70,4 +71,5 @@ class ComponentDecoder(Decoder):
         return self
 
     def read(self, numbers: wp.array, values: wp.array) -> None:
-        decode_components(self._code, self._bounds, self._basis, self._row, numbers, values)
+        ambient = ambient_numbers(self.channels)
+        decode_components(self._code, self._bounds, self._basis, self._row, numbers, ambient, values)

@@ -5,8 +5,8 @@ coefficients.
 
 The magnitude of a probe is about the norm of its numbers, so that the precision follows the light of each probe. The
 directions b_k are the right singular vectors of all probes' numbers; with as many directions as numbers they are the
-unit vectors, which take no memory. This is the method of Sloan et al., Clustered Principal Components for Precomputed
-Radiance Transfer, 2003, with one cluster.
+unit vectors, which take no memory. Ambient light, the first three numbers of spherical harmonics, is clamped at 0. This
+is the method of Sloan et al., Clustered Principal Components for Precomputed Radiance Transfer, 2003, with one cluster.
 """
 
 from collections.abc import Mapping
@@ -17,6 +17,7 @@ import numpy as np
 
 from wlm.formats.parts import Part
 from wlm.probe.model import Content, Profile
+from wlm.probe.relative import norms
 
 ENOUGH = 0.02
 """Relative error at which no component is added: RMS over all probes of the error divided by the probe's norm."""
@@ -104,7 +105,7 @@ def fit_components(values: np.ndarray, most_bytes: int | None = None) -> tuple[C
     """
     values = values.astype(np.float64)
     live, outputs = values.shape
-    norm = _norm(values)
+    norm = norms(values)
     directions = np.linalg.svd(np.linalg.qr(values / norm.max(), mode="r"))[2]
     identity = component_bytes(live, outputs, outputs, identity=True)
     best, error = _coded(values, norm, directions[:1].astype(np.float16))
@@ -138,7 +139,7 @@ def _coded(values: np.ndarray, norm: np.ndarray, basis: np.ndarray) -> tuple[Com
         bounds=np.concatenate([bounds, ranges], 1),
         basis=basis,
     )
-    return components, float(np.sqrt(np.square(_norm(error) / norm).mean()))
+    return components, float(np.sqrt(np.square(norms(error) / norm).mean()))
 
 
 def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -154,11 +155,3 @@ def _quantised(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def _half_above(numbers: np.ndarray) -> np.ndarray:
     near = numbers.astype(np.float16)
     return np.where(near < numbers, np.nextafter(near, np.float16(np.inf)), near).astype(np.float64)
-
-
-def _norm(values: np.ndarray) -> np.ndarray:
-    """Returns the norms of rows; rows are scaled first, since squares of the smallest and largest floats would not
-    fit."""
-    largest = np.abs(values).max(1)
-    scaled = values / np.where(largest > 0, largest, 1.0)[:, None]
-    return largest * np.linalg.norm(scaled, axis=1)

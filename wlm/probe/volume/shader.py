@@ -127,7 +127,7 @@ vec3 wlm_volume_diffuse(vec3 p, vec3 n)
     vec3 sum = vec3(0.0, 0.0, 0.0);
     for (int c = 0; c < {coefficients}; ++c)
         sum += weight[c] * vec3(values[3 * c], values[3 * c + 1], values[3 * c + 2]);
-    return sum;
+    return max(sum, vec3(0.0, 0.0, 0.0)); // few bands ring below 0
 }}
 """
 

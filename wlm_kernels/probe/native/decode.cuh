@@ -1,5 +1,6 @@
 // The network of a block of points (gaussian-probe-compression, eq. 7), after layers.cuh: the partial sums of each point's
-// Gaussians are added in shared memory, and the outputs are written in rows.
+// Gaussians are added in shared memory, and the outputs are written in rows. Constants from wlm_kernels/probe/decode.py:
+// OUT numbers of a point, and one output more, D = OUT + 1, if that is the magnitude; AMBIENT of them are clamped at 0.
 // The reference is benchmarks/probe_exact.py; layers.cuh gives the reason for native code.
 
 const int t = threadIdx.x, first = block * P, part = t / P, point = t % P;
@@ -19,9 +20,12 @@ for (int turn = 0; turn < T / P; ++turn) {
 }
 forward(X, I, w1, A);
 forward(A, H, w2, B);
-last(B, w3, [&](int c, int p, float y) { E[c * LD + p] = gain * y; });
+last(B, w3, [&](int c, int p, float y) { E[c * LD + p] = y; });
 __syncthreads();
-for (int m = t; m < P * D; m += T) {
-    const int p = m / D;
-    if (first + p < count) out.data[size_t(first) * D + m] = E[m % D * LD + p];
+for (int m = t; m < P * OUT; m += T) {
+    const int p = m / OUT, c = m % OUT;
+    float value = gain * E[c * LD + p];
+    if (D > OUT) value *= expf(fminf(E[(D - 1) * LD + p], 0.0f));
+    if (c < AMBIENT) value = fmaxf(value, 0.0f);
+    if (first + p < count) out.data[size_t(first) * OUT + m] = value;
 }

@@ -9,7 +9,8 @@ vec3 wlm_diffuse(vec3 n, vec3 c[9])
 {
     vec3 light = 0.2820948 * c[0] + 0.3257350 * (n.y * c[1] + n.z * c[2] + n.x * c[3]);
     light += 0.2731371 * (n.x * n.y * c[4] + n.y * n.z * c[5] + n.x * n.z * c[7]);
-    return light + 0.0788479 * (3.0 * n.z * n.z - 1.0) * c[6] + 0.1365686 * (n.x * n.x - n.y * n.y) * c[8];
+    light += 0.0788479 * (3.0 * n.z * n.z - 1.0) * c[6] + 0.1365686 * (n.x * n.x - n.y * n.y) * c[8];
+    return max(light, vec3(0.0));  // few bands ring below 0
 }
 `;
 

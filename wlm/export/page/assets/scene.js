@@ -44,7 +44,7 @@ out vec3 v_radiance;
 ${DIFFUSE}
 void main()
 {
-    v_radiance = a_colour * max(wlm_diffuse(mat3(u_pose) * a_normal, u_sh), vec3(0.0));
+    v_radiance = a_colour * wlm_diffuse(mat3(u_pose) * a_normal, u_sh);
     gl_Position = u_camera * (u_pose * vec4(a_position, 1.0));
 }`;
 const PROBED = `${HEAD}
