@@ -121,9 +121,13 @@ GAUSSIANS = [
 ]
 COMPONENTS = [
     {"code": lambda part: part[:-1]},
-    {"bounds": put((1, 2), -1.0)},
-    {"bounds": put((0, 0), 100.0)},
-    {"bounds": put((0, 0), np.nan)},
+    {"code": put((0, 3), 1)},
+    {"code": put((1, 3), 255)},
+    {"width": put(2, 9)},
+    {"clusters": 2},
+    {"bounds": put((1, 0, 2), -1.0)},
+    {"bounds": put((0, 0, 0), 100.0)},
+    {"bounds": put((0, 0, 0), np.nan)},
     {"basis": put((0, 0), np.inf)},
     {"count": 28},
     {"count": 27},

@@ -31,7 +31,7 @@ from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
 from wlm.probe.gaussian.model import Gaussians
 from wlm.probe.model import Content, ProbeModel, Profile
-from wlm.probe.pca.model import Components
+from wlm.probe.pca.model import CLUSTERS, Components
 from wlm.system import Header, Name
 
 _METHODS: dict[str, type[Content]] = {each.METHOD: each for each in (Gaussians, Components)}
@@ -51,6 +51,7 @@ class _Header(Header):
     source: str = Field(pattern="^[0-9a-f]{8}$")
     profile: Profile
     count: int = Field(ge=1, le=PROBES)
+    clusters: int = Field(1, ge=1, le=CLUSTERS)
     dropped: int = Field(0, ge=0, le=PROBES)
     live: int | None = Field(None, ge=1, le=PROBES)
     positions: bool = False
@@ -134,7 +135,9 @@ def _table(header: _Header) -> dict[str, Part]:
         table["dead"] = Part(np.uint8, (-(-header.probes // 8),))
     if header.positions:
         table["positions"] = Part(np.uint16, (3, header.probes))
-    return table | _METHODS[header.profile.method].table(header.profile, header.outputs, header.count, live)
+    return table | _METHODS[header.profile.method].table(
+        header.profile, header.outputs, header.count, live, header.clusters
+    )
 
 
 def _planes(part: np.ndarray) -> bytes:

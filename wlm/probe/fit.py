@@ -112,21 +112,22 @@ def compress(
         **box,
     )
     values = probes.values[probes.live]
-    pca = Profile(name=profile.name, method="pca")
+    pca, relative = Profile(name=profile.name, method="pca"), profile.error == "relative"
     if profile.method == "pca":
-        model = make(profile=pca, content=fit_components(values)[0], choice="PCA, as the profile asks")
+        model = make(
+            profile=pca, content=fit_components(values, relative=relative)[0], choice="PCA, as the profile asks"
+        )
         return _measured(model, probes, device)[0]
     if profile.method == "auto":
         count = gaussian_count(profile.ratio, len(values))
         budget = gaussian_bytes(count, profile.latent, profile.hidden, profile.columns(probes.outputs))
-        components, error = fit_components(values, budget)
+        components, error = fit_components(values, budget, relative=relative)
         if error <= ENOUGH and components.nbytes <= budget:
             took = (
                 f"{components.count} components reach {error:.1%} of each probe's light in {components.nbytes:,} bytes"
             )
             choice = f"PCA: {took} of GPU memory, Gaussians take {budget:,}"
             return _measured(make(profile=pca, content=components, choice=choice), probes, device)[0]
-    relative = profile.error == "relative"
     check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, relative, device)
     gaussians = _fit_gaussians(make, probes, profile, seed, device, progress, checkpoint)
     gaussians, error = _measured(gaussians, probes, device)
@@ -134,7 +135,7 @@ def compress(
         return gaussians
     most = gaussians.content.nbytes
     told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
-    components, _ = fit_components(values, most)
+    components, _ = fit_components(values, most, relative=relative)
     if components.nbytes > most:
         return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
     rival, possible = _measured(make(profile=pca, content=components), probes, device)

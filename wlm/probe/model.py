@@ -90,7 +90,7 @@ class Content(ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, int]:
-        """Returns entries of a file's header: `count` of Gaussians or components, and `dropped` Gaussians."""
+        """Returns entries of a file's header: `count` of Gaussians or components, `clusters`, and `dropped` Gaussians."""
 
     @abstractmethod
     def parts(self) -> dict[str, np.ndarray]:
@@ -102,8 +102,9 @@ class Content(ABC):
 
     @classmethod
     @abstractmethod
-    def table(cls, profile: Profile, outputs: int, count: int, live: int) -> dict[str, Part]:
-        """Returns the types and shapes of these arrays, by name, for `count` Gaussians or components and `live` probes.
+    def table(cls, profile: Profile, outputs: int, count: int, live: int, clusters: int) -> dict[str, Part]:
+        """Returns the types and shapes of these arrays, by name, for `count` Gaussians, or components of each of
+        `clusters`, and `live` probes.
 
         Raises:
             ValueError: There are more components than numbers of a probe.

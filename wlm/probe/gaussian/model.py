@@ -181,7 +181,7 @@ class Gaussians(Content):
         return {"count": self.count, "dropped": self.dropped}
 
     @classmethod
-    def table(cls, profile: Profile, outputs: int, count: int, live: int) -> dict[str, Part]:
+    def table(cls, profile: Profile, outputs: int, count: int, live: int, clusters: int) -> dict[str, Part]:
         channels = STORED_LATENT.start + profile.latent
         shapes = layer_shapes(profile.latent, profile.hidden, profile.columns(outputs))
         weights = sum(rows * columns for rows, columns in shapes)

@@ -29,8 +29,9 @@ class ComponentDecoder(Decoder):
         super().__init__(model, device, position=position)
         content = model.content
         assert isinstance(content, Components)
-        self._code = self._put(content.code, wp.uint8)
-        self._bounds = self._put(content.bounds, float)
+        self._codes = self._put(content.packed(), wp.uint32)
+        self._place = self._put(content.places(), wp.vec2i)
+        self._bounds = self._put(np.moveaxis(content.bounds, 0, 2), wp.vec2)
         self._basis = self._put(content.basis, wp.float16)
         live = model.live
         row = np.where(live, np.cumsum(live) - 1, -1)
@@ -72,4 +73,4 @@ class ComponentDecoder(Decoder):
 
     def read(self, numbers: wp.array, values: wp.array) -> None:
         ambient = ambient_numbers(self.channels)
-        decode_components(self._code, self._bounds, self._basis, self._row, numbers, ambient, values)
+        decode_components(self._codes, self._place, self._bounds, self._basis, self._row, numbers, ambient, values)
