@@ -61,17 +61,11 @@ def free_memory(device: wp.Device) -> int:
 
 
 def to_warp(tensor: torch.Tensor, dtype: Any = None) -> wp.array:
-    """Wraps a tensor as a Warp array, without a copy and without a gradient array.
+    """Wraps a tensor as a Warp array, without a copy and without a gradient array; it keeps the tensor's memory alive.
 
-    Wrap once and keep the array: a raw tensor as a launch argument makes every launch three times as expensive.
-    A gradient buffer is wrapped by a separate call, `to_warp(tensor.grad)`.
-
-    Args:
-        tensor: A tensor of any strides; trailing dimensions that become a vector or matrix must be contiguous.
-        dtype: The Warp type of an element, a vector or matrix type for example; default the tensor's number type.
-
-    Returns:
-        An array that shares the tensor's memory and keeps it alive.
+    Wrap once and keep the array: a raw tensor as a launch argument makes every launch three times as expensive. A
+    gradient buffer is wrapped by a separate call, `to_warp(tensor.grad)`. The tensor may have any strides, but trailing
+    dimensions that become a vector or matrix, by the Warp type `dtype` of an element, must be contiguous.
     """
     # Wrapping a tensor doesn't initialise Warp, unlike every other call.
     wp.init()

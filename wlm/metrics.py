@@ -65,14 +65,8 @@ BRIGHTER = 10.0
 def check_pair(
     ref: np.ndarray, test: np.ndarray, mask: np.ndarray | None, where: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Checks a reference, a test image and a mask, and returns them as float64, float64 and bool.
-
-    Args:
-        ref: `[H, W, C]`, linear.
-        test: `[H, W, C]`, linear.
-        mask: `[H, W]`, or None for all texels.
-        where: Name of this pair in error messages ("city 12 h").
-    """
+    """Checks a reference and a test image, [H, W, C], and a mask [H, W], None for all texels, and returns them as
+    float64, float64 and bool; `where` names the pair in messages ("city 12 h")."""
     ref = np.asarray(ref, np.float64)
     test = np.asarray(test, np.float64)
     if ref.ndim != 3 or ref.shape != test.shape:
@@ -162,18 +156,12 @@ def flip_display(ref: np.ndarray, test: np.ndarray) -> np.ndarray:
 
 
 def flip_filled(ref: np.ndarray, test: np.ndarray, span: tuple[float, float] | None) -> np.ndarray:
-    """Computes the HDR-FLIP error at every texel, at flip_evaluator's default of 67 pixels per degree.
+    """Computes the HDR-FLIP error at every texel, float64 [H, W] in [0, 1], at flip_evaluator's default of 67 pixels
+    per degree.
 
-    Negative values count as zero. If no valid texel of the reference is above zero, no exposure can be chosen: the
-    error is zero if the test is black too, else LDR-FLIP between black and the test clipped to [0, 1].
-
-    Args:
-        ref: `[H, W, 3]`, linear RGB, finite; texels outside the mask hold the nearest valid value.
-        test: `[H, W, 3]`, linear RGB, equal to `ref` outside the mask.
-        span: Result of `flip_exposures`.
-
-    Returns:
-        `[H, W]` float64 in [0, 1], 0 where no difference is visible.
+    Both images are linear RGB [H, W, 3]; texels outside the mask hold the nearest valid value in both. Negative values
+    count as zero. If no valid texel of the reference is above zero, `flip_exposures` gives no `span`: the error is zero
+    if the test is black too, else LDR-FLIP between black and the test clipped to [0, 1].
     """
     import flip_evaluator  # imported here because the import is slow
 

@@ -165,16 +165,8 @@ def doubts(light: np.ndarray) -> list[str]:
 
 
 def repair(frame: np.ndarray, mask: np.ndarray, where: str) -> list[str]:
-    """Replaces non-finite values and clamps a lightmap to [0, 65504], half float's range, in place.
-
-    Args:
-        frame: [H, W, 3], linear.
-        mask: bool [H, W], the valid texels; changes to other texels aren't reported.
-        where: Name of the lightmap in the error.
-
-    Returns:
-        One line with the count for each kind of change to valid texels.
-    """
+    """Replaces non-finite values of a lightmap [H, W, 3], in place, and clamps it to [0, 65504], half float's range;
+    returns one line with the count for each kind of change to the valid texels of the mask."""
     notes, good = [], mask
     with np.errstate(invalid="ignore"):
         least, greatest = float(frame.min()), float(frame.max())  # NaN if there is one

@@ -19,9 +19,9 @@ import wlm
 from wlm.formats import scratch
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import read_exr, write_exr, write_planes
+from wlm.formats.hours import hours_of_names
 from wlm.formats.light import read_light
 from wlm.lightmap.data import Layer, LightmapSet, from_layers, parse_times
-from wlm.lightmap.hours import hours_of_names
 
 HEIGHT, WIDTH = 5, 7
 TIMES = (0.0, 6.5, 18.55)

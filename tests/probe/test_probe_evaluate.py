@@ -56,7 +56,7 @@ def test_the_scores_are_those_of_plain_sums(pair):
     lengths = [math.dist(row, [0.0] * 27) for row in probes.values.tolist()]
     typical = math.exp(sum(math.log(length) for length in lengths if length) / 48)
     relative = [
-        math.dist(a, b) / math.hypot(c, 1e-3 * typical) for a, b, c in zip(decoded, probes.values, lengths, strict=True)
+        math.dist(a, b) / math.hypot(c, 1e-4 * typical) for a, b, c in zip(decoded, probes.values, lengths, strict=True)
     ]
     worst = int(np.argmax(relative))
     assert report.worst_probe == {

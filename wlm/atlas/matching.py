@@ -257,13 +257,8 @@ def misfits(
     or the lightmap turned or mirrored, make it clearly smoother in the charts, light and charts lie apart, or the
     charts leave nearly all of the light out.
 
-    Args:
-        name: The lightmap's name.
-        lightmap, position, triangle, uv: The light, and the mesh with the UVs in [0, 1] that are used.
-        chart: The chart at each texel with these UVs, see `chart_map`.
-        used: Words for these UVs.
-        alternatives: Words and UVs [V, 2] to compare with. The UVs that are used, stretched to the lit texels, are
-            compared too.
+    `chart` is the chart at each texel with the mesh's UVs in [0, 1], see `chart_map`, and `used` words for these UVs.
+    `alternatives` are words and UVs [V, 2] to compare with, besides the UVs that are used, stretched to the lit texels.
     """
     step = -(-max(lightmap.shape[:2]) // _EXAMINED)
     light = lightmap[::step, ::step]

@@ -329,13 +329,11 @@ def slot_readings(
 def settle(
     document: GltfDocument, primitives: Sequence[GltfPrimitive], readings: Readings
 ) -> tuple[GltfDocument, list[GltfPrimitive], int, dict[int, tuple[int, Rectangle]]]:
-    """Makes all readings of a node one rectangle of one UV set.
+    """Makes all readings of a node one rectangle of one UV set; returns the document, its primitives, n of the UV set,
+    and by node the number of its sheet and its rectangle.
 
     Where they are not, because a transform turns, a node's materials have different transforms, or slots read different
     sets, the moved UVs are added to a copy of the document as a new UV set.
-
-    Returns:
-        The document, its primitives, n of the UV set, and by node the number of its sheet and its rectangle.
     """
     by_node: dict[int, set[Reading | None]] = {}
     for each in primitives:

@@ -100,13 +100,8 @@ class _Outside:
 
 
 def irradiance(scene: Any, texels: Any, tracing: Tracing, *, report: Any = None) -> Gathered:
-    """Computes irradiance at the texels of a lightmap, as the mean over their sample positions.
-
-    `report` is called with the finished share of the work.
-
-    Returns:
-        Estimates with three channels, RGB.
-    """
+    """Computes irradiance, RGB, at the texels of a lightmap, as the mean over their sample positions; `report` is
+    called with the finished share of the work."""
     places = [mi.Point3f(texels.position.T), mi.Vector3f(texels.normal.T), mi.Vector3f(texels.face.T)]
     first = mi.UInt32(texels.first[:-1].astype(np.uint32))
     count = mi.UInt32(np.diff(texels.first).astype(np.uint32))

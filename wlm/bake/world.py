@@ -23,17 +23,8 @@ _DAY = 24.0
 
 
 def make_hour(scene: BakeScene, geometry: Geometry, picture: np.ndarray | None, hour: float) -> tuple[Any, Tracing]:
-    """Builds the Mitsuba scene with the lights of one hour.
-
-    Args:
-        scene: The settings.
-        geometry: The surfaces.
-        picture: The environment map, float32 [H, W, 3], or None.
-        hour: The hour of the day, as in `scene.hours`.
-
-    Returns:
-        Mitsuba's scene with all lights except the sun and uniform ambient light, and settings that include these two.
-    """
+    """Builds Mitsuba's scene with the lights of one hour of `scene.hours`, except the sun and uniform ambient light,
+    and settings that include these two; `picture` is the environment map, float32 [H, W, 3], or None."""
     content: dict[str, Any] = {"type": "scene"}
     glowing = {lamp.material: lamp.radiance if lamp.is_lit(hour) else (0.0, 0.0, 0.0) for lamp in scene.lamps}
     for i, surface in enumerate(geometry.surfaces):

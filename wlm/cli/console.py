@@ -262,16 +262,10 @@ def running(
     """Shows the progress of long work and, if it has a checkpoint, lets a signal stop it between two steps.
 
     The output of the work must be written inside the block, so that a signal cannot interrupt it. A stage whose name
-    differs from `what` gets its own bar, named `what: stage`.
-
-    Args:
-        what: Name of the work in a word or two.
-        checkpoint: The file that keeps an interrupted run; None: Ctrl-C and SIGTERM end the work at once.
-        unit: Name of a step, for messages, such as "frame".
-        whole: Whether a signal waits for the end of a step; False for steps that write their results by themselves.
-
-    Yields:
-        A function to call with a `Progress`. If a signal stops the work later, a line says how to continue.
+    differs from `what` gets its own bar, named `what: stage`. Without a checkpoint Ctrl-C and SIGTERM end the work at
+    once; `unit` is the name of a step, such as "frame", and `whole` tells whether a signal waits for its end, not so
+    for steps that write their results by themselves. Yields a function to call with a `Progress`. If a signal stops the
+    work later, a line says how to continue.
     """
     last: Any = None
     hold = checkpoint is not None and whole

@@ -57,9 +57,17 @@ def fit(
 
 
 def export(
-    file: Path, output: Path, engine: str | None, shader: str | None, exact: bool, device: str, **options: Any
+    file: Path,
+    output: Path,
+    engine: str | None,
+    shader: str | None,
+    exact: bool,
+    device: str,
+    time: float | None = None,
+    **options: Any,
 ) -> None:
-    """Exports a model to a folder and lists the written files. `options` that are None are left out.
+    """Exports a model to a folder and lists the written files. `time` is that of light probes with several hours.
+    `options` that are None are left out.
 
     Raises:
         WlmError: An option has no meaning for the engine, or the folder cannot be written.
@@ -72,7 +80,7 @@ def export(
     from wlm.system import load
 
     given = {name: value for name, value in options.items() if value is not None}
-    model = load(file)
+    model = load(file) if time is None else load(file).at(time)
     show_files(output, export(model, output, engine, shader=shader or "glsl", exact=exact, device=device, **given))
 
 

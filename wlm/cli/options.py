@@ -66,7 +66,10 @@ Key = Annotated[
     str | None,
     typer.Option(help="Name of the array of light to read from a probe file with several, such as one an hour."),
 ]
-
+Time = Annotated[
+    float | None,
+    typer.Option(metavar="HOUR", help="Hour of the day of light probes that have several; may be between two of them."),
+]
 
 Weights = Annotated[
     list[str] | None,

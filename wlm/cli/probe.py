@@ -26,7 +26,6 @@ from wlm.cli.options import (
     Device,
     Engine,
     ExactShader,
-    Key,
     ModelFile,
     Profile,
     ReportFile,
@@ -34,6 +33,7 @@ from wlm.cli.options import (
     SceneFile,
     Seed,
     ShaderLanguage,
+    Time,
     output_option,
 )
 from wlm.cli.settings import with_settings
@@ -55,6 +55,12 @@ _Order = Annotated[
         "default as their shape shows, or as fits light."
     ),
 ]
+_Keys = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--key", help="Name of the array of light in PROBES, if there are several; repeat it for hours; default all."
+    ),
+]
 _At = Annotated[
     Path | None,
     typer.Option(metavar="PROBES", help="File with the positions of the probes, for a FILE.wlm that stores none."),
@@ -71,7 +77,7 @@ def compress(
     positions: Annotated[
         bool, typer.Option("--positions", help="Also store the positions of the probes, 16 bits per axis.")
     ] = False,
-    key: Key = None,
+    key: _Keys = None,
     convention: _Convention = None,
     order: _Order = None,
     seed: Seed = 0,
@@ -88,7 +94,9 @@ def compress(
     def load() -> "ProbeSet":
         from wlm.probe import load
 
-        return load(probes, key=key, convention=convention, order=order)
+        return load(probes, key=key or None, convention=convention, order=order)
+
+    from wlm.probe.hours import listed_times
 
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every, "positions": positions}
     data, model, facts = models.fit("probe", load, output, profile, settings, **options)
@@ -97,6 +105,7 @@ def compress(
         "share of float32": f"{size / data.float_bytes:.2%}",
         "bits per probe": f"{size * 8 / data.probes:.2f}",
         "method": model.method,
+        **({"hours": listed_times(model.times)} if len(model.times) else {}),
         **model.content.facts(),
     }
     show_facts(model.name, facts)
@@ -117,12 +126,16 @@ def evaluate(
         int, typer.Option(help="Number of pictures to render and score, of balls at probes and of --mesh; 0: none.")
     ] = 0,
     mesh: SceneFile = None,
-    key: Key = None,
+    time: Time = None,
+    key: _Keys = None,
     convention: _Convention = None,
     order: _Order = None,
     device: Device = "cpu",
 ) -> None:
-    """Compare compressed probes with the original: PSNR of the coefficients and of the irradiance, and sizes."""
+    """Compare compressed probes with the original: PSNR of the coefficients and of the irradiance, and sizes.
+
+    --volume and --views compare the light at one hour, --time.
+    """
     if json_path is not None:
         check_output(json_path, ".json")
     quiet_warp()
@@ -131,15 +144,17 @@ def evaluate(
     from wlm.system import load as load_model
 
     model = load_model(file, "probe")
-    probes = load(probes_path, key=key, convention=convention, order=order)
+    probes = load(probes_path, key=key or None, convention=convention, order=order)
     note_warnings(probes.warnings)
+    drawn = views or mesh is not None
+    one = (model.at(time), probes.at(time)) if drawn or volume else (model, probes)
     with running("evaluate") as progress:
         size = file.stat().st_size
         report = evaluate(model, probes, device=device, progress=progress, file_bytes=size)
     if not probes.source.startswith(model.source):
         note(f"warning: {probes_path}: not the input that {file} was made from; check the file, --key and --convention")
-    pictures = score_pictures(model, probes, views, mesh, device) if views or mesh is not None else []
-    walks = score_walks(model, probes, device) if volume else {}
+    pictures = score_pictures(*one, views, mesh, device) if drawn else []
+    walks = score_walks(*one, device) if volume else {}
     if json_path is not None:
         content = report.to_json() | ({"volume": walks} if walks else {})
         write_json(json_path, content | ({"views": [score.to_json() for score in pictures]} if pictures else {}))
@@ -156,6 +171,7 @@ def decode(
         Path | None,
         typer.Option(metavar="PROBES", help="File with the positions to decode at; default those stored in FILE.wlm."),
     ] = None,
+    time: Time = None,
     convention: Annotated[str, typer.Option(help=f"SH convention of the output: {_CONVENTIONS}.")] = "threejs",
     original: _At = None,
     device: Device = "cpu",
@@ -171,7 +187,7 @@ def decode(
     from wlm.probe.places import positions_of
     from wlm.system import load
 
-    model = load(file, "probe")
+    model = load(file, "probe").at(time)
     position = model.stored_positions() if positions is None else load_positions(positions)
     own = positions is None or model.has_probes_at(position)
     given = position if own and positions is not None else positions_of(model, original)
@@ -205,11 +221,12 @@ def export(
         Literal["x", "y", "z"] | None,
         typer.Option(help="With --engine unity: axis to mirror, as Unity is left-handed."),
     ] = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write light probes for an engine: buffers and a shader, or with --engine a grid or probes that it can load."""
     options = {"original": original, "cells": cells, "mirror": mirror}
-    models.export(file, output, engine, shader, exact, device, **options)
+    models.export(file, output, engine, shader, exact, device, time, **options)
 
 
 def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> None:
@@ -230,6 +247,7 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
             "probes": model.probes,
             "dead_probes": int((~model.live).sum()),
             "numbers_per_probe": model.outputs,
+            **({"hours": model.times.tolist()} if len(model.times) else {}),
             "bits_per_probe": file.stat().st_size * 8 / model.probes,
             "positions_stored": model.has_positions,
             "GPU_bytes": model.content.nbytes,
@@ -245,11 +263,15 @@ def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
     rows = table(str(file), ["", *columns])
     psnr = (number(value, ".2f") for value in (report.psnr, report.psnr_live, report.irradiance_psnr))
     sizes = (f"{report.bytes:,}", f"{report.ratio:.2%}", f"{report.bits_per_probe:.2f}")
-    rows.add_row(f"wlm {escape(model.profile.name)}", *psnr, *sizes)
+    worst = ", the worst hour" if report.hours else ""
+    rows.add_row(f"wlm {escape(model.profile.name)}{worst}", *psnr, *sizes)
     if report.psnr_by_band is not None:
         rows.add_section()
         for band, value in enumerate(report.psnr_by_band):
             rows.add_row(f"SH band {band}", number(value, ".2f"))
+    for hour in report.hours:
+        figures = (number(hour[name], ".2f") for name in ("psnr", "psnr_live", "irradiance_psnr"))
+        rows.add_row(f"at {hour['time']:g} h", *figures)
     rows.add_section()
     if report.between_psnr is not None:
         rows.add_row("half-way between probes", number(report.between_psnr, ".2f"))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from wlm.cli.console import number, quiet_warp, running, show, show_files, table
-from wlm.cli.options import Device, Key, ModelFile, output_option
+from wlm.cli.options import Device, Key, ModelFile, Time, output_option
 
 if TYPE_CHECKING:
     from wlm.probe import ProbeModel, ProbeSet
@@ -42,6 +42,7 @@ def volume(
         float | None, typer.Option(help="Side of the finest blocks in world units; default by the probes' spacing.")
     ] = None,
     key: Key = None,
+    time: Time = None,
     device: Device = "cpu",
 ) -> None:
     """Write a volume of light around a viewer, coarser farther away: buffers, an index, and a shader that reads them.
@@ -58,8 +59,8 @@ def volume(
     from wlm.probe.volume.walk import settle
     from wlm.system import load
 
-    model = load(file, "probe")
-    known = probes_of(model, probes_path, key)
+    model = load(file, "probe").at(time)
+    known = probes_of(model, probes_path, key, time)
     light = model.decoder(device).light(known.position)
     made = Volume(known.position, light, live=known.live, normal=known.normal, block=block)
     lit = known.position[known.live]

@@ -17,12 +17,10 @@ def exit_code() -> int:
 
 @contextmanager
 def handled(after: signal.Handlers | None = None) -> Iterator[None]:
-    """Makes the first Ctrl-C or SIGTERM raise KeyboardInterrupt, and the second end the process.
+    """Makes the first Ctrl-C or SIGTERM raise KeyboardInterrupt, and the second end the process; `after` handles the
+    signals after the block, None restores the earlier handlers.
 
     Only the main thread receives signals; in another thread this changes nothing.
-
-    Args:
-        after: Handler of the signals after the block; None restores the earlier ones.
     """
     global _received
     if threading.current_thread() is not threading.main_thread():

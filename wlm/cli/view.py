@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from wlm.cli.console import check_output, quiet_warp, running, show, table
-from wlm.cli.options import Key, Original, SceneFile, Up
+from wlm.cli.options import Key, Original, SceneFile, Time, Up
 from wlm.errors import WlmError
 
 _SLIDERS = ("hour", "frame", "turn", "height", "sigma", "exposure", "error")
@@ -25,6 +25,7 @@ def view(
     mesh: SceneFile = None,
     original: Original = None,
     key: Key = None,
+    time: Time = None,
     view: Annotated[
         str | None,
         typer.Option(help="Picture to show: light or tiles of lightmaps; balls, gaussians or volume of probes."),
@@ -73,7 +74,7 @@ def view(
     from wlm.view.window import Window
 
     need("pyvista", "view")
-    options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "flat": flat, "up": up}
+    options = {"mesh": mesh, "original": original, "key": key, "time": time, "walk": walk, "flat": flat, "up": up}
     options["block"] = values.pop("block", None)
     with running("view") as progress:
         many = len(files) > 1 or files[0].is_dir()

@@ -7,7 +7,7 @@ import typer
 from rich.markup import escape
 
 from wlm.cli.console import check_output, quiet_warp, running, show, table
-from wlm.cli.options import Key, Original, SceneFile, Up, output_option
+from wlm.cli.options import Key, Original, SceneFile, Time, Up, output_option
 
 
 def web(
@@ -23,6 +23,7 @@ def web(
     mesh: SceneFile = None,
     original: Original = None,
     key: Key = None,
+    time: Time = None,
     hours: Annotated[
         int, typer.Option(min=1, help="Most original lightmaps in the page, evenly spread over the times.")
     ] = 6,
@@ -34,7 +35,7 @@ def web(
     quiet_warp()
     from wlm.export import write_page
 
-    options = {"mesh": mesh, "original": original, "key": key, "hours": hours, "rate": rate, "up": up}
+    options = {"mesh": mesh, "original": original, "key": key, "time": time, "hours": hours, "rate": rate, "up": up}
     with running("page") as progress:
         size = write_page(output, files, **options, progress=progress)
     rows = table(str(files[0]), ["page", "bytes"])

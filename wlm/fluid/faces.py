@@ -37,15 +37,11 @@ class Face:
 def make_face(
     shape: tuple[int, int, int], name: str, kind: int, velocity=(0.0, 0.0, 0.0), density=None, where=None
 ) -> Face:
-    """Makes the condition of kind `kind`, such as `lattice_links.BOUNCE`, on a face of a box of `shape` cells.
+    """Makes the condition of kind `kind`, such as `lattice_links.BOUNCE`, on the face `name` of `FACES` of a box of
+    `shape` cells.
 
-    Args:
-        shape: Cells of the box along x, y and z.
-        name: One of `FACES`.
-        kind: The kind of boundary.
-        velocity: Velocity of a wall or an inlet in cells per step, (3,) or [A, B, 3].
-        density: Density to which an outlet relaxes, above 0; None for the other kinds.
-        where: bool [A, B], false where the face is a wall at rest instead; None: true everywhere.
+    `velocity` is that of a wall or an inlet in cells per step, (3,) or [A, B, 3]; `density`, above 0, that to which an
+    outlet relaxes; `where`, bool [A, B], is false where the face is a wall at rest instead.
     """
     if name not in FACES:
         raise ValueError(f"face: expected one of {', '.join(FACES)}, got {name!r}")

@@ -78,16 +78,9 @@ def choose(
     """Chooses the grids of the density and of the temperature by their names and classes.
 
     The density is the grid `density`, else the only one with a name of smoke, else the only one whose name is that of
-    no other quantity. A level set is chosen only by its name.
-
-    Args:
-        where: Name of the file or folder in messages.
-        heads: Its grids.
-        density, temperature: Names that are given; None: chosen.
-
-    Returns:
-        The name of the density's grid, that of the temperature's if there is one, and warnings for grids that were
-        chosen by another name than `density`.
+    no other quantity. A level set is chosen only by its name. `where` names the file or folder in messages. Returns the
+    name of the density's grid, that of the temperature's if there is one, and warnings for grids that were chosen by
+    another name than `density`.
     """
     found = one_line(", ".join(map(str, heads[:_MOST_NAMES])), 400) or "no grid"
     first = {head.name: head for head in reversed(heads)}

@@ -99,17 +99,11 @@ SHARES.flags.writeable = False
 
 
 def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Packs endpoints and indices into blocks.
+    """Packs endpoints, uint8 [..., 2, 4], RGBA, and indices, uint8 [..., 16] in 0..15, row-major, into blocks, uint8
+    [..., 16]; the four bytes of an endpoint share their lowest bit.
 
-    The file requires an index below 8 for texel 0. Where it is larger, the endpoints are swapped and the indices
-    become 15 - index, which decodes to the same texels.
-
-    Args:
-        endpoints: uint8 [..., 2, 4], RGBA; the four bytes of an endpoint share their lowest bit.
-        indices: uint8 [..., 16] in 0..15, row-major.
-
-    Returns:
-        The blocks, uint8 [..., 16].
+    The file requires an index below 8 for texel 0. Where it is larger, the endpoints are swapped and the indices become
+    15 - index, which decodes to the same texels.
     """
     if endpoints.dtype != np.uint8 or indices.dtype != np.uint8:
         raise ValueError(f"endpoints, indices: expected uint8, got {endpoints.dtype} and {indices.dtype}")

@@ -48,13 +48,8 @@ def read_channels(
 
 
 def read_encoded(path: str | os.PathLike[str], encoding: str, notes: list[str] | None = None) -> np.ndarray:
-    """Reads the light of a picture by an encoding of the module's table: linear, float32 [H, W, 3], the top row first.
-
-    Args:
-        path: The file.
-        encoding: The encoding, such as "srgb" or "rgbm:16:1".
-        notes: Each assumption, and each doubt about the encoding, adds a line.
-    """
+    """Reads the light of a picture by an encoding of the module's table, such as "srgb" or "rgbm:16:1": linear, float32
+    [H, W, 3], the top row first. Each assumption, and each doubt about the encoding, adds a line to `notes`."""
     notes = [] if notes is None else notes
     name, largest, gamma = parse_encoding(encoding)
     if name == _LAYER:

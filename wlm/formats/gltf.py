@@ -179,16 +179,11 @@ def document_from_arrays(
 def document_from_meshes(
     meshes: Sequence[Arrays], name: str, uv_set: int = 0
 ) -> tuple[GltfDocument, list[GltfPrimitive]]:
-    """Makes a glTF document of several meshes, each with its own node.
+    """Makes a glTF document of several meshes, at least one, each with its own node; returns it with its primitives,
+    one for each mesh.
 
-    Args:
-        meshes: At least one: name; positions [V, 3], stored as float32; triangles int [F, 3], at least one; and UVs
-            [V, 2], u right, v down, stored as float32 in all UV sets up to `uv_set`.
-        name: Name of the document.
-        uv_set: n of the last `TEXCOORD_n`.
-
-    Returns:
-        The document and its primitives, one for each mesh.
+    A mesh has a name; positions [V, 3], stored as float32; triangles int [F, 3], at least one; and UVs [V, 2], u right,
+    v down, stored as float32 in all UV sets up to `TEXCOORD_n` with n = `uv_set`.
     """
     views, accessors, data, primitives = [], [], [], []
     nodes, trees, start = [], [], 0

@@ -33,17 +33,8 @@ def is_fallback(buffer: dict[str, Any]) -> bool:
 def unpack(
     path: str | os.PathLike[str], content: dict, buffers: Sequence[bytes], components: dict[int, str]
 ) -> tuple[dict, tuple[bytes, ...]]:
-    """Decompresses the buffer views and primitives of a glTF tree.
-
-    Args:
-        path: The file, for messages.
-        content: The JSON tree.
-        buffers: The bytes of each buffer.
-        components: NumPy types of component types.
-
-    Returns:
-        The tree and the buffers; those that were given if nothing is compressed.
-    """
+    """Decompresses the buffer views and primitives of a glTF tree, with the bytes of each buffer and the NumPy types of
+    component types; returns the tree and the buffers, those that were given if nothing is compressed."""
     stated = (*content.get("extensionsUsed", []), *content.get("extensionsRequired", []))
     used = [name for name in (DRACO, *MESHOPT) if name in stated]
     if not used:

@@ -59,14 +59,11 @@ _FIRST = 12  # bytes that identify a format
 
 
 def read_light(path: str | os.PathLike[str], notes: _Notes | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a picture of linear light in the primaries of Rec. 709, whatever its suffix.
+    """Reads a picture of linear light in the primaries of Rec. 709, whatever its suffix, float32 [H, W, 3 or 4], the
+    top row first; returns it and the names of the channels, ("R", "G", "B") or ("R", "G", "B", "A").
 
     NaN, infinity and negative values are kept: the caller checks them. Each assumption and each conversion adds a line
     to `notes`.
-
-    Returns:
-        The pixels, float32 [H, W, 3 or 4], the top row first, and the names of the channels, ("R", "G", "B") or ("R",
-        "G", "B", "A").
     """
     with open_file(path, "the lightmap") as file:
         first = file.read(_FIRST)

@@ -35,12 +35,10 @@ DAMAGED_PICTURE = (
 
 
 def read_mask(path: Path, beside: str | os.PathLike[str], size: tuple[int, int], others: str = "") -> np.ndarray:
-    """Reads a PNG as a mask, bool [H, W]: true where any colour channel is above 0.
+    """Reads a PNG, of a height and width `size`, as a mask, bool [H, W]: true where any colour channel is above 0.
 
-    Args:
-        beside: Path of the lightmap to which the mask belongs, for messages.
-        size: Expected height and width in texels.
-        others: Text after "expected a PNG" in the message of a missing file, for example "or alpha in the lightmap".
+    In messages `beside` is the path of its lightmap, and `others` follows "expected a PNG", for example "or alpha in
+    the lightmap".
     """
     data = read_file(path, IMAGE_BYTES, f"the mask (expected a PNG of {size[1]}x{size[0]}{others})")
     # `Image.open` would try the readers of other formats and refuse masks of 16384 x 16384. From a file on disk, Pillow

@@ -33,13 +33,8 @@ def header_of(path: str | os.PathLike[str], head: bytes) -> tuple[int, int, int,
 
 
 def read_pfm(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a PFM picture.
-
-    `notes` gets a line if the picture is grey or states a unit.
-
-    Returns:
-        The pixels, float32 [H, W, 3], the top row first, and the names of the channels. Grey is repeated.
-    """
+    """Reads a PFM picture, float32 [H, W, 3], the top row first, grey repeated; returns it and the names of the
+    channels. `notes` gets a line if the picture is grey or states a unit."""
     with open_file(path, "the PFM picture") as file:
         held = os.fstat(file.fileno()).st_size
         width, height, channels, scale, start = header_of(path, file.read(_HEADER_BYTES))

@@ -40,13 +40,11 @@ _SINGULAR = 1e3  # condition number of primaries that are no longer distinct; th
 
 
 def to_rec709(pixels: np.ndarray, chromaticities: Sequence[float], where: str, notes: list[str]) -> None:
-    """Converts linear light, float32 [..., at least 3], to the primaries of Rec. 709, in place.
+    """Converts linear light, float32 [..., at least 3], to the primaries of Rec. 709, in place; channels after the
+    third are kept.
 
-    Args:
-        pixels: The light; channels after the third are kept.
-        chromaticities: x, y of red, green, blue and white.
-        where: The file and its field, for messages.
-        notes: A line is added if the chromaticities are not those of Rec. 709.
+    `chromaticities` are x, y of red, green, blue and white; `where` names the file and its field in messages. `notes`
+    gets a line if the chromaticities are not those of Rec. 709.
     """
     if _close(chromaticities, REC709):
         return

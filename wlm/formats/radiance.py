@@ -30,14 +30,11 @@ _FIELDS = {"FORMAT": 1, "GAMMA": 1, "EXPOSURE": 1, "COLORCORR": 3, "PRIMARIES": 
 
 
 def read_radiance(path: str | os.PathLike[str], notes: list[str] | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads a Radiance picture of RGB or CIE XYZ.
+    """Reads a Radiance picture of RGB or CIE XYZ, float32 [H, W, 3], the top row first whatever the file's orientation;
+    returns it and the names of the channels.
 
     Values are divided by every `EXPOSURE` and `COLORCORR` of the header, which are factors that were applied to them.
     CIE XYZ and other `PRIMARIES` are converted to Rec. 709. Each of these adds a line to `notes`.
-
-    Returns:
-        The pixels, float32 [H, W, 3], the top row first whatever the file's orientation, and the names of the
-        channels.
     """
     notes = [] if notes is None else notes
     with open_file(path, "the Radiance picture") as file:

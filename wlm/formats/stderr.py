@@ -14,14 +14,8 @@ _LOCK = threading.RLock()
 
 @contextmanager
 def captured_stderr(chosen: Callable[[bytes], bool]) -> Iterator[list[bytes]]:
-    """Captures chosen lines inside the block; other lines, for example of other threads, are passed on afterwards.
-
-    Args:
-        chosen: Returns whether a line is captured.
-
-    Yields:
-        The list of the captured lines, which is filled at the end of the block.
-    """
+    """Captures the lines inside the block for which `chosen` is true; other lines, for example of other threads, are
+    passed on afterwards. Yields the list of the captured lines, which is filled at the end of the block."""
     captured: list[bytes] = []
     with _LOCK, _sink() as sink:
         sys.stderr.flush()

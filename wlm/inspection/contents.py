@@ -13,15 +13,11 @@ _PROBES = ("probes", "godot bake", "unity asset")
 
 
 def content_of(files: Sequence[str | os.PathLike[str]]) -> tuple[str, list[Path]]:
-    """Finds the kind of content of files.
+    """Finds the kind of content of one file or folder, or of six-way lightmaps of smoke, one EXR a frame.
 
-    Args:
-        files: One file or folder, or six-way lightmaps of smoke, one EXR a frame.
-
-    Returns:
-        The kind, and the files; a folder of six-way lightmaps is replaced by its files. The kind is the system of a
-        model ("lightmap", "atlas", "probe" or "smoke"); "six-way"; "set" of lightmaps over time; "probes"; "volume" of
-        smoke or frames of a simulation; or another kind of `wlm.inspection.files.kind_of`, such as "picture" or "mesh".
+    Returns the kind, and the files; a folder of six-way lightmaps is replaced by its files. The kind is the system of a
+    model ("lightmap", "atlas", "probe" or "smoke"); "six-way"; "set" of lightmaps over time; "probes"; "volume" of
+    smoke or frames of a simulation; or another kind of `wlm.inspection.files.kind_of`, such as "picture" or "mesh".
     """
     paths = [Path(file) for file in files]
     if not paths:

@@ -22,6 +22,7 @@ from wlm.formats.artifact import read_artifact
 from wlm.formats.checkpoint import SUFFIX as CHECKPOINT
 from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_users
+from wlm.formats.hours import hours_of_names
 from wlm.formats.ktx2 import VOLUME_HEAD, is_volume
 from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import SUFFIXES
@@ -137,7 +138,7 @@ def _probes(path: Path) -> Finding:
     from wlm.probe.data import load as load_probes
 
     keys = _value_names(_names(path)) if path.suffix.lower() == ".npz" else []
-    key = keys[0] if len(keys) > 1 else None
+    key = keys[0] if len(keys) > 1 and None in hours_of_names(keys)[0] else None
     probes = load_probes(path, key=key)
     coefficients = probes.outputs // 3 if probes.outputs % 3 == 0 else 0
     form = f"{coefficients} RGB coefficients" if coefficients else f"{probes.outputs} numbers"

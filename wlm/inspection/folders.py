@@ -12,6 +12,7 @@ from wlm.errors import WlmError
 from wlm.formats.folder import read_index
 from wlm.formats.gltf import read_gltf
 from wlm.formats.godot import read_users
+from wlm.formats.hours import hours_of_names
 from wlm.formats.light import SUFFIXES
 from wlm.formats.meshes import SUFFIXES as MESHES
 from wlm.inspection.files import (
@@ -27,7 +28,6 @@ from wlm.inspection.files import (
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
 from wlm.inspection.pictures import Picture, half_of, picture_of, said, size_of
 from wlm.inspection.sets import UNREADABLE_SET, assumed, inspect_set, named, together
-from wlm.lightmap.hours import hours_of_names
 from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders
 from wlm.lightmap.sheet import BASE
 

@@ -103,14 +103,7 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
     holds F_ut and F_vt side by side (neural-dynamic-gi, table 1), `frames` (BC7) has a layer for each stored time, and
     `valid` is 255 inside charts. BC7 blocks are copied from the model without re-encoding. The buffer `networks`,
     float32 [n, 4], holds the weights, and `hours` the result of `hour_tables`. The reference image `frame` is the map
-    at the first stored time.
-
-    Args:
-        sheet: The sheet.
-        model: Its model.
-        name: Name of the bundle.
-        source: Hash of the input.
-        device: Device that decodes the reference image.
+    at the first stored time, decoded on `device`.
     """
     textures = {key: texture for encoding in ENCODINGS for key, texture in encoding.textures(model).items()}
     for key, texture in textures.items():

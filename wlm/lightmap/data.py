@@ -238,7 +238,7 @@ def load(
 
     The files of a plain folder that end in `.exr`, `.hdr`, `.pfm`, `.tif`, `.ktx2` or `.dds` are read in natural order
     of their names ("2" before "10"). Without `times`, the hours are read from the names if every name ends in one
-    (`wlm.lightmap.hours`); if all are within a day, the period is 24. A `mask.png` among them is the mask unless `mask`
+    (`wlm.formats.hours`); if all are within a day, the period is 24. A `mask.png` among them is the mask unless `mask`
     says otherwise.
 
     A folder with `NAME_comp_light.exr`, as Unity writes it, is one state of light; a folder of such folders has a state

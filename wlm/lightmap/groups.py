@@ -65,13 +65,7 @@ def times_of(sheets: Mapping[Sheet, Timed]) -> np.ndarray:
 def changed_weights(
     where: str, weights: Mapping[str, np.ndarray], changes: Mapping[str, Weight]
 ) -> dict[str, np.ndarray]:
-    """Returns weights by group, float32 [3], with some of them replaced.
-
-    Args:
-        where: Name of the model, for messages.
-        weights: The weights of all groups.
-        changes: The new weights by group.
-    """
+    """Returns weights by group, float32 [3], with some of them replaced; `where` names the model in messages."""
     result = dict(weights)
     for group, given in changes.items():
         if group not in result:

@@ -16,11 +16,11 @@ from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings
 from wlm.errors import WlmError
+from wlm.formats.hours import DAY, hours_of_names
 from wlm.formats.levels import SUFFIXES as LEVEL_SUFFIXES
 from wlm.formats.light import EXPECTED, SUFFIXES
 from wlm.formats.limits import TIMES
 from wlm.formats.reading import named_file, read_json_file
-from wlm.lightmap.hours import DAY, hours_of_names
 from wlm.lightmap.sheet import BASE, LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEETS, is_group, is_name
 
 SET_FILE = "set.json"

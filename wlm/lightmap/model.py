@@ -91,15 +91,11 @@ def tiles_of(kind: np.ndarray, kinds: Iterable[TileKind]) -> np.ndarray:
 
 
 def part_table(profile: Profile, kind: np.ndarray, times: int) -> dict[str, Part]:
-    """Returns the types and shapes of the arrays of a sheet.
+    """Returns the types and shapes of the arrays of a sheet with tiles of the given `TileKind`s, uint8 [tiles], at T =
+    `times` times.
 
     N_m tiles have feature maps (static and dynamic tiles, by rising number) and N_d of them are dynamic, with temporal
     maps; N_c tiles are constant and N_f are stored as frames.
-
-    Args:
-        profile: The settings.
-        kind: uint8 [tiles], `TileKind` of each tile of the grid.
-        times: T, the number of stored times.
     """
     _, constant, static, dynamic, framed = np.bincount(kind, minlength=len(TileKind)).tolist()
     mapped, r = dynamic + static, profile.uvt_resolution // 4

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from wlm.errors import WlmError
+from wlm.formats.hours import neighbours
 from wlm.lightmap.sheet import Sheet
 from wlm.system import Settings
 from wlm_kernels.lightmap.features import STATIC_INPUTS, TEMPORAL_INPUTS
@@ -144,19 +145,7 @@ class TimeAxis:
 
     def neighbours(self, t: float) -> tuple[int, int, float]:
         """Returns the indices of the stored times before and after t, and the weight of the later one, 0 to 1."""
-        t = self.wrap(t)
-        n = len(self.times)
-        if n == 1:
-            return 0, 0, 0.0
-        after = int(np.searchsorted(self.times, t, side="right"))
-        before = after - 1
-        if self.period is None:
-            before, after = max(before, 0), min(after, n - 1)
-            gap = self.times[after] - self.times[before]
-            return before, after, float((t - self.times[before]) / gap) if gap > 0 else 0.0
-        before, after = before % n, after % n
-        gap = (self.times[after] - self.times[before]) % self.period or self.period
-        return before, after, float(((t - self.times[before]) % self.period) / gap)
+        return neighbours(self.times, self.period, self.wrap(t))
 
     def place(self, t: float) -> float:
         """Returns tau in [0, 1], the position on the time axis at which the feature maps are read for time t."""

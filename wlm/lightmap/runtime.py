@@ -55,15 +55,13 @@ class RuntimeDecoder:
         return wp.zeros((len(self.numbers), TILE, TILE), dtype=wp.uint32, device=self.device)
 
     def set_time(self, time: float) -> None:
-        """Sets the time of the following decodes.
+        """Sets the time of the following decodes, in the unit of the set's times, stored or between; see
+        `wlm.lightmap.decode.SheetDecoder`.
 
         A CUDA graph that was captured before must be captured again, because the position on the time axis is an
         argument of the launches. Between two stored times, each decode decodes the light of both times and
         interpolates. A renderer that keeps the light of both and interpolates by itself only has to decode once for
         each stored time.
-
-        Args:
-            time: In the unit of the set's times, stored or between; see `wlm.lightmap.decode.SheetDecoder`.
         """
         raise NotImplementedError
 

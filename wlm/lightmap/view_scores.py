@@ -92,13 +92,8 @@ class Views:
         self._pictures = Pictures()
 
     def add(self, index: int, original: np.ndarray, decoded: np.ndarray) -> None:
-        """Draws the views of one time from the original and the decoded map, and adds their errors.
-
-        Args:
-            index: Index of the time.
-            original: Linear radiance, float32 [H, W, 3], with gaps filled.
-            decoded: The decoded map, in the same form.
-        """
+        """Draws the views of the time of an index from the original and the decoded map, linear radiance float32 [H, W,
+        3] with gaps filled, and adds their errors."""
         numbers = self._cameras[index]
         if not numbers:
             return
@@ -224,12 +219,11 @@ class Tally:
         self._added: dict[int, np.ndarray | None] = {}
 
     def add(self, index: int, decoded: np.ndarray, metrics: FrameMetrics) -> None:
-        """Adds the decoded map of a stored time; an interval is scored once both of its ends are added.
+        """Adds the decoded map of a stored time, linear radiance [H, W, 3]; an interval is scored once both of its ends
+        are added.
 
-        Args:
-            index: Index of the time, above that of the last call.
-            decoded: The map at that time, linear radiance [H, W, 3].
-            metrics: Its metrics from `evaluate_frame` with the same mask: the scored tiles and their ranges.
+        `index` rises from call to call. `metrics` are from `evaluate_frame` with the same mask: the scored tiles and
+        their ranges.
         """
         filled = self._lightmaps.frames[index][self._nearest]
         decoded = np.asarray(decoded, np.float32)

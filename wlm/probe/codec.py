@@ -27,6 +27,7 @@ from wlm.config import check_settings
 from wlm.formats import zstd
 from wlm.formats.artifact import Artifact
 from wlm.formats.compact import BODY
+from wlm.formats.hours import DAY
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
 from wlm.probe.gaussian.model import Gaussians
@@ -55,6 +56,7 @@ class _Header(Header):
     dropped: int = Field(0, ge=0, le=PROBES)
     live: int | None = Field(None, ge=1, le=PROBES)
     positions: bool = False
+    hours: int = Field(1, ge=1, le=NUMBERS)
 
 
 class _NameHeader(Header):
@@ -75,9 +77,12 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
     header |= model.content.settings()
     header |= {"live": live} if live < model.probes else {}
     header |= {"positions": True} if model.has_positions else {}
+    header |= {"hours": len(model.times)} if len(model.times) else {}
     parts = {"box": np.array([*model.origin, model.extent, *model.size])} | model.content.parts()
     if live < model.probes:
         parts["dead"] = np.packbits(model.dead)
+    if len(model.times):
+        parts |= {"times": model.times, "scales": model.scales}
     if model.has_positions:
         # Differences from probe to probe, modulo 2^16: on a lattice they repeat, which zstd compresses well.
         parts["positions"] = np.diff(model.positions, axis=0, prepend=np.zeros((1, 3), np.uint16)).T
@@ -122,9 +127,15 @@ def decode(artifact: Artifact) -> ProbeModel:
     positions = np.zeros((0, 3), np.uint16)
     if "positions" in table:
         positions = np.cumsum(stored["positions"].T, axis=0, dtype=np.uint16)
-    content = _METHODS[profile.method].from_parts(profile, outputs, stored, header.dropped)
+    times, scales = stored.get("times", np.zeros(0)), stored.get("scales", np.ones(1))
+    if not ((np.diff(times) > 0).all() and (times < DAY).all()):
+        raise ValueError("part times: expected increasing hours of the day, from 0 to less than 24")
+    content = _METHODS[profile.method].from_parts(profile, header.hours * outputs, header.hours, stored, header.dropped)
+    known = {"times": times, "scales": scales}
     place = {"origin": origin, "extent": extent, "size": size, "positions": positions}
-    return ProbeModel(name, header.source, profile, header.probes, outputs, dead=dead, content=content, **place)
+    return ProbeModel(
+        name, header.source, profile, header.probes, outputs, dead=dead, content=content, **place, **known
+    )
 
 
 def _table(header: _Header) -> dict[str, Part]:
@@ -135,9 +146,14 @@ def _table(header: _Header) -> dict[str, Part]:
         table["dead"] = Part(np.uint8, (-(-header.probes // 8),))
     if header.positions:
         table["positions"] = Part(np.uint16, (3, header.probes))
-    return table | _METHODS[header.profile.method].table(
-        header.profile, header.outputs, header.count, live, header.clusters
-    )
+    if header.hours > 1:
+        table["times"] = Part(np.float64, (header.hours,), least=0.0)
+        table["scales"] = Part(np.float64, (header.hours,), least=0.0, most=1.0)
+    numbers = header.hours * header.outputs
+    if numbers > NUMBERS:
+        raise ValueError(f"setting hours: expected at most {NUMBERS} numbers of a probe at all hours, found {numbers}")
+    content = _METHODS[header.profile.method]
+    return table | content.table(header.profile, numbers, header.count, live, header.clusters)
 
 
 def _planes(part: np.ndarray) -> bytes:

@@ -1,6 +1,7 @@
 """Reads light probes at free positions from `.npz`, `.json`, tables, and files of Godot, Unity, three.js and Bevy.
 
-A probe holds spherical harmonics (gaussian-probe-compression, eq. 1, with 3, 12 or 27 numbers), or any other numbers.
+A probe holds spherical harmonics (gaussian-probe-compression, eq. 1, with 3, 12 or 27 numbers), or any other numbers,
+at one or several hours of the day.
 The table of hard cases in docs/probe.md lists what is repaired and what is refused. `ProbeSet.warnings` has a line for
 each kind of repair; probes are counted from 0.
 """
@@ -9,8 +10,9 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +20,7 @@ from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.folder import rounded
 from wlm.formats.godot import read_lmbake
+from wlm.formats.hours import DAY, hours_of_names
 from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.npz import read_npz
 from wlm.formats.scratch import room
@@ -30,6 +33,7 @@ from wlm.probe.conventions import (
     to_canonical,
 )
 from wlm.probe.fields import read_fields, read_positions, read_table
+from wlm.probe.hours import hour_factors, listed_times
 from wlm.probe.layouts import COEFFICIENT, ORDERS, choose_order, coefficients_first, described
 from wlm.probe.sphere import sh_count, unit_or_zero
 
@@ -40,6 +44,7 @@ _ROWS = 1 << 16  # probes per piece, so that float64 copies stay at some tens of
 _FARTHEST = 1e150  # squares of distances fit float64
 _POSITION, _CONVENTION, _PROBES, _SH = "position", "convention", "probes", "sh"
 _NORMAL, _VALID = _BESIDE = "normal", "valid"
+_Key = str | Sequence[str] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +54,17 @@ class ProbeSet:
     Attributes:
         name: Name of the set.
         position: float64 [N, 3], in the unit and the axes of the input.
-        values: float32 [N, D], finite; zero where a probe is dead. Arrays above 1 GiB are mapped to a temporary file.
-            For spherical harmonics D = 3 C, and `values.reshape(N, C, 3)` are canonical coefficients of radiance
-            (`wlm.probe.conventions`), RGB last.
-        key: Name of the array that was read.
-        live: bool [N], false where the probe takes no part in the fit and decodes to zero; at least one is true.
+        values: float32 [N, T D], finite: D numbers at the first of T hours, then at the second, and so on; zero where a
+            probe is dead. Arrays above 1 GiB are mapped to a temporary file. For spherical harmonics D = 3 C, and
+            `values.reshape(N, T, C, 3)` are canonical coefficients of radiance (`wlm.probe.conventions`), RGB last.
+        key: Name of the array that was read, or the names of several.
+        live: bool [N], false where the probe takes no part in the fit and decodes to zero, which is so if it is dark at
+            all hours; at least one is true.
         source: Hash of the positions, the values and `live`, 16 hexadecimal digits of BLAKE2b.
         warnings: A line of text for each kind of repair.
         normal: float64 [N, 3], unit normal of each probe's surface, 0 for a probe on no surface; None if unknown.
         reading: How the numbers were understood, in one line: convention, order, axes; and what was assumed.
+        times: float64 [T], increasing hours of the day in [0, 24), if there are several; else empty.
     """
 
     name: str
@@ -69,6 +76,7 @@ class ProbeSet:
     warnings: tuple[str, ...]
     normal: np.ndarray | None = None
     reading: str = ""
+    times: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def probes(self) -> int:
@@ -77,30 +85,51 @@ class ProbeSet:
 
     @property
     def outputs(self) -> int:
-        """The count of numbers per probe, D: 27 for second-order spherical harmonics in three colours."""
-        return self.values.shape[1]
+        """The count of numbers per probe at one hour, D: 27 for second-order spherical harmonics in three colours."""
+        return self.values.shape[1] // max(len(self.times), 1)
 
     @property
     def float_bytes(self) -> int:
         """The bytes of all values in float32, to which compressed sizes are compared."""
-        return self.probes * self.outputs * 4
+        return self.values.size * 4
+
+    def at(self, time: float | None = None) -> "ProbeSet":
+        """Returns the set at one hour of the day, between two hours their light mixed linearly; None: the only hour.
+        Probes that are dark then are dead, perhaps all.
+
+        Raises:
+            WlmError: The set has several hours and no time is given, or the time is not finite.
+        """
+        factors = hour_factors(self.name, self.times, time)
+        if factors is None:
+            return self
+        values = np.zeros((self.probes, self.outputs), np.float32)
+        for hour in np.flatnonzero(factors):
+            values += np.float32(factors[hour]) * self.values[:, hour * self.outputs : (hour + 1) * self.outputs]
+        return replace(self, values=values, live=values.any(1), times=np.zeros(0))
 
 
 @dataclass(frozen=True)
 class _Raw:
-    """The unchecked content of a file; `key` is the name of `values`, `convention` the name that the file states."""
+    """The unchecked content of a file: `key` is the name of `values`, which have an array for each of `times`, or only
+    one; `convention` is the name that the file states."""
 
     position: np.ndarray
-    values: np.ndarray
+    values: list[np.ndarray]
     key: str
     convention: str = ""
     beside: Mapping[str, np.ndarray] = field(default_factory=dict)
     axes: str = ""
     reading: str = ""  # if the file determines everything about its numbers
+    times: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 def load(
-    path: str | os.PathLike[str], *, key: str | None = None, convention: str | None = None, order: str | None = None
+    path: str | os.PathLike[str],
+    *,
+    key: str | Sequence[str] | None = None,
+    convention: str | None = None,
+    order: str | None = None,
 ) -> ProbeSet:
     """Reads light probes from a file.
 
@@ -116,8 +145,8 @@ def load(
 
     Args:
         path: The file; its suffix determines the kind.
-        key: Name of the array of values, or that name without the prefix "sh_" ("12.00" for "sh_12.00"). None takes
-            the only array whose name begins with "sh".
+        key: Name of the array of values, or that name without the prefix "sh_" ("12.00" for "sh_12.00"), or several
+            names that end in an hour of the day. None takes all arrays whose names begin with "sh".
         convention: Convention of the file's numbers, one of `wlm.probe.conventions.CONVENTIONS`. None takes the file's
             own: "godot" for `.lmbake`, "unity" for `.asset`, otherwise the field `convention`, or else canonical.
         order: Order of the numbers of spherical harmonics: "coefficient" (r0 g0 b0 r1 ...) or "channel" (r0 r1 ... g0
@@ -171,18 +200,21 @@ def from_arrays(
     order: str | None = None,
     normal: np.ndarray | None = None,
     valid: np.ndarray | None = None,
+    times: Sequence[float] | np.ndarray | None = None,
 ) -> ProbeSet:
     """Builds a checked set from arrays, under the same rules as `load`.
 
     Args:
         position: [N, 3] of numbers; copied.
-        values: [N, C, 3], RGB last, [N, 3, C] or [N, D] of numbers; copied.
+        values: [N, C, 3], RGB last, [N, 3, C] or [N, D] of numbers; with `times` an array of one of these for each of
+            them; copied.
         name: Name of the set, also used in messages.
         key: Name of the array of values.
         convention: Convention of the values, one of `wlm.probe.conventions.CONVENTIONS`.
         order: Order of the values, as for `load`.
         normal: [N, 3], normal of each probe's surface, of any length, 0 for a probe on no surface; copied.
         valid: [N], true or false, or from 0 to 1: a probe below 0.5 is dead.
+        times: [T], hours of the day, 0 to 24; None: the light does not change.
 
     Returns:
         The set, with its faults repaired where that is possible; see `ProbeSet.warnings`.
@@ -192,7 +224,15 @@ def from_arrays(
     """
     beside = {_NORMAL: normal, _VALID: valid}
     beside = {field: np.asarray(array) for field, array in beside.items() if array is not None}
-    return _check(name, name, _Raw(np.asarray(position), np.asarray(values), key, beside=beside), convention, order)
+    numbers = [np.asarray(values)]
+    hours = np.zeros(0)
+    if times is not None:
+        hours = _checked_hours(name, times)
+        if len(numbers[0]) != len(hours):
+            raise WlmError(f"{name}: {key}: expected an array for each of {len(hours)} hours, got {len(numbers[0])}")
+        numbers = [numbers[0][i] for i in np.argsort(hours)]
+        hours = np.sort(hours) if len(hours) > 1 else np.zeros(0)
+    return _check(name, name, _Raw(np.asarray(position), numbers, key, beside=beside, times=hours), convention, order)
 
 
 def save_probes(
@@ -243,30 +283,53 @@ def save_probes(
         raise WlmError(f"{path}: expected a name that ends in .npz or .json, found {path.suffix or 'none'}")
 
 
-def _read_npz(path: Path, key: str | None) -> _Raw:
-    name = ""
+def _read_npz(path: Path, key: _Key) -> _Raw:
+    chosen: list[str] = []
 
     def choose(names: Sequence[str]) -> list[str]:
-        nonlocal name
-        name = _choose(path, names, key)
-        return [_POSITION, name, *({_CONVENTION, *_BESIDE} & set(names) - {name})]
+        chosen[:] = _choose(path, names, key)
+        return [_POSITION, *chosen, *({_CONVENTION, *_BESIDE} & set(names) - set(chosen))]
 
     arrays = read_npz(path, choose, numbers=PROBES * NUMBERS)
     stated = arrays[_CONVENTION] if _CONVENTION in arrays else np.array("")
     if stated.dtype.kind != "U" or stated.ndim:
         raise WlmError(f"{path}: {_CONVENTION}: expected a string, got {stated.dtype} {stated.shape}")
-    beside = {field: arrays[field] for field in _BESIDE if field in arrays and field != name}
-    return _Raw(arrays[_POSITION], arrays[name], name, str(stated), beside)
+    beside = {field: arrays[field] for field in _BESIDE if field in arrays and field not in chosen}
+    return _raw(path, arrays[_POSITION], chosen, arrays.__getitem__, convention=str(stated), beside=beside)
 
 
-def _read_json(path: Path, key: str | None) -> _Raw:
+def _read_json(path: Path, key: _Key) -> _Raw:
     fields = read_fields(path)
-    name = _choose(path, fields.names, key)
+    chosen = _choose(path, fields.names, key)
     beside = {field: fields.read(field) for field in _BESIDE if field in fields.names}
-    position, values = fields.read(_POSITION), fields.read(name)
-    if values.ndim == 1 and len(position) and len(values) % len(position) == 0:
-        values = values.reshape(len(position), -1)
-    return _Raw(position, values, name, fields.convention, beside, fields.axes)
+    position = fields.read(_POSITION)
+
+    def read(name: str) -> np.ndarray:
+        values = fields.read(name)
+        flat = values.ndim == 1 and len(position) and len(values) % len(position) == 0
+        return values.reshape(len(position), -1) if flat else values
+
+    return _raw(path, position, chosen, read, convention=fields.convention, beside=beside, axes=fields.axes)
+
+
+def _raw(path: Path, position: np.ndarray, names: list[str], read: Callable[[str], np.ndarray], **known: Any) -> _Raw:
+    """Reads the named arrays, in the order of the hours in their names if there are several."""
+    if len(names) == 1:
+        return _Raw(position, [read(names[0])], names[0], **known)
+    hours, _ = hours_of_names(names)
+    if None in hours:
+        raise WlmError(f"{path}: found several arrays of values; choose one by its key: {', '.join(names)}")
+    times = _checked_hours(str(path), hours)
+    order = np.argsort(times)
+    key = ", ".join(names[i] for i in order)
+    return _Raw(position, [read(names[i]) for i in order], key, times=times[order], **known)
+
+
+def _checked_hours(where: str, hours: Any) -> np.ndarray:
+    times = np.asarray(hours, np.float64)
+    if not (len(times) and (times >= 0).all() and (times <= DAY).all() and len(np.unique(times % DAY)) == len(times)):
+        raise WlmError(f"{where}: expected different hours of the day, 0 to 24, got {listed_times(times) or 'none'}")
+    return times % DAY
 
 
 def _lighting_data(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -276,13 +339,13 @@ def _lighting_data(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return data.position, data.values
 
 
-def _only_sh(read: Callable[[Path], tuple], **known: str) -> Callable[[Path, str | None], _Raw]:
+def _only_sh(read: Callable[[Path], tuple], **known: str) -> Callable[[Path, _Key], _Raw]:
     """Makes a function that reads a file of positions and one array "sh"; `known` are further fields of its result."""
 
-    def reader(path: Path, key: str | None) -> _Raw:
+    def reader(path: Path, key: _Key) -> _Raw:
         position, values, *remark = read(path)
-        name = _choose(path, (_POSITION, _SH), key)
-        return _Raw(position, values, name, **known | ({"axes": remark[0]} if remark else {}))
+        (name,) = _choose(path, (_POSITION, _SH), key)
+        return _Raw(position, [values], name, **known | ({"axes": remark[0]} if remark else {}))
 
     return reader
 
@@ -301,25 +364,28 @@ _READERS = {
 }
 
 
-def _choose(path: Path, names: Sequence[str], key: str | None) -> str:
-    """Returns the name of the array of values: `key`, with or without "sh_", or else the only one that begins "sh"."""
+def _choose(path: Path, names: Sequence[str], key: _Key) -> list[str]:
+    """Returns the names of the arrays of values: `key`, with or without "sh_", or else those that begin with "sh"."""
     if _POSITION not in names:
         raise WlmError(f"{path}: the field {_POSITION} is missing; found {', '.join(names) or 'nothing'}")
     fields = [name for name in names if name not in (_POSITION, _CONVENTION, *_BESIDE)]
     listed = ", ".join(fields) or "nothing"
     if key is not None:
-        for name in (key, f"{_SH}_{key}"):
-            if name in fields:
-                return name
-        raise WlmError(f"{path}: expected values named {key} or {_SH}_{key}; found {listed}")
+        wanted = [key] if isinstance(key, str) else key
+        return [_named(path, fields, each, listed) for each in dict.fromkeys(wanted)]
     candidates = [name for name in fields if name.startswith(_SH)]
     if not candidates:
         raise WlmError(
             f"{path}: expected an array of light, whose name begins with {_SH} or is given as --key; found {listed}"
         )
-    if len(candidates) > 1:
-        raise WlmError(f"{path}: found several arrays of values; choose one by its key: {', '.join(candidates)}")
-    return candidates[0]
+    return candidates
+
+
+def _named(path: Path, fields: Sequence[str], key: str, listed: str) -> str:
+    for name in (key, f"{_SH}_{key}"):
+        if name in fields:
+            return name
+    raise WlmError(f"{path}: expected values named {key} or {_SH}_{key}; found {listed}")
 
 
 def _convert(where: str, values: np.ndarray, name: str, change: Callable[[np.ndarray, str], np.ndarray]) -> np.ndarray:
@@ -348,10 +414,13 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
 
     `convention` and `order` are those that the caller states.
     """
-    position, values, key, beside = _check_positions(where, raw.position), raw.values, raw.key, raw.beside
-    count = len(position)
-    if values.dtype.kind not in "iuf":
-        raise WlmError(f"{where}: {key}: expected numbers, got {values.dtype}")
+    position, key, beside = _check_positions(where, raw.position), raw.key, raw.beside
+    count, values = len(position), raw.values[0]
+    for hour in raw.values:
+        if hour.dtype.kind not in "iuf":
+            raise WlmError(f"{where}: {key}: expected numbers, got {hour.dtype}")
+        if hour.shape != values.shape:
+            raise WlmError(f"{where}: {key}: expected one shape at all hours, got {values.shape} and {hour.shape}")
     coefficients = sh_count(values.size // count) if values.ndim > 1 else None
     by_channel = coefficients is not None and values.shape[1:] == (3, coefficients)
     fits = values.ndim == 2 or (values.ndim == 3 and (values.shape[2] == 3 or by_channel))
@@ -360,8 +429,8 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
             f"{where}: {key}: expected the shape ({count}, C, 3) with RGB last or ({count}, D), a row for each "
             f"position, got {values.shape}"
         )
-    if values.size > NUMBERS * count:
-        raise WlmError(f"{where}: {key}: expected at most {NUMBERS} numbers a probe, got {values.size // count}")
+    if (total := values.size // count * len(raw.values)) > NUMBERS:
+        raise WlmError(f"{where}: {key}: expected at most {NUMBERS} numbers a probe, got {total}")
     if order is not None and (order not in ORDERS or coefficients is None):
         raise WlmError(
             f"{where}: order: expected {' or '.join(ORDERS)}, for 3, 12, 27 ... numbers a probe, got {order!r} for "
@@ -378,28 +447,33 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
     elif coefficients is not None:
         _convert(where, values[:1], convention, to_canonical)  # refuses what does not fit
         certain = order is not None or values.ndim == 3 or coefficients == 1
-        order, doubts = choose_order(values, convention, order)
+        every = values if len(raw.values) == 1 else np.concatenate(raw.values)
+        order, doubts = choose_order(every, convention, order)
         reading = described(convention, origin, order, certain)
     reading = raw.reading or f"{reading}; {raw.axes or 'positions and axes as stored'}"
 
-    checked = room((count, values.size // count), np.float32, where)
-    finite = np.empty(count, bool)
-    for start in range(0, count, _ROWS):
-        rows = slice(start, start + _ROWS)
-        # float64 distinguishes numbers that do not fit float32 from Inf.
-        wide = values[rows].astype(np.float64)
-        finite[rows] = np.isfinite(wide).all(axis=tuple(range(1, wide.ndim)))
-        if coefficients is not None and order is not None:
-            wide = coefficients_first(wide, order)
-        wide = _convert(where, wide, convention, to_canonical).reshape(len(wide), -1)
-        beyond = np.flatnonzero(finite[rows] & (np.abs(wide).max(axis=1) > LARGEST))
-        if len(beyond):
-            worst = np.abs(wide[beyond[0]]).max()
-            raise WlmError(
-                f"{where}: {key}[{start + beyond[0]}]: expected numbers of at most {LARGEST:.2g}, got {worst:.3g}"
-            )
-        wide[~finite[rows]] = 0.0
-        checked[rows] = wide
+    outputs = values.size // count
+    checked = room((count, len(raw.values) * outputs), np.float32, where)
+    finite = np.ones(count, bool)
+    for number, hour in enumerate(raw.values):
+        for start in range(0, count, _ROWS):
+            rows = slice(start, start + _ROWS)
+            # float64 distinguishes numbers that do not fit float32 from Inf.
+            wide = hour[rows].astype(np.float64)
+            whole = np.isfinite(wide).all(axis=tuple(range(1, wide.ndim)))
+            finite[rows] &= whole
+            if coefficients is not None and order is not None:
+                wide = coefficients_first(wide, order)
+            wide = _convert(where, wide, convention, to_canonical).reshape(len(wide), -1)
+            beyond = np.flatnonzero(whole & (np.abs(wide).max(axis=1) > LARGEST))
+            if len(beyond):
+                worst = np.abs(wide[beyond[0]]).max()
+                raise WlmError(
+                    f"{where}: {key}[{start + beyond[0]}]: expected numbers of at most {LARGEST:.2g}, got {worst:.3g}"
+                )
+            wide[~whole] = 0.0
+            checked[rows, number * outputs : (number + 1) * outputs] = wide
+    checked[~finite] = 0.0
     if _VALID in beside:
         valid = _check_beside(where, _VALID, beside[_VALID], "biuf", (count,))
         for bad in np.flatnonzero((valid < 0) | (valid > 1))[:1]:
@@ -421,8 +495,8 @@ def _check(where: str, name: str, raw: _Raw, convention: str | None, order: str 
         )
     if repeated := _repeated(position):
         warnings.append(f"{name}: {_probes(repeated)} at the position of another: Gaussians decode them to one value")
-    source = _hash(position, checked, live)
-    return ProbeSet(name, position, checked, key, live, source, tuple(warnings), normal, reading)
+    source = _hash(position, checked, live, raw.times)
+    return ProbeSet(name, position, checked, key, live, source, tuple(warnings), normal, reading, raw.times)
 
 
 def _check_positions(where: str, position: np.ndarray) -> np.ndarray:
@@ -463,12 +537,13 @@ def _probes(count: int) -> str:
     return f"{count} {'probe' if count == 1 else 'probes'}"
 
 
-def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray) -> str:
+def _hash(position: np.ndarray, values: np.ndarray, live: np.ndarray, times: np.ndarray) -> str:
     digest = hashlib.blake2b(digest_size=8)
     digest.update(np.asarray(values.shape, "<i8").tobytes())
     digest.update(np.ascontiguousarray(position, "<f8"))
     digest.update(np.ascontiguousarray(values, "<f4"))
     digest.update(np.packbits(live).tobytes())
+    digest.update(times.astype("<f8"))
     return digest.hexdigest()
 
 

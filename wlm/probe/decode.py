@@ -1,14 +1,18 @@
 """Decodes the light of a compressed model on a CPU or GPU: at the model's own probes or at any points."""
 
+import math
 from abc import ABC, abstractmethod
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
+from wlm.formats.hours import DAY, neighbours
 from wlm.probe.model import ProbeModel
 from wlm.probe.volume.light import Light
+from wlm_kernels.probe.hours import mix_hours
 
 
 class Decoder(ABC):
@@ -31,6 +35,7 @@ class Decoder(ABC):
         """
         self.model, self.device = model, interop.check_device(device)
         self._arrays: list[wp.array] = []
+        self._hours: tuple[wp.array, wp.array] | None = None
         self._position = None
         if position is not None:
             self.check_own(position)
@@ -44,6 +49,31 @@ class Decoder(ABC):
     def device_bytes(self) -> int:
         """The bytes of memory that the model takes on the device."""
         return sum(array.capacity for array in self._arrays)
+
+    def _contents(self) -> list[Any]:
+        """Returns the model's content at each hour, as contents of one hour."""
+        content, scales = self.model.content, self.model.scales
+        return [content.at(row) for row in np.diag(scales)] if len(self.model.times) else [content]
+
+    def _keep_hours(self, numbers: np.ndarray, mixed: wp.array) -> None:
+        """Uploads the numbers at each hour, [T, P], that `set_time` mixes into a device array of P numbers."""
+        if len(numbers) > 1:
+            self._hours = self._put(numbers, float), mixed
+
+    def set_time(self, time: float) -> None:
+        """Sets the time of the light that is decoded from now on; at first it is the model's first hour.
+
+        Light between two hours is linear between theirs, and the day begins again after 24 hours. A model of one hour
+        has the same light at any time. On CUDA the work is queued, not awaited. A volume keeps the blocks that it has.
+
+        Raises:
+            WlmError: The time is not finite.
+        """
+        if not math.isfinite(time):
+            raise WlmError(f"time: expected a finite number, got {time}")
+        if self._hours is not None:
+            hours, mixed = self._hours
+            mix_hours(hours, *neighbours(self.model.times, DAY, time), mixed)
 
     @abstractmethod
     def decode(self, position: np.ndarray) -> np.ndarray:

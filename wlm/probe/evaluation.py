@@ -15,6 +15,7 @@ from wlm.errors import WlmError
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
 from wlm.probe.decode import Decoder
+from wlm.probe.hours import listed_times
 from wlm.probe.model import ProbeModel
 from wlm.probe.places import nearest_weights
 from wlm.probe.relative import norms, relative_errors
@@ -31,6 +32,16 @@ OFF = 0.5
 MANY_OFF = 0.01
 """Share of the live probes that may be off without a warning."""
 
+_OF_HOUR = (
+    "psnr",
+    "psnr_live",
+    "irradiance_psnr",
+    "relative_error",
+    "relative_median",
+    "relative_p95",
+    "off",
+    "between_psnr",
+)
 _NEAREST = 8  # probes that are weighted by the inverse square of their distance
 _ROWS = 32768  # probes per piece, so that float64 copies stay at some tens of MB
 
@@ -49,6 +60,8 @@ class Report(BaseReport):
         bits_per_probe: `bytes * 8 / N`, over all probes; the paper's bpp.
         ratio: Bytes of the file divided by `N * D * 4`, the bytes of the input in float32.
         gpu_bytes: Bytes of the buffers that a GPU holds; 0 if unknown.
+        hours: For each of several hours its `time`, `psnr`, `psnr_live`, `irradiance_psnr` and `between_psnr`; other
+            figures are those of the hour with the lowest PSNR.
         peak: Range of the input's coefficients.
         psnr: PSNR over all coefficients of all probes.
         psnr_live: PSNR over the live probes; dead probes decode exactly to zero.
@@ -60,8 +73,8 @@ class Report(BaseReport):
         worst_probe: The live probe with the largest relative error: `probe` (index), `error`, `position`, and the norms
             of its numbers, `light`, and of the decoded ones, `decoded`; None if all are exact.
         psnr_by_band: PSNR of each band of spherical harmonics, over all probes and colours.
-        irradiance_psnr: PSNR of the irradiance, at least 0, on `NORMALS` fixed normals of every live probe in RGB; its peak is the
-            range of the input's irradiance.
+        irradiance_psnr: PSNR of the irradiance, clamped at 0, on `NORMALS` fixed normals of every live probe in RGB; its
+            peak is the range of the input's irradiance.
         warnings: A sentence that names the worst probe, if more than a share `MANY_OFF` of the live probes is off.
         between_psnr: PSNR between the probes, see the function `between_psnr`; None if it was not computed.
     """
@@ -88,6 +101,7 @@ class Report(BaseReport):
     warnings: list[str] = field(default_factory=list)
     between_psnr: float | None = None
     gpu_bytes: int = 0
+    hours: list[dict[str, Any]] = field(default_factory=list)
 
 
 def evaluate(
@@ -104,29 +118,58 @@ def evaluate(
         model: The model.
         probes: The input, in the order of the fit.
         device: Where the model is decoded.
-        progress: Called after the decode and at the end.
+        progress: Called after each hour.
         file_bytes: Size of the model's file; None: the size that `model.save` would write.
 
     Returns:
         The report.
 
     Raises:
-        WlmError: The device does not exist, the set has other probes, or a decoded number is not finite.
+        WlmError: The device does not exist, the set has other probes or hours, or a decoded number is not finite.
     """
-    meter = Meter(progress, "evaluate", 2)
     if len(probes.position) != model.probes:
         raise WlmError(f"{probes.name}: has {probes.probes} probes, but {model.probes} were compressed")
+    if not np.array_equal(probes.times, model.times):
+        found, expected = (listed_times(times) or "one" for times in (probes.times, model.times))
+        raise WlmError(f"{probes.name}: has the hours {found}, but {expected} were compressed; choose with --key")
     decoder = model.decoder(device, position=probes.position)
-    decoded = decoder.decode_probes()
-    meter.report(1)
-    report = score(decoded, probes, model.file_bytes() if file_bytes is None else file_bytes)
-    report = replace(
-        report,
-        between_psnr=between_psnr(decoder, probes),
+    size = model.file_bytes() if file_bytes is None else file_bytes
+    times = probes.times.tolist() or [None]
+    meter = Meter(progress, "evaluate", len(times))
+    reports = []
+    for done, time in enumerate(times, 1):
+        if time is not None:
+            decoder.set_time(time)
+        reports.append(_evaluate(decoder, probes.at(time), size))
+        meter.report(done, PSNR_dB=reports[-1].psnr)
+    worst = min(reports, key=lambda report: report.psnr)
+    hours = [
+        {"time": time} | {name: getattr(each, name) for name in _OF_HOUR}
+        for time, each in zip(times, reports, strict=True)
+    ]
+    return replace(
+        worst,
         gpu_bytes=model.content.nbytes,
+        ratio=worst.ratio / len(times),
+        warnings=[
+            at_hour(time) + text for time, report in zip(times, reports, strict=True) for text in report.warnings
+        ],
+        hours=hours if len(times) > 1 else [],
     )
-    meter.report(2, PSNR_dB=report.psnr)
-    return report
+
+
+def at_hour(time: float | None) -> str:
+    """Returns the beginning of a sentence about one of several hours."""
+    return "" if time is None else f"at {time:g} h, "
+
+
+def _evaluate(decoder: Decoder, probes: ProbeSet, file_bytes: int) -> Report:
+    """Compares the light that a decoder has at its present time with that of one hour."""
+    decoded = decoder.decode_probes()
+    return replace(
+        score(decoded, probes, file_bytes),
+        between_psnr=between_psnr(decoder, probes),
+    )
 
 
 def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
@@ -142,11 +185,13 @@ def score(decoded: np.ndarray, probes: ProbeSet, file_bytes: int) -> Report:
         no probe is live. The PSNRs of bands and irradiance are None if D is not 3 (l + 1)² for any band l.
 
     Raises:
-        WlmError: The number of probes or of their numbers differs, or a number is NaN or infinite.
+        WlmError: The number of probes or of their numbers differs, a number is NaN or infinite, or the input has
+            several hours.
         ValueError: `file_bytes` is not positive, or `decoded` is no matrix.
     """
     if file_bytes <= 0:
         raise ValueError(f"file_bytes: expected a positive number, got {file_bytes}")
+    probes = probes.at()
     decoded, values, live = np.asarray(decoded), probes.values, probes.live
     if decoded.ndim != 2:
         raise ValueError(f"decoded: expected an array [N, D], got {decoded.shape}")

@@ -14,7 +14,7 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
-from wlm.probe.evaluation import relative_figures
+from wlm.probe.evaluation import at_hour, relative_figures
 from wlm.probe.gaussian.model import check_outputs, gaussian_bytes, gaussian_count
 from wlm.probe.gaussian.packing import pack_model
 from wlm.probe.gaussian.trainer import Trainer
@@ -22,6 +22,7 @@ from wlm.probe.model import CODES, ProbeModel, Profile, box_of
 from wlm.probe.pca.model import ENOUGH, fit_components
 from wlm.system import Meter, OnProgress
 
+_MOST_LATENT = 32
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps after which progress and checkpoint may be due
 
 
@@ -73,6 +74,9 @@ def compress(
     have less error in no more GPU memory, which is the case for a few hundred probes; `ProbeModel.choice` says why.
     Dead probes take no part in the fit: the model stores one bit per probe if any probe is dead.
 
+    Several hours are fitted as one, with probes that have the numbers of all hours; those of each hour are divided by
+    their root mean square.
+
     Args:
         probes: The set.
         profile: The settings: a name, a YAML file, or a `Profile`.
@@ -95,6 +99,46 @@ def compress(
     """
     profile = Profile.load(profile).override(overrides)
     device = interop.check_device(device)
+    if not probes.live.any():
+        raise WlmError(f"{probes.name}: every probe is dark: there is nothing to fit")
+    rest = device, progress, checkpoint, positions
+    if not len(probes.times):
+        return _with_warnings(_compress(probes, profile, seed, *rest), probes, device)
+    hours, outputs = len(probes.times), probes.outputs
+    by_hour = np.split(probes.values, hours, axis=1)
+    scales = np.sqrt([np.einsum("nd,nd->", light, light, dtype=np.float64) for light in by_hour])
+    scales /= scales.max()
+    even = [light / np.float32(scale or 1.0) for light, scale in zip(by_hour, scales, strict=True)]
+    joint = replace(probes, values=np.concatenate(even, 1), times=np.zeros(0))
+    longer = profile.model_copy(update={"latent": min(_MOST_LATENT, round(profile.latent * _longer(hours)))})
+    model = _compress(joint, longer, seed, *rest)
+    content: Any = model.content
+    content = replace(content, outputs=outputs, hours=hours)
+    model = replace(model, outputs=outputs, content=content, times=probes.times, scales=scales)
+    return _with_warnings(model, probes, device)
+
+
+def _with_warnings(model: ProbeModel, probes: ProbeSet, device: str) -> ProbeModel:
+    decoder = model.decoder(device, position=probes.position)
+    lines: list[str] = []
+    for time in model.times.tolist() or [None]:
+        if time is not None:
+            decoder.set_time(time)
+        found = relative_figures(decoder.decode_probes(), probes.at(time))["warnings"]
+        lines += [at_hour(time) + line for line in found]
+    return replace(model, warnings=tuple(lines))
+
+
+def _compress(
+    probes: ProbeSet,
+    profile: Profile,
+    seed: int,
+    device: str,
+    progress: OnProgress | None,
+    checkpoint: Checkpoint | None,
+    positions: bool,
+) -> ProbeModel:
+    """Compresses a set of one hour."""
     box = box_of(probes.position)
     stored = np.zeros((0, 3), np.uint16)
     if positions:
@@ -114,10 +158,8 @@ def compress(
     values = probes.values[probes.live]
     pca, relative = Profile(name=profile.name, method="pca"), profile.error == "relative"
     if profile.method == "pca":
-        model = make(
-            profile=pca, content=fit_components(values, relative=relative)[0], choice="PCA, as the profile asks"
-        )
-        return _measured(model, probes, device)[0]
+        content = fit_components(values, relative=relative)[0]
+        return make(profile=pca, content=content, choice="PCA, as the profile asks")
     if profile.method == "auto":
         count = gaussian_count(profile.ratio, len(values))
         budget = gaussian_bytes(count, profile.latent, profile.hidden, profile.columns(probes.outputs))
@@ -126,28 +168,31 @@ def compress(
             took = (
                 f"{components.count} components reach {error:.1%} of each probe's light in {components.nbytes:,} bytes"
             )
-            choice = f"PCA: {took} of GPU memory, Gaussians take {budget:,}"
-            return _measured(make(profile=pca, content=components, choice=choice), probes, device)[0]
+            return make(profile=pca, content=components, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
     check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, relative, device)
     gaussians = _fit_gaussians(make, probes, profile, seed, device, progress, checkpoint)
-    gaussians, error = _measured(gaussians, probes, device)
     if profile.method == "gaussians":
         return gaussians
-    most = gaussians.content.nbytes
+
+    def error_of(model: ProbeModel) -> float:
+        decoded = model.decoder(device, position=probes.position).decode_probes()
+        return relative_figures(decoded, probes)["relative_error"]
+
+    error, most = error_of(gaussians), gaussians.content.nbytes
     told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
     components, _ = fit_components(values, most, relative=relative)
     if components.nbytes > most:
         return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
-    rival, possible = _measured(make(profile=pca, content=components), probes, device)
+    rival = make(profile=pca, content=components)
+    possible = error_of(rival)
     if possible < error:
         return replace(rival, choice=f"PCA: {components.count} components reach {possible:.1%}, {told}")
     return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1%}")
 
 
-def _measured(model: ProbeModel, probes: ProbeSet, device: str) -> tuple[ProbeModel, float]:
-    """Returns the model with its warnings, and its relative error."""
-    figures = relative_figures(model.decoder(device, position=probes.position).decode_probes(), probes)
-    return replace(model, warnings=tuple(figures["warnings"])), figures["relative_error"]
+def _longer(hours: int) -> float:
+    """Returns how much longer the latents of a fit of several hours are than those of one hour."""
+    return 1.0 + 0.5 * math.log2(hours)
 
 
 def _fit_gaussians(

@@ -6,7 +6,7 @@ The method of compression is data: `ProbeModel.content` holds the light, either 
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pkgutil import resolve_name
 from typing import Any, ClassVar, Literal, Self
 
@@ -15,6 +15,7 @@ from pydantic import ConfigDict, Field
 
 from wlm.errors import WlmError
 from wlm.formats.parts import Part
+from wlm.probe.hours import hour_factors
 from wlm.system import Model, Settings
 
 CODES = 65535
@@ -68,6 +69,10 @@ class Profile(Settings):
 class Content(ABC):
     """The compressed light of a model, in the form of one compression method.
 
+    The last step of a decoder is a matrix: the last layer of the network, or the principal components. It has columns
+    for the D numbers of a probe at each of T hours, so the light at any time is that of a matrix of D columns, the sum
+    of the hours' columns with the time's factors. Everything before it is shared by all hours.
+
     Attributes:
         METHOD: Name of the method in files and reports.
         DECODER: Class of its decoder, a `wlm.probe.decode.Decoder`, as `module:name`.
@@ -85,12 +90,16 @@ class Content(ABC):
         """The bytes of the content's GPU buffers, as `wlm.probe.bundle` makes them."""
 
     @abstractmethod
+    def at(self, factors: np.ndarray) -> Self:
+        """Returns the content of one hour whose light is the sum of that of T hours times factors, float64 [T]."""
+
+    @abstractmethod
     def facts(self) -> dict[str, Any]:
         """Returns values that `wlm info` shows, as JSON values by name."""
 
     @abstractmethod
     def settings(self) -> dict[str, int]:
-        """Returns entries of a file's header: `count` of Gaussians or components, `clusters`, and `dropped` Gaussians."""
+        """Returns entries of a file's header: `count` of Gaussians or components, `clusters`, `dropped` Gaussians."""
 
     @abstractmethod
     def parts(self) -> dict[str, np.ndarray]:
@@ -104,7 +113,7 @@ class Content(ABC):
     @abstractmethod
     def table(cls, profile: Profile, outputs: int, count: int, live: int, clusters: int) -> dict[str, Part]:
         """Returns the types and shapes of these arrays, by name, for `count` Gaussians, or components of each of
-        `clusters`, and `live` probes.
+        `clusters`; `live` probes; and `outputs` numbers of a probe at all hours.
 
         Raises:
             ValueError: There are more components than numbers of a probe.
@@ -112,8 +121,10 @@ class Content(ABC):
 
     @classmethod
     @abstractmethod
-    def from_parts(cls, profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Self:
-        """Builds the content from a file's arrays, whose types and shapes have been checked.
+    def from_parts(
+        cls, profile: Profile, outputs: int, hours: int, stored: Mapping[str, np.ndarray], dropped: int
+    ) -> Self:
+        """Builds the content from a file's arrays, whose types and shapes have been checked; `outputs` as for `table`.
 
         Raises:
             ValueError: The numbers contradict each other, or exceed what a decoder can compute in float32.
@@ -122,14 +133,14 @@ class Content(ABC):
 
 @dataclass(frozen=True, eq=False)
 class ProbeModel(Model):
-    """A compressed set of N probes of D numbers each.
+    """A compressed set of N probes of D numbers each, at one or several hours of the day.
 
     Attributes:
         name: Name of the set.
         source: Hash of the input, 16 hexadecimal digits; a file stores the first 8.
         profile: Settings of the fit, with the method that was used; PCA has no other settings.
         probes: Number of probes, N.
-        outputs: Numbers per probe, D: 27 for second-order spherical harmonics in three colours.
+        outputs: Numbers per probe at one hour, D: 27 for second-order spherical harmonics in three colours.
         origin: float64 [3], lowest corner of the probes' bounding box, in the unit of the positions.
         extent: Longest side of the box; 1 if all probes coincide.
         size: float64 [3], sides of the box divided by `extent`, each in [0, 1].
@@ -139,6 +150,9 @@ class ProbeModel(Model):
         content: The compressed light, in the form of the method.
         choice: Sentence that says why the fit used this method. Files do not store it.
         warnings: Sentences about light that the fit lost, as in `wlm.probe.Report`. Files do not store them.
+        times: float64 [T], increasing hours of the day in [0, 24), if there are several; else empty.
+        scales: float64 [T], factor of the light of each hour of `content`, by which the fit divided it, so that the
+            precision of an hour follows its own light.
     """
 
     SYSTEM: ClassVar[str] = "probe"
@@ -156,6 +170,8 @@ class ProbeModel(Model):
     content: Content
     choice: str = ""
     warnings: tuple[str, ...] = ()
+    times: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    scales: np.ndarray = field(default_factory=lambda: np.ones(1))
 
     @property
     def method(self) -> str:
@@ -171,6 +187,20 @@ class ProbeModel(Model):
     def has_positions(self) -> bool:
         """Whether the model stores the positions of its probes."""
         return len(self.positions) > 0
+
+    def at(self, time: float | None = None) -> "ProbeModel":
+        """Returns the model of the light at one time of the day, linear between two hours; None: the only hour.
+
+        The result decodes and exports as any other model, but cannot be saved: `evaluate` needs its `file_bytes`. It is
+        mixed in float64 and rounded to half floats; a decoder's `set_time` is quicker.
+
+        Raises:
+            WlmError: The model has several hours and no time is given, or the time is not finite.
+        """
+        factors = hour_factors(self.name, self.times, time)
+        if factors is None:
+            return self
+        return replace(self, content=self.content.at(factors * self.scales), times=np.zeros(0), scales=np.ones(1))
 
     def decoder(self, device: str = "cpu", **options: Any) -> Any:
         """Loads the model onto a device and returns its decoder.

@@ -32,20 +32,23 @@ class Known(NamedTuple):
     normal: np.ndarray | None
 
 
-def probes_of(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None = None) -> Known:
+def probes_of(
+    model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None = None, time: float | None = None
+) -> Known:
     """Finds the positions of a model's probes, and reads their values and normals from the input of the fit.
 
     Args:
-        model: The model.
+        model: The model, of one hour.
         original: The file that was compressed; None: the positions stored with the model are used.
         key: Name of the file's array, as for `wlm.probe.load`.
+        time: Hour of the day of the file's values, if it has several.
 
     Raises:
         WlmError: No positions are known, or the file cannot be read or has other probes.
     """
     live = model.live
     if original is not None:
-        probes = load(original, key=key)
+        probes = load(original, key=key).at(time)
         if not model.has_probes_at(probes.position) or probes.outputs != model.outputs:
             raise WlmError(
                 f"{original}: expected the {model.probes} probes of {model.outputs} numbers of {model.name}, in their "

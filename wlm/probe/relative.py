@@ -5,12 +5,12 @@ all directions times a constant. Errors are divided by
 
     m = sqrt(|L|^2 + floor^2),   floor = FLOOR * geometric mean of |L| over the live probes
 
-so that light of 1 and of 1 : 10,000 in one set are equally exact, and noise in nearly black probes costs nothing.
+so that light of 1 and of 1 : 10,000 in one set are about equally exact, and noise in nearly black probes costs nothing.
 """
 
 import numpy as np
 
-FLOOR = 1e-3
+FLOOR = 1e-4
 """The floor of relative errors, as a share of the geometric mean of all live probes' light."""
 
 _LEAST = 1e-6  # of the brightest probe: darker probes count as this bright in the mean

@@ -14,8 +14,8 @@ from scipy.interpolate import CubicHermiteSpline
 
 from wlm.config import load_settings
 from wlm.errors import WlmError
+from wlm.formats.hours import DAY, hours_of_names
 from wlm.formats.reading import named_file
-from wlm.lightmap.hours import DAY, hours_of_names
 from wlm.lightmap.model import LightmapModel
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import irradiance, unit_or_zero
@@ -188,7 +188,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
             raise WlmError(f"{path}: {key}: there is no file or folder {found}")
         return found
 
-    probes = [(row.hour, _probes(file(f"probes.{i}.file", row.file))) for i, row in enumerate(given.probes)]
+    probes = [(row.hour, _probes(file(f"probes.{i}.file", row.file), row.hour)) for i, row in enumerate(given.probes)]
     for i, (_, model) in enumerate(probes[1:], 1):
         if not np.array_equal(model.positions, probes[0][1].positions):
             raise WlmError(f"{path}: probes.{i}.file: expected probes at the positions of {given.probes[0].file}")
@@ -229,8 +229,8 @@ def _light(path: Path) -> LightmapModel:
     return model
 
 
-def _probes(path: Path) -> ProbeModel:
-    model: Any = load_model(path, "probe")
+def _probes(path: Path, hour: float) -> ProbeModel:
+    model: Any = load_model(path, "probe").at(hour)
     if model.outputs != _SH or not model.has_positions:
         positions = "with" if model.has_positions else "without"
         raise WlmError(

@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from wlm.lightmap.hours import DAY
+from wlm.formats.hours import DAY
 
 FIELDS = (1.0, 150.0)
 """Smallest and largest vertical field of view, degrees."""

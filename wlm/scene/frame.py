@@ -22,9 +22,9 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
+from wlm.formats.hours import DAY
 from wlm.formats.light import read_light
 from wlm.interop import to_warp
-from wlm.lightmap.hours import DAY
 from wlm.lightmap.virtual.texture import BUDGET, VirtualTexture
 from wlm.ops.raster import Raster, interpolate, rasterize, texture
 from wlm.probe.sphere import unit_or_zero

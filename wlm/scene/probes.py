@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from wlm.lightmap.hours import DAY
+from wlm.formats.hours import DAY
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.virtual.clock import Clock
 from wlm.probe.model import ProbeModel

@@ -22,13 +22,8 @@ _ABOUT = {
 
 
 def bundle(book: Book, *, name: str = "smoke", device: str = "cpu") -> Bundle:
-    """Makes the bundle of a flip book: its textures with 8 bits per channel, their description, and a shader.
-
-    Args:
-        book: The flip book; one of its textures must store the opacity of the smoke.
-        name: Name of the smoke, for an engine's assets.
-        device: Ignored, since a flip book is always in the memory of the CPU.
-    """
+    """Makes the bundle of a flip book, one of whose textures stores the opacity: its textures with 8 bits per channel,
+    their description, and a shader. `device` is ignored, since a flip book is always in the memory of the CPU."""
     if not any(ALPHA in names for names in book.channels.values()):
         raise WlmError(f"{name}: the flip book has no opacity: expected an alpha channel in one of its textures")
     textures, clipped = {}, 0

@@ -23,6 +23,7 @@ def open_scene(
     mesh: _Path | None = None,
     original: _Path | None = None,
     key: str | None = None,
+    time: float | None = None,
     walk: _Path | None = None,
     block: float | None = None,
     flat: bool = False,
@@ -36,14 +37,16 @@ def open_scene(
         mesh: Mesh file that the light belongs to; for lightmaps it needs their UVs.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Name of the array to show of a probe file with several.
+        time: Hour of the day to show of light probes that have several.
         walk: File with the viewpoints of the cascaded volume, as `wlm.probe.load_positions` reads it.
         block: Side of the cascaded volume's finest blocks; None to derive it from the probes' spacing.
         flat: Whether a lightmap is shown unwrapped, although its mesh is known.
         up: The axis that points up.
         progress: Called about twice a second while frames of smoke are read.
     """
-    options = {"mesh": mesh, "original": original, "key": key, "walk": walk, "block": block, "flat": flat}
-    given = {name: value for name, value in options.items() if value not in (None, False)}
+    options = {"mesh": mesh, "original": original, "key": key, "time": time, "walk": walk, "block": block}
+    options["flat"] = flat or None
+    given = {name: value for name, value in options.items() if value is not None}
     kind, paths = content_of(files)
     if kind not in _OPENERS:
         raise WlmError(f"{paths[0]}: {_REASONS.get(kind, _EXPECTED)}")
@@ -89,6 +92,7 @@ def _probes(
     mesh: _Path | None = None,
     original: _Path | None = None,
     key: str | None = None,
+    time: float | None = None,
     walk: _Path | None = None,
     block: float | None = None,
 ) -> Scene:
@@ -97,10 +101,10 @@ def _probes(
     from wlm.view.probe_scene import model_probes, probe_scene, set_probes
 
     if content_of(paths)[0] == "probe":
-        probes = model_probes(load(paths[0], "probe"), original, key, title)
+        probes = model_probes(load(paths[0], "probe").at(time), original, key, title, time)
     else:
         check_options(paths[0], ("original",) if original else (), ())
-        probes = set_probes(load_probes(paths[0], key=key), title)
+        probes = set_probes(load_probes(paths[0], key=key).at(time), title)
     geometry = None if mesh is None else read_geometry(mesh, with_uv=False)
     path = None if walk is None else load_positions(walk)
     return probe_scene(probes, title=title, geometry=geometry, walk=path, block=block, up=up)

@@ -53,9 +53,15 @@ class Probes:
     note: str
 
 
-def model_probes(model: ProbeModel, original: str | os.PathLike[str] | None, key: str | None, title: str) -> Probes:
-    """Takes the probes of a model; the arguments are those of `wlm.probe.places.probes_of`."""
-    position, given, live, _ = probes_of(model, original, key)
+def model_probes(
+    model: ProbeModel,
+    original: str | os.PathLike[str] | None,
+    key: str | None,
+    title: str,
+    time: float | None = None,
+) -> Probes:
+    """Takes the probes of a model of one hour; the other arguments are those of `wlm.probe.places.probes_of`."""
+    position, given, live, _ = probes_of(model, original, key, time)
     count = _coefficients(model.outputs, title)
     decoder, places = model.decoder(position=position), position[live]
     values = {"decoded": decoder.decode_probes()[live].reshape(-1, count, 3)}
@@ -90,15 +96,10 @@ def probe_scene(
     block: float | None = None,
     up: int = 1,
 ) -> Scene:
-    """Makes the scene of probes.
+    """Makes the scene of probes, with a mesh that is lit at its vertices.
 
-    Args:
-        probes: The probes.
-        title: Title of the window.
-        geometry: Mesh of the scene, lit at its vertices; or None.
-        walk: [F, 3], viewpoints of the cascaded volume; None for a loop through the scene.
-        block: Side of the volume's finest blocks; None to derive it from the probes' spacing.
-        up: The axis that points up.
+    `walk`, [F, 3], are viewpoints of the cascaded volume, None for a loop through the scene, and `block` the side of
+    its finest blocks, None to derive it from the probes' spacing.
     """
     light = StoredLight(next(iter(probes.values.values())))  # the decoded light, or else the original
     volume = Volume(probes.position, light, block=block)

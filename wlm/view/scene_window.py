@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from wlm.formats.hours import DAY
 from wlm.interop import check_device
 from wlm.lightmap.decode import Decoder
 from wlm.lightmap.groups import Weight, changed_weights
-from wlm.lightmap.hours import DAY
 from wlm.ops.raster import interpolate, rasterize_uv
 from wlm.scene.content import Scene as Content
 from wlm.scene.probes import DayProbes
@@ -24,13 +24,8 @@ _MOST = 4.0  # of the slider of a light group
 
 
 def day_scene(content: Content, weights: Mapping[str, Weight] | None = None, device: str = "cpu") -> Scene:
-    """Makes the scene of a window: a slider for the hour, and one for the weight of each light group.
-
-    Args:
-        content: The scene; it must stay open.
-        weights: Factors of light groups, by which the sliders multiply.
-        device: "cpu", "cuda" or "cuda:N": decodes the lightmaps and the probes.
-    """
+    """Makes the scene of a window, of content that must stay open: a slider for the hour, and one for each light group
+    that multiplies its weight; `device` decodes the lightmaps and the probes."""
     model, device = content.light, check_device(device)
     factors = changed_weights(model.name, {group: np.ones(3, np.float32) for group in model.groups}, weights or {})
     hour = Slider("hour", 0.0, DAY, content.day.first % DAY, 0.25, wraps=True, clock=True)

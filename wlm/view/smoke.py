@@ -125,14 +125,10 @@ class Drawing:
                 kernels.shadow(self._solids, self._as_lamps(), view, to_warp(surface.contiguous()))
 
     def __call__(self, smoke: SixWay | LitSmoke | ScatteredSmoke) -> torch.Tensor:
-        """Draws a frame.
+        """Draws a frame, and returns `image`.
 
-        Args:
-            smoke: On the device: lightmaps with transparency and, if there are obstacles, with depth; or smoke that was
-                lit by the drawing's lights. `ScatteredSmoke` already includes the albedo.
-
-        Returns:
-            `image`.
+        `smoke`, on the device, are lightmaps with transparency and, if there are obstacles, with depth; or smoke that
+        was lit by the drawing's lights. `ScatteredSmoke` already includes the albedo.
         """
         six = smoke if isinstance(smoke, SixWay) else None
         seen = smoke.lit if isinstance(smoke, ScatteredSmoke) else smoke

@@ -86,17 +86,10 @@ def run(
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> Iterator[Frame]:
-    """Simulates a scene and draws each of its frames.
+    """Simulates a scene and draws each of its frames; six-way lighting needs an orthographic camera.
 
-    Args:
-        scene: The scene; six-way lighting needs an orthographic camera.
-        lighting: The lighting; None: light of all orders with the scene's albedo.
-        white: Radiance that becomes white.
-        device: Result of `wlm.interop.check_device`.
-        progress: Called after each frame.
-
-    Yields:
-        The frames. Each stage waits for the device, so that its duration is measured separately.
+    Without `lighting` it is light of all orders with the scene's albedo; `white` is the radiance that becomes white.
+    Each stage waits for the device, so that its duration is measured separately.
     """
     lighting = Lighting(scene.smoke.albedo) if lighting is None else lighting
     solver = make_solver(scene, device=device)

@@ -32,13 +32,7 @@ _PLANES, _SMOKE = "planes", "smoke"
 
 
 def six_way_scene(paths: Sequence[Path], *, title: str, progress: OnProgress | None = None) -> Scene:
-    """Makes the scene of six-way lightmaps.
-
-    Args:
-        paths: One EXR a frame, of one size, as `wlm smoke bake` or `predict` wrote them.
-        title: Title of the window.
-        progress: Called about twice a second.
-    """
+    """Makes the scene of six-way lightmaps, one EXR a frame, of one size, as `wlm smoke bake` or `predict` write."""
     frames: list[SixWay] = []
     meter = Meter(progress, "read", len(paths))
     for path in paths:

@@ -99,15 +99,8 @@ def lightmap_scene(
     geometry: Geometry | None = None,
     up: int = 1,
 ) -> SurfaceScene:
-    """Makes the scene of a sheet of lightmaps over time: the model, its input, or both side by side.
-
-    Args:
-        model: The model of the sheet; or None.
-        lightmaps: The input of the model's size; or None.
-        title: Title of the window.
-        geometry: The mesh, with lightmap UVs; None for a flat picture.
-        up: The axis that points up.
-    """
+    """Makes the scene of a sheet of lightmaps over time: the model, its input of the same size, or both side by side,
+    on a mesh with lightmap UVs or as a flat picture."""
     first = model if model is not None else lightmaps
     height, width = (model.height, model.width) if model is not None else lightmaps.mask.shape
     times = first.times
@@ -203,15 +196,11 @@ def atlas_scene(
     flat: bool = False,
     up: int = 1,
 ) -> SurfaceScene:
-    """Makes the scene of a mesh under its lightmap: the first sheet of a scene in its first state.
+    """Makes the scene of a mesh under its lightmap: the first sheet of a scene in its first state, of the model, or of
+    the input without one.
 
-    Args:
-        scene: The meshes; without a model their input lightmap is shown.
-        model: The compressed lightmaps; None for the input.
-        original: [H, W, 3], the lightmap that was compressed, shown beside the decoded one; or None.
-        title: Title of the window.
-        flat: Whether the lightmap is shown unwrapped, not on its mesh.
-        up: The axis that points up.
+    `original`, [H, W, 3], is the lightmap that was compressed, shown beside the decoded one; `flat` shows the lightmap
+    unwrapped.
     """
     sheet = scene.sheets[0]
     height, width = sheet.mask.shape

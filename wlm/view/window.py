@@ -45,14 +45,8 @@ class Window:
     def __init__(
         self, scene: Scene, *, size: tuple[int, int] = (1280, 720), rate: float = 24.0, off_screen: bool = True
     ) -> None:
-        """Makes the window and draws the scene.
-
-        Args:
-            scene: The scene.
-            size: Width and height, pixels.
-            rate: Frames a second of scenes with frames.
-            off_screen: Whether the window stays hidden.
-        """
+        """Makes the window, of a width and height in pixels, and draws the scene, whose frames change at `rate` a
+        second; it stays hidden if `off_screen`."""
         pyvista = need("pyvista", "view")
         require_opengl()
         self.scene, self.playing, self._rate = scene, False, rate

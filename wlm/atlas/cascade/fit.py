@@ -102,17 +102,12 @@ def fit_cascade(
     *,
     repack: bool = True,
 ) -> AtlasModel:
-    """Compresses a lightmap to a cascade of two textures.
+    """Compresses a lightmap, of a scene of one sheet and one state, to a cascade of two textures; the groups of its
+    triangles share texels.
 
-    Args:
-        scene: A scene of one sheet and one state.
-        clusters: The groups of its triangles that share texels; None: no triangles share any.
-        profile, seed, stages: As for `wlm.atlas.fit.compress`.
-        repack: Whether charts are packed anew (section 3.3.1). If false, the mesh keeps its UVs, tuning starts from the
-            original lightmap, and `clusters` and the profile's `scale` are ignored (section 4.5.2).
-
-    Returns:
-        A model of method "cascade"; or "plain", with the colour texture T_p alone, if `lut_scale` is 0.
+    Without `repack`, charts are not packed anew (section 3.3.1): the mesh keeps its UVs, tuning starts from the
+    original lightmap, and `clusters` and the profile's `scale` are ignored (section 4.5.2). Returns a model of method
+    "cascade"; or "plain", with the colour texture T_p alone, if `lut_scale` is 0.
     """
     (sheet,), facts = scene.sheets, {}
     count = len(sheet.triangle)

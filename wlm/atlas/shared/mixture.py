@@ -68,16 +68,12 @@ def moments(light: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 def find_mixtures(
     moment: np.ndarray, texels: np.ndarray, rank: int, count: int, seed: int, like: int | None = None
 ) -> Mixtures:
-    """Finds at most `count` mixtures for some tiles: each is a set of K components' factors in M states that a group of
-    the tiles shares. There are fewer if a group would have no tile.
+    """Finds at most `count` mixtures for some tiles: each is a set of K = `rank` components' factors in M states that a
+    group of the tiles shares. There are fewer if a group would have no tile.
 
-    Args:
-        moment: float [T, 3, M, M], result of `moments` for T tiles.
-        texels: float [T, N, M, 3], N texels of each of the tiles, not negative.
-        rank: K, the number of components, 1 to M.
-        count: Largest number of mixtures, at least 1.
-        seed: Seed for choosing the tiles from which the mixtures start.
-        like: Number of first components by which tiles are assigned to mixtures; None: all K.
+    `moment`, float [T, 3, M, M], is the result of `moments` for T tiles, and `texels`, float [T, N, M, 3], N texels of
+    each, not negative. `seed` chooses the tiles from which the mixtures start; tiles are assigned to mixtures by the
+    first `like` components, None: by all.
     """
     random, moment, few = np.random.default_rng(seed), np.asarray(moment, np.float64), like or rank
     flat, energy = moment.reshape(len(moment), -1), np.trace(moment, axis1=2, axis2=3).sum(1)

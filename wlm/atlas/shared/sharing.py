@@ -146,16 +146,11 @@ def fitted(
     seed: int,
     stages: Stages,
 ) -> Fitted:
-    """Chooses components and sizes for the tiles of all planes. Tiles are shared by the states or separate for each.
+    """Chooses components and sizes for the tiles of all planes, from `planes_of`. Tiles are shared by the states or
+    separate for each.
 
-    Args:
-        scene: The scene.
-        planes: Sheets and mip levels, from `planes_of`.
-        unit: float64 [M], the divisor of each state's light.
-        varies: Variation of each sheet's light, from `variation`.
-        profile: The settings.
-        seed: Seed of all random choices.
-        stages: Reports and times the stages.
+    `unit`, float64 [M], is the divisor of each state's light, and `varies` the variation of each sheet's light, from
+    `variation`.
     """
     states = len(scene.states)
     # One state has one component.

@@ -26,13 +26,8 @@ _FORMATS = {"half": "half floats", "rgb9e5": "RGB9E5", "bc6h": "BC6H", "astc": "
 def atlas_page(
     paths: Sequence[Path], *, original: str | os.PathLike[str] | None = None, up: Literal["y", "z"] = "y"
 ) -> Page:
-    """Makes the HTML page of a model with one lightmap.
-
-    Args:
-        paths: The model's file.
-        original: The lightmap that was compressed, to compare with.
-        up: The axis that points up in the scene.
-    """
+    """Makes the HTML page of a model with one lightmap; `original` is the lightmap that was compressed, to compare
+    with, and `up` the axis that points up in the scene."""
     model = load(paths[0], "atlas")
     if model.method == "shared":
         raise WlmError(f"{model.name}: expected a model of one lightmap, found {len(model.sheets) * len(model.states)}")

@@ -41,6 +41,7 @@ def make_page(
     mesh: str | os.PathLike[str] | None = None,
     original: str | os.PathLike[str] | None = None,
     key: str | None = None,
+    time: float | None = None,
     hours: int = 6,
     rate: float = 30.0,
     up: Literal["y", "z"] = "y",
@@ -54,6 +55,7 @@ def make_page(
         mesh: Mesh file of the scene. To show lightmaps over time, it must have the UVs of the lightmaps.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Name of the array to read from an original probe file with several arrays.
+        time: Hour of the day to show of light probes that have several.
         hours: Largest number of original lightmaps in the page, at evenly spread times.
         rate: Playback speed of smoke, in frames per second.
         up: The axis that points up in the scene.
@@ -72,7 +74,7 @@ def make_page(
     module, function = _PAGES[kind]
     make = getattr(import_module(module), function)
     known = signature(make).parameters
-    given: dict[str, Any] = {"mesh": mesh, "original": original, "key": key}
+    given: dict[str, Any] = {"mesh": mesh, "original": original, "key": key, "time": time}
     given = {name: value for name, value in given.items() if value is not None}
     check_options(Path(files[0]), tuple(given), tuple(known))
     # These have defaults for every kind.

@@ -66,16 +66,17 @@ def probe_page(
     mesh: str | os.PathLike[str] | None = None,
     original: str | os.PathLike[str] | None = None,
     key: str | None = None,
+    time: float | None = None,
     up: Literal["y", "z"] = "y",
 ) -> Page:
     """Makes the HTML page of a probe model, which shows spheres at the positions of the model or the original."""
-    model, file_bytes = load_model(paths[0], "probe"), paths[0].stat().st_size
+    model, file_bytes = load_model(paths[0], "probe").at(time), paths[0].stat().st_size
     coefficients = sh_count(model.outputs)
     if coefficients is None:
         raise WlmError(
             f"{model.name}: expected probes of RGB spherical harmonics, found {model.outputs} numbers a probe"
         )
-    position, values, live, _ = probes_of(model, original, key)
+    position, values, live, _ = probes_of(model, original, key, time)
     places = position[live].astype(np.float32)
     decoded = model.decoder(position=position).decode_probes()[live]
     made = bundle(model)
@@ -116,6 +117,6 @@ def probe_page(
         ("profile", model.profile.name),
     ]
     if original is not None:
-        score = evaluate(model, load(original, key=key), file_bytes=file_bytes).psnr
+        score = evaluate(model, load(original, key=key).at(time), file_bytes=file_bytes).psnr
         figures.append(("PSNR of coefficients", "–" if math.isnan(score) else f"{score:.2f} dB"))
     return Page("probe", model.name, "Light probes, decoded on this GPU.", figures, manifest, arrays)

@@ -14,12 +14,12 @@ from wlm.export.engines.kit import filled
 from wlm.export.page.html import Page, asset
 from wlm.export.page.lightmap import pack_groups, pack_originals
 from wlm.export.page.smoke import pack_frames
+from wlm.formats.hours import DAY
 from wlm.formats.light import read_light
 from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.groups import times_of
-from wlm.lightmap.hours import DAY
 from wlm.lightmap.model import SheetModel
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.sheet import first_light

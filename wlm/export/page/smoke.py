@@ -18,13 +18,8 @@ _WHITE = 0.8  # screen value of the brightest lightmap
 
 
 def smoke_page(paths: Sequence[Path], *, rate: float = 30.0, progress: OnProgress | None = None) -> Page:
-    """Makes the HTML page that plays six-way lightmaps of smoke.
-
-    Args:
-        paths: One EXR per frame, written by `wlm smoke bake` or `predict`, all of one size.
-        rate: Playback speed in frames per second.
-        progress: Called about twice a second while the frames are read.
-    """
+    """Makes the HTML page that plays six-way lightmaps of smoke, an EXR per frame of `wlm smoke bake` or `predict`, all
+    of one size, at `rate` frames per second."""
     if not 0 < rate < float("inf"):
         raise WlmError(f"--rate: expected a number above 0, got {rate}")
     codes, most, hot = pack_frames(paths, progress)

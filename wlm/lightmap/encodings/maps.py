@@ -328,14 +328,12 @@ def fours(profile: Profile) -> int:
 
 
 def shader_networks(sheet: SheetModel) -> np.ndarray:
-    """Returns all networks as the shader reads them: weights W and bias b of layers 1 to 3, one row of W per input.
+    """Returns all networks as the shader reads them, float32 [n, 4]: weights W and bias b of layers 1 to 3, one row of
+    W per input; `network_starts` says where each network begins.
 
     Dynamic tiles come first, then static ones. Rows are padded with zeros to groups of four, and so are the inputs of
     the next layer. The shader passes features f as the textures hold them: their centring, (f - 1/2) sqrt(12), is part
     of W1 and b1.
-
-    Returns:
-        float32 [n, 4]; `network_starts` says where each network begins.
     """
     hidden, wide = sheet.profile.hidden, 4 * fours(sheet.profile)
     made = [np.zeros((0, 4), np.float32)]

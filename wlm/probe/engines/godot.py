@@ -59,7 +59,7 @@ def write_kit(
         WlmError: A probe has other than 9 coefficients, `cells` is out of range or given with an `.lmbake`, the
             `.lmbake` has other probes, the light exceeds float32, or the device does not exist.
     """
-    model = bundle.model
+    model = bundle.model.at()
     bake = original if original is not None and Path(original).suffix.lower() == ".lmbake" else None
     info: dict[str, object] = {"probes": model.probes}
     if bake is None:

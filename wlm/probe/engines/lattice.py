@@ -123,7 +123,7 @@ def lattice_kit(
             WlmError: A probe has other than 9 coefficients, `cells` is out of range, the light exceeds the range of the
                 engine's numbers, or the device does not exist.
         """
-        lattice = lattice_of(bundle.model, cells, most, positions_of(bundle.model, original), device)
+        lattice = lattice_of(bundle.model.at(), cells, most, positions_of(bundle.model, original), device)
         document = {"format": form, "version": 1, "about": about, "name": lattice.name}
         document |= {"resolution": lattice.count.tolist()}
         write_index(folder / index, document | write(folder, lattice, lattice.light(lattice.centres())))

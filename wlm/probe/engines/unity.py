@@ -185,7 +185,7 @@ def write_kit(
             not exist, the positions are unknown or of other probes, a number exceeds float32, or the device does not
             exist.
     """
-    model, position = bundle.model, positions_of(bundle.model, original)
+    model, position = bundle.model.at(), positions_of(bundle.model, original)
     coefficients = sh_count(model.outputs)
     if coefficients is None or coefficients > _L2:
         raise WlmError(f"{model.name}: expected 3, 12 or 27 numbers per probe (RGB SH, up to L2), got {model.outputs}")

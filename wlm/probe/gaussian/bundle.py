@@ -10,7 +10,7 @@ from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.folder import rounded
 from wlm.probe.decode import Decoder
-from wlm.probe.gaussian.model import CENTRE, CUT, SCALE, Gaussians
+from wlm.probe.gaussian.model import CENTRE, CUT, SCALE, Gaussians, padded_size
 from wlm.probe.gaussian.shader import HEAD_WORDS, gaussian_words, probe_glsl
 from wlm.probe.model import ProbeModel
 
@@ -62,7 +62,10 @@ def gaussian_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
         "words_per_gaussian": gaussian_words(content.latent),
         "slenderness": float(f"{(scale.max(1) / scale.min(1)).max():.3g}"),
     }
-    buffers = {"gaussians": _gaussian_words(model, content), "network": _network_words(content)}
+    network = _network_words(content)
+    words = padded_size(content.hidden, content.columns) // 2
+    document["hour"] = {"buffer": "network", "first_word": len(network) - words, "words": words}
+    buffers = {"gaussians": _gaussian_words(model, content), "network": network}
     reference = {"position": position, "values": decoder.decode(position)}
     return Bundle("probe", model.name, probe_glsl(content), document, buffers=buffers, reference=reference)
 

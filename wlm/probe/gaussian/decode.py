@@ -55,10 +55,13 @@ class GaussianDecoder(Decoder):
         self._shapes = gaussian_sum.shapes(self._rows, CUT, content.support)
         self._cubes = probe_cubes.build(self._shapes, np.zeros(3, np.float32), model.size.astype(np.float32))
         self.pairs = self._cubes.item.shape[0]
-        first, second, third = (layer.astype(np.float32) for layer in content.layers())
-        third = np.pad(third, ((0, 0), (0, probe_network.padded(content.columns) - content.columns)))
-        net = np.concatenate([first.ravel(), second.ravel(), third.ravel()])
-        self._net = self._put(net, float)
+        columns = model.outputs + content.relative
+        shared = np.concatenate([layer.ravel() for layer in content.layers()[:2]])
+        last = np.stack([each.layers()[2] for each in self._contents()])
+        last = np.pad(last, ((0, 0), (0, 0), (0, probe_network.padded(columns) - columns)))
+        last = last.reshape(len(last), -1).astype(np.float32)
+        self._net = self._put(np.concatenate([shared.astype(np.float32), last[0]]), float)
+        self._keep_hours(last, self._net[len(shared) :])
         self._arrays += [self._shapes, self._cubes.start, self._cubes.item]
         kind = "cpu" if self.device == "cpu" else "cuda"
         sizes = content.latent, content.hidden, model.outputs, content.relative, ambient_numbers(model.outputs)

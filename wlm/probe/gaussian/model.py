@@ -25,7 +25,7 @@ ellipsoid with its axes in another order. The rotation with the smallest angle i
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Self
 
@@ -116,7 +116,7 @@ class Gaussians(Content):
     Attributes:
         latent: L, length of a latent.
         hidden: Width of both hidden layers.
-        outputs: D, numbers per probe.
+        outputs: D, numbers per probe at one hour.
         support: Support of a Gaussian, "ellipsoid" or "sphere".
         relative: Whether the network has an output for the magnitude, D + 1 outputs in all.
         gain: Factor of the network's outputs.
@@ -126,6 +126,7 @@ class Gaussians(Content):
         net: float16 [P]: for each layer a row of weights for every input, then the biases.
         dropped: Number of Gaussians that the fit dropped, since no probe needed them.
         whole: The integers from which the arrays are computed; None until a fit is quantised for its file.
+        hours: T, number of hours; the network has T D outputs.
     """
 
     METHOD: ClassVar[str] = "gaussians"
@@ -144,6 +145,7 @@ class Gaussians(Content):
     net: np.ndarray
     dropped: int
     whole: WholeNumbers | None = None
+    hours: int = 1
 
     @property
     def count(self) -> int:
@@ -152,12 +154,13 @@ class Gaussians(Content):
 
     @property
     def nbytes(self) -> int:
-        return gaussian_bytes(self.count, self.latent, self.hidden, self.columns)
+        one = gaussian_bytes(self.count, self.latent, self.hidden, self.outputs + self.relative)
+        return one + (2 * self.hours * padded_size(self.hidden, self.outputs + self.relative) if self.hours > 1 else 0)
 
     @property
     def columns(self) -> int:
-        """The number of outputs of the network."""
-        return self.outputs + self.relative
+        """The number of outputs of the network, for all hours."""
+        return self.hours * self.outputs + self.relative
 
     @property
     def steps(self) -> np.ndarray:
@@ -173,6 +176,15 @@ class Gaussians(Content):
     def layers(self) -> list[np.ndarray]:
         """Returns the three layers of `net`, float16, as `layer_shapes` describes them."""
         return split_layers(self.net, layer_shapes(self.latent, self.hidden, self.columns))
+
+    def at(self, factors: np.ndarray) -> Self:
+        *shared, last = self.layers()
+        light, magnitude = np.split(last.astype(np.float64), [self.hours * self.outputs], axis=1)
+        mixed = np.concatenate([factors @ light.reshape(len(last), self.hours, -1), magnitude], 1)
+        net = np.concatenate(
+            [*(layer.ravel() for layer in shared), np.clip(mixed, -65504, 65504).astype("<f2").ravel()]
+        )
+        return replace(self, net=net, whole=None, hours=1)
 
     def facts(self) -> dict[str, Any]:
         return {"gaussians": self.count, "dropped": self.dropped, "latent": self.latent, "hidden": self.hidden}
@@ -209,7 +221,9 @@ class Gaussians(Content):
         }
 
     @classmethod
-    def from_parts(cls, profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Self:
+    def from_parts(
+        cls, profile: Profile, outputs: int, hours: int, stored: Mapping[str, np.ndarray], dropped: int
+    ) -> Self:
         latent, hidden = profile.latent, profile.hidden
         steps = (stored["steps"].astype(np.uint32) << 16).view(np.float32).astype(np.float64)
         if not (np.isfinite(steps).all() and (steps > 0).all()):
@@ -222,9 +236,8 @@ class Gaussians(Content):
             net=(first, second, third),
             net_step=steps[STORED_LATENT.start + latent :],
         )
-        gain, relative = float(stored["gain"][0]), profile.error == "relative"
-        sizes = latent, hidden, outputs, profile.support, relative, gain
-        content = cls(*sizes, dropped=dropped, whole=whole, **whole.codes())
+        sizes = latent, hidden, outputs // hours, profile.support, profile.error == "relative", float(stored["gain"][0])
+        content = cls(*sizes, dropped=dropped, whole=whole, hours=hours, **whole.codes())
         content._check_range()
         return content
 
@@ -240,7 +253,9 @@ class Gaussians(Content):
         first, _, third = (np.abs(layer.astype(np.float64)) for layer in self.layers())
         sums = self.count * np.abs(self.bounds[:, LATENT].astype(np.float64)).max(0)
         first *= np.concatenate([np.maximum(sums, 1.0), np.ones(4)])[:, None]
-        most = max(first.sum(0).max(), third.sum(0).max(), self.gain * third[:, : self.outputs].sum(0).max())
+        most = max(
+            first.sum(0).max(), third.sum(0).max(), self.gain * third[:, : self.hours * self.outputs].sum(0).max()
+        )
         if not most <= np.finfo(np.float32).max:
             raise ValueError("parts network, gaussians and gain: expected light within the range of float32")
 
@@ -255,11 +270,15 @@ def gaussian_bytes(count: int, latent: int, hidden: int, outputs: int) -> int:
     """Returns the bytes of the GPU buffers of `count` Gaussians and a network with `outputs` outputs; see
     `wlm.probe.gaussian.bundle`."""
     channels = LATENT.start + latent
-    padded = [
-        (1 + -(-(rows - 1) // 4) * 4, -(-columns // 4) * 4) for rows, columns in layer_shapes(latent, hidden, outputs)
-    ]
     gaussians = 4 * (10 + 2 * channels + count * ((channels + 1) // 2))
-    return gaussians + 2 * sum(rows * columns for rows, columns in padded)
+    return gaussians + 2 * sum(
+        padded_size(rows - 1, columns) for rows, columns in layer_shapes(latent, hidden, outputs)
+    )
+
+
+def padded_size(inputs: int, outputs: int) -> int:
+    """Returns the number of weights of a layer in a GPU buffer, with biases, and fours of inputs and of outputs."""
+    return (1 + -(-inputs // 4) * 4) * -(-outputs // 4) * 4
 
 
 def layer_shapes(latent: int, hidden: int, outputs: int) -> list[tuple[int, int]]:

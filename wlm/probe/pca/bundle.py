@@ -116,6 +116,8 @@ def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     shader = component_glsl(content.count, model.outputs, has_basis)
     document = {"about": _ABOUT, "live": len(values), "components": content.count, "basis": has_basis}
     document["clusters"] = content.clusters
+    first = 4 + content.count + content.clusters * (1 + content.count)
+    document["hour"] = {"buffer": "probes", "first_word": first, "words": halves.size // 2}
     reference = {"live": chosen.astype(np.int32), "values": values[chosen]}
     buffers = {"probes": np.concatenate(words)}
     return Bundle("probe", model.name, shader, document, buffers=buffers, reference=reference)

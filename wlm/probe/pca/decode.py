@@ -32,12 +32,18 @@ class ComponentDecoder(Decoder):
         self._codes = self._put(content.packed(), wp.uint32)
         self._place = self._put(content.places(), wp.vec2i)
         self._bounds = self._put(np.moveaxis(content.bounds, 0, 2), wp.vec2)
-        self._basis = self._put(content.basis, wp.float16)
+        bases = [each.basis for each in self._contents()]
+        self._basis = self._put(bases[0], wp.float16)
+        self._keep_hours(np.stack(bases).reshape(len(bases), -1), self._basis.flatten())
         live = model.live
         row = np.where(live, np.cumsum(live) - 1, -1)
         self._row = self._put(row.astype(np.int32), int)
         self.count, self.channels = model.probes, model.outputs
         self._volume: Volume | None = None
+
+    def set_time(self, time: float) -> None:
+        super().set_time(time)
+        self._volume = None
 
     def decode(self, position: np.ndarray) -> np.ndarray:
         """Returns the light at any points as a renderer reads it: from the cascaded volume around a nearby viewer.

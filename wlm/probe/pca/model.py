@@ -12,7 +12,7 @@ three numbers of spherical harmonics, is clamped at 0.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -43,14 +43,15 @@ _NARROW, _SHARES = 5, (1.0, 0.75, 0.55)  # fewer bits may be worth more if they 
 
 @dataclass(frozen=True, eq=False)
 class Components(Content):
-    """V live probes of D numbers, each a sum of K components, in C clusters.
+    """V live probes of D numbers at each of T hours, a sum of K components, in C clusters.
 
     Attributes:
-        outputs: Numbers per probe, D.
+        outputs: Numbers per probe at one hour, D.
         code: uint8 [V, 2 + K], cluster, and codes of the logarithm of the magnitude and of the coefficients.
         width: uint8 [2 + K], bits of each column of `code`.
         bounds: float16 [2, C, 1 + K], lowest value and step of each column of `code` but the first.
-        basis: float16 [C K, D]; empty where the directions are the unit vectors, K = D.
+        basis: float16 [C K, T D]; empty where the directions are the unit vectors, K = T D.
+        hours: T, number of hours.
     """
 
     METHOD: ClassVar[str] = "pca"
@@ -62,6 +63,7 @@ class Components(Content):
     width: np.ndarray
     bounds: np.ndarray
     basis: np.ndarray
+    hours: int = 1
 
     @property
     def count(self) -> int:
@@ -75,8 +77,15 @@ class Components(Content):
 
     @property
     def nbytes(self) -> int:
-        basis = len(self.basis)
-        return component_bytes(len(self.code), self.outputs, self.count, self.clusters, int(self.width.sum()), basis)
+        several, bits = self.hours > 1, int(self.width.sum())
+        basis = len(self.basis) or several * self.count
+        one = component_bytes(len(self.code), self.outputs, self.count, self.clusters, bits, basis)
+        return one + (4 * self.hours * basis * -(-self.outputs // 2) if several else 0)
+
+    def at(self, factors: np.ndarray) -> Self:
+        basis = self.basis.astype(np.float64) if len(self.basis) else np.eye(self.count)
+        mixed = factors @ basis.reshape(len(basis), self.hours, -1)
+        return replace(self, basis=np.clip(mixed, -65504, 65504).astype(np.float16), hours=1)
 
     def facts(self) -> dict[str, Any]:
         basis = "principal components" if len(self.basis) else "unit vectors"
@@ -100,7 +109,9 @@ class Components(Content):
         return {"code": self.code.T, "width": self.width, "bounds": self.bounds, "basis": self.basis}
 
     @classmethod
-    def from_parts(cls, profile: Profile, outputs: int, stored: Mapping[str, np.ndarray], dropped: int) -> Self:
+    def from_parts(
+        cls, profile: Profile, outputs: int, hours: int, stored: Mapping[str, np.ndarray], dropped: int
+    ) -> Self:
         bounds, width, code = stored["bounds"].astype(np.float64), stored["width"], stored["code"]
         levels = 2.0**width - 1.0
         if (width > _WIDEST).any() or (code > levels[:, None]).any() or code[0].max() >= bounds.shape[1]:
@@ -111,7 +122,8 @@ class Components(Content):
             raise ValueError(f"part bounds: expected steps of at least 0, and log magnitudes within {_MOST_LOG:g}")
         if not (np.exp(most[:, 0]) * most[:, 1:].sum(1)).max() * largest <= np.finfo(np.float32).max:
             raise ValueError("parts bounds and basis: expected light within the range of float32")
-        return cls(outputs, np.ascontiguousarray(code.T), width, stored["bounds"], stored["basis"])
+        code = np.ascontiguousarray(code.T)
+        return cls(outputs // hours, code, width, stored["bounds"], stored["basis"], hours)
 
     def places(self) -> np.ndarray:
         """Returns the first bit and the number of bits of each column of `code` in the bits of a probe, [2 + K, 2]."""
@@ -121,10 +133,12 @@ class Components(Content):
     def packed(self) -> np.ndarray:
         """Returns the codes as they are on a GPU: all bits of a probe, then those of the next, uint32."""
         place = [(column, bit) for column, width in enumerate(self.width) for bit in range(width)]
-        column, bit = np.array(place, np.uint8).reshape(-1, 2).T
+        column, bit = np.array(place, np.intp).reshape(-1, 2).T
         words = []
         for start in range(0, len(self.code), _RECORDS):  # records of 32 probes end with a word
-            bits = np.packbits(self.code[start : start + _SAMPLE, column] >> bit & 1, bitorder="little")
+            bits = np.packbits(
+                self.code[start : start + _RECORDS, column] >> bit.astype(np.uint8) & 1, bitorder="little"
+            )
             words.append(np.pad(bits, (0, -len(bits) % 4)).view("<u4"))
         return np.concatenate(words)
 

@@ -75,14 +75,11 @@ def _like(text: str, other: str) -> str:
 
 
 def six_way_channels(names: Sequence[str]) -> dict[str, list[list[str]]]:
-    """Finds six-way lightmaps among the channels of an EXR file.
+    """Finds six-way lightmaps among the channels of an EXR file: for each direction, `ALPHA`, `EMISSION` and
+    `TRANSPARENCY` the channels of each candidate; empty if a direction has none.
 
     A direction is a channel such as "left", a layer or a part such as "C_left" of R, G and B, or a channel of one of
     two layers that are named like textures, such as "lightmapA.R".
-
-    Returns:
-        For each direction, `ALPHA`, `EMISSION` and `TRANSPARENCY` the channels of each candidate; empty if a direction
-        has none.
     """
     found: dict[str, dict[str, list[str]]] = {}
     layers: dict[str, dict[str, str]] = {}

@@ -44,17 +44,8 @@ def generator(validation: bool, *numbers: int) -> np.random.Generator:
 
 
 def draw_scene(settings: DatasetSettings, seed: int, index: int, *, validation: bool = False) -> Scene:
-    """Draws a random scene; the same arguments give the same scene.
-
-    Args:
-        settings: Settings of the samples, of which grid, times and probabilities are used.
-        seed: Seed of a set of scenes, at least 0.
-        index: Number of the scene in its set, at least 0.
-        validation: Whether the set is not used in training.
-
-    Returns:
-        The scene. Its frames are as far apart in time as the two frames of a pair.
-    """
+    """Draws random scene number `index` of a set with a seed; frames are as far apart in time as the two frames of a
+    pair. Sets for validation are not used in training."""
     random = generator(validation, seed, index, 0)
     if random.random() < settings.hot:
         kind = "burst" if random.random() < 0.6 else "flame"

@@ -90,18 +90,8 @@ def orders_march(volume: DensityVolume, g: float = 0.0) -> March:
 def make_inputs(
     volume: DensityVolume, camera: Camera, lights: Sequence[AnyLight], albedos: Sequence[float], march: March
 ) -> tuple[LitSmoke, Inputs]:
-    """Computes light scattered once and light by diffusion; to be called inside `wlm.interop.stream`.
-
-    Args:
-        volume: The smoke.
-        camera: Any camera.
-        lights: Any number of lights.
-        albedos: Any number of albedos.
-        march: Settings of the march, with g = 0.
-
-    Returns:
-        Images of the light scattered once, and the inputs of the prediction.
-    """
+    """Computes light scattered once, whose images it returns, and light by diffusion, and thus the inputs of the
+    prediction; `march` has g = 0. To be called inside `wlm.interop.stream`."""
     ways = [aim(light, volume) for light in lights]
     with marching(volume, camera, march) as scene:
         spreading = Spreading(scene, volume, lights)

@@ -1,7 +1,9 @@
-"""Reads the hours of lightmaps from the names of their files or folders."""
+"""Hours of the day: in the names of files, folders and arrays, and between stored ones."""
 
 import re
 from collections.abc import Sequence
+
+import numpy as np
 
 DAY = 24.0
 """Hours in a day, the period of hours that names state."""
@@ -20,16 +22,12 @@ _MOST = 26  # times of an alternative that a line lists
 
 
 def hours_of_names(stems: Sequence[str]) -> tuple[list[float | None], str]:
-    """Reads the hour at the end of each name: `_18h`, `_18h30`, `_1830h`, `_6pm`, `_18.5` or `_18_30h`.
+    """Reads the hour at the end of each name without its suffix: `_18h`, `_18h30`, `_1830h`, `_6pm`, `_18.5` or
+    `_18_30h`.
 
     The two digits of `_18_30h` are minutes if those of all names are 00, 15, 30 or 45; otherwise, and after a point,
     they are decimals. A number before them that is the same in all names is part of the name: `_2_06h`, `_2_18h`.
-
-    Args:
-        stems: Names without their suffixes.
-
-    Returns:
-        The hours, None for a name without one; and a line about names that may be read differently, or "".
+    Returns the hours, None for a name without one; and a line about names that may be read differently, or "".
     """
     found = [_HOUR.search(stem) for stem in stems]
     pairs = [match for match in found if match and match["part"]]
@@ -68,3 +66,26 @@ def _hour(match: re.Match[str] | None, minutes: bool, clock: bool) -> float | No
     if match["bare"]:
         return float(match["bare"])
     return int(match["whole"]) + int(match["part"]) / 60 if minutes else float(f"{match['whole']}.{match['part']}")
+
+
+def neighbours(times: np.ndarray, period: float | None, t: float) -> tuple[int, int, float]:
+    """Returns the indices of the stored times before and after a time, and the weight of the later one, 0 to 1.
+
+    Args:
+        times: float64 [T], increasing.
+        period: Length of the day; the last and the first time are neighbours. None: `t` is within the times.
+        t: The time, finite.
+    """
+    count = len(times)
+    if count == 1:
+        return 0, 0, 0.0
+    t = t if period is None else t % period
+    after = int(np.searchsorted(times, t, side="right"))
+    before = after - 1
+    if period is None:
+        before, after = max(before, 0), min(after, count - 1)
+        gap = times[after] - times[before]
+        return before, after, float((t - times[before]) / gap) if gap > 0 else 0.0
+    before, after = before % count, after % count
+    gap = (times[after] - times[before]) % period or period
+    return before, after, float(((t - times[before]) % period) / gap)
