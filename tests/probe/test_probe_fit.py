@@ -245,7 +245,7 @@ def test_clusters_and_bits_have_the_error_that_is_stated(relative, clustered):
     decoded = reference_decode(components.code, components.bounds, components.basis, 0)
     scale = np.linalg.norm(clustered, axis=1)
     found = np.linalg.norm(decoded - clustered, axis=1) / (scale if relative else scale.max())
-    assert np.sqrt(np.mean(found**2)) == pytest.approx(error, rel=1e-3)
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(error, rel=1e-2)
     one = np.linalg.svd(clustered / scale[:, None], full_matrices=False)[2][:12]
     rest = clustered - clustered @ one.T @ one  # what 12 directions of all probes leave, in more bytes
     assert error < 0.5 * np.sqrt(np.mean((np.linalg.norm(rest, axis=1) / (scale if relative else scale.max())) ** 2))

@@ -20,7 +20,7 @@ from scipy.cluster.vq import kmeans2
 
 from wlm.formats.parts import Part
 from wlm.probe.model import Content, Profile
-from wlm.probe.relative import magnitudes, norms
+from wlm.probe.relative import norms
 
 ENOUGH = 0.02
 """Relative error at which no bit is added: RMS over all probes of the error divided by the probe's magnitude."""
@@ -36,6 +36,7 @@ _ROUNDS = 6  # of k-means, and again of k-means with subspaces
 _BITS, _RANK = 6, 8  # mean bits of a coefficient in most fits, and the largest dimension of a subspace for clustering
 _MOST = 64  # directions of a cluster
 _SAMPLE = 1 << 13  # probes from which clusters and bits are chosen
+_MADE_UP = 1 / 16  # of the rounding of the magnitude, that coefficients in unit vectors do not make up for
 _RECORDS = 1 << 15  # probes that are packed at once
 _SAFE = 0.95  # the predicted error is not exact, since coefficients make up for rounded magnitudes
 _NARROW, _SHARES = 5, (1.0, 0.75, 0.55)  # fewer bits may be worth more if they cover only a share of the range
@@ -92,7 +93,7 @@ class Components(Content):
         return {"components": self.count, "clusters": self.clusters, "bits": int(self.width.sum()), "basis": basis}
 
     def settings(self) -> dict[str, int]:
-        return {"count": self.count, "clusters": self.clusters}
+        return {"count": self.count} | ({"clusters": self.clusters} if self.clusters > 1 else {})
 
     @classmethod
     def table(cls, profile: Profile, outputs: int, count: int, live: int, clusters: int) -> dict[str, Part]:
@@ -287,6 +288,8 @@ def _plans(
         options = np.full((_WIDEST + 1, bits + 1), np.inf)
         for width in range(min(_WIDEST, bits) + 1):
             error = np.square(_quantised(values, groups, width).values - values).sum()
+            if column == 0 and division.directions is None:
+                error *= _MADE_UP
             options[width, width:] = total[: bits + 1 - width] + error
         pick = options.argmin(0)
         total, last = options.min(0), np.where(pick > 0, column, last[places - pick])
