@@ -20,8 +20,7 @@ of numbers of the time, and no reading of textures, which `shader-speed` measure
 means of the decoded texels.
 
 Rows "format" have the error of the physical texture's format beside its rival, 8 bits per channel in gamma space
-relative to the bound of a page. Rows "mips" have the error of the mips, whose texels are means of 16 samples, against
-means of all texels. Both are of the uncompressed lightmaps; `texel_rms` is relative to a texel's brightest channel.
+relative to the bound of a page, of the uncompressed lightmaps; `texel_rms` is relative to a texel's brightest channel.
 
 The large set, which is measured if no set is given, has four sheets of 4096 x 4096 texels at 26 times, of random maps
 and networks that change about as much in an hour as a real set does. Its sheets are a plain on which the camera walks.
@@ -75,7 +74,7 @@ _BLOCKS = ("bc7", "bc6h")
 _METRES = 128.0  # side of a sheet of the large set
 _ALL = 1 << 40  # bytes: the pages of all levels
 _EVERY = 6  # one of so many times is measured in a quick run
-_GAMMA, _BORDER, _GRID = 2.2, 4, 4  # of colours of 8 bits; of a page; samples of a texel of a mip along each axis
+_GAMMA, _BORDER = 2.2, 4  # of colours of 8 bits; of a page
 _WARMUP = 32  # frames, in which modules are loaded and the graph is captured
 _WAIT_CYCLES = 10_000_000  # of the GPU, about 5 ms: longer than the host needs to queue a frame
 
@@ -96,7 +95,7 @@ def run(
 
     Returns:
         Three rows: a walk, and a day with 8 and with 64 pages per frame; then the rows of the rivals in the walk and
-        in the day, and of a set those of formats and mips.
+        in the day, and of a set those of formats.
 
     Raises:
         WlmError: The set, its mesh or the device does not exist.
@@ -173,17 +172,13 @@ class _RunTime(Bench):
         return found
 
     def format_rows(self, sheet: SheetFrames) -> list[Row]:
-        """Returns the rows of formats and mips, of some of the uncompressed lightmaps."""
-        self.note("formats and mips")
+        """Returns the rows of formats, of some of the uncompressed lightmaps."""
+        self.note("formats")
         found = []
         frames = sheet.frames[:: _EVERY if self.quick else 1].astype(np.float32)
         shared = unpack_rgb9e5(pack_rgb9e5(frames))
         for method, decoded in (("RGB9E5", shared), ("RGBA8", np.stack([_as_bytes(frame) for frame in frames]))):
             found.append(self.row("format", method, **_differences(decoded, frames, sheet.mask)))
-        for level in (3, 4):
-            exact, covered = _mip(frames, sheet.mask, level, 1 << level)
-            sampled, met = _mip(frames, sheet.mask, level, _GRID)
-            found.append(self.row("mips", f"level {level}", **_differences(sampled, exact, covered & met)))
         return found
 
     def _path(self, name: str, camera: Camera, sheet: SheetFrames | None) -> "_Path":
@@ -406,7 +401,7 @@ class _Errors:
         return figures
 
 
-# ---- formats and mips ----
+# ---- formats ----
 
 
 def _as_bytes(frame: np.ndarray) -> np.ndarray:
@@ -419,20 +414,6 @@ def _as_bytes(frame: np.ndarray) -> np.ndarray:
             part = np.s_[y : y + TILE, x : x + TILE]
             out[part] = (np.rint(colour[part] / bound * 255.0) / 255.0 * bound) ** _GAMMA
     return out
-
-
-def _mip(frames: np.ndarray, mask: np.ndarray, level: int, grid: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a mip of lightmaps [T, H, W, 3], means of grid x grid valid samples, and which texels have one."""
-    step, (height, width) = 1 << level, (size >> level << level for size in mask.shape)
-    total, count = 0.0, 0
-    for a in range(grid):
-        for b in range(grid):
-            y, x = a, b
-            if grid < step:
-                y, x = (step * (2 * at + 1) // (2 * grid**2) for at in (a * grid + b, b * grid + grid - 1 - a))
-            part = np.s_[y:height:step, x:width:step]
-            total, count = total + mask[part][..., None] * frames[:, *part], count + mask[part]
-    return total / np.maximum(count, 1)[..., None], count > 0
 
 
 def _differences(decoded: np.ndarray, exact: np.ndarray, mask: np.ndarray) -> dict[str, float]:

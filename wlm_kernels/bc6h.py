@@ -562,13 +562,9 @@ def _encode(
 
 
 def encode(light, weight, tables: Tables, blocks, decoded) -> None:
-    """Encodes N blocks of 4 x 4 texels as unsigned BC6H.
+    """Encodes N blocks of 4 x 4 texels, vec3 [N, 16], row by row, finite, clamped to [0, 65504], as unsigned BC6H.
 
-    Args:
-        light: vec3 [N, 16], texels row by row, finite; clamped to [0, 65504].
-        weight: float [N, 16], weight of each texel's squared error, 0 or more.
-        tables: The format's tables, on the same device.
-        blocks: uint32 [N, 4], written: 16 bytes per block, the lowest first.
-        decoded: vec3 [N, 16], written: the decoded texels of the blocks.
+    `weight`, float [N, 16], is that of each texel's squared error, 0 or more. Written are `blocks`, uint32 [N, 4], 16
+    bytes per block, the lowest first, and `decoded`, vec3 [N, 16], the decoded texels.
     """
     wp.launch(_encode, len(light), inputs=[light, weight, tables], outputs=[blocks, decoded], device=light.device)

@@ -107,13 +107,9 @@ class MlpKernels:
     _backward: Any
 
     def forward(self, hidden, output, x, y) -> None:
-        """Evaluates N networks on B inputs each.
+        """Evaluates N networks on B inputs each, `x`, vecI [N, B]; writes the outputs `y`, vecO [N, B].
 
-        Args:
-            hidden: vecH [N, I + H + 2], the hidden layers, see the module.
-            output: vecO [N, H + 1], the output layers.
-            x: vecI [N, B], the inputs.
-            y: vecO [N, B], written: the outputs.
+        The layers are `hidden`, vecH [N, I + H + 2], see the module, and `output`, vecO [N, H + 1].
         """
         wp.launch(self._forward, x.shape, inputs=[hidden, output, x], outputs=[y], device=x.device)
 

@@ -4,15 +4,8 @@ from importlib import resources
 
 
 def native_source(package: str, name: str, **constants: int) -> str:
-    """Reads the body of a native function for `wp.func_native`, or a part of one.
-
-    Args:
-        package: The package whose folder `native` contains the file `NAME.cuh`: `__package__` of the kernels.
-        name: The file's NAME.
-        constants: Integer constants of the code, by name.
-
-    Returns:
-        The declarations of the constants, followed by the file's text.
+    """Reads the body of a native function for `wp.func_native`, or a part of one, from `NAME.cuh` in the folder
+    `native` of a package, which is `__package__` of the kernels; declarations of the integer constants come before it.
     """
     declarations = (f"constexpr int {key} = {value};\n" for key, value in constants.items())
     return "".join(declarations) + (resources.files(package) / "native" / f"{name}.cuh").read_text(encoding="utf-8")

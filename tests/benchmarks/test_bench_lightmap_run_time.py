@@ -1,4 +1,4 @@
-"""The benchmark of the virtual texture: its cameras, its large set, its mips, and rows that are of what they name."""
+"""The benchmark of the virtual texture: its cameras, its large set, and rows that are of what they name."""
 
 from types import SimpleNamespace
 
@@ -57,14 +57,9 @@ def test_the_large_set_changes_as_a_real_one():
     assert 0.005 < np.abs(later - noon).mean() / noon.mean() < 0.2 < np.abs(night - noon).mean() / noon.mean()
 
 
-def test_mips_and_formats():
+def test_formats():
     random = np.random.default_rng(0)
     frames, mask = random.uniform(0.0, 2.0, (2, 40, 24, 3)).astype(np.float32), random.random((40, 24)) < 0.7
-    mean, covered = bench._mip(frames, mask, 2, 4)
-    blocks = np.where(mask[..., None], frames, np.nan).reshape(2, 10, 4, 6, 4, 3)
-    np.testing.assert_allclose(mean[:, covered], np.nanmean(blocks, (2, 4))[:, covered], rtol=1e-5)
-    sampled, met = bench._mip(frames, mask, 3, 4)
-    assert sampled.shape == (2, 5, 3, 3) and met.all() and np.abs(sampled - 1.0).max() < 0.7
     error = bench._differences(np.stack([bench._as_bytes(frame) for frame in frames]), frames, mask)
     assert 45.0 < error["psnr"] < 60.0
 
@@ -96,7 +91,6 @@ def test_every_row_has_its_figures(rows, tmp_path):
         *(("virtual texture", path) for path in paths),
         *((name, path) for name in others for path in ("walk", "day")),
         *(("format", name) for name in ("RGB9E5", "RGBA8")),
-        *(("mips", f"level {level}") for level in (3, 4)),
     ]
     for row in own:
         assert 0.0 < row["current"] <= row["nearly_current"] <= 1.0 and row["cached_psnr"] > 30.0

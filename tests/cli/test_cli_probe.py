@@ -55,7 +55,7 @@ def test_compress_prints_one_table(room, profile, tmp_path):
         assert word in text
     assert re.search(rf"gaussians +│ +{model.content.count} │", text)
     assert model.content.count + model.content.dropped == round(0.1 * (PROBES - DEAD))
-    assert re.search(r"fit: 30 of 30, PSNR \d+\.\d+ dB", call.stderr)
+    assert re.search(r"fit: 30 of 30, error \d+\.\d+", call.stderr)
     assert f"{room}: {data.load(room).reading}" in call.stderr
     assert (model.profile.name, model.profile.steps, len(model.positions)) == ("tiny", 30, 0)
     assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"], "no checkpoint is left"
@@ -146,7 +146,7 @@ def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path):
     for word in (f"{report.psnr:.2f}", f"{report.irradiance_psnr:.2f}", f"{size:,}", "wlm tiny", "SH band 2"):
         assert word in text
     said = [line.removeprefix("warning: ") for line in call.stderr.splitlines() if line.startswith("warning: ")]
-    assert "worst probe:" in call.stderr and said == report.warnings
+    assert f"at the worst, probe {report.worst_probe['probe']} at (" in call.stderr and said == report.warnings
 
 
 def test_evaluate_reads_numbers_channel_by_channel(fitted, room, tmp_path):

@@ -34,7 +34,7 @@ def test_it_learns_and_says_how_well():
     # The last report is of the model before it is packed, which may cost a little, and fits what a short fit has left.
     assert psnr - 1.0 < reports[-1].figures["PSNR dB"] < psnr + 0.1
     model = compress(probes, SMALL, steps=300, progress=reports.append)
-    assert reports[-1].figures["relative error"] == pytest.approx(evaluate(model, probes).relative_error, rel=0.1)
+    assert reports[-1].figures["error"] == pytest.approx(evaluate(model, probes).relative_error, rel=0.1)
 
 
 def _input(probes):

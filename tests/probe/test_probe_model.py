@@ -118,7 +118,7 @@ def test_the_least_rotation_gives_the_same_ellipsoids():
 
 
 def test_quantising_costs_next_to_nothing():
-    plain = random_model(count=60, latent=3)
+    plain = random_model(count=60, latent=3, outputs=26, error="absolute")
     position = plain.origin + plain.extent * plain.size * np.random.default_rng(1).random((400, 3))
     # Its own light, a little off: the error of a fit.
     light = plain.decoder().decode(position)
@@ -134,8 +134,8 @@ def test_quantising_costs_next_to_nothing():
 
 def test_a_model_without_error_gets_fine_steps():
     # Light that the model gives exactly: any rounding shows, and no coarse step costs as little as allowed.
-    plain = random_model(count=3, latent=1, hidden=8, outputs=3, bits=4)
+    plain = random_model(count=3, latent=1, hidden=8, outputs=5, bits=4, error="absolute")
     position = plain.origin + plain.extent * plain.size * np.random.default_rng(0).random((500, 3))
     found = pack_model(plain, position, plain.decoder().decode(position), "cpu")
     assert found.content.whole is not None
-    np.testing.assert_allclose(found.decoder().decode(position), plain.decoder().decode(position), atol=1e-3)
+    np.testing.assert_allclose(found.decoder().decode(position), plain.decoder().decode(position), atol=2e-3)

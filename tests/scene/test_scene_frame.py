@@ -181,7 +181,7 @@ def test_a_lamp_is_on_in_the_first_frame_after_its_switch(changed, tmp_path):
             shown += [red] * film.info["duration"]
     assert len(shown) == 1000
     dark, lit = shown[(1000 * after - 500) // FRAMES], shown[(1000 * after + 500) // FRAMES]
-    assert abs(dark - floor[0]) < 0.04 and abs(lit - floor[-1]) < 0.04
+    assert abs(dark - floor[after - 1]) < 0.04 and abs(lit - floor[after]) < 0.04
 
 
 def test_six_lights_are_integrals_of_the_weights():

@@ -5,35 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from wlm.cli import models
-from wlm.cli.console import (
-    check_output,
-    exclusive,
-    note_warnings,
-    number,
-    quiet_warp,
-    running,
-    show,
-    show_facts,
-    table,
-    write_json,
-)
-from wlm.cli.options import (
-    AsJson,
-    CheckpointEvery,
-    Device,
-    Encoding,
-    Engine,
-    ExactShader,
-    ModelFile,
-    Profile,
-    ReportFile,
-    Resume,
-    Seed,
-    ShaderLanguage,
-    Trust,
-    output_option,
-)
+from wlm.cli import console, models
+from wlm.cli import options as opt
 from wlm.cli.settings import with_settings
 from wlm.errors import WlmError
 
@@ -84,24 +57,24 @@ _Resolution = Annotated[
 
 
 @with_settings("wlm.atlas:Profile")
-@exclusive
+@console.exclusive
 def compress(
     mesh: _Mesh,
-    output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
+    output: Annotated[Path, opt.output_option("OUT.wlm", "The file to write.")],
     settings: dict[str, Any],
     lightmaps: _Lights = None,
-    profile: Profile = "standard",
+    profile: opt.Profile = "standard",
     mask: _Mask = None,
     uv_set: _UvSet = None,
     node: _Node = None,
-    encoding: Encoding = None,
+    encoding: opt.Encoding = None,
     flip: _Flip = False,
     slot: _Slot = None,
-    seed: Seed = 0,
-    device: Device = "cpu",
-    resume: Resume = False,
-    checkpoint_every: CheckpointEvery = 30.0,
-    trust: Trust = False,
+    seed: opt.Seed = 0,
+    device: opt.Device = "cpu",
+    resume: opt.Resume = False,
+    checkpoint_every: opt.CheckpointEvery = 30.0,
+    trust: opt.Trust = False,
 ) -> None:
     """Compress the lightmaps of a mesh or a scene, in one state or several, into one file together with the triangles.
 
@@ -117,30 +90,30 @@ def compress(
 
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
     _, model, facts = models.fit("atlas", load, output, profile, settings, **options)
-    show_facts(model.name, facts | _facts(model))
-    note_warnings(model.report.get("lost light", ()))
+    console.show_facts(model.name, facts | _facts(model))
+    console.note_warnings(model.report.get("lost light", ()))
 
 
 def evaluate(
-    file: ModelFile,
+    file: opt.ModelFile,
     mesh: _Mesh,
     lightmaps: _Lights = None,
     views: _Views = None,
     resolution: _Resolution = None,
-    json_path: ReportFile = None,
+    json_path: opt.ReportFile = None,
     mask: _Mask = None,
     uv_set: _UvSet = None,
     node: _Node = None,
-    encoding: Encoding = None,
+    encoding: opt.Encoding = None,
     flip: _Flip = False,
     slot: _Slot = None,
-    device: Device = "cpu",
-    trust: Trust = False,
+    device: opt.Device = "cpu",
+    trust: opt.Trust = False,
 ) -> None:
     """Compare compressed lightmaps with the originals on rendered views of the scene."""
     if json_path is not None:
-        check_output(json_path, ".json")
-    quiet_warp()
+        console.check_output(json_path, ".json")
+    console.quiet_warp()
     from wlm.atlas import evaluate, load
     from wlm.interop import check_device
     from wlm.system import load as load_model
@@ -150,18 +123,18 @@ def evaluate(
     uv_set = model.stored.uv_set if uv_set is None else uv_set
     reading = {"uv_set": uv_set, "node": node, "encoding": encoding, "flip": flip, "slot": slot}
     scene = load(mesh, lightmaps, mask_path=mask, **reading, trust=trust)
-    with running("evaluate") as progress:
+    with console.running("evaluate") as progress:
         report = evaluate(model, scene, views=views, resolution=resolution, device=device, progress=progress)
     if not report.views:
         raise WlmError(f"{file}: cannot be scored: no camera sees its charts, neither from around nor from inside")
     if json_path is not None:
-        write_json(json_path, report.to_json() | {"cameras": views, "resolution": resolution, "device": device})
+        console.write_json(json_path, report.to_json() | {"cameras": views, "resolution": resolution, "device": device})
     _show_report(file, model, report)
 
 
 def decode(
-    file: ModelFile,
-    output: Annotated[Path, output_option("OUT", "A .exr; with --view also a .png.")],
+    file: opt.ModelFile,
+    output: Annotated[Path, opt.output_option("OUT", "A .exr; with --view also a .png.")],
     sheet: Annotated[int, typer.Option(min=0, help="Number of the lightmap in the list of wlm info, from 0.")] = 0,
     state: Annotated[float, typer.Option(min=0.0, help="Number of the state, from 0; 1.5 mixes states 1 and 2.")] = 0.0,
     view: Annotated[
@@ -169,17 +142,17 @@ def decode(
     ] = None,
     views: _Views = None,
     resolution: _Resolution = None,
-    device: Device = "cpu",
+    device: opt.Device = "cpu",
 ) -> None:
     """Decode a lightmap in its original layout, or draw a view of the scene. The original files are not needed."""
-    check_output(output, ".exr", ".png")
+    console.check_output(output, ".exr", ".png")
     if view is None:
         if output.suffix.lower() == ".png":
             raise WlmError(f"{output}: expected .exr for a lightmap; a .png needs --view")
         for option, value in (("views", views), ("resolution", resolution)):
             if value is not None:
                 raise WlmError(f"--{option}: has no meaning without --view")
-    quiet_warp()
+    console.quiet_warp()
     from wlm.formats.exr import write_exr
     from wlm.system import load
 
@@ -211,22 +184,22 @@ def decode(
     inside = picture[covered]
     if inside.size:
         facts |= {"mean": float(inside.mean()), "largest": float(inside.max())}
-    show_facts(str(file), facts)
+    console.show_facts(str(file), facts)
 
 
 def export(
-    file: ModelFile,
-    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    engine: Engine = None,
-    shader: ShaderLanguage = None,
-    exact: ExactShader = False,
-    device: Device = "cpu",
+    file: opt.ModelFile,
+    output: Annotated[Path, opt.output_option("DIR", "The folder to write to.")],
+    engine: opt.Engine = None,
+    shader: opt.ShaderLanguage = None,
+    exact: opt.ExactShader = False,
+    device: opt.Device = "cpu",
 ) -> None:
     """Write the lightmaps for an engine: textures, the mesh and a shader, or with --engine a mesh and a material."""
     models.export(file, output, engine, shader, exact, device)
 
 
-def info(file: ModelFile, as_json: AsJson = False) -> None:
+def info(file: opt.ModelFile, as_json: opt.AsJson = False) -> None:
     """Show what a file of mesh lightmaps contains."""
     models.describe(file, "atlas", None, as_json, _facts)
 
@@ -248,26 +221,26 @@ def _facts(model: "AtlasModel") -> dict[str, Any]:
 
 
 def _show_report(file: Path, model: "AtlasModel", report: "Report") -> None:
-    rows = table(f"{file}: {report.views} views", ["", "value"])
+    rows = console.table(f"{file}: {report.views} views", ["", "value"])
     for label, value in (
         ("GPU bytes", f"{report.gpu_bytes:,}"),
         ("GPU bytes saved", f"{report.cr:.2%}"),
         ("bytes on disk, without the mesh", f"{report.bytes - report.geometry_bytes:,}"),
-        ("PSNR of the views, dB", number(report.psnr, ".2f")),
-        ("  from around, dB", number(report.around_psnr, ".2f")),
-        ("  from inside, dB", number(report.inside_psnr, ".2f")),
-        (f"  worst, view {report.worst_view}, dB", number(report.psnr_worst, ".2f")),
-        ("PSNR tone mapped, dB", number(report.tone_psnr, ".2f")),
-        ("PSNR of the texels, dB", number(report.texel_psnr, ".2f")),
-        ("1 - SSIM", number(report.one_minus_ssim, ".5f")),
-        ("FLIP", number(report.flip, ".4f")),
-        ("error at seams relative to elsewhere", number(report.seam_ratio, ".2f")),
-        ("range of the reference", number(report.peak, ".4g")),
-        ("brightest reference", number(report.brightest, ".4g")),
+        ("PSNR of the views, dB", console.number(report.psnr, ".2f")),
+        ("  from around, dB", console.number(report.around_psnr, ".2f")),
+        ("  from inside, dB", console.number(report.inside_psnr, ".2f")),
+        (f"  worst, view {report.worst_view}, dB", console.number(report.psnr_worst, ".2f")),
+        ("PSNR tone mapped, dB", console.number(report.tone_psnr, ".2f")),
+        ("PSNR of the texels, dB", console.number(report.texel_psnr, ".2f")),
+        ("1 - SSIM", console.number(report.one_minus_ssim, ".5f")),
+        ("FLIP", console.number(report.flip, ".4f")),
+        ("error at seams relative to elsewhere", console.number(report.seam_ratio, ".2f")),
+        ("range of the reference", console.number(report.peak, ".4g")),
+        ("brightest reference", console.number(report.brightest, ".4g")),
     ):
         rows.add_row(label, value)
     if len(model.states) > 1:
         rows.add_section()
         for state, value in zip(model.states, report.psnr_by_state, strict=True):
-            rows.add_row(f"PSNR, {state}, dB", number(value, ".2f"))
-    show(rows)
+            rows.add_row(f"PSNR, {state}, dB", console.number(value, ".2f"))
+    console.show(rows)

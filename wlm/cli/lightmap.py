@@ -7,38 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from wlm.cli import models
-from wlm.cli.console import (
-    check_output,
-    exclusive,
-    note,
-    note_warnings,
-    number,
-    quiet_warp,
-    running,
-    show,
-    show_facts,
-    table,
-    write_json,
-)
-from wlm.cli.options import (
-    AsJson,
-    CheckpointEvery,
-    Colours,
-    Device,
-    Encoding,
-    Engine,
-    ExactShader,
-    ModelFile,
-    Profile,
-    ReportFile,
-    Resume,
-    Seed,
-    ShaderLanguage,
-    Trust,
-    Weights,
-    output_option,
-)
+from wlm.cli import console, models
+from wlm.cli import options as opt
 from wlm.cli.settings import with_settings
 from wlm.errors import WlmError
 
@@ -107,17 +77,17 @@ _SHOWN = (
 
 
 @with_settings("wlm.lightmap:Profile")
-@exclusive
+@console.exclusive
 def compress(
     set_path: _Set,
-    output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
+    output: Annotated[Path, opt.output_option("OUT.wlm", "The file to write.")],
     settings: dict[str, Any],
-    profile: Profile = "M",
+    profile: opt.Profile = "M",
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
     layers: _Layers = None,
-    encoding: Encoding = None,
+    encoding: opt.Encoding = None,
     groups: _Groups = None,
     workers: Annotated[
         int | None,
@@ -131,11 +101,11 @@ def compress(
         str | None,
         typer.Option(metavar="ADDRESS", help='Fit on a Ray cluster (extra `cluster`): ray://HOST:10001, or "auto".'),
     ] = None,
-    seed: Seed = 0,
-    device: Device = "cpu",
-    resume: Resume = False,
-    checkpoint_every: CheckpointEvery = 30.0,
-    trust: Trust = False,
+    seed: opt.Seed = 0,
+    device: opt.Device = "cpu",
+    resume: opt.Resume = False,
+    checkpoint_every: opt.CheckpointEvery = 30.0,
+    trust: opt.Trust = False,
 ) -> None:
     """Compress lightmaps over time into one file.
 
@@ -153,28 +123,28 @@ def compress(
         settings,
         **options,
     )
-    show_facts(model.name, facts | _facts(model))
+    console.show_facts(model.name, facts | _facts(model))
     _show_sheets(model)
-    note_warnings(model.warnings)
+    console.note_warnings(model.warnings)
 
 
 def evaluate(
-    file: ModelFile,
+    file: opt.ModelFile,
     set_path: _Set,
-    json_path: ReportFile = None,
+    json_path: opt.ReportFile = None,
     views: Annotated[int, typer.Option(min=0, help="Number of rendered views to score, if the set names a mesh.")] = 50,
     times: _Times = None,
     mask: _Mask = None,
     period: _Period = None,
     layers: _Layers = None,
-    encoding: Encoding = None,
+    encoding: opt.Encoding = None,
     groups: _Groups = None,
     all_lights: Annotated[
         Path | None,
         typer.Option(metavar="SET", help="A bake of all lights together, to compare the sum of the light groups with."),
     ] = None,
-    device: Device = "cpu",
-    trust: Trust = False,
+    device: opt.Device = "cpu",
+    trust: opt.Trust = False,
 ) -> None:
     """Compare compressed lightmaps with the originals: PSNR, SSIM and FLIP by tile and time, and bits per texel.
 
@@ -182,8 +152,8 @@ def evaluate(
     tiles, over time, and in views of the set's mesh.
     """
     if json_path is not None:
-        check_output(json_path, ".json")
-    quiet_warp()
+        console.check_output(json_path, ".json")
+    console.quiet_warp()
     from wlm.interop import check_device
     from wlm.lightmap import evaluate
     from wlm.system import load
@@ -192,33 +162,33 @@ def evaluate(
     model = load(file, "lightmap")
     lightmaps = _load(set_path, times, mask, period, layers, encoding, groups, trust)
     together = None if all_lights is None else _load(all_lights, None, mask, period, layers, encoding, None, trust)
-    note_warnings((*lightmaps.warnings, *(together.warnings if together is not None else ())))
-    with running("score") as progress:
+    console.note_warnings((*lightmaps.warnings, *(together.warnings if together is not None else ())))
+    with console.running("score") as progress:
         size = file.stat().st_size
         options: dict[str, Any] = {"file_bytes": size, "all_lights": together}
         report = evaluate(model, lightmaps, views=views, device=device, progress=progress, **options)
     if json_path is not None:
-        write_json(json_path, report.to_json())
+        console.write_json(json_path, report.to_json())
     _show_report(file, report)
 
 
 def decode(
-    file: ModelFile,
+    file: opt.ModelFile,
     time: Annotated[float, typer.Option(help="Time to decode, in the unit of the set; may be between stored times.")],
-    output: Annotated[Path, output_option("FRAME.exr", "The EXR to write.")],
+    output: Annotated[Path, opt.output_option("FRAME.exr", "The EXR to write.")],
     layer: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the layer; default the first layer of radiance.")
     ] = None,
     atlas: Annotated[
         str | None, typer.Option(metavar="NAME", help="Name of the atlas; default the first that has the layer.")
     ] = None,
-    weights: Weights = None,
-    colours: Colours = None,
-    device: Device = "cpu",
+    weights: opt.Weights = None,
+    colours: opt.Colours = None,
+    device: opt.Device = "cpu",
 ) -> None:
     """Decode a whole lightmap at one time: the sum of its light groups."""
-    check_output(output, ".exr")
-    quiet_warp()
+    console.check_output(output, ".exr")
+    console.quiet_warp()
     import numpy as np
 
     from wlm.formats.exr import write_planes
@@ -233,22 +203,22 @@ def decode(
     write_planes(output, dict(zip(names, np.moveaxis(frame, 2, 0), strict=True)))
     facts = {"file": output, "time": time, "layer": sheets[0].layer, "atlas": sheets[0].atlas, "channels": names}
     facts |= {"size": f"{frame.shape[1]}x{frame.shape[0]}", "mean": float(frame.mean()), "largest": float(frame.max())}
-    show_facts(str(file), facts)
+    console.show_facts(str(file), facts)
 
 
 def export(
-    file: ModelFile,
-    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    engine: Engine = None,
-    shader: ShaderLanguage = None,
-    exact: ExactShader = False,
-    device: Device = "cpu",
+    file: opt.ModelFile,
+    output: Annotated[Path, opt.output_option("DIR", "The folder to write to.")],
+    engine: opt.Engine = None,
+    shader: opt.ShaderLanguage = None,
+    exact: opt.ExactShader = False,
+    device: opt.Device = "cpu",
 ) -> None:
     """Write lightmaps for an engine: textures, buffers and a shader, or with --engine a kit that shows them."""
     models.export(file, output, engine, shader, exact, device)
 
 
-def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> None:
+def info(file: opt.ModelFile, as_json: opt.AsJson = False, device: opt.Device = "cpu") -> None:
     """Show what a file of lightmaps contains, and its memory on a device."""
     from wlm.lightmap.codec import group_sizes
 
@@ -326,24 +296,26 @@ def _show_sheets(model: "LightmapModel") -> None:
     from wlm.lightmap.codec import group_sizes, sheet_bytes
 
     if len(model.groups) > 1:
-        rows = table("light groups", ["group", "times", "bytes on disk", "GPU bytes"])
+        rows = console.table("light groups", ["group", "times", "bytes on disk", "GPU bytes"])
         for name, facts in group_sizes(model).items():
             rows.add_row(escape(name), str(len(facts["times"])), f"{facts['bytes']:,}", f"{facts['GPU_bytes']:,}")
-        show(rows)
+        console.show(rows)
     sizes = sheet_bytes(model)
     columns = ["sheet", "values", "size", "bytes on disk", "GPU bytes", "tiles"]
-    rows = table("sheets", columns, text=["values", "tiles"])
+    rows = console.table("sheets", columns, text=["values", "tiles"])
     for sheet, own in model.sheets.items():
         facts = _sheet(own)
         tiles = ", ".join(f"{count} {kind}" for kind, count in facts["tiles"].items())
         size = f"{facts['width']}x{facts['height']}"
         rows.add_row(escape(sheet.label), sheet.encoding, size, f"{sizes[sheet]:,}", f"{facts['GPU_bytes']:,}", tiles)
-    show(rows)
+    console.show(rows)
 
 
 def _show_report(file: Path, report: "Report") -> None:
     columns = [heading for heading, *_ in _SCORES]
-    rows = table(str(file), ["", *columns, "bytes on disk", "bits per texel on disk", "bits per texel on the GPU"])
+    rows = console.table(
+        str(file), ["", *columns, "bytes on disk", "bits per texel on disk", "bits per texel on the GPU"]
+    )
     sheets = {escape(sheet.label): own for sheet, own in report.sheets.items()} if len(report.sheets) > 1 else {}
     for name, own in {f"wlm {escape(report.profile)}": report, **sheets}.items():
         sizes = (f"{own.bytes:,}", f"{own.bpp:.3f}", f"{own.memory_bpp:.3f}")
@@ -352,25 +324,29 @@ def _show_report(file: Path, report: "Report") -> None:
     light = report.light
     scores = (light.psnr_by_time, light.ssim_by_time, light.flip_by_time)
     for stamp, *values in zip(report.times, *scores, strict=True):
-        rows.add_row(f"time {stamp:g}", *map(number, values, (".2f", ".4f", ".4f")))
-    show(rows)
+        rows.add_row(f"time {stamp:g}", *map(console.number, values, (".2f", ".4f", ".4f")))
+    console.show(rows)
     _show_where_shown(report)
     _show_held_out(report)
     if report.sums:
-        rows = table(
+        rows = console.table(
             "sum of the light groups", ["compared with", "times", "PSNR, dB", "SSIM", "PSNR of the inputs, dB"]
         )
         for score in report.sums:
             name = f"{score.reference}: {score.sheet}"
-            figures = number(score.psnr, ".2f"), number(score.ssim, ".4f"), number(score.between_inputs, ".2f")
+            figures = (
+                console.number(score.psnr, ".2f"),
+                console.number(score.ssim, ".4f"),
+                console.number(score.between_inputs, ".2f"),
+            )
             rows.add_row(escape(name), str(len(score.times)), *figures)
-        show(rows)
+        console.show(rows)
     _note_worst(light)
-    note_warnings(report.warnings)
+    console.note_warnings(report.warnings)
 
 
 def _cells(report: "Report | Summary", columns: Any) -> list[str]:
-    return [number(factor * getattr(report, name), form) for _, name, form, factor in columns]
+    return [console.number(factor * getattr(report, name), form) for _, name, form, factor in columns]
 
 
 def _show_held_out(report: "Report") -> None:
@@ -378,11 +354,11 @@ def _show_held_out(report: "Report") -> None:
     held = {escape(sheet.label): own.held_out for sheet, own in report.sheets.items() if own.held_out is not None}
     if held:
         columns = ["times", *(heading for heading, *_ in _SCORES)]
-        rows = table("times of the set that the file does not store", ["", *columns])
+        rows = console.table("times of the set that the file does not store", ["", *columns])
         for name, scores in held.items():
             for what, own in (("decoded", scores.decoded), ("originals at stored times, interpolated", scores.mixed)):
                 rows.add_row(f"{name}: {what}", str(len(scores.times)), *_cells(own, _SCORES))
-        show(rows)
+        console.show(rows)
 
 
 def _show_where_shown(report: "Report") -> None:
@@ -391,10 +367,10 @@ def _show_where_shown(report: "Report") -> None:
         column for column in _SHOWN if any(math.isfinite(getattr(own, column[1])) for own in report.sheets.values())
     ]
     if columns:
-        rows = table("PSNR and errors where light is shown", ["", *(heading for heading, *_ in columns)])
+        rows = console.table("PSNR and errors where light is shown", ["", *(heading for heading, *_ in columns)])
         for sheet, own in report.sheets.items():
             rows.add_row(escape(sheet.label), *_cells(own, columns))
-        show(rows)
+        console.show(rows)
 
 
 def _note_worst(report: "SheetReport") -> None:
@@ -406,10 +382,10 @@ def _note_worst(report: "SheetReport") -> None:
     }
     for what, worst in places.items():
         if worst is not None:
-            note(f"worst PSNR{what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
+            console.note(f"worst PSNR{what}: {worst['psnr']:.2f} dB, tile {worst['tile']} at {worst['time']:g}")
     if (worst := report.worst_view) is not None:
         place = f"camera {worst['view']} at {worst['time']:g}"
-        note(f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, {place}")
+        console.note(f"worst view: {worst['psnr']:.2f} dB, FLIP {worst['flip']:.4f}, {place}")
     reasons = ", ".join(f"{count} {reason}" for reason, count in report.not_scored.items() if count)
     if reasons:
-        note(f"tiles without a score, counted at each time: {reasons}")
+        console.note(f"tiles without a score, counted at each time: {reasons}")

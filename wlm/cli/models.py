@@ -6,16 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from wlm.cli.console import (
-    check_output,
-    note_start,
-    note_warnings,
-    quiet_warp,
-    running,
-    show_facts,
-    show_files,
-    show_json,
-)
+from wlm.cli import console
 from wlm.errors import WlmError
 
 
@@ -38,17 +29,17 @@ def fit(
     settings, which replace those of the profile, have been checked; `options` are further options of `compress`.
     Returns the input, the model, and the first facts of the result's table.
     """
-    check_output(output, ".wlm")
-    quiet_warp()
+    console.check_output(output, ".wlm")
+    console.quiet_warp()
     package = import_module(f"wlm.{system}")
     checked = package.Profile.load(profile).override(settings, "--")
     data = load()
-    note_warnings(data.warnings)
+    console.note_warnings(data.warnings)
     shared = {"seed": seed, "device": device}
     checkpoint = package.open_checkpoint(output, data, checked, resume=resume, every=every, **shared)
-    note_start(checkpoint, resume, "at step 0")
+    console.note_start(checkpoint, resume, "at step 0")
     start = time.perf_counter()
-    with running("fit", checkpoint.path) as progress:
+    with console.running("fit", checkpoint.path) as progress:
         model = package.compress(data, checked, progress=progress, checkpoint=checkpoint, **shared, **options)
         seconds = time.perf_counter() - start
         size = model.save(output)
@@ -75,13 +66,15 @@ def export(
     for option, given in (("shader", shader), ("exact", exact)):
         if given and engine is not None:
             raise WlmError(f"--{option}: has no meaning with --engine {engine}, whose kit has its own shaders")
-    quiet_warp()
+    console.quiet_warp()
     from wlm.export import export
     from wlm.system import load
 
     given = {name: value for name, value in options.items() if value is not None}
     model = load(file) if time is None else load(file).at(time)
-    show_files(output, export(model, output, engine, shader=shader or "glsl", exact=exact, device=device, **given))
+    console.show_files(
+        output, export(model, output, engine, shader=shader or "glsl", exact=exact, device=device, **given)
+    )
 
 
 def describe(
@@ -92,7 +85,7 @@ def describe(
     `facts` returns the facts of a model as JSON values by name. With a device, the memory that the model needs there is
     shown.
     """
-    quiet_warp()
+    console.quiet_warp()
     from wlm.formats.artifact import read_artifact
     from wlm.system import load
 
@@ -105,7 +98,7 @@ def describe(
         shown |= {"device": decoder.device, "bytes_on_device": decoder.device_bytes}
     parts = {"header": artifact.header_bytes} | artifact.parts
     if as_json:
-        show_json(shown | {"parts": parts, "profile": model.profile.model_dump(mode="json")})
+        console.show_json(shown | {"parts": parts, "profile": model.profile.model_dump(mode="json")})
     else:
-        show_facts(str(file), shown | {"profile": model.profile.name, "bytes": parts})
+        console.show_facts(str(file), shown | {"profile": model.profile.name, "bytes": parts})
     return model

@@ -6,36 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.markup import escape
 
-from wlm.cli import models
-from wlm.cli.console import (
-    check_output,
-    exclusive,
-    note,
-    note_warnings,
-    number,
-    quiet_warp,
-    running,
-    show,
-    show_facts,
-    table,
-    write_json,
-)
-from wlm.cli.options import (
-    AsJson,
-    CheckpointEvery,
-    Device,
-    Engine,
-    ExactShader,
-    ModelFile,
-    Profile,
-    ReportFile,
-    Resume,
-    SceneFile,
-    Seed,
-    ShaderLanguage,
-    Time,
-    output_option,
-)
+from wlm.cli import console, models
+from wlm.cli import options as opt
 from wlm.cli.settings import with_settings
 
 if TYPE_CHECKING:
@@ -68,22 +40,22 @@ _At = Annotated[
 
 
 @with_settings("wlm.probe:Profile")
-@exclusive
+@console.exclusive
 def compress(
     probes: _Probes,
-    output: Annotated[Path, output_option("OUT.wlm", "The file to write.")],
+    output: Annotated[Path, opt.output_option("OUT.wlm", "The file to write.")],
     settings: dict[str, Any],
-    profile: Profile = "standard",
+    profile: opt.Profile = "standard",
     positions: Annotated[
         bool, typer.Option("--positions", help="Also store the positions of the probes, 16 bits per axis.")
     ] = False,
     key: _Keys = None,
     convention: _Convention = None,
     order: _Order = None,
-    seed: Seed = 0,
-    device: Device = "cpu",
-    resume: Resume = False,
-    checkpoint_every: CheckpointEvery = 30.0,
+    seed: opt.Seed = 0,
+    device: opt.Device = "cpu",
+    resume: opt.Resume = False,
+    checkpoint_every: opt.CheckpointEvery = 30.0,
 ) -> None:
     """Compress light probes into one file: Gaussians and a small network, or principal components for small sets.
 
@@ -108,81 +80,85 @@ def compress(
         **({"hours": listed_times(model.times)} if len(model.times) else {}),
         **model.content.facts(),
     }
-    show_facts(model.name, facts)
-    note(f"{probes}: {data.reading}")
+    console.show_facts(model.name, facts)
+    console.note(f"{probes}: {data.reading}")
     if model.choice:
-        note(model.choice)
-    note_warnings(model.warnings)
+        console.note(model.choice)
+    console.note_warnings(model.warnings)
 
 
 def evaluate(
-    file: ModelFile,
+    file: opt.ModelFile,
     probes_path: _Probes,
-    json_path: ReportFile = None,
+    json_path: opt.ReportFile = None,
     volume: Annotated[
         bool, typer.Option("--volume", help="Also score light read from the cascaded volume along a path.")
     ] = False,
     views: Annotated[
         int, typer.Option(help="Number of pictures to render and score, of balls at probes and of --mesh; 0: none.")
     ] = 0,
-    mesh: SceneFile = None,
-    time: Time = None,
+    mesh: opt.SceneFile = None,
+    time: opt.Time = None,
     key: _Keys = None,
     convention: _Convention = None,
     order: _Order = None,
-    device: Device = "cpu",
+    device: opt.Device = "cpu",
 ) -> None:
     """Compare compressed probes with the original: PSNR of the coefficients and of the irradiance, and sizes.
 
     --volume and --views compare the light at one hour, --time.
     """
     if json_path is not None:
-        check_output(json_path, ".json")
-    quiet_warp()
+        console.check_output(json_path, ".json")
+    console.quiet_warp()
     from wlm.cli.probe_volume import score_pictures, score_walks, show_pictures, show_walks
     from wlm.probe import evaluate, load
     from wlm.system import load as load_model
 
     model = load_model(file, "probe")
     probes = load(probes_path, key=key or None, convention=convention, order=order)
-    note_warnings(probes.warnings)
+    console.note_warnings(probes.warnings)
     drawn = views or mesh is not None
     one = (model.at(time), probes.at(time)) if drawn or volume else (model, probes)
-    with running("evaluate") as progress:
+    with console.running("evaluate") as progress:
         size = file.stat().st_size
         report = evaluate(model, probes, device=device, progress=progress, file_bytes=size)
     if not probes.source.startswith(model.source):
-        note(f"warning: {probes_path}: not the input that {file} was made from; check the file, --key and --convention")
+        console.note(
+            f"warning: {probes_path}: not the input that {file} was made from; check the file, --key and --convention"
+        )
     pictures = score_pictures(*one, views, mesh, device) if drawn else []
     walks = score_walks(*one, device) if volume else {}
     if json_path is not None:
         content = report.to_json() | ({"volume": walks} if walks else {})
-        write_json(json_path, content | ({"views": [score.to_json() for score in pictures]} if pictures else {}))
+        console.write_json(
+            json_path, content | ({"views": [score.to_json() for score in pictures]} if pictures else {})
+        )
     _show_report(file, model, report)
-    note(f"{probes_path}: {probes.reading}")
+    console.note(f"{probes_path}: {probes.reading}")
     show_walks(walks)
     show_pictures(pictures)
 
 
 def decode(
-    file: ModelFile,
-    output: Annotated[Path, output_option("OUT", "The .npz or .json file to write.")],
+    file: opt.ModelFile,
+    output: Annotated[Path, opt.output_option("OUT", "The .npz or .json file to write.")],
     positions: Annotated[
         Path | None,
         typer.Option(metavar="PROBES", help="File with the positions to decode at; default those stored in FILE.wlm."),
     ] = None,
-    time: Time = None,
+    time: opt.Time = None,
     convention: Annotated[str, typer.Option(help=f"SH convention of the output: {_CONVENTIONS}.")] = "threejs",
     original: _At = None,
-    device: Device = "cpu",
+    device: opt.Device = "cpu",
 ) -> None:
     """Decode the light at the stored positions, or at the positions in another file.
 
     Given positions of the same number and bounding box as the compressed probes are taken for these probes, in order.
     Then probes without light (dead probes, such as those in walls) decode to zero.
     """
-    check_output(output, ".npz", ".json")
-    quiet_warp()
+    console.check_output(output, ".npz", ".json")
+    console.quiet_warp()
     from wlm.probe import load_positions, save_probes
     from wlm.probe.places import positions_of
     from wlm.system import load
@@ -196,15 +172,17 @@ def decode(
     save_probes(output, position, values, convention=convention)
     facts = {"file": output, "positions": len(position), "positions are": "the probes" if own else "other points"}
     zero = int((~model.live).sum()) if own else 0
-    show_facts(str(file), facts | {"dead probes": zero, "mean": float(values.mean()), "largest": float(values.max())})
+    console.show_facts(
+        str(file), facts | {"dead probes": zero, "mean": float(values.mean()), "largest": float(values.max())}
+    )
 
 
 def export(
-    file: ModelFile,
-    output: Annotated[Path, output_option("DIR", "The folder to write to.")],
-    engine: Engine = None,
-    shader: ShaderLanguage = None,
-    exact: ExactShader = False,
+    file: opt.ModelFile,
+    output: Annotated[Path, opt.output_option("DIR", "The folder to write to.")],
+    engine: opt.Engine = None,
+    shader: opt.ShaderLanguage = None,
+    exact: opt.ExactShader = False,
     original: Annotated[
         Path | None,
         typer.Option(
@@ -221,15 +199,15 @@ def export(
         Literal["x", "y", "z"] | None,
         typer.Option(help="With --engine unity: axis to mirror, as Unity is left-handed."),
     ] = None,
-    time: Time = None,
-    device: Device = "cpu",
+    time: opt.Time = None,
+    device: opt.Device = "cpu",
 ) -> None:
     """Write light probes for an engine: buffers and a shader, or with --engine a grid or probes that it can load."""
     options = {"original": original, "cells": cells, "mirror": mirror}
     models.export(file, output, engine, shader, exact, device, time, **options)
 
 
-def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> None:
+def info(file: opt.ModelFile, as_json: opt.AsJson = False, device: opt.Device = "cpu") -> None:
     """Show what a file of light probes contains, and its memory on a device, with that of a volume of its probes."""
 
     def volume_bytes(model: "ProbeModel") -> dict[str, int]:
@@ -260,28 +238,28 @@ def info(file: ModelFile, as_json: AsJson = False, device: Device = "cpu") -> No
 
 def _show_report(file: Path, model: "ProbeModel", report: "Report") -> None:
     columns = ["PSNR, dB", "live probes, dB", "irradiance, dB", "bytes on disk", "share of float32", "bits per probe"]
-    rows = table(str(file), ["", *columns])
-    psnr = (number(value, ".2f") for value in (report.psnr, report.psnr_live, report.irradiance_psnr))
+    rows = console.table(str(file), ["", *columns])
+    psnr = (console.number(value, ".2f") for value in (report.psnr, report.psnr_live, report.irradiance_psnr))
     sizes = (f"{report.bytes:,}", f"{report.ratio:.2%}", f"{report.bits_per_probe:.2f}")
     worst = ", the worst hour" if report.hours else ""
     rows.add_row(f"wlm {escape(model.profile.name)}{worst}", *psnr, *sizes)
     if report.psnr_by_band is not None:
         rows.add_section()
         for band, value in enumerate(report.psnr_by_band):
-            rows.add_row(f"SH band {band}", number(value, ".2f"))
+            rows.add_row(f"SH band {band}", console.number(value, ".2f"))
     for hour in report.hours:
-        figures = (number(hour[name], ".2f") for name in ("psnr", "psnr_live", "irradiance_psnr"))
+        figures = (console.number(hour[name], ".2f") for name in ("psnr", "psnr_live", "irradiance_psnr"))
         rows.add_row(f"at {hour['time']:g} h", *figures)
     rows.add_section()
     if report.between_psnr is not None:
-        rows.add_row("half-way between probes", number(report.between_psnr, ".2f"))
-    show(rows)
+        rows.add_row("half-way between probes", console.number(report.between_psnr, ".2f"))
+    console.show(rows)
     if report.worst_probe is not None:
         worst = report.worst_probe
         place = ", ".join(f"{x:.4g}" for x in worst["position"])
-        note(
+        console.note(
             f"relative error: {report.relative_median:.1%} in the median, {report.relative_p95:.1%} at 95% of the live "
             f"probes; {report.off:.2%} are off by more than half; {worst['error']:.1%} at the worst, probe "
             f"{worst['probe']} at ({place})"
         )
-    note_warnings(report.warnings)
+    console.note_warnings(report.warnings)

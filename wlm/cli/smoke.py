@@ -8,19 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.markup import escape
 
-from wlm.cli import smoke_book, smoke_network
-from wlm.cli.console import (
-    check_output,
-    exclusive,
-    note,
-    note_warnings,
-    number,
-    quiet_warp,
-    running,
-    show,
-    show_facts,
-    table,
-)
+from wlm.cli import console, smoke_book, smoke_network
 from wlm.cli.options import CheckpointEvery, Device, Resume, Seed, output_option
 from wlm.cli.smoke_network import evaluate, info
 from wlm.cli.smoke_options import (
@@ -74,7 +62,7 @@ _Lightmaps = Annotated[Path, output_option("OUT", "The .exr to write; for a fold
 
 
 @app.command()
-@exclusive
+@console.exclusive
 def simulate(
     scene_name: _SceneName,
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
@@ -89,7 +77,7 @@ def simulate(
     The state is saved in DIR from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume to continue
     exactly.
     """
-    quiet_warp()
+    console.quiet_warp()
     from wlm.interop import check_device
     from wlm.smoke.data import CHECKPOINT, open_frames
     from wlm.smoke.simulation import make_solver, simulate, warnings_of
@@ -99,11 +87,11 @@ def simulate(
     scene = _scene(scene_name, scale, frames)
     # The solver comes first, so that a simulation that cannot start removes no earlier frames.
     solver = make_solver(scene, device=device)
-    note_warnings(warnings := warnings_of(scene))
+    console.note_warnings(warnings := warnings_of(scene))
     folder = open_frames(output, scene, resume=resume)
     figures: dict[str, float] = {}
     most = 0.0
-    with running("simulate", output / CHECKPOINT, unit="frame") as report:
+    with console.running("simulate", output / CHECKPOINT, unit="frame") as report:
 
         def progress(now: Progress) -> None:
             nonlocal most
@@ -114,7 +102,7 @@ def simulate(
         options = {"resume": resume, "checkpoint_every": checkpoint_every}
         first = simulate(folder, solver=solver, progress=progress, **options)
     if resume and first == 1:
-        note(f"{output}: there was nothing to resume; started at frame 1")
+        console.note(f"{output}: there was nothing to resume; started at frame 1")
     facts: dict[str, Any] = {
         "frames": scene.frames,
         "cells of the air": " x ".join(map(str, scene.grid.cells)),
@@ -125,7 +113,7 @@ def simulate(
         facts |= {"smoke in the last frame": figures["smoke"], "seconds per frame": figures["frame s"]}
         if not most and not warnings:
             _note_no_smoke(scene)
-    show_facts(f"{output}: {scene.name}", facts)
+    console.show_facts(f"{output}: {scene.name}", facts)
 
 
 def _scene(name: str, scale: float, frames: int | None) -> "Scene":
@@ -138,12 +126,12 @@ def _scene(name: str, scale: float, frames: int | None) -> "Scene":
 
 
 def _note_no_smoke(scene: "Scene") -> None:
-    note_warnings([f"{scene.name}: no frame has smoke: is each source inside an obstacle?"])
+    console.note_warnings([f"{scene.name}: no frame has smoke: is each source inside an obstacle?"])
 
 
 @app.command()
 @with_smoke
-@exclusive
+@console.exclusive
 def bake(
     smoke: Input,
     output: _Lightmaps,
@@ -172,7 +160,7 @@ def bake(
         raise WlmError(f"--supersample: expected 1 with --fit sphere, got {supersample}")
     if albedo is not None and fit == "axes":
         raise WlmError("--albedo needs --fit sphere: with --fit axes lightmaps have single scattering only")
-    quiet_warp()
+    console.quiet_warp()
     from wlm.smoke.march.six_way import bake
 
     frames = options.open(smoke)
@@ -188,7 +176,7 @@ def bake(
 
 @app.command()
 @with_smoke
-@exclusive
+@console.exclusive
 def predict(
     smoke: Input,
     output: _Lightmaps,
@@ -207,7 +195,7 @@ def predict(
     """
     if coarse and network is not None:
         raise WlmError("--coarse: expected no --network, since --coarse uses no network")
-    quiet_warp()
+    console.quiet_warp()
     from wlm.smoke.codec import open_network
     from wlm.smoke.march.six_way import bake_coarse, coarse_march
     from wlm.smoke.network.prediction import SmokePredictor
@@ -226,12 +214,12 @@ def predict(
         make = partial(predictor, seed=seed)
     write_lightmaps(frames, options.view(frames), output, make, made, resume=resume)
     if predictor is not None and (line := predictor.note()):
-        note(line)
+        console.note(line)
 
 
 @app.command()
 @with_smoke
-@exclusive
+@console.exclusive
 def light(
     smoke: Input,
     output: Annotated[Path, output_option("OUT", "The .png or .exr to write; for a folder of frames, a folder.")],
@@ -271,7 +259,7 @@ def light(
     behind = around if background is None else vector("--background", background)
     check_white(white)
     own, twelve = parse_lights(lights, points, around)
-    quiet_warp()
+    console.quiet_warp()
     from wlm.formats.exr import write_exr
     from wlm.smoke.scene import obstacle_mesh
     from wlm.smoke.shading import Light
@@ -289,11 +277,13 @@ def light(
         own = [Light((1.0, 1.0, 1.0))] if frames.scene is None else [each.light() for each in frames.scene.lights]
     colour, highest = colour or (1.0, 1.0, 1.0), 1 if orders == "single" else HIGHEST
     file = outputs(smoke, frames.single, output, "light", ".png", ".exr")
-    rows = table(str(smoke), ["file", "mean", "largest", "clipped pixels", *(["noise"] * (samples is not None))])
+    rows = console.table(
+        str(smoke), ["file", "mean", "largest", "clipped pixels", *(["noise"] * (samples is not None))]
+    )
     pictures, thickness = [], 0.0
-    with running("light") as progress:
+    with console.running("light") as progress:
         for frame, volume in frames.volumes(progress=progress):
-            note_warnings(volume.warnings)
+            console.note_warnings(volume.warnings)
             thickness = max(thickness, volume.thickness)
             view, looks, noise = frames.view(camera, volume), frames.looks(frame), []
             if samples is None:
@@ -324,12 +314,12 @@ def light(
             rows.add_row(escape(path.name), f"{image.mean():.4g}", f"{image.max():.4g}", f"{clipped:.1%}", *noise)
     if not frames.single:
         contact_sheet(output / SHEET, {"": pictures})
-    show(rows)
+    console.show(rows)
     note_thickness(frames, thickness)
 
 
 @app.command()
-@exclusive
+@console.exclusive
 def run(
     scene_name: _SceneName,
     output: Annotated[Path, output_option("OUT", "A folder of PNGs, or an .mp4.")],
@@ -366,8 +356,8 @@ def run(
     colour = _given_albedo(albedo)
     film_file = output.suffix.lower() == ".mp4"
     if film_file:
-        check_output(output, ".mp4")
-    quiet_warp()
+        console.check_output(output, ".mp4")
+    console.quiet_warp()
     from wlm.formats.film import film
     from wlm.interop import check_device
     from wlm.smoke.data import NumberedFiles
@@ -386,10 +376,10 @@ def run(
     scene = scene.model_copy(update={"camera": camera})
     if colour is not None:
         scene = scene.model_copy(update={"smoke": scene.smoke.model_copy(update={"albedo": colour})})
-    note_warnings(warnings := warnings_of(scene))
+    console.note_warnings(warnings := warnings_of(scene))
     predictor = None if network is None else SmokePredictor(network, device)
     lighting = Lighting(None if single else scene.smoke.albedo, predictor)
-    with running("run", unit="frame") as progress:
+    with console.running("run", unit="frame") as progress:
         made = frames_of(scene, lighting, white=white, device=device, progress=progress)
         if film_file:
             width = max(round(camera.resolution * camera.aspect), 1)
@@ -400,11 +390,11 @@ def run(
             seconds, smoke = write_all(made, lambda number, pixels: save_png(files.file(number), pixels))
     if not smoke and not warnings:
         _note_no_smoke(scene)
-    rows = table(f"{output}: {scene.name}, {scene.frames} frames", ["stage", "ms per frame", "frames"])
+    rows = console.table(f"{output}: {scene.name}, {scene.frames} frames", ["stage", "ms per frame", "frames"])
     for stage, taken in seconds.items():
         counted = taken[_WARM:] or taken
-        rows.add_row(stage, number(1e3 * median(counted), ".4g"), f"{len(taken)}")
-    show(rows)
+        rows.add_row(stage, console.number(1e3 * median(counted), ".4g"), f"{len(taken)}")
+    console.show(rows)
 
 
 def _given_albedo(text: str | None) -> tuple[float, float, float] | None:

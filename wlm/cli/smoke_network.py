@@ -6,19 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from wlm.cli.console import (
-    check_output,
-    exclusive,
-    note,
-    number,
-    quiet_warp,
-    running,
-    show,
-    show_facts,
-    show_json,
-    table,
-    write_json,
-)
+from wlm.cli import console
 from wlm.cli.options import AsJson, CheckpointEvery, Device, ModelFile, ReportFile, Resume, Seed, output_option
 from wlm.cli.settings import Generated, with_settings
 
@@ -34,7 +22,7 @@ def register(app: typer.Typer) -> None:
 
 
 @with_settings("wlm.smoke:Profile")
-@exclusive
+@console.exclusive
 def train(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Settings: fast, paper, or a YAML file.")],
     output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
@@ -52,8 +40,8 @@ def train(
     The state is saved in NETWORK.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume
     to continue exactly. NETWORK.csv has the loss curves.
     """
-    check_output(output, ".safetensors")
-    quiet_warp()
+    console.check_output(output, ".safetensors")
+    console.quiet_warp()
     from wlm.formats.checkpoint import SUFFIX
     from wlm.smoke import Profile
     from wlm.smoke.fit import train as fit
@@ -61,13 +49,15 @@ def train(
     checked = Profile.load(profile).override(settings, "--")
     checkpoint = Path(f"{output}{SUFFIX}")
     if resume and not checkpoint.exists() and not output.exists():
-        note(f"{checkpoint}: there is nothing to resume; starting at step 0")
+        console.note(f"{checkpoint}: there is nothing to resume; starting at step 0")
     options = {"seed": seed, "device": device, "minutes": minutes, "resume": resume}
     options["checkpoint_every"] = checkpoint_every
-    with running("train", checkpoint) as progress:
+    with console.running("train", checkpoint) as progress:
         training = fit(checked, output, progress=progress, **options)
     if not training.finished:
-        note(f"out of time at step {training.steps}: repeat the command with --resume to continue from {checkpoint}")
+        console.note(
+            f"out of time at step {training.steps}: repeat the command with --resume to continue from {checkpoint}"
+        )
     facts: dict[str, Any] = {
         "steps": f"{training.steps:,} of {checked.training.total:,}",
         "skipped steps": training.skipped,
@@ -79,7 +69,7 @@ def train(
     facts["seconds"] = f"{training.seconds:.1f}"
     if training.model is not None:
         facts["bytes on disk"] = output.stat().st_size
-    show_facts(f"{output}: {checked.name}", facts)
+    console.show_facts(f"{output}: {checked.name}", facts)
 
 
 def export_onnx(
@@ -93,8 +83,8 @@ def export_onnx(
     ] = 512,
 ) -> None:
     """Write a network as ONNX: from encoded guiding maps to encoded lightmaps, of a fixed size, in float32."""
-    check_output(output, ".onnx")
-    quiet_warp()
+    console.check_output(output, ".onnx")
+    console.quiet_warp()
     from wlm.smoke.codec import open_network, shipped
     from wlm.smoke.network import onnx_file
     from wlm.smoke.network.planes import GUIDES, PLANES
@@ -103,7 +93,7 @@ def export_onnx(
     model = open_network(network)
     size = onnx_file.export_onnx(model, output, height=resolution, width=resolution)
     facts = {"input planes": " ".join(GUIDES[model.settings.guide]), "output planes": " ".join(PLANES)}
-    show_facts(str(output), facts | {"image": f"{resolution} x {resolution} pixels", "bytes": size})
+    console.show_facts(str(output), facts | {"image": f"{resolution} x {resolution} pixels", "bytes": size})
 
 
 def evaluate(
@@ -125,8 +115,8 @@ def evaluate(
     is the change between frames that motion does not explain, relative to the reference's flicker.
     """
     if json_path is not None:
-        check_output(json_path, ".json")
-    quiet_warp()
+        console.check_output(json_path, ".json")
+    console.quiet_warp()
     from wlm.interop import check_device
     from wlm.smoke.codec import open_network
     from wlm.smoke.evaluation import compare
@@ -135,25 +125,25 @@ def evaluate(
     model = open_network(network)
     sizes = {"resolution": resolution, "cells": model.dataset.cells if cells is None else cells}
     settings = model.dataset.model_copy(update=sizes)
-    with running("evaluate") as progress:
+    with console.running("evaluate") as progress:
         comparisons = compare(model, settings, smoke or (), device=device, progress=progress)
     if json_path is not None:
         content = {"network": _facts(network, model), "device": device, **sizes}
-        write_json(json_path, content | {"sets": [comparison.to_json() for comparison in comparisons]})
+        console.write_json(json_path, content | {"sets": [comparison.to_json() for comparison in comparisons]})
     _show_comparisons(network, comparisons)
 
 
 def info(file: ModelFile, as_json: AsJson = False) -> None:
     """Show the shape of a network and facts about its training."""
-    quiet_warp()
+    console.quiet_warp()
     from wlm.formats.artifact import read_artifact
     from wlm.smoke.codec import open_network
 
     facts = _facts(file, open_network(file)) | {"bytes_on_disk": read_artifact(file).file_bytes}
     if as_json:
-        show_json(facts)
+        console.show_json(facts)
     else:
-        show_facts(str(file), facts)
+        console.show_facts(str(file), facts)
 
 
 def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
@@ -169,21 +159,21 @@ def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
 def _show_comparisons(path: Path, comparisons: "list[Comparison]") -> None:
     from wlm.smoke.network.planes import PLANES
 
-    scores = table(
+    scores = console.table(
         str(path), ["smoke", "method", "PSNR, dB", "lowest, dB", "highest, dB", "relative flicker"], text=["method"]
     )
-    planes = table(f"{path}: PSNR of each plane, dB", ["smoke", "method", *PLANES], text=["method"])
+    planes = console.table(f"{path}: PSNR of each plane, dB", ["smoke", "method", *PLANES], text=["method"])
     for comparison in comparisons:
         smoke = escape(comparison.name)
         for name, score in comparison.methods.items():
-            decibels = (number(value, ".2f") for value in (score.psnr, score.lowest, score.highest))
-            scores.add_row(smoke, name, *decibels, number(score.flicker_ratio, ".3f"))
-            planes.add_row(smoke, name, *(number(value, ".2f") for value in score.planes))
+            decibels = (console.number(value, ".2f") for value in (score.psnr, score.lowest, score.highest))
+            scores.add_row(smoke, name, *decibels, console.number(score.flicker_ratio, ".3f"))
+            planes.add_row(smoke, name, *(console.number(value, ".2f") for value in score.planes))
             smoke = ""
         scores.add_section()
         planes.add_section()
-    show(scores)
-    show(planes)
+    console.show(scores)
+    console.show(planes)
     for comparison in comparisons:
         if comparison.half_loss is not None:
-            note(f"{comparison.name}: half floats lose {comparison.half_loss:.3f} dB")
+            console.note(f"{comparison.name}: half floats lose {comparison.half_loss:.3f} dB")

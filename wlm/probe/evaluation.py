@@ -73,8 +73,8 @@ class Report(BaseReport):
         worst_probe: The live probe with the largest relative error: `probe` (index), `error`, `position`, and the norms
             of its numbers, `light`, and of the decoded ones, `decoded`; None if all are exact.
         psnr_by_band: PSNR of each band of spherical harmonics, over all probes and colours.
-        irradiance_psnr: PSNR of the irradiance, clamped at 0, on `NORMALS` fixed normals of every live probe in RGB; its
-            peak is the range of the input's irradiance.
+        irradiance_psnr: PSNR of the irradiance, clamped at 0, on `NORMALS` fixed normals of every live probe in RGB;
+            its peak is the range of the input's irradiance.
         warnings: A sentence that names the worst probe, if more than a share `MANY_OFF` of the live probes is off.
         between_psnr: PSNR between the probes, see the function `between_psnr`; None if it was not computed.
     """

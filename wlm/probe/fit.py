@@ -82,7 +82,7 @@ def compress(
         profile: The settings: a name, a YAML file, or a `Profile`.
         seed: Seed of the fit; the same seed gives the same result on one kind of device.
         device: "cpu" or "cuda:N".
-        progress: Called about twice a second, with the relative error of the live probes, or with the PSNR over all
+        progress: Called about twice a second, with the live probes' relative error, "error", or with the PSNR over all
             numbers of all probes if the profile asks for the absolute error.
         checkpoint: From `open_checkpoint` for the same settings, or None. A running fit is saved there, and an
             interrupted one is resumed from there.
@@ -236,7 +236,7 @@ def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, chec
     def figures() -> dict[str, float]:
         error = trainer.mse()
         if trainer.relative:
-            return {"relative_error": math.sqrt(error * (probes.outputs + 1))}
+            return {"error": math.sqrt(error * (probes.outputs + 1))}
         return {"PSNR_dB": psnr_from_mse(error * live, peak)}
 
     for start in range(trainer.step, steps, chunk):

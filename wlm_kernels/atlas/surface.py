@@ -85,14 +85,11 @@ def _loss_gradient(
 
 
 def loss_gradient(value, target, weight: float, across: bool, grad) -> None:
-    """Computes the gradient, by an image, of the L1 of its difference to a target plus `weight` times the L1 of the
-    changes of this difference from pixel to pixel.
+    """Computes the gradient, by an image float [H, W, 3], of the L1 of its difference to a target plus `weight` times
+    the L1 of the changes of this difference from pixel to pixel, and writes it to `grad`.
 
-    Args:
-        value, target: float [H, W, 3]; the difference is 0 where one of them is NaN.
-        weight: Weight of the changes.
-        across: Whether changes between horizontal neighbours count, besides those between vertical neighbours.
-        grad: float [H, W, 3], written.
+    The difference is 0 where one of them is NaN. `across` tells whether changes between horizontal neighbours count,
+    besides those between vertical neighbours.
     """
     inputs = [value, target, weight, int(across)]
     wp.launch(_loss_gradient, value.shape, inputs=inputs, outputs=[grad], device=value.device)

@@ -405,14 +405,11 @@ def advect_backward(
     predicted: Fields | None = None,
     on_predicted: Fields | None = None,
 ) -> None:
-    """Adds the gradients of `advection.advect`, or with `predicted` and `on_predicted` those of its second half.
+    """Adds the gradients of `advection.advect`, which describes the first arguments, in float32, or with `predicted`
+    and `on_predicted` those of its second half.
 
-    Args:
-        box, velocity, walls, fields, dt, decay, predicted: As for `advect`, in float32.
-        on_out: Gradients to its result.
-        on_fields: Gradients to `fields`, added to.
-        on_velocity: vec3 [coarse cells], the gradient to `velocity`, added to.
-        on_predicted: Gradients to `predicted`, added to.
+    `on_out` are the gradients to its result. Added to are `on_fields`, `on_velocity`, vec3 [coarse cells], and
+    `on_predicted`.
     """
     cells, device = fields.density.shape[0], fields.density.device
     settings = [float(dt), wp.vec2(*decay), on_out.arrays]
@@ -437,14 +434,11 @@ def source_backward(
     *,
     fixed: bool,
 ) -> None:
-    """Computes the gradients of `advection_sources.add_source` for values of at least 0, so that nothing is clamped.
+    """Computes the gradients of `advection_sources.add_source`, which describes the first arguments, for values of at
+    least 0, so that nothing is clamped.
 
-    Args:
-        box, walls, shape, centre, size, fixed: As for `add_source`.
-        number: Number of the source.
-        on_fields: Gradients to the fields after it, overwritten by those to the fields before it.
-        on_values: vec2 [S], the gradients to the density and the temperature that each source adds or sets; that of
-            this source is added to.
+    `on_fields`, the gradients to the fields after it, are overwritten by those to the fields before it. Those to the
+    density and the temperature that source `number` adds or sets are added to its row of `on_values`, vec2 [S].
     """
     low, cells, total = region_of(box, centre, size)
     if total > 0:
@@ -460,13 +454,8 @@ def buoyancy_backward(
     on_force: wp.array,
     on_fields: Fields,
 ) -> None:
-    """Adds the gradients of `advection_sources.buoyancy` to those of the fields.
-
-    Args:
-        box, walls, by_density, by_temperature: As for `buoyancy`.
-        on_force: vec3 [coarse cells], the gradient to its result.
-        on_fields: Gradients to the fields, added to.
-    """
+    """Adds the gradients of `advection_sources.buoyancy`, which describes the first arguments, to those of the fields;
+    `on_force`, vec3 [coarse cells], is the gradient to its result."""
     inputs = [box, walls, wp.vec3(*by_density), wp.vec3(*by_temperature), on_force]
     cells, device = on_fields.density.shape[0], on_force.device
     wp.launch(_lift, cells, inputs=inputs, outputs=[on_fields.arrays], device=device)

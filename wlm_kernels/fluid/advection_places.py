@@ -299,13 +299,8 @@ def clip_at_solid(box: Box, walls: wp.array1d[wp.uint8], x: wp.vec3, end: wp.vec
 
 
 def make_box(coarse: Sequence[int], refinement: int, ends: Sequence[tuple[int, int]]) -> Box:
-    """Makes a domain.
-
-    Args:
-        coarse: Coarse cells along x, y and z.
-        refinement: Fine cells along an edge of a coarse cell, at least 1.
-        ends: For each axis the kind of its low and its high end: `PERIODIC`, `OPEN` or `CLOSED`.
-    """
+    """Makes a domain of coarse cells along x, y and z, each with `refinement` fine cells along an edge; `ends` has for
+    each axis the kind of its low and its high end: `PERIODIC`, `OPEN` or `CLOSED`."""
     if refinement < 1:
         raise ValueError(f"refinement: expected at least 1, got {refinement}")
     if any((low == PERIODIC) != (high == PERIODIC) for low, high in ends):
@@ -345,13 +340,8 @@ def _mark(
 
 
 def mark_walls(box: Box, solid: wp.array, walls: wp.array) -> None:
-    """Marks each coarse cell as free (0), beside a solid (1), or solid (2).
-
-    Args:
-        box: The domain.
-        solid: uint8 [coarse cells], above 0 where a cell is solid.
-        walls: uint8 [coarse cells], the marks, written.
-    """
+    """Marks each coarse cell in `walls`, uint8 [coarse cells], as free (0), beside a solid (1), or solid (2), by
+    `solid`, uint8 [coarse cells], above 0 where a cell is solid."""
     wp.launch(_mark, solid.shape[0], inputs=[box, solid], outputs=[walls], device=solid.device)
 
 

@@ -252,12 +252,8 @@ def add_source(
 def change_solids(box: Box, before: wp.array, after: wp.array, fields: Fields, bricks: Bricks = DENSE) -> None:
     """Empties the cells that become solid, and fills the cells that become fluid from their neighbours.
 
-    Args:
-        box: The domain.
-        before, after: Marks of solid cells before and after the change, uint8 [coarse cells], from
-            `advection_places.mark_walls`.
-        fields: The smoke, modified.
-        bricks: Bricks that receive smoke are marked as busy.
+    `before` and `after` are marks of solid cells, uint8 [coarse cells], from `advection_places.mark_walls`. Bricks that
+    receive smoke are marked as busy.
     """
     _launch("cover", before.shape[0], [box, before, after, bricks], fields.arrays, fields)
 

@@ -382,14 +382,8 @@ def _force(
 
 
 def set_inlets(tables: Tables, links: Links, row: wp.array, velocity: wp.array) -> None:
-    """Sets the terms of the links of inlets to those of given velocities.
-
-    Args:
-        tables: The velocity set.
-        links: The links; `term` is modified.
-        row: int [L], the inlet cell of each link.
-        velocity: vec3 [I], the velocity of each inlet cell, or [1] for all, in cells per step.
-    """
+    """Sets the terms of the links of inlets to those of given velocities, vec3 [I] by inlet cell, or [1] for all, in
+    cells per step; `row`, int [L], is the inlet cell of each link."""
     inputs = [tables, links, row, velocity]
     wp.launch(_inlets, links.cell.shape[0], inputs=inputs, outputs=[links.term], device=row.device)
 
@@ -397,13 +391,8 @@ def set_inlets(tables: Tables, links: Links, row: wp.array, velocity: wp.array) 
 def step_backward(tables: Tables, flow: Flow, f: wp.array, on_out: wp.array, on_f: wp.array, on_forces: wp.array):
     """Computes the gradients of a step without the links of its faces and solids.
 
-    Args:
-        tables: The velocity set, with Q velocities.
-        flow: The lattice.
-        f: [Q, N], the populations before the step.
-        on_out: [Q, N], the gradient to the populations that leave the cells.
-        on_f: [Q, N], the gradient to `f`, 0 at the call.
-        on_forces: vec3 [N], the gradient to the forces, added to; [0] without.
+    `f`, [Q, N], are the populations before the step, and `on_out` the gradient to those that leave the cells. `on_f`, 0
+    at the call, receives that to `f`; that to the forces is added to `on_forces`, vec3 [N], [0] without.
     """
     inputs, outputs = [tables, flow, f, on_out], [on_f, on_forces]
     wp.launch(_step, f.shape[1], inputs=inputs, outputs=outputs, device=f.device)

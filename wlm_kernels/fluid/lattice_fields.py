@@ -78,27 +78,19 @@ def _mesh(
 
 
 def voxelise_sphere(solid, body: int, centre, radius: float) -> None:
-    """Marks the cells whose centres are in a sphere with a body's number, and clears the body's other cells.
-
-    Args:
-        solid: uint8 [X, Y, Z], modified.
-        body: The body's number, 1 to 255.
-        centre, radius: Centre and radius of the sphere, in cells.
-    """
+    """Marks the cells of `solid`, uint8 [X, Y, Z], whose centres are in a sphere, in cells, with a body's number, 1 to
+    255, and clears the body's other cells."""
     n = wp.vec3i(*solid.shape)
     inputs = [n, wp.uint8(body), wp.vec3(*centre), float(radius)]
     wp.launch(_sphere, solid.size, inputs=inputs, outputs=[solid.flatten()], device=solid.device)
 
 
 def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position, scale: float) -> None:
-    """Marks the cells whose centres are in a closed mesh with a body's number, and clears the body's other cells.
+    """Marks the cells of `solid`, uint8 [X, Y, Z], whose centres are in a closed mesh with a body's number, 1 to 255,
+    and clears the body's other cells.
 
-    Args:
-        solid: uint8 [X, Y, Z], modified.
-        body: The body's number, 1 to 255.
-        mesh: Mesh on the device of `solid`, made with `support_winding_number=True`.
-        position: Position of the mesh's origin, in cells.
-        scale: Cells per unit of the mesh.
+    The mesh, on the same device, was made with `support_winding_number=True`. `position` is that of its origin in
+    cells, and `scale` the cells per unit of the mesh.
     """
     n = wp.vec3i(*solid.shape)
     # No cell is farther away than the domain's diagonal.

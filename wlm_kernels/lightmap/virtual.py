@@ -8,13 +8,15 @@ change from frame to frame.
    to frame.
 3. `select` gives each page a priority: its number of pixels, times a factor for a page that is missing, that is to be
    ready for a coming switch, or whose light has changed. It ranks the pages, decodes the first ones, up to a number of
-   pages and of samples, and finds a slot of the physical texture
-   for each page that is decoded in this frame: the least recently needed one of a group of slots. Each page takes from
-   another group, and groups take turns. A slot whose page was needed in the last frames is never given away.
-4. `wlm_kernels.lightmap.pages` decodes the chosen pages into their slots.
-5. `refer` writes the page table: the slot of each page, or of its finest ancestor that has one.
+   pages and of samples, and finds a slot of the physical texture for each page that is decoded in this frame: the least
+   recently needed one of a group of slots. Each page takes from another group, and groups take turns. A slot whose page
+   was needed in the last frames is never given away.
+4. `wlm_kernels.lightmap.pages` decodes the chosen pages, or one of their parts each, into their slots.
+5. `refer` writes the page table: the slot of each page, or of its finest ancestor that has one, with all parts.
 
-How much light has changed is known without decoding it: `Pages.change` adds up the changes between stored times.
+How much light has changed is known without decoding it: `Pages.change` adds up the changes between stored times. While
+the clock runs forward, a page is decoded for a time at which its light will have changed by `REFRESH` of the tolerance,
+and again when it has changed by as much since: half the error of light that is only ever late.
 """
 
 from typing import Any
@@ -23,26 +25,28 @@ import numpy as np
 import warp as wp
 
 from wlm_kernels.lightmap.matrix_pages import blocks_of
-from wlm_kernels.lightmap.pages import BLOCK, CLOCK, COARSE_LEVEL, GRID_BITS, Jobs, samples_of
+from wlm_kernels.lightmap.pages import CLOCK, Jobs, parts_of, samples_of
 from wlm_kernels.shared_exponent import unpack_rgb9e5
 
 GROUP = 32  # slots from which one is chosen
 MOST = 4096  # most pages that are ranked
 SAMPLES = 4  # most samples of a texel of all decoded pages together, for each page that a frame may decode
 KEEP = 16  # frames for which a page counts as needed
+REFRESH = 0.3  # of the tolerance: change of light from which on a page is decoded again if a frame has room
 VISIBLE, MISSING, STALE, AHEAD, WAITING, DECODED, GATHERED = range(7)
 """Counters of a frame: pages that are needed; pages among them without a slot, whose light has changed, that are not
 ready for the coming switch, and that wait for tiles; decoded pages; and pages that could have been decoded."""
 
-ADOPT, DROP, PREPARE = range(3)
+ADOPT, DROP, PREPARE, FORWARD = range(4)
 """Numbers of a light group in a frame: whether the pages for the switch are now those to show, whether they are not
-needed any more; and whether to decode pages for a coming switch."""
+needed any more; whether to decode pages for a coming switch; and whether light may be decoded for a later time."""
 
 _VISIBLE, _MISSING, _STALE, _AHEAD, _WAITING, _DECODED, _GATHERED = (wp.constant(i) for i in range(7))
-_ADOPT, _DROP, _PREPARE = (wp.constant(i) for i in range(3))
-_MOST, _KEEP, _SAMPLES = (wp.constant(i) for i in (MOST, KEEP, SAMPLES))
+_ADOPT, _DROP, _PREPARE, _FORWARD = (wp.constant(i) for i in range(4))
+_MOST, _KEEP, _SAMPLES, _REFRESH = (wp.constant(i) for i in (MOST, KEEP, SAMPLES, REFRESH))
 _FADE = wp.constant(0.75)  # share of its pixels that a page keeps in the next frame
 _IF_OFF = wp.constant(1.0 / 64.0)  # factor of the priority in a group whose weight is 0
+_IF_EARLY = wp.constant(1.0 / 64.0)  # and of a page whose light has changed by less than the tolerance
 _IF_MISSING, _IF_AHEAD, _IF_STALE = wp.constant(64.0), wp.constant(32.0), wp.constant(8.0)  # factors of the priority
 _SHARE = wp.constant(2)  # column of a clock, see `pages`
 
@@ -50,7 +54,7 @@ GROUPS = 8
 """Most light groups."""
 
 Times = wp.types.matrix(shape=(2 * GROUPS, CLOCK), dtype=float)
-Switches = wp.types.matrix(shape=(GROUPS, 3), dtype=int)
+Switches = wp.types.matrix(shape=(GROUPS, 4), dtype=int)
 
 
 @wp.struct
@@ -112,11 +116,14 @@ class Slots:
         owner: [C], page in the slot, or -1.
         stamp: [C], last frame in which the page was needed; -1 for an empty slot.
         mark: [C], value of `Pages.change` at the time for which the page was decoded.
+        parts: [C], parts that were decoded since the page is in the slot; a page is shown once it has all, and is
+            decoded again part by part.
     """
 
     owner: wp.array1d[int]
     stamp: wp.array1d[int]
     mark: wp.array1d[float]
+    parts: wp.array1d[int]
 
 
 @wp.struct
@@ -127,7 +134,7 @@ class Work:
         clock: [2 G, CLOCK], the time of the frame for each group, and then the time after its coming switch; see
             `pages`.
         frame: [1], number of the frame.
-        switches: [G, 3], see `ADOPT`.
+        switches: [G, 4], see `ADOPT`.
         counters: [7], see `VISIBLE`.
         gathered: [MOST], pages that could be decoded: twice the page, plus the row of the clock.
         priority: [MOST], priority of each gathered page.
@@ -155,9 +162,9 @@ def _look(times: Times, switches: Switches, frame: int, work: Work):
     if row < work.clock.shape[0]:
         column = i % work.clock.shape[1]
         work.clock[row, column] = times[row, column]
-    row = i // 3
+    row = i // 4
     if row < work.switches.shape[0]:
-        work.switches[row, i % 3] = switches[row, i % 3]
+        work.switches[row, i % 4] = switches[row, i % 4]
     if i == 0:
         work.frame[0] = frame
     if i < work.counters.shape[0]:
@@ -253,7 +260,7 @@ def _change_at(pages: Pages, page: int, clock: wp.array2d[float], target: int) -
 def _between(pages: Pages, page: int, a: float, b: float) -> float:
     lag = wp.abs(a - b)
     if pages.periodic == 1:
-        lag = wp.min(lag, pages.change[page, pages.change.shape[1] - 1] - lag)
+        lag = wp.abs(wp.min(lag, pages.change[page, pages.change.shape[1] - 1] - lag))
     return lag
 
 
@@ -273,13 +280,14 @@ def _score(pages: Pages, slots: Slots, tolerance: float, work: Work):
     group = pages.group[pages.place[p][0]]
     slot = pages.slot[p]
     ahead = pages.ahead[p]
+    parts = parts_of(pages.place[p][1])
     if ahead >= 0:
         spare = int(-1)
-        if work.switches[group, _ADOPT] == 1:
+        if work.switches[group, _ADOPT] == 1 and slots.parts[ahead] >= parts:
             spare = slot
             slot = ahead
             ahead = -1
-        elif work.switches[group, _DROP] == 1:
+        elif work.switches[group, _ADOPT] + work.switches[group, _DROP] > 0:
             spare = ahead
             ahead = -1
         if spare >= 0:
@@ -304,17 +312,27 @@ def _score(pages: Pages, slots: Slots, tolerance: float, work: Work):
         now = _change_at(pages, p, work.clock, group)
         priority = float(0.0)
         early = float(0.0)
-        if slot < 0:
+        decoded = int(0)
+        if slot >= 0:
+            slots.stamp[slot] = frame
+            decoded = slots.parts[slot]
+        if decoded < parts:
             priority = _IF_MISSING * area
             wp.atomic_add(work.counters, _MISSING, 1)
         else:
-            slots.stamp[slot] = frame
             lag = _between(pages, p, now, slots.mark[slot])
-            if lag > tolerance:
+            if decoded % parts > 0:
+                priority = _IF_STALE * area
+            elif lag > tolerance:
                 priority = wp.min(lag / tolerance, _IF_STALE) * area
                 wp.atomic_add(work.counters, _STALE, 1)
+            elif lag > _REFRESH * tolerance:
+                priority = _IF_EARLY * lag / tolerance * area
         if ahead >= 0:
             slots.stamp[ahead] = frame
+            if slots.parts[ahead] < parts:
+                early = _IF_AHEAD * area
+                wp.atomic_add(work.counters, _AHEAD, 1)
         elif work.switches[group, _PREPARE] == 1:
             if _between(pages, p, now, _change_at(pages, p, work.clock, group + work.switches.shape[0])) > tolerance:
                 early = _IF_AHEAD * area
@@ -351,7 +369,7 @@ def _rank(work: Work):
 
 
 @wp.kernel(enable_backward=False)
-def _allocate(pages: Pages, slots: Slots, size: int, work: Work, jobs: Jobs):
+def _allocate(pages: Pages, slots: Slots, size: int, tolerance: float, work: Work, jobs: Jobs):
     k = wp.tid()
     slot = int(-1)
     code = work.chosen[k]
@@ -359,8 +377,9 @@ def _allocate(pages: Pages, slots: Slots, size: int, work: Work, jobs: Jobs):
         frame = work.frame[0]
         page = code // 2
         target = code % 2
-        if target == 0:
-            slot = pages.slot[page]
+        slot = pages.slot[page]
+        if target == 1:
+            slot = pages.ahead[page]
         if slot < 0:
             groups = (slots.owner.shape[0] + size - 1) // size
             # There are at least as many groups as pages, so that no two pages of a frame take from one group.
@@ -379,6 +398,7 @@ def _allocate(pages: Pages, slots: Slots, size: int, work: Work, jobs: Jobs):
                     else:
                         pages.ahead[before] = -1
                 slots.owner[slot] = page
+                slots.parts[slot] = 0
                 if target == 0:
                     pages.slot[page] = slot
                 else:
@@ -386,8 +406,26 @@ def _allocate(pages: Pages, slots: Slots, size: int, work: Work, jobs: Jobs):
         if slot >= 0:
             slots.stamp[slot] = frame
             place = pages.place[page]
-            row = pages.group[place[0]] + target * work.switches.shape[0]
-            slots.mark[slot] = _change_at(pages, page, work.clock, row)
+            group = pages.group[place[0]]
+            row = group + target * work.switches.shape[0]
+            part = slots.parts[slot] % parts_of(place[1])
+            slots.parts[slot] += 1
+            now = _change_at(pages, page, work.clock, row)
+            if part == 0:
+                slots.mark[slot] = now
+            lead = float(0.0)
+            if target == 0 and work.switches[group, _FORWARD] == 1:
+                before = int(work.clock[row, 0])
+                speed = pages.change[page, before + 1] - pages.change[page, before]
+                # The other parts of a page follow the first.
+                wanted = wp.where(part == 0, _REFRESH * tolerance, slots.mark[slot] - now)
+                if speed > 0.0:
+                    share = work.clock[row, _SHARE]
+                    lead = wp.clamp(wanted / speed, -share, 1.0 - share)
+                if part == 0:
+                    slots.mark[slot] = now + lead * speed
+            jobs.lead[k] = lead
+            jobs.part[k] = part
             y = place[2] * pages.side - pages.border
             x = place[3] * pages.side - pages.border
             jobs.place[k] = wp.vec4i(place[0], place[1], y, x)
@@ -395,21 +433,32 @@ def _allocate(pages: Pages, slots: Slots, size: int, work: Work, jobs: Jobs):
             wp.atomic_add(work.counters, _DECODED, 1)
     jobs.slot[k] = slot
     edge = pages.side + 2 * pages.border
-    before = int(0)
+    blocks = int(0)
     for i in range(k + 1):
         if i == k:
-            jobs.first[k] = before
+            jobs.first[k] = blocks
         if work.chosen[i] >= 0:
-            before += blocks_of(pages.place[work.chosen[i] // 2][1], edge * edge)
+            blocks += blocks_of(pages.place[work.chosen[i] // 2][1], edge)
     if k == work.chosen.shape[0] - 1:
-        jobs.first[k + 1] = before
+        jobs.first[k + 1] = blocks
+
+
+@wp.func
+def _shown(pages: Pages, slots: Slots, page: int) -> bool:
+    """Returns whether all parts of a page are there, as those of a whole sheet always are."""
+    if pages.parent[page] < 0:
+        return True
+    slot = pages.slot[page]
+    if slot < 0:
+        return False
+    return slots.parts[slot] >= parts_of(pages.place[page][1])
 
 
 @wp.kernel(enable_backward=False)
-def _refer(pages: Pages):
+def _refer(pages: Pages, slots: Slots):
     p = wp.tid()
     page = int(p)
-    while pages.parent[page] >= 0 and pages.slot[page] < 0:
+    while not _shown(pages, slots, page):
         page = pages.parent[page]
     pages.table[p] = 16 * pages.slot[page] + pages.place[page][1]
 
@@ -487,7 +536,7 @@ class Look:
 
     def __init__(self, work: Work) -> None:
         count = max(work.clock.size, work.switches.size, work.counters.shape[0], work.chosen.shape[0])
-        self._times, self._switches = np.zeros((2 * GROUPS, CLOCK), np.float32), np.zeros((GROUPS, 3), np.int32)
+        self._times, self._switches = np.zeros((2 * GROUPS, CLOCK), np.float32), np.zeros((GROUPS, 4), np.int32)
         # The launch's arguments use these arrays' memory: building them from numbers takes longer than the launch.
         first = [Times.from_buffer(self._times), Switches.from_buffer(self._switches), 0]
         self._launch = wp.launch(_look, count, [*first, work], device=work.clock.device, record_cmd=True)
@@ -497,7 +546,7 @@ class Look:
 
         Args:
             times: [2 G, CLOCK], the rows of `Work.clock`.
-            switches: Integers [G, 3], the rows of `Work.switches`.
+            switches: Integers [G, 4], the rows of `Work.switches`.
             frame: Number of the frame, higher than in the frame before.
         """
         self._times[: len(times)], self._switches[: len(switches)] = times, switches
@@ -528,33 +577,19 @@ def select(pages: Pages, slots: Slots, tolerance: float, work: Work, jobs: Jobs)
 
     Args:
         pages, slots, work: The state, which is changed.
-        tolerance: Relative change of light up to which a page is not decoded again.
+        tolerance: Relative change of light above which a page is stale; it is decoded again before, see `REFRESH`.
         jobs: As many as `work.chosen`, written.
     """
     device, count = work.clock.device, work.chosen.shape[0]
     wp.launch(_score, pages.slot.shape, inputs=[pages, slots, tolerance, work], device=device)
     wp.launch(_rank, MOST, inputs=[work], device=device)
     size = max(1, min(GROUP, slots.owner.shape[0] // count))
-    wp.launch(_allocate, count, inputs=[pages, slots, size, work, jobs], device=device)
+    wp.launch(_allocate, count, inputs=[pages, slots, size, tolerance, work, jobs], device=device)
 
 
-def most_blocks(decodes: int, texels: int, levels: np.ndarray) -> int:
-    """Returns the most blocks that the pages of a frame need, see `matrix_pages`.
-
-    Args:
-        decodes: Most pages of a frame.
-        texels: Texels of a page.
-        levels: int [P], the level of each page.
-    """
-    samples = np.where(levels < COARSE_LEVEL, 4 ** np.minimum(levels, GRID_BITS), 1)
-    # Each page may be decoded for a coming switch too.
-    every = 2 * int((-(-texels * samples // BLOCK)).sum())
-    return min(decodes + -(-max(SAMPLES * decodes, 4**GRID_BITS) * texels // BLOCK), every)
-
-
-def refer(pages: Pages) -> None:
+def refer(pages: Pages, slots: Slots) -> None:
     """Writes the page table from the slots of the pages; the pages of whole sheets must have a slot."""
-    wp.launch(_refer, pages.slot.shape, inputs=[pages], device=pages.slot.device)
+    wp.launch(_refer, pages.slot.shape, inputs=[pages, slots], device=pages.slot.device)
 
 
 def sample(texture, pages: Pages, slots: Slots, clock, points: tuple[Any, Any, Any], light, coarser, change) -> None:

@@ -28,14 +28,10 @@ def _first_hit(
 
 
 def first_hit(mesh: wp.Mesh, origin: wp.array, direction: wp.array, distance: wp.array, front: wp.array) -> None:
-    """Casts rays from P points in D directions.
+    """Casts rays from P points, vec3 [P], in D directions of unit length, vec3 [D].
 
-    Args:
-        mesh: The triangles.
-        origin: vec3 [P], the points.
-        direction: vec3 [D], of unit length, the same for all points.
-        distance: float [P, D], written: distance to the first triangle; infinite if there is none.
-        front: int8 [P, D], written: 1 for a front face (corners counter-clockwise), -1 for a back face, 0 for none.
+    Written are `distance`, float [P, D], to the first triangle, infinite if there is none; and `front`, int8 [P, D], 1
+    for a front face (corners counter-clockwise), -1 for a back face, 0 for none.
     """
     wp.launch(
         _first_hit,

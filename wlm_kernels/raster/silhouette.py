@@ -194,14 +194,10 @@ def find(clip, triangle, sides, group, visible, depth, offset, edge) -> None:
 
 
 def find_backward(clip, triangle, edge, grad_offset, grad_clip) -> None:
-    """Computes the gradient of the vertices from that of the offsets that `find` returns; z has none.
+    """Adds the gradient of the vertices, float [B, V, 4], z without any, from that of the offsets that `find` returns,
+    float [B, H, W, 2].
 
     On CUDA crossings are added in any order, so that the last bits change from run to run.
-
-    Args:
-        clip, triangle, edge: Arguments and result of `find`.
-        grad_offset: float [B, H, W, 2], gradient of the offsets.
-        grad_clip: float [B, V, 4], to which the gradient is added.
     """
     inputs = [clip, triangle, frame(*edge.shape[1:3], "clip"), edge, grad_offset]
     wp.launch(_find_backward, edge.shape, inputs=inputs, outputs=[grad_clip], device=clip.device)

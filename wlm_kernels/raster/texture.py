@@ -199,12 +199,8 @@ def _sample_backward(
 
 
 def codes(filter: str, boundary: str) -> tuple[int, int]:
-    """Returns the integer codes by which kernels know a filter and a boundary mode.
-
-    Args:
-        filter: "linear" interpolates between the four nearest texels; "nearest" reads the nearest one.
-        boundary: "clamp", "wrap" or "mirror", see the module.
-    """
+    """Returns the integer codes by which kernels know a filter and a boundary mode: "linear" interpolates between the
+    four nearest texels, "nearest" reads the nearest one; the module describes "clamp", "wrap" and "mirror"."""
     for name, value, names in (("filter", filter, FILTERS), ("boundary", boundary, BOUNDARIES)):
         if value not in names:
             raise ValueError(f"{name}: expected {' or '.join(names)}, got {value!r}")
@@ -212,14 +208,8 @@ def codes(filter: str, boundary: str) -> tuple[int, int]:
 
 
 def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp") -> None:
-    """Reads a texture at N points with any coordinates.
-
-    Args:
-        texture: float [H, W, C].
-        uv: vec2 [N], coordinates (u, v).
-        out: float [N, C], written.
-        filter, boundary: Names, see `codes`.
-    """
+    """Reads a texture, float [H, W, C], at N points with any coordinates, vec2 [N]; writes `out`, float [N, C]. `codes`
+    explains filter and boundary."""
     inputs = [texture, uv, *codes(filter, boundary)]
     wp.launch(_sample, uv.shape, inputs=inputs, outputs=[out], device=texture.device)
 

@@ -203,16 +203,11 @@ def make_lattice(
 
 
 def add_up(medium: Medium, lattice: Lattice, counts: Sequence[int], pairs: int, light_step: float) -> wp.array:
-    """Computes the optical depths from the nodes to one or two pairs of opposite lights at infinity.
+    """Computes the optical depths from the nodes of a lattice of `make_lattice` to one or two `pairs` of opposite
+    lights at infinity: at both ends of the lattice's first axis, and of its second.
 
-    Args:
-        medium: The smoke.
-        lattice, counts: The results of `make_lattice`.
-        pairs: 1: lights at both ends of the lattice's first axis; 2: also at both ends of its second axis.
-        light_step: Longest step between two nodes, in voxels.
-
-    Returns:
-        vec2 [X, Y, Z, pairs] for each node: depths to the light at the axis's end and to the light at its start.
+    `light_step` is the longest step between two nodes, in voxels. Returns vec2 [X, Y, Z, pairs] for each node: depths
+    to the light at the axis's end and to the light at its start.
     """
     parts = wp.vec2i(*(parts_of(lattice.gap[n], light_step) for n in range(2)))
     gaps, nodes = medium.buffer((*counts, pairs), float), medium.buffer((*counts, pairs), wp.vec2)

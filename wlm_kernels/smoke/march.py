@@ -41,12 +41,10 @@ _PATTERNS = wp.constant(64)  # number of patterns of the gradient noise, a power
 
 @functools.cache
 def smoke_struct(dtype: Any, in_bricks: bool) -> Any:
-    """Builds (once) the struct in which kernels take smoke.
+    """Builds (once) the struct in which kernels take smoke with densities of `wp.float32` or `wp.float16`.
 
-    Args:
-        dtype: Type of the densities, `wp.float32` or `wp.float16`.
-        in_bricks: Whether it is known which bricks of 8^3 voxels contain smoke. If not, `bricks` is a meaningless
-            integer, so that marches contain no test of bricks.
+    `in_bricks` tells whether it is known which bricks of 8^3 voxels contain smoke. If not, `bricks` is a meaningless
+    integer, so that marches contain no test of bricks.
     """
 
     @wp.struct
@@ -113,18 +111,13 @@ class Medium:
 
 
 def for_smoke(build: Callable[..., wp.Kernel]) -> Callable[..., None]:
-    """Turns a function that builds a kernel for a type of smoke into the function that launches it.
+    """Turns a function that builds a kernel for a `Medium.smoke_type`, and for further compile-time arguments, into the
+    function that launches it.
 
     The kernel and its first argument, the smoke, come from the same medium: Warp does not check the type of a struct,
-    and a kernel for another type of smoke would read other memory.
-
-    Args:
-        build: Builds a kernel for a `Medium.smoke_type`, and for further compile-time arguments; called once for each
-            combination.
-
-    Returns:
-        A function of the medium, the size of the launch, the kernel's inputs after the smoke, its outputs, and the
-        further arguments of `build`. Its attribute `build` is `build` with a cache.
+    and a kernel for another type of smoke would read other memory. The result takes the medium, the size of the launch,
+    the kernel's inputs after the smoke, its outputs, and the further arguments of `build`. Its attribute `build` is
+    `build` with a cache.
     """
     build = functools.cache(build)
 

@@ -116,16 +116,11 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
 
 
 def guide_nodes(medium: Medium, up: Sequence[float], step: float) -> wp.array:
-    """Computes optical depths towards the top and the bottom at the nodes of a lattice over the grid's box.
+    """Computes optical depths towards the top, a direction of length 1, and the bottom at the nodes of a lattice over
+    the grid's box: vec2 [A, B, C], see `march.node_position`.
 
-    Args:
-        medium: The smoke.
-        up: Direction to the top, of length 1.
-        step: Largest distance between nodes (at least a voxel is used) and longest step of a march from a node, both
-            in voxels.
-
-    Returns:
-        vec2 [A, B, C], the depths to the top and to the bottom at each node; see `march.node_position`.
+    `step` is the largest distance between nodes (at least a voxel is used) and longest step of a march from a node, in
+    voxels.
     """
     nodes = medium.buffer(nodes_along(medium.density.shape, step), wp.vec2)
     _guide_nodes(medium, nodes.shape, [wp.vec3(*map(float, up)), step], [nodes])

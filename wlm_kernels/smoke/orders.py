@@ -144,13 +144,10 @@ def _light(
 
 
 def mixes(depth: wp.array, known: wp.array, cosine: float, out: wp.array) -> None:
-    """Computes the terms of the polynomial that gives the features' weights for a light.
+    """Computes the terms of the polynomial that gives the features' weights for a light, float [MIXES].
 
-    Args:
-        depth: float [1], logarithm of the smoke's mean optical depth.
-        known: float [2], the smallest and the largest such depth in the fit; `depth` is clamped to this range.
-        cosine: Cosine of the angle between the directions to the light and to the camera.
-        out: float [MIXES], written.
+    `depth`, float [1], is the logarithm of the smoke's mean optical depth, clamped to the smallest and the largest in
+    the fit, `known`, float [2]; `cosine` is that of the angle between the directions to the light and to the camera.
     """
     wp.launch(_write_mixes, 1, [depth, known, float(cosine)], [out], device=out.device)
 

@@ -133,28 +133,22 @@ def _compose(
 
 
 def light_solids(solids: Solids, lamps: Lamps, ambient: float, view: View, light: wp.array, depth: wp.array) -> None:
-    """Computes the light that obstacles reflect to each pixel; obstacles cast no shadows on each other.
+    """Computes the light that obstacles reflect to each pixel, vec3 [H, W], 0 where there is none, and their distance
+    along the rays, float [H, W], infinite there; obstacles cast no shadows on each other.
 
-    Args:
-        solids: The obstacles.
-        lamps: The lights.
-        ambient: Ambient light, added to each colour channel before the albedo is applied.
-        view: The camera; its `voxel` and `moved` are not used.
-        light: vec3 [H, W], written; 0 where there is no obstacle.
-        depth: float [H, W], written: distance along the rays, infinite where there is no obstacle.
+    `ambient` is added to each colour channel before the albedo is applied. The camera's `voxel` and `moved` are not
+    used.
     """
     inputs = [solids.mesh.id, solids.owner, solids.colours, lamps.count, lamps.toward, lamps.irradiance, ambient, view]
     wp.launch(_light_solids, depth.shape, inputs, [light, depth], device=depth.device)
 
 
 def shadow(solids: Solids, lamps: Lamps, view: View, surface: wp.array) -> None:
-    """Computes which lights reach the surface of the smoke, by a ray from each pixel's surface to each light.
+    """Computes which lights reach the surface of the smoke, by a ray from each pixel's surface to each light:
+    `visibility` of the lamps is written, 0 where an obstacle is on the way to a directional light.
 
-    Args:
-        solids: The obstacles.
-        lamps: The lights; their `visibility` is written, 0 where an obstacle is on the way to a directional light.
-        view: The camera; its `voxel` and `moved` are not used.
-        surface: float [H, W], distance along the rays to the surface; 0: no surface, which counts as lit.
+    `surface`, float [H, W], is the distance along the rays to the surface; 0: no surface, which counts as lit. The
+    camera's `voxel` and `moved` are not used.
     """
     size = (lamps.count, *surface.shape)
     inputs = [solids.mesh.id, lamps.toward, view, surface]

@@ -400,13 +400,8 @@ def depths(density, toward, step: float, nodes) -> None:
 
 
 def depths_backward(toward, step: float, grad_nodes, grad_density) -> None:
-    """Computes the gradient of the density from that of the optical depths towards lights, the result of `depths`.
-
-    Args:
-        toward, step: Arguments of `depths`.
-        grad_nodes: float [L, A, B, C], gradient of the loss with respect to the nodes.
-        grad_density: float [X, Y, Z], the gradient with respect to the density is added to it.
-    """
+    """Adds the gradient of the density, float [X, Y, Z], from that of the optical depths towards lights, float [L, A,
+    B, C], the result of `depths`."""
     inputs = [toward, step * _SLACK, grad_nodes]
     wp.launch(_depths_backward, grad_nodes.shape, inputs=inputs, outputs=[grad_density], device=grad_density.device)
 
@@ -476,13 +471,8 @@ def rays_backward(
     grad_origin,
     grad_direction,
 ) -> None:
-    """Computes the gradients of the rays of `march`; the number of a ray's steps is constant.
-
-    Args:
-        density, emission, nodes, origin, direction, step, depth, count: Arguments and results of `march`.
-        grad_scattered, grad_emitted, grad_depth: Arguments of `march_backward`.
-        grad_origin, grad_direction: vec3 [R], written. The three numbers of a direction count as independent.
-    """
+    """Computes the gradients of the rays of `march`, vec3 [R], from the arguments of `march_backward`; the number of a
+    ray's steps is constant, and the three numbers of a direction count as independent."""
     inputs = [density, emission, nodes, origin, direction, step * _SLACK, depth, count]
     inputs += [grad_scattered, grad_emitted, grad_depth]
     outputs = [grad_origin, grad_direction]

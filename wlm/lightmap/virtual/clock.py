@@ -55,12 +55,13 @@ class Clock:
     def _read(self, time: float) -> tuple[list[float], np.ndarray]:
         return [self.axis.place(time), *self.axis.neighbours(time)], self.axis.encode(time)
 
-    def frame(self, time: float) -> tuple[np.ndarray, tuple[int, int, int]]:
+    def frame(self, time: float) -> tuple[np.ndarray, tuple[int, int, int, int]]:
         """Moves the clock to a time.
 
         Returns:
             The rows of the frame's time and of the time after the coming switch, float32 [2, CLOCK]; and whether pages
-            for a switch are now shown, are not needed any more, and are to be decoded (0 or 1 each).
+            for a switch are now shown, are not needed any more, and are to be decoded, and whether light may be decoded
+            for a later time, since the clock runs forward and light is interpolated (0 or 1 each).
 
         Raises:
             WlmError: The time is not finite.
@@ -69,11 +70,14 @@ class Clock:
         adopt = self._coming is not None and self._passed(self._coming, time)
         coming = self._next(time)
         drop = self._coming is not None and not adopt and coming != self._coming
+        moved = self._forward(self._last, time)
         self._coming, self._last = coming, time
         before, _, share = self.axis.neighbours(time)
-        now = self.row(float(self.axis.times[before]) if share > 0.0 and before in self.switches else time)
+        held = before in self.switches
+        forward = 0.0 < moved <= self._lead and not held and self.axis.interpolation == "radiance"
+        now = self.row(float(self.axis.times[before]) if share > 0.0 and held else time)
         after = now if coming is None else self.row(self._end(coming))
-        return np.stack([now, after]), (int(adopt), int(drop), int(coming is not None))
+        return np.stack([now, after]), (int(adopt), int(drop), int(coming is not None), int(forward))
 
     def _end(self, switch: int) -> float:
         return float(self.axis.times[(switch + 1) % len(self.axis.times)])

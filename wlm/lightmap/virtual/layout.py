@@ -15,7 +15,7 @@ from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.sheet import Sheet
 from wlm.lightmap.tiles import TILE
 from wlm.texels import REACH
-from wlm_kernels.lightmap.pages import COARSE_LEVEL
+from wlm_kernels.lightmap.pages import COARSE_LEVEL, FAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class Layout:
                     else tile_first[s] + inner[:, 0] * own.grid.cols + inner[:, 2]
                 )
                 if level < COARSE_LEVEL and not whole:
-                    boxes = _tiles_below(own, level, row, column, side, border + REACH)
+                    boxes = _tiles_below(own, level, row, column, side, border + (REACH if level else FAR))
                     for page, box in enumerate(boxes, int(first[s, level])):
                         parts["read"].append(_numbers(box, own.grid.cols) + tile_first[s])
                         parts["reader"].append(np.full(len(parts["read"][-1]), page))

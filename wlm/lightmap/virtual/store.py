@@ -1,6 +1,7 @@
 """The tiles of a light group on a device: all of them, or as many as memory is given for, loaded when needed.
 
-All tiles are read once, when the store is made, to decode `COARSE` x `COARSE` texels of each tile at each stored time.
+All tiles are read once, when the store is made, to decode `COARSE` x `COARSE` texels of each tile at each stored time,
+means of all valid texels below them.
 The coarsest mip levels are read from these texels, and the change of each tile's light between stored times is computed
 from them.
 """
@@ -24,6 +25,7 @@ from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.virtual.clock import Clock
 from wlm.lightmap.virtual.layout import Layout
 from wlm.texels import OFFSETS, nearest_valid
+from wlm.workers import cores, each
 from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap import frames as frame_kernels
 from wlm_kernels.lightmap import matrix_pages
@@ -33,7 +35,7 @@ from wlm_kernels.lightmap.matrix_decode import pack_biases, pack_networks, packe
 from wlm_kernels.lightmap.virtual import KEEP
 
 _CHUNK = 64  # tiles that are read at once
-_GRID = 1 << kernels.GRID_BITS  # most samples of a texel along each axis; those of a coarse texel
+_NOTHING = 1.0 / 1024.0  # weight of a coarse texel without a valid texel
 _DARK = 0.01  # of a tile's brightest time: changes of less light than that are not relative to it
 _UPLOADS = 8  # most loaded tiles that are copied to the device in a frame
 _ALIGNED = 64  # bytes; the first of an array in a pool
@@ -233,6 +235,7 @@ class TileStore:
         tiles.bits = self._array(np.concatenate(bits), wp.uint32)
         shape = (len(self._kind), len(layout.models[0].times), kernels.COARSE**2)
         tiles.coarse = wp.zeros(shape, dtype=wp.uint32, device=self._device)
+        tiles.covered = wp.zeros((shape[0], shape[2]), dtype=wp.float16, device=self._device)
         tiles.slot = self._array(self.slot, int)
         self.tiles = tiles
 
@@ -247,17 +250,15 @@ class TileStore:
         rest = (tiles.kind, tiles.slot, tiles.mask, tiles.colours)
         return {
             "tiles": sum(pool.memory_bytes for pool in self._pools.values()),
-            "coarse": tiles.coarse.capacity,
+            "coarse": tiles.coarse.capacity + tiles.covered.capacity,
             "masks": tiles.bits.capacity,
             "tables": sum(array.capacity for array in rest),
         }
 
-    def decode(
-        self, clock: wp.array, offsets: wp.array, jobs: kernels.Jobs, direct: bool, out: wp.array, blocks: int
-    ) -> None:
+    def decode(self, clock: wp.array, offsets: wp.array, jobs: kernels.Jobs, direct: bool, out: wp.array) -> None:
         """Decodes squares of texels; for the arguments see `wlm_kernels.lightmap.pages.decode`."""
-        most = blocks if self._matrix else None
-        kernels.decode(self.kernel, self.source, clock, offsets, jobs, direct, out, most)
+        blocks = matrix_pages.BLOCKS if self._matrix else None
+        kernels.decode(self.kernel, self.source, clock, offsets, jobs, direct, out, blocks)
 
     # ---- coarse texels ----
 
@@ -272,11 +273,13 @@ class TileStore:
                     if len(read):
                         words[layout.tile_first[s] + read] = self._coarse(s, own, read, rows)
         self.change = np.zeros(words.shape[:2], np.float32)
+        covered = np.zeros((len(words), kernels.COARSE**2), np.float16)
         for s, own in enumerate(layout.models):
             part = slice(layout.tile_first[s], layout.tile_first[s + 1])
-            self._fill(own, words[part], self.slot[part])
+            covered[part] = self._fill(own, words[part], self.slot[part])
             self.change[part] = _changes(words[part], clock.axis.period is not None)
         self.tiles.coarse.assign(words.reshape(self.tiles.coarse.shape))
+        self.tiles.covered.assign(covered)
         self.tiles.slot.assign(self.slot)
         for pool in self._pools.values():
             pool.free_staging()
@@ -325,43 +328,48 @@ class TileStore:
 
     def _coarse(self, s: int, own: SheetModel, numbers: np.ndarray, rows: wp.array) -> np.ndarray:
         """Decodes coarse texels of n tiles at all T stored times, uint32 [n, T, COARSE, COARSE]."""
-        count, times = len(numbers), rows.shape[0]
+        count, times, side = len(numbers), rows.shape[0], kernels.COARSE
         self.tiles.slot.assign(self.slot)
-        row, column = np.divmod(numbers, own.grid.cols)
-        one = np.full(count, 1)
-        side = kernels.COARSE
-        place = np.stack([(self._first + s) * one, kernels.COARSE_LEVEL * one, side * row, side * column], 1).astype(
-            np.int32
-        )
-        jobs = kernels.Jobs()
-        jobs.place = self._array(place.repeat(times, 0), wp.vec4i)
-        jobs.target = self._array(np.tile(np.arange(times, dtype=np.int32), count), int)
-        jobs.slot = self._array(np.arange(count * times, dtype=np.int32), int)
-        each = -(-side * side * _GRID**2 // kernels.BLOCK)  # blocks
-        jobs.first = self._array(each * np.arange(count * times + 1, dtype=np.int32), int)
         out = wp.zeros((count * times, side, side), dtype=wp.uint32, device=self._device)
-        self.decode(rows, self.offsets[:1], jobs, True, out, each * count * times)
+
+        def decode(rank: np.ndarray) -> None:
+            place = np.empty((len(rank), 4), np.int32)
+            place[:, 0], place[:, 1] = self._first + s, kernels.COARSE_LEVEL
+            place[:, 2:] = side * np.stack(np.divmod(numbers[rank], own.grid.cols), 1)
+            jobs, most = kernels.Jobs(), len(rank) * times
+            jobs.place = self._array(place.repeat(times, 0), wp.vec4i)
+            jobs.target = self._array(np.tile(np.arange(times, dtype=np.int32), len(rank)), int)
+            jobs.slot = self._array((rank[:, None] * times + np.arange(times)).ravel().astype(np.int32), int)
+            jobs.part, jobs.lead = (wp.zeros(most, dtype=dtype, device=self._device) for dtype in (int, float))
+            blocks = -(-side * side * matrix_pages.GROUP // kernels.BLOCK)
+            jobs.first = self._array(blocks * np.arange(most + 1, dtype=np.int32), int)
+            self.decode(rows, self.offsets[:1], jobs, True, out)
+
+        ranks = np.arange(count)
+        if self._device == "cpu":  # a launch takes one core
+            wp.load_module(self.kernel.module, "cpu", block_dim=kernels.BLOCK)
+            list(each(decode, np.array_split(ranks, min(cores(), count))))
+        else:
+            decode(ranks)
         return out.numpy().reshape(count, times, side, side)
 
-    def _fill(self, own: SheetModel, words: np.ndarray, slot: np.ndarray) -> None:
-        """Gives the coarse texels of a sheet without a valid sample, or in a damaged tile, the nearest one's light."""
+    def _fill(self, own: SheetModel, words: np.ndarray, slot: np.ndarray) -> np.ndarray:
+        """Gives the coarse texels of a sheet without a valid texel, or in a damaged tile, the nearest one's light, and
+        returns `Tiles.covered` of the sheet's n tiles, [n, COARSE * COARSE]."""
         grid, side, step = own.grid, kernels.COARSE, TILE // kernels.COARSE
         stored = ((own.kind != TileKind.EMPTY) & (slot != kernels.BROKEN)).reshape(grid.rows, grid.cols)
         mask = np.zeros((grid.rows * TILE, grid.cols * TILE), bool)
         mask[: own.height, : own.width] = own.mask
         mask &= stored.repeat(TILE, 0).repeat(TILE, 1)
-        covered = np.zeros((grid.rows * side, grid.cols * side), bool)
-        for a in range(_GRID):
-            for b in range(_GRID):
-                y, x = (step * (2 * at + 1) // (2 * _GRID**2) for at in (a * _GRID + b, b * _GRID + _GRID - 1 - a))
-                covered |= mask[y::step, x::step]
-        if covered.all() or not covered.any():
-            return
-        image = words.reshape(grid.rows, grid.cols, -1, side, side).transpose(2, 0, 3, 1, 4)
-        image = image.reshape(-1, *covered.shape)
-        rows, columns = nearest_valid(covered)
-        filled = image[:, rows, columns].reshape(len(image), grid.rows, side, grid.cols, side)
-        words[...] = filled.transpose(1, 3, 0, 2, 4).reshape(words.shape)
+        valid = mask.reshape(grid.rows * side, step, grid.cols * side, step).sum((1, 3))
+        if not valid.all() and valid.any():
+            image = words.reshape(grid.rows, grid.cols, -1, side, side).transpose(2, 0, 3, 1, 4)
+            image = image.reshape(-1, *valid.shape)
+            rows, columns = nearest_valid(valid > 0)
+            filled = image[:, rows, columns].reshape(len(image), grid.rows, side, grid.cols, side)
+            words[...] = filled.transpose(1, 3, 0, 2, 4).reshape(words.shape)
+        by_tile = valid.reshape(grid.rows, side, grid.cols, side).swapaxes(1, 2).reshape(len(words), -1)
+        return np.maximum(by_tile, _NOTHING)
 
     # ---- tiles that are loaded when they are needed ----
 

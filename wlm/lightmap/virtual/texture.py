@@ -27,6 +27,7 @@ from wlm.lightmap.virtual.layout import Layout
 from wlm.lightmap.virtual.store import TileStore, page_changes
 from wlm_kernels.lightmap import pages as page_kernels
 from wlm_kernels.lightmap import virtual as kernels
+from wlm_kernels.lightmap.matrix_pages import GROUP
 
 BUDGET = 64 << 20
 """Bytes of the physical texture."""
@@ -35,7 +36,7 @@ DECODES = 8
 """Largest number of pages that are decoded in a frame."""
 
 TOLERANCE = 0.02
-"""Relative change of a page's light up to which it is not decoded again."""
+"""Relative change of a page's light from which on it is stale."""
 
 STRIDE = 8
 """Distance between the pixels that are read in a frame to find the pages that a view needs, a power of two."""
@@ -63,12 +64,14 @@ class Reading:
 
 class State(NamedTuple):
     """Copies in host memory of what a shader reads: the physical texture, RGB9E5 [slots, side, side], and the page
-    table [pages]; and of each slot's page, last frame in which it was needed, and each page's slots and parent."""
+    table [pages]; of each slot's page, last frame in which it was needed, and decoded parts; and of each page's slots
+    and parent."""
 
     texture: np.ndarray
     table: np.ndarray
     owner: np.ndarray
     stamp: np.ndarray
+    parts: np.ndarray
     slot: np.ndarray
     ahead: np.ndarray
     parent: np.ndarray
@@ -86,7 +89,7 @@ class VirtualTexture:
         weights: float32 [3] by light group, the factors of red, green and blue; initially 1. Changed by `set_weights`.
         slots: Number of pages that the physical texture holds.
         decodes: Largest number of pages that are decoded in a frame.
-        tolerance: Relative change of light up to which a page is not decoded again.
+        tolerance: Relative change of light from which on a page is stale.
         texture: `wp.array` uint32 [slots, side + 2 border, side + 2 border], the physical texture, RGB9E5: an array of
             textures, one layer for each slot.
         table: `wp.array` int [n * 1024], the page table as a texture whose rows have 1,024 pages; see
@@ -113,8 +116,10 @@ class VirtualTexture:
             device: "cpu", "cuda" or "cuda:N".
             budget: Bytes of the physical texture. More than the pages of all levels need is not allocated.
             decodes: Largest number of pages that are decoded in a frame, 1 to 1024. A page of the first mip counts as
-                one, of the next two as four, since their texels are means of 16 samples.
-            tolerance: Relative change of a page's light (RMS) up to which it is not decoded again, above 0.
+                one, of the second as four, since its texels are means of 16; and so does a quarter of a page of the
+                third, of which a frame decodes one.
+            tolerance: Relative change of a page's light (RMS) from which on it is stale, above 0. A frame that has no
+                missing or stale page decodes pages from 0.3 of it on.
             tiles: Bytes for the tiles on the device. If not all fit, a thread loads those that are needed. None: all.
             gelu: GELU variant of the networks; None: the model's, or on CUDA the instruction for its approximation.
             side: Texels along a side of a page without its border: 8, 16, 32, 64 or 128.
@@ -207,7 +212,8 @@ class VirtualTexture:
             **fresh,
             **numbers,
         )
-        self._slots = struct(kernels.Slots, owner=(self.slots, -1), stamp=(self.slots, -1), mark=(self.slots, 0))
+        empty = dict.fromkeys(("owner", "stamp"), (self.slots, -1)) | dict.fromkeys(("mark", "parts"), (self.slots, 0))
+        self._slots = struct(kernels.Slots, **empty)
         most = {
             "gathered": (kernels.MOST, 0),
             "priority": (kernels.MOST, 0),
@@ -215,11 +221,13 @@ class VirtualTexture:
             "chosen": (self.decodes, -1),
         }
         groups = len(layout.groups)
-        frame = {"clock": (2 * groups, page_kernels.CLOCK, 0), "switches": (groups, 3, 0), "frame": (1, 0)}
+        frame = {"clock": (2 * groups, page_kernels.CLOCK, 0), "switches": (groups, 4, 0), "frame": (1, 0)}
         self._frame_work = struct(kernels.Work, counters=(7, 0), asked=(2, count, 0), **frame, **most)
-        jobs = {"target": (self.decodes, 0), "slot": (self.decodes, -1), "first": (self.decodes + 1, 0)}
-        self._jobs = struct(page_kernels.Jobs, place=np.zeros((self.decodes, 4), np.int32), **jobs)
-        self._blocks = kernels.most_blocks(self.decodes, edge * edge, layout.place[:, 1])
+        jobs: dict[str, Any] = dict.fromkeys(("target", "part", "lead"), (self.decodes, 0)) | {
+            "slot": (self.decodes, -1)
+        }
+        jobs |= {"first": (self.decodes + 1, 0), "place": (self.decodes, 4, 0)}
+        self._jobs = struct(page_kernels.Jobs, **jobs)
         self.texture = wp.zeros((self.slots, edge, edge), dtype=wp.uint32, device=self.device)
         self.table = self._pages.table
         self._look = kernels.Look(self._frame_work)
@@ -233,12 +241,17 @@ class VirtualTexture:
         self._frame_work.clock.assign(rows)
         slot, owner = np.full(len(layout.parent), -1, np.int32), np.full(self.slots, -1, np.int32)
         slot[whole], owner[: len(whole)] = np.arange(len(whole)), whole
-        stamp, mark = np.where(owner >= 0, self._frame, -1).astype(np.int32), np.zeros(self.slots, np.float32)
-        for array, values in ((self._pages.slot, slot), (self._slots.owner, owner), (self._slots.stamp, stamp)):
-            array.assign(values)
-        self._slots.mark.assign(mark)
+        stamp, parts = np.where(owner >= 0, self._frame, -1), np.where(owner >= 0, page_kernels.PARTS, 0)
+        for array, values in (
+            (self._pages.slot, slot),
+            (self._slots.owner, owner),
+            (self._slots.stamp, stamp),
+            (self._slots.parts, parts),
+        ):
+            array.assign(values.astype(np.int32))
         # One after another: together they may take more samples than a frame.
-        first = np.full(self.decodes + 1, self._blocks, np.int32)
+        blocks = -(-GROUP * math.prod(self.texture.shape[1:]) // page_kernels.BLOCK)
+        first = np.full(self.decodes + 1, blocks, np.int32)
         first[0] = 0
         jobs.first.assign(first)
         for page in whole.tolist():
@@ -248,8 +261,10 @@ class VirtualTexture:
             jobs.place.assign(place)
             jobs.target.assign(np.full(self.decodes, self._pages.group.numpy()[place[0, 0]], np.int32))
             jobs.slot.assign(slots)
-            self._decode()
-        kernels.refer(self._pages)
+            for part in range(page_kernels.PARTS if place[0, 1] == page_kernels.COARSE_LEVEL - 1 else 1):
+                jobs.part.assign(np.full(self.decodes, part, np.int32))
+                self._decode()
+        kernels.refer(self._pages, self._slots)
 
     def set_weights(self, weights: Mapping[str, Weight]) -> None:
         """Sets the weights of some light groups for the following frames; the others keep theirs.
@@ -302,7 +317,11 @@ class VirtualTexture:
     @property
     def stages(self) -> dict[str, Callable[[], None]]:
         """The parts of a frame that one CUDA graph contains, in order, by name, for measurements."""
-        return {"select": self._select, "decode": self._decode, "table": partial(kernels.refer, self._pages)}
+        return {
+            "select": self._select,
+            "decode": self._decode,
+            "table": partial(kernels.refer, self._pages, self._slots),
+        }
 
     def _work(self) -> None:
         for stage in self.stages.values():
@@ -315,7 +334,7 @@ class VirtualTexture:
         if self.device == "cpu" and not (self._jobs.slot.numpy() >= 0).any():
             return
         for store in self._stores:
-            store.decode(self._frame_work.clock, store.offsets, self._jobs, False, self.texture, self._blocks)
+            store.decode(self._frame_work.clock, store.offsets, self._jobs, False, self.texture)
 
     def _points(self, sheet: Any, uv: Any, derivatives: Any, axes: int) -> tuple[wp.array, wp.array, wp.array]:
         """Converts the arguments to arrays on the device: those that are there already are not copied."""
@@ -394,7 +413,7 @@ class VirtualTexture:
         """Copies the physical texture and the tables from the device to the host."""
         pages, slots = self._pages, self._slots
         count = len(self.layout.parent)
-        parts = (pages.table[:count], slots.owner, slots.stamp, pages.slot, pages.ahead, pages.parent)
+        parts = (pages.table[:count], slots.owner, slots.stamp, slots.parts, pages.slot, pages.ahead, pages.parent)
         with interop.stream(self.device):
             return State(self.texture.numpy(), *(part.numpy() for part in parts))
 
@@ -404,7 +423,7 @@ class VirtualTexture:
         - `visible`, the pages that a view needed in the last 16 frames, and of these before the frame's decode:
           `missing`, pages without a slot; `stale`, pages whose light has changed by more than `tolerance`; `ahead`,
           pages that are not ready for the coming switch; `waiting`, pages that wait for tiles.
-        - `decoded`, the pages that the frame decoded.
+        - `decoded`, the pages or parts of pages that the frame decoded.
         - `slots`, and `used`, those that hold a page.
         - `memory`, bytes on the device by part: `texture`, `pages` (page table, feedback and selection), `tiles`,
           `coarse`, `masks`, `tables`.
