@@ -140,7 +140,7 @@ COMPONENTS = [
     [*(("gaussians", changes) for changes in GAUSSIANS), *(("pca", changes) for changes in COMPONENTS)],
 )
 def test_parts_that_do_not_fit_are_one_line(method, changes, tmp_path):
-    model = whole_model(positions=True) if method == "gaussians" else wlm.probe.compress(synthetic(100, dead=5))
+    model = whole_model(positions=True) if method == "gaussians" else wlm.probe.compress(synthetic(300, dead=5))
     header, parts, read = stored(model, tmp_path)
     assert_same(read(header, parts).content, model.content)
     for key, value in changes.items():

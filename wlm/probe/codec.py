@@ -45,13 +45,14 @@ _SURE, _PER_BYTE = 1 << 24, 4096
 
 
 class _Header(Header):
-    """The header of a file: `count` is the number of Gaussians or components; `profile.method` is the method used."""
+    """The header of a file: `count` is the number of Gaussians, or of components, 0 for unit vectors. The method is in
+    `profile`."""
 
     probes: int = Field(ge=1, le=PROBES)
     outputs: int = Field(27, ge=1, le=NUMBERS)
     source: str = Field(pattern="^[0-9a-f]{8}$")
     profile: Profile
-    count: int = Field(ge=1, le=PROBES)
+    count: int = Field(0, ge=0, le=PROBES)
     clusters: int = Field(1, ge=1, le=CLUSTERS)
     dropped: int = Field(0, ge=0, le=PROBES)
     live: int | None = Field(None, ge=1, le=PROBES)

@@ -30,12 +30,12 @@ _TEMPLATE = """\
 //   0    number of live probes, an integer
 //   1    number of clusters C, an integer
 //   2    {columns} words, one for each code of a probe: its first bit among those of the probe (16 bits), and its width
-//   {first}   {numbers} words for each cluster: the lowest value and the step of the magnitude's logarithm and of each
+//   {first}   for each cluster {numbers} words: the lowest value and the step of the magnitude's logarithm and of each
 //        coefficient, half floats
-//   {first} + {numbers} C   {count_basis} basis vectors for each cluster, each of {words} words: half floats, two in a word, the low
-//        half first
-//   {first} + {stride} C   the bits of one probe after another, from the lowest bit of a word: its cluster, the code of its
-//        magnitude, and those of its coefficients
+//   {first} + {numbers} C   for each cluster {count_basis} basis vectors of {words} words: half floats, two in a word,
+//        the low half first
+//   {first} + {stride} C   the bits of one probe after another, from the lowest bit of a word: its cluster, the code of
+//        its magnitude, and those of its coefficients
 //
 // It is a storage buffer, unless WLM_PROBE_PROBES(i) is defined before this file as another way to read word i.
 

@@ -31,7 +31,7 @@ CLUSTERS = 256
 _WIDEST = 8  # bits of a code
 _MOST_LOG = 88.0  # largest logarithm in a file: the exponential still fits float32
 _TRIED = (1, 8, 24)  # numbers of clusters
-_FEWEST = 8  # probes per cluster, in the mean
+_FEWEST = 8  # probes per cluster, in the mean; smaller sets have unit vectors, unless their probes have many numbers
 _ROUNDS = 6  # of k-means, and again of k-means with subspaces
 _BITS, _RANK = 6, 8  # mean bits of a coefficient in most fits, and the largest dimension of a subspace for clustering
 _MOST = 64  # directions of a cluster
@@ -93,27 +93,36 @@ class Components(Content):
         return {"components": self.count, "clusters": self.clusters, "bits": int(self.width.sum()), "basis": basis}
 
     def settings(self) -> dict[str, int]:
-        return {"count": self.count} | ({"clusters": self.clusters} if self.clusters > 1 else {})
+        return ({"count": self.count} if len(self.basis) else {}) | (
+            {"clusters": self.clusters} if self.clusters > 1 else {}
+        )
 
     @classmethod
     def table(cls, profile: Profile, outputs: int, count: int, live: int, clusters: int) -> dict[str, Part]:
-        if count > outputs:
-            raise ValueError(f"setting count: expected at most {outputs} components, found {count}")
+        if count >= outputs or (clusters > 1 and not count):
+            raise ValueError(f"setting count: expected at most {outputs - 1} components in clusters, found {count}")
+        numbers = count or outputs
         return {
-            "code": Part(np.uint8, (2 + count, live)),
-            "width": Part(np.uint8, (2 + count,)),
-            "bounds": Part(np.float16, (2, clusters, 1 + count)),
-            "basis": Part(np.float16, (0 if count == outputs else clusters * count, outputs)),
+            "code": Part(np.uint8, (numbers + 1 + (clusters > 1), live)),
+            "width": Part(np.uint8, (-(-(numbers + 1 + (clusters > 1)) // 2),)),
+            "bounds": Part(np.float16, (2, clusters, 1 + numbers)),
+            "basis": Part(np.float16, (clusters * count, outputs)),
         }
 
     def parts(self) -> dict[str, np.ndarray]:
-        return {"code": self.code.T, "width": self.width, "bounds": self.bounds, "basis": self.basis}
+        first = int(self.clusters == 1)  # all probes are in one cluster
+        code, width = self.code[:, first:].T, np.pad(self.width[first:], (0, (len(self.width) - first) % 2))
+        width = width[::2] | width[1::2] << 4
+        return {"code": code, "width": width, "bounds": self.bounds, "basis": self.basis}
 
     @classmethod
     def from_parts(
         cls, profile: Profile, outputs: int, hours: int, stored: Mapping[str, np.ndarray], dropped: int
     ) -> Self:
-        bounds, width, code = stored["bounds"].astype(np.float64), stored["width"], stored["code"]
+        bounds, code, halves = stored["bounds"].astype(np.float64), stored["code"], stored["width"]
+        width = np.stack([halves & 15, halves >> 4], 1).reshape(-1)[: len(code)]
+        if bounds.shape[1] == 1:
+            code, width = np.pad(code, ((1, 0), (0, 0))), np.pad(width, (1, 0))
         levels = 2.0**width - 1.0
         if (width > _WIDEST).any() or (code > levels[:, None]).any() or code[0].max() >= bounds.shape[1]:
             raise ValueError(f"parts code and width: expected codes of at most {_WIDEST} bits, and clusters that exist")
@@ -154,8 +163,8 @@ def component_bytes(live: int, outputs: int, count: int, clusters: int, bits: in
 def fit_components(
     values: np.ndarray, most_bytes: int | None = None, *, relative: bool = True, seed: int = 0
 ) -> tuple[Components, float]:
-    """Compresses live probes to the smallest GPU buffer whose relative error is at most about `ENOUGH`; with
-    `most_bytes` and the error not relative, to the one with the least error.
+    """Compresses live probes to the smallest GPU buffer whose relative error is at most about `ENOUGH`, or a
+    sixteenth of it if errors are not relative.
 
     Args:
         values: float32 [V, D], numbers of live probes; no row is zero.
@@ -164,24 +173,24 @@ def fit_components(
         seed: Seed of the clusters.
 
     Returns:
-        The components and their error, which is above `ENOUGH` if `most_bytes` does not allow more.
+        The components and their error, which is above that if `most_bytes` does not allow more.
     """
     values = values.astype(np.float64)
     live, outputs = values.shape
     # A half float holds the logarithm of a common magnitude exactly.
-    light = (
-        magnitudes(values) if relative else np.full(live, np.exp(np.float64(np.float16(np.log(norms(values).max())))))
-    )
+    light = norms(values)
+    if not relative:
+        light = np.full(live, np.exp(np.float64(np.float16(np.log(light.max())))))
     some = slice(None, None, -(-live // _SAMPLE))
     unit, logarithm = (values / light[:, None])[some], np.log(light)[some]
     bits = _WIDEST * (1 + outputs)
     if most_bytes is not None:
         bits = min(bits, 8 * most_bytes // live)
     rank = min(max(bits // _BITS, 1), _RANK)
-    enough = ENOUGH if relative or most_bytes is None else 0.0
+    enough = ENOUGH if relative else ENOUGH / 16
     plans = []
     for clusters in (0, *_TRIED):
-        if clusters <= max(1, live // _FEWEST):
+        if clusters <= max(live // _FEWEST, _FEWEST * live <= outputs):
             division = _divided(unit, clusters, rank, seed)
             plans += [(plan, division) for plan in _plans(unit, logarithm, division, bits, live, most_bytes, enough)]
     plan, division = min(plans, key=lambda each: each[0].key)
@@ -277,7 +286,8 @@ def _plans(
     enough: float,
 ) -> list[_Plan]:
     """Allocates 0, 1, ... `bits` bits of each probe to the logarithm of its magnitude and to its coefficients, with the
-    least sum of squared errors. Errors up to `enough` are equally good; `unit` and `logarithm` may be of some probes."""
+    least sum of squared errors. Errors up to `enough` are equally good. `unit` and `logarithm` may be of fewer probes
+    than `live`."""
     outputs = unit.shape[1]
     groups, division = _grouped(unit, division)
     unit, logarithm = unit[groups.order], logarithm[groups.order]
