@@ -218,15 +218,12 @@ class Actors(Workers):
         address: str,
         share: dict[str, float],
     ) -> None:
-        """Connects to the cluster and requests the workers; they start when resources become free.
+        """Connects to the cluster at an address, as for `ray.init`, and requests the workers; they start when resources
+        become free.
 
-        Args:
-            make: The class of the workers, from a module that every machine of the cluster can import.
-            arguments: Constructor arguments of each worker.
-            count: Number of workers; None uses all resources of the cluster.
-            most: Maximum number of workers.
-            address: Address of the cluster, as for `ray.init`.
-            share: Resources of one worker: `{"CPU": 2}` or `{"GPU": 1}`.
+        `make`, their class, is from a module that every machine of the cluster can import. There are `count` workers,
+        None for all resources of the cluster, but at most `most`, each of which takes a `share`, `{"CPU": 2}` or
+        `{"GPU": 1}`.
         """
         try:
             import ray

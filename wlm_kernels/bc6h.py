@@ -38,15 +38,8 @@ _Moments = wp.types.vector(length=10, dtype=float)
 
 @wp.struct
 class Tables:
-    """The tables of the format, described in `wlm.formats.bc6h`.
-
-    Attributes:
-        modes: int [14, 7], bit counts of each mode: `MODES`.
-        layout: int [14, 82], meaning of each bit in each mode: `LAYOUT`.
-        masks: int [32], texels on the second line of each partition: `MASKS`.
-        anchors: int [32], anchor texel of the second line of each partition: `SECOND_ANCHORS`.
-        halves: float [31,744], the value of each half float by its bit pattern.
-    """
+    """The tables of the format, described in `wlm.formats.bc6h`: `MODES`, int [14, 7]; `LAYOUT`, int [14, 82]; `MASKS`,
+    int [32]; `SECOND_ANCHORS`, int [32]; and the value of each half float by its bit pattern, float [31,744]."""
 
     modes: wp.array2d[int]
     layout: wp.array2d[int]
@@ -57,14 +50,11 @@ class Tables:
 
 @wp.struct
 class _Block:
-    """A block that is encoded in one mode.
+    """A block that is encoded in one mode, with the weighted squared error of its texels and their indices and decoded
+    light.
 
-    Attributes:
-        error: Weighted squared error of its texels.
-        mode, partition: Rows of the mode and of the partition in `Tables.modes` and `Tables.masks`.
-        code: The endpoints w, x, y and z in the mode's number of bits, before differences to w are taken.
-        index: Index of each texel.
-        light: Decoded light of each texel.
+    `mode` and `partition` are rows of `Tables.modes` and `Tables.masks`; `code` has the endpoints w, x, y and z in the
+    mode's number of bits, before differences to w are taken.
     """
 
     error: float
@@ -77,15 +67,11 @@ class _Block:
 
 @wp.struct
 class _Texels:
-    """The target texels of a block.
+    """The target texels of a block: their linear light, the weights of their squared errors, and their colours in
+    BC6H's 16-bit space, not rounded.
 
-    Attributes:
-        light: Linear light of each texel.
-        weight: Weight of each texel's squared error.
-        place: The colour of each texel in BC6H's 16-bit space, not rounded.
-        pull: Weight of each channel's squared error in the 16-bit space.
-        middle: Mean of `place` over the texels.
-        metric: Scale of each channel's distance from the mean: the square root of the mean of `pull`.
+    `pull` is the weight of each channel's squared error in the 16-bit space, `middle` the mean of `place` over the
+    texels, and `metric` the scale of each channel's distance from it: the square root of the mean of `pull`.
     """
 
     light: _Colours
@@ -98,12 +84,8 @@ class _Texels:
 
 @wp.struct
 class _Sums:
-    """The normal equations of a line's two ends, for each channel.
-
-    Attributes:
-        aa, ab, bb: Weighted sums of products of the texels' interpolation weights a (first end) and b (second end).
-        ay, by: Weighted sums of the texels' colours (`place`) times a, and times b.
-    """
+    """The normal equations of a line's two ends, for each channel: sums over the texels, weighted, of products of their
+    interpolation weights a (first end) and b (second end), and of their colours (`place`) times a and b."""
 
     aa: wp.vec3
     ab: wp.vec3
@@ -182,14 +164,11 @@ def _moments(texels: _Texels, mask: int) -> _Moments:
 
 @wp.func
 def _fitted(texels: _Texels, mask: int, ends: _Ends, line: int, moments: _Moments, steps: int) -> _Ends:
-    """Fits a line to the texels in `mask`: the extremes along their principal axis, refined twice by least squares.
+    """Fits a line to the texels in `mask`, a bit each: the extremes along their principal axis, refined twice by least
+    squares.
 
-    Args:
-        texels: The block.
-        mask: The line's texels, one bit each.
-        ends: The endpoints of both lines; rows 2 `line` and 2 `line` + 1 are replaced.
-        moments: The moments of these texels.
-        steps: The largest index, which selects the line's second end.
+    Of the endpoints of both lines, rows 2 `line` and 2 `line` + 1 are replaced. `moments` are those of these texels;
+    `steps` is the largest index, which selects the line's second end.
     """
     principal = _axis_of(moments, _AXIS_ROUNDS)
     axis = wp.vec3(principal[0], principal[1], principal[2])

@@ -165,10 +165,7 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
     assert "the mesh has no UVs, or some" in error_of(load, tmp_path / "a.obj", light)
     (tmp_path / "a.gltf").write_text(json.dumps({"asset": {"version": "2.0"}}))
     assert "a.gltf: has no triangles" in error_of(load, tmp_path / "a.gltf", light)
-    (tmp_path / "a.obj").write_text("v 0 0 0\nvt 0 0\n")
-    assert "a.obj: has no triangles" in error_of(load, tmp_path / "a.obj", light)
     assert "expected a name that ends in one of .glb" in error_of(load, tmp_path / "a.fbx", light)
-    assert "has no triangles" in error_of(from_arrays, POSITION, TRIANGLE[:0], UV, _lightmap())
 
 
 @pytest.mark.parametrize(
@@ -176,13 +173,11 @@ def test_no_uvs_no_triangles_and_other_names(tmp_path):
     [
         ({"position": POSITION[:, :2]}, "position: expected numbers [N, 3], got float64 (4, 2)"),
         ({"triangle": TRIANGLE + 1}, "triangle: expected vertex numbers 0 to 3, found 1 to 4"),
-        ({"mask": _chart()[:3]}, "expected a mask of the lightmap's (6, 8) texels, got (3, 8)"),
         ({"mask": np.zeros((HEIGHT, WIDTH))}, "thing: mask: the mask is empty"),
         (
             {"position": _with(POSITION, (3, 1), np.nan)},
             "POSITION of vertex 3: expected finite numbers, got (2, nan, 0)",
         ),
-        ({"position": _with(POSITION, (1, 0), 1e39)}, "POSITION of vertex 1: expected finite numbers, got (inf, 0, 0)"),
         ({"uv": _with(UV, (2, 0), np.nan)}, "TEXCOORD_0 of vertex 2: expected finite numbers, got (nan, "),
         ({"lightmap": _with(_lightmap(), np.s_[:3], np.nan)}, "lightmap: expected a finite texel inside the mask"),
     ],
@@ -301,9 +296,6 @@ def test_a_mesh_is_written_with_new_uvs(tmp_path):
     corner_uv[1, 0] = 0.25
     assert _write_mesh(tmp_path / "out.glb", again, corner_uv) == 2
     assert len(load(tmp_path / "out.glb", files[1], uv_set=2).sheets[0].position) == 5
-    for wrong in (corner_uv[:1], _with(corner_uv, (0, 0, 0), np.nan)):
-        with pytest.raises(ValueError, match="corner_uv: expected finite numbers"):
-            _write_mesh(tmp_path / "out.glb", mesh, wrong)
 
 
 def test_what_came_from_an_obj_is_written_as_glb(tmp_path):

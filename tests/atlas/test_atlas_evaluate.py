@@ -303,8 +303,6 @@ def test_even_views_are_spread_all_around():
     nearest = np.degrees(np.arccos(cosine.max(axis=1)))
     assert nearest.min() > 20.0 and nearest.max() < 33.0  # 50 circles that just touch would be 31 degrees apart
     assert sphere_views(0) == [] and len(sphere_views(1)) == 1
-    with pytest.raises(ValueError, match="got -1"):
-        sphere_views(-1)
 
 
 def test_axes_also_at_the_poles():
@@ -314,9 +312,6 @@ def test_axes_also_at_the_poles():
         assert np.linalg.det(axes) == pytest.approx(1.0)
         unit = np.array(direction) / np.abs(direction).max()
         np.testing.assert_allclose(axes[2], unit / np.linalg.norm(unit), atol=1e-12)
-    for wrong in ([0, 0, 0], [np.nan, 1, 0], [np.inf, 0, 0], [1, 0]):
-        with pytest.raises(ValueError, match="direction"):
-            View.of(wrong)
 
 
 def test_the_picture_just_holds_the_sphere():

@@ -520,27 +520,6 @@ def test_lightmaps_are_bounded_together(tmp_path, monkeypatch):
     assert len(load(path, trust=True).sheets) == 4
 
 
-def test_what_inspect_says_of_lightmaps_named_by_tile_or_mesh(tmp_path):
-    """Beside the mesh, in a folder of their own, and without it; the commands work as printed."""
-    for names, words in (
-        (("Floor", "Wall"), "named after the meshes of room.gltf"),
-        ((1001, 1002), "of the UDIM tiles"),
-    ):
-        wall = UV + np.float32([names[0] == 1001, 0])
-        things = [Thing("Floor", POSITION, TRIANGLE, [UV]), Thing("Wall", POSITION, TRIANGLE, [wall])]
-        path = write_scene(tmp_path / "room.gltf", things)
-        folder = tmp_path / f"bakes {names[0]}"
-        folder.mkdir()
-        for name in names:
-            write_exr(folder / f"lm_{name}.exr", light())
-        found = next(each for each in inspect(tmp_path) if each.path == folder)
-        assert words in found.what and found.command == f"wlm compress {path} '{folder}' -o OUT.wlm"
-    (found,) = inspect(folder)
-    assert "UDIM tiles 1001, 1002" in found.what and "compress them with their mesh" in found.what and not found.command
-    (folder / "room.gltf").write_bytes(path.read_bytes())
-    assert inspect(folder)[0].command == f"wlm compress '{folder / 'room.gltf'}' '{folder}' -o OUT.wlm"
-
-
 def test_what_inspect_says_of_them(tmp_path):
     """The command that it prints reads them as they are; a picture beside the mesh is no second lightmap."""
     path = writers_scene(tmp_path, "MX")

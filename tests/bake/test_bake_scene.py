@@ -33,14 +33,11 @@ from wlm.probe.data import load as load_probes
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"hours": []}, "hours"),
-        ({"hours": [3, 3]}, "hours: expected different hours"),
         ({"hours": [3, 3.0000000001]}, "hours: expected different hours"),
         ({"hours": [24], "period": 24}, "below the period of 24"),
         ({"daylight": {}, "sky": {}}, "found both"),
         ({"lamps": [{"material": "a", "position": [0, 0, 0]}]}, "either a position or a material"),
         ({"lamps": [{"material": "a", "intensity": [1, 1, 1]}]}, "an intensity for a lamp with a position"),
-        ({"sky": {"radiance": [-1, 0, 0]}}, "sky.radiance"),
         ({"bounce": 3}, "did you mean 'bounces'"),
         ({"geometry": "../room.gltf"}, "expected a file within"),
     ],

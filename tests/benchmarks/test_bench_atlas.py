@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from builders.atlas_meshes import charts, constant, image, sheet, soft
+from builders.atlas_meshes import charts, image, sheet, soft
 from builders.bench_rows import check_outputs, keys
 
 import benchmarks.atlas as bench
@@ -12,7 +12,6 @@ from wlm.atlas.evaluation import compare
 from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
 from wlm.atlas.stored import store
-from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 
 FEW = {"views": 2}
@@ -108,15 +107,6 @@ def test_means(rows):
                 assert row["max_error"] == max(r["max_error"] for r in both)
 
 
-def test_a_lightmap_of_one_colour_has_no_scores():
-    """There is no range to measure against, and the rows say nothing instead of infinity."""
-    lightmap = Lightmap("flat", sheet(constant(0.5, 0.5, 0.5), 32, 32))
-    profile = PROFILES[0].model_copy(update={"fallback": False})
-    rows = run_rows([lightmap], [profile], device="cpu", views=2, resolution=32, whole=False, points=100, repeats=1)
-    assert all("psnr" not in row.figures for row in rows)
-    assert [row.method for row in rows] == ["ours", "lightmap", *RIVALS]
-
-
 def _files(folder, mesh: LightmappedScene, *names: str, masked: bool = False) -> None:
     from PIL import Image
 
@@ -143,25 +133,3 @@ def test_folders(tmp_path):
     assert named.scene == "Cube night" and named.lit.source == read_lightmaps(tmp_path / "Cube")[1].lit.source
     exr.rename(exr.with_stem("Cube"))
     assert [lightmap.scene for lightmap in read_lightmaps(tmp_path / "Cube")] == ["Cube", "Cube day"]
-
-
-def test_what_is_refused(tmp_path, lightmaps):
-    _files(tmp_path / "Cube", charts(), "day")
-    mesh, exr = tmp_path / "Cube" / "mesh.glb", tmp_path / "Cube" / "day.exr"
-    for paths, line in (
-        ((tmp_path / "absent",), "absent: no such folder"),
-        ((tmp_path / "Cube", mesh, [exr]), "expected --mesh FILE with --lightmap FILE, or only --meshes DIR"),
-        ((None, mesh), "expected --mesh FILE with --lightmap FILE"),
-        ((None, None, [exr]), "--lightmap and --mask need --mesh FILE"),
-        ((None, tmp_path / "absent.glb", [exr]), "absent.glb"),
-    ):
-        with pytest.raises(WlmError, match=line):
-            read_lightmaps(*paths)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(WlmError, match="expected a .glb file and its .exr lightmaps, there or one folder below"):
-        read_lightmaps(tmp_path / "empty")
-    (tmp_path / "Cube" / "second.glb").write_bytes(mesh.read_bytes())
-    with pytest.raises(WlmError, match="Cube: expected one .glb file in the folder, found 2"):
-        read_lightmaps(tmp_path)
-    with pytest.raises(ValueError, match="at least one lightmap and one profile"):
-        run_rows(lightmaps, [], device="cpu", views=1, resolution=32, whole=False)

@@ -7,8 +7,6 @@ from builders.bench_rows import check_outputs, keys
 from benchmarks import Panel
 from benchmarks.atlas import Lightmap
 from benchmarks.atlas_ablation import ABLATION, run_rows
-from wlm.atlas.evaluation import evaluate
-from wlm.atlas.fit import compress
 from wlm.atlas.model import Profile
 
 PROFILE = Profile(name="small", method="cascade", steps=6, resolution=32, fallback=False, space="uv")
@@ -34,15 +32,6 @@ def test_rows_and_means(rows, tmp_path):
     assert [row.scene for row in rows] == [scene for scene in scenes for _ in names]
     for row in rows:
         assert row["psnr"] > 5.0 and row["bpp"] == pytest.approx(48 * (1 - row["compression_ratio"]))
-
-
-def test_the_whole_is_the_profile(lightmaps, rows):
-    """The same compression, scored by itself under its own charts."""
-    report = evaluate(compress(lightmaps[1].lit, PROFILE), lightmaps[1].lit, **VIEWS)
-    row = next(row for row in rows if row.scene.startswith("cube night") and row.option == "whole")
-    assert row["compression_ratio"] == report.cr
-    for name in ("psnr", "texel_psnr", "one_minus_ssim", "seam_ratio"):
-        assert row[name] == pytest.approx(getattr(report, name)), name
 
 
 def test_each_row_lacks_its_part(rows):

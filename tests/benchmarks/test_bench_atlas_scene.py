@@ -13,9 +13,7 @@ from benchmarks import Panel
 from benchmarks.atlas_scene import LEAST_TEXELS, cut, read_scene, run_rows
 from benchmarks.rivals.scene_parts import scene_parts
 from wlm.atlas.evaluation import compare
-from wlm.atlas.fit import compress
 from wlm.atlas.model import SOURCE_BITS
-from wlm.errors import WlmError
 from wlm.formats.exr import write_exr
 from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
@@ -85,17 +83,6 @@ def test_objects_keep_their_light(scene):
     assert means[0] == pytest.approx(means[1], rel=0.05)
 
 
-def test_one_object_of_few_texels():
-    """There is nothing that it could belong to."""
-    position, triangle, uv = (
-        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float),
-        np.array([[0, 1, 2]]),
-        np.eye(3)[:, :2],
-    )
-    scene = cut(from_arrays(np.ones((1, 2, 2, 3)), [0.0]).light, position, triangle, uv)
-    assert len(scene.sheets) == 1 and (scene.sheets[0].lightmaps == 1.0).all()
-
-
 def test_a_set_is_read_and_what_is_wrong_is_said(tmp_path):
     document, _ = document_from_arrays(*arrays(), "boxes")
     write_glb(tmp_path / "scene.glb", document, [], 1)
@@ -133,10 +120,3 @@ def test_parts_are_lightmaps_of_their_own(scene):
     assert many.bits == pytest.approx(0.12 * source_bits, rel=0.15)
     scores = compare(scene, {"few": few, "many": many}, views=2, resolution=48)
     assert scores["many"].psnr > scores["few"].psnr + 10.0 and min(scores["many"].psnr_by_state) > 30.0
-
-
-def test_a_scene_without_its_parts_and_one_that_has_no_room(scene, few):
-    (alone,) = run_rows(scene, [few], budget=0.12, device="cpu", parts=False, views=1, resolution=32)
-    assert alone["psnr"] > 30.0 and "gain" not in alone.figures
-    with pytest.raises(WlmError, match=r"budget: .* is less than"):
-        compress(scene, few, budget=1e-4)

@@ -1,14 +1,10 @@
 """The lightmap benchmark on a set of two small tiles and one constant one: every row has its figures."""
 
-import sys
-
 import numpy as np
 import pytest
 from builders.bench_rows import check_outputs, keys
 
-import benchmarks.lightmap as bench
-from benchmarks.lightmap import PANELS, run, run_rows
-from benchmarks.rivals.lightmap import FEW, usual
+from benchmarks.lightmap import PANELS, run_rows
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.profile import Profile
 
@@ -99,39 +95,8 @@ def test_all_pages_are_decoded_and_timed(rows):
     assert pages["pages_decoded"] == 3 + 2 + 1 and abs(pages["psnr"] - texture["psnr"]) < 0.1
 
 
-def test_a_codec_without_its_package_says_so(lightmaps, monkeypatch):
-    monkeypatch.setitem(sys.modules, "astc_encoder", None)  # as if it weren't installed
-    monkeypatch.setattr(bench, "load", lambda path: lightmaps)
-    astc, bc7 = run(quick=True, device="cpu", set_path="set", rival_names=["astc12", "bc7"])
-    assert not astc.figures and "needs the extra: pip install 'wlm[baselines]'" in astc.notes
-    assert bc7["psnr"] > 40.0
-
-
 def test_frames_have_nothing_to_fit(lightmaps):
     rows = run_rows(lightmaps, [Profile.load("frames")], device="cpu", chosen=[0], repeats=1)
     assert keys(rows) == [("ours", "frames"), ("texture", "frames")]
     assert [rows[0].get(figure) for figure in ("frames_tiles", "constant_tiles", "steps")] == [2, 1, None]
     assert rows[0]["psnr"] > 45.0 and rows[0]["decode_ms"] > 0.0 and rows[0]["load_ms"] > 0.0
-
-
-def test_a_quick_run_has_few_rivals_and_a_full_one_all(monkeypatch):
-    calls = []
-    monkeypatch.setattr(bench, "load", lambda path: from_arrays(np.ones((1, 8, 8, 3)), [12.0]))
-    monkeypatch.setattr(bench, "run_rows", lambda *args, **options: calls.append(options["rivals"]))
-    for quick in (True, False):
-        run(quick=quick, device="cpu", set_path="set")
-    run(quick=False, device="cpu", set_path="set", rivals=False)
-    assert calls == [FEW, usual("cpu"), ()]
-
-
-def test_the_rivals_alone(rows, lightmaps, monkeypatch):
-    monkeypatch.setattr(bench, "load", lambda path: lightmaps)
-    monkeypatch.setattr(bench, "usual", lambda device, quick: ("bc7", "av1-75"))
-    lines = []
-    alone = run(quick=True, device="cpu", set_path="set", rivals_only=True, progress=lines.append)
-    assert keys(alone) == [("BC7", ""), ("AV1", "75")] and len(lines) == 2
-    beside = {(row.method, row.option): row for row in rows}
-    for row in alone:  # 9, 12 and 21 h, as in the rows above
-        assert row["psnr"] == beside[row.method, row.option]["psnr"] and row["times_scored"] == 3
-    (one,) = run(quick=True, device="cpu", set_path="set", rival_names=["bc7"])
-    assert one.figures["psnr"] == alone[0]["psnr"]

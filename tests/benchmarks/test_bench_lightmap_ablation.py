@@ -1,7 +1,5 @@
 """The ablation of feature maps on a set of a dynamic tile and one that needs no fit."""
 
-import sys
-
 import numpy as np
 import pytest
 from builders.bench_rows import check_outputs
@@ -9,7 +7,6 @@ from builders.small_sets import moving_light, static_light, tiny_profile
 
 from benchmarks import Panel
 from benchmarks.lightmap_ablation import HELD_OUT, KERNELS, VARIANTS, run_rows
-from wlm.errors import WlmError
 from wlm.lightmap.data import from_arrays
 
 
@@ -48,18 +45,3 @@ def test_every_row_has_its_figures(made, lightmaps, tmp_path):
     network = {name: 2 * (features.inputs * 16 + 16 * 16 + 16 * 3 + 35) for name, features in VARIANTS.items()}
     for name, features in VARIANTS.items():
         assert by_name[name]["bytes"] == features.bytes + network[name] + 4 * 5 + 12
-
-
-def test_one_row_and_a_missing_package(lightmaps, monkeypatch):
-    (row,) = run_rows(lightmaps, tiny_profile(steps=10), ["3D alone"], device="cpu")
-    assert row.option == "3D alone" and row["steps"] == 10
-    monkeypatch.setitem(sys.modules, "ispc_texcomp", None)  # as if it weren't installed
-    (row,) = run_rows(lightmaps, tiny_profile(steps=10), ["no block simulation"], device="cpu")
-    assert not row.figures and "ispc_texcomp is missing" in row.notes
-
-
-def test_what_is_refused(lightmaps):
-    with pytest.raises(WlmError, match="expected one of hybrid, 2D alone.*found '4D'"):
-        run_rows(lightmaps, tiny_profile(), ["4D"], device="cpu")
-    with pytest.raises(WlmError, match="static: expected a tile whose light changes"):
-        run_rows(static_light(), tiny_profile(), device="cpu")

@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 
 from benchmarks import Panel, Row, pareto_front, plot
-from wlm.errors import WlmError
 
 NAN = math.nan
 ROWS = [
@@ -69,24 +68,6 @@ def test_panels_name_the_rows_that_have_their_values(tmp_path, as_text):
     assert texts.count("half slow") == texts.count("not measured") == 1
     assert texts.count("Pareto front") >= 2
     assert [p.name for p in tmp_path.iterdir()] == ["p.svg"]
-
-
-@pytest.mark.parametrize(
-    ("rows", "name", "x", "message"),
-    [
-        (ROWS, "p.png", "speed", "unknown measured quantity 'speed'"),
-        (ROWS, "p.gif", "bpp", r"\.gif.*ends in"),
-        ([], "p.png", "bpp", "no row"),
-        ([Row("l", "c", "m", "", {"psnr": 1.0})], "p.png", "bpp", "expected results with both psnr and bpp"),
-        (ROWS, "nowhere/p.png", "bpp", "nowhere"),
-        (ROWS, "p.png", Panel("bpp", "max_error"), "expected results with both max_error and bpp"),
-        (ROWS, "p.png", Panel("bpp", methods=("PCA",)), "expected results with both psnr and bpp"),
-    ],
-)
-def test_what_cannot_be_drawn_is_one_clear_line(tmp_path, rows, name, x, message):
-    with pytest.raises(WlmError, match=message):
-        plot(rows, tmp_path / name, x=x)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_zero_cost_one_point_and_equal_points(tmp_path):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from builders.bench_rows import check_outputs, keys
 
-import benchmarks.probe as bench
-from benchmarks.probe import PANELS, run, run_rows
+from benchmarks.probe import PANELS, run_rows
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
 from wlm.probe.views import KINDS
@@ -83,13 +82,3 @@ def test_rivals_keep_to_the_bytes(rows):
             assert row["psnr"] > 40.0 and row["bytes"] < 27 * 2 * PROBES[row.scene]
         if row.method == "held out" and row.scene == "room":  # the other has too few to be told well
             assert row["nearest_psnr"] < row["distance_psnr"] and row["half_way_psnr"] > 10.0
-
-
-def test_rivals_alone_are_the_same(sets, rows, monkeypatch):
-    monkeypatch.setattr(bench, "load", lambda path, key: sets[0])
-    monkeypatch.setattr(bench, "SHARES", (5, 10))
-    alone = run(probes_path="room.npz", rivals_only=True)
-    beside = [row for row in rows if row.scene == "room" and row.method in [*RIVALS, "Unreal packing"]]
-    assert keys(alone) == keys(beside)
-    for name in ("bytes", "psnr"):
-        assert [row.get(name) for row in alone] == [row.get(name) for row in beside]

@@ -5,12 +5,7 @@ from dataclasses import replace
 import pytest
 from builders.bench_rows import by_option, check_outputs
 
-from benchmarks.smoke import (
-    PANELS,
-    QUICK,
-    plotted,
-    run,
-)
+from benchmarks.smoke import PANELS, QUICK, plotted, run
 
 TINY = replace(
     QUICK,

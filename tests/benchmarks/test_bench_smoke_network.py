@@ -2,31 +2,15 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from builders.bench_rows import by_option, check_outputs
 
 import benchmarks.smoke_network as bench
-from benchmarks import path_tracer
-from benchmarks.path_tracer import PathTracer, denoise
-from benchmarks.smoke_network import (
-    PANELS,
-    QUICK,
-    NetworkBench,
-    Subject,
-    open_subjects,
-    plotted,
-    run_rows,
-    score,
-)
-from wlm.errors import WlmError
-from wlm.smoke.march.six_way import bake
+from benchmarks.smoke_network import PANELS, QUICK, Subject, open_subjects, plotted, run_rows, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
 from wlm.smoke.network.unet import SixWayNetwork
-from wlm.smoke.scene import CameraSettings, make_camera
-from wlm.smoke.synthetic import make_plume
 
 TINY = replace(
     QUICK,
@@ -125,64 +109,8 @@ def test_a_score():
     assert score(predicted, references) == pytest.approx(expected, abs=1e-3)
 
 
-def test_scenes_that_do_not_come_up():
-    with pytest.raises(WlmError, match="expected scenes of jet, whirl, got "):
-        NetworkBench("cpu", replace(TINY, kinds=("jet", "whirl"), cells=16, refine=1, resolution=8), [])
-
-
-def test_networks_are_named_and_read(network, tmp_path):
-    (subject,) = open_subjects([network], [])
-    assert subject.name == "young" and subject.trained and subject.settings == SETTINGS
-    (raw,) = open_subjects([], ["paper"])
-    assert raw.name == "network-paper untrained" and not raw.trained and raw.model.settings.width == 16
-    with pytest.raises(WlmError, match="got young 2 times"):
-        open_subjects([network, network], [])
-    with pytest.raises(WlmError, match="nosuch"):
-        open_subjects([], ["nosuch"])
-    path = tmp_path / "bare.safetensors"
-    SmokeModel(SixWayNetwork(NETWORK), {}).save(path)
-    with pytest.raises(WlmError, match="summary.dataset"):
-        open_subjects([path], [])
-
-
 def test_rows_make_a_file_tables_and_a_plot(rows, tmp_path):
     points = plotted(rows)
     check_outputs(rows, tmp_path, PANELS, points)
     assert [row.method for row in points] == ["six ways"] * 3 + ["coarse"] * 4 + ["young", "raw"]
     assert points[0].option == "step 4" and points[-3].option == "h 0.8, nodes 4"
-
-
-def test_without_the_extra(monkeypatch):
-    monkeypatch.setattr(path_tracer, "has_tracer", lambda: False)
-    monkeypatch.setattr(path_tracer, "has_denoiser", lambda: False)
-    volume, camera = _plume()
-    with pytest.raises(WlmError, match=r"mitsuba: install wlm\[bake\]"):
-        PathTracer(volume, camera)
-    with pytest.raises(WlmError, match=r"pyoidn: install wlm\[bake\]"):
-        denoise(np.zeros((6, 8, 8)))
-    with pytest.raises(ValueError, match="orthographic"):
-        PathTracer(volume, replace(camera, perspective=True))
-
-
-def test_a_path_tracer_finds_the_same_light():
-    """Its noise is the most of what it differs by, and where that is much a denoiser takes most of it away."""
-    pytest.importorskip("mitsuba")
-    volume, camera = _plume()
-    # A tracer's pixels are means over their area.
-    march = bake(volume, camera, step=0.5, supersample=4, estimate=False)
-    trace = PathTracer(volume, camera)
-    lightmaps, transparency = trace(256)
-    exact = march.lightmaps.numpy()
-    np.testing.assert_allclose(lightmaps.mean((1, 2)), exact.mean((1, 2)), rtol=0.04)
-    assert np.abs(transparency - march.transparency.numpy()).mean() < 0.02
-    few, _ = trace(4)
-    fine, rough = (float(np.square(images - exact).mean()) for images in (lightmaps, few))
-    # 64 times the samples, and as many times less of the mean square.
-    assert fine < 2e-4 and rough == pytest.approx(64.0 * fine, rel=0.4)
-    pytest.importorskip("pyoidn")
-    assert float(np.square(denoise(few) - exact).mean()) < 0.3 * rough
-
-
-def _plume():
-    volume = make_plume(24, hot=False, extinction=14.0)
-    return volume, make_camera(CameraSettings(resolution=24).turned(20.0), volume.origin, (1.0, 1.0, 1.0))

@@ -12,11 +12,8 @@ from builders.smoke_plumes import facing, plume
 import benchmarks.rivals.smoke_orders as rivals
 import benchmarks.smoke_orders as bench
 from benchmarks import read_json, tables, write_json
-from benchmarks.rivals.smoke_orders import FITTED, SCALES, filter_planes, octaves
+from benchmarks.rivals.smoke_orders import FITTED
 from benchmarks.smoke_orders import ALBEDOS, GRIDS, INSIDE, METHOD, PHASES, QUICK, GridSizes, run
-from wlm.smoke.camera import Camera
-from wlm.smoke.shading import Light
-from wlm.smoke.transport.lighting import light_smoke
 
 SINGLE = GridSizes((12, 16), extinctions=(20.0,), pixels=10, samples=64)
 SMALL = {"plumes": 1, "pixels": 10, "samples": 96, "scale": 0.08, "frames": 20, "sides": 1}
@@ -96,18 +93,3 @@ def test_flicker_is_what_the_smokes_motion_leaves():
     # Those that stay have nothing that a picture's flicker could be compared with.
     still = [(0.0 * light, 0.0 * light)] * 2
     assert set(bench._flicker(shots, [light, 1.5 * light], still, opacity)) == {"flicker"}
-
-
-def test_planes_of_rivals(device: str):
-    """Octaves of the smoke's own extinction are single scattering, and a blur keeps the light."""
-    volume = plume(device=device)
-    camera = Camera.around(volume, toward=(0.5, 0.2, 1.0), pixels=16)
-    lights = [Light((1.0, 0.5, 0.6))]
-    once = light_smoke(volume, camera, lights).shade()
-    planes = filter_planes(volume, camera, lights)
-    assert planes.shape == (1, 12 * (1 + len(SCALES)), 16, 16)
-    # A blur keeps what doesn't leave the image.
-    assert float(planes[0, 6].sum()) == pytest.approx(float(planes[0, 0].sum()), rel=0.02)
-    assert torch.allclose(planes[0, 30:], planes[0, 3] * planes[0, :30], atol=1e-6)
-    made = octaves(volume, camera, lights)
-    assert made.shape == (len(FITTED), 16, 16, 3) and torch.allclose(made[0], once, atol=0.02)

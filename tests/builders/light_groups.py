@@ -63,10 +63,7 @@ def lit_sets(size: int = 128) -> dict[str, LightmapSet]:
     """Sky and sun at different hours, and three lamps with one lightmap each."""
     v, u = np.mgrid[:size, :size] / 128.0
     wall = np.random.default_rng(5).uniform(0.6, 1.0, (size, size, 1))
-    sets = {
-        "sky": moving_light(size, size, HOURS[:3], gain=0.3),
-        "sun": moving_light(size, size, HOURS[2:], seed=1),
-    }
+    sets = {"sky": moving_light(size, size, HOURS[:3], gain=0.3), "sun": moving_light(size, size, HOURS[2:], seed=1)}
     for i, colour in enumerate(([1.0, 0.7, 0.4], [0.3, 0.5, 1.0], [0.8, 0.8, 0.8])):
         spot = np.exp(-20.0 * ((u - 0.25 * (i + 1)) ** 2 + (v - 0.5) ** 2))[..., None] * wall * colour
         sets[f"lamp {i}"] = from_arrays(spot[None], [0.0], name=f"lamp {i}")

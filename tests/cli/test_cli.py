@@ -1,7 +1,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -76,14 +75,6 @@ def test_doctor_reads_a_cache_that_others_change(tmp_path, monkeypatch):
     assert "3.0 MB" in call("doctor")
 
 
-def test_doctor_says_which_extra_lacks_what(monkeypatch):
-    stated = ["numpy", "typer; extra == 'one'", 'no-such-package>=2; extra == "two"']
-    monkeypatch.setattr("importlib.metadata.requires", lambda name: stated)
-    text = call("doctor")
-    assert re.search(r"extra one +│ complete", text)
-    assert "missing: no-such-package; pip install 'wlm[two]'" in text
-
-
 def test_compress_prints_one_table(folder, profile, tmp_path):
     out = tmp_path / "a.wlm"
     text = call("compress", folder, "-o", out, "--profile", profile, "--steps", 10, "--seed", 4)
@@ -142,19 +133,6 @@ def test_evaluate_prints_and_writes_the_report(fitted, folder, tmp_path):
     assert f"{report.light.seen:.2f}" in scores and f"{report.light.between:.2f}" in scores
     # There are no gaps, one tile and no mesh.
     assert not any(title in scores for title in ("beside charts", "tile borders", "views"))
-
-
-def test_times_left_out_of_the_fit_are_scored_apart(folder, profile, tmp_path):
-    some, path, report = tmp_path / "some", tmp_path / "a.wlm", tmp_path / "r.json"
-    shutil.copytree(folder, some, ignore=shutil.ignore_patterns("light_5h*", "light_13.5h*"))
-    call("compress", some, "-o", path, "--profile", profile, "--period", 24)
-    assert json.loads(call("info", path, "--json"))["times"] == [0.0, 11.0, 20.0]
-    text = call("evaluate", path, folder, "--period", 24, "--json", report)
-    (sheet,) = json.loads(report.read_text())["sheets"]
-    assert sheet["held_out"]["times"] == [5.0, 13.5]
-    shown = text.split("that the file does not store")[1]
-    for name in ("decoded", "mixed"):
-        assert f"{sheet['held_out'][name]['psnr']:.2f}" in shown
 
 
 def test_info_says_what_is_in_the_file(fitted):

@@ -114,18 +114,16 @@ def test_wrong_words_are_one_line(inputs, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.parametrize("kind", ["tiles", "cascade"])
-def test_evaluate(kind, inputs, request, tmp_path):
+def test_evaluate(tiles, inputs, tmp_path):
     """The report of the library."""
-    path, options = request.getfixturevalue(kind), {"views": 3, "resolution": 64}
+    options = {"views": 3, "resolution": 64}
     words = ["--views", 3, "--resolution", 64, "--json", tmp_path / "a.json"]
-    text = call("evaluate", path, *inputs, *words)
+    text = call("evaluate", tiles, *inputs, *words)
     report = json.loads((tmp_path / "a.json").read_text())
-    expected = evaluate(wlm.load(path), load(*inputs), **options).to_json()
+    expected = evaluate(wlm.load(tiles), load(*inputs), **options).to_json()
     assert report.items() >= (expected | {"views": 3}).items() and f"{report['psnr']:.2f}" in text
     assert "evaluate: 3 of 3" in call.stderr
-    # One chart has no seam.
-    assert (report["seam_ratio"] is None) == (kind == "tiles")
+    assert report["seam_ratio"] is None, "one chart has no seam"
 
 
 def test_evaluate_refuses_other_inputs(inputs, tiles, tmp_path):
@@ -148,9 +146,8 @@ def test_decode_the_lightmap(kind, inputs, request, tmp_path):
     assert "48x40" in text and np.abs(decoded - mesh.lightmap)[mesh.mask].mean() < 0.1
 
 
-@pytest.mark.parametrize("kind", ["tiles", "cascade"])
-def test_decode_a_view(kind, request, tmp_path):
-    words = ["decode", request.getfixturevalue(kind), "--view", 2, "--views", 5, "--resolution", 48]
+def test_decode_a_view(tiles, tmp_path):
+    words = ["decode", tiles, "--view", 2, "--views", 5, "--resolution", 48]
     text = call(*words, "-o", tmp_path / "a.exr")
     assert "48x48" in text
     call(*words, "-o", tmp_path / "a.png")

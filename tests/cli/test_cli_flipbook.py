@@ -138,9 +138,7 @@ def test_wrong_flip_books(straight, tmp_path):
     for extra, line in (
         (["--cells", "2x2"], "no opacity"),
         (["--cells", "2x2", "--straight"], "for straight alpha, found none"),
-        (["--cells", "0x2"], "--cells: expected rows and columns"),
         (["--cells", "3x3"], "expected textures that divide into 3 rows and 3 columns"),
-        (["--with", opacity, "--with", opacity, "--cells", "2x2"], "got 4"),
     ):
         assert call(*words, *extra, *out, code=2) == "" and line in call.stderr.splitlines()[-1]
     assert "--straight: has no meaning without --with" in fails("smoke", "shade", first, "--straight", *out)
@@ -153,11 +151,8 @@ def test_wrong_options_are_one_line(baked, tmp_path):
     for words, line in (
         ([*book, "--engine", "godot", "--shader", "hlsl"], "shader and exact have no meaning for a kit"),
         ([*book, "--engine", "unity", "--layout", "o3de"], "layout: expected unity for unity, got o3de"),
-        ([*book, "--layout", "godot"], "--layout"),
         ([*book, "--rate", 0], "--rate: expected a number above 0, got 0"),
-        ([*book, "--gain", "nan"], "--gain: expected a number above 0, got nan"),
         ([*textures, "--engine", "three"], "--engine needs a folder as the output"),
-        ([*textures, "--shader", "wgsl"], "--shader needs a folder as the output"),
         ([*textures[:-1], tmp_path / "a.jpg"], "ends in .exr or .png or .tga"),
     ):
         assert call(*words, code=2) == "" and line in call.stderr.splitlines()[-1]

@@ -47,7 +47,9 @@ def camera_of(volume, **settings):
     ("words", "place", "other"),
     [
         (["bake", "--step", 1], "wlm.smoke.march.six_way.bake", ["--step", 2]),
-        (["predict", "--coarse"], "wlm.smoke.march.six_way.bake_coarse", ["--seed", 7]),
+        pytest.param(
+            ["predict", "--coarse"], "wlm.smoke.march.six_way.bake_coarse", ["--seed", 7], marks=pytest.mark.slow
+        ),
     ],
 )
 def test_frames_that_were_made_are_not_made_again(words, place, other, frames, tmp_path, monkeypatch):
@@ -180,18 +182,10 @@ def test_wrong_words_are_one_line(volume, frames, baked, tmp_path):
     out = tmp_path / "a.exr"
     made = ("smoke", "bake", volume, "-o", out)
     for text, line in (
-        ("toward=1,0", "--camera toward: expected three numbers"),
         ("toward=0,0,0", "--camera toward: expected a direction other than 0, 0, 0"),
         ("resolution=8", "--camera: expected NAME=VALUE with a name of toward"),
     ):
         assert line in fails(*made, "--camera", text)
-    for text, line in (
-        ("extinction=0", "extinction: expected a number above 0"),
-        ("up=w", "--volume up: expected one of x, y, z, got 'w'"),
-    ):
-        assert line in fails(*made, "--volume", text)
-    for words, line in ((("--fit", "sphere", "--supersample", 2), "--supersample"),):
-        assert line in fails(*made, *words)
     line = fails("smoke", "bake", frames, "-o", out, "--volume", "up=z")
     assert "option up: applies only to files of other programs" in line
     shaded = ("smoke", "shade", baked / "six_0001.exr", "-o", tmp_path / "a.png")

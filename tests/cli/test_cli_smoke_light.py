@@ -67,10 +67,8 @@ def test_frames_keep_their_obstacles_and_lights(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--albedo", "1.5"), "--albedo"),
         (("--light", "0,0,0"), "--light"),
         (("--point", "0,0,0:-1"), "--point"),
-        (("--sky", "1,-1,1"), "--sky"),
         (("--samples", "4", "--background", "1,1,1"), "--background cannot be used with --samples"),
     ],
 )

@@ -69,13 +69,9 @@ def test_train(trained):
     assert model.settings.guide == "six" and model.summary["seed"] == 3
     assert model.dataset == DatasetSettings(**PROFILE["dataset"])
     assert (folder / "a.safetensors.csv").read_text().count("\n") == 3
-    # The same from Python.
-    again = wlm.smoke.train(folder / "tiny.yaml", folder / "b.safetensors", seed=3)
-    assert again.finished and file_content(folder / "b.safetensors") == file_content(folder / "a.safetensors")
-    for name in ("b.safetensors", "b.safetensors.csv"):
-        (folder / name).unlink()
 
 
+@pytest.mark.slow
 def test_a_training_is_stopped_and_resumed(trained, tmp_path, monkeypatch):
     """A training stopped by Ctrl-C and by the time limit ends with the same weights."""
     folder, _, _ = trained

@@ -44,6 +44,7 @@ def test_run_is_what_its_stages_are_one_by_one(scene, tmp_path):
     assert np.abs(png(tmp_path / "net" / "run_0001.png") - png(tmp_path / "run" / "run_0001.png")).mean() < 6
 
 
+@pytest.mark.slow
 def test_run_has_light_of_all_orders(scene, tmp_path):
     """The pictures equal those of `light` and are brighter than single scattering."""
     two = ("--frames", 2)

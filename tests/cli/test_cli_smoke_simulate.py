@@ -15,7 +15,6 @@ from builders.smoke_plumes import SCENE, write_frames
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import load_volume, save_volume
-from wlm.formats.artifact import read_artifact
 from wlm.smoke import simulation
 from wlm.smoke.data import CHECKPOINT, load_frames, open_frames
 from wlm.smoke.scene import Scene
@@ -67,9 +66,6 @@ def test_simulate_as_told(jet, tmp_path):
     assert "there was nothing to resume" in call.stderr
     footage = load_frames(tmp_path / "a")
     assert footage.numbers == (1,) and footage.scene.grid.cells == (4, 5, 4) and footage.scene.grid.cell == 0.25
-    line = fails("smoke", "simulate", "jet-sphere", "-o", tmp_path / "b", "--scale", 50)
-    assert "jet past a sphere: grid.cells.0: expected less than or equal to 4096, got 5000" in line
-    assert not (tmp_path / "b").exists()
     for change, words in (
         ({"grid": {"cells": [4096, 4096, 4096], "cell": 0.1, "faces": {}}}, "4096 x 4096 x 4096 cells"),
         ({"air": {"speed": 0.1}}, "cells per step: expected at most 0.3"),
@@ -120,25 +116,6 @@ def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch)
     assert (out / "frame_0004.npz").stat().st_mtime_ns == before
 
 
-def test_a_blow_up_keeps_the_last_good_state(tmp_path, monkeypatch):
-    scene = Scene.model_validate(JET)
-    out, check = tmp_path / "out", Solver.check
-    last = 2 * (scene.steps // 2) + 1
-
-    def failing(self):
-        if self.steps > last:
-            raise WlmError("lattice: blew up in step 9 at cell (1, 2, 3): not a number" + self._kept)
-        check(self)
-
-    monkeypatch.setattr(Solver, "check", failing)
-    with pytest.raises(WlmError, match="blew up in step 9"):
-        simulate(open_frames(out, scene), checkpoint_every=0.0)
-    assert int(read_artifact(out / CHECKPOINT).tensors["lattice.steps"]) == 2 * last
-    monkeypatch.undo()
-    first = simulate(open_frames(out, scene, resume=True), resume=True)
-    assert first == 3 and not (out / CHECKPOINT).exists() and load_frames(out).numbers == (1, 2, 3, 4)
-
-
 def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatch):
     """A state is saved after its frame: a missing frame is simulated again."""
     scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_volume
@@ -163,29 +140,10 @@ def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatc
     assert load_frames(out).numbers == (1, 2, 3, 4) and not (out / CHECKPOINT).exists()
 
 
-def test_fewer_frames_leave_the_state_that_is_past_them(tmp_path):
-    scene, out = Scene.model_validate(JET), tmp_path / "out"
-
-    def stopped(progress):
-        if progress.done == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        simulate(open_frames(out, scene), progress=stopped)
-    kept = (out / CHECKPOINT).read_bytes()
-    fewer = scene.model_copy(update={"frames": 2})
-    assert simulate(open_frames(out, fewer, resume=True), resume=True) == 3
-    assert (out / CHECKPOINT).read_bytes() == kept
-    assert simulate(open_frames(out, scene, resume=True), resume=True) == 4
-    assert load_frames(out).numbers == (1, 2, 3, 4) and not (out / CHECKPOINT).exists()
-
-
-@pytest.mark.parametrize("case", ["empty", "covered", "one cell", "hot", "bricks of halves"])
+@pytest.mark.parametrize("case", ["empty", "one cell", "hot", "bricks of halves"])
 def test_hard_scenes(case, tmp_path):
     changed = {
         "empty": {"inlets": []},
-        # The body lies over the inlet: no smoke comes in.
-        "covered": {"obstacles": [{"radius": [0.6, 0.2, 0.6], "shape": "box", "path": [[0, 0, 0, 0]]}]},
         "one cell": {"grid": {"cells": [1, 1, 1], "cell": 1.0, "refine": 1}, "inlets": [], "obstacles": []},
         "bricks of halves": {"smoke": {"bricks": True, "storage": "float16", "scheme": "semi-lagrangian"}},
         "hot": {

@@ -38,8 +38,7 @@ def run(number, *work):
 
 
 def test_a_signal_ends_a_command_with_its_exit_code():
-    for number, code in SIGNALS.items():
-        assert run(number, "press()", "print('not stopped')") == (code, "", "")
+    assert run(signal.SIGTERM, "press()", "print('not stopped')") == (143, "", "")
     # Printing is as good a place as any.
     show = ["rows = console.table('', ['a'])", "console.escape = press", "rows.add_row(console.escape('x') or 'x')"]
     assert run(signal.SIGINT, *show, "console.show(rows)")[::2] == (130, "")

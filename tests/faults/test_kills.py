@@ -171,7 +171,8 @@ def check_kills(command: Command, folder: Path, kills: int) -> None:
             break
         command.state(output, earlier, expected)
         resume = command.partial is not None and (output / command.partial.format(output.name)).resolve().exists()
-    call(*command.words, "-o", output, *["--resume"] * resume)
+    else:
+        call(*command.words, "-o", output, *["--resume"] * resume)
     assert command.content(output) == expected
     assert set(os.listdir(output.parent)) <= set(os.listdir(folder))
 

@@ -127,7 +127,8 @@ def test_air(kind: str, device: str):
     totals = []
     for shaped in ((3,), (air.inlets, 3), (STEPS, air.inlets, 3)):
         many = _tensor(np.broadcast_to((0.05, 0.01, 0.0), shaped), device)
-        (air.fields(air.advance(start.detach(), STEPS, inlet=many, begin=0))[1] * w_u).sum().backward()
+        moved = air.advance(start.detach(), STEPS, inlet=many, force=force.detach(), begin=0)
+        (air.fields(moved)[1] * w_u).sum().backward()
         totals.append(_double(many.grad).reshape(-1, 3).sum(0))
     np.testing.assert_allclose(totals[1:], totals[:1] * 2, rtol=1e-4, atol=1e-4)
 
@@ -224,33 +225,6 @@ def test_values_are_the_solvers(device: str):
     fluid_cells = solver.solid.numpy() == 0
     populations = solver.lattice.populations().numpy()[:, fluid_cells]
     np.testing.assert_allclose(out.populations.cpu().numpy()[:, fluid_cells], populations, atol=1e-6)
-
-
-def test_drag_by_inlet_speed(device: str):
-    """The derivative of the drag of a box by the speed of the inlet, against runs of the solver at two speeds."""
-
-    def lattice(speed: float) -> Lattice:
-        made = Lattice((16, 10, 1), lattice="D2Q9", viscosity=VISCOSITY, device=device, ramp=20)
-        made.set_inlet("-x", (speed, 0.0, 0.0))
-        made.set_outlet("+x")
-        for face in ("-y", "+y"):
-            made.set_wall(face)
-        mask = np.zeros((16, 10, 1), int)
-        mask[5:8, 4:7] = 1
-        made.set_solid(mask)
-        return made
-
-    drags = []
-    for speed in (0.045, 0.055):
-        run = lattice(speed)
-        run.step(100)
-        drags.append(run.force_on_solid()[0])
-    air = fluid.DifferentiableLattice(lattice(0.02))
-    inlet = torch.tensor([0.05, 0.0, 0.0], device=device, requires_grad=True)
-    drag = air.force_on_solid(air.advance(air.populations(), 100, inlet=inlet))
-    drag[0].backward()
-    assert drag[0].item() == pytest.approx(np.mean(drags), rel=0.01) and drag[0] > 0.0
-    assert inlet.grad[0].item() == pytest.approx((drags[1] - drags[0]) / 0.01, rel=TOLERANCE)
 
 
 @pytest.mark.parametrize("smoky", [False, True])
@@ -387,13 +361,6 @@ def test_refusals():
             fluid.DifferentiableSolver(Solver(lattice, refinement=1, **settings))
     model, _, _ = _smoke("channel", "cpu", "maccormack", sources=SOURCES)
     state, air = model.state(), model.air
-    for call, words in (
-        (lambda: air.advance(state.populations, inlet=torch.full((3,), 0.5)), "inlet: expected numbers from -0.3"),
-        (lambda: model.carry(-1.0 - state.density, torch.zeros(9, 8, 1, 3), state.temperature), "density: .* from 0"),
-        (lambda: model.advance(state, sources=torch.full((2, 2), math.nan)), "sources: expected finite"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            call()
     with pytest.raises(WlmError, match=r"blew up in step \d+ at cell .*not a number"):
         air.advance(torch.full_like(state.populations, math.nan), 2)
     assert torch.equal(air.advance(state.populations, 0), state.populations)

@@ -9,7 +9,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid import lattice as lattice_module
 from wlm.fluid.faces import FACES
-from wlm.fluid.lattice import CHECK_EVERY, MAX_SPEED, Domain, Lattice
+from wlm.fluid.lattice import CHECK_EVERY, MAX_SPEED, Lattice
 from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 
 SHAPE = (12, 8, 8)
@@ -229,16 +229,6 @@ def test_freed_cells_get_the_mean_of_their_neighbours(device: str):
     box.step(3)
     assert box.mass() == 1.0
     np.testing.assert_array_equal(box.velocity().numpy(), 0.0)
-
-
-def test_domain_converts():
-    domain = Domain(0.05, 0.1 * 0.05 / 4.0)
-    assert domain.speed(4.0) == pytest.approx(0.1)
-    assert domain.viscosity(1.5e-5) == pytest.approx(1.5e-5 * domain.step / 0.05**2)
-    assert domain.acceleration(9.81) == pytest.approx(9.81 * domain.step**2 / 0.05)
-    for wrong in ((0.0, 1.0), (1.0, float("nan"))):
-        with pytest.raises(ValueError):
-            Domain(*wrong)
 
 
 # u on the cavity's vertical midline (Ghia, Ghia and Shin 1982, table I), and where.

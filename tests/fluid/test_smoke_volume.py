@@ -175,13 +175,8 @@ def test_wrong_nvdb(tmp_path: Path):
     ("arrays", "message"),
     [
         ({"smoke": np.ones((2, 2, 2))}, "the array density is missing; found smoke"),
-        (
-            {"density": np.ones((2, 2))},
-            r"density: expected \[X, Y, Z\], 1 to 2147483647 voxels, found \(2, 2\)",
-        ),
-        ({"density": np.ones((1, 1, 1), complex)}, "density: expected an array of real numbers"),
+        ({"density": np.ones((2, 2))}, r"density: expected \[X, Y, Z\], 1 to 2147483647 voxels, found \(2, 2\)"),
         ({"density": np.ones((2, 2, 2)), "temperature": np.ones((2, 2, 1))}, "temperature: expected"),
-        ({"density": np.ones((1, 1, 1)), "voxel": 0.0}, "voxel: expected a length above 0"),
         ({"density": np.ones((1, 1, 1)), "origin": [0.0, np.nan, 0.0]}, "origin: expected 3 finite numbers"),
     ],
 )
@@ -203,12 +198,6 @@ def test_wrong_files(tmp_path: Path):
     ):
         with pytest.raises(WlmError, match=message):
             load_volume(tmp_path / name)
-    for options, message in (
-        ({"voxel": 1e-60}, "voxel: expected a length above 0 that float32 holds"),
-        ({"emission": 1e39}, "emission: expected a number of at least 0 that float32 holds"),
-    ):
-        with pytest.raises(WlmError, match=message):
-            from_array(np.ones((1, 1, 1)), **options)
 
 
 def test_emission_beyond_what_pictures_hold_is_lowered(device: str):

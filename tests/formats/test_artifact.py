@@ -1,6 +1,5 @@
 import hashlib
 import json
-import os
 import struct
 from pathlib import Path
 
@@ -128,11 +127,8 @@ def test_other_files_are_refused(tmp_path):
     assert "No such file" in _refusal(path)
     assert "found a folder" in _refusal(tmp_path)
     assert "found a file of 0 bytes" in _refusal(path, b"")
-    assert "found a file of 7 bytes" in _refusal(path, b"x" * 7)
-    assert "found other content" in _refusal(path, b"\x89PNG" + b"x" * 100)
     assert "found other content" in _refusal(path, struct.pack("<Q", 2**63) + b"{}")
     assert "cut short" in _refusal(path, struct.pack("<Q", 10) + b"{}")
-    assert "header is damaged" in _refusal(path, struct.pack("<Q", 2) + b"{x")
     assert "header is damaged" in _refusal(path, struct.pack("<Q", 9000) + b'{"":' * 2250)
     safetensors.numpy.save_file({"a": np.zeros(3)}, path)
     assert "without its metadata" in _refusal(path)
@@ -174,9 +170,7 @@ def test_a_newer_version_and_another_system_are_named(artifact):
     [
         ({"shape": [3, 5, 15]}, "expected 225 bytes, found 240"),
         ({"dtype": "F16"}, "expected 480 bytes, found 240"),
-        ({"dtype": "BF16"}, "expected a type, a shape and two offsets"),
         ({"shape": [-3, -5, 16]}, "expected a type, a shape and two offsets"),
-        ({"data_offsets": [None, 240]}, "expected a type, a shape and two offsets"),
         ({"data_offsets": [0, 240]}, "expected its data at byte"),
     ],
 )
@@ -196,22 +190,6 @@ def test_wrong_settings_under_a_right_digest_are_refused(artifact):
     header["__metadata__"]["settings"] = "{}"
     artifact.write_bytes(_signed(header, payload))
     assert read_artifact(artifact).settings == {}
-
-
-@pytest.mark.parametrize(
-    ("system", "settings", "tensors", "source"),
-    [
-        ("light map", {}, {}, "x"),
-        ("lightmap", {}, {}, "é"),
-        ("lightmap", {"a": float("nan")}, {}, "x"),
-        ("lightmap", {}, {"__metadata__": np.zeros(1)}, "x"),
-        ("lightmap", {}, {"a": np.zeros(1, np.complex64)}, "x"),
-    ],
-)
-def test_what_the_format_cannot_hold_is_a_value_error(tmp_path, system, settings, tensors, source):
-    with pytest.raises(ValueError):
-        write_artifact(tmp_path / "a.wlm", system, settings, tensors, source)
-    assert os.listdir(tmp_path) == []
 
 
 @pytest.mark.parametrize("shape", [[0, 1 << 62], [0] + [1 << 20] * 4, [1] * 9, [0] * 100])

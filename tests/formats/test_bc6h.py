@@ -18,8 +18,6 @@ def test_blocks_of_every_mode_and_of_none_decode_as_elsewhere():
     blocks = np.random.default_rng(0).integers(0, 256, (32 * 200, 16), np.uint8)
     blocks[:, 0] = blocks[:, 0] & 0xE0 | np.arange(len(blocks)) % 32
     np.testing.assert_array_equal(decode_bc6h(blocks).view(np.uint16), _other(blocks).view(np.uint16))
-    with pytest.raises(ValueError, match=r"expected uint8 \[B, 16\], got uint8 \(3, 15\)"):
-        decode_bc6h(np.zeros((3, 15), np.uint8))
 
 
 def _pictures() -> np.ndarray:

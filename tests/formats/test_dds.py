@@ -68,12 +68,6 @@ TEXELS = np.arange(15 + 2 + 1, dtype="<u4").tobytes()  # 5x3, 2x1, 1x1
             {"width": 8, "height": 12, "depth": 5, "fmt": "BC7_UNORM"},
             {FLAGS: 0x881007, PITCH: 96, DEPTH: 5, CAPS: 0x1008, CAPS2: 0x200000, DIMENSION: 4},
         ),
-        # A volume of one slice.
-        (
-            _blocks(2),
-            {"width": 8, "height": 4, "depth": 1, "fmt": "BC7_UNORM"},
-            {FLAGS: 0x881007, DEPTH: 1, DIMENSION: 4},
-        ),
         # DDSD_PITCH and the bytes of a row take the place of DDSD_LINEARSIZE and those of the texture.
         (
             bytes(range(30)),
@@ -109,19 +103,3 @@ def test_every_format(tmp_path, fmt, depth):
     assert struct.unpack_from("<I", data, 128) == (DXGI_FORMATS[fmt],)
     assert [_field(data, at) for at in (DEPTH, DIMENSION)] == ([depth, 4] if depth else [0, 3])
     assert os.listdir(tmp_path) == ["a.dds"]
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"fmt": "BC1_UNORM"},
-        {"width": 0},
-        {"depth": 2},
-        {"layers": 2},
-        {"width": 4, "depth": 2, "layers": 1},
-    ],
-)
-def test_what_does_not_fit_is_a_value_error(tmp_path, change):
-    with pytest.raises(ValueError):
-        write_dds(tmp_path / "a.dds", _blocks(2), **{"width": 8, "height": 4, "fmt": "BC7_UNORM", **change})
-    assert os.listdir(tmp_path) == []

@@ -240,28 +240,6 @@ def test_sets_that_are_missing_between_are_filled(tmp_path):
     np.testing.assert_array_equal(found.uv[0][found.triangle], PLACES[GATHER][CORNERS])
 
 
-def test_nothing_replaced_is_a_copy(tmp_path):
-    before = _document(tmp_path)
-    write_glb(tmp_path / "out.glb", before, [], 1)
-    first, second = read_gltf(tmp_path / "in.gltf")[1], read_gltf(tmp_path / "out.glb")[1]
-    assert len(first) == len(second) == 2
-    for one, two in zip(first, second, strict=True):
-        np.testing.assert_array_equal(one.position, two.position)
-        np.testing.assert_array_equal(one.triangle, two.triangle)
-    assert json.loads(json.dumps(before.content))["nodes"] == read_gltf(tmp_path / "out.glb")[0].content["nodes"]
-
-
-def test_a_set_that_is_there_and_a_primitive_twice_are_value_errors(tmp_path):
-    document = _document(tmp_path)
-    replacements = _replacements(tmp_path)
-    with pytest.raises(
-        ValueError, match="expected 0 or more, a UV set that node 0, mesh 0, primitive 1 does not have, got 0"
-    ):
-        write_glb(tmp_path / "out.glb", document, replacements, 0)
-    with pytest.raises(ValueError, match="at most one for each primitive"):
-        write_glb(tmp_path / "out.glb", document, [*replacements, replacements[0]], 1)
-
-
 def test_what_is_malformed_beside_the_scene_is_one_line(tmp_path):
     document = _document(tmp_path)
     document.content["meshes"].append({"primitives": [{"attributes": {"POSITION": 99}}]})

@@ -159,21 +159,15 @@ MERGES = "".join(f"{b}: &{b} {{<<: [{','.join([f'*{a}'] * 9)}]}}\n" for a, b in 
     ("text", "expected"),
     [
         ("- &a [x,x,x,x,x,x,x,x,x]\n" + BOMB, "found the anchor or alias 'a' (line 1, column 3)"),
-        ("name: [&a [x,x], *a]\n", "found the anchor or alias 'a'"),
         ("a: &a {k: 1}\n" + MERGES, "found the anchor or alias 'a'"),
         ("&a [*a]\n", "found the anchor or alias 'a'"),
-        ("name: *b\n", "found the anchor or alias 'b'"),
         ("name: x\n<<: {steps: 1}\n", "expected keys of settings, found '<<'"),
         ("!!timestamp x\n", "expected YAML"),
-        ("name: !!int x\n", "expected YAML"),
-        ("name: !!bool x\n", "expected YAML"),
         ("name: x\nsteps: 0x" + "f" * 5000, "expected an integer within 64 bits"),
         ("name: x\nsteps: " + "9" * 5000, "expected an integer within 64 bits"),
         ("name: x\nsteps: " + "1" + ":59" * 3000, "expected an integer within 64 bits"),
-        (f"name: x\nsteps: {2**63}", "expected an integer within 64 bits"),
         (f"name: {2**63 - 1}", "name: expected a valid string, got 9223372036854775807"),
         ("[" * 20_000, "expected values at most 50 deep in others (line 1, column 52)"),
-        ("{" * 20_000, "expected values at most 50 deep"),
         ("- " * 20_000, "expected values at most 50 deep"),
         ("name: " + "[" * 40 + "]" * 40, "name: expected a valid string, got [[[[...]]]]"),
         ("name: [" + "x, " * 5_000 + "x]", "name: expected a valid string, got ['x', 'x', "),
@@ -202,10 +196,8 @@ rate: RATE
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"VELOCITY": "1.0e+300"}, "inlets.0.velocity.1: expected less than or equal to 1000000000000000000"),
         ({"VELOCITY": "1.0e+12"}, "expected at most 1,000,000 steps per frame, found a speed of 1e+12 m/s"),
         ({"CELL": "1.0e-300"}, "grid.cell: expected greater than or equal to 0.000000001"),
-        ({"CELL": "1.0e+300"}, "grid.cell: expected less than or equal to 1000000000"),
         ({"RATE": "1.0e-9"}, "rate: expected greater than or equal to 0.000001"),
         ({"SPEED": "1.0e-300"}, "expected at most 1,000,000 steps per frame"),
     ],
@@ -378,10 +370,8 @@ def test_a_set_names_files_of_its_folder(tmp_path):
     ("changes", "expected"),
     [
         ({"mask": "x" * 5000}, "mask: expected a name of at most 1024 characters, found 5000"),
-        ({"mask": "x" * 1000}, "cannot read the mask"),
         ({"mask": "\ud800"}, "cannot read the mask"),
         ({"entries": [{"time_hours": 0, "file": "\ud800"}]}, "cannot read the lightmap: the name has"),
-        ({"entries": [{"time_hours": 0, "file": "x" * 1000}]}, "cannot read the lightmap"),
         (
             {"entries": [{"time_hours": 0, "file": "set.json"}]},
             "expected a lightmap, EXR, Radiance (.hdr), PFM, TIFF of floats, KTX2 or DDS, found other",

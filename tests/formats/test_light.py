@@ -13,17 +13,15 @@ from builders.textures import make_dds, make_ktx2
 
 from benchmarks.rivals.lightmap_blocks import ispc_bc6h
 from wlm.formats.channels import read_encoded
-from wlm.formats.dds import write_dds
 from wlm.formats.exr import write_exr
 from wlm.formats.hdr_blocks import ASTC_BLOCKS, ASTC_MEDIUM, astc
-from wlm.formats.ktx2 import write_ktx2
 from wlm.formats.light import read_light
 
 RGB, RGBA = ("R", "G", "B"), ("R", "G", "B", "A")
 # Byte offsets, from the specifications.
-FORMAT, WIDTH, HEIGHT, DEPTH, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, LEVEL = 12, 20, 24, 28, 32, 36, 44, 48, 80
+FORMAT, HEIGHT, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, LEVEL = 12, 24, 32, 36, 44, 48, 80
 DDS_SIZE, DDS_HEIGHT, DDS_FLAGS, DDS_CODE, DDS_CAPS2 = 4, 12, 80, 84, 112
-DXGI, DIMENSION, MISC, ARRAY = 128, 132, 136, 140
+DXGI, MISC, ARRAY = 128, 136, 140
 
 
 def _read(path, content):
@@ -128,18 +126,6 @@ def test_astc_of_high_dynamic_range(tmp_path, block):
     assert abs(pixels - light).mean() < 60 and abs(pixels - light).max() < 900
 
 
-def test_what_the_atlas_exports_is_read(tmp_path):
-    light = _light(8, 8, 4)
-    write_ktx2(tmp_path / "a", light[..., :3].tobytes(), 8, 8, "R16G16B16_SFLOAT")
-    np.testing.assert_array_equal(read_light(tmp_path / "a")[0], light[..., :3])
-    write_dds(tmp_path / "a", light.tobytes(), 8, 8, fmt="R16G16B16A16_FLOAT")
-    np.testing.assert_array_equal(read_light(tmp_path / "a")[0], light)
-    blocks = ispc_bc6h(light[..., :3])
-    write_ktx2(tmp_path / "a", blocks, 8, 8, "BC6H_UFLOAT_BLOCK")
-    write_dds(tmp_path / "b", blocks, 8, 8, "BC6H_UF16")
-    np.testing.assert_array_equal(read_light(tmp_path / "a")[0], read_light(tmp_path / "b")[0])
-
-
 def test_a_picture_of_several_bands_is_one(tmp_path, monkeypatch):
     blocks = np.random.default_rng(0).integers(0, 256, (8, 8, 16), np.uint8).tobytes()
     whole = _read(tmp_path / "a", make_ktx2(143, 31, 29, [blocks]))[0]
@@ -192,14 +178,10 @@ def test_kinds_are_told_by_content(tmp_path):
     [
         (FORMAT, 37, "BC6H or ASTC SFLOAT, found 37"),
         (FORMAT, 97, "byteLength of level 0: expected 120 for 5 x 3 texels of R16G16B16A16_SFLOAT, found 90"),
-        (WIDTH, 0, "expected at least one texel, at most 268435456 texels and 65536 along a side, found 0 x 3"),
         (HEIGHT, 0, "pixelHeight: expected at least 1 (2D), found 0"),
-        (DEPTH, 2, "pixelDepth: expected 0 (no volume), found 2"),
         (LAYERS, 3, "layerCount: expected 0 (no array), found 3"),
         (FACES, 6, "faceCount: expected 1 (no cube), found 6"),
-        (SCHEME, 1, "supercompressionScheme: expected none (0), zstd (2) or zlib (3), found 1"),
         (SCHEME, 2, "level 0: cannot unpack: zstd: "),
-        (SCHEME, 3, "level 0: cannot unpack: zlib: Error -3 while decompressing"),
         (LEVEL, 500, "level 0: the file is cut short: expected 590 bytes"),
         (DESCRIPTOR_AT, 2**31, "the data format descriptor: the file is cut short"),
         (104 + 14, 2, "expected linear light (transfer function 1), found 2"),
@@ -232,13 +214,10 @@ def test_other_orders_are_refused(tmp_path, pairs, words):
     [
         (DDS_SIZE, 125, "header size: expected 124, found 125"),
         (DDS_HEIGHT, 4, "5 x 4 texels of R16G16B16A16_FLOAT: the file is cut short: expected 308 bytes, found 268"),
-        (DDS_HEIGHT, 0, "65536 along a side, found 5 x 0"),
         (DDS_FLAGS, 0x40, "pixel format: expected DX10, or FourCC 113 (A16B16G16R16F) or 116 (A32B32G32R32F), found"),
         (DDS_CODE, 0x31545844, "found FourCC DXT1"),
         (DDS_CAPS2, 0xFE00, "expected a 2D texture, found a cube"),
-        (DDS_CAPS2, 0x200000, "expected a 2D texture, found a volume"),
         (DXGI, 98, "found 98 (BC7_UNORM)"),
-        (DIMENSION, 4, "dimension: expected 3 (2D), found 4"),
         (MISC, 4, "DX10 flags: expected no cube, found 0x4"),
         (ARRAY, 6, "array size: expected 1 (no array), found 6"),
     ],
@@ -249,15 +228,6 @@ def test_a_wrong_field_of_dds_is_named(tmp_path, at, value, words):
     (tmp_path / "a.dds").write_bytes(content)
     message = error_of(read_light, tmp_path / "a.dds")
     assert message.startswith(f"{tmp_path / 'a.dds'}: ") and words in message
-
-
-@pytest.mark.parametrize("scheme", [0, 2, 3, None])
-def test_a_shorter_file_is_refused(tmp_path, scheme):
-    data, path = _light(3, 5, 4).tobytes(), tmp_path / "a"
-    whole = make_dds(10, 5, 3, data) if scheme is None else make_ktx2(97, 5, 3, [data], scheme)
-    for length in range(0, len(whole), 3):
-        path.write_bytes(whole[:length])
-        assert error_of(read_light, path).startswith(f"{path}: ")
 
 
 def test_a_missing_package_is_named_with_the_file(tmp_path, monkeypatch):
@@ -285,7 +255,6 @@ def test_pfm_of_either_byte_order_and_of_grey(tmp_path):
     [
         (b"PF\n2 2\n-1\n" + bytes(47), "the texels: the file is cut short: expected 58 bytes, found 57"),
         (b"PF\n2 2\n0\n" + bytes(48), "expected a PFM header"),
-        (b"PF\n0 2\n-1\n", "expected at least one texel"),
         (b"PF\n16384 16384\n-1\n" + bytes(48), "expected at most 2048 times"),
     ],
 )
@@ -350,9 +319,7 @@ def test_tiffs_that_are_refused(tmp_path):
         assert error_of(read_light, path).startswith(f"{path}: ")
     for tag, value, words in (
         (256, 60000, "cut short or damaged"),
-        (256, 70000, "65536 along a side"),
         (262, 5, "expected a TIFF of grey or RGB, found the photometric interpretation 5 with 3 samples"),
-        (277, 2, "with 2 samples"),
         (257, 17, "a.tif: "),
     ):
         path.write_bytes(_with_tag(whole, tag, value))

@@ -63,19 +63,14 @@ def test_arrays_come_as_they_were_written(tmp_path):
     [
         plain_header("((((("),
         plain_header("{'descr': '<f4',\n  'fortran_order': False,\n 'shape': (3, 3)}"),
-        plain_header("{b'descr': '<f4', 'fortran_order': False, 'shape': (3, 3)}"),
         plain_header("[" * 9000),
-        header("(" + "9" * 20 + ",)"),
         header((999_999_999_999,)),
         header((-1, 3)),
         header((3, 3)) + bytes(35),
-        header((3, 3)) + bytes(37),
         header((1, 3), "|O") + bytes(24),
-        header((3,), "|V0"),
         header((2**40,), "|V0"),
         header((3, 3)).replace(b"\x01\x00", b"\x09\x00", 1) + bytes(36),
         b"\x93NUMPY\x02\x00" + (2**32 - 1).to_bytes(4, "little") + b" " * 3_000_000,
-        b"no",
         b"",
     ],
 )
@@ -114,7 +109,7 @@ def bomb(path: Path, arrays: dict[str, tuple[tuple[int, ...], int]]) -> Path:
     return path
 
 
-def test_bombs(tmp_path):
+def test_bombs(tmp_path, monkeypatch):
     zeros = bomb(tmp_path / "a.npz", {"density": ((1290, 1290, 1290), 1 << 20)})
     assert "density: expected an array of at most 1073741824 numbers, found the shape" in refused(load_volume, zeros)
     # 70 MB for 70 KB: more than the 64 MB that any array may have.
@@ -128,8 +123,9 @@ def test_bombs(tmp_path):
     assert "b.npz: expected at most 67108864 bytes of arrays" in refused(load_probes, path)
     assert "b.npz: expected at most 67108864 bytes of arrays" in refused(load_positions, path)
     # The limit is for the sum of the arrays that are read, and small types count as float32.
-    np.savez_compressed(path, density=np.zeros((400, 500, 500), np.uint8), temperature=np.zeros((400, 500, 500), "f2"))
-    assert "b.npz: expected at most 536870912 bytes of arrays" in refused(load_volume, path)
+    monkeypatch.setattr("wlm.fluid.volume.SURE_VOXELS", 1 << 17)
+    np.savez_compressed(path, density=np.zeros((40, 50, 50), np.uint8), temperature=np.zeros((40, 50, 50), "f2"))
+    assert "b.npz: expected at most 524288 bytes of arrays" in refused(load_volume, path)
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])

@@ -84,14 +84,6 @@ def test_others_are_refused(unity, objects, said):
         read_lighting_data(unity(*objects))
 
 
-def test_text_and_bundles_are_named(unity):
-    path = unity()
-    for head, said in ((b"%YAML 1.1\n", "found nothing"), (b"UnityFS\0", "found an asset bundle")):
-        path.write_bytes(head)
-        with pytest.raises(WlmError, match=said):
-            read_lighting_data(path)
-
-
 def test_without_the_extra(monkeypatch, tmp_path):
     path = tmp_path / "LightingData.asset"
     path.write_bytes(bytes(64))

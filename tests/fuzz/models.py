@@ -150,10 +150,7 @@ def _again(model: Any, path: Path) -> None:
 def _fits() -> dict[str, tuple[Any, Any]]:
     """The input and the profile of a short fit, by system."""
     probes = wlm.probe.Profile(name="tiny", method="gaussians", ratio=0.1, steps=10, hidden=16, latent=3)
-    return {
-        "lightmap": (moving_light(hours=(0.0, 11.0)), tiny_profile(steps=10)),
-        "probe": (synthetic(60), probes),
-    }
+    return {"lightmap": (moving_light(hours=(0.0, 11.0)), tiny_profile(steps=10)), "probe": (synthetic(60), probes)}
 
 
 @functools.cache

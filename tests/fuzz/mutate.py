@@ -30,18 +30,7 @@ _TEXTS = (
     "../x",
     "/dev/zero",
 )
-NAMES = (
-    "../a.exr",
-    "/etc/passwd",
-    "/dev/zero",
-    "/dev/stdin",
-    "..",
-    ".",
-    "x" * 5000,
-    "\ud800",
-    "a.exr\n",
-    "mask.png",
-)
+NAMES = ("../a.exr", "/etc/passwd", "/dev/zero", "/dev/stdin", "..", ".", "x" * 5000, "\ud800", "a.exr\n", "mask.png")
 """File names that a reader must not follow, or cannot."""
 
 _VALUES = (*INTEGERS, *_SIGNED, *FLOATS, *_TEXTS, None, True, False, [], {}, [[]], [1, 2, 3], {"a": 1})

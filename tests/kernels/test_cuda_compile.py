@@ -114,26 +114,19 @@ FACTORIES = [
     *_cases("matrix_decode", matrix_decode.matrix_kernels, [(16, 32, True)], (16, 48, 64), (4, 32, 128), BOTH),
     *_cases("frames", lambda: list(FRAMES), []),
     *_cases("pages", lambda *of: [pages.page_kernel(*of)], [], (8, 16, 64), ("fast", "exact")),
-    *_cases("matrix_pages", lambda width: [matrix_pages.page_kernel(width)], [(16,)], (16, 48, 64)),
+    *_cases("matrix_pages", lambda width: [matrix_pages.page_kernel(width)], [], (16, 48, 64)),
     *_cases("gaussian_step", lambda latent: probe_step.step_kernels(latent, "cuda"), [], LATENTS),
     *_cases("gaussian_sum", gaussian_sum.sum_kernels, [], LATENTS),
     *_cases("probe_network", _probe_network, [((9, 64, 27),)], ((9, 64, 27), (1, 8, 3), (12, 48, 12), (12, 128, 75))),
     *_cases("smoke", _smoke, [], FLOATS),
     *_cases("lattice_step", lambda settings: [lattice.step_kernel(lattice.Spec(**settings))], [], LATTICE_STEPS),
     *_cases(
-        "lattice_boundaries",
-        _boundaries,
-        [],
-        (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")),
-        BOTH,
+        "lattice_boundaries", _boundaries, [], (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")), BOTH
     ),
     *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
     *_cases("planes", _planes, [], BOTH),
     *_cases(
-        "naf_block",
-        lambda of: naf_block.kernels(*of, True),
-        [((128, True),)],
-        ((24, False), (24, True), (128, True)),
+        "naf_block", lambda of: naf_block.kernels(*of, True), [((128, True),)], ((24, False), (24, True), (128, True))
     ),
 ]
 

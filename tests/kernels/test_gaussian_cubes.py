@@ -155,9 +155,3 @@ def test_flat_boxes(device: str):
             counts = [*cubes.counts]
             assert counts[:axes] == [1] * axes and all(count > 1 for count in counts[axes:])
             assert _table(cubes, 40).any(0).all()
-
-
-def test_everything_is_one_list(device: str):
-    cubes = probe_cubes.everything(5, device)
-    assert [items.tolist() for items in _lists(cubes)] == [[0, 1, 2, 3, 4]]
-    assert probe_cubes.everything(0, device).start.numpy().tolist() == [0, 0]

@@ -157,12 +157,3 @@ def test_not_a_number(device: str):
         assert f[0, 7] == 0.0
         np.testing.assert_array_equal(np.delete(f, 7, 1), want)
         _hold(np.delete(grad, 7, 0), want_grad, problem.rows)
-
-
-@pytest.mark.parametrize("lists", [False, True])
-def test_same_bits_every_time(device: str, lists: bool):
-    """Nothing is added in an order that changes."""
-    problem = _problem(9, 8.0)
-    first, second = (Sums(problem, device, lists=lists) for _ in range(2))
-    np.testing.assert_array_equal(first.forward(), second.forward())
-    np.testing.assert_array_equal(first.backward(), second.backward())

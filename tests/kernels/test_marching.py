@@ -156,7 +156,7 @@ def test_empty_bricks(device: str):
     assert 0.2 < occupied(Medium(array(sparse, float, device), 1.0)).numpy().mean() < 0.9
     askew = _scene(True)
     middle = np.array(sparse.shape) / 2
-    scene = Scene(sparse, 5.0, middle + 30.0 * askew.toward, askew.right, askew.up, askew.toward, 2.0, 20, 20)
+    scene = Scene(sparse, 5.0, middle + 30.0 * askew.toward, askew.right, askew.up, askew.toward, 4.0, 10, 10)
     toward = np.array([0.6, 0.0, 0.8])
     expected = reference.lit(scene, toward, 0.4, 0.0)
     assert expected.max() > 0.1

@@ -10,7 +10,6 @@ import torch
 from benchmarks import plain
 from kernels.compare import close, exact
 from wlm import ops
-from wlm_kernels import mlp
 
 NETWORKS, BATCH = 3, 37
 # Inputs, units and outputs; the cases of the operation have them too.
@@ -67,12 +66,3 @@ def test_gradients_repeat(device: str):
     first, second = (_run(device, _problem()) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert torch.equal(a, b)
-
-
-def test_shapes_are_checked():
-    """A size below 1 or an unknown GELU is an error, and a shape is built once."""
-    assert mlp.parameter_count(16, 16) == 16 * 16 + 16 + 16 * 16 + 16 + 16 * 3 + 3
-    assert mlp.kernels(16, 8) is mlp.kernels(16, 8)
-    for wrong in ((0, 8, "exact"), (4, 0, "exact"), (4, 8, "relu"), (4, 8, "exact", 0)):
-        with pytest.raises(ValueError, match="MLP: expected sizes above 0 and GELU"):
-            mlp.kernels(*wrong)

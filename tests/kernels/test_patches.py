@@ -153,10 +153,3 @@ def test_the_threshold_itself_is_not_alike(device: str, step: int, alike: bool, 
     edge = wp.zeros((2, 2), dtype=wp.uint8, device=device)
     graphs.find_edges(graph, 0, 2, edge)
     assert edge.numpy().tolist() == [[0, int(alike)], [int(alike), 0]]
-
-
-def test_too_many_samples():
-    """Refused before anything is allocated."""
-    level = np.full(300000, 7, np.int32)
-    with pytest.raises(ValueError, match="samples"):
-        kernels.sample(np.zeros((1, 1, 4), np.uint16), np.zeros((300000, 3, 2), np.int64), level, "cpu")

@@ -156,18 +156,6 @@ def test_features_and_collect(device: str, latent: int, sphere: int):
     close(got[:, SUMS["rotation"]], np.stack(off, 1), 1e-5, "rotation")
 
 
-def test_steps_repeat(device: str):
-    """Nothing is added in an order that changes."""
-    grad_f = np.random.default_rng(3).normal(size=(9, 500)).astype(np.float32)
-    runs = []
-    for _ in range(2):
-        step = Step(_x(500), _rows(70), device)
-        step.prepare()
-        runs.append((step.features(), step.collect(grad_f)))
-    np.testing.assert_array_equal(runs[0][0], runs[1][0])
-    np.testing.assert_array_equal(runs[0][1], runs[1][1])
-
-
 def test_two_lanes_equal_one():
     """On the CPU two threads take halves of the probes, or of the Gaussians."""
     grad_f = np.random.default_rng(3).normal(size=(9, 300)).astype(np.float32)

@@ -210,12 +210,12 @@ def test_networks_off_their_levels_are_one_line(tmp_path):
 
 
 def test_a_fit_on_levels_is_what_its_file_decodes_to(tmp_path):
-    profile = small_sets.tiny_profile(net_bits=8, steps=60)
+    profile = small_sets.tiny_profile(net_bits=8, steps=30)
     lightmaps = small_sets.moving_light()
     model = wlm.lightmap.compress(lightmaps, profile)
     model.save(tmp_path / "a.wlm")
     assert_same(wlm.load(tmp_path / "a.wlm"), model)
-    plain = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile(steps=60))
+    plain = wlm.lightmap.compress(lightmaps, small_sets.tiny_profile(steps=30))
     scores = [wlm.lightmap.evaluate(each, lightmaps, metrics=["psnr"]).psnr for each in (model, plain)]
     assert abs(scores[0] - scores[1]) < 2.0
     assert not np.array_equal(model.sheets[LIGHT].net, plain.sheets[LIGHT].net)

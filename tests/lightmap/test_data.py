@@ -235,31 +235,14 @@ def test_sizes_that_disagree_name_both_files(tmp_path):
     assert "a.exr: has 7x5 pixels" in message and "set.json states 8x5" in message
 
 
-def test_missing_truncated_and_misnamed_exr_name_the_file(tmp_path):
-    path = _write_set(tmp_path, _frames())
-    whole = (tmp_path / "b.exr").read_bytes()
-    (tmp_path / "b.exr").write_bytes(whole[: len(whole) // 2])
-    assert "b.exr" in error_of(load, path)
-    (tmp_path / "b.exr").unlink()
-    assert "b.exr" in error_of(load, path)
-    # One letter in the list of channels: R becomes X.
-    (tmp_path / "b.exr").write_bytes(whole.replace(b"R\0\x02\0\0\0", b"X\0\x02\0\0\0", 1))
-    message = error_of(load, path)
-    assert "b.exr" in message and "X" in message
-
-
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
         ({"width": None}, "width and height: expected both or neither, found one"),
-        ({"width": 0}, "width: expected greater than 0, got 0"),
-        ({"name": " "}, "name: expected a name that is not blank"),
         ({"period_hours": 0}, "period_hours: expected greater than 0, got 0"),
-        ({"lightmaps": []}, "lightmaps: expected at least 1 entries, found 0"),
         ({"lightmaps": ["a.exr"]}, "lightmaps.0: expected a mapping, got 'a.exr'"),
         ({"lightmaps": [{"time_hours": 0}]}, "lightmaps.0.file: expected a value, found none"),
         ({"lightmaps": [{"time_hours": 0, "file": "a\0.exr"}]}, "lightmaps.0.file: expected a name"),
-        ({"lightmaps": [{"file": "a.exr"}]}, "lightmaps.0.time_hours: expected a finite number, found none"),
         ({"lightmaps": [{"time_hours": float("nan"), "file": "a.exr"}]}, "lightmaps.0.time_hours: expected a finite"),
     ],
 )
@@ -377,13 +360,10 @@ def test_from_arrays_checks_shapes():
     ("text", "expected"),
     [
         ("0,1,2.5", [0.0, 1.0, 2.5]),
-        (" 3 ", [3.0]),
         ("0:24:1", [float(i) for i in range(24)]),
         ("0:3:1,18.45, 19:21:1", [0.0, 1.0, 2.0, 18.45, 19.0, 20.0]),
-        ("2:0:-1", [2.0, 1.0]),
         ("0.1:0.4:0.1", [0.1, 0.2, 0.3]),
         ("0:24:0.1", [0.1 * i for i in range(240)]),
-        ("0:1:0.3", [0.0, 0.3, 0.6, 0.9]),
     ],
 )
 def test_parse_times(text, expected):
@@ -563,22 +543,15 @@ def test_a_set_names_layers_channels_and_slices(tmp_path):
         ({"layers": {"a\nb": "unit"}}, "printable"),
         ({"atlases": {"0": {"width": 3, "height": 4}}}, "a.exr: has 5x2 pixels, but"),
         ({"atlases": {"0": {}, "1": {}}}, "atlas 1: expected a picture of it in an entry of lightmaps, found none"),
-        ({"atlases": {"0": {"mask": "alpha"}}}, "expected a channel A"),
         (
             {"lightmaps": [{"time_hours": 1.0, "files": {"0": {}}}]},
             "lightmaps.0.files: expected a picture, found none of the atlases",
         ),
         ({"lightmaps": [{"time_hours": 1.0, "files": {"0": {"light": "../a.exr"}}}]}, "found ../a.exr; trust=True"),
-        ({"lightmaps": [{"time_hours": 1.0, "files": {"0": {"light": "a.png"}}}]}, "expected a lightmap, EXR"),
-        (
-            {"lightmaps": [{"time_hours": 1.0, "files": {"0": {"light": {"file": "a.exr", "slice": 2, "slices": 2}}}}]},
-            "slice: expected a whole number from 0 to 1",
-        ),
         (
             {"lightmaps": [{"time_hours": 1.0, "files": {"0": {"light": {"file": "a.exr", "slice": 0, "slices": 3}}}}]},
             "expected 3 slices of equal height, found 2 rows",
         ),
-        ({"layers": {"light": {"encoding": "unit", "channels": ["R"] * 2}}}, "channels: expected different names"),
         ({"layers": {"light": {"encoding": "unit", "channels": list("abcdefghijklm")}}}, "at most 12 entries"),
     ],
 )
@@ -609,8 +582,6 @@ def test_twelve_channels_and_no_more():
     assert "at most 12 channels, found 13" in error_of(from_layers, [*layers, more], [0.0])
     other = Layer(np.zeros((1, 5, 4, 1)), "c", "1")
     assert len(from_layers([*layers, other], [0.0]).sheets) == 5
-    wrong = Layer(np.zeros((1, 5, 4, 6)), "b", encoding="unit", channels=tuple("RGBxyz"))
-    assert "0/b RGB has 4x5 texels, but others of its layer have 4x4" in error_of(from_layers, [*layers, wrong], [0.0])
     # Not the second in place of the first.
     assert "0/b: expected every channel once" in error_of(from_layers, [*layers, layers[1]], [0.0])
 

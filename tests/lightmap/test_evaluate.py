@@ -111,8 +111,6 @@ def test_a_set_that_does_not_fit_is_one_line(fitted):
         evaluate(model, lightmaps, metrics=("lpips",))
     with pytest.raises(WlmError, match="device"):
         evaluate(model, lightmaps, device="tpu")
-    with pytest.raises(ValueError, match="file_bytes"):
-        evaluate(model, lightmaps, file_bytes=100, metrics=("psnr",))
 
 
 def test_a_firefly_that_is_lost_is_said():

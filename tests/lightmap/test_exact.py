@@ -31,7 +31,7 @@ from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import TileKind, classify, split
 from wlm.metrics import evaluate_frame, summarise
 
-TIMES = (0.0, 7.5, 10.0, 13.0, 21.7, 23.99)
+TIMES = (0.0, 7.5, 10.0, 21.7)
 
 
 @pytest.mark.parametrize(
@@ -169,9 +169,7 @@ def test_two_states_are_as_good_as_bc7_in_as_many_bytes(two_hours, tmp_path):
     model.save(tmp_path / "a.wlm")
     found = wlm.lightmap.evaluate(wlm.load(tmp_path / "a.wlm"), two_hours, metrics=("psnr",))
     rival, frames = encode_set(
-        "bc7",
-        light,
-        lambda i, decoded: evaluate_frame(light.frames[i], decoded, light.mask, 128, ("psnr",)),
+        "bc7", light, lambda i, decoded: evaluate_frame(light.frames[i], decoded, light.mask, 128, ("psnr",))
     )
     assert found.psnr > summarise(frames).psnr and found.bytes < 1.04 * rival.disk_bytes
 

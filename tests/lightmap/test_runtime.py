@@ -13,7 +13,6 @@ from wlm.errors import WlmError
 from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.runtime import ExactDecoder, MapDecoder, MatrixDecoder, StripDecoder
-from wlm.lightmap.tiles import TileKind
 from wlm.texels import near_gaps
 from wlm_kernels.shared_exponent import pack_rgb9e5 as pack_kernel
 from wlm_kernels.shared_exponent import unpack_rgb9e5 as unpack_kernel
@@ -85,19 +84,6 @@ def test_a_captured_decode_repeats(device):
         graph()
         assert np.array_equal(strip.numpy(), expected)
     assert graph.captured == (device != "cpu")
-
-
-def test_what_is_refused():
-    with pytest.raises(WlmError, match="expected at least one dynamic tile, found none"):
-        StripDecoder(random_sheet((2, 0)))
-    with pytest.raises(WlmError, match="expected at least one static tile, found none"):
-        ExactDecoder(random_sheet((3, 0)), kind=TileKind.STATIC)
-    with pytest.raises(WlmError, match="expected cuda for MatrixDecoder, got cpu"):
-        MatrixDecoder(random_sheet((3, 0)), "cpu")
-    with pytest.raises(WlmError, match="gelu: expected one of"):
-        StripDecoder(random_sheet((3, 0)), gelu="relu")
-    with pytest.raises(WlmError, match="finite"):
-        StripDecoder(random_sheet((3, 0))).set_time(float("inf"))
 
 
 MAP_KINDS = (3, 4, 2, 1, 4, 3)

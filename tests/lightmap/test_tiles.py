@@ -2,18 +2,12 @@
 
 import numpy as np
 import pytest
-from builders.checks import error_of
 from builders.small_sets import sheet_from_arrays as from_arrays
 from builders.synthetic import random_sheet
 
-import wlm
 from wlm.errors import WlmError
-from wlm.formats import zstd
-from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.decode import SheetDecoder
-from wlm.lightmap.model import LightmapModel
-from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.tiles import (
     TILE,
     TileData,
@@ -254,20 +248,3 @@ def test_a_map_and_its_tiles_agree(model, time):
     target, source = near_gaps(model.mask)
     assert np.array_equal(frame[tuple(target.T)], raw[tuple(source.T)])
     assert (target // 128 != source // 128).any(), "some gaps take light from another tile"
-
-
-def _file_of(sheet):
-    return LightmapModel("m", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
-
-
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [(b"x", "part mask: "), (b"", "part mask: "), (zstd.compress(bytes(7288)), "part mask: expected a frame of 7287 ")],
-)
-def test_a_wrong_mask_is_one_line(model, tmp_path, content, says):
-    path = tmp_path / "m.wlm"
-    _file_of(model).save(path)
-    artifact = read_artifact(path)
-    tensors = artifact.tensors | {"0.mask": np.frombuffer(content, np.uint8)}
-    write_artifact(tmp_path / "bad.wlm", "lightmap", artifact.settings, tensors, artifact.source)
-    assert says in error_of(lambda: wlm.load(tmp_path / "bad.wlm"))

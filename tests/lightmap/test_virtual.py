@@ -219,8 +219,6 @@ def test_points_without_light(device):
         assert virtual.report()["visible"] == 1, "only the page that always stays"
         reading = virtual.sample(sheet, uv, derivative)
         assert not reading.light.any() and (reading.coarser == -1).all() and not reading.change.any()
-        with pytest.raises(ValueError, match="expected 2 equal axes"):
-            virtual.frame(3.0, sheet[:4], uv, derivative)
         assert "finite" in error_of(virtual.frame, np.nan, sheet, uv, derivative)
 
 
@@ -384,9 +382,9 @@ def test_groups_are_added_by_their_weights(device):
 def test_tiles_are_loaded_when_they_are_needed(tmp_path, device):
     random_model((3, 2, 4) * 8, columns=6).save(tmp_path / "a.wlm")
     with wlm.load(tmp_path / "a.wlm") as model:
-        own, whole = model.light, sum(VirtualTexture(model, **SMALL).report()["memory"].values())
+        own = model.light
         with VirtualTexture(model, device, **SMALL, decodes=64, tiles=450_000) as virtual:
-            assert sum(virtual.report()["memory"].values()) < whole
+            assert virtual.report()["memory"]["tiles"] <= 450_000 < model.memory_bytes
             for window in ((0.0, 0.0, 0.3, 1.0), (0.7, 0.0, 1.0, 1.0), (0.0, 0.0, 0.3, 1.0)):
                 at = view(own, 1.0, window=window)
                 settle(virtual, 13.0, at)
@@ -479,14 +477,3 @@ def test_the_clock_passes_switches(times, period, moves):
         assert rows[0, [BEFORE, AFTER]].tolist() == list(around)
         held = around[0] in clock.switches
         assert rows[0, SHARE] == (0.0 if held else np.float32(clock.axis.neighbours(time)[2]))
-
-
-def test_changes_are_those_between_stored_times():
-    sheet = random_sheet((1, 1), columns=1, period=None)
-    sheet = replace(
-        sheet, constant=np.array([[[1.0] * 3, [2.0] * 3, [2.0] * 3, [0.0] * 3], [[0.0] * 3] * 4], np.float16)
-    )
-    model = LightmapModel("two", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
-    with VirtualTexture(model) as virtual:
-        np.testing.assert_allclose(virtual._stores[0].change, [[0.5, 0.0, 1.0, 0.0], [0.0] * 4], atol=0.01)
-        np.testing.assert_allclose(virtual._pages.change.numpy()[-1], [0.0, 0.5, 0.5, 1.5, 1.5], atol=0.01)

@@ -70,39 +70,6 @@ def test_a_batch_of_textures(device: str, mode: dict):
     _equal(together, [results(*each) for each in zip(images, uv, slopes, strict=True)], device, 1)
 
 
-def test_rays_of_several_cameras(device: str):
-    origin, direction = (_numbers(2, 3, 5, 3, seed=seed).to(device) for seed in (1, 2))
-    direction = torch.nn.functional.normalize(direction, dim=-1)
-    density = _numbers(6, 7, 8).abs().to(device)
-    together = ops.march(density, origin, direction)
-    alone = [ops.march(density, *each) for each in zip(origin, direction, strict=True)]
-    _equal([*together], [[*each] for each in alone], device, 2)
-
-
-def test_what_batches_refuse(device: str):
-    clip, triangle = _meshes(device), TRIANGLE.to(device)
-    raster, uv = ops.rasterize(clip, triangle, 5, 6), torch.zeros(3, 4, 2, device=device)
-    for call, message in (
-        (lambda: ops.rasterize(clip[:0], triangle, 5, 6), r"clip: expected at least one mesh, got \(0, 5, 4\)"),
-        (
-            lambda: ops.interpolate(clip[:2], triangle, raster),
-            r"raster.barycentric: expected float32 \[2, any, any, 2\]",
-        ),
-        (
-            lambda: ops.interpolate(clip, triangle, raster, derivatives=True),
-            "raster.derivative: expected derivatives, got None: use rasterize",
-        ),
-        (
-            lambda: ops.texture(
-                _numbers(4, 4, 1).to(device), uv, derivatives=uv[..., None] * uv[..., None, :], filter="nearest"
-            ),
-            "filter: expected linear with derivatives, got 'nearest'",
-        ),
-    ):
-        with pytest.raises(ValueError, match=f"^{message}"):
-            call()
-
-
 @pytest.mark.parametrize("boundary", ["clamp", "wrap", "mirror"])
 @pytest.mark.parametrize("size", [(8, 16), (5, 7), (1, 6)])
 def test_mip_levels_against_float64(device: str, size: tuple[int, int], boundary: str):

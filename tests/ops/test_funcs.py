@@ -190,15 +190,6 @@ def test_texels(device: str, quantised: bool):
         close(grads[name], leaf.grad, 1e-5, name)
 
 
-def test_texels_against_differences(device: str):
-    """Inside [0, 1] and without rounding the straight-through gradient is the slope."""
-    leaves = {"endpoints": uniform(0.1, 0.9, 2, 3, 2, 4), "weights": uniform(0.1, 0.9, 8, 12)}
-    adjoint = normal(8, 12, 4)
-    _, grads = _texels_on_tape(leaves, False, adjoint, device)
-    for name, (along, slope) in _twin(plain.bc7_texels, leaves, adjoint)[1].items():
-        assert abs(float((grads[name] * along).sum()) - slope) < 1e-4 * abs(slope)
-
-
 def test_networks_of_slices(device: str):
     """Weights in slices of arrays get their gradients, by two activations at once."""
     leaves = network_of(5, 17, 4, 3)

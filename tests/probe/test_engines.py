@@ -17,8 +17,9 @@ from benchmarks.rivals.probe import pack_unreal, unpack_unreal
 from wlm.errors import WlmError
 from wlm.export import export
 from wlm.formats.godot import read_lmbake, relit
+from wlm.probe.axes import read_axes
 from wlm.probe.conventions import from_canonical
-from wlm.probe.data import from_arrays
+from wlm.probe.data import from_arrays, save_probes
 from wlm.probe.engines.lattice import lattice_of
 from wlm.probe.engines.unreal import SH_FILES
 from wlm.probe.sphere import fibonacci_sphere, irradiance
@@ -64,7 +65,8 @@ def shade(sh: np.ndarray, n: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("outputs", [27, 12])
 def test_unity_shows_the_same_light(mirror, outputs, tmp_path):
     model = random_model(outputs=outputs, probes=20, positions=True)
-    export(model, tmp_path / "out", "unity", mirror=mirror)
+    axes = mirror and ",".join("-" * (axis == mirror) + axis for axis in "xyz")
+    export(model, tmp_path / "out", "unity", axes=axes)
     content = json.loads((tmp_path / "out" / "probes.json").read_text())
     position = np.array(content["position"]).reshape(-1, 3)
     sh = np.array(content["sh"]).reshape(-1, 3, 9)
@@ -141,7 +143,7 @@ def test_the_shader_reads_the_light(model, tmp_path):
     content = json.loads((tmp_path / "out" / "light.json").read_text())
     count = np.array(content["resolution"])
     assert count[0] == 6 and len(set(count.tolist())) == 3
-    centre = lattice_of(model, 6, 128, None, "cpu").centres()
+    centre = lattice_of(model, 6, 128, None, "cpu", None).centres()
     light = model.decoder().decode(centre).reshape(-1, 9, 3)
     turned = from_canonical(light.astype(float), "unreal")
     stored = unpack_unreal(pack_unreal(turned.reshape(-1, 27), 3), 27, 3).reshape(-1, 9, 3)
@@ -252,6 +254,30 @@ def test_a_bake_keeps_all_but_its_light(order, double, tmp_path):
     np.testing.assert_array_equal(relit(made, read_lmbake(path)[1]), old)
 
 
+@pytest.mark.parametrize("axes", ["x,z,-y", "-y,x,z"])
+def test_axes_turn_the_light_with_the_scene(axes, tmp_path):
+    """In and out, mirrored and turned: the irradiance at a turned place and normal is that before."""
+    model, matrix = random_model(probes=20, positions=True), read_axes(axes)
+    position, values = model.stored_positions(), model.decoder().decode_probes()
+    normals = fibonacci_sphere(16)
+    save_probes(tmp_path / "a.npz", position, values)
+    loaded = wlm.probe.load(tmp_path / "a.npz", axes=axes)
+    assert loaded.source != wlm.probe.load(tmp_path / "a.npz").source
+    np.testing.assert_allclose(loaded.position @ matrix, position)
+    want = irradiance(values.reshape(20, 9, 3), normals)
+    np.testing.assert_allclose(
+        irradiance(loaded.values.reshape(20, 9, 3), normals @ matrix.T), want, rtol=1e-4, atol=1e-5
+    )
+    export(model, tmp_path / "bevy", "bevy", cells=3, axes=axes)
+    made = json.loads((tmp_path / "bevy" / "light.json").read_text())
+    volume = wlm.probe.load(tmp_path / "bevy" / "light.vxgi.ktx2")
+    places = np.array(made["translation"]) + volume.position * made["scale"]
+    straight = model.decoder().decode(places @ matrix).reshape(-1, 9, 3)
+    faces = np.concatenate([np.eye(3), -np.eye(3)])
+    want = np.maximum(irradiance(straight, faces @ matrix), 0.0)  # a texel holds no negative light
+    np.testing.assert_allclose(irradiance(volume.values.reshape(-1, 9, 3), faces), want, atol=0.02 * want.max())
+
+
 def _bake_file(folder):
     path = folder / "a.lmbake"
     points = np.random.default_rng(0).random((9, 3))
@@ -268,7 +294,8 @@ REFUSED = {
     "unity": [
         ({"outputs": 48, "positions": True}, {}, "expected 3, 12 or 27 numbers per probe"),
         ({"outputs": 5, "positions": True}, {}, "expected 3, 12 or 27 numbers per probe"),
-        ({"positions": True}, {"mirror": "w"}, "mirror: expected x, y or z"),
+        ({"positions": True}, {"axes": "x,y,w"}, "axes: expected three of x, y, z"),
+        ({"positions": True}, {"axes": "x,y,y"}, "axes: expected three of x, y, z"),
         ({}, {}, "stores no positions"),
         ({}, {"original": _bake_file}, "expected the 200 probes"),
     ],
@@ -280,6 +307,7 @@ REFUSED = {
     "godot": [
         ({"outputs": 12}, {}, "expected 27 numbers per probe"),
         ({"outputs": 12}, {"original": _bake_file}, "expected 27 numbers per probe"),
+        ({}, {"axes": "x,z,-y", "original": _bake_file}, "axes: expected none with"),
         ({}, {"cells": 65}, "cells: expected 1 to 64"),
         ({}, {"cells": 4, "original": _bake_file}, "cells: expected none"),
         ({}, {"original": _bake_file}, "a.lmbake: expected the 200 probes"),

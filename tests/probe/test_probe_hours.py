@@ -20,12 +20,14 @@ TINY = Profile(name="tiny", method="gaussians", ratio=0.1, latent=1, hidden=16, 
 
 @pytest.fixture(scope="module")
 def day():
-    """150 probes of three numbers at nine hours; dark nights but for a lamp, five dead probes."""
+    """150 probes of three numbers at nine hours, by a sky, a sun and at night a lamp; five are dead, and one is dark at
+    the first hour."""
     room = synthetic(150, dead=5)
-    ambient = room.values[:, :3].astype(np.float64)
-    sun = np.maximum(0.0, np.sin((np.array(TIMES) - 6.0) / 12.0 * np.pi))[:, None, None]
-    lamp = np.where(room.position[:, :1] > 4.0, 0.01, 0.0) * ambient
-    return from_arrays(room.position, sun * ambient * room.position[:, 1:2] + lamp, times=TIMES, name="day")
+    ambient, (x, y, _) = room.values[:, :3].astype(np.float64), room.position.T[..., None]
+    height = np.sin((np.array(TIMES) - 6.0) / 12.0 * np.pi)[:, None, None]
+    values = np.maximum(height, 0.05) * ambient * (1.0 + y * np.abs(height)) + (height < 0) * 0.02 * x * ambient
+    values[0, 77] = 0.0
+    return from_arrays(room.position, values, times=TIMES, name="day")
 
 
 @pytest.fixture(scope="module", params=["gaussians", "pca"])
@@ -44,8 +46,7 @@ def test_hours_are_read_from_the_names_of_arrays(day, tmp_path):
     np.testing.assert_array_equal(every.times, TIMES)
     np.testing.assert_array_equal(every.values, day.values)
     assert every.source == day.source and (every.outputs, every.probes) == (3, 150)
-    # A probe without lamp is dark at night, but live.
-    assert every.live.sum() == 145 and not hours[every.live, 0].any(1).all()
+    assert every.live.sum() == 145 and every.live[77] and not every.at(2.0).live[77]
     two = load(path, key=["21.00", "sh_09.00"])
     np.testing.assert_array_equal(two.times, [9, 21])
     np.testing.assert_array_equal(two.values.reshape(150, 2, 3), hours[:, [3, 8]])
@@ -84,25 +85,40 @@ def test_light_between_hours_is_linear_and_periodic(day, time, expected):
 def test_decoding_at_any_time_is_the_mix_of_the_hours(day, model, device):
     decoder = model.decoder(device)
 
-    def exact(time):
-        one = model.at(time)
+    def exact(factors):
+        content = model.content
         if model.method == "gaussians":
+            *shared, last = content.layers()
+            hours = last.reshape(len(last), 9, 4).astype(np.float64)
+            net = np.concatenate([layer.ravel() for layer in (*shared, np.einsum("t,rtd->rd", factors, hours))])
+            one = dataclasses.replace(model.at(2.0), content=dataclasses.replace(content, hours=1, net=net))
             return decode64(one, model.stored_positions()) * model.live[:, None]
+        basis = content.basis.reshape(-1, 9, 3).astype(np.float64)
+        basis = np.einsum("t,ktd->kd", factors * model.scales, basis)
         values = np.zeros((150, 3))
-        values[model.live] = reference_decode(one.content.code, one.content.bounds, one.content.basis, 3)
+        values[model.live] = reference_decode(content.code, content.bounds, basis, 3)
         return values
 
-    stored = {time: exact(time) for time in TIMES}
-    largest = max(np.abs(values).max() for values in stored.values())
-    lit = np.all([values > 0.0 for values in stored.values()], 0)  # light is clamped at 0 after the mix
+    largest = max(np.abs(exact(row)).max() for row in np.eye(9))
     for time in (2.0, 13.0, 0.0, 21.0 + 24.0, 18.0):
         decoder.set_time(time)
-        wanted = sum(factor * stored[TIMES[i]] for i, factor in enumerate(hour_factors("", model.times, time)))
-        # Mixed components and the model of one time are rounded to half floats.
-        close = 2e-5 if model.method == "gaussians" or time in TIMES else 2e-3
-        np.testing.assert_allclose(decoder.decode_probes()[lit], wanted[lit], rtol=0, atol=close * largest)
-        np.testing.assert_allclose(exact(time)[lit], wanted[lit], rtol=0, atol=6e-3 * largest)
+        wanted = exact(hour_factors("", model.times, time))
+        # Components and the model of one time are rounded to half floats.
+        close = 2e-5 if model.method == "gaussians" else 2e-3
+        np.testing.assert_allclose(decoder.decode_probes(), wanted, rtol=0, atol=close * largest)
+        one = model.at(time).decoder().decode_probes()
+        np.testing.assert_allclose(one, wanted, rtol=0, atol=1e-2 * largest)
     assert "time: expected a finite number" in error_of(decoder.set_time, np.inf)
+
+
+def test_numbers_without_magnitudes_are_mixed_linearly(model):
+    if model.method == "gaussians":
+        content = dataclasses.replace(model.content, relative=False, outputs=4)
+        factors, scales = np.linspace(0.0, 0.25, 9), np.linspace(1.0, 0.1, 9)
+        hours = content.layers()[2].reshape(-1, 9, 4).astype(np.float64)
+        wanted, mixed = np.einsum("t,rtd->rd", factors * scales, hours), content.at(factors, scales)
+        assert mixed.columns == 4
+        np.testing.assert_allclose(mixed.layers()[2], wanted, rtol=1e-3, atol=1e-6)
 
 
 def test_scores_are_by_hour(day, model):
@@ -115,7 +131,7 @@ def test_scores_are_by_hour(day, model):
         assert hour["time"] == TIMES[i]
         assert hour["psnr"] == pytest.approx(10 * np.log10(np.ptp(wanted) ** 2 / error), abs=1e-3)
         # Each hour is fitted with the precision of its own light, the dark ones too.
-        assert hour["psnr"] > (40 if model.method == "pca" else 17)
+        assert hour["relative_error"] < (0.025 if model.method == "pca" else 0.9)
     assert report.psnr == min(hour["psnr"] for hour in report.hours)
     assert report.gpu_bytes == model.content.nbytes
     assert "has the hours one, but 2, 5, 6.5, 9" in error_of(evaluate, model, day.at(9.0))
@@ -146,7 +162,7 @@ def test_the_bundle_has_the_words_of_all_hours(model):
     shown[span] = wanted[span]
     np.testing.assert_array_equal(shown, wanted)
     scale = np.abs(made.reference["values"]).max()
-    np.testing.assert_allclose(half.bundle().reference["values"], made.reference["mixed"], atol=2e-3 * scale)
+    np.testing.assert_allclose(half.bundle().reference["values"], made.reference["mixed"], atol=4e-3 * scale)
 
 
 def test_an_interrupted_fit_resumes_exactly(day, tmp_path):
@@ -179,7 +195,8 @@ def test_the_commands_take_a_time(day, model, tmp_path):
     call("decode", file, "-o", out, "--time", 13)
     decoder = model.decoder()
     decoder.set_time(13.0)
-    np.testing.assert_allclose(load(out).values, decoder.decode_probes(), rtol=5e-3, atol=1e-2)
+    light = decoder.decode_probes()
+    np.testing.assert_allclose(load(out).values, light, rtol=0, atol=4e-3 * light.max())
     text = call("evaluate", file, probes)
     assert "at 18.5 h" in text and "worst hour" in text
     assert "but 2, 5" in fails("evaluate", file, probes, "--key", "9h")

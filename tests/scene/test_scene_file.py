@@ -78,15 +78,12 @@ def test_smoke_plays_again(scene):
     ("old", "new", "line"),
     [
         ("light: room.wlm", "light: none.wlm", "light: there is no file or folder"),
-        ("light: room.wlm", "light: probes_0.wlm", "expected an artifact of lightmap"),
         ("mesh: room.glb", "mesh: ../room.glb", "mesh: expected a file within"),
         ("mesh: room.glb", "mesh: car.glb", "expected lightmap UVs in TEXCOORD_0, found none"),
         ("smoke:\n", "smok:\n", "unknown key 'smok'; did you mean 'smoke'"),
-        ("fov: 60", "fov: 0", "camera.0.fov: expected greater than or equal to 1, got 0"),
         ("second: 2", "second: 9", "camera: expected rows of rising second"),
         ("last: 29", "last: 5", "day.last: expected a later hour"),
         ("file: probes_12.wlm", "file: room.wlm", "expected an artifact of probe"),
-        ("seconds: 4", "seconds: .nan", "expected a finite number"),
         ("smoke\n", "car.glb\n", "smoke.0.files: expected a folder of six-way lightmaps"),
         ("original_12.00h.exr", "room.glb", "originals.0: expected an hour"),
     ],
@@ -130,5 +127,3 @@ def test_base_colours_are_those_of_vertices_times_the_factor(tmp_path):
     np.testing.assert_allclose(vertex_colours(*read_gltf(path))[0], np.tile([0.125, 0.25, 0.25], (3, 1)))
     with pytest.raises(WlmError, match="expected 3 colours or more, found 2"):
         read_mesh(glb(tmp_path / "a.glb", np.full((2, 3), 0.25, np.float32)))
-    with pytest.raises(WlmError, match="colour: expected finite numbers"):
-        read_mesh(glb(tmp_path / "a.glb", np.full((3, 3), np.nan, np.float32)))

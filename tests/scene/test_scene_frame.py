@@ -202,10 +202,7 @@ def test_six_lights_are_integrals_of_the_weights():
     ("options", "line"),
     [
         ({"height": 0}, "size: expected 1 to"),
-        ({"samples": 5}, "samples: expected 1 to 4"),
-        ({"device": "tpu"}, "device 'tpu'"),
         ({"hours": [48.0]}, "hours: expected 0 to 48, got 48"),
-        ({"frames": -1}, "frames: expected 0 to"),
         ({"frames": 10**6, "height": 64, "width": 64}, "for an animated WebP"),
         ({"weights": {"lamp": 1.0}}, "expected a group among sky, sun"),
     ],

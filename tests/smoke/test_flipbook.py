@@ -16,7 +16,7 @@ from wlm.formats.exr import read_exr, write_exr, write_planes
 from wlm.smoke.camera import DIRECTIONS, LAYOUTS, Camera
 from wlm.smoke.data import is_six_way, read_shaded
 from wlm.smoke.flipbook.book import Book, Shot, pack_book, write_book
-from wlm.smoke.flipbook.naming import parse_layout, second_names
+from wlm.smoke.flipbook.naming import second_names
 from wlm.smoke.flipbook.reading import read_flipbook
 from wlm.smoke.lightmaps import SixWay, axis_faults
 from wlm.smoke.march.six_way import bake
@@ -176,16 +176,11 @@ def test_names_of_pairs():
     for first, second, layout in (
         ("puff_RLT_8x8", "puff_BBF_8x8", "o3de"),
         ("six_point_1_tlr", "six_point_2_bbf", "embergen"),
-        ("smoke_RTBk", "smoke_LBTF", "unity"),
         ("smokeP", "smokeN", "unity"),
-        ("fx_positive", "fx_negative", "unity"),
-        ("LightmapA", "LightmapB", ""),
         ("a_1", "a_2", ""),
     ):
         assert (second.lower(), layout) in [(name.lower(), known) for name, known in second_names(first)]
     assert second_names("wall") == []
-    with pytest.raises(WlmError, match="--from: expected unity, o3de"):
-        parse_layout("right,left:top")
 
 
 def test_straight_alpha_in_a_third_texture(tmp_path: Path):
@@ -219,10 +214,8 @@ def test_wrong_files(tmp_path: Path):
         refused(f"{cells} rows and {cells} columns of cells, found a height of 6 and a width of 9", cells=cells)
     Image.new("L", (9, 6)).save(paths[1])
     refused("a_2.png: expected a texture of RGB or RGBA, found one of L")
-    whole = paths[0].read_bytes()
-    paths[0].write_bytes(whole[: len(whole) // 2])
-    refused("a_1.png: cannot read the PNG")
     # The header alone states the size; the rest of the file is as before.
+    whole = paths[0].read_bytes()
     header = b"IHDR" + struct.pack(">2I", 9400, 9400) + whole[24:29]
     paths[0].write_bytes(whole[:12] + header + struct.pack(">I", zlib.crc32(header)) + whole[33:])
     refused(f"a_1.png: expected at most 2048 times its {len(whole)} compressed bytes")

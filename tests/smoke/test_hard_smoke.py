@@ -99,5 +99,3 @@ def test_pictures_of_hard_smoke(device: str, way: str):
     seen = ((replace(smoke, extinction=1000.0), camera), (voxel, facing(voxel, size=6)), (smoke, within))
     for made in (*(picture(*each, lights) for each in seen), picture(fire, camera, [])):
         assert torch.isfinite(made).all() and (made >= 0).all() and made.any()
-    with pytest.raises(ValueError, match="albedo"):
-        picture(smoke, camera, lights, albedo=(1.0, 2.0, 0.0))

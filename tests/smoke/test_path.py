@@ -39,7 +39,7 @@ def close(traced: torch.Tensor, noise: torch.Tensor, expected: torch.Tensor, sha
     assert 0.6 < float((traced - expected).square().mean() / noise.square().mean()) < 1.6
 
 
-@pytest.mark.parametrize("g", [-0.3, 0.0, 0.6])
+@pytest.mark.parametrize("g", [-0.3, pytest.param(0.0, marks=pytest.mark.slow), 0.6])
 def test_the_first_order_is_single_scattering(device: str, g: float):
     """The mean is within 0.5% of the march from every sample, the pixels within the stated noise."""
     volume = make_plume(24, hot=False, extinction=14.0, device=device)

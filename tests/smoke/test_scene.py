@@ -1,7 +1,6 @@
 """Scenes from YAML, cameras, moving obstacles, folders of frames, and files of lightmaps."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -113,8 +112,6 @@ def test_scaling_keeps_one_cell(tmp_path):
     small = scene.scaled(0.25)
     assert small.grid.cells == (2, 1, 1) and small.grid.cell == 4.0
     assert _scene(tmp_path, grid={"cells": [1, 1, 1], "cell": 1.0}).scaled(0.01).grid.cells == (1, 1, 1)
-    with pytest.raises(ValueError, match="factor"):
-        scene.scaled(0)
     with pytest.raises(WlmError, match="plume: grid.cells.0: expected less than or equal to 4096, got 8000"):
         scene.scaled(1000)
 
@@ -122,17 +119,13 @@ def test_scaling_keeps_one_cell(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"grid": GRID | {"cell": -1}}, "grid.cell: expected greater than or equal to 0.000000001, got -1"),
         ({"grid": GRID | {"faces": {"-x": "periodic"}}}, "both faces of an axis"),
         ({"smoke": {"glow": [[0, 1, 1, 1]]}}, "smoke.glow: expected no stops, or at least two whose emission"),
-        ({"air": {"viscosity": math.nan}}, "air.viscosity: expected a finite number, got nan"),
         ({"sources": [{"centre": [0, 0, 0], "radius": 1, "start": 2, "stop": 1}]}, "expected a time after start"),
         ({"obstacles": [SPHERE | {"path": [[0, 0, 0, 0], [0, 1, 1, 1]]}]}, "0.path: expected times that increase"),
-        ({"obstacles": [SPHERE | {"shape": "box"}]}, "obstacles.0.radius: expected one number for a sphere, three"),
         ({"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]}, "inlets.0.velocity: expected a velocity that points"),
         ({"grid": GRID | {"faces": dict.fromkeys(FACES, "wall")}}, "expected an open face"),
         ({"grid": GRID | {"faces": dict.fromkeys(("-y", "+y"), "periodic")}}, "inlets on faces that aren't periodic"),
-        ({"lights": [{"toward": [0, 0, 0]}]}, "lights.0.toward: expected a direction other than 0, 0, 0"),
         ({"camara": {}}, "unknown key 'camara'; did you mean 'camera'?"),
     ],
 )
@@ -256,8 +249,6 @@ def test_folders_that_are_none(tmp_path):
     (tmp_path / "a" / "notes.txt").write_text("x")
     with pytest.raises(WlmError, match="found other files"):
         open_frames(tmp_path / "a", scene)
-    with pytest.raises(WlmError, match="cannot write: the folder .* does not exist"):
-        open_frames(tmp_path / "none" / "b", scene)
     with pytest.raises(WlmError, match=r"or one sequence of volumes .*, found neither scene.json nor any"):
         load_frames(tmp_path / "a")
     for content, said in (
@@ -284,8 +275,6 @@ def test_numbered_files_replace_those_of_an_earlier_run(tmp_path):
     assert [path.read_text() for path in folder.iterdir()] == ["y"]
     with pytest.raises(WlmError, match="expected an empty folder or results of an earlier run, found six_0001.exr"):
         NumberedFiles(folder, "guide", ".exr")
-    with pytest.raises(WlmError, match="cannot write into the folder"):
-        NumberedFiles(tmp_path / "none" / "b", "six", ".exr")
 
 
 def test_frames_evenly_spread():
@@ -312,8 +301,6 @@ def test_files_that_are_no_lightmaps(tmp_path):
     volume = plume()
     camera = make_camera(CameraSettings(resolution=8), volume.origin, (1, 1.2, 1))
     six = bake(volume, camera, step=2.0, estimate=False)
-    with pytest.raises(ValueError, match="the lightmaps have no camera"):
-        write_six_way(tmp_path / "a.exr", replace(six, camera=None))
     path = tmp_path / "a.exr"
     write_six_way(path, six)
     planes, note = read_planes(path)

@@ -13,7 +13,7 @@ from builders.smoke_samples import random_model, small_pool
 import wlm
 from wlm.fluid.volume import save_volume
 from wlm.metrics import psnr_from_mse
-from wlm.smoke.evaluation import COARSE, HALF, NETWORK, coarse, compare, evaluate, of_decoder, of_network, score
+from wlm.smoke.evaluation import COARSE, HALF, NETWORK, coarse, compare, evaluate, of_network, score
 from wlm.smoke.model import SmokeModel
 from wlm.smoke.network.dataset import make_validation
 from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
@@ -69,14 +69,10 @@ def test_noise_flickers_and_the_targets_are_perfect():
 
 def test_hard_pools():
     pool = small_pool(2)
-    with pytest.raises(ValueError, match="at least one sample"):
-        evaluate(_network(), pool.take(torch.zeros(len(pool), dtype=torch.bool)))
     empty = replace(pool, guides=torch.zeros_like(pool.guides), targets=torch.zeros_like(pool.targets))
     report = evaluate(_network(), empty)
     assert report.psnr > 90 and math.isnan(report.flicker) and math.isnan(report.flicker_ratio)
     assert report.to_json()["flicker"] is None and json.dumps(report.to_json(), allow_nan=False)
-    with pytest.raises(ValueError, match=r"planes: expected shape \[2, 2, 8, 32, 32\], got \[2, 2, 7, 32, 32\]"):
-        score(lambda pool, part: pool.targets[part][:, :, :7], pool)
 
 
 def test_a_decoder_scores_as_its_network(device):
@@ -87,8 +83,6 @@ def test_a_decoder_scores_as_its_network(device):
         assert report.psnr == pytest.approx(expected.psnr, abs=error)
         assert report.flicker == pytest.approx(expected.flicker, rel=error)
         assert (report.samples, report.bytes) == (2, model.file_bytes())
-    with pytest.raises(ValueError, match="encoded"):
-        score(of_decoder(model.decoder(device, height=16, width=16)), pool)
 
 
 def test_all_methods_on_all_sets(tmp_path, device):
@@ -123,5 +117,3 @@ def test_the_coarse_march_is_its_guide():
     pool = small_pool(2, kind="six")
     for name, plane in zip(PLANES, coarse(pool, slice(0, 2)).unbind(2), strict=True):
         assert torch.equal(plane, pool.guides[:, :, GUIDES["six"].index(name)].float())
-    with pytest.raises(ValueError, match="kind six"):
-        coarse(small_pool(2), slice(0, 2))

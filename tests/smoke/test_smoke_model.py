@@ -228,7 +228,8 @@ def test_the_network_that_ships_is_better_than_the_march_that_it_reads():
     assert score(coarse) - 0.05 < found < score(coarse) + 1.0
 
 
-@pytest.mark.parametrize("voxels", [32, pytest.param(128, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("voxels", [32, 128])
 def test_no_grid_makes_the_network_worse_than_the_march_that_it_reads(voxels):
     """On smooth smoke the network alone loses 10 dB, and the gate gives it little weight."""
     volume = make_plume(voxels, hot=True, extinction=14.0)

@@ -72,7 +72,7 @@ def test_it_learns_a_small_pool_by_heart(tmp_path, device):
     assert model.dataset == profile.dataset
 
 
-@pytest.mark.parametrize("temporal", [0.0, 0.1])
+@pytest.mark.parametrize("temporal", [pytest.param(0.0, marks=pytest.mark.slow), 0.1])
 def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, temporal):
     monkeypatch.setattr("wlm.smoke.fit._CHUNK", 2)
     profile = _profile(temporal=temporal)
@@ -102,6 +102,7 @@ def test_a_stopped_training_ends_as_if_it_had_not_been(tmp_path, monkeypatch, te
     assert path.read_bytes() == content and not (tmp_path / "parts.partial").exists()
 
 
+@pytest.mark.slow
 def test_a_training_stopped_in_its_first_pool_is_resumed(tmp_path):
     profile = _profile()
     _train(tmp_path / "whole", profile)
@@ -180,15 +181,14 @@ def test_the_best_network_is_kept(tmp_path):
     assert training.model.summary["psnr"] == training.best
 
 
-@pytest.mark.parametrize("name", ["guides", "targets", "motion"])
-def test_nan_in_a_pool_is_an_error(tmp_path, name):
+def test_nan_in_a_pool_is_an_error(tmp_path):
     def broken(settings, *, round, **options) -> Pool:
         pool = small_pool(4, 10)
-        values = getattr(pool, name).clone()
-        values[2, 0, 0, 1] = math.nan
-        return replace(pool, **{name: values}) if round == 1 else pool
+        motion = pool.motion.clone()
+        motion[2, 0, 0, 1] = math.nan
+        return replace(pool, motion=motion) if round == 1 else pool
 
-    with pytest.raises(WlmError, match=f"round 1: {name}: sample 2: expected finite"):
+    with pytest.raises(WlmError, match="round 1: motion: sample 2: expected finite"):
         _train(tmp_path / "a", _profile(steps=2), make_pool=broken)
     empty = small_pool().take(torch.zeros(6, dtype=torch.bool))
     with pytest.raises(WlmError, match="validation: expected samples with smoke, found none"):
@@ -298,8 +298,6 @@ def test_a_step_learns_from_crops():
         assert torch.equal(motion[0], pool.motion[n, :, y : y + 16, x : x + 16].float())
     trainer.run(pool, plan)
     assert trainer.step == 6 and trainer.skipped == 0
-    with pytest.raises(ValueError, match="at most the samples' 32 pixels"):
-        plan_round(settings.model_copy(update={"crop": 48}), pool, seed=0, round=0)
 
 
 @pytest.mark.parametrize("temporal", [0.0, 0.1])
@@ -349,8 +347,6 @@ def test_profiles_load():
         assert profile.name == f"network-{name}"
         assert profile.network.guide == profile.dataset.guide == ("paper" if name == "paper" else "six")
         assert profile.network.width == {"paper": 16, "fast": 24}[name]
-    with pytest.raises(WlmError, match="profile '7' of smoke-network"):
-        Profile.load("7")
 
 
 def test_a_profile_is_overridden_part_by_part():
@@ -361,7 +357,6 @@ def test_a_profile_is_overridden_part_by_part():
     assert profile.dataset == fast.dataset and fast.override({}) is fast
     for wrong, message in (
         ({"training": {"stps": 7}}, "unknown key 'training.stps'; did you mean 'steps'"),
-        ({"name": {"a": 1}}, "name: expected a valid string"),
         ({"network": {"guide": "paper"}}, "dataset.guide: expected paper"),
     ):
         with pytest.raises(WlmError, match=message):
@@ -372,9 +367,7 @@ def test_a_profile_is_overridden_part_by_part():
     "network, dataset, message",
     [
         ("{guide: six}", "{}", "dataset.guide: expected six like network.guide, found paper"),
-        ("{}", "{guide: six}", "dataset.guide: expected paper like network.guide, found six"),
         ("{guide: back}", "{}", "network.guide: expected 'paper' or 'six'"),
-        ("{levels: 1}", "{}", "network.levels: "),
         ("{}", "{resolution: 32}\ntraining: {crop: 64}", "training.crop: expected at most dataset.resolution"),
     ],
 )

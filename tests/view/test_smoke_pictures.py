@@ -54,8 +54,6 @@ def _flat(camera, transparency, light=0.0, device="cpu"):
 def test_bytes():
     assert to_bytes(torch.tensor([[0.0, 0.5, 1.0, 9.0]])).tolist() == [[[0] * 3, [188] * 3, [255] * 3, [255] * 3]]
     assert to_bytes(np.full((1, 1, 3), 2.0), 4.0).tolist() == [[[188] * 3]]
-    with pytest.raises(ValueError, match="white"):
-        to_bytes(torch.zeros(1, 1), 0.0)
 
 
 @pytest.mark.parametrize("perspective", [False, True])
@@ -156,19 +154,6 @@ def test_shadow_of_a_box(device, toward, perspective):
     assert (result[~sure] == 1).all()
 
 
-@pytest.mark.parametrize("far", [0.0, 1000.0])
-def test_shadow_of_a_sphere(device, far):
-    """The shadow has the area of a circle, also a thousand radii from the origin."""
-    camera = Camera.look_at((far, 8, far), (far, 0, far), extent=4.0, height=100, width=100, world_up=(0, 0, 1))
-    ball = ObstacleSettings(radius=1.0, path=((0.0, far, 0, far),))
-    light = shadow_of(torch.full((100, 100), 12.0, device=device), camera, (0, 1, 0), ball)
-    area = float((1 - light).sum()) * (4.0 / 100) ** 2
-    # The sphere has 48 sides.
-    assert area == pytest.approx(24 * np.sin(np.pi / 24), rel=1e-2)
-    centre = (1 - light.cpu().numpy()).sum(0) @ (np.arange(100) + 0.5) / float((1 - light).sum())
-    assert centre == pytest.approx(50.0, abs=0.1)
-
-
 def test_without_obstacles_it_is_smoke_over_a_colour(device):
     camera = _camera(8)
     six = _flat(camera, 0.5, 0.25, device)
@@ -187,12 +172,6 @@ def test_without_obstacles_it_is_smoke_over_a_colour(device):
                 expected = six.shade(given, background=(0.2, 0.4, 0.6), ramp=colours, rule=rule)
                 found = picture(six, given, background=(0.2, 0.4, 0.6), ramp=colours, rule=rule)
                 torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
-    with pytest.raises(ValueError, match="irradiance"):
-        picture(six, [Light((0, 0, 1), (-1, 0, 0))])
-    with pytest.raises(ValueError, match="transparency"):
-        picture(replace(six, transparency=None), [light])
-    with pytest.raises(ValueError, match="depth"):
-        picture(six, [light], obstacles=[_ball()])
 
 
 def test_a_contact_sheet(tmp_path):
@@ -208,11 +187,6 @@ def test_a_contact_sheet(tmp_path):
             x, y = sheet.shape[1] - (4 - column) * 16, 28 + row * 14
             np.testing.assert_array_equal(sheet[y : y + 10, x : x + 12], rows[label][i])
     assert contact_sheet(tmp_path / "b.png", {"": rows["one"][:1]}) == (0,)
-    for wrong in ({"a": rows["one"], "b": rows["one"][:3]}, {}, {"a": []}, {"a": [sheet, rows["one"][0]]}):
-        with pytest.raises(ValueError, match="rows: expected equally"):
-            contact_sheet(tmp_path / "c.png", wrong)
-    with pytest.raises(ValueError, match="titles"):
-        contact_sheet(tmp_path / "c.png", rows, ["a"])
     assert not (tmp_path / "c.png").exists()
 
 
@@ -252,7 +226,5 @@ def test_smoke_under_its_own_lights_is_drawn_as_it_shades(device, orders):
 
 def test_lightmaps_are_lit_from_directions_alone():
     camera = _camera(8)
-    with pytest.raises(ValueError, match="expected only directional lights"):
-        picture(_flat(camera, 0.5), [PointLight((0.0, 1.0, 0.0))])
     half = picture(_flat(camera, 0.5, 0.4), [FRONT], albedo=(0.5, 1.0, 0.0))
     torch.testing.assert_close(half, picture(_flat(camera, 0.5, 0.4), [FRONT]) * torch.tensor([0.5, 1.0, 0.0]))

@@ -57,14 +57,8 @@ class Part:
 
 @dataclass(frozen=True)
 class Placed:
-    """A node of the mesh file whose light is in a sheet (a UV layout with its lightmaps).
-
-    Attributes:
-        node: The node's number in the mesh file.
-        label: The node's name.
-        sheet: Number of the sheet.
-        scale_offset: The node's rectangle in the sheet, v downwards: UV times the first two numbers, plus the last two.
-    """
+    """A node of the mesh file, by number and name, whose light is in a sheet (a UV layout with its lightmaps), by
+    number; `scale_offset` is its rectangle there, v downwards: UV times the first two numbers, plus the last two."""
 
     node: int
     label: str
@@ -107,14 +101,10 @@ class Sheet:
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """All triangles of a scene, sheet by sheet, then those without a lightmap.
+    """All triangles of a scene, int32 [F, 3], sheet by sheet, then those without a lightmap, which only hide others.
 
-    Attributes:
-        position: float64 [V, 3].
-        triangle: int32 [F, 3].
-        uv: float64 [V, 2]; 0 for triangles without a lightmap.
-        sheet: int32 [F], the sheet that lights each triangle; -1 for triangles without a lightmap, which only hide
-            others.
+    Vertices are float64 [V, 3], with UVs float64 [V, 2], 0 for triangles without a lightmap; `sheet`, int32 [F], is the
+    sheet that lights each triangle, or -1.
     """
 
     position: np.ndarray

@@ -187,14 +187,10 @@ class Profile(Settings):
 
 @dataclass(frozen=True)
 class SheetPlace:
-    """The place of a sheet (a UV layout with its lightmaps), or of its mip level, in the lookup texture T_c.
-
-    Attributes:
-        name: The sheet's name.
-        height, width: Size of the sheet's lightmaps in texels.
-        row, column: Place of the sheet's first entry in T_c.
-        rows, columns: Rows and columns of tiles; 0 if the method has no tiles.
-        smaller: Row in `AtlasModel.table` of the next smaller mip level; 0 if there is none.
+    """The place of a sheet (a UV layout with its lightmaps), or of its mip level, in the lookup texture T_c: its name,
+    the size of its lightmaps in texels, its first entry's row and column, and its numbers of rows and columns of tiles,
+    0 if the method has no tiles. `smaller` is the row in `AtlasModel.table` of the next smaller mip level; 0 if there
+    is none.
     """
 
     name: str

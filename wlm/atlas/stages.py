@@ -12,15 +12,10 @@ from wlm.system import Meter, OnProgress
 
 
 class Stages:
-    """Reports and times the stages of a compression.
+    """Reports and times the stages of a compression: `seconds` of the finished ones, by name.
 
-    A checkpoint saves the results of long stages as batches, numbered in order.
-
-    Attributes:
-        device: "cpu" or "cuda:N".
-        progress: The callback, also called within stages of many steps; or None.
-        checkpoint: The checkpoint, or None.
-        seconds: Seconds of the finished stages, by name.
+    A checkpoint saves the results of long stages as batches, numbered in order. The progress callback is also called
+    within stages of many steps.
     """
 
     def __init__(self, device: str, progress: OnProgress | None = None, checkpoint: Checkpoint | None = None) -> None:

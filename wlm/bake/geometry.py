@@ -39,16 +39,11 @@ _BRIGHTEST = 0.99  # largest albedo: with 1, light in a closed scene would never
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """A diffuse material.
+    """A diffuse material, with a name by which lamps refer to it, or "".
 
-    Attributes:
-        name: Name by which lamps refer to it; "" if it has none.
-        colour: Linear RGB albedo, multiplied by the texture's if there is one.
-        texture: Linear RGB albedo, float32 [H, W, 3], or None.
-        uv_set: The number n of the UV set `TEXCOORD_n` that the texture uses.
-        placed: Matrix of `KHR_texture_transform`, [2, 3], that moves the UVs (u, v, 1) of the texture.
-        emission: Radiance on the front, RGB.
-        double: Whether the back reflects as well; otherwise it absorbs all light.
+    Its linear RGB albedo is `colour` times that of the texture, float32 [H, W, 3], if there is one; this uses the UV
+    set `TEXCOORD_n` of n = `uv_set`, whose UVs (u, v, 1) `placed`, the matrix [2, 3] of `KHR_texture_transform`, moves.
+    `emission` is the radiance on the front. The back reflects as well if it is `double`, else it absorbs all light.
     """
 
     name: str = ""
@@ -62,15 +57,12 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles of one material.
+    """Triangles of one material, int32 [F, 3], counter-clockwise as seen from the front, of vertices float64 [V, 3] in
+    the world.
 
-    Attributes:
-        position: float64 [V, 3], in the world.
-        triangle: int32 [F, 3]; counter-clockwise as seen from the front.
-        normal: float64 [V, 3], unit shading normals; 0 where the file has none.
-        uv: float64 [V, 2], lightmap UVs; None if the surface has none and isn't baked.
-        texture_uv: float32 [V, 2], UVs of the material's texture, or None.
-        material: The material.
+    `normal`, float64 [V, 3], are unit shading normals, 0 where the file has none; `uv`, float64 [V, 2], are lightmap
+    UVs, None if the surface has none and isn't baked; `texture_uv`, float32 [V, 2] or None, are for the material's
+    texture.
     """
 
     position: np.ndarray
@@ -83,14 +75,11 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """The surfaces of a glTF file.
+    """The surfaces of a glTF file, in its order.
 
-    Attributes:
-        document: The file, to which new UVs are written.
-        surfaces: The surfaces in the order of the file.
-        replacements: The primitives with new UVs, for `write_glb`; empty if the file wasn't unwrapped.
-        uv_set: The number n of the lightmap's UV set `TEXCOORD_n`; None if no lightmap UVs were requested.
-        usual: Whether readers choose this UV set by default: `TEXCOORD_1` if it exists, else `TEXCOORD_0`.
+    New UVs are written to `document`; `replacements` are the primitives with new UVs, for `write_glb`. `uv_set` is the
+    number n of the lightmap's UV set `TEXCOORD_n`, None if no lightmap UVs were requested; `usual` tells whether
+    readers choose this UV set by default: `TEXCOORD_1` if it exists, else `TEXCOORD_0`.
     """
 
     document: GltfDocument

@@ -37,16 +37,11 @@ _ABOUT = (
 
 @dataclass(frozen=True, eq=False)
 class BakedLightmaps:
-    """The baked lightmaps of a scene, for T hours.
+    """The baked lightmaps of a scene, for T hours in ascending order.
 
-    Attributes:
-        hours: Hours in ascending order.
-        light: float16 [T, H, W, 3], irradiance; texels outside the mask have the value of the nearest valid texel.
-        noise: float16 [T, H, W, 3], standard error of the irradiance, 0 outside the charts.
-        mask: bool [H, W], true for valid texels.
-        coverage: float32 [H, W], the share of each texel that is on a surface.
-        back: float32 [H, W], the share of rays that hit back faces.
-        geometry: The surfaces, with their lightmap UVs.
+    `light`, float16 [T, H, W, 3], is irradiance, outside `mask`, bool [H, W], that of the nearest valid texel; `noise`
+    of this shape is its standard error, 0 outside the charts. `coverage`, float32 [H, W], is the share of each texel
+    that is on a surface, and `back` the share of rays that hit back faces. `geometry` has lightmap UVs.
     """
 
     hours: tuple[float, ...]

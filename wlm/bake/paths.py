@@ -34,12 +34,8 @@ _COEFFICIENTS = 9
 
 @dataclass(frozen=True)
 class Sun:
-    """The sun as a distant light.
-
-    Attributes:
-        direction: Direction to the sun, [3], of unit length.
-        irradiance: R, G, B on a surface that faces the sun.
-    """
+    """The sun as a distant light: the direction to it, [3], of unit length, and its irradiance R, G, B on a surface
+    that faces it."""
 
     direction: tuple[float, float, float]
     irradiance: tuple[float, float, float]
@@ -49,13 +45,9 @@ class Sun:
 class Tracing:
     """Settings of the path tracer, and the lights outside Mitsuba's scene, which need no random light selection.
 
-    Attributes:
-        sun: The sun; None if there is none or if it is below the horizon.
-        ambient: Radiance of rays that hit no surface, R, G, B.
-        sun_direct: Whether the sun's direct light is included.
-        samples: Number of paths per texel or probe, rounded up to a multiple of 8.
-        bounces: Maximum number of reflections.
-        seed: Seed of the random numbers.
+    There is no `sun` if it is below the horizon; `sun_direct` tells whether its direct light is included. `ambient` is
+    the radiance R, G, B of rays that hit no surface. `samples` counts paths per texel or probe, rounded up to a
+    multiple of 8; `bounces` is the largest number of reflections.
     """
 
     sun: Sun | None
@@ -68,13 +60,9 @@ class Tracing:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Estimated incident light at N points.
-
-    Attributes:
-        mean: float32 [N, C], estimates.
-        noise: float32 [N, C], the standard error of each estimate.
-        back: float32 [N], the share of first rays that hit the back of a single-sided surface, which indicates a point
-            inside an object.
+    """Estimated incident light at N points, float32 [N, C], with the standard error of each estimate; `back`, float32
+    [N], is the share of first rays that hit the back of a single-sided surface, which indicates a point inside an
+    object.
     """
 
     mean: np.ndarray

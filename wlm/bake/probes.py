@@ -24,14 +24,8 @@ _HIDDEN = 0.25  # share of rays that hit back faces above which a probe counts a
 
 @dataclass(frozen=True, eq=False)
 class BakedProbes:
-    """The N baked probes of a scene, for T hours.
-
-    Attributes:
-        hours: Hours in ascending order.
-        position: float32 [N, 3], metres.
-        values: float32 [T, N, 9, 3], radiance in nine orthonormal spherical harmonics, RGB; 0 inside an object.
-        noise: float32 [T, N, 9, 3], standard errors of the values.
-    """
+    """The N baked probes of a scene at positions float32 [N, 3], metres, for T hours in ascending order: radiance in
+    nine orthonormal spherical harmonics, RGB, float32 [T, N, 9, 3], 0 inside an object, and its standard error."""
 
     hours: tuple[float, ...]
     position: np.ndarray

@@ -18,14 +18,9 @@ _MOST_SIDE = 16384  # sample positions along a side of the lightmap
 class Texels:
     """The T covered texels of a lightmap, with N sample positions in total.
 
-    Attributes:
-        height, width: Size of the lightmap in texels.
-        index: int64 [T], row * width + column, ascending.
-        first: int64 [T + 1], index of each texel's first sample.
-        position: float32 [N, 3], sample positions.
-        normal: float32 [N, 3], unit shading normals.
-        face: float32 [N, 3], unit geometric normals of the triangles, on the side of `normal`.
-        coverage: float32 [T], the covered share of the texel.
+    `index`, int64 [T], ascending, is row * width + column, and `first`, int64 [T + 1], each texel's first sample;
+    `coverage`, float32 [T], is the covered share. Samples have positions, unit shading normals and unit geometric
+    normals on the side of these, float32 [N, 3] each.
     """
 
     height: int

@@ -24,15 +24,9 @@ _REPORTS = 100  # progress reports per hour
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A scene file and the files that it refers to.
-
-    Attributes:
-        scene: The settings.
-        path: The YAML file.
-        geometry: The glTF file.
-        sky: The environment map, float32 [H, W, 3], or None.
-        source: Hash of the geometry and the environment map: 32 hexadecimal digits of BLAKE2b.
-        trust: Whether the files may refer to files outside their folder.
+    """A scene file and the files that it refers to: the settings, the YAML file, the glTF file, and the environment
+    map, float32 [H, W, 3] or None. `source` is a hash of geometry and map, 32 hexadecimal digits of BLAKE2b; `trust`
+    tells whether the files may refer to files outside their folder.
     """
 
     scene: BakeScene

@@ -20,6 +20,14 @@ _CONVENTIONS = "threejs, godot, unreal or unity"
 _Convention = Annotated[
     str | None, typer.Option(help=f"SH convention of PROBES: {_CONVENTIONS}; default the file's own.")
 ]
+_Axes = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="Change the axes of positions and light: the old axes that become x, y, z, such as x,z,-y from z up to y "
+        "up, or, with an equals sign, --axes=-x,y,z to mirror x for a left-handed engine.",
+    ),
+]
 _Order = Annotated[
     Literal["coefficient", "channel"] | None,
     typer.Option(
@@ -52,6 +60,7 @@ def compress(
     key: _Keys = None,
     convention: _Convention = None,
     order: _Order = None,
+    axes: _Axes = None,
     seed: opt.Seed = 0,
     device: opt.Device = "cpu",
     resume: opt.Resume = False,
@@ -66,7 +75,7 @@ def compress(
     def load() -> "ProbeSet":
         from wlm.probe import load
 
-        return load(probes, key=key or None, convention=convention, order=order)
+        return load(probes, key=key or None, convention=convention, order=order, axes=axes)
 
     from wlm.probe.hours import listed_times
 
@@ -102,6 +111,7 @@ def evaluate(
     key: _Keys = None,
     convention: _Convention = None,
     order: _Order = None,
+    axes: _Axes = None,
     device: opt.Device = "cpu",
 ) -> None:
     """Compare compressed probes with the original: PSNR of the coefficients and of the irradiance, and sizes.
@@ -116,7 +126,7 @@ def evaluate(
     from wlm.system import load as load_model
 
     model = load_model(file, "probe")
-    probes = load(probes_path, key=key or None, convention=convention, order=order)
+    probes = load(probes_path, key=key or None, convention=convention, order=order, axes=axes)
     console.note_warnings(probes.warnings)
     drawn = views or mesh is not None
     one = (model.at(time), probes.at(time)) if drawn or volume else (model, probes)
@@ -195,15 +205,12 @@ def export(
         int | None,
         typer.Option(help="With --engine three, godot, unreal or bevy: grid cells along the longest side; default 24."),
     ] = None,
-    mirror: Annotated[
-        Literal["x", "y", "z"] | None,
-        typer.Option(help="With --engine unity: axis to mirror, as Unity is left-handed."),
-    ] = None,
+    axes: _Axes = None,
     time: opt.Time = None,
     device: opt.Device = "cpu",
 ) -> None:
     """Write light probes for an engine: buffers and a shader, or with --engine a grid or probes that it can load."""
-    options = {"original": original, "cells": cells, "mirror": mirror}
+    options = {"original": original, "cells": cells, "axes": axes}
     models.export(file, output, engine, shader, exact, device, time, **options)
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from wlm.cli.console import number, quiet_warp, running, show, show_files, table
-from wlm.cli.options import Device, Key, ModelFile, Time, output_option
+from wlm.cli.options import Device, Key, ModelFile, ShaderLanguage, Time, output_option
 
 if TYPE_CHECKING:
     from wlm.probe import ProbeModel, ProbeSet
@@ -41,6 +41,10 @@ def volume(
     block: Annotated[
         float | None, typer.Option(help="Side of the finest blocks in world units; default by the probes' spacing.")
     ] = None,
+    update: Annotated[
+        bool, typer.Option("--update", help="Also write compute shaders that update the volume, to DIR/update.")
+    ] = False,
+    shader: ShaderLanguage = None,
     key: Key = None,
     time: Time = None,
     device: Device = "cpu",
@@ -50,12 +54,15 @@ def volume(
     Normals of PROBES keep light from passing through walls. wlm evaluate --volume scores such a volume.
     """
     quiet_warp()
+    from dataclasses import replace
+
     import numpy as np
 
     from wlm.export import export
     from wlm.probe.places import probes_of
     from wlm.probe.volume.bundle import volume_bundle
     from wlm.probe.volume.cascade import Volume
+    from wlm.probe.volume.update import update_bundle
     from wlm.probe.volume.walk import settle
     from wlm.system import load
 
@@ -63,9 +70,11 @@ def volume(
     known = probes_of(model, probes_path, key, time)
     light = model.decoder(device).light(known.position)
     made = Volume(known.position, light, live=known.live, normal=known.normal, block=block)
+    # Without any light yet, it makes the example of the update.
+    parts = {"update": update_bundle(made, model)} if update else {}
     lit = known.position[known.live]
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else np.array(at))
-    show_files(output, export(volume_bundle(made), output))
+    show_files(output, export(replace(volume_bundle(made), parts=parts), output, shader=shader or "glsl"))
     rows = table("the volume on the device", ["part", "bytes"])
     for part, size in (made.memory | {"in all": made.memory_bytes}).items():
         rows.add_row(part, f"{size:,}")

@@ -66,7 +66,7 @@ def export(
         device: Device that decodes the model for the folder's reference image, for example "cpu" or "cuda:0".
         options: Options of the kit. Probes: `original`, the file that was compressed, if the model does not store its
             positions; `cells`, the number of a grid's cells along its longest side (three, godot, unreal, bevy);
-            `mirror`, the axis to mirror (unity).
+            `axes`, the scene's axes that become the engine's x, y and z, for example "-x,y,z".
 
     Returns:
         The files written, the index last.

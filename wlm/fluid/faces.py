@@ -19,13 +19,10 @@ _STILL = 0  # a wall at rest
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """The boundary condition on a face of A x B cells, along the two axes of the face in the order x, y, z.
-
-    Attributes:
-        rank: int [A, B], precedence at the edges of the box, where two faces meet: the lower rank decides.
-        kind: int [A, B], kind of boundary of each cell, such as `lattice_links.BOUNCE`.
-        velocity: float64 [A, B, 3], velocity of a wall or an inlet, cells per step.
-        excess: Density minus 1 to which an outlet with a given density relaxes.
+    """The boundary condition on a face of A x B cells, along the two axes of the face in the order x, y, z: for each
+    cell the kind of boundary, such as `lattice_links.BOUNCE`; the velocity of a wall or an inlet, float64 [A, B, 3],
+    cells per step; and its rank: where two faces meet at the edges of the box, the lower decides. `excess` is the
+    density minus 1 to which an outlet with a given density relaxes.
     """
 
     rank: np.ndarray

@@ -382,12 +382,9 @@ class DifferentiableSolver:
 
 
 class _Work:
-    """Small arrays that the steps of a call use, in torch's memory.
-
-    Attributes:
-        clock, trouble, sums: See `wlm_kernels.fluid.lattice.step_kernel`.
-        done, first_trouble: `clock` and `trouble` as tensors.
-        links: The lattice's links with terms and values of this call.
+    """Small arrays that the steps of a call use, in torch's memory: `clock`, `trouble` and `sums` of
+    `wlm_kernels.fluid.lattice.step_kernel`, the first two also as tensors, and the lattice's links with terms and
+    values of this call.
     """
 
     def __init__(self, air: DifferentiableLattice) -> None:

@@ -32,13 +32,8 @@ _APART = 1e-4  # offset in voxels up to which the voxels of two grids coincide
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """The values of a file's grid in the box of its active voxels.
-
-    Attributes:
-        name: Name in error messages.
-        values: float32 tensor [X, Y, Z].
-        matrix: float64 [4, 4], transform of an index of `values` to the centre of this voxel in the world.
-    """
+    """The values of a file's grid in the box of its active voxels, float32 tensor [X, Y, Z]; `matrix`, float64 [4, 4],
+    transforms an index of them to the centre of this voxel in the world, and `name` is for error messages."""
 
     name: str
     values: torch.Tensor
@@ -118,11 +113,9 @@ def is_level_set(grid: VdbGrid, group: str) -> bool:
 
 def on_one_lattice(grids: Sequence[Grid], most: int, up: str = "y") -> tuple[Lattice, list[torch.Tensor]]:
     """Brings grids to one lattice, which covers all of them and has the voxels of the first grid, if these are cubic.
-
     `most` is the largest number of voxels; `up` is "x", "y" or "z", the axis of the grids' world that becomes +y.
 
-    Returns:
-        The lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
+    Returns the lattice, and each grid's values on it, float32 [X, Y, Z]; 0 where a grid has none.
     """
     turned = [(grid, _turned(grid, up)) for grid in grids]
     first, matrix = turned[0]

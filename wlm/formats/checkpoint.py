@@ -62,14 +62,9 @@ class Pace:
 
 
 class Checkpoint:
-    """The state of one fit, in the file `OUTPUT.partial`.
+    """The state of one fit, in the file `OUTPUT.partial`; `resumed` tells whether it was read from there.
 
     Batches are numbered from 0, and several may be unfinished at a time.
-
-    Attributes:
-        path: The file.
-        system: The system of the artifact, for example "lightmap-checkpoint".
-        resumed: Whether a state was read from the file.
     """
 
     def __init__(

@@ -8,17 +8,10 @@ PACKAGE, MEMORY, SECONDS = "DracoPy", 2 << 30, 10
 
 
 def main(data: bytes, most: str) -> dict[str, np.ndarray]:
-    """Decompresses all meshes.
+    """Decompresses all meshes; `data` is a line of JSON, the number of bytes of each mesh, and then their bytes.
 
-    Args:
-        data: A line of JSON, the number of bytes of each mesh, and the bytes of all meshes.
-        most: Largest allowed number of bytes of all arrays.
-
-    Returns:
-        The arrays of mesh i by the names "i,j": j is the id of an attribute, or -1 for the corners of the triangles.
-
-    Raises:
-        ValueError: The arrays have more bytes.
+    Returns the arrays of mesh i by the names "i,j": j is the id of an attribute, or -1 for the corners of the
+    triangles. A ValueError means that these have more than `most` bytes.
     """
     import DracoPy
 

@@ -39,16 +39,11 @@ def read_exr(
     """Reads the light of an EXR file, over its display window, in the primaries of Rec. 709.
 
     Half and float files are read, scan lines or tiles, of one part or several. The light is in the channels R, G and B,
-    also in lower case; without them in the only layer that has such channels, or in a lone channel Y, which is grey.
-    NaN and infinity are kept. Texels of the display window that the file doesn't store are 0.
+    also in lower case; without them in the only layer that has such channels, or in a lone channel Y, which is grey; or
+    it is in the layer or part `layer`. NaN and infinity are kept. Texels of the display window that the file doesn't
+    store are 0. Each assumption and conversion adds a line to `notes`.
 
-    Args:
-        path: The file.
-        notes: Each assumption and conversion adds a line.
-        layer: Name of the layer or the part; None: the rule above.
-
-    Returns:
-        The pixels, float32 [H, W, 3 or 4], and the names of the channels, ("R", "G", "B") or ("R", "G", "B", "A").
+    Returns the pixels, float32 [H, W, 3 or 4], and the names of the channels, ("R", "G", "B") or ("R", "G", "B", "A").
     """
     notes = [] if notes is None else notes
     channels = _channels(path)
@@ -247,13 +242,10 @@ def write_planes(
     *,
     whole: tuple[str, ...] = (),
 ) -> None:
-    """Writes single-channel images (planes) as one EXR file with lossless ZIP compression, atomically.
+    """Writes single-channel images (planes) [H, W], linear, not empty, as one EXR file with lossless ZIP compression,
+    atomically; the keys name the channels, and `note`, a JSON object, is stored in the header.
 
-    Args:
-        path: The file to write; its folder must exist.
-        planes: [H, W] each, linear, not empty; the keys name the channels.
-        note: JSON object that is stored in the header.
-        whole: Names of the planes that stay float32. The others become half floats, clamped to +-65504.
+    The planes in `whole` stay float32; the others become half floats, clamped to +-65504.
     """
     shapes = {np.shape(plane) for plane in planes.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2 or 0 in next(iter(shapes)):

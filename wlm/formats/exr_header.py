@@ -24,13 +24,8 @@ _SAMPLE_BYTES = (4, 2, 4)  # of uint, half and float, by the type's number
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """The header of a part.
-
-    Attributes:
-        size: Width and height of the display window.
-        channels: Names of the channels, in the order of the file.
-        attributes: Type and value of each attribute, as stored.
-    """
+    """The header of a part: width and height of the display window, the names of the channels in the order of the file,
+    and type and value of each attribute as stored."""
 
     size: tuple[int, int]
     channels: tuple[str, ...]

@@ -34,11 +34,8 @@ MOST_SLICES = 2048
 class Layout:
     """Memory layout of a texel format.
 
-    Attributes:
-        channels: Channels of a decoded texel: 3, or 4 with alpha.
-        size: Bytes of a texel, or of a block.
-        decode: Decodes whole rows of whole blocks to half or float [rows, columns, channels].
-        block: Width and height of a block in texels.
+    It states the channels of a decoded texel, 3, or 4 with alpha; the bytes of a texel or of a block, and a block's
+    width and height in texels. `decode` decodes whole rows of whole blocks to half or float [rows, columns, channels].
     """
 
     channels: int

@@ -16,13 +16,8 @@ _ROOM = 0.25  # smallest fraction of the bounding box that an interior encloses
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Triangles and their lightmap UVs.
-
-    Attributes:
-        position: float32 [V, 3].
-        triangle: uint32 [F, 3].
-        uv: float32 [V, 2], u right, v down; None if UVs were not requested.
-    """
+    """Triangles, uint32 [F, 3], of vertices float32 [V, 3], and their lightmap UVs, float32 [V, 2], u right, v down;
+    None if UVs were not requested."""
 
     position: np.ndarray
     triangle: np.ndarray

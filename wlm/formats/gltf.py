@@ -70,14 +70,11 @@ _REFUSED = {"EXT_mesh_gpu_instancing": "make its instances nodes first, for exam
 
 @dataclass(frozen=True, eq=False)
 class GltfDocument:
-    """A glTF file.
+    """A glTF file: its path, for messages and for the files that it refers to; the JSON tree, which must not be
+    changed; the bytes of each buffer.
 
-    Attributes:
-        path: Path of the file, for messages and for the files that it refers to.
-        content: The JSON tree; it must not be changed.
-        buffers: The bytes of each buffer.
-        trust: Whether the file may name files outside its folder and exceed the limits for its size.
-        most: Largest allowed number of drawn corners and vertices, and of elements of an accessor without data.
+    `trust` tells whether the file may name files outside its folder and exceed the limits for its size; `most` is the
+    largest allowed number of drawn corners and vertices, and of elements of an accessor without data.
     """
 
     path: str

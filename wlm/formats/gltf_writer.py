@@ -50,11 +50,9 @@ HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "KHR_mesh_quantizat
 class Replacement:
     """New vertices and triangles of a primitive.
 
-    Attributes:
-        primitive: The primitive to replace.
-        gather: int [V'], for each new vertex the vertex of `primitive` whose attributes it takes.
-        triangle: int [F', 3], at least one, indices of new vertices.
-        uv: [V', 2], the new UV; u right, v down; stored as float32.
+    `gather`, int [V'], names for each new vertex the vertex of the primitive whose attributes it takes; `triangle`, int
+    [F', 3], at least one, has indices of new vertices; `uv`, [V', 2], is the new UV, u right, v down, stored as
+    float32.
     """
 
     primitive: GltfPrimitive

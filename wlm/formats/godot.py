@@ -64,12 +64,9 @@ _DEEPEST = 32
 
 @dataclass(frozen=True)
 class GodotUser:
-    """A mesh that uses a lightmap.
-
-    Attributes:
-        node: Path of its node, with "/" between names.
-        rectangle: x, y, width, height: UV2 is scaled by the last two and offset by the first two, v down.
-        slice: Index of the slice, counted through all textures.
+    """A mesh that uses a lightmap: path of its node with "/" between names; the rectangle x, y, width, height, by whose
+    last two UV2 is scaled and by whose first two it is offset, v down; index of the slice, counted through all
+    textures.
     """
 
     node: str
@@ -79,13 +76,8 @@ class GodotUser:
 
 @dataclass(frozen=True)
 class GodotUsers:
-    """The lightmaps of a bake and their users.
-
-    Attributes:
-        textures: Godot's names of the pictures (res://...).
-        users: The users in the order of the file.
-        directional: Whether each slice has four parts: one of light and three of directions.
-    """
+    """The lightmaps of a bake, by Godot's names of the pictures (res://...), and their users in the order of the file.
+    If they are directional, each slice has four parts: one of light and three of directions."""
 
     textures: tuple[str, ...]
     users: tuple[GodotUser, ...]
@@ -406,13 +398,10 @@ def lmbake_bytes(
 ) -> bytes:
     """Returns the content of a new bake in format 4, with a `LightmapGIData` that sets only `probe_data`.
 
-    Args:
-        points: [N, 3], metres.
-        sh: [N, 9, 3], the numbers that the module's description defines.
-        tetrahedra: int [T, 4], indices of points.
-        planes: [M, 4], planes n x = d of a BSP tree.
-        children: int [M, 2], two children per node: on the side n x > d, and on the other side; each is the index of a
-            node, or -1 - t for tetrahedron t.
+    `points`, [N, 3], are in metres; `sh`, [N, 9, 3], are the numbers that the module's description defines;
+    `tetrahedra`, int [T, 4], are indices of points. `planes`, [M, 4], n x = d, are those of a BSP tree; `children`, int
+    [M, 2], its two children per node, on the side n x > d and on the other: each is the index of a node, or -1 - t for
+    tetrahedron t.
     """
     low, high = points.min(0), points.max(0)
     node = np.zeros((len(planes), 6), "<u4")

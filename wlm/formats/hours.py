@@ -69,12 +69,10 @@ def _hour(match: re.Match[str] | None, minutes: bool, clock: bool) -> float | No
 
 
 def neighbours(times: np.ndarray, period: float | None, t: float) -> tuple[int, int, float]:
-    """Returns the indices of the stored times before and after a time, and the weight of the later one, 0 to 1.
+    """Returns the indices of the stored times, float64 [T], increasing, before and after a finite time, and the weight
+    of the later one, 0 to 1.
 
-    Args:
-        times: float64 [T], increasing.
-        period: Length of the day; the last and the first time are neighbours. None: `t` is within the times.
-        t: The time, finite.
+    In a day of length `period` the last and the first time are neighbours; None: `t` is within the times.
     """
     count = len(times)
     if count == 1:

@@ -30,12 +30,9 @@ _ZERO = re.compile(rb"^ *f [^\r\n]*[ /]0(?=[ /\r\n]|\Z)", re.MULTILINE)
 
 @dataclass(frozen=True, eq=False)
 class MeshArrays:
-    """The triangles of a file.
+    """The triangles of a file, int32 [F, 3], in the order of the file, maybe none, of vertices float64 [V, 3].
 
-    Attributes:
-        position: float64 [V, 3].
-        uv: float64 [V, 2], u right, v down; None where the file or some of its meshes have no UVs.
-        triangle: int32 [F, 3], in the order of the file; may be empty.
+    Their UVs are float64 [V, 2], u right, v down; None where the file or some of its meshes have no UVs.
     """
 
     position: np.ndarray

@@ -18,12 +18,10 @@ _PIECE = 1 << 20  # numbers checked at once, which bounds the memory of masks
 class Part:
     """The requirements for one array of a file, called a part.
 
-    Attributes:
-        dtype: NumPy type, or the allowed types.
-        shape: Length of each axis; None allows any length. A part without elements is left out of the file.
-        optional: Whether the file may lack the part, which is then empty along its first axis.
-        least, most: Smallest and largest allowed number, or None for no bound. NaN violates any bound.
-        finite: Whether floats must be finite.
+    It has a NumPy type, or one of several, and a shape, in which None allows any length. A part without elements is
+    left out of the file; the file may lack an `optional` part, which is then empty along its first axis. `least` and
+    `most` are the smallest and largest allowed number, None for no bound, and NaN violates any; `finite` tells whether
+    floats must be finite.
     """
 
     dtype: type | tuple[type, ...]
@@ -35,18 +33,10 @@ class Part:
 
 
 def check_parts(tensors: Mapping[str, np.ndarray], table: Mapping[str, Part]) -> dict[str, np.ndarray]:
-    """Checks the tensors of a file against its table of parts.
+    """Checks the tensors of a file against its table of parts, which has all parts that the file may have.
 
-    Args:
-        tensors: The tensors by name.
-        table: All parts that the file may have, by name.
-
-    Returns:
-        Every part of the table; parts that the file leaves out are empty.
-
-    Raises:
-        ValueError: A part is unknown, is missing, has another type or shape, contains NaN or infinity, or is out of
-            range.
+    Returns every part of the table; parts that the file leaves out are empty. A ValueError means that a part is unknown
+    or missing, has another type or shape, contains NaN or infinity, or is out of range.
     """
     if extra := tensors.keys() - table.keys():
         raise ValueError(f"part {one_line(min(extra), 60)} is unknown")

@@ -55,13 +55,11 @@ def tags_of(path: str | os.PathLike[str], data: bytes) -> dict[str, int]:
 
 
 def read_tiff(path: str | os.PathLike[str], notes: list[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Reads the first image of a TIFF of grey or RGB, with alpha or without.
+    """Reads the first image of a TIFF of grey or RGB, with alpha or without. `notes` gets a line if the file states
+    primaries or a colour profile, which are not applied.
 
-    `notes` gets a line if the file states primaries or a colour profile, which are not applied.
-
-    Returns:
-        The pixels, [H, W, C], the top row first whatever the file's orientation: float32, or uint8 and uint16 as
-        stored; and the names of the channels: L, or R, G and B, then A if there is alpha.
+    Returns the pixels, [H, W, C], the top row first whatever the file's orientation: float32, or uint8 and uint16 as
+    stored; and the names of the channels: L, or R, G and B, then A if there is alpha.
     """
     data = read_file(path, IMAGE_BYTES, "the TIFF")
     tags = tags_of(path, data)

@@ -42,12 +42,8 @@ def has_lightmap(number: Any) -> bool:
 
 @dataclass(frozen=True)
 class Rectangle:
-    """The rectangle of a renderer in its lightmap.
-
-    Attributes:
-        lightmap: Index of the lightmap.
-        scale_offset: `lightmapScaleOffset`: UVs are scaled by the first two numbers and offset by the last two, v up.
-    """
+    """The rectangle of a renderer in its lightmap: UVs are scaled by the first two numbers of `lightmapScaleOffset` and
+    offset by the last two, v up."""
 
     lightmap: int
     scale_offset: tuple[float, float, float, float]
@@ -55,12 +51,9 @@ class Rectangle:
 
 @dataclass(frozen=True, eq=False)
 class LightingData:
-    """Content of an asset.
-
-    Attributes:
-        position: float64 [N, 3], positions of the light probes in Unity's axes.
-        values: float64 [N, 9, 3], coefficients of `SphericalHarmonicsL2`.
-        rectangles: One for each renderer with a lightmap, in the order of the file, which does not name renderers.
+    """Content of an asset: the light probes' positions, float64 [N, 3], in Unity's axes, and their coefficients of
+    `SphericalHarmonicsL2`, float64 [N, 9, 3]; and a rectangle for each renderer with a lightmap, in the order of the
+    file, which does not name renderers.
     """
 
     position: np.ndarray

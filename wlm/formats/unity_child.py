@@ -28,17 +28,11 @@ def main(data: bytes) -> dict[str, np.ndarray]:
 
 
 def encode(objects: Iterable[tuple[str, Callable[[], dict]]]) -> dict[str, np.ndarray]:
-    """Collects the arrays of objects.
+    """Collects the arrays of objects, each given by its type and a function that reads its members; a LookupError,
+    TypeError or ValueError means other members.
 
-    Args:
-        objects: The type of each object, and a function that reads its members.
-
-    Returns:
-        The types of all objects, text [K]; the positions [N, 3] and coefficients [N, 27] of light probes; and for each
-        renderer the number, scale and offset of its lightmap [R, 5]; float64.
-
-    Raises:
-        LookupError, TypeError, ValueError: An object has other members.
+    Returns the types of all objects, text [K]; the positions [N, 3] and coefficients [N, 27] of light probes; and for
+    each renderer the number, scale and offset of its lightmap [R, 5]; float64.
     """
     kinds: set[str] = set()
     position, light, renderer = [], [], []

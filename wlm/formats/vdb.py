@@ -61,14 +61,9 @@ class GridHead:
 
 @dataclass(frozen=True, eq=False)
 class VdbGrid:
-    """A grid of a file.
-
-    Attributes:
-        name: Name of the grid in the file.
-        matrix: float64 [4, 4], from the indices of voxel centres to world space.
-        low: Index of the lowest voxel of the bounding box, (x, y, z).
-        values: float32 [X, Y, Z] over the bounding box of the active voxels, or voxel 0 if none is active.
-        background: Value of all voxels that are not stored.
+    """A grid of a file: its name, and values float32 [X, Y, Z] over the bounding box of the active voxels, or voxel 0
+    if none is active. `low` is the box's lowest voxel (x, y, z); `matrix`, float64 [4, 4], maps indices of voxel
+    centres to world space; `background` is the value of all voxels that are not stored.
     """
 
     name: str
@@ -89,12 +84,8 @@ class _Entry:
 
 
 class GridFile(ABC):
-    """A file of grids in memory, of which only the list of grids has been read.
-
-    Attributes:
-        FORMAT: Name of the format.
-        heads: The grids, in the order of the file; of several with one name, only the first can be read.
-    """
+    """A file of grids in memory, of which only the list of grids, `heads`, has been read, in the order of the file; of
+    several with one name, only the first can be read. `FORMAT` is the name of the format."""
 
     FORMAT: ClassVar[str]
 
@@ -385,14 +376,8 @@ def leaf_array(low: np.ndarray, high: np.ndarray, most: int, where: str) -> tupl
 
 @dataclass(frozen=True, eq=False)
 class Tiles:
-    """Children of a node with one constant value each (tiles).
-
-    Attributes:
-        corner: Index of the lowest voxel of the node, [3].
-        edge: Edge of a child, in voxels.
-        values: Value of each child, [N, N, N], N children along each edge.
-        seen: Whether each child is a tile that differs from the background, [N, N, N].
-        active: Whether each child is active, [N, N, N].
+    """Children of a node with one constant value each (tiles): the node's lowest voxel, the edge of a child in voxels,
+    and [N, N, N] each child's value, whether it is a tile that differs from the background, and whether it is active.
     """
 
     corner: np.ndarray

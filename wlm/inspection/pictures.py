@@ -29,13 +29,9 @@ _TEXTURE = re.compile(r"(^|[_. -])(rlt|bbf|tlr|rtbk?|lbt?f|tlrb)(?=[_. -]|$)", r
 
 @dataclass(frozen=True)
 class Picture:
-    """Facts from the header of a picture.
-
-    Attributes:
-        kind: "EXR", "Radiance", "PFM", "TIFF", "KTX2" or "DDS"; or "PNG", "JPEG", "WebP" or "TGA", which are no light
-            without an encoding.
-        width, height: Size in texels; 0 if the beginning of the file does not state it.
-        channels: Names of the channels; empty if the beginning of the file does not state them.
+    """Facts from the header of a picture: its kind, "EXR", "Radiance", "PFM", "TIFF", "KTX2" or "DDS", or one that is
+    no light without an encoding, "PNG", "JPEG", "WebP" or "TGA"; and its size in texels and the names of its channels,
+    0 and empty if the beginning of the file does not state them.
     """
 
     kind: str

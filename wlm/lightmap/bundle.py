@@ -72,14 +72,8 @@ _SHEETS = (
 
 
 def bundle(model: LightmapModel, *, device: str = "cpu") -> Bundle:
-    """Makes the bundle of a model, or a collection with a bundle for each sheet if the model has several sheets.
-
-    A sheet holds up to three channels of one layer of an atlas.
-
-    Args:
-        model: The model.
-        device: Device that decodes the reference image.
-    """
+    """Makes the bundle of a model, or a collection with a bundle for each sheet if the model has several sheets;
+    `device` decodes the reference image."""
     if len(model.sheets) == 1:
         ((sheet, own),) = model.sheets.items()
         return sheet_bundle(sheet, own, model.name, model.source, device)

@@ -58,13 +58,10 @@ class SheetDecoder:
         gelu: str | None = None,
         tiles: Sequence[int] | np.ndarray | None = None,
     ) -> None:
-        """Uploads a sheet.
+        """Uploads a sheet, or only the tiles of some numbers, which alone are read of a sheet of a file.
 
-        Args:
-            model: The sheet.
-            device: "cpu", "cuda" or "cuda:N".
-            gelu: GELU variant to use instead of the one that the model was trained with, for speed; None: the model's.
-            tiles: Numbers of the tiles to upload; of a sheet of a file only these are read. None: all.
+        `gelu` is a GELU variant to use instead of the one that the model was trained with, for speed; None: the
+        model's.
         """
         self.device, gelu = device_of(device), gelu_of(model, gelu)
         self.model = model if tiles is None else model.only(tiles)

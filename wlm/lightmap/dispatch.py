@@ -29,14 +29,10 @@ Parts = dict[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Tiles of one sheet (three channels) and of one kind, which are fitted together.
+    """Tiles of one sheet (three channels) and of one kind, STATIC or DYNAMIC, which are fitted together.
 
-    Attributes:
-        number: Number of the batch, from 0.
-        kind: STATIC or DYNAMIC.
-        rows: int [n], indices of the tiles in `SheetFit.index`.
-        first: Number of tiles of the same kind in earlier batches of the sheet.
-        fit: The `wlm.lightmap.fit.SheetFit` of the sheet.
+    `rows`, int [n], are indices of the tiles in `SheetFit.index`; `first` is the number of tiles of the same kind in
+    earlier batches of the sheet. Batches are numbered from 0.
     """
 
     number: int

@@ -171,15 +171,11 @@ class _Facts:
 
 
 class SheetFit:
-    """The tiles of a sheet to be fitted, and the model that receives their maps and networks.
+    """The tiles of a sheet to be fitted, by rising number, int [N], with their kinds, and the model that receives their
+    maps and networks; those of batches that are not stored yet are still missing. `warning` is a setting that could not
+    be followed, or None.
 
     Tiles are cut out of the sheet as they are needed, a few at a time: all tiles of a large set do not fit in memory.
-
-    Attributes:
-        index: int [N], numbers of the tiles in their grid, rising.
-        kinds: int [N], `TileKind` of each tile.
-        model: The model; maps and networks of batches that are not stored yet are still missing.
-        warning: A setting that could not be followed, or None.
     """
 
     def __init__(

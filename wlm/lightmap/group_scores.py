@@ -26,12 +26,9 @@ ORIGINALS, BAKE = "originals of the groups", "bake of all lights"
 class SumScore(Summary):
     """Error of the sum of all groups of a sheet over tiles and times; the scores are those of `Summary`.
 
-    Attributes:
-        sheet: Label of the sheet, without a group.
-        reference: `ORIGINALS` or `BAKE`.
-        times: float64 [T], the times that are scored.
-        between_inputs: PSNR of the sum of the originals against the reference, in dB: the noise of the bakes, which no
-            compression can undo. NaN if the reference is that sum itself.
+    `sheet` is the sheet's label, without a group; `reference` is `ORIGINALS` or `BAKE`. `between_inputs` is the PSNR of
+    the sum of the originals against the reference, in dB: the noise of the bakes, which no compression can undo; NaN if
+    the reference is that sum itself.
     """
 
     sheet: str
@@ -43,18 +40,13 @@ class SumScore(Summary):
 def score_sums(
     model: LightmapModel, lightmaps: LightmapSet, all_lights: LightmapSet | None, device: str, metrics: Sequence[str]
 ) -> list[SumScore]:
-    """Scores the sum of the groups of each sheet of light.
+    """Scores the sum of the groups of each sheet of light by some of `wlm.metrics.METRICS`.
 
-    Args:
-        model: The model.
-        lightmaps: Its input, with the same sheets.
-        all_lights: A bake of all lights together, without groups, at any times; None: there is none.
-        device: Device that decodes.
-        metrics: Any of `wlm.metrics.METRICS`.
+    `lightmaps` is the model's input, with the same sheets; `all_lights` is a bake of all lights together, without
+    groups, at any times; None: there is none.
 
-    Returns:
-        Of each sheet in several groups the score against the originals, and of each sheet that is in `all_lights` the
-        score against it.
+    Returns of each sheet in several groups the score against the originals, and of each sheet that is in `all_lights`
+    the score against it.
     """
     scores: list[SumScore] = []
     wanted = {} if all_lights is None else dict(all_lights.sheets)

@@ -53,10 +53,9 @@ class Source:
 
 @dataclass(frozen=True)
 class LayerInfo:
-    """Description of a layer, which every atlas of the set has.
+    """A layer, which every atlas of the set has.
 
     Attributes:
-        name: Name of the layer.
         encoding: "radiance", "unit" for values in [0, 1], or "signed" for values in [-1, 1].
         channels: Channels to read; None reads R, G and B of radiance and all channels of other layers.
         stored: How the files of a layer of radiance store their light, if they don't define it themselves: an encoding
@@ -71,14 +70,11 @@ class LayerInfo:
 
 @dataclass(frozen=True)
 class AtlasInfo:
-    """Description of an atlas.
+    """An atlas.
 
-    Attributes:
-        name: Name of the atlas.
-        mask: "all", "alpha", the path of a PNG, or None: "alpha" if the layer of light has an alpha channel, otherwise
-            "all".
-        size: Height and width in texels if the set states them, else None.
-        mesh: Path of the mesh that the atlas belongs to (it does not have to exist), or None.
+    `mask` is "all", "alpha", the path of a PNG, or None: "alpha" if the layer of light has an alpha channel, otherwise
+    "all". `size` is height and width in texels if the set states them, else None. `mesh` is the path of the mesh that
+    the atlas belongs to (it does not have to exist), or None.
     """
 
     name: str

@@ -15,13 +15,10 @@ from wlm.lightmap.sheet import Sheet
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """A tile that was loaded, or the reason why it was not.
+    """A tile that was loaded, by sheet and number, or the line of the error of a damaged file.
 
-    Attributes:
-        sheet, number: The sheet and the number of the tile in its grid.
-        tile: The sheet with this tile alone: its arrays have one row, as they are uploaded. None after an error.
-        error: The error of a damaged file in one line; None of a tile.
-        prepared: The result of the loader's `prepare`; None without it.
+    `tile` is the sheet with this tile alone: its arrays have one row, as they are uploaded. `prepared` is the result of
+    the loader's `prepare`, None without it.
     """
 
     sheet: Sheet
@@ -44,13 +41,11 @@ class TileLoader:
     def __init__(
         self, model: LightmapModel, most: int = 64, prepare: Callable[[Sheet, int, SheetModel], Any] | None = None
     ) -> None:
-        """Starts the thread.
+        """Starts the thread for a model, usually from `wlm.load`.
 
-        Args:
-            model: The model, usually from `wlm.load`.
-            most: Largest number of waiting requests, and of results that nobody has taken; at least 1.
-            prepare: Called in the thread with the sheet, the number and the content of each tile, for work that no
-                frame should wait for.
+        `most`, at least 1, is the largest number of waiting requests, and of results that nobody has taken. `prepare`
+        is called in the thread with the sheet, the number and the content of each tile, for work that no frame should
+        wait for.
         """
         if most < 1:
             raise WlmError(f"most: expected at least 1, got {most}")

@@ -111,13 +111,10 @@ class Profile(Settings):
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """Converts times to positions on the time axis of the feature maps; see `Profile.time_axis`.
+    """Converts times, float64 [T], increasing, to positions on the time axis of the feature maps.
 
-    Attributes:
-        times: float64 [T], increasing.
-        period: Length of the day in the unit of the times; None if the set is not periodic.
-        kind: "paper" or "frames", see `Profile.time_axis`.
-        interpolation: "radiance" or "network", see `Profile.interpolation`.
+    `period` is the length of the day, None if the set is not periodic; for `kind` see `Profile.time_axis`, for
+    `interpolation` the setting of this name.
     """
 
     times: np.ndarray

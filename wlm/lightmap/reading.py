@@ -33,13 +33,9 @@ def size_text(shape: Sequence[int]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """The pictures of a layer of an atlas at T times, in the order of the times.
-
-    Attributes:
-        frames: `[T, H, W, 3]` float32 by sheet, levels.
-        alpha: `[T, H, W]` bool, where alpha is above 0; None if the mask is not from alpha.
-        present: `[T]` bool, the times that have a picture.
-        warnings: Lines about the pictures.
+    """The pictures of a layer of an atlas at T times: `frames`, float32 [T, H, W, 3] by sheet, are levels; `alpha`,
+    bool [T, H, W], is true where alpha is above 0, and None if the mask is not from alpha; `present`, bool [T], marks
+    the times that have a picture; `warnings` are lines about the pictures.
     """
 
     frames: dict[Sheet, np.ndarray]
@@ -49,11 +45,8 @@ class Stack:
 
 
 class Bounds:
-    """Limits of all groups of a set together, unless it is trusted (`wlm.formats.limits`).
-
-    Attributes:
-        made: Bytes of the sheets that memory was allocated for.
-    """
+    """Limits of all groups of a set together, unless it is trusted (`wlm.formats.limits`); `made` counts the bytes of
+    the sheets that memory was allocated for."""
 
     def __init__(self, where: str, listings: Sequence[Listing], trust: bool) -> None:
         """Takes the groups' listings; `where` names the set in messages."""

@@ -35,10 +35,8 @@ from wlm_kernels.lightmap import matrix_decode, output, texture
 class RuntimeDecoder:
     """Base class: decodes all tiles of one kind on a device at a time that `set_time` chooses.
 
-    Attributes:
-        numbers: int [n], numbers of the tiles in the grid, in the order of `out`.
-        out: `wp.array` uint32 [n, 128, 128], written by `decode`: 8-bit RGBA with R in the lowest byte and alpha 255;
-            or RGB9E5.
+    `decode` writes `out`, `wp.array` uint32 [n, 128, 128], in the order of the tiles' `numbers`: 8-bit RGBA with R in
+    the lowest byte and alpha 255; or RGB9E5.
     """
 
     _tiles: MapTiles | FrameTiles
@@ -129,20 +127,14 @@ class _OneTimeDecoder(_MapDecoder):
 
 
 class StripDecoder(_OneTimeDecoder):
-    """Fast decoder of dynamic tiles: one thread decodes four texels (neural-dynamic-gi, section 3.5).
-
-    Attributes:
-        gelu: The GELU variant in use.
-    """
+    """Fast decoder of dynamic tiles, with one of the variants of GELU: one thread decodes four texels
+    (neural-dynamic-gi, section 3.5)."""
 
     def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None, shared: bool = False) -> None:
         """Uploads the dynamic tiles of a sheet and allocates all buffers; the time is initially the first stored one.
 
-        Args:
-            model: The sheet.
-            device: "cpu", "cuda" or "cuda:N".
-            gelu: GELU variant to use instead of the model's, see `wlm_kernels.mlp`; None: the model's.
-            shared: Whether texels are linear radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
+        `gelu` is a variant to use instead of the model's, see `wlm_kernels.mlp`; with `shared`, texels are linear
+        radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
         """
         super().__init__(model, device, gelu, TileKind.DYNAMIC, shared)
         n, resolution = len(self.numbers), model.profile.uvt_resolution
@@ -253,11 +245,8 @@ class MapDecoder:
     ) -> None:
         """Uploads a map and allocates all buffers; the time is initially the first stored one.
 
-        Args:
-            model: The sheet; or the sheet of each light group, as `LightmapModel.maps` returns them, which share size
-                and mask.
-            device: "cpu", "cuda" or "cuda:N".
-            mips: Number of mips besides the map itself; None: down to one texel.
+        `model` is the sheet, or the sheet of each light group, as `LightmapModel.maps` returns them, which share size
+        and mask. `mips` counts the mips besides the map itself; None: down to one texel.
         """
         self.device = device_of(device)
         self.groups = {BASE: model} if isinstance(model, SheetModel) else dict(model)

@@ -24,11 +24,8 @@ _FEW = 4  # tiles that are unpacked without threads, whose start takes as long
 class PackedMask:
     """The mask of an atlas, which is unpacked at its first use: at 4096 x 4096 texels that takes as long as some tiles.
 
-    Attributes:
-        where: The file and the sheet, for messages.
-        shape: Height and width in texels.
-        frame: A zstd frame of a bit for each texel, row-major, the first in the highest bit of the first byte; None:
-            all are valid.
+    `frame` is a zstd frame of a bit for each texel, row-major, the first in the highest bit of the first byte; None:
+    all are valid. `where` names the file and the sheet in messages.
     """
 
     where: str
@@ -63,14 +60,8 @@ class PackedMask:
 
 @dataclass(frozen=True, eq=False)
 class StoredTiles:
-    """The packed tiles of a sheet in a file, or of a model that is about to be saved.
-
-    Attributes:
-        where: The file and the sheet, for messages.
-        numbers: int [n], numbers of the packed tiles, rising.
-        pieces: A zstd frame for each of them.
-        mask: The mask of the sheet.
-    """
+    """The packed tiles of a sheet in a file, or of a model that is about to be saved: a zstd frame for each, by rising
+    number, int [n], and the sheet's mask. `where` names the file and the sheet in messages."""
 
     where: str
     numbers: np.ndarray

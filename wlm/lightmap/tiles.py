@@ -32,14 +32,8 @@ _HALF_MANTISSA_BITS = 10
 
 @dataclass(frozen=True)
 class TileGrid:
-    """The grid of 128 x 128 tiles that covers a map, numbered row by row; tiles may reach past the map's edges.
-
-    Attributes:
-        height: Height of the map in texels.
-        width: Width of the map in texels.
-        rows: Number of tiles from top to bottom.
-        cols: Number of tiles from left to right.
-    """
+    """The grid of 128 x 128 tiles that covers a map of `height` x `width` texels, numbered row by row; tiles may reach
+    past the map's edges."""
 
     height: int
     width: int
@@ -82,14 +76,11 @@ class TileGrid:
 
 @dataclass(frozen=True, eq=False)
 class TileData:
-    """N tiles as gamma-space colours, padded to 128 x 128 texels.
+    """N tiles as gamma-space colours, padded to 128 x 128 texels, with their numbers in the grid, int64 [N], row-major.
 
-    Attributes:
-        index: `[N]` int64, number of each tile in its grid, row-major.
-        colour: `[N, T, 128, 128, 3]` float32, `irradiance ** (1 / gamma)`. Texels outside the mask repeat the
-            nearest valid one of the tile; past the map's end its last row and column repeat. All zero in an empty
-            tile.
-        mask: `[N, 128, 128]` bool, true where a texel is valid; false past the map's end.
+    `colour`, float32 [N, T, 128, 128, 3], is `irradiance ** (1 / gamma)`: texels outside the mask repeat the nearest
+    valid one of the tile; past the map's end its last row and column repeat; all is 0 in an empty tile. `mask`, bool
+    [N, 128, 128], is true where a texel is valid; false past the map's end.
     """
 
     index: np.ndarray
@@ -99,12 +90,8 @@ class TileData:
 
 @dataclass(frozen=True, eq=False)
 class TileCut:
-    """N tiles as array views into their lightmaps, without a copy.
-
-    Attributes:
-        index: `[N]` int64, number of each tile in its grid, row-major.
-        light: For each tile `[T, h, w, 3]` float32, irradiance at T times; h and w are 128, or less at the map's end.
-        mask: For each tile `[h, w]` bool, true where a texel is valid.
+    """N tiles as array views into their lightmaps, without a copy: numbers int64 [N] in the grid, and for each tile the
+    irradiance at T times, float32 [T, h, w, 3], and the mask, bool [h, w]; h and w are 128, or less at the map's end.
     """
 
     index: np.ndarray

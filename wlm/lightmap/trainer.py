@@ -118,14 +118,9 @@ class Targets:
 
 @dataclass(frozen=True, eq=False)
 class TileJob:
-    """A batch of N tiles of one kind, sent to a worker, which computes the training data from it.
-
-    Attributes:
-        tiles: Light and masks of the tiles.
-        dynamic: Whether the tiles are dynamic instead of static.
-        scale, affine: See `Targets`.
-        profile: The settings.
-        axis: The time axis.
+    """A batch of N tiles of one kind, sent to a worker, which computes the training data from it: light and masks of
+    the tiles, whether they are dynamic instead of static, `scale` and `affine` (see `Targets`), the settings and the
+    time axis.
     """
 
     tiles: TileCut

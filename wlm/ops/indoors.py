@@ -38,12 +38,8 @@ _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 
 @dataclass(frozen=True, eq=False)
 class Indoors:
-    """Valid eye positions inside a scene.
-
-    Attributes:
-        eye: float64 [P, 3], eye positions in random order; empty if there is none.
-        height: Height of the eyes above the floor, in the scene's unit.
-    """
+    """Valid eye positions inside a scene, float64 [P, 3], in random order, maybe none, and their height above the
+    floor, in the scene's unit."""
 
     eye: np.ndarray
     height: float

@@ -70,12 +70,8 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A camera inside the scene with a field of view of 90 degrees in both directions.
-
-    Attributes:
-        eye: float64 [3], the camera's position in the mesh's space and unit.
-        forward: float64 [3], the viewing direction; not straight up or down.
-    """
+    """A camera inside the scene with a field of view of 90 degrees in both directions: its position, float64 [3], in
+    the mesh's space and unit, and its direction, float64 [3], not straight up or down."""
 
     eye: np.ndarray
     forward: np.ndarray

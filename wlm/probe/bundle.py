@@ -18,8 +18,9 @@ _ABOUT = {
     "hours": "If there are `times`, hours of the day, the light is that of the first of them. The buffer hours has "
     "`hour.words` words for each of them, half floats, two in a word. For the light at another time, mix those of the "
     "times before and after it linearly (the first time follows the last one), and write them into the buffer "
-    "`hour.buffer` from `hour.first_word` on. The numbers `mixed` of the reference are the light half-way between the "
-    "first two times.",
+    "`hour.buffer` from `hour.first_word` on. If magnitude is true, the bias b of the last output is rounded to a half "
+    "h: multiply gain, word 7 of gaussians, by exp(b - h), or light flickers by a hundredth as time passes. `mixed` of "
+    "the reference is the light half-way between the first two times.",
     "positions": "If the buffer positions exists: 3 unsigned 16-bit codes per probe, position = origin + extent * size "
     "* code / 65535.",
 }

@@ -131,7 +131,7 @@ def decode(artifact: Artifact) -> ProbeModel:
     times, scales = stored.get("times", np.zeros(0)), stored.get("scales", np.ones(1))
     if not ((np.diff(times) > 0).all() and (times < DAY).all()):
         raise ValueError("part times: expected increasing hours of the day, from 0 to less than 24")
-    content = _METHODS[profile.method].from_parts(profile, header.hours * outputs, header.hours, stored, header.dropped)
+    content = _METHODS[profile.method].from_parts(profile, outputs, header.hours, stored, header.dropped)
     known = {"times": times, "scales": scales}
     place = {"origin": origin, "extent": extent, "size": size, "positions": positions}
     return ProbeModel(
@@ -150,11 +150,10 @@ def _table(header: _Header) -> dict[str, Part]:
     if header.hours > 1:
         table["times"] = Part(np.float64, (header.hours,), least=0.0)
         table["scales"] = Part(np.float64, (header.hours,), least=0.0, most=1.0)
-    numbers = header.hours * header.outputs
-    if numbers > NUMBERS:
+    if (numbers := header.hours * header.outputs) > NUMBERS:
         raise ValueError(f"setting hours: expected at most {NUMBERS} numbers of a probe at all hours, found {numbers}")
     content = _METHODS[header.profile.method]
-    return table | content.table(header.profile, numbers, header.count, live, header.clusters)
+    return table | content.table(header.profile, header.outputs, header.hours, header.count, live, header.clusters)
 
 
 def _planes(part: np.ndarray) -> bytes:

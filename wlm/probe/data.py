@@ -26,6 +26,7 @@ from wlm.formats.npz import read_npz
 from wlm.formats.scratch import room
 from wlm.formats.unity_asset import read_lighting_data
 from wlm.probe.ambient_cube import READING, read_irradiance_volume
+from wlm.probe.axes import read_axes, turned
 from wlm.probe.conventions import (
     CANONICAL,
     CONVENTIONS,
@@ -130,6 +131,7 @@ def load(
     key: str | Sequence[str] | None = None,
     convention: str | None = None,
     order: str | None = None,
+    axes: str | None = None,
 ) -> ProbeSet:
     """Reads light probes from a file.
 
@@ -152,6 +154,8 @@ def load(
         order: Order of the numbers of spherical harmonics: "coefficient" (r0 g0 b0 r1 ...) or "channel" (r0 r1 ... g0
             ...). None takes the order that the shape shows, (N, C, 3) or (N, 3, C), or for (N, D) the one that fits
             light better, with a warning if that is "channel".
+        axes: Old axes that become the new x, y and z of positions, normals and light, for example "x,z,-y" or, to
+            mirror x, "-x,y,z"; None: no change.
 
     Returns:
         The set, with its faults repaired where that is possible; see `ProbeSet.warnings`.
@@ -163,7 +167,16 @@ def load(
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise WlmError(f"{path}: expected a name that ends in {' or '.join(_READERS)}, found {path.suffix or 'none'}")
-    return _check(str(path), path.stem, reader(path, key), convention, order)
+    probes, matrix = _check(str(path), path.stem, reader(path, key), convention, order), read_axes(axes)
+    if axes is None:
+        return probes
+    hours = [probes.values[:, i : i + probes.outputs] for i in range(0, probes.values.shape[1], probes.outputs)]
+    values = np.concatenate([turned(hour, matrix) for hour in hours], 1)
+    position = probes.position @ matrix.T
+    normal = None if probes.normal is None else probes.normal @ matrix.T
+    source = _hash(position, values, probes.live, probes.times)
+    reading = f"{probes.reading}; then x, y, z from {axes}"
+    return replace(probes, position=position, values=values, normal=normal, source=source, reading=reading)
 
 
 def load_positions(path: str | os.PathLike[str]) -> np.ndarray:

@@ -53,7 +53,7 @@ class Decoder(ABC):
     def _contents(self) -> list[Any]:
         """Returns the model's content at each hour, as contents of one hour."""
         content, scales = self.model.content, self.model.scales
-        return [content.at(row) for row in np.diag(scales)] if len(self.model.times) else [content]
+        return [content.at(row, scales) for row in np.eye(len(scales))] if len(self.model.times) else [content]
 
     def _keep_hours(self, numbers: np.ndarray, mixed: wp.array) -> None:
         """Uploads the numbers at each hour, [T, P], that `set_time` mixes into a device array of P numbers."""
@@ -74,6 +74,15 @@ class Decoder(ABC):
         if self._hours is not None:
             hours, mixed = self._hours
             mix_hours(hours, *neighbours(self.model.times, DAY, time), mixed)
+
+    def decode_hours(self, position: np.ndarray) -> np.ndarray:
+        """Returns the light at points at all of T hours, float32 [M, T D], and sets the time to the first hour;
+        arguments and errors are those of `decode`."""
+        light = []
+        for time in (*self.model.times[1:], *self.model.times[:1]) or (0.0,):
+            self.set_time(time)
+            light.append(self.decode(position))
+        return np.concatenate(light[-1:] + light[:-1], 1)
 
     @abstractmethod
     def decode(self, position: np.ndarray) -> np.ndarray:

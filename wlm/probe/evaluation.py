@@ -32,16 +32,8 @@ OFF = 0.5
 MANY_OFF = 0.01
 """Share of the live probes that may be off without a warning."""
 
-_OF_HOUR = (
-    "psnr",
-    "psnr_live",
-    "irradiance_psnr",
-    "relative_error",
-    "relative_median",
-    "relative_p95",
-    "off",
-    "between_psnr",
-)
+_RELATIVE = ("relative_error", "relative_median", "relative_p95", "off")
+_OF_HOUR = ("psnr", "psnr_live", "irradiance_psnr", "between_psnr", *_RELATIVE)
 _NEAREST = 8  # probes that are weighted by the inverse square of their distance
 _ROWS = 32768  # probes per piece, so that float64 copies stay at some tens of MB
 
@@ -73,8 +65,8 @@ class Report(BaseReport):
         worst_probe: The live probe with the largest relative error: `probe` (index), `error`, `position`, and the norms
             of its numbers, `light`, and of the decoded ones, `decoded`; None if all are exact.
         psnr_by_band: PSNR of each band of spherical harmonics, over all probes and colours.
-        irradiance_psnr: PSNR of the irradiance, clamped at 0, on `NORMALS` fixed normals of every live probe in RGB;
-            its peak is the range of the input's irradiance.
+        irradiance_psnr: PSNR of the irradiance, at least 0, on `NORMALS` fixed normals of every live probe in RGB; its
+            peak is the range of the input's irradiance.
         warnings: A sentence that names the worst probe, if more than a share `MANY_OFF` of the live probes is off.
         between_psnr: PSNR between the probes, see the function `between_psnr`; None if it was not computed.
     """
@@ -151,9 +143,7 @@ def evaluate(
         worst,
         gpu_bytes=model.content.nbytes,
         ratio=worst.ratio / len(times),
-        warnings=[
-            at_hour(time) + text for time, report in zip(times, reports, strict=True) for text in report.warnings
-        ],
+        warnings=[at_hour(time) + text for time, each in zip(times, reports, strict=True) for text in each.warnings],
         hours=hours if len(times) > 1 else [],
     )
 
@@ -250,7 +240,7 @@ def relative_figures(decoded: np.ndarray, probes: ProbeSet) -> dict[str, Any]:
     `score`."""
     index = np.flatnonzero(probes.live)
     if not len(index):
-        none = dict.fromkeys(("relative_error", "relative_median", "relative_p95", "off"), math.nan)
+        none = dict.fromkeys(_RELATIVE, math.nan)
         return none | {"worst_probe": None, "warnings": []}
     decoded, values = decoded[index], probes.values[index]
     error = relative_errors(decoded, values)

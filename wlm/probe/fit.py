@@ -101,44 +101,16 @@ def compress(
     device = interop.check_device(device)
     if not probes.live.any():
         raise WlmError(f"{probes.name}: every probe is dark: there is nothing to fit")
-    rest = device, progress, checkpoint, positions
-    if not len(probes.times):
-        return _with_warnings(_compress(probes, profile, seed, *rest), probes, device)
-    hours, outputs = len(probes.times), probes.outputs
-    by_hour = np.split(probes.values, hours, axis=1)
-    scales = np.sqrt([np.einsum("nd,nd->", light, light, dtype=np.float64) for light in by_hour])
-    scales /= scales.max()
-    even = [light / np.float32(scale or 1.0) for light, scale in zip(by_hour, scales, strict=True)]
-    joint = replace(probes, values=np.concatenate(even, 1), times=np.zeros(0))
-    longer = profile.model_copy(update={"latent": min(_MOST_LATENT, round(profile.latent * _longer(hours)))})
-    model = _compress(joint, longer, seed, *rest)
-    content: Any = model.content
-    content = replace(content, outputs=outputs, hours=hours)
-    model = replace(model, outputs=outputs, content=content, times=probes.times, scales=scales)
-    return _with_warnings(model, probes, device)
-
-
-def _with_warnings(model: ProbeModel, probes: ProbeSet, device: str) -> ProbeModel:
-    decoder = model.decoder(device, position=probes.position)
-    lines: list[str] = []
-    for time in model.times.tolist() or [None]:
-        if time is not None:
-            decoder.set_time(time)
-        found = relative_figures(decoder.decode_probes(), probes.at(time))["warnings"]
-        lines += [at_hour(time) + line for line in found]
-    return replace(model, warnings=tuple(lines))
-
-
-def _compress(
-    probes: ProbeSet,
-    profile: Profile,
-    seed: int,
-    device: str,
-    progress: OnProgress | None,
-    checkpoint: Checkpoint | None,
-    positions: bool,
-) -> ProbeModel:
-    """Compresses a set of one hour."""
+    hours = max(len(probes.times), 1)
+    values, scales = probes.values, np.ones(hours)
+    if hours > 1:
+        by_hour = np.split(values, hours, axis=1)
+        scales = np.sqrt([np.einsum("nd,nd->", light, light, dtype=np.float64) for light in by_hour])
+        scales /= scales.max()
+        even = [light / np.float32(scale or 1.0) for light, scale in zip(by_hour, scales, strict=True)]
+        values = np.concatenate(even, 1)
+        longer = min(_MOST_LATENT, round(profile.latent * (1.0 + 0.5 * math.log2(hours))))
+        profile = profile.model_copy(update={"latent": longer})
     box = box_of(probes.position)
     stored = np.zeros((0, 3), np.uint16)
     if positions:
@@ -153,46 +125,55 @@ def _compress(
         outputs=probes.outputs,
         dead=np.zeros(0, bool) if probes.live.all() else ~probes.live,
         positions=stored,
+        times=probes.times,
+        scales=scales,
         **box,
     )
-    values = probes.values[probes.live]
+    even = replace(probes, values=values)
+    values = values[probes.live]
     pca, relative = Profile(name=profile.name, method="pca"), profile.error == "relative"
     if profile.method == "pca":
-        content = fit_components(values, relative=relative)[0]
-        return make(profile=pca, content=content, choice="PCA, as the profile asks")
+        content = fit_components(values, None, hours, relative=relative)[0]
+        model = make(profile=pca, content=content, choice="PCA, as the profile asks")
+        return _measured(model, probes, device)[0]
     if profile.method == "auto":
         count = gaussian_count(profile.ratio, len(values))
-        budget = gaussian_bytes(count, profile.latent, profile.hidden, profile.columns(probes.outputs))
-        components, error = fit_components(values, budget, relative=relative)
+        budget = gaussian_bytes(count, profile.latent, profile.hidden, profile.columns(probes.outputs), hours)
+        components, error = fit_components(values, budget, hours, relative=relative)
         if error <= ENOUGH and components.nbytes <= budget:
             took = (
                 f"{components.count} components reach {error:.1%} of each probe's light in {components.nbytes:,} bytes"
             )
-            return make(profile=pca, content=components, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
-    check_outputs(probes.name, profile.latent, profile.hidden, probes.outputs, relative, device)
-    gaussians = _fit_gaussians(make, probes, profile, seed, device, progress, checkpoint)
+            choice = f"PCA: {took} of GPU memory, Gaussians take {budget:,}"
+            return _measured(make(profile=pca, content=components, choice=choice), probes, device)[0]
+    check_outputs(probes.name, profile.latent, profile.hidden, hours * probes.outputs, hours * relative, device)
+    # Magnitudes follow each probe at each hour by themselves, and half floats would round a scale's logarithm.
+    of_fit = (partial(make, scales=np.ones(hours)), probes) if relative else (make, even)
+    gaussians = _fit_gaussians(*of_fit, profile, seed, device, progress, checkpoint)
+    gaussians, error = _measured(gaussians, probes, device)
     if profile.method == "gaussians":
         return gaussians
-
-    def error_of(model: ProbeModel) -> float:
-        decoded = model.decoder(device, position=probes.position).decode_probes()
-        return relative_figures(decoded, probes)["relative_error"]
-
-    error, most = error_of(gaussians), gaussians.content.nbytes
+    most = gaussians.content.nbytes
     told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
-    components, _ = fit_components(values, most, relative=relative)
+    components, _ = fit_components(values, most, hours, relative=relative)
     if components.nbytes > most:
         return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
-    rival = make(profile=pca, content=components)
-    possible = error_of(rival)
+    rival, possible = _measured(make(profile=pca, content=components), probes, device)
     if possible < error:
         return replace(rival, choice=f"PCA: {components.count} components reach {possible:.1%}, {told}")
     return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1%}")
 
 
-def _longer(hours: int) -> float:
-    """Returns how much longer the latents of a fit of several hours are than those of one hour."""
-    return 1.0 + 0.5 * math.log2(hours)
+def _measured(model: ProbeModel, probes: ProbeSet, device: str) -> tuple[ProbeModel, float]:
+    """Returns the model with its warnings, and its relative error, the root mean square over all hours."""
+    decoder = model.decoder(device, position=probes.position)
+    warnings, squares = [], []
+    for time in probes.times.tolist() or [None]:
+        decoder.set_time(time or 0.0)
+        figures = relative_figures(decoder.decode_probes(), probes.at(time))
+        warnings += [at_hour(time) + line for line in figures["warnings"]]
+        squares.append(figures["relative_error"] ** 2)
+    return replace(model, warnings=tuple(warnings)), math.sqrt(np.nanmean(squares))
 
 
 def _fit_gaussians(
@@ -208,7 +189,7 @@ def _fit_gaussians(
     box = box_of(probes.position)
     position, values = probes.position[probes.live], probes.values[probes.live]
     x = ((position - box["origin"]) / box["extent"]).astype(np.float32)
-    trainer = Trainer(x, values, profile, seed, device)
+    trainer = Trainer(x, values, profile, seed, device, max(len(probes.times), 1))
     try:
         if checkpoint is not None:
             checkpoint.restore(0, trainer.load)

@@ -7,7 +7,7 @@ _BUFFER = """\
 #ifndef WLM_{PART}_{NAME}_BINDING
 #define WLM_{PART}_{NAME}_BINDING {number}
 #endif
-layout(std430, binding = WLM_{PART}_{NAME}_BINDING) readonly buffer Wlm{Part}{Name}
+layout(std430, binding = WLM_{PART}_{NAME}_BINDING) {access}buffer Wlm{Part}{Name}
 {{
     {kind} wlm_{part}_{name}[];
 }};
@@ -26,17 +26,19 @@ void {name}({arguments}, out vec3 sh[{coefficients}])
 """
 
 
-def buffer_glsl(part: str, name: str, number: int, kind: str = "uint") -> str:
+def buffer_glsl(part: str, name: str, number: int, kind: str = "uint", written: bool = False) -> str:
     """Returns the GLSL of a storage buffer and of the macro `WLM_PART_NAME(i)`, which reads entry i of the buffer.
 
     Args:
         part, name: Words for PART and NAME in the macro's name, in upper or lower case.
         number: Default binding of the buffer.
         kind: GLSL type of an entry.
+        written: Whether shaders write the buffer, too.
     """
     part, name = part.lower(), name.lower()
     words = {"part": part, "name": name, "Part": part.title(), "Name": name.title()}
-    return _BUFFER.format(number=number, kind=kind, PART=part.upper(), NAME=name.upper(), **words)
+    access = "" if written else "readonly "
+    return _BUFFER.format(number=number, kind=kind, access=access, PART=part.upper(), NAME=name.upper(), **words)
 
 
 def clamp_glsl(outputs: int) -> str:

@@ -61,9 +61,10 @@ class Profile(Settings):
     gain: float = Field(3.0, gt=0.0, le=10.0)
     """Magnitude of the hidden layers' initial weights; 1: uniform random numbers of variance 1 / (3 * inputs)."""
 
-    def columns(self, outputs: int) -> int:
-        """Returns the number of outputs of the network for D numbers per probe: one more if the error is relative."""
-        return outputs + (self.error == "relative")
+    def columns(self, outputs: int, hours: int = 1) -> int:
+        """Returns the number of outputs of the network for D numbers per probe at each hour: one more each if the error
+        is relative."""
+        return hours * (outputs + (self.error == "relative"))
 
 
 class Content(ABC):
@@ -90,8 +91,9 @@ class Content(ABC):
         """The bytes of the content's GPU buffers, as `wlm.probe.bundle` makes them."""
 
     @abstractmethod
-    def at(self, factors: np.ndarray) -> Self:
-        """Returns the content of one hour whose light is the sum of that of T hours times factors, float64 [T]."""
+    def at(self, factors: np.ndarray, scales: np.ndarray) -> Self:
+        """Returns the content of one hour that is the mix of T hours, with factors, float64 [T], which add up to 1, and
+        `scales` of their light, float64 [T]. The logarithms of magnitudes are mixed, where there are such."""
 
     @abstractmethod
     def facts(self) -> dict[str, Any]:
@@ -111,9 +113,9 @@ class Content(ABC):
 
     @classmethod
     @abstractmethod
-    def table(cls, profile: Profile, outputs: int, count: int, live: int, clusters: int) -> dict[str, Part]:
+    def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int, clusters: int) -> dict[str, Part]:
         """Returns the types and shapes of these arrays, by name, for `count` Gaussians, or components of each of
-        `clusters`; `live` probes; and `outputs` numbers of a probe at all hours.
+        `clusters`; `live` probes; and `outputs` numbers of a probe at each hour.
 
         Raises:
             ValueError: There are more components than numbers of a probe.
@@ -152,7 +154,7 @@ class ProbeModel(Model):
         warnings: Sentences about light that the fit lost, as in `wlm.probe.Report`. Files do not store them.
         times: float64 [T], increasing hours of the day in [0, 24), if there are several; else empty.
         scales: float64 [T], factor of the light of each hour of `content`, by which the fit divided it, so that the
-            precision of an hour follows its own light.
+            precision of an hour follows its own light; 1 where `content` has magnitudes for each hour.
     """
 
     SYSTEM: ClassVar[str] = "probe"
@@ -200,7 +202,7 @@ class ProbeModel(Model):
         factors = hour_factors(self.name, self.times, time)
         if factors is None:
             return self
-        return replace(self, content=self.content.at(factors * self.scales), times=np.zeros(0), scales=np.ones(1))
+        return replace(self, content=self.content.at(factors, self.scales), times=np.zeros(0), scales=np.ones(1))
 
     def decoder(self, device: str = "cpu", **options: Any) -> Any:
         """Loads the model onto a device and returns its decoder.

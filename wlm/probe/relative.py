@@ -17,25 +17,29 @@ _LEAST = 1e-6  # of the brightest probe: darker probes count as this bright in t
 
 
 def norms(values: np.ndarray) -> np.ndarray:
-    """Returns the norms of rows [N, D] of float32 numbers, float64 [N]."""
-    return np.sqrt(np.einsum("nd,nd->n", values, values, dtype=np.float64))
+    """Returns the norms of rows [..., D] of float32 numbers, float64 [...]."""
+    return np.sqrt(np.einsum("...d,...d->...", values, values, dtype=np.float64))
 
 
-def magnitudes(values: np.ndarray) -> np.ndarray:
-    """Returns m, by which errors of live probes [V, D] are divided, float64 [V]; positive if any number is not 0."""
-    norm = norms(values)
-    least = _LEAST * norm.max(initial=0.0)
-    floor = FLOOR * np.exp(np.log(np.maximum(norm, least)).mean()) if least > 0 else 0.0
+def magnitudes(values: np.ndarray, hours: int = 1) -> np.ndarray:
+    """Returns m, by which errors of live probes [V, T D] at T hours are divided, float64 [V, T]; each hour has its own
+    floor. It is positive if any number is not 0."""
+    norm = norms(values.reshape(len(values), hours, -1))
+    brightest = norm.max(0, initial=0.0)
+    lit = brightest > 0
+    floor = np.full(hours, norm.max(initial=0.0))  # of an hour without light
+    floor[lit] = FLOOR * np.exp(np.log(np.maximum(norm[:, lit], _LEAST * brightest[lit])).mean(0))
     return np.hypot(norm, floor)
 
 
 def relative_errors(decoded: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Returns the relative errors |decoded - L| / m of live probes [V, D], float64 [V]."""
-    return norms(decoded.astype(np.float64) - values) / magnitudes(values)
+    return norms(decoded.astype(np.float64) - values) / magnitudes(values)[:, 0]
 
 
-def with_magnitude(values: np.ndarray) -> np.ndarray:
-    """Returns numbers whose squared error is about the squared relative error, float64 [V, D + 1]: the numbers of live
-    probes [V, D] divided by m, then the logarithm of m, less that of the brightest probe."""
-    m = magnitudes(values)
-    return np.concatenate([values / m[:, None], np.log(m / m.max())[:, None]], 1)
+def with_magnitude(values: np.ndarray, hours: int = 1) -> np.ndarray:
+    """Returns numbers whose squared error is about the squared relative error, float64 [V, T (D + 1)]: for each of T
+    hours the numbers of live probes [V, T D] divided by m, then the logarithm of m, less that of the brightest."""
+    m = magnitudes(values, hours)
+    light = values.reshape(len(values), hours, -1) / m[..., None]
+    return np.concatenate([light, np.log(m / m.max())[..., None]], 2).reshape(len(values), -1)

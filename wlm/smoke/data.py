@@ -52,16 +52,12 @@ _DEPTH = "depth"
 
 @dataclass(frozen=True)
 class Frames:
-    """Smoke over time, with one volume in memory at a time: a single file, or a folder of frames.
+    """Smoke over time, with one volume in memory at a time: a single file, or a folder of frames, by number in rising
+    order.
 
-    Attributes:
-        path: The file or the folder.
-        scene: Scene of a folder that `simulate` wrote; None: a single volume, or another program's frames.
-        files: Existing files by number, in rising order; a single volume has number 1.
-        device: Device of the volumes.
-        extinction, emission: Replace the scene's extinction and emission; None: the scene's, or 1 without a scene.
-        options: Options of `load` for the files of other programs: `trust`, `up`, `density`, `temperature`.
-        warnings: Assumptions about the files of other programs, one line each.
+    `scene` is that of a folder that `simulate` wrote; None: a single volume, number 1, or another program's frames.
+    `extinction` and `emission` replace the scene's; None: the scene's, or 1 without a scene. `options` are those of
+    `load` for the files of other programs, and `warnings` the assumptions about these, one line each.
     """
 
     path: Path
@@ -292,12 +288,8 @@ class NumberedFiles:
     """A folder of results with one file per frame, which replace the files of an earlier run.
 
     The files of the earlier run are removed when the first new file is about to be written, so that a run that fails
-    before keeps them. Until a resumable run is finished, `STEM.partial` stores its settings.
-
-    Attributes:
-        folder: The folder.
-        partial: File with the settings of an unfinished run.
-        done: Numbers of the frames whose results exist already, if a run is resumed.
+    before keeps them. Until a resumable run is finished, `STEM.partial` stores its settings. `done` are the numbers of
+    the frames whose results exist already, if a run is resumed.
     """
 
     def __init__(
@@ -309,14 +301,11 @@ class NumberedFiles:
         run: Mapping[str, Any] | None = None,
         resume: bool = False,
     ) -> None:
-        """Checks that the folder can be made, or that an existing one contains only files of an earlier run.
+        """Checks that the folder, whose parent must exist, can be made, or that an existing one contains only files of
+        an earlier run. It is made for the first file; `stem` and `suffix` are as for `numbered`.
 
-        Args:
-            folder: The folder, whose parent must exist; it is made for the first file.
-            stem, suffix: Stem and suffix of the files, as for `numbered`.
-            others: Names of further files that a run may write into the folder.
-            run: Settings on which the results depend, as JSON values; None: the run cannot be resumed.
-            resume: Whether to keep the files of an interrupted run.
+        A run may also write `others` into the folder. `run` are settings on which the results depend, as JSON values;
+        None: the run cannot be resumed. `resume` keeps the files of an interrupted run.
         """
         self.folder, self._stem, self._suffix, self._others = Path(folder), stem, suffix, others
         self._cleared = False

@@ -188,13 +188,7 @@ def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgre
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Scores of several methods on one test set.
-
-    Attributes:
-        name: Name of the test set.
-        samples: Number of samples, each a pair of frames in one view.
-        methods: Scores by name of the method.
-    """
+    """Scores of several methods, by name, on one test set of a number of samples, each a pair of frames in one view."""
 
     name: str
     samples: int

@@ -44,13 +44,9 @@ _SCORES = ("psnr", "lowest", "highest", "flicker", "reference_flicker")  # colum
 class Training:
     """Result of a training.
 
-    Attributes:
-        finished: Whether all rounds are done; otherwise the time ran out and the training can be resumed.
-        best: Validation PSNR of the saved network in dB; NaN if none has been validated.
-        score: Scores of the last validation; None if there was none.
-        steps, skipped: Number of steps; number of these without an update because the gradient was not finite.
-        seconds: Total time in seconds, earlier runs included.
-        model: The saved network, read from its file; None if there is none yet.
+    Unless it is `finished`, the time ran out and it can be resumed. `best` is the validation PSNR of the saved network,
+    `model`, in dB; NaN and None without any yet. `score` has the scores of the last validation, None if there was none.
+    `skipped` of the steps had no update because the gradient was not finite; `seconds` include earlier runs.
     """
 
     finished: bool

@@ -21,14 +21,11 @@ _LEAST_SHIFT = 1e-3  # of the image, between the centres of light of opposite li
 
 @dataclass(frozen=True)
 class StepError:
-    """Difference between the lightmaps of two marches, of which the finer has half the step.
+    """Difference between the lightmaps of two marches, of which the finer has half the step: the largest difference of
+    a pixel in any lightmap, and in its transparency; and the root mean square of the differences divided by that of the
+    lightmaps, 0 if these are black.
 
     The error falls with the square of the step, so that the error of the finer one is about a third of the difference.
-
-    Attributes:
-        largest: Largest difference of a pixel in any lightmap.
-        rms: Root mean square of the differences, divided by that of the lightmaps; 0 if the lightmaps are black.
-        transparency: Largest difference of a pixel's transparency.
     """
 
     largest: float

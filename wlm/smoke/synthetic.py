@@ -13,14 +13,10 @@ _HOT = 0.3  # height up to which a plume is hot
 def make_plume(
     n: int = 48, *, seed: int = 1, hot: bool = True, extinction: float = 1.0, device: str = "cpu"
 ) -> DensityVolume:
-    """Makes smoke in a box of edge 1: a leaning column of billows that widens with height.
+    """Makes smoke in a box of edge 1 with `n` voxels: a leaning column of billows that widens with height.
 
-    Args:
-        n: Number of voxels along an edge of the box, at least 1.
-        seed: Seed of the billows.
-        hot: Whether the smoke has a temperature, which is highest at the bottom.
-        extinction: Optical depth of density 1 across the box.
-        device: "cpu" or "cuda:N".
+    `seed` is that of the billows; `hot` smoke has a temperature, which is highest at the bottom; `extinction` is the
+    optical depth of density 1 across the box.
     """
     random = np.random.default_rng(seed)
     axis = (np.arange(n) + 0.5) / n

@@ -19,13 +19,8 @@ _HEAT_AT = (0.0, 0.33, 0.66, 1.0)
 
 @dataclass(frozen=True)
 class Display:
-    """How linear light is converted to screen colours.
-
-    Attributes:
-        exposure: Factor on linear light; a product of 1 is white.
-        tone: One of `TONES`.
-        gain: Factor on errors.
-    """
+    """How linear light is converted to screen colours: by a factor `exposure`, after which 1 is white, and one of
+    `TONES`; `gain` is a factor on errors."""
 
     exposure: float = 1.0
     tone: str = "clamped"

@@ -49,17 +49,11 @@ def contact_sheet(
     *,
     columns: int = MOST_COLUMNS,
 ) -> tuple[int, ...]:
-    """Writes a PNG of rows of pictures, with a label on the left of each row. If the rows have more than `columns`
-    pictures, that many are chosen, evenly spread and at the same places in each row.
+    """Writes a PNG of rows of pictures uint8 [H, W, 3], as many in each row, of one size within it, with the row's
+    label on the left and titles above the columns, if there are any.
 
-    Args:
-        path: The PNG to write; its folder must exist.
-        rows: Pictures uint8 [H, W, 3] by label, the same number in each row, those of a row of one size.
-        titles: Titles of the columns, one for each picture of a row; or none.
-        columns: The largest number of pictures in a row.
-
-    Returns:
-        The places in a row of the chosen pictures, from 0.
+    If the rows have more than `columns` pictures, that many are chosen, evenly spread and at the same places in each
+    row. Returns these places, from 0.
     """
     counts = {len(row) for row in rows.values()}
     uneven = any(len({cell.shape for cell in row}) > 1 for row in rows.values())

@@ -36,14 +36,10 @@ _SHRUNK = 0.8  # drawn size of a block, so that neighbours stay apart
 
 @dataclass(frozen=True, eq=False)
 class Probes:
-    """The live probes of a file.
+    """The live probes of a file, at positions float64 [N, 3].
 
-    Attributes:
-        position: float64 [N, 3].
-        values: float32 [N, C, 3] by name, "decoded" or "original" or both.
-        decode: Function that returns light float32 [M, 3 C] at points [M, 3].
-        model: The model, if it has Gaussians; otherwise None.
-        note: Text for the caption of the window.
+    `values`, float32 [N, C, 3] each, are named "decoded" or "original" or both; `decode` returns light float32 [M, 3 C]
+    at points [M, 3]. `model` is the model if it has Gaussians, else None; `note` is for the caption of the window.
     """
 
     position: np.ndarray

@@ -61,13 +61,7 @@ def frame_slider(count: int, views: tuple[str, ...] = ()) -> tuple[Slider, ...]:
 
 @dataclass
 class State:
-    """The user's choices.
-
-    Attributes:
-        values: Values of the sliders by name.
-        view: One of the scene's views.
-        tone: One of `wlm.view.display.TONES`.
-    """
+    """The user's choices: values of the sliders by name, a view of the scene, and one of `wlm.view.display.TONES`."""
 
     values: dict[str, float]
     view: str

@@ -48,17 +48,11 @@ class Drawing:
         rule: str = "squared",
         device: str = "cpu",
     ) -> None:
-        """Allocates the buffers.
+        """Allocates the buffers for a view under any number of lights.
 
-        Args:
-            camera: The view.
-            lights: Any number.
-            albedo: R, G, B single-scattering albedo, applied to light scattered once.
-            background: A linear colour.
-            ramp: Colour of the emission; None: grey.
-            obstacles: Obstacles that are drawn and cast shadows on the smoke's surface.
-            rule: How the lightmaps are weighted by a light's direction, one of `wlm.smoke.camera.RULES`.
-            device: A device as `wlm.interop.check_device` returns it.
+        `albedo`, R, G, B, is applied to light scattered once; `background` is a linear colour; `ramp` is the colour of
+        the emission, None for grey; obstacles are drawn and cast shadows on the smoke's surface. `rule` is how the
+        lightmaps are weighted by a light's direction, one of `wlm.smoke.camera.RULES`.
         """
         self._camera, self._obstacles, self._device = camera, tuple(obstacles), device
         self._albedo, self._background = tuple(map(float, checked_albedo(albedo))), tuple(map(float, background))

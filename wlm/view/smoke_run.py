@@ -35,13 +35,8 @@ _SURFACE = March(step=2.0, jitter=0.0)  # march to the surface on which shadows 
 
 @dataclass(frozen=True)
 class Lighting:
-    """A way to light the smoke of a frame.
-
-    Attributes:
-        albedo: R, G, B albedo for multiple scattering of all lights and of fire; None: single scattering by six-way
-            lightmaps, as engines show it.
-        network: Network that makes the lightmaps; None: a coarse march.
-    """
+    """A way to light the smoke of a frame. With an `albedo`, multiple scattering of all lights and of fire; else single
+    scattering by six-way lightmaps, as engines show it, made by a network or, without one, by a coarse march."""
 
     albedo: Sequence[float] | None = (1.0, 1.0, 1.0)
     network: SmokePredictor | None = None

@@ -50,14 +50,8 @@ def compared(decoded: bool, original: bool) -> tuple[str, ...]:
 
 @dataclass(kw_only=True)
 class SurfaceScene(Scene):
-    """A scene of one lightmap.
-
-    Attributes:
-        geometry: The mesh, with lightmap UVs.
-        brightness: Exposure at 0 EV.
-        height, width: Size of the lightmap in texels.
-        mask: bool [H, W], texels inside charts; None if unknown.
-    """
+    """A scene of one lightmap of `height` x `width` texels on a mesh with lightmap UVs; `mask`, bool [H, W], are the
+    texels inside charts, None if unknown, and `brightness` is the exposure at 0 EV."""
 
     geometry: Geometry
     brightness: float = 1.0

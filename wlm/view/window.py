@@ -31,14 +31,8 @@ _ERROR = Slider("error", 1.0, 64.0, 8.0, 1.0, ".0f", "×", whole=True)
 
 
 class Window:
-    """A window of a scene.
-
-    Attributes:
-        scene: The scene.
-        state: The user's choices; change them with `set`, `choose` and `tone`.
-        playing: Whether the scene is played.
-        sliders: The sliders by name.
-    """
+    """A window of a scene, with its sliders by name. `state` has the user's choices: change them with `set`, `choose`
+    and `tone`; `playing` tells whether the scene is played."""
 
     _played: float
 

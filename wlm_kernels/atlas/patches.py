@@ -48,13 +48,9 @@ _HALF_BYTE = wp.constant(wp.int64(65536 * 257 // 2))
 
 @wp.struct
 class Patch:
-    """A patch, which stores the colours of a triangle, without its samples.
-
-    Attributes:
-        start: Index of the patch's first sample in the array of all samples.
-        level: Index of the patch's size n in `SIZES`: n = 2 ** level + 1.
-        low, high: Lowest and highest value of each channel, packed as a colour.
-        colour: Histogram bin of the dominant colour, one number per channel, packed as a colour.
+    """A patch, which stores the colours of a triangle, without its samples: the index of its first one in the array of
+    all, and the index `level` of its size n in `SIZES`, n = 2 ** level + 1. Packed as colours, it has the lowest and
+    highest value of each channel, and the histogram bin of the dominant colour, one number per channel.
     """
 
     start: int

@@ -20,13 +20,10 @@ _TINY = wp.constant(1e-30)
 
 @wp.struct
 class Grid:
-    """The grids of samples and points of a tile.
+    """The grids of a tile: m points along an axis, and nx x ny samples, at most `MOST` along each.
 
-    Attributes:
-        points: m, number of points along an axis.
-        nx, ny: Number of samples along x and y, at most `MOST`.
-        first_x, first_y: int [m], index of the sample before each point along the axis; 0 if there is only one sample.
-        share_x, share_y: float [m], weight of the next sample at each point; 0 if there is only one sample.
+    `first_x` and `first_y`, int [m], have the index of the sample before each point along the axis, `share_x` and
+    `share_y`, float [m], the weight of the next sample there; both are 0 if there is only one sample.
     """
 
     points: int
@@ -40,14 +37,11 @@ class Grid:
 
 @wp.struct
 class System:
-    """The normal equations of T tiles; the S = nx * ny samples of a tile are stored row by row.
+    """The normal equations of T tiles, [T, S] each; the S = nx * ny samples of a tile are stored row by row.
 
-    Attributes:
-        own: [T, S], coefficient of a sample with itself.
-        right, down: [T, S], coefficients with the next sample along x and y; 0 for the last sample.
-        cross: [T, S], coefficient with the sample to the lower right. The right and the lower neighbour have the same
-            coefficient with each other.
-        diagonal: [T, S], sum of a sample's coefficients with itself and all neighbours: the preconditioner.
+    They are coefficients of a sample with itself and with its neighbours to the right, below and to the lower right, 0
+    beyond the last sample; the right and the lower neighbour have the last of these with each other. `diagonal` is the
+    sum of a sample's coefficients with itself and all neighbours: the preconditioner.
     """
 
     own: wp.array2d[float]
@@ -236,16 +230,11 @@ def solve(
     work: list[wp.array],
     out: wp.array,
 ) -> None:
-    """Solves the normal equations of T tiles by conjugate gradients.
+    """Solves the normal equations of T tiles, which `gather_system` has written, by conjugate gradients.
 
-    Args:
-        light: float [T, 3, m * m], the light that the samples should reproduce at the points.
-        weight, scale, grid, system: As for `gather_system`, which has written `system`.
-        ridge: Weight of the squared difference of a sample from `start`.
-        rounds: Number of iterations.
-        start: float [T, 3, S], the samples at which the iterations begin.
-        work: Three arrays of the shape of `start`, scratch memory.
-        out: float [T, 3, S], written: the samples.
+    `light`, float [T, 3, m * m], is what the samples `out`, float [T, 3, S], written, should reproduce at the points.
+    The iterations, `rounds` of them, begin at `start`, from which the squared difference of a sample has the weight
+    `ridge`. `work` are three arrays of the same shape, scratch memory.
     """
     inputs = [light, weight, scale, grid, system, ridge, rounds, start, *work, out]
     wp.launch(_solve, light.shape[:2], inputs=inputs, device=light.device, block_dim=_BLOCK)

@@ -49,13 +49,10 @@ _FieldArrays = fields_struct(wp.float32)
 class Trace:
     """A trace from a cell back in time, with what its gradient needs.
 
-    Attributes:
-        start, middle: The velocities that it reads at the cell and at its midpoint.
-        passes: The derivative of the position of `middle` by that of the midpoint, along each axis: 0 or 1.
-        end: Its end, within the domain.
-        stays: The derivative of `end` by the unclamped and uncut end, along each axis.
-        left: Whether it left the domain through an open face.
-        beside: Whether its end is beside a solid.
+    It reads the velocities `start` at the cell and `middle` at its midpoint; `passes` is the derivative of the position
+    of `middle` by that of the midpoint, along each axis, 0 or 1. Its `end` is within the domain; `stays` is its
+    derivative by the unclamped and uncut end, along each axis. `left` tells whether it left the domain through an open
+    face, `beside` whether its end is beside a solid.
     """
 
     start: Stencil

@@ -101,13 +101,9 @@ def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position, scale: float) -> No
 
 @dataclass(frozen=True)
 class FluidKernels:
-    """Kernels for one lattice and storage type; each has one thread per cell.
-
-    Attributes:
-        fields: Computes the density minus 1 and the velocity of every cell.
-        start: Sets every cell to the equilibrium of a given density and velocity.
-        neighbours: Computes the mean density and velocity of the fluid around each cell that becomes fluid.
-        uncover: Sets each cell that becomes fluid to the equilibrium of this mean.
+    """Kernels for one lattice and storage type, with one thread per cell: `fields` computes the density minus 1 and the
+    velocity, `start` sets the equilibrium of given ones; for each cell that becomes fluid, `neighbours` computes the
+    means of the fluid around it, and `uncover` sets the equilibrium of these.
     """
 
     fields: wp.Kernel

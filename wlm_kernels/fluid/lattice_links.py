@@ -49,15 +49,12 @@ HOLD = wp.constant(0.3)
 
 @wp.struct
 class Links:
-    """The links of the domain's faces, followed by the links of solids, on a device; arrays have room for L links.
+    """The links of the domain's faces, followed by the links of solids, on a device; arrays have room for L links, of
+    which `used`, int [1], are in use, `faces` of them links of faces.
 
-    Attributes:
-        cell: int [L], index of the fluid cell a.
-        code: uint8 [L], the direction q + 32 times the kind of boundary.
-        term: float [L], the term of the boundary condition, see the module.
-        value: float [L], the population that the boundary returns, result of the first pass.
-        used: int [1], number of links.
-        faces: Number of links of faces.
+    `cell`, int [L], is the fluid cell a; `code`, uint8 [L], the direction q + 32 times the kind of boundary; `term`,
+    float [L], the term of the boundary condition, see the module; `value`, float [L], the population that the boundary
+    returns, result of the first pass.
     """
 
     cell: wp.array1d[int]
@@ -70,12 +67,9 @@ class Links:
 
 @dataclass(frozen=True)
 class LinkKernels:
-    """Kernels for one lattice and storage type; each has one thread per link.
-
-    Attributes:
-        values: First pass: computes the value of each link; the number of threads is a multiple of `BLOCK`.
-        write: Second pass: writes these values into the populations.
-        force: Sums the force of the fluid on each body.
+    """Kernels for one lattice and storage type, with one thread per link: `values` computes the value of each link (its
+    number of threads is a multiple of `BLOCK`), then `write` writes these into the populations; `force` sums the force
+    of the fluid on each body.
     """
 
     values: wp.Kernel
@@ -286,17 +280,11 @@ def _find(
 def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, velocity: wp.array, links: Links):
     """Lists the links of solid cells, in any order, after the links of faces; `links.used` is not changed.
 
-    Args:
-        tables: The velocity set.
-        n: Cells along x, y and z; N in all.
-        bounded: 1 for each axis that is not periodic, else 0.
-        solid: uint8 [N], number of the body of each cell, 0 for fluid.
-        velocity: vec3 [256], velocity of each body.
-        links: The links, modified.
+    `n` are the cells along x, y and z, N in all; `bounded` is 1 for each axis that is not periodic; `solid`, uint8 [N],
+    has the number of the body of each cell, 0 for fluid, and `velocity`, vec3 [256], that of each body.
 
-    Returns:
-        Number of the solids' links, int [1], which may exceed the room in the arrays: the other links are then missing;
-        speed of the fastest body that has links, in cells per step, float [1].
+    Returns the number of the solids' links, int [1], which may exceed the room in the arrays: the other links are then
+    missing; and the speed of the fastest body that has links, in cells per step, float [1].
     """
     count, fastest = (wp.zeros(1, dtype=dtype, device=solid.device) for dtype in (int, float))
     inputs = [tables, n, bounded, solid, velocity, links]

@@ -27,14 +27,8 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True)
 class VelocitySet:
-    """A set of Q lattice velocities with their weights.
-
-    Attributes:
-        name: "D2Q9", "D3Q19" or "D3Q27".
-        axes: Number of dimensions, 2 (in the plane of x and y) or 3.
-        c: The Q velocities, cells per step.
-        w: The weight of each velocity.
-    """
+    """A set of Q lattice velocities `c`, cells per step, with their weights `w`, in 2 dimensions (the plane of x and y)
+    or 3; its name is "D2Q9", "D3Q19" or "D3Q27"."""
 
     name: str
     axes: int
@@ -72,13 +66,8 @@ def lattice(name: str) -> VelocitySet:
 
 @wp.struct
 class Tables:
-    """A velocity set in arrays, for kernels that index its Q velocities.
-
-    Attributes:
-        c: vec3i [Q], the velocities.
-        w: float [Q], their weights.
-        index: int [27], the number q of the velocity (x, y, z) at index 9 (x + 1) + 3 (y + 1) + z + 1.
-    """
+    """A velocity set in arrays, for kernels that index its Q velocities `c` and weights `w`; `index`, int [27], has the
+    number q of the velocity (x, y, z) at 9 (x + 1) + 3 (y + 1) + z + 1."""
 
     c: wp.array1d[wp.vec3i]
     w: wp.array1d[float]
@@ -181,14 +170,11 @@ class MemoryFunctions:
 def memory_functions(
     lattice_name: str, storage: str, walls: tuple[bool, bool, bool], wide: bool = True
 ) -> MemoryFunctions:
-    """Builds (once) the functions for a lattice and a storage type.
+    """Builds (once) the functions for a lattice of `LATTICES` and a storage type of `STORAGES`, by whose scale numbers
+    are multiplied, with walls at rest that close some axes.
 
-    Args:
-        lattice_name: One of `LATTICES`.
-        storage: One of `STORAGES`; scaled numbers are multiplied by its scale.
-        walls: For each axis whether walls at rest close it.
-        wide: Whether populations are indexed in 64 bits, which adds a sixth to a step's instructions; otherwise there
-            may be at most `NARROW` of them.
+    `wide` indexes populations in 64 bits, which adds a sixth to a step's instructions; otherwise there may be at most
+    `NARROW` of them.
     """
     c = lattice(lattice_name).c
     count = len(c)

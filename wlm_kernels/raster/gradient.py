@@ -156,15 +156,11 @@ def interpolate(attribute, triangle, visible, barycentric, out) -> None:
 
 
 def interpolate_backward(attribute, triangle, visible, barycentric, grad_out, grad_attribute, grad_barycentric) -> None:
-    """Computes the gradients of attributes and barycentrics from the gradient of a result of `interpolate`.
+    """Computes the gradients of attributes and barycentrics from `grad_out`, float [H, W, C], the gradient of a result
+    of `interpolate`, and its arguments.
 
-    On CUDA pixels are added to `grad_attribute` in any order, so that the last bits change from run to run.
-
-    Args:
-        attribute, triangle, visible, barycentric: Arguments of `interpolate`.
-        grad_out: float [H, W, C], gradient of the result.
-        grad_attribute: float [V, C], to which the gradient is added; of shape [0, 0] if it is not wanted.
-        grad_barycentric: vec2 [H, W], written; of shape [0, 0] if it is not wanted.
+    `grad_attribute`, float [V, C], is added to, `grad_barycentric`, vec2 [H, W], is written; with no elements they are
+    not wanted. On CUDA pixels are added in any order, so that the last bits of `grad_attribute` change from run to run.
     """
     inputs = [attribute, triangle, visible, barycentric, grad_out]
     outputs = [grad_attribute, grad_barycentric]

@@ -344,14 +344,8 @@ class Rasterizer:
         )
 
     def run(self, position) -> Raster:
-        """Draws the triangles with their corners at the given positions.
-
-        Args:
-            position: float [V, 4], clip coordinates x, y, z, w of V vertices; or in UV space float [V, 2], u and v.
-
-        Returns:
-            The attribute `raster`, which the next run overwrites.
-        """
+        """Draws the triangles with their V corners at float [V, 4], clip coordinates x, y, z, w, or in UV space float
+        [V, 2], u and v. Returns the attribute `raster`, which the next run overwrites."""
         device, count = self._triangle.device, self._triangle.shape[0]
         self._keys.fill_(_EMPTY)
         self._queued.zero_()

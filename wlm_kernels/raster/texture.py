@@ -65,13 +65,8 @@ def triangle_wave_slope(x: float) -> float:
 
 @wp.func
 def axis_at(x: float, size: int, filter: int, boundary: int) -> Axis:
-    """Finds the two texels next to a coordinate along one axis, and their weights.
-
-    Args:
-        x: u or v.
-        size: Texels along the axis, at least 1.
-        filter, boundary: Integer codes, returned by `codes`.
-    """
+    """Finds the two texels next to a coordinate u or v along an axis of `size` texels, at least 1, and their weights;
+    `filter` and `boundary` are integer codes, returned by `codes`."""
     out = Axis()
     n = wp.float64(size)
     t = wp.float64(x)
@@ -217,16 +212,12 @@ def sample(texture, uv, out, *, filter: str = "linear", boundary: str = "clamp")
 def sample_backward(
     texture, uv, grad_out, grad_texture, grad_uv, *, filter: str = "linear", boundary: str = "clamp"
 ) -> None:
-    """Computes the gradients of the texture and of uv from the gradient of a result of `sample`.
+    """Computes the gradients of the texture and of uv from `grad_out`, float [N, C], the gradient of a result of
+    `sample`, and its arguments.
 
+    `grad_texture`, float [H, W, C], is added to, `grad_uv`, vec2 [N], is written; with no elements they are not wanted.
     The gradient of a coordinate is the slope between the texels that it reads, 0 at a clamped border. On CUDA samples
-    are added to `grad_texture` in any order, so that the last bits change from run to run.
-
-    Args:
-        texture, uv, filter, boundary: Arguments of `sample`.
-        grad_out: float [N, C], gradient of the result.
-        grad_texture: float [H, W, C], to which the gradient is added; of shape [0, 0, 0] if it is not wanted.
-        grad_uv: vec2 [N], written; of shape [0] if it is not wanted.
+    are added in any order, so that the last bits of `grad_texture` change from run to run.
     """
     inputs = [texture, uv, *codes(filter, boundary), grad_out]
     wp.launch(_sample_backward, uv.shape, inputs=inputs, outputs=[grad_texture, grad_uv], device=texture.device)

@@ -175,17 +175,11 @@ def make_lattice(
     origin: Sequence[float] = (0.0, 0.0, 0.0),
     most: int = MOST_NODES,
 ) -> tuple[Lattice, tuple[int, ...]]:
-    """Makes a lattice over the grid's box and half a voxel around it.
+    """Makes a lattice over the grid's box and half a voxel around it, along three orthogonal axes of length 1.
 
-    Args:
-        shape: Voxels along x, y, z.
-        axes: The three axes, orthogonal and of length 1.
-        spacing: Largest distance between nodes in voxels; at least a quarter of a voxel is used.
-        origin: Origin of the lattice's coordinates, in voxels.
-        most: Largest number of lattice cells; the spacing is enlarged until there are at most that many.
-
-    Returns:
-        The lattice, and the number of nodes along each axis.
+    `spacing` is the largest distance between nodes in voxels; at least a quarter of a voxel is used, and more for more
+    than `most` cells. `origin` is that of the lattice's coordinates, in voxels. Returns the lattice, and the number of
+    nodes along each axis.
     """
     extents = [sum((n + 1) * abs(a) for n, a in zip(shape, row, strict=True)) for row in axes]
     spacing = max(spacing, _LEAST_SPACING)
@@ -224,17 +218,11 @@ def spacing_of(march: March) -> tuple[float, float]:
 
 
 def reach(medium: Medium, place: Sequence[float], radius: float | None, march: March) -> tuple[Lattice, wp.array]:
-    """Computes optical depths from the smoke to a light.
+    """Computes optical depths from the smoke to a light at `place`: the direction to a light at infinity, of length 1,
+    or the position of a point light in voxels with a radius in voxels, within which its irradiance is constant.
 
-    Args:
-        medium: The smoke.
-        place: Direction to a light at infinity, of length 1, or position of a point light in voxels.
-        radius: Radius of a point light in voxels, within which its irradiance is constant; None: light at infinity.
-        march: Only its spacing and light_step are used; the lattice of a point light has at most 2^24 nodes.
-
-    Returns:
-        A lattice, and vec2 [X, Y, Z] at its nodes: depths to the light and to the opposite light. A point light has no
-        opposite light; its second depth is 0.
+    Of `march` only spacing and light_step are used; the lattice of a point light has at most 2^24 nodes. Returns a
+    lattice, and vec2 [X, Y, Z] at its nodes: depths to the light and to the opposite light, for a point light 0.
     """
     spacing, step = spacing_of(march)
     shape = medium.density.shape

@@ -197,15 +197,11 @@ def _refine(
 def spread(
     medium: Medium, extinction: wp.array, source: wp.array, cell: wp.vec3, albedos: wp.vec3, each: int, light: wp.array
 ) -> None:
-    """Solves for the fluence of light that was scattered at least once.
+    """Solves for the fluence f of light that was scattered at least once, of L lights, for the first `each` of three
+    albedos: `light`, float [L * each, X, Y, Z], is written.
 
-    Args:
-        medium: The smoke, which allocates buffers.
-        extinction: float [X, Y, Z], extinction per voxel of each cell of the coarse grid.
-        source: float [L, X, Y, Z], the source q of each of L lights.
-        cell: Edges of a cell in voxels.
-        albedos, each: The equation is solved for the first `each` of the three albedos, 1 to 3.
-        light: float [L * each, X, Y, Z], written: the fluence f of each light, for each albedo.
+    `extinction`, float [X, Y, Z], is that per voxel of each cell of the coarse grid, with edges `cell` in voxels, and
+    `source`, float [L, X, Y, Z], the source q of each light.
     """
     device = light.device
     grids = [(extinction.reshape((1, *extinction.shape)), source, cell)]
@@ -391,29 +387,21 @@ def _gather(smoke_type: Any) -> wp.Kernel:
 def shoot(
     medium: Medium, place: wp.vec3, radius: float, step: float, cell: wp.vec3, power: float, out: wp.array
 ) -> None:
-    """Adds to each cell the direct light that it extinguishes from a point light.
+    """Adds to each cell of `out`, float [X, Y, Z], the direct light that it extinguishes from a point light of some
+    `power`, which all its rays together carry at their start.
 
-    Args:
-        medium: The smoke.
-        place: Position of the light, in voxels.
-        radius: Distance in voxels within which the irradiance is constant.
-        step: Longest step along the light's rays, in voxels.
-        cell: Edges of a cell in voxels.
-        power: Power of the light, which all its rays together carry at their start.
-        out: float [X, Y, Z], the light extinguished in each cell, added to.
+    All lengths are in voxels: the light's place, the `radius` within which its irradiance is constant, the longest step
+    along its rays, and the edges of a cell.
     """
     _shoot(medium, _RAYS, [place, radius, step, cell, power / _RAYS], [out])
 
 
 def stop(medium: Medium, depths: tuple[Lattice, wp.array], cell: wp.vec3, step: float, out: wp.array) -> None:
-    """Computes the direct light that each cell extinguishes from a light at infinity of irradiance 4 pi.
+    """Computes the direct light that each cell extinguishes, `out`, float [X, Y, Z], per volume, from a light at
+    infinity of irradiance 4 pi.
 
-    Args:
-        medium: The smoke.
-        depths: Result of `depth_lattice.reach`.
-        cell: Edges of a cell in voxels.
-        step: Largest distance in voxels between samples in a cell, unless this needs more than four along an axis.
-        out: float [X, Y, Z], written: the extinguished light per volume.
+    `depths` is the result of `depth_lattice.reach`; `cell` are the edges of a cell in voxels. `step` is the largest
+    distance in voxels between samples in a cell, unless this needs more than four along an axis.
     """
     lattice, nodes = depths
     parts = wp.vec3i(*(max(1, min(_PARTS, math.ceil(edge / step))) for edge in cell))

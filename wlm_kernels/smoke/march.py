@@ -60,15 +60,11 @@ def smoke_struct(dtype: Any, in_bricks: bool) -> Any:
 
 @dataclass(frozen=True)
 class Medium:
-    """Smoke on a device.
+    """Smoke on a device: density, float or half [X, Y, Z], and extinction per voxel at density 1; temperature in an
+    array like the density's, None for smoke without light, and light emitted per voxel at temperature 1.
 
-    Attributes:
-        density: float or half [X, Y, Z].
-        extinction: Extinction per voxel at density 1.
-        temperature: Array of the density's shape and type; None: the smoke emits no light.
-        emission: Light emitted per voxel at temperature 1.
-        empty: Function that allocates buffers on the density's device; None: Warp's own allocator.
-        bricks: Which bricks of 8^3 voxels contain smoke, a result of `occupied`; None: marches sample every voxel.
+    `empty` allocates buffers on the density's device; None: Warp's own allocator. `bricks` tells which bricks of 8^3
+    voxels contain smoke, a result of `occupied`; None: marches sample every voxel.
     """
 
     density: wp.array

@@ -17,13 +17,8 @@ _FAR = wp.constant(1.0e30)
 
 @dataclass(frozen=True)
 class Solids:
-    """Obstacles on a device.
-
-    Attributes:
-        mesh: Their surfaces, in the coordinates of the camera `view` of the functions below.
-        owner: int32 [F], index of each triangle's obstacle.
-        colours: vec3 [obstacles], albedo of each obstacle.
-    """
+    """Obstacles on a device: their surfaces, in the coordinates of the camera `view` of the functions below, the index
+    of each triangle's obstacle, int32 [F], and each obstacle's albedo, vec3."""
 
     mesh: wp.Mesh
     owner: wp.array
@@ -34,12 +29,9 @@ class Solids:
 class Lamps:
     """L lights on a device; without lights the arrays have one unused element.
 
-    Attributes:
-        count: Number of lights.
-        toward: vec3 [L], directions to the lights in the world, of length 1; 0 for a point light, which does not light
-            obstacles.
-        irradiance: vec3 [L], irradiance of each light in R, G, B; of a point light its intensity.
-        visibility: float [L, H, W], share of each light that reaches the smoke.
+    `toward`, vec3 [L], are directions to the lights in the world, of length 1; 0 for a point light, which does not
+    light obstacles. `irradiance`, vec3 [L], is of a point light its intensity. `visibility`, float [L, H, W], is the
+    share of each light that reaches the smoke.
     """
 
     count: int

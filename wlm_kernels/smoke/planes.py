@@ -171,14 +171,8 @@ class PlaneKernels:
 
 @functools.cache
 def kernels(edge: int, reach: int, half: bool, cuda: bool) -> PlaneKernels:
-    """Builds (once) the kernels for half floats or float32, on a GPU or a CPU.
-
-    Args:
-        edge: Edge of the filter in pixels, odd, at most 15.
-        reach: Edge of a block in pixels: 4, 8, 16 or 32.
-        half: Whether the numbers T are half floats; else they are float32.
-        cuda: Whether the kernels run on a GPU.
-    """
+    """Builds (once) the kernels for half floats or float32, on a GPU or a CPU, for a filter with an odd edge of at most
+    15 pixels and blocks with an edge `reach` of 4, 8, 16 or 32 pixels."""
     if edge not in range(1, 16, 2):
         raise ValueError(f"edge: expected an odd number of pixels from 1 to 15, got {edge}")
     if reach not in (4, 8, 16, 32):

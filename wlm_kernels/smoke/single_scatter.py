@@ -386,14 +386,11 @@ def _rays_backward(
 
 
 def depths(density, toward, step: float, nodes) -> None:
-    """Computes optical depths towards lights at the nodes of a lattice.
+    """Computes optical depths towards L lights at the nodes of a lattice.
 
-    Args:
-        density: float [X, Y, Z], extinction per voxel, at least 0.
-        toward: vec3 [L], the directions to the lights, of length 1.
-        step: The longest step, in voxels.
-        nodes: float [L, A, B, C], written; `march.nodes_along` gives the numbers of nodes and `march.node_position`
-            their positions.
+    `density`, float [X, Y, Z], is extinction per voxel, at least 0; `toward`, vec3 [L], are directions of length 1;
+    `step` is the longest step, in voxels. `nodes`, float [L, A, B, C], is written; `march.nodes_along` gives the
+    numbers of nodes and `march.node_position` their positions.
     """
     inputs = [density, toward, step * _SLACK]
     wp.launch(_depths, nodes.shape, inputs=inputs, outputs=[nodes], device=density.device)

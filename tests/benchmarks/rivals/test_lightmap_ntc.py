@@ -5,8 +5,7 @@ import pytest
 from builders.checks import psnr
 from builders.small_sets import moving_light
 
-from benchmarks.rivals.lightmap import FEW, RIVALS, encode_set, usual
-from benchmarks.rivals.lightmap_ntc import LADDER, Latents, encode_ntc
+from benchmarks.rivals.lightmap_ntc import Latents, encode_ntc
 
 SMALL = Latents(2, 4, 4, 4)
 NETWORK = 28 * 64 + 64 + 64 * 64 + 64  # weights and biases of two layers, of 4 * 4 + 4 + 8 inputs
@@ -44,14 +43,6 @@ def test_sizes(shape):
     assert rival.bytes == bytes_of(*shape[1:], shape[0]) + 12 * (shape[2] > 128)
 
 
-def test_empty_black_and_constant():
-    all_of = np.ones((8, 8), bool)
-    nothing = encode(np.full((2, 8, 8, 3), np.nan), ~all_of)
-    assert not nothing.decoded.any() and nothing.bytes == 12
-    assert not encode(np.zeros((2, 8, 8, 3)), steps=10).decoded.any()
-    np.testing.assert_allclose(encode(np.full((2, 8, 8, 3), 0.7), steps=10).decoded, 0.7, rtol=0.01)
-
-
 def test_what_lies_in_the_gaps_changes_nothing():
     frames, mask = moving_light(24, 40).light.frames, np.ones((24, 40), bool)
     mask[7:20, 10:35] = False
@@ -65,21 +56,3 @@ def test_what_lies_in_the_gaps_changes_nothing():
     assert not np.ptp(a.decoded[:, 9:18, 12:33], axis=(1, 2)).any()
     part, full = encode(zeros, mask, steps=2), encode(frames, steps=2)
     assert part.bytes == full.bytes and part.disk_bytes < full.disk_bytes
-
-
-def test_it_is_a_method_that_takes_a_device(monkeypatch):
-    moving = moving_light(24, 24).light
-    names = [name for name, method in RIVALS.items() if method.fitted]
-    assert names == [f"ntc-{name}" for name in LADDER]
-    assert usual("cpu", quick=True) == FEW and usual("cuda:0", quick=True) == (*FEW, "ntc-medium")
-    assert set(usual("cuda:0")) - set(usual("cpu")) == set(names) and usual("cuda:0") == tuple(RIVALS)
-    calls = []
-
-    def fake(frames, mask, **options):
-        calls.append(options)
-        return encode(frames, mask, steps=2)
-
-    method = RIVALS["ntc-medium"]
-    monkeypatch.setitem(RIVALS, "ntc-medium", type(method)("NTC", "medium", fake, alone=False, fitted=True))
-    rival, visits = encode_set("ntc-medium", moving, lambda i, decoded: decoded.shape, [1, 3], device="cuda:1")
-    assert calls == [{"device": "cuda:1"}] and visits == [(24, 24, 3)] * 2 and rival.decoded is None

@@ -6,7 +6,6 @@ import torch
 from builders.small_sets import moving_light, tiny_profile
 from builders.small_sets import sheet_from_arrays as from_arrays
 
-from benchmarks.lightmap_ablation import VARIANTS
 from benchmarks.lightmap_exact import decode_tile64
 from benchmarks.rivals.lightmap_torch import Features, PlainFit
 from wlm.lightmap.fit import compress, dynamic_targets
@@ -89,28 +88,3 @@ def test_its_loss_is_that_of_the_kernels():
     theirs = 50.0 * float(trainer.losses()[0])  # a running mean that begins at 0
     trainer.close()
     assert float(fit.step()) == pytest.approx(theirs, rel=0.05)
-
-
-def test_variants_take_about_the_same_bytes():
-    sizes = {name: features.bytes for name, features in VARIANTS.items()}
-    assert sizes["hybrid"] == sizes["tri-plane"] == sizes["no block simulation"] == sizes["encoder at the end"] == 34816
-    assert sizes["3D alone"] == 34560 and sizes["2D alone"] == 32768
-    assert sizes["8 channels of F_uv"] == 45056  # table 8: 0.86 bits a texel beside 0.67
-    assert [features.inputs for features in VARIANTS.values()] == [16, 12, 8, 20, 16, 16, 16]
-    assert Features.of(Profile.load("M")) == VARIANTS["hybrid"]
-
-
-def test_an_encoder_at_the_end_takes_the_texels_as_trained():
-    """No step rounds the blocks' texels or freezes them; the encoder changes them once, within what BC7 loses."""
-    lightmaps = moving_light(128, 128).light
-    features = Features(uvt=8, slices=4, encoded=True)
-    fit = plain_fit(lightmaps, tiny_profile(steps=10, map_rate=0.05), features=features)
-    for _ in range(10):
-        fit.step()
-    assert fit._fixed is None
-    trained, stored = fit._maps(quantised=True)[0].detach(), fit._stored()[0]
-    assert float((trained * 255.0 - (trained * 255.0).round()).abs().max()) > 0.3
-    levels = stored * 255.0
-    assert float((levels - levels.round()).abs().max()) < 1e-3
-    off = float((stored - trained).abs().max())
-    assert 1e-4 < off < 0.5 and float((stored - trained).square().mean().sqrt()) < 0.1

@@ -99,16 +99,10 @@ def test_bytes_and_positions_are_all_that_decoding_needs(bits):
         if partition.kind == probe_pca.PLACE:
             elsewhere = probe_pca.decode(payload, position[:, ::-1])
             assert _error(values, elsewhere) > 2 * _error(values, decoded)
-        for wrong in (payload[:-1], payload + b"\0", payload[:5], b"", b"\xff" * 20):
-            with pytest.raises(WlmError, match="payload of|compressed by PCA|expected .* bytes"):
-                probe_pca.decode(wrong, position)
     payload = probe_mbd.encode(position, wide, 2, 3, 3, bits)
     assert len(payload) == probe_mbd.payload_bytes(400, 12, 2, probe_mbd.grid_parts(position, 3), bits)
     shown = moving_basis(position, values, 2, 3, 3, bits=bits).decoded
     np.testing.assert_array_equal(probe_mbd.decode(payload, position), shown)
-    for wrong in (payload[:-1], payload[:5]):
-        with pytest.raises(WlmError, match="payload of|compressed by PCA|expected .* bytes"):
-            probe_mbd.decode(wrong, position)
 
 
 def test_clusters_by_signal_find_lines_that_share_one_place():
@@ -145,33 +139,6 @@ def test_moving_basis_never_gets_worse_and_beats_pca(grid):
             assert found < _error(values, global_pca(position, values, k).decoded)
     none = moving_basis(position, values, 3, grid, 0).decoded
     assert _error(values, none) == pytest.approx(_error(values, global_pca(position, values, 3).decoded), rel=1e-3)
-
-
-@pytest.mark.parametrize("bits", [None, 8])
-@pytest.mark.parametrize("name", METHODS)
-def test_hard_cases(name, bits):
-    position, values = _probes(count=40)
-    cases = {
-        "one probe": (position[:1], values[:1]),
-        "two probes": (position[:2], values[:2]),
-        "fewer probes than parts": (position[:5], values[:5]),
-        "one place": (np.ones((40, 3)), values),
-        "a line": (position * (1, 0, 0), values),
-        "far from the origin": (position + 1e7, values),
-        "zero": (position, np.zeros_like(values)),
-        "constant": (position, np.full_like(values, 0.1)),
-        "doubled": (np.repeat(position[:6], 7, 0), np.repeat(values[:6], 7, 0)),
-        "huge": (position, values * np.float32(1e37)),
-        "above half": (position, values * np.float32(1e5)),
-        "tiny": (position, values * np.float32(1e-39)),
-    }
-    for case, (place, light) in cases.items():
-        for components in (1, 12):
-            result = _make(name, place, light, components, bits=bits)
-            assert np.isfinite(result.decoded).all(), case
-            if components == 12 or case in ("one probe", "zero", "constant"):
-                limit = (4 * HALF if bits is None else 0.02) * np.abs(light).max()
-                np.testing.assert_allclose(result.decoded, light, rtol=0, atol=limit, err_msg=case)
 
 
 def _sh(direction: np.ndarray) -> np.ndarray:

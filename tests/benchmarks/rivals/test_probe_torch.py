@@ -94,16 +94,3 @@ def test_loss_falls_and_seeds_repeat():
     # From the variance that there is to about a third.
     assert first[-1] < 0.4 * first[0]
     assert losses(3) == first[:10] and losses(4) != first[:10]
-
-
-def test_one_probe_and_probes_at_one_place():
-    for x, values, count in (
-        (np.full((1, 3), 0.5), np.ones((1, 1)), 1),
-        (np.full((5, 3), 0.5), np.arange(10.0).reshape(5, 2), 1),
-        (np.random.default_rng(0).random((6, 3)), np.full((6, 3), 7.0), 4),
-    ):
-        fit = dense(x, values, count=4, steps=200)
-        losses = [float(fit.step()) for _ in range(200)]
-        assert np.isfinite(losses).all() and len(fit.parameters[0]) == count
-        # Where all is one place, or one value, the best there is, is the mean.
-        np.testing.assert_allclose(fit.decoded(), values.mean(0)[None].repeat(len(x), 0), atol=1e-2)

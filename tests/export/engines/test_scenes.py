@@ -16,7 +16,6 @@ from test_folders import TEXTS, as_glsl, surface_compiles
 from wlm.atlas.model import SHORT_ENTRY
 from wlm.export import ENGINES, export
 from wlm.formats.shared_exponent import unpack_rgb9e5
-from wlm.inspection import inspect
 
 SIZE = 64
 
@@ -71,17 +70,6 @@ def test_each_engines_files_take_the_place_of_anothers(made, tmp_path):
         assert {each["file"] for each in info["textures"].values()} < set(os.listdir(tmp_path / "out"))
     paths = export(model, tmp_path / "out", shader="wgsl")
     assert "fn wlm_object" in (tmp_path / "out" / "atlas.wgsl").read_text() and paths[-1].name == "bundle.json"
-
-
-def test_inspect_names_a_scenes_files(made, tmp_path):
-    """Their pictures are no lightmaps to compress, the file no network."""
-    made.save(tmp_path / "made.wlm")
-    (file,) = inspect(tmp_path / "made.wlm")
-    assert file.what.startswith("compressed lightmaps of meshes") and file.command.startswith("wlm web")
-    for engine in (*ENGINES, None):
-        export(made, tmp_path / f"{engine}", engine)
-        (found,) = inspect(tmp_path / f"{engine}")
-        assert "wlm export wrote" in found.what and not found.command
 
 
 def test_scenes_that_cannot_be_exported(made, tmp_path):

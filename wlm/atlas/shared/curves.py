@@ -41,15 +41,12 @@ _AT_ONCE = 1024  # tiles
 
 @dataclass(frozen=True, eq=False)
 class SceneTiles:
-    """All T tiles of sheets (UV layouts) and their mip levels that have a weight above 0.
+    """All T tiles of sheets (UV layouts) and their mip levels that have a weight above 0, of B = `size` texels along a
+    side.
 
-    Attributes:
-        texels: float32 [T, B + 1, B + 1, M, 3], light divided by a unit for each state, in M states.
-        weight: float32 [T, P], weights of the tiles' points; all add up to 1.
-        plane: int [T], number of the sheet or mip level of each tile, ascending.
-        index: int64 [T], the tile's number in its sheet or mip level, row by row.
-        size: B, texels along a tile.
-        device: The device on which tiles are fitted.
+    `texels`, float32 [T, B + 1, B + 1, M, 3], is light divided by a unit for each of M states; `weight`, float32 [T,
+    P], has the weights of the tiles' points, which all add up to 1. `plane`, int [T], ascending, numbers the sheets and
+    mip levels, and `index`, int64 [T], the tiles in each, row by row.
     """
 
     texels: torch.Tensor
@@ -99,13 +96,10 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """The errors of all T tiles with a certain number of components.
-
-    Attributes:
-        mixtures, number: The mixtures (sets of factors that tiles share), and each tile's mixture, int [T].
-        choices: The sizes of the components.
-        error: float64 [choices, T], squared error of each tile for each choice, mean over the states.
-        left: Estimated error of the whole scene if tiles may have up to this number of components.
+    """The errors of all T tiles with a certain number of components: the mixtures (sets of factors that tiles share)
+    and each tile's mixture, int [T]; the sizes of the components, and the squared error of each tile for each choice of
+    them, float64 [choices, T], mean over the states; `left` estimates the error of the whole scene if tiles may have up
+    to this number of components.
     """
 
     mixtures: Mixtures

@@ -95,14 +95,8 @@ def _levels(plane: Plane, mask: np.ndarray, device: str) -> list[Plane]:
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """Sheets and mip levels, cut into tiles.
-
-    Attributes:
-        planes, places: Sheets and mip levels, from `planes_of`, and the place of each in the lookup texture T_c.
-        shape: Rows and columns of T_c.
-        tiles: The tiles of all planes.
-        bits: The budget of bits of the whole model.
-    """
+    """Sheets and mip levels (`planes_of`), cut into tiles, with the place of each in the lookup texture T_c; rows and
+    columns of T_c; and the budget of bits of the whole model."""
 
     planes: list[Plane]
     places: list[SheetPlace]
@@ -120,13 +114,10 @@ class Cut:
 class Fitted:
     """The components, sizes and places chosen for all tiles.
 
-    Attributes:
-        cut: Sheets and levels with their tiles; separate tiles are listed state by state.
-        tried: The errors of all tiles for each number of components, weighted by `balance`.
-        given: Components, sizes and places of the tiles.
-        numbers: Number of integers per entry of T_c.
-        states: Number of states with separate tiles; 1: all share tiles.
-        gain: Estimated advantage of separate tiles in views, in dB; None if it wasn't computed to the end.
+    Separate tiles are listed state by state in `cut`; `states` is the number of states with separate tiles, 1 if all
+    share tiles. `tried` are the errors of all tiles for each number of components, weighted by `balance`; `given` has
+    what the tiles got; an entry of T_c has `numbers` integers. `gain` estimates the advantage of separate tiles in
+    views, in dB; None if it wasn't computed to the end.
     """
 
     cut: Cut

@@ -57,14 +57,11 @@ _LEAST_GAIN = 2.0**-24 / 48
 
 @dataclass(frozen=True)
 class Tiles:
-    """The light of the T tiles that have a weight above 0.
+    """The light of the T tiles that have a weight above 0, with their numbers in the grid, int64 [T], row by row.
 
-    Attributes:
-        index: int64 [T], number of the tile in the grid, row by row.
-        light: float [T, 3, m * m], at m x m points of the tile, row by row, at (k + 0.5) / m of its side along each
-            axis.
-        weight: float [T, m * m], weight of each point's squared error, 0 or more; the sum over all tiles is 1.
-        size: Texels along a tile.
+    `light`, float [T, 3, m * m], is at m x m points of the tile, row by row, at (k + 0.5) / m of its side along each
+    axis; `weight`, float [T, m * m], is each point's weight in the squared error, with a sum of 1 over all tiles. A
+    tile has `size` texels along a side.
     """
 
     index: torch.Tensor

@@ -27,14 +27,9 @@ _COMMON = ("content.js", "graphics.js", "blocks.js", "camera.js", "panel.js", "l
 class Page:
     """The content of a page.
 
-    Attributes:
-        kind: `lightmap`, `atlas`, `probe`, `smoke` or `scene`; selects the page's main script.
-        title: Title of the panel and of the browser's window.
-        note: A sentence that the page shows below its title; may be empty.
-        figures: Rows of the panel's table: a name and a text each.
-        manifest: JSON values for the script.
-        arrays: Arrays for the script by name.
-        scripts: Further scripts that the main script needs.
+    Its kind, `lightmap`, `atlas`, `probe`, `smoke` or `scene`, selects the main script, which may need further
+    `scripts` and reads `manifest`, JSON values, and `arrays` by name. The panel shows the title, a sentence below it,
+    which may be empty, and the table `figures`, of a name and a text each.
     """
 
     kind: str

@@ -14,6 +14,12 @@ float2 wlm_halves(uint word)
     return float2(f16tof32(word & 65535u), f16tof32(word >> 16));
 }
 """
+_PACK = """\
+uint wlm_pack_halves(float2 pair)
+{
+    return f32tof16(pair.x) | (f32tof16(pair.y) << 16);
+}
+"""
 _SIZE = """\
 int2 wlm_size_of_{name}()
 {{
@@ -24,6 +30,16 @@ int2 wlm_size_of_{name}()
 """
 
 
+_ATOMIC = """\
+uint wlm_{function}_{name}(int i, uint value)
+{{
+    uint before;
+    {own}({name}[i], value, before);
+    return before;
+}}"""
+_ATOMICS = {"atomicAdd": "InterlockedAdd", "atomicXor": "InterlockedXor"}
+
+
 class HlslWriter(Writer):
     """Writes HLSL functions for an include file. One sampler reads all textures; Unity creates it from its name."""
 
@@ -31,7 +47,9 @@ class HlslWriter(Writer):
         **{name: f"{kind}{n}" for name, (kind, n) in VECTORS.items()},
         "mix": "lerp",
         "uintBitsToFloat": "asfloat",
+        "floatBitsToUint": "asuint",
         "unpackHalf2x16": "wlm_halves",
+        "packHalf2x16": "wlm_pack_halves",
     }
 
     def head(self) -> list[str]:
@@ -42,6 +60,10 @@ class HlslWriter(Writer):
             return [f"{_TEXTURES[variable.type]} {variable.name};"]
         if variable.way == "buffer":
             return [f"StructuredBuffer<{self.kind(variable.type)}> {variable.name};"]
+        if variable.way == "storage":
+            own = sorted(function for function, name in self.atomics if name == variable.name)
+            helpers = [_ATOMIC.format(function=each, name=variable.name, own=_ATOMICS[each]) for each in own]
+            return [f"RWStructuredBuffer<{self.kind(variable.type)}> {variable.name};", *helpers]
         if variable.way == "uniform":
             # A float3 in an array of a constant buffer takes the space of a float4.
             return [f"cbuffer {variable.name}_values", "{", f"    {self.local(variable)};", "};"]
@@ -56,6 +78,12 @@ class HlslWriter(Writer):
         if len(values) == 1 and name in VECTORS:
             return f"(({self.kind(name)})({values[0]}))"
         return super().make(name, values)
+
+    def call(self, node: Node) -> str:
+        if node.text in _ATOMICS:
+            buffer, i = node.parts[0].parts
+            return f"wlm_{node.text}_{buffer.text}({self.write(i)}, {self.write(node.parts[1])})"
+        return super().call(node)
 
     def fetch(self, texture: Variable, place: Node) -> str:
         whole = "int4" if texture.type == "sampler2DArray" else "int3"
@@ -77,4 +105,6 @@ class HlslWriter(Writer):
         for texture in self._measured.values():
             declared = f"{_TEXTURES[texture.type]} {texture.name};\n"
             text = text.replace(declared, declared + _SIZE.format(name=texture.name), 1)
-        return f"{_HALVES}\n{text}" if "wlm_halves(" in text else text
+        for name, helper in (("wlm_pack_halves(", _PACK), ("wlm_halves(", _HALVES)):
+            text = f"{helper}\n{text}" if name in text else text
+        return text

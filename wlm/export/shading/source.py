@@ -12,14 +12,8 @@ _WORD = re.compile(
 
 @dataclass(frozen=True)
 class Word:
-    """A token of a shader.
-
-    Attributes:
-        kind: `comment`, `number`, `name` or `mark` (an operator or bracket).
-        text: Text as written.
-        alone: Whether the token is the first on its line.
-        blank: Whether a blank line precedes the token.
-    """
+    """A token of a shader: a `comment`, `number`, `name` or `mark` (an operator or bracket) with its text as written;
+    whether it is the first on its line, and whether a blank line precedes it."""
 
     kind: str
     text: str

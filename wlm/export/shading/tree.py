@@ -27,13 +27,8 @@ _ASSIGN = ("=", "+=", "-=", "*=", "/=", "%=", "&=", "|=", "^=")
 
 @dataclass(frozen=True)
 class Node:
-    """A node of an expression tree.
-
-    Attributes:
-        kind: `number`, `name`, `call`, `member`, `index`, `unary`, `binary`, `choice` (?:), `assign` or `step` (++).
-        text: The number, name, member or operator.
-        parts: Operands.
-    """
+    """A node of an expression tree: its kind (`number`, `name`, `call`, `member`, `index`, `unary`, `binary`, `choice`
+    (?:), `assign` or `step` (++)); the text of the number, name, member or operator; and its operands."""
 
     kind: str
     text: str
@@ -42,14 +37,9 @@ class Node:
 
 @dataclass(frozen=True)
 class Variable:
-    """A parameter, constant, local variable, texture, uniform or buffer.
-
-    Attributes:
-        type: GLSL type.
-        name: Name.
-        size: Length of an array; None for other types.
-        way: `in`, `out` or `inout` for a parameter or local variable; `const`, `uniform` or `buffer`.
-        value: Initial value, or None.
+    """A parameter, constant, local variable, texture, uniform or buffer of a GLSL type. `size` is the length of an
+    array, else None; `way` is `in`, `out` or `inout` of a parameter or local variable, or `const`, `uniform`, `buffer`
+    or, of a buffer that is written, `storage`; `value` is the initial value, or None.
     """
 
     type: str
@@ -61,16 +51,11 @@ class Variable:
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement.
+    """A statement: `comment`, `declare`, `expression`, `return`, `if`, `for` or `block`.
 
-    Attributes:
-        kind: `comment`, `declare`, `expression`, `return`, `if`, `for` or `block`.
-        text: Text of a comment.
-        parts: Expressions.
-        variable: Variable of a declaration or a loop.
-        bodies: Blocks: one or two of `if`, one of `for` and `block`.
-        tail: Comment at the end of the statement's line.
-        blank: Whether a blank line precedes the statement.
+    It has the text of a comment, expressions, the variable of a declaration or a loop, and blocks: one or two of `if`,
+    one of `for` and `block`. `tail` is the comment at the end of its line; `blank` tells whether a blank line precedes
+    it.
     """
 
     kind: str
@@ -94,11 +79,8 @@ class Function:
 
 @dataclass
 class Shader:
-    """The declarations of a shader.
-
-    Attributes:
-        items: Comments (text), variables and functions in order, each with a flag: whether a blank line precedes it.
-    """
+    """The declarations of a shader: comments (text), variables and functions in order, each with a flag, whether a
+    blank line precedes it."""
 
     items: list[tuple[str | Variable | Function, bool]] = field(default_factory=list)
 
@@ -110,7 +92,11 @@ class Shader:
     @property
     def bound(self) -> dict[str, Variable]:
         """Returns the shader's textures, uniforms and buffers by name."""
-        found = [item for item, _ in self.items if isinstance(item, Variable) and item.way in ("uniform", "buffer")]
+        found = [
+            item
+            for item, _ in self.items
+            if isinstance(item, Variable) and item.way in ("uniform", "buffer", "storage")
+        ]
         return {item.name: item for item in found}
 
 
@@ -165,14 +151,14 @@ class _Reader:
             self.at += 1
 
     def _buffer(self) -> Variable:
-        self.take("readonly")
+        way = "buffer" if self.taken("readonly") else "storage"
         self.take("buffer")
         self.take()
         self.take("{")
         kind, name = self.take().text, self.take().text
         for mark in ("[", "]", ";", "}", ";"):
             self.take(mark)
-        return Variable(kind, name, way="buffer")
+        return Variable(kind, name, way=way)
 
     def _variable(self, way: str) -> Variable:
         kind, name = self.take().text, self.take().text

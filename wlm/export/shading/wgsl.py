@@ -1,7 +1,9 @@
 """Writes WGSL: functions, and declarations of textures and buffers in bind group 0."""
 
+import functools
+
 from wlm.export.shading.tree import SAMPLERS, VECTORS, Function, Node, Statement, Variable
-from wlm.export.shading.writer import Writer, nodes_of
+from wlm.export.shading.writer import ATOMICS, Writer, nodes_of
 
 _TEXTURES = {"sampler2D": "texture_2d<f32>", "usampler2D": "texture_2d<u32>", "sampler2DArray": "texture_2d_array<f32>"}
 _SCALARS = {"float": "f32", "int": "i32", "uint": "u32", "bool": "bool"}
@@ -14,6 +16,7 @@ class WgslWriter(Writer):
         **{name: f"vec{n}{kind[0]}" for name, (kind, n) in VECTORS.items()},
         **_SCALARS,
         "unpackHalf2x16": "unpack2x16float",
+        "packHalf2x16": "pack2x16float",
     }
     linear = "wlm_linear_clamp"
 
@@ -33,6 +36,10 @@ class WgslWriter(Writer):
             return [f"{self._bind(variable.name)} {variable.name}: {_TEXTURES[variable.type]};"]
         if variable.way == "buffer":
             return [f"{self._bind(variable.name)}<storage, read> {variable.name}: array<{self.kind(variable.type)}>;"]
+        if variable.way == "storage":
+            kind = self.kind(variable.type)
+            kind = f"atomic<{kind}>" if variable.name in self._atomic else kind
+            return [f"{self._bind(variable.name)}<storage, read_write> {variable.name}: array<{kind}>;"]
         if variable.way == "uniform":
             return [f"{self._bind(variable.name)}<uniform> {variable.name}: {self.type_of(variable)};"]
         assert variable.value is not None
@@ -65,7 +72,16 @@ class WgslWriter(Writer):
         variable = self.scope.get(node.text)
         return f"(*{node.text})" if variable is not None and variable.way != "in" else node.text
 
+    @functools.cached_property
+    def _atomic(self) -> set[str]:
+        """The names of the buffers whose entries are atomic, because some function changes them in one step."""
+        return {name for _, name in self.atomics}
+
     def write(self, node: Node) -> str:
+        entry = node.parts[0] if node.kind == "assign" else node
+        if entry.kind == "index" and entry.parts[0].text in self._atomic:
+            place = f"&{super().write(entry)}"
+            return f"atomicLoad({place})" if entry is node else f"atomicStore({place}, {self.write(node.parts[1])})"
         if node.kind == "choice":
             condition, chosen, other = map(self.write, node.parts)
             return f"select({other}, {chosen}, {condition})"
@@ -80,6 +96,10 @@ class WgslWriter(Writer):
     def call(self, node: Node) -> str:
         if node.text == "uintBitsToFloat":
             return f"bitcast<f32>({self.write(node.parts[0])})"
+        if node.text == "floatBitsToUint":
+            return f"bitcast<u32>({self.write(node.parts[0])})"
+        if node.text in ATOMICS:
+            return f"{node.text}(&{super().write(node.parts[0])}, {self.write(node.parts[1])})"
         return super().call(node)
 
     def arguments(self, name: str, arguments: tuple[Node, ...]) -> list[str]:

@@ -11,6 +11,9 @@ _PLAIN = {("+", "*"), ("+", "/"), ("-", "*"), ("-", "/"), ("+", "%"), ("-", "%")
 FILTERS = {"textureLod", "textureGrad"}
 """Functions that read a texture through its filter."""
 
+ATOMICS = ("atomicAdd", "atomicXor")
+"""Functions that change an entry of a buffer of uint in one step, and return its value before."""
+
 _COMPARED = ("<", ">", "<=", ">=", "==", "!=")
 
 
@@ -32,12 +35,8 @@ def nodes_of(body: tuple[Statement, ...]) -> Iterator[Node]:
 
 
 class Writer(ABC):
-    """Writes a parsed shader in a C-like language; subclasses override the differences.
-
-    Attributes:
-        shader: The parsed shader.
-        linear: Name of the sampler that reads all filtered textures.
-    """
+    """Writes a parsed shader in a C-like language; subclasses override the differences. `linear` is the name of the
+    sampler that reads all filtered textures."""
 
     names: dict[str, str] = {}
     """Names of types and functions that differ from GLSL."""
@@ -220,6 +219,13 @@ class Writer(ABC):
     def textures(self) -> list[Variable]:
         """Returns the variables of all textures that the shader declares."""
         return [each for each in self.bound.values() if each.type in SAMPLERS]
+
+    @property
+    def atomics(self) -> set[tuple[str, str]]:
+        """Returns the function and the buffer of the calls of atomic functions."""
+        nodes = (node for function in self.functions.values() for node in nodes_of(function.body))
+        calls = (node for node in nodes if node.kind == "call" and node.text in ATOMICS)
+        return {(node.text, node.parts[0].parts[0].text) for node in calls}
 
     @property
     def filters(self) -> list[str]:

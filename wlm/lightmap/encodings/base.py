@@ -14,12 +14,8 @@ from wlm.lightmap.tiles import TileKind
 
 
 class DeviceTiles(ABC):
-    """All tiles of a sheet that are stored with the same encoding, uploaded to a device.
-
-    Attributes:
-        numbers: int [n], numbers of the tiles in the grid, rising.
-        device_bytes: Memory that they take on the device, bytes.
-    """
+    """All tiles of a sheet that are stored with the same encoding, uploaded to a device, where they take
+    `device_bytes`; `numbers`, int [n], are their numbers in the grid, rising."""
 
     device_bytes = 0
 
@@ -40,12 +36,8 @@ class DeviceTiles(ABC):
 
 
 class Encoding(ABC):
-    """One way to store tiles.
-
-    Attributes:
-        kinds: The kinds of tiles that are stored in this way.
-        codes: The number of each of these kinds in the shader's tables, see `wlm.lightmap.bundle.hour_tables`.
-    """
+    """One way to store tiles of some kinds; `codes` has the number of each of these kinds in the shader's tables, see
+    `wlm.lightmap.bundle.hour_tables`."""
 
     kinds: ClassVar[tuple[TileKind, ...]]
     codes: ClassVar[tuple[int, ...]]

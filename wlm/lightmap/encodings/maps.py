@@ -56,13 +56,9 @@ def tile_bytes(profile: Profile, temporal: bool) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Reads:
-    """Which texels of a dynamic tile's temporal maps are read when its valid texels are decoded at the evaluated times.
-
-    Attributes:
-        slices: bool [S], slices of F_uvt that are read.
-        texels: bool [R, R], texels that are read in each of these slices.
-        rows: bool [rows], rows of F_ut and F_vt that are read.
-        columns: bool [2, columns], columns of F_ut and of F_vt that are read.
+    """Which texels of a dynamic tile's temporal maps are read when its valid texels are decoded at the evaluated times:
+    slices of F_uvt, bool [S], and texels in each of them, bool [R, R]; rows of F_ut and F_vt, bool [rows], and columns
+    of each, bool [2, columns].
     """
 
     slices: np.ndarray
@@ -233,10 +229,8 @@ def _together(data: np.ndarray) -> np.ndarray:
 class MapTiles(DeviceTiles):
     """The static or the dynamic tiles of a sheet on a device.
 
-    Attributes:
-        model: The sheet.
-        places: int [n] on the device, 0 to n - 1: indices of the tiles in the arrays of a `TimeState`.
-        arguments: First arguments of each decode kernel: `Stored` and the networks, see `wlm_kernels.mlp`.
+    `places`, int [n] on the device, 0 to n - 1, are indices of the tiles in the arrays of a `TimeState`; `arguments`
+    are the first arguments of each decode kernel: `Stored` and the networks, see `wlm_kernels.mlp`.
     """
 
     def __init__(self, sheet: SheetModel, kind: TileKind, device: str, gelu: str) -> None:

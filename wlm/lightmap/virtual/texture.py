@@ -223,11 +223,9 @@ class VirtualTexture:
         groups = len(layout.groups)
         frame = {"clock": (2 * groups, page_kernels.CLOCK, 0), "switches": (groups, 4, 0), "frame": (1, 0)}
         self._frame_work = struct(kernels.Work, counters=(7, 0), asked=(2, count, 0), **frame, **most)
-        jobs: dict[str, Any] = dict.fromkeys(("target", "part", "lead"), (self.decodes, 0)) | {
-            "slot": (self.decodes, -1)
-        }
-        jobs |= {"first": (self.decodes + 1, 0), "place": (self.decodes, 4, 0)}
-        self._jobs = struct(page_kernels.Jobs, **jobs)
+        each = (self.decodes, 0)
+        jobs = {"place": (self.decodes, 4, 0), "slot": (self.decodes, -1), "first": (self.decodes + 1, 0)}
+        self._jobs = struct(page_kernels.Jobs, target=each, part=each, lead=each, **jobs)
         self.texture = wp.zeros((self.slots, edge, edge), dtype=wp.uint32, device=self.device)
         self.table = self._pages.table
         self._look = kernels.Look(self._frame_work)

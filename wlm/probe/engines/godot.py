@@ -47,13 +47,15 @@ def write_kit(
     *,
     cells: int | None = None,
     original: str | os.PathLike[str] | None = None,
+    axes: str | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
     """Writes a model of second-order spherical harmonics in three colours as a bake of Godot 4, `light.lmbake`.
 
     If `original` is the `.lmbake` that was compressed, a copy of it gets the model's light. Otherwise the bake has
     probes at the corners of cubic cells that fill the probes' box, 1 to 64 `cells` along its longest side (None: 24).
-    If the decoder needs the probes' positions and the model stores none, they are read from `original`.
+    If the decoder needs the probes' positions and the model stores none, they are read from `original`. `axes` are the
+    scene's axes that become Godot's (`wlm.probe.axes`); a bake has Godot's own already.
 
     Raises:
         WlmError: A probe has other than 9 coefficients, `cells` is out of range or given with an `.lmbake`, the
@@ -64,7 +66,7 @@ def write_kit(
     info: dict[str, object] = {"probes": model.probes}
     if bake is None:
         position = positions_of(model, original)
-        lattice = lattice_of(model, CELLS if cells is None else cells, _MOST_CELLS, position, device)
+        lattice = lattice_of(model, CELLS if cells is None else cells, _MOST_CELLS, position, device, axes)
         points, count = lattice.corners(), lattice.count
         values = _godot(model.name, lattice.light(points))
         if not np.abs(points).max() < _LARGEST:
@@ -76,6 +78,8 @@ def write_kit(
             raise WlmError(
                 f"cells: expected none with {bake}: the light replaces that of this bake's probes, without a grid"
             )
+        if axes is not None:
+            raise WlmError(f"axes: expected none with {bake}: the bake's probes stay where they are")
         check_numbers(model)
         places = positions_of(model, bake)
         content = relit(bake, _godot(model.name, model.decoder(device, position=places).decode_probes()))

@@ -14,6 +14,7 @@ import numpy as np
 from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.formats.folder import compact_json, rounded
+from wlm.probe.axes import read_axes, turned
 from wlm.probe.conventions import from_canonical
 from wlm.probe.places import positions_of
 from wlm.probe.sphere import sh_count
@@ -22,11 +23,8 @@ FORMAT = "wlm-unity-probes"
 _VERSION = 1
 INFO_FILE = "probes.json"
 SCRIPT_FILE = "WlmLightProbes.cs"
-_AXES = "xyz"
 _L2 = 9
 _MOST_PROBES = 1 << 17  # the JSON stays short enough to be read as an index
-# Coefficients that are odd in an axis and change sign with it, of 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2.
-_ODD = {"x": (3, 4, 7), "y": (1, 4, 5), "z": (2, 5, 7)}
 _ABOUT = (
     "position: x, y, z of each probe, in Unity's units and axes. sh: of each probe 27 numbers, 9 of red, 9 of green, 9 "
     "of blue, as SphericalHarmonicsL2 has them. Put this folder into Assets; the script's head says the rest."
@@ -170,15 +168,15 @@ def write_kit(
     folder: Path,
     engine: str,
     *,
-    mirror: str | None = None,
+    axes: str | None = None,
     original: str | os.PathLike[str] | None = None,
     device: str = "cpu",
 ) -> dict[str, Any]:
     """Writes a model's probes for Unity: `WlmLightProbes.cs`, and `probes.json`, which it reads.
 
-    Unity is left-handed: importers mirror a glTF scene along x or z, and `mirror` is this axis, or None for a scene
-    that came from Unity. The positions are read from `original`, the file that was compressed; if it is None, the
-    stored positions are used.
+    Unity is left-handed: importers mirror a glTF scene along x or z, hence `axes` "-x,y,z" or "x,y,-z"
+    (`wlm.probe.axes`), or None for a scene that came from Unity. The positions are read from `original`, the file that
+    was compressed; if it is None, the stored positions are used.
 
     Raises:
         WlmError: The numbers are not spherical harmonics of order 0 to 2, there are over 131,072 probes, the axis does
@@ -191,15 +189,12 @@ def write_kit(
         raise WlmError(f"{model.name}: expected 3, 12 or 27 numbers per probe (RGB SH, up to L2), got {model.outputs}")
     if model.probes > _MOST_PROBES:
         raise WlmError(f"{model.name}: expected at most {_MOST_PROBES} probes, got {model.probes}")
-    if mirror is not None and mirror not in tuple(_AXES):
-        raise WlmError(f"mirror: expected x, y or z, the axis to mirror, got {mirror}")
+    matrix = read_axes(axes)
     place = model.stored_positions() if position is None else np.array(position, np.float64)
-    values = model.decoder(device, position=place).decode_probes()
+    values = turned(model.decoder(device, position=place).decode_probes(), matrix)
+    place = place @ matrix.T
     light = np.zeros((len(values), _L2, 3))
     light[:, :coefficients] = from_canonical(values.reshape(len(values), coefficients, 3), "unity")
-    if mirror is not None:
-        place[:, _AXES.index(mirror)] *= -1.0
-        light[:, _ODD[mirror]] *= -1.0
     if not max(np.abs(place).max(), np.abs(light).max()) < np.finfo(np.float32).max:
         raise WlmError(f"{model.name}: expected positions and light within the range of float32")
     document = {

@@ -10,7 +10,6 @@ from wlm.probe.morton import morton_order
 from wlm.probe.sphere import ambient_numbers
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
-from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import volume_frame as frame_kernels
 from wlm_kernels.probe.decode import decode_kernels
 
@@ -55,10 +54,9 @@ class GaussianDecoder(Decoder):
         self._shapes = gaussian_sum.shapes(self._rows, CUT, content.support)
         self._cubes = probe_cubes.build(self._shapes, np.zeros(3, np.float32), model.size.astype(np.float32))
         self.pairs = self._cubes.item.shape[0]
-        columns = model.outputs + content.relative
         shared = np.concatenate([layer.ravel() for layer in content.layers()[:2]])
         last = np.stack([each.layers()[2] for each in self._contents()])
-        last = np.pad(last, ((0, 0), (0, 0), (0, probe_network.padded(columns) - columns)))
+        last = np.pad(last, ((0, 0), (0, 0), (0, -last.shape[2] % 4)))
         last = last.reshape(len(last), -1).astype(np.float32)
         self._net = self._put(np.concatenate([shared.astype(np.float32), last[0]]), float)
         self._keep_hours(last, self._net[len(shared) :])

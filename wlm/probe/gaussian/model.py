@@ -24,6 +24,7 @@ ellipsoid with its axes in another order. The rotation with the smallest angle i
 (Shuster, A Survey of Attitude Representations, 1993).
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -154,13 +155,12 @@ class Gaussians(Content):
 
     @property
     def nbytes(self) -> int:
-        one = gaussian_bytes(self.count, self.latent, self.hidden, self.outputs + self.relative)
-        return one + (2 * self.hours * padded_size(self.hidden, self.outputs + self.relative) if self.hours > 1 else 0)
+        return gaussian_bytes(self.count, self.latent, self.hidden, self.columns // self.hours, self.hours)
 
     @property
     def columns(self) -> int:
-        """The number of outputs of the network, for all hours."""
-        return self.hours * self.outputs + self.relative
+        """The number of outputs of the network: at each hour those of a probe, and one for the magnitude."""
+        return self.hours * (self.outputs + self.relative)
 
     @property
     def steps(self) -> np.ndarray:
@@ -177,14 +177,16 @@ class Gaussians(Content):
         """Returns the three layers of `net`, float16, as `layer_shapes` describes them."""
         return split_layers(self.net, layer_shapes(self.latent, self.hidden, self.columns))
 
-    def at(self, factors: np.ndarray) -> Self:
-        *shared, last = self.layers()
-        light, magnitude = np.split(last.astype(np.float64), [self.hours * self.outputs], axis=1)
-        mixed = np.concatenate([factors @ light.reshape(len(last), self.hours, -1), magnitude], 1)
-        net = np.concatenate(
-            [*(layer.ravel() for layer in shared), np.clip(mixed, -65504, 65504).astype("<f2").ravel()]
-        )
-        return replace(self, net=net, whole=None, hours=1)
+    def at(self, factors: np.ndarray, scales: np.ndarray) -> Self:
+        *shared, last = (layer.astype(np.float64) for layer in self.layers())
+        hours = last.reshape(len(last), self.hours, -1)
+        if not self.relative:
+            hours *= scales[:, None]
+        mixed = [*shared, factors @ hours]
+        net = np.clip(np.concatenate([layer.ravel() for layer in mixed]), -65504, 65504).astype(np.float16)
+        # A half float would round the logarithm of all light by up to a hundredth.
+        rounded = math.exp(mixed[-1][-1, -1] - float(net[-1])) if self.relative else 1.0
+        return replace(self, net=net, gain=self.gain * rounded, whole=None, hours=1)
 
     def facts(self) -> dict[str, Any]:
         return {"gaussians": self.count, "dropped": self.dropped, "latent": self.latent, "hidden": self.hidden}
@@ -193,9 +195,9 @@ class Gaussians(Content):
         return {"count": self.count, "dropped": self.dropped}
 
     @classmethod
-    def table(cls, profile: Profile, outputs: int, count: int, live: int, clusters: int) -> dict[str, Part]:
+    def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int, clusters: int) -> dict[str, Part]:
         channels = STORED_LATENT.start + profile.latent
-        shapes = layer_shapes(profile.latent, profile.hidden, profile.columns(outputs))
+        shapes = layer_shapes(profile.latent, profile.hidden, profile.columns(outputs, hours))
         weights = sum(rows * columns for rows, columns in shapes)
         return {
             "gain": Part(np.float64, (1,), least=0.0, most=float(np.finfo(np.float32).max)),
@@ -228,7 +230,7 @@ class Gaussians(Content):
         steps = (stored["steps"].astype(np.uint32) << 16).view(np.float32).astype(np.float64)
         if not (np.isfinite(steps).all() and (steps > 0).all()):
             raise ValueError("part steps: expected finite quantisation steps above 0")
-        shapes = layer_shapes(latent, hidden, profile.columns(outputs))
+        shapes = layer_shapes(latent, hidden, profile.columns(outputs, hours))
         first, second, third = split_layers(stored["network"].astype(np.int64), shapes)
         whole = WholeNumbers(
             gaussians=stored["gaussians"].T.astype(np.int64) + stored["lowest"],
@@ -236,7 +238,8 @@ class Gaussians(Content):
             net=(first, second, third),
             net_step=steps[STORED_LATENT.start + latent :],
         )
-        sizes = latent, hidden, outputs // hours, profile.support, profile.error == "relative", float(stored["gain"][0])
+        gain, relative = float(stored["gain"][0]), profile.error == "relative"
+        sizes = latent, hidden, outputs, profile.support, relative, gain
         content = cls(*sizes, dropped=dropped, whole=whole, hours=hours, **whole.codes())
         content._check_range()
         return content
@@ -253,9 +256,8 @@ class Gaussians(Content):
         first, _, third = (np.abs(layer.astype(np.float64)) for layer in self.layers())
         sums = self.count * np.abs(self.bounds[:, LATENT].astype(np.float64)).max(0)
         first *= np.concatenate([np.maximum(sums, 1.0), np.ones(4)])[:, None]
-        most = max(
-            first.sum(0).max(), third.sum(0).max(), self.gain * third[:, : self.hours * self.outputs].sum(0).max()
-        )
+        light = third.reshape(len(third), self.hours, -1)[..., : self.outputs]
+        most = max(first.sum(0).max(), third.sum(0).max(), self.gain * light.sum(0).max())
         if not most <= np.finfo(np.float32).max:
             raise ValueError("parts network, gaussians and gain: expected light within the range of float32")
 
@@ -266,14 +268,13 @@ def split_layers(net: Any, shapes: list[tuple[int, int]]) -> list[Any]:
     return [net[start:end].reshape(shape) for (start, end), shape in zip(pairwise(ends), shapes, strict=True)]
 
 
-def gaussian_bytes(count: int, latent: int, hidden: int, outputs: int) -> int:
-    """Returns the bytes of the GPU buffers of `count` Gaussians and a network with `outputs` outputs; see
-    `wlm.probe.gaussian.bundle`."""
+def gaussian_bytes(count: int, latent: int, hidden: int, outputs: int, hours: int = 1) -> int:
+    """Returns the bytes of the GPU buffers of `count` Gaussians and a network with `outputs` outputs at each hour; see
+    `wlm.probe.gaussian.bundle`, and for several hours `wlm.probe.bundle`."""
     channels = LATENT.start + latent
     gaussians = 4 * (10 + 2 * channels + count * ((channels + 1) // 2))
-    return gaussians + 2 * sum(
-        padded_size(rows - 1, columns) for rows, columns in layer_shapes(latent, hidden, outputs)
-    )
+    *shared, last = (padded_size(rows - 1, columns) for rows, columns in layer_shapes(latent, hidden, outputs))
+    return gaussians + 2 * (sum(shared) + last * (hours + 1 if hours > 1 else 1))
 
 
 def padded_size(inputs: int, outputs: int) -> int:

@@ -56,7 +56,7 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
     Args:
         model: The fit, whose Gaussians have no whole numbers yet.
         position: float64 [N, 3], positions of the live probes.
-        values: float32 [N, D], the numbers of these probes.
+        values: float32 [N, T D], the numbers of these probes at T hours, without the model's `scales`.
         device: Device on which results are compared with the fit.
 
     Returns:
@@ -64,15 +64,17 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
     """
     content = model.content
     assert isinstance(content, Gaussians)
-    many = slice(None, None, -(-len(position) // _MANY))
+    many, hours = slice(None, None, -(-len(position) // _MANY)), content.hours
     if content.relative:
-        unit, wanted, faint = magnitudes(values)[:, None], with_magnitude(values), _FAINT
+        unit = np.repeat(magnitudes(values, hours), content.outputs, axis=1)
+        wanted, faint = with_magnitude(values, hours), _FAINT
     else:
         unit, wanted = np.full((1, 1), content.gain), values.astype(np.float64) / content.gain
         faint = _FAINT * max(float(np.ptp(wanted)), float(np.abs(wanted).max())) ** 2
 
     def error(tried: ProbeModel) -> float:
-        decoded = GaussianDecoder(tried, device).decode(position).astype(np.float64)
+        plain = replace(tried, scales=np.ones(hours))
+        decoded = GaussianDecoder(plain, device).decode_hours(position).astype(np.float64)
         return float(np.square((decoded - values) / unit).mean())
 
     search = _Search(content, model.normalise(position[many]), wanted[many], faint, device)

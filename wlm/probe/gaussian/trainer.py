@@ -66,21 +66,25 @@ class Trainer:
         dropped_change: Largest change of a number of a probe that results from dropping Gaussians.
     """
 
-    def __init__(self, x: np.ndarray, values: np.ndarray, profile: Profile, seed: int, device: str) -> None:
+    def __init__(
+        self, x: np.ndarray, values: np.ndarray, profile: Profile, seed: int, device: str, hours: int = 1
+    ) -> None:
         """Starts a fit.
 
         Args:
             x: float32 [N, 3], positions of the live probes relative to their box, in [0, 1].
-            values: float32 [N, D], the numbers of these probes.
+            values: float32 [N, T D], the numbers of these probes at T hours.
             profile: The settings.
             seed: Seed of the fit; the same seed gives the same result on one device.
             device: "cpu" or "cuda:N".
+            hours: T.
         """
         self.device, self._cuda = device, device != "cpu"
         self.steps, self._name, self._support = profile.steps, profile.name, profile.support
-        self.relative, self._gain = profile.error == "relative", float(magnitudes(values).max())
+        self._hours = hours
+        self.relative, self._gain = profile.error == "relative", float(magnitudes(values, hours).max())
         if self.relative:
-            values = with_magnitude(values)
+            values = with_magnitude(values, hours)
         self._probes, self._outputs = values.shape
         self._latent, self._hidden = profile.latent, profile.hidden
         self._layers = layer_shapes(self._latent, self._hidden, probe_network.padded(self._outputs))
@@ -314,7 +318,7 @@ class Trainer:
         return Gaussians(
             latent=self._latent,
             hidden=self._hidden,
-            outputs=d - self.relative,
+            outputs=d // self._hours - self.relative,
             support=self._support,
             relative=self.relative,
             gain=gain,
@@ -323,6 +327,7 @@ class Trainer:
             bounds=t["bounds"].astype(np.float32),
             net=np.clip(net, -65504, 65504).astype(np.float16),
             dropped=int((~self.needed).sum()),
+            hours=self._hours,
         )
 
     def state(self) -> dict[str, np.ndarray]:

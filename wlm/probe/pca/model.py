@@ -20,7 +20,7 @@ from scipy.cluster.vq import kmeans2
 
 from wlm.formats.parts import Part
 from wlm.probe.model import Content, Profile
-from wlm.probe.relative import norms
+from wlm.probe.relative import magnitudes, norms
 
 ENOUGH = 0.02
 """Relative error at which no bit is added: RMS over all probes of the error divided by the probe's magnitude."""
@@ -38,7 +38,6 @@ _MOST = 64  # directions of a cluster
 _SAMPLE = 1 << 13  # probes from which clusters and bits are chosen
 _MADE_UP = 1 / 16  # of the rounding of the magnitude, that coefficients in unit vectors do not make up for
 _RECORDS = 1 << 15  # probes that are packed at once
-_SAFE = 0.95  # the predicted error is not exact, since coefficients make up for rounded magnitudes
 _NARROW, _SHARES = 5, (1.0, 0.75, 0.55)  # fewer bits may be worth more if they cover only a share of the range
 
 
@@ -78,14 +77,14 @@ class Components(Content):
 
     @property
     def nbytes(self) -> int:
-        several, bits = self.hours > 1, int(self.width.sum())
-        basis = len(self.basis) or several * self.count
-        one = component_bytes(len(self.code), self.outputs, self.count, self.clusters, bits, basis)
-        return one + (4 * self.hours * basis * -(-self.outputs // 2) if several else 0)
+        bits = int(self.width.sum())
+        return component_bytes(
+            len(self.code), self.outputs, self.count, self.clusters, bits, self.hours, identity=not len(self.basis)
+        )
 
-    def at(self, factors: np.ndarray) -> Self:
+    def at(self, factors: np.ndarray, scales: np.ndarray) -> Self:
         basis = self.basis.astype(np.float64) if len(self.basis) else np.eye(self.count)
-        mixed = factors @ basis.reshape(len(basis), self.hours, -1)
+        mixed = (factors * scales) @ basis.reshape(len(basis), self.hours, -1)
         return replace(self, basis=np.clip(mixed, -65504, 65504).astype(np.float16), hours=1)
 
     def facts(self) -> dict[str, Any]:
@@ -98,7 +97,8 @@ class Components(Content):
         )
 
     @classmethod
-    def table(cls, profile: Profile, outputs: int, count: int, live: int, clusters: int) -> dict[str, Part]:
+    def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int, clusters: int) -> dict[str, Part]:
+        outputs *= hours
         if count >= outputs or (clusters > 1 and not count):
             raise ValueError(f"setting count: expected at most {outputs - 1} components in clusters, found {count}")
         numbers = count or outputs
@@ -133,7 +133,7 @@ class Components(Content):
         if not (np.exp(most[:, 0]) * most[:, 1:].sum(1)).max() * largest <= np.finfo(np.float32).max:
             raise ValueError("parts bounds and basis: expected light within the range of float32")
         code = np.ascontiguousarray(code.T)
-        return cls(outputs // hours, code, width, stored["bounds"], stored["basis"], hours)
+        return cls(outputs, code, width, stored["bounds"], stored["basis"], hours)
 
     def places(self) -> np.ndarray:
         """Returns the first bit and the number of bits of each column of `code` in the bits of a probe, [2 + K, 2]."""
@@ -153,22 +153,25 @@ class Components(Content):
         return np.concatenate(words)
 
 
-def component_bytes(live: int, outputs: int, count: int, clusters: int, bits: int, basis: int) -> int:
-    """Returns the bytes of the GPU buffer of V = `live` probes with `bits` bits each, and `basis` directions; see
-    `wlm.probe.pca.bundle`."""
-    words = 4 + count + clusters * (1 + count) + basis * -(-outputs // 2)
-    return 4 * (words + -(-live * bits // 32))
+def component_bytes(
+    live: int, outputs: int, count: int, clusters: int, bits: int, hours: int, *, identity: bool
+) -> int:
+    """Returns the bytes of the GPU buffers of V = `live` probes with `bits` bits each, and `count` directions for each
+    of `clusters`; see `wlm.probe.pca.bundle`, and for several hours `wlm.probe.bundle`."""
+    basis = clusters * count * -(-outputs // 2) * (hours + 1 if hours > 1 else int(not identity))
+    return 4 * (4 + count + clusters * (1 + count) + basis + -(-live * bits // 32))
 
 
 def fit_components(
-    values: np.ndarray, most_bytes: int | None = None, *, relative: bool = True, seed: int = 0
+    values: np.ndarray, most_bytes: int | None = None, hours: int = 1, *, relative: bool = True, seed: int = 0
 ) -> tuple[Components, float]:
-    """Compresses live probes to the smallest GPU buffer whose relative error is at most about `ENOUGH`, or a
+    """Compresses live probes to the smallest GPU buffers whose relative error is at most `ENOUGH` at each hour, or a
     sixteenth of it if errors are not relative.
 
     Args:
-        values: float32 [V, D], numbers of live probes; no row is zero.
+        values: float32 [V, T D], numbers of live probes at T hours; no row is zero.
         most_bytes: Largest number of GPU bytes; None: no limit. At least one component is fitted.
+        hours: T.
         relative: Whether an error is relative to the light of its probe; if not, to that of the brightest probe.
         seed: Seed of the clusters.
 
@@ -176,25 +179,40 @@ def fit_components(
         The components and their error, which is above that if `most_bytes` does not allow more.
     """
     values = values.astype(np.float64)
-    live, outputs = values.shape
-    # A half float holds the logarithm of a common magnitude exactly.
+    live, numbers = values.shape
     light = norms(values)
+    unit = light[:, None]
+    if hours > 1 and relative:
+        # A probe that is dark at an hour has no error relative to its light then.
+        unit = np.where(norms(values.reshape(live, hours, -1)) > 0, magnitudes(values, hours), np.inf)
     if not relative:
+        # A half float holds the logarithm of a common magnitude exactly.
         light = np.full(live, np.exp(np.float64(np.float16(np.log(light.max())))))
+        unit = light[:, None]
     some = slice(None, None, -(-live // _SAMPLE))
-    unit, logarithm = (values / light[:, None])[some], np.log(light)[some]
-    bits = _WIDEST * (1 + outputs)
+    bits = _WIDEST * (1 + numbers)
     if most_bytes is not None:
         bits = min(bits, 8 * most_bytes // live)
     rank = min(max(bits // _BITS, 1), _RANK)
-    enough = ENOUGH if relative else ENOUGH / 16
     plans = []
     for clusters in (0, *_TRIED):
-        if clusters <= max(live // _FEWEST, _FEWEST * live <= outputs):
-            division = _divided(unit, clusters, rank, seed)
-            plans += [(plan, division) for plan in _plans(unit, logarithm, division, bits, live, most_bytes, enough)]
-    plan, division = min(plans, key=lambda each: each[0].key)
-    return _coded(values, light, division, plan.width)
+        if clusters <= max(live // _FEWEST, _FEWEST * live <= numbers):
+            shape = (values / light[:, None])[some]
+            division = _divided(shape, clusters, rank, seed)
+            plans += _plans(shape, np.log(light)[some], division, bits, live, hours)
+    plans = [plan for plan in plans if most_bytes is None or plan.size <= most_bytes] or [min(plans, key=_size)]
+    target = enough = ENOUGH if relative else ENOUGH / 16
+    while True:  # the errors of plans are predictions, and not of each hour
+        good = [plan for plan in plans if plan.error <= enough]
+        plan = min(good, key=_size) if good else min(plans, key=lambda plan: plan.error)
+        components, error = _coded(values, light, unit, plan)
+        if error <= target or not good:
+            return components, error
+        enough = min(0.9 * enough * target / error, 0.99 * plan.error)
+
+
+def _size(plan: "_Plan") -> tuple[int, float]:
+    return plan.size, plan.error
 
 
 class _Division(NamedTuple):
@@ -214,10 +232,12 @@ class _Groups(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """Bits of each column of `Components.code`, and a key that is least for the best plan."""
+    """Bits of each column of `Components.code`, GPU bytes, predicted error, and the division."""
 
-    key: tuple[float, ...]
     width: list[int]
+    size: int
+    error: float
+    division: _Division
 
 
 def _divided(unit: np.ndarray, clusters: int, rank: int, seed: int) -> _Division:
@@ -277,18 +297,10 @@ def _numbers(unit: np.ndarray, groups: _Groups, division: _Division) -> tuple[np
 
 
 def _plans(
-    unit: np.ndarray,
-    logarithm: np.ndarray,
-    division: _Division,
-    bits: int,
-    live: int,
-    most_bytes: int | None,
-    enough: float,
+    unit: np.ndarray, logarithm: np.ndarray, division: _Division, bits: int, live: int, hours: int
 ) -> list[_Plan]:
     """Allocates 0, 1, ... `bits` bits of each probe to the logarithm of its magnitude and to its coefficients, with the
-    least sum of squared errors. Errors up to `enough` are equally good. `unit` and `logarithm` may be of fewer probes
-    than `live`."""
-    outputs = unit.shape[1]
+    least sum of squared errors. `unit` and `logarithm` may be of fewer probes than `live`."""
     groups, division = _grouped(unit, division)
     unit, logarithm = unit[groups.order], logarithm[groups.order]
     numbers, sums = _numbers(unit, groups, division)
@@ -308,23 +320,21 @@ def _plans(
     index = (clusters - 1).bit_length()
     plans = []
     for spent, error in enumerate(np.sqrt((total + rest) / len(unit))):
-        count = outputs if division.directions is None else max(int(last[spent]), 1)
-        basis = 0 if division.directions is None else clusters * count
-        size = component_bytes(live, outputs, count, clusters, index + spent, basis)
-        if most_bytes is not None and size > most_bytes:
-            key = (2.0, size, error)
-        else:
-            key = (0.0, size, error) if error <= _SAFE * enough else (1.0, error, size)
+        count = unit.shape[1] if division.directions is None else max(int(last[spent]), 1)
+        identity = division.directions is None
+        size = component_bytes(live, unit.shape[1] // hours, count, clusters, index + spent, hours, identity=identity)
         width, left = [], spent
         for pick in reversed(picks):
             width.insert(0, int(pick[left]))
             left -= width[0]
-        plans.append(_Plan(key, [index, *width[: 1 + count]]))
+        plans.append(_Plan([index, *width[: 1 + count]], size, float(error), division))
     return plans
 
 
-def _coded(values: np.ndarray, light: np.ndarray, division: _Division, width: list[int]) -> tuple[Components, float]:
-    """Codes probes [V, D] with given magnitudes; returns the components and their error relative to these."""
+def _coded(values: np.ndarray, light: np.ndarray, unit: np.ndarray, plan: _Plan) -> tuple[Components, float]:
+    """Codes probes [V, T D] of given magnitudes; returns the components, and the largest error of an hour, in `unit`
+    [V, T]."""
+    width, division = plan.width, plan.division
     basis = np.zeros((0, values.shape[1]), np.float16)
     if division.directions is not None:
         basis = division.directions[:, : len(width) - 2].astype(np.float16)
@@ -342,12 +352,13 @@ def _coded(values: np.ndarray, light: np.ndarray, division: _Division, width: li
     if division.directions is not None:
         pairs = zip(division.directions, _pieces(groups), strict=True)
         decoded = np.concatenate([decoded[rows] @ each for each, rows in pairs])
-    error = norms(magnitude * decoded - values) / light
+    hours = unit.shape[1]
+    error = norms((magnitude * decoded - values).reshape(len(values), hours, -1)) / unit[groups.order]
     code = np.empty((len(values), len(width)), np.uint8)
     code[groups.order] = np.stack([groups.label, *(column.code for column in columns)], 1)
     bounds = np.stack([np.stack([column.low, column.step]) for column in columns], 2).astype(np.float16)
-    components = Components(values.shape[1], code, np.array(width, np.uint8), bounds, basis)
-    return components, float(np.sqrt(np.square(error).mean()))
+    components = Components(values.shape[1] // hours, code, np.array(width, np.uint8), bounds, basis, hours)
+    return components, float(np.sqrt(np.square(error).mean(0).max()))
 
 
 class _Quantised(NamedTuple):

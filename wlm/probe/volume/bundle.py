@@ -6,7 +6,7 @@ from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.sphere import sh_count
-from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.cascade import State, Volume
 from wlm.probe.volume.shader import volume_glsl
 
 _REFERENCES = 64
@@ -36,11 +36,6 @@ def volume_bundle(volume: Volume) -> Bundle:
     rows, pages = np.unique(state.pages[state.pages >= 0]), state.pages
     if not len(rows):
         raise WlmError("volume: cannot export: no block of light is near the viewpoint; choose one near the probes")
-    starts = np.cumsum(volume.sides.prod(1)) - volume.sides.prod(1)
-    head = [np.array([len(volume.sizes), len(pages), volume.channels, len(rows)], "<u4")]
-    for view, base, start, sides in zip(state.views, state.bases, starts, volume.sides, strict=True):
-        whole = np.concatenate([base, [start], sides, [0]])
-        head += [view.astype("<f4").view("<u4"), whole.astype("<i4").view("<u4")]
     document = {
         "about": _ABOUT,
         "outputs": volume.channels,
@@ -60,12 +55,24 @@ def volume_bundle(volume: Volume) -> Bundle:
         shader=volume_glsl(volume.channels),
         document=document,
         buffers={
-            "volume": np.concatenate(head),
+            "volume": head_words(volume, state, len(rows)),
             "pages": pack_words(np.where(pages >= 0, np.searchsorted(rows, pages), -1).astype("<i2")),
             "pool": pool_words(state.pool[rows], state.factor[rows]),
         },
         reference=_reference(volume),
     )
+
+
+def head_words(volume: Volume, state: State, rows: int) -> np.ndarray:
+    """Returns the buffer `volume`, uint32, of a volume in a state with some rows; its layout is in the shader."""
+    starts, index = np.cumsum(volume.sides.prod(1)) - volume.sides.prod(1), volume.index
+    counts = [len(starts), len(state.pages), volume.channels, rows]
+    counts += [volume.frame, index.count, len(index.block), volume.sides.max()]
+    ends = (starts, index.level_start[:-1], index.ratios)
+    threes = (state.bases, volume.sides, state.before)
+    levels = [np.column_stack([three, end]) for three, end in zip(threes, ends, strict=True)]
+    whole = np.concatenate([state.views.astype("<f4").view("<i4"), *levels], 1)
+    return np.concatenate([counts, whole.reshape(-1)]).astype("<i4").view("<u4")
 
 
 def pack_words(numbers: np.ndarray) -> np.ndarray:

@@ -93,6 +93,7 @@ class State(NamedTuple):
     factor: np.ndarray
     pages: np.ndarray
     bases: np.ndarray
+    before: np.ndarray
     views: np.ndarray
 
 
@@ -108,6 +109,8 @@ class Volume:
         sizes: Side of a block at each level, in the unit of the positions.
         sides: int64 [L, 3], blocks along the axes of each level's window.
         budget: Largest number of blocks decoded per frame.
+        rows: Number of blocks that have memory.
+        frame: Number of updates so far.
         channels: Numbers per probe, D.
         device: "cpu" or "cuda:N".
     """
@@ -163,12 +166,17 @@ class Volume:
             raise WlmError(f"volume block: expected sides of all levels from {limits}, got {list(self.sizes)}")
         self.position, self.light = position, light
         self.sides = np.minimum(side, self.index.high - self.index.low + 1)
+        self._half, self._last, self._slots = (
+            self.sides // 2,
+            self.index.high + 1 - self.sides,
+            int(self.sides.prod(1).sum()),
+        )
         self.budget, self.channels = budget, light.channels
         self.device = light.device
         self._size = np.array(self.sizes)
         self._viewpoint: np.ndarray | None = None
         self._base = np.zeros((len(ratios), 3), np.int64)
-        self._frame = 0
+        self.frame = 0
         self.normal = None if normal is None else _unit(normal, position.shape)
         self._make(rows, self.normal)
         self._step = interop.StepGraph(self._work, self.device)
@@ -177,7 +185,7 @@ class Volume:
         """Allocates all arrays on the device."""
         host, probes = self.index, max(1, min(frame_kernels.PROBES, self.index.count))
         slots, blocks = self.sides.prod(1), max(1, len(host.block))
-        rows, budget = min(rows, blocks), min(self.budget, blocks)
+        self.rows, self.budget = rows, budget = min(rows, blocks), min(self.budget, blocks)
         self._bytes: dict[str, int] = {}
 
         def struct(part: str, kind: Any, value: int, **contents: Any) -> Any:
@@ -283,20 +291,20 @@ class Volume:
         if np.abs(at).max() > _FARTHEST:
             limit = _FARTHEST * self.sizes[0]
             raise WlmError(f"viewpoint: expected a point within {limit:g} of the probes, got {viewpoint.tolist()}")
-        low, high = self.index.low, self.index.high
-        base = np.clip(np.floor(at + 0.5).astype(np.int64) - self.sides // 2, low, high + 1 - self.sides)
+        base = np.floor(at + 0.5).astype(np.int64) - self._half
+        base = np.minimum(np.maximum(base, self.index.low), self._last)
         # Before the first frame the windows are where they share no block with those of the frame.
         before = self._base if self._viewpoint is not None else base + self.sides
         kept = np.maximum(self.sides - np.abs(base - before), 0).prod(1).sum()
         self._viewpoint, self._base = viewpoint, base
-        self._frame += 1
+        self.frame += 1
         views = np.column_stack([at - base - 0.5, 1.0 / self._size])
         with interop.stream(self.device):
-            self._look(base, before, views, self._frame)
+            self._look(base, before, views, self.frame)
             self._step()
         counters = self._frame_work.counters.numpy()
         queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
-        entered = int(self.sides.prod(1).sum() - kept)
+        entered = self._slots - int(kept)
         return FrameStats(entered, queued, dropped, updated, cached, left, probes, time.perf_counter() - start)
 
     def _work(self) -> None:
@@ -346,7 +354,7 @@ class Volume:
     def state(self) -> State:
         """Copies the arrays that a shader reads from the device to the host."""
         windows, pool = self._windows, self._pool
-        parts = (pool.light, pool.factor, windows.pages, windows.bases, windows.views)
+        parts = (pool.light, pool.factor, windows.pages, windows.bases, windows.before, windows.views)
         with interop.stream(self.device):
             return State(*(part.numpy() for part in parts))
 

@@ -3,8 +3,8 @@
 from wlm.probe.glsl import buffer_glsl
 from wlm.probe.sphere import sh_count
 
-_HEAD_WORDS = 4  # words of the buffer `volume` before the levels
-_LEVEL_WORDS = 12
+HEAD_WORDS = 8  # words of the buffer `volume` before the levels
+LEVEL_WORDS = 16
 
 _TEMPLATE = """\
 // Reads the light of a cascaded lighting volume (Gaussian Compression for Precomputed Indirect Illumination, section
@@ -12,10 +12,12 @@ _TEMPLATE = """\
 // it below #version. It fits every volume of {outputs} numbers per block.
 //
 // Buffer volume, 32-bit words, little-endian:
-//   0    levels L, slots of all windows, numbers per block, rows of the pool: integers
-//   4    L times 12 words, the finest level first: 4 floats, position of the viewer in the window in blocks, from the
+//   0    levels L, slots of all windows, numbers per block, rows of the pool, number of the frame, probes, blocks near
+//        probes, longest side of a window in blocks: integers
+//   8    L times 16 words, the finest level first: 4 floats, position of the viewer in the window in blocks, from the
 //        centre of the first block, and 1 / side of a block; 3 integers, the first block of the window; 1, the first
-//        slot of the level; 3, the blocks along the axes of the window; 0
+//        slot of the level; 3, the blocks along the axes of the window; 1, the first of its blocks near probes; 3, the
+//        first block of the window in the frame before; 1, the side of a block divided by that of the finest level
 // Buffer pages, two signed 16-bit integers a word, the first in the lower half, one for each slot. Block b of a level
 //        has slot first + ((b.x mod sides.x) * sides.y + (b.y mod sides.y)) * sides.z + (b.z mod sides.z). Its entry is
 //        its row of the pool, or negative where the block is missing.
@@ -26,12 +28,6 @@ _TEMPLATE = """\
 // this file as other ways to read word i.
 {buffers}
 const int WLM_VOLUME_OUTPUTS = {outputs};
-
-int wlm_volume_wrap(int i, int side)
-{{
-    int r = i % side;
-    return r < 0 ? r + side : r;
-}}
 
 int wlm_volume_row(int slot)
 {{
@@ -77,9 +73,9 @@ float wlm_volume_read(vec3 p, vec3 normal, out float values[{outputs}])
                     * (corner / 4 == 1 ? fz : 1.0 - fz);
                 int row = -1;
                 if (min(u, min(v, w)) >= 0 && u < sx && v < sy && w < sz) {{
-                    u = wlm_volume_wrap(u + int(WLM_VOLUME_HEAD(at + 4)), sx);
-                    v = wlm_volume_wrap(v + int(WLM_VOLUME_HEAD(at + 5)), sy);
-                    w = wlm_volume_wrap(w + int(WLM_VOLUME_HEAD(at + 6)), sz);
+                    u = (u + int(WLM_VOLUME_HEAD(at + 4))) % sx; // no block has a negative coordinate
+                    v = (v + int(WLM_VOLUME_HEAD(at + 5))) % sy;
+                    w = (w + int(WLM_VOLUME_HEAD(at + 6))) % sz;
                     int slot = int(WLM_VOLUME_HEAD(at + 7)) + (u * sy + v) * sz + w;
                     row = wlm_volume_row(slot);
                 }}
@@ -134,6 +130,11 @@ vec3 wlm_volume_diffuse(vec3 p, vec3 n)
 _BUFFERS = ("HEAD", "PAGE", "POOL")  # in the order of their bindings
 
 
+def row_words(outputs: int) -> int:
+    """Returns the number of 32-bit words of a row of the pool: a factor, and D half floats."""
+    return 1 + (outputs + 1) // 2
+
+
 def volume_glsl(outputs: int) -> str:
     """Returns the GLSL that reads a volume: functions to be included below `#version`.
 
@@ -145,7 +146,7 @@ def volume_glsl(outputs: int) -> str:
         GLSL 4.30, which is also valid Vulkan GLSL.
     """
     buffers = [buffer_glsl("volume", name, number) for number, name in enumerate(_BUFFERS)]
-    words = {"head": _HEAD_WORDS, "level_words": _LEVEL_WORDS, "row_words": 1 + (outputs + 1) // 2}
+    words = {"head": HEAD_WORDS, "level_words": LEVEL_WORDS, "row_words": row_words(outputs)}
     text = _TEMPLATE.format(buffers="".join(buffers), outputs=outputs, **words)
     coefficients = sh_count(outputs)
     if coefficients in (1, 4, 9):

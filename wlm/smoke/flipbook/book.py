@@ -35,13 +35,8 @@ RATE = 25.0
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A frame of six-way lightmaps, and the scene's settings for its picture.
-
-    Attributes:
-        number: Number of the frame.
-        six: Lightmaps with their camera; if there are obstacles, also with their depth.
-        looks: Lights, colours and obstacles of the scene; None: unknown.
-    """
+    """A frame of six-way lightmaps with their camera, and if there are obstacles also with their depth; and the scene's
+    settings for its picture, None if unknown."""
 
     number: int
     six: SixWay

@@ -266,12 +266,11 @@ def _layout(
 
 
 def _best(frames: Sequence[torch.Tensor], others: Sequence[Layout]) -> tuple[str | None, float, float]:
-    """Finds the layout whose directions fit the light of two textures [N, C, H, W].
+    """Finds the layout whose directions fit the light of two textures [N, C, H, W]. Besides the known layouts, the
+    variants of `others` with two opposite directions exchanged are tried.
 
-    Besides the known layouts, the variants of `others` with two opposite directions exchanged are tried.
-
-    Returns:
-        Its text for `parse_layout`, None if no layout fits; how well it fits; and how well the first of `others` does.
+    Returns its text for `parse_layout`, None if no layout fits; how well it fits; and how well the first of `others`
+    does.
     """
     counts = [each.shape[1] for each in frames]
     centres = light_centres(torch.cat(list(frames), 1))

@@ -109,11 +109,7 @@ def march_planes(volume: DensityVolume, camera: Camera, march: March) -> torch.T
 @dataclass(frozen=True, eq=False)
 class Guide:
     """A guiding map of H x W pixels (algorithm 1): a cheap picture of smoke, from which a network predicts lightmaps.
-
-    Attributes:
-        maps: float32 tensor [3, H, W] on the smoke's device: light, transparency, depth.
-        camera: Camera of the maps.
-    """
+    `maps`, float32 tensor [3, H, W] on the smoke's device, are light, transparency and depth, seen by `camera`."""
 
     maps: torch.Tensor
     camera: Camera

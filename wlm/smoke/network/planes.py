@@ -116,12 +116,10 @@ def decode_lightmaps(planes: torch.Tensor, *, hot: bool = True, camera: Camera |
 class Pool:
     """N samples on one device, each with two successive frames, the earlier first; all floats are half floats.
 
-    Attributes:
-        guides: [N, 2, C, H, W], encoded guiding maps with the C planes of their kind in `GUIDES`.
-        targets: [N, 2, 8, H, W], encoded reference lightmaps, in the order of `PLANES`.
-        motion: [N, 2, H, W], pixels to the right and down by which the smoke in the later frame has moved since the
-            earlier frame.
-        sequence: int [N], number of the simulated sequence that each sample is from; sets share no sequence.
+    `guides`, [N, 2, C, H, W], are encoded guiding maps with the C planes of their kind in `GUIDES`; `targets`, [N, 2,
+    8, H, W], encoded reference lightmaps, in the order of `PLANES`. `motion`, [N, 2, H, W], is by how many pixels to
+    the right and down the smoke in the later frame has moved. `sequence`, int [N], is the simulated sequence of each
+    sample; sets share no sequence.
     """
 
     guides: torch.Tensor

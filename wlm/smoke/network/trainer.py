@@ -21,13 +21,8 @@ _MIRRORED = {"right": "left", "left": "right"}  # planes that a mirror exchanges
 
 
 class Trainer:
-    """A network in training: its weights, the running mean of the weights, and the Adam optimiser.
-
-    Attributes:
-        network: The network in training, on the device.
-        average: The network with the running mean of the weights, which is validated and saved.
-        step: Number of steps done, including those whose update was skipped.
-    """
+    """A network in training, on the device, with its Adam optimiser and the number of steps done, including those whose
+    update was skipped. `average` has the running mean of the weights; it is validated and saved."""
 
     def __init__(self, network: NetworkSettings, settings: TrainSettings, *, seed: int, device: str) -> None:
         """Makes an untrained network; a seed gives the same initial weights on all devices."""
@@ -192,13 +187,9 @@ def _mirrored(planes: tuple[str, ...], device: str) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Plan:
-    """The samples that some training steps use, B samples per step.
-
-    Attributes:
-        samples: int [steps, B], indices of samples in a pool.
-        frames: int [steps, B], which of a sample's two frames is used, 0 or 1; ignored with a temporal loss.
-        flips: bool [steps, B], whether a sample is mirrored left to right.
-        corners: int [steps, B, 2], row and column of the top left pixel of the crop; None: whole images.
+    """The samples that some training steps use: indices in a pool, int [steps, B], which of a sample's two frames is
+    used, 0 or 1, ignored with a temporal loss; whether it is mirrored left to right; and `corners`, int [steps, B, 2],
+    row and column of the top left pixel of the crop; None: whole images.
     """
 
     samples: torch.Tensor

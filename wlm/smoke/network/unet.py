@@ -125,13 +125,10 @@ def support(opacity: torch.Tensor) -> torch.Tensor:
 
 
 class SixWayNetwork(nn.Module):
-    """Maps encoded guiding maps to encoded lightmaps, at any resolution.
+    """Maps encoded guiding maps to encoded lightmaps, at any resolution: the planes `names`, of which each adapter
+    computes one of `groups`.
 
     Outputs are not clamped to their ranges, so that there is a gradient everywhere; `decode_lightmaps` clamps them.
-
-    Attributes:
-        groups: Names of the planes that each adapter computes.
-        names: Names of the planes of all adapters, in order.
     """
 
     def __init__(self, settings: NetworkSettings) -> None:

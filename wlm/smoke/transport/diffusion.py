@@ -86,13 +86,8 @@ def thrown_by_fire(scene: Marching, volume: DensityVolume, albedos: Sequence[flo
 
 
 class CoarseSmoke:
-    """Smoke on the coarse grid of the diffusion.
-
-    Attributes:
-        medium: The smoke at full resolution.
-        extinction: float32 tensor [X, Y, Z], mean extinction per voxel of each cell.
-        edges: Edges of a cell along x, y and z in voxels.
-    """
+    """Smoke on the coarse grid of the diffusion: the smoke at full resolution, the mean extinction per voxel of each
+    cell, float32 tensor [X, Y, Z], and the edges of a cell along x, y and z in voxels."""
 
     def __init__(self, volume: DensityVolume, cells: int = CELLS) -> None:
         """Averages the smoke over `cells` cells along its longest edge; to be called inside `wlm.interop.stream`."""
