@@ -139,7 +139,7 @@ def compress(
     if profile.method == "auto":
         count = gaussian_count(profile.ratio, len(values))
         budget = gaussian_bytes(count, profile.latent, profile.hidden, profile.columns(probes.outputs), hours)
-        components, error = fit_components(values, budget, hours, relative=relative)
+        components, error = fit_components(values, budget, hours)
         if error <= ENOUGH and components.nbytes <= budget:
             took = (
                 f"{components.count} components reach {error:.1%} of each probe's light in {components.nbytes:,} bytes"
@@ -155,7 +155,7 @@ def compress(
         return gaussians
     most = gaussians.content.nbytes
     told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
-    components, _ = fit_components(values, most, hours, relative=relative)
+    components, _ = fit_components(values, most, hours)
     if components.nbytes > most:
         return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
     rival, possible = _measured(make(profile=pca, content=components), probes, device)

@@ -196,6 +196,8 @@ class Gaussians(Content):
 
     @classmethod
     def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int, clusters: int) -> dict[str, Part]:
+        if not count:
+            raise ValueError("setting count: expected at least one Gaussian, found none")
         channels = STORED_LATENT.start + profile.latent
         shapes = layer_shapes(profile.latent, profile.hidden, profile.columns(outputs, hours))
         weights = sum(rows * columns for rows, columns in shapes)
