@@ -3,10 +3,12 @@
 The map has 1024 x 1024 texels with random maps and networks. The rows:
 
 - "ours": the fast decoder at a stored hour, 8 bits per channel, of profiles M and `standard`.
-- "GLSL": the exported shader as a compute shader through OpenGL, which decodes the same hour to half floats; numbers
-  of networks and of the hour are in textures as exported, or by the shader's macros in storage buffers.
-- "WGSL": its translation through wgpu, with the same two places of numbers; a time is the difference of long and short
-  runs, over the difference of their dispatches.
+- "GLSL": the exported functions in a compute shader through OpenGL, which decodes the same hour to half floats; numbers
+  of networks and of the hour are in textures as exported, or by the shader's macros in storage buffers. "groups share a
+  network" is the exported compute shader, with storage buffers.
+- "WGSL": the same translated, through wgpu; a time is the difference of long and short runs, over the difference of
+  their dispatches.
+- "Chromium", on the CPU: the page of a map of 128 x 128 texels, by WebGL2 in software, beside our decoder of this map.
 - "read": a view of 1280 x 720 pixels of four sheets, read trilinearly: from a virtual texture, and from two hours of
   BC7, BC6H and RGB9E5 with mips, interpolated. "nothing" reads the view's coordinates alone, as all others do.
 
@@ -17,22 +19,28 @@ filter has 8 bits for a position between two texels. A way that this machine can
 import re
 import time
 from collections.abc import Callable
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from benchmarks.lightmap_run_time import _PlainCamera, large_model, random_sheet
+from benchmarks.rivals.browser_run import page_time
 from benchmarks.rivals.gl_run import Screen
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from wlm.bundle import Bundle
 from wlm.errors import WlmError
+from wlm.export.compute import compute_shader
 from wlm.export.shading import translate
 from wlm.lightmap.bundle import sheet_bundle
+from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.runtime import fast_decoder
-from wlm.lightmap.sheet import Sheet
+from wlm.lightmap.shader import GROUP_SIZE
+from wlm.lightmap.sheet import LIGHT, Sheet
+from wlm.lightmap.tiles import TILE
 from wlm.lightmap.virtual.shader import sheet_words, virtual_glsl
 from wlm.lightmap.virtual.texture import VirtualTexture
 
@@ -47,6 +55,14 @@ _DISPATCHES = (10, 110)  # of the two runs of WGSL
 _BUFFERS = {"networks": ("NET", 0), "hours": ("HOUR_AT", 1)}  # macro and binding of each buffer
 
 _SHOWN = "vec4 shown(ivec2 pixel) { return vec4(wlm_radiance(pixel), 1.0); }\n"
+_WGSL_MAIN = """
+@group(1) @binding(0) var wlm_out: texture_storage_2d<rgba16float, write>;
+@compute @workgroup_size(8, 8) fn main(@builtin(global_invocation_id) id: vec3u)
+{
+    textureStore(wlm_out, id.xy, shown(vec2i(id.xy)));
+}
+"""
+_TEXTURES, _BUFFERED, _GROUPS = "numbers in textures", "numbers in buffers", "groups share a network"
 _READ = """
 uniform sampler2D u_view;
 uniform sampler2D u_slopes;
@@ -85,7 +101,8 @@ def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
     bench = _ShaderBench(quick, device, progress)
     # In software OpenGL compiles the larger network for minutes.
     profiles = _PROFILES[:1] if bench.device == "cpu" else _PROFILES
-    return [*(row for name in profiles for row in bench.profile_rows(name)), *bench.read_rows()]
+    rows = [row for name in profiles for row in bench.profile_rows(name)]
+    return [*rows, *(bench.page_rows() if bench.device == "cpu" else []), *bench.read_rows()]
 
 
 class _ShaderBench(Bench):
@@ -106,12 +123,11 @@ class _ShaderBench(Bench):
         (ours,) = self.time_rows([(self.row("ours", name, f"8 bits, {self.mode}"), self.replay(decoder.decode))])
         made = sheet_bundle(Sheet(), model, name, "0" * 16, self.device)
         rows = [ours]
-        for language, option, draw in (
-            ("GLSL", "numbers in textures", lambda: self._glsl(made, False)),
-            ("GLSL", "numbers in buffers", lambda: self._glsl(made, True)),
-            ("WGSL", "numbers in textures", lambda: self._wgsl(made, False)),
-            ("WGSL", "numbers in buffers", lambda: self._wgsl(made, True)),
-        ):
+        for language, option, draw in [
+            (language, option, partial(draw, made, option == _TEXTURES, option == _GROUPS))
+            for language, draw in (("GLSL", self._glsl), ("WGSL", self._wgsl))
+            for option in (_TEXTURES, _BUFFERED, _GROUPS)
+        ]:
             self.note(f"{language} of {name}, {option}")
             try:
                 picture, duration, renderer = draw()
@@ -123,6 +139,19 @@ class _ShaderBench(Bench):
             figures = {"decode_ms": duration, "times_ours": duration / ours["decode_ms"], "max_error": error}
             rows.append(self.row(language, f"{name}, {option}", renderer, **figures))
         return rows
+
+    def page_rows(self) -> list[Row]:
+        """Returns the rows of a tile in a browser, and of our decoder of this tile."""
+        self.note("decoding a tile in Chromium")
+        sheet, scene = random_sheet(TILE, np.array(_HOURS), 0, Profile.load("M")), f"a tile, {TILE} x {TILE}"
+        decoder = fast_decoder(sheet, self.device)
+        (ours,) = self.time_rows([(self.row("ours", "M", f"8 bits, {self.mode}", scene=scene), decoder.decode)])
+        try:
+            duration = page_time(LightmapModel("tile", "0" * 16, sheet.profile, {LIGHT: sheet}), self._repeats)
+        except Exception as error:  # whatever a browser says
+            return [ours, self.missing_row("Chromium", "M", error)]
+        figures = {"decode_ms": duration, "times_ours": duration / ours["decode_ms"]}
+        return [ours, self.row("Chromium", "M", "WebGL2 by SwiftShader", scene=scene, **figures)]
 
     def read_rows(self) -> list[Row]:
         """Returns the rows of the ways to read a view."""
@@ -136,26 +165,27 @@ class _ShaderBench(Bench):
             raise self._screen
         return self._screen
 
-    def _glsl(self, made: Bundle, buffers: bool) -> tuple[np.ndarray, float, str]:
+    def _glsl(self, made: Bundle, textured: bool, groups: bool) -> tuple[np.ndarray, float, str]:
         screen = self._opened()
         textures = {
             f"wlm_lightmap_{name}": screen.texture([part.data], part.fmt, part.width, part.height, part.layers)
             for name, part in made.textures.items()
         }
-        text, stored = made.shader + _SHOWN, {}
+        text, stored = compute_shader(made, "glsl") if groups else made.shader + _SHOWN, {}
         numbers = {"networks": made.buffers["networks"], "hours": made.buffers["hours"][0]}
         for name, (macro, place) in _BUFFERS.items():
-            if buffers:
+            if not textured:
                 block = f"layout(std430, binding = {place}) readonly buffer Wlm{place} {{ vec4 wlm_{name}[]; }};\n"
                 text = f"{block}#define WLM_LIGHTMAP_{macro}(i) wlm_{name}[i]\n{text}"
                 stored[place] = np.float32(numbers[name])
             else:
                 rows = _rows_of_fours(numbers[name])
                 textures[_uniform(name)] = screen.texture([rows], "R32G32B32A32_FLOAT", _ROW, len(rows))
-        picture = screen.picture(text, (self._side, self._side), textures, stored)
+        picture = screen.picture(text, (self._side, self._side), textures, stored, GROUP_SIZE if groups else None)
         return picture.read(), picture.time(self._repeats), screen.name
 
-    def _wgsl(self, made: Bundle, buffers: bool) -> tuple[np.ndarray, float, str]:
+    @cached_property
+    def _device_of_wgpu(self) -> tuple[Any, Any]:
         import wgpu
 
         adapters = wgpu.gpu.enumerate_adapters_sync()
@@ -166,46 +196,50 @@ class _ShaderBench(Bench):
         # Vulkan before OpenGL.
         adapter = min(found, key=lambda each: str(each.info["backend_type"]) != "Vulkan")
         side = adapter.limits["max-texture-dimension-2d"]
+        shared = "max-compute-workgroup-storage-size"
         gpu = adapter.request_device_sync(
-            required_features=["texture-compression-bc"], required_limits={"max-texture-dimension-2d": side}
+            required_features=["texture-compression-bc"],
+            required_limits={"max-texture-dimension-2d": side, shared: adapter.limits[shared]},
         )
-        text = translate(made.shader + _SHOWN, "wgsl")
-        for name in ("hour", "networks") if buffers else ():
+        return adapter, gpu
+
+    def _wgsl(self, made: Bundle, textured: bool, groups: bool) -> tuple[np.ndarray, float, str]:
+        import wgpu
+
+        adapter, gpu = self._device_of_wgpu
+        text = compute_shader(made, "wgsl") if groups else translate(made.shader + _SHOWN, "wgsl") + _WGSL_MAIN
+        for name in () if textured else ("hour", "networks"):
             own = f"wlm_lightmap_{name}"
             text = text.replace(f"var {own}: texture_2d<f32>", f"var<storage, read> {own}: array<vec4f>")
             text = text.replace(f"textureLoad({own}, vec2i(i & 1023, i >> 10), 0)", f"{own}[i]")
-        code = f"""{text}
-@group(1) @binding(0) var wlm_out: texture_storage_2d<rgba16float, write>;
-@compute @workgroup_size(8, 8) fn main(@builtin(global_invocation_id) id: vec3u)
-{{
-    textureStore(wlm_out, id.xy, shown(vec2i(id.xy)));
-}}"""
         pipeline = gpu.create_compute_pipeline(
-            layout="auto", compute={"module": gpu.create_shader_module(code=code), "entry_point": "main"}
+            layout="auto", compute={"module": gpu.create_shader_module(code=text), "entry_point": "main"}
         )
         # The mask is read to fill gaps only, which no shader is asked for here.
-        names = re.findall(r"@binding\((\d+)\) var(?:<[^>]*>)? (?!wlm_lightmap_valid\b)(\w+)", text)
+        names = re.findall(r"@group\(0\) @binding\((\d+)\) var(?:<[^>]*>)? (?!wlm_lightmap_valid\b)(\w+)", text)
         entries = [
-            {"binding": int(place), "resource": _wgpu_resource(gpu, made, name, buffers)}
+            {"binding": int(place), "resource": _wgpu_resource(gpu, made, name, not textured)}
             for place, name in names
             if len(re.findall(rf"\b{name}\b", text)) > 1
         ]
         kinds = wgpu.TextureUsage
         size = (self._side, self._side, 1)
         out = gpu.create_texture(size=size, format="rgba16float", usage=kinds.STORAGE_BINDING | kinds.COPY_SRC)
-        groups = [
+        bound = [
             gpu.create_bind_group(layout=pipeline.get_bind_group_layout(i), entries=each)
             for i, each in enumerate((entries, [{"binding": 0, "resource": out.create_view()}]))
         ]
+
+        columns, rows = GROUP_SIZE if groups else (8, 8)
 
         def dispatch(count: int) -> float:
             encoder = gpu.create_command_encoder()
             work = encoder.begin_compute_pass()
             work.set_pipeline(pipeline)
-            for i, group in enumerate(groups):
+            for i, group in enumerate(bound):
                 work.set_bind_group(i, group)
             for _ in range(count):
-                work.dispatch_workgroups(self._side // 8, self._side // 8)
+                work.dispatch_workgroups(self._side // columns, self._side // rows)
             work.end()
             start = time.perf_counter()
             gpu.queue.submit([encoder.finish()])

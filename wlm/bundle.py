@@ -36,7 +36,20 @@ FORMAT = "wlm-bundle"
 """`format` of these indexes."""
 
 RESERVED = frozenset(
-    ("format", "version", "system", "name", "engine", "shader", "textures", "buffers", "reference", "files", "parts")
+    (
+        "format",
+        "version",
+        "system",
+        "name",
+        "engine",
+        "shader",
+        "compute",
+        "textures",
+        "buffers",
+        "reference",
+        "files",
+        "parts",
+    )
 )
 """Keys of an exported index that `wlm.export` fills in; a document must not have them."""
 
@@ -108,6 +121,8 @@ class Bundle:
             is no collection.
         exact: Name of the macro with which the shader fetches texels and interpolates in floats instead of using the
             texture filter; empty if the shader has no such variant.
+        group: Name of the macro with which the shader is for compute shaders whose groups share the network of a tile;
+            empty if the shader has no such variant.
         model: The model itself, for engine kits that decode it at positions of their own, such as a grid of probes.
     """
 
@@ -121,6 +136,7 @@ class Bundle:
     files: Mapping[str, bytes] = field(default_factory=dict)
     parts: Mapping[str, "Bundle"] = field(default_factory=dict)
     exact: str = ""
+    group: str = ""
     model: Any = None
 
     @property

@@ -124,6 +124,7 @@ class Screen:
         size: tuple[int, int],
         textures: Mapping[str, Any],
         buffers: Mapping[int, np.ndarray] | None = None,
+        group: tuple[int, int] | None = None,
     ) -> "Picture":
         """Compiles a shader whose function `vec4 shown(ivec2 pixel)` gives the colour of each pixel.
 
@@ -132,16 +133,25 @@ class Screen:
             size: Rows and columns of the picture, half floats.
             textures: Results of `texture` by the names of uniforms.
             buffers: float32 [n, 4] by the numbers of bindings of storage buffers.
+            group: Columns and rows of a group if the text is a whole compute shader, which writes to image 0.
         """
         with self._context:
-            return self._compiled(text, size, textures, buffers or {})
+            return self._compiled(
+                f"{text}{'' if group else _MAIN}", size, textures, buffers or {}, group or (_GROUP, _GROUP)
+            )
 
     def _compiled(
-        self, text: str, size: tuple[int, int], textures: Mapping[str, Any], buffers: Mapping[int, np.ndarray]
+        self,
+        text: str,
+        size: tuple[int, int],
+        textures: Mapping[str, Any],
+        buffers: Mapping[int, np.ndarray],
+        group: tuple[int, int],
     ) -> "Picture":
         context, (height, width) = self._context, size
+        groups = -(-width // group[0]), -(-height // group[1])
         software = self.name.lower().startswith(_SOFTWARE)
-        program = context.compute_shader(f"{_HEAD}{text}{_MAIN}")
+        program = context.compute_shader(f"{_HEAD}{text}")
         for unit, name in enumerate(textures):
             if name in program:
                 program[name].value = unit
@@ -158,7 +168,7 @@ class Screen:
                 query, start = context.query(time=True), time.perf_counter()
                 with query:
                     for _ in range(count):
-                        program.run(-(-width // _GROUP), -(-height // _GROUP))
+                        program.run(*groups)
                 context.finish()
                 # Timer queries of software leave out compute shaders.
                 return 1e9 * (time.perf_counter() - start) if software else float(query.elapsed)

@@ -482,7 +482,7 @@ TURNS = {
 }
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 2), (16, 16)])
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), pytest.param((16, 16), marks=pytest.mark.slow)])
 def test_a_turned_lightmap_is_noticed(tmp_path, size):
     """The warning names the turn that makes it fit; also for a lightmap of another aspect, and for a large one."""
     position, triangle, uv = box((0, 0, 0), (1, 1, 1))

@@ -140,7 +140,7 @@ def test_a_triangle_below_a_texel():
     np.testing.assert_allclose(decoded[mesh.sheets[0].mask], 0.25)
 
 
-@pytest.mark.parametrize("name", [PLAIN, "cascade"])
+@pytest.mark.parametrize("name", [PLAIN, pytest.param("cascade", marks=pytest.mark.slow)])
 def test_charts_that_overlap_have_no_area_or_one_texel(name: str):
     """Beside a square that has none of this: it is decoded as well as alone, and they to finite light."""
     square = np.array([[0.1, 0.1], [0.6, 0.1], [0.6, 0.6], [0.1, 0.6]])

@@ -95,6 +95,7 @@ def test_all_pages_are_decoded_and_timed(rows):
     assert pages["pages_decoded"] == 3 + 2 + 1 and abs(pages["psnr"] - texture["psnr"]) < 0.1
 
 
+@pytest.mark.slow
 def test_frames_have_nothing_to_fit(lightmaps):
     rows = run_rows(lightmaps, [Profile.load("frames")], device="cpu", chosen=[0], repeats=1)
     assert keys(rows) == [("ours", "frames"), ("texture", "frames")]

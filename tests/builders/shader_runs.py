@@ -61,6 +61,30 @@ def _draw(context, head, text, main, size, textures, uniforms):
     vertex = head.splitlines(True)[0] + _WHOLE
     body = f"out vec4 light;\nvoid main()\n{{\n    ivec2 pixel = ivec2(gl_FragCoord.xy);\n    {main}\n}}\n"
     program = context.program(vertex_shader=vertex, fragment_shader=head + text + body)
+    made = _bind(context, program, textures)
+    for name, value in uniforms.items():
+        program[name].value = value
+    target = context.texture(size[::-1], 4, dtype="f4")
+    frame = context.framebuffer([target])
+    frame.use()
+    array = context.vertex_array(program, [])
+    array.render(context.TRIANGLES, vertices=3)
+    return _read(context, target, size, np.float32, made)
+
+
+def run_glsl_compute(text, head, size, textures, group):
+    """What a compute shader stores, float32 [height, width, 4]."""
+    with gl() as context:
+        program = context.compute_shader(head + text)
+        made = _bind(context, program, textures)
+        target = context.texture(size[::-1], 4, dtype="f2")
+        target.bind_to_image(0, read=False, write=True)
+        program.run(-(-size[1] // group[0]), -(-size[0] // group[1]))
+        context.memory_barrier()
+        return _read(context, target, size, np.float16, made)
+
+
+def _bind(context, program, textures):
     made = []
     for unit, (name, values) in enumerate(textures.items()):
         if name not in program:
@@ -76,16 +100,13 @@ def _draw(context, head, text, main, size, textures, uniforms):
         texture.use(unit)
         program[name].value = unit
         made.append(texture)
-    for name, value in uniforms.items():
-        program[name].value = value
-    target = context.texture(size[::-1], 4, dtype="f4")
-    frame = context.framebuffer([target])
-    frame.use()
-    array = context.vertex_array(program, [])
-    array.render(context.TRIANGLES, vertices=3)
+    return made
+
+
+def _read(context, target, size, kind, made):
     error = context.error
     assert error == "GL_NO_ERROR", error
-    picture = np.frombuffer(target.read(), np.float32).reshape(*size, 4).copy()
+    picture = np.frombuffer(target.read(), kind).reshape(*size, 4).astype(np.float32)
     for thing in made:
         thing.release()
     return picture
@@ -130,15 +151,34 @@ def run_wgsl(text, expression, size, bound):
     let pixel = vec2i(id.xy);
     if (pixel.x < {size[1]} && pixel.y < {size[0]}) {{ wlm_out[pixel.y * {size[1]} + pixel.x] = {expression}; }}
 }}"""
-    bindings = {name: int(place) for place, name in re.findall(r"@binding\((\d+)\) var(?:<[^>]*>)? (\w+)", text)}
+    bindings = _bindings(text)
     used = {name: place for name, place in bindings.items() if len(re.findall(rf"\b{name}\b", text + expression)) > 1}
     return _run(code, size, {name: bound.get(name) for name in used}, used)
 
 
-def run_hlsl(text, expression, size, bound, tmp_path):
-    """The same with HLSL, which glslang compiles to SPIR-V."""
+def _bindings(text):
+    found = re.findall(r"@group\(0\) @binding\((\d+)\) var(?:<[^>]*>)? (\w+)", text)
+    return {name: int(place) for place, name in found}
+
+
+def run_wgsl_compute(text, size, bound, group):
+    """What a compute shader stores in a texture of half floats, float32 [height, width, 4]."""
+    used = {name: at for name, at in _bindings(text).items() if name in bound}
+    return _run(text, size, {name: bound[name] for name in used}, used, group)
+
+
+def compile_hlsl(source, folder):
+    """Compiles HLSL to shader.spv; skips the test, with what to install, where glslang is missing."""
     if shutil.which("glslangValidator") is None:
         pytest.skip("no glslangValidator: install glslang-tools")
+    (folder / "shader.comp").write_text(source)
+    words = ["glslangValidator", "-D", "-V", "-e", "main", "-o", "shader.spv", "shader.comp"]
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def run_hlsl(text, expression, size, bound, tmp_path):
+    """The same with HLSL, which glslang compiles to SPIR-V."""
     declared = r"^((?:Texture2D\w*<\w+>|StructuredBuffer<\w+>|SamplerState) (\w+);|cbuffer (\w+)_values$)"
     names = [match[2] or match[3] for match in re.finditer(declared, text, re.MULTILINE)]
     place = iter(range(len(names)))
@@ -150,16 +190,13 @@ def run_hlsl(text, expression, size, bound, tmp_path):
     int2 pixel = int2(id.xy);
     if (pixel.x < {size[1]} && pixel.y < {size[0]}) {{ wlm_out[pixel.y * {size[1]} + pixel.x] = {expression}; }}
 }}"""
-    (tmp_path / "shader.comp").write_text(source)
-    words = ["glslangValidator", "-D", "-V", "-e", "main", "-o", "shader.spv", "shader.comp"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
+    compile_hlsl(source, tmp_path)
     used = {name: place for place, name in enumerate(names) if len(re.findall(rf"\b{name}\b", source)) > 1}
     code = (tmp_path / "shader.spv").read_bytes()
     return _run(code, size, {name: bound.get(name) for name in used}, used)
 
 
-def _run(code, size, bound, places):
+def _run(code, size, bound, places, group=None):
     gpu = device()
     import wgpu
 
@@ -189,17 +226,28 @@ def _run(code, size, bound, places):
             gpu.queue.write_texture({"texture": texture}, data, layout, (width, height, count))
             resource = texture.create_view(dimension="2d-array" if values.ndim == 4 else "2d")
         entries.append({"binding": places[name], "resource": resource})
-    out = gpu.create_buffer(size=16 * size[0] * size[1], usage=usage.STORAGE | usage.COPY_SRC)
+    if group:
+        flags = kinds.STORAGE_BINDING | kinds.COPY_SRC
+        out = gpu.create_texture(size=(size[1], size[0], 1), format="rgba16float", usage=flags)
+        target = out.create_view()
+    else:
+        out = gpu.create_buffer(size=16 * size[0] * size[1], usage=usage.STORAGE | usage.COPY_SRC)
+        target = {"buffer": out}
     encoder = gpu.create_command_encoder()
     work = encoder.begin_compute_pass()
     work.set_pipeline(pipeline)
     if entries:
         work.set_bind_group(0, gpu.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=entries))
-    last = [{"binding": 0, "resource": {"buffer": out}}]
+    last = [{"binding": 0, "resource": target}]
     work.set_bind_group(1, gpu.create_bind_group(layout=pipeline.get_bind_group_layout(1), entries=last))
-    work.dispatch_workgroups(-(-size[1] // 8), -(-size[0] // 8))
+    columns, rows = group or (8, 8)
+    work.dispatch_workgroups(-(-size[1] // columns), -(-size[0] // rows))
     work.end()
     gpu.queue.submit([encoder.finish()])
+    if group:
+        layout = {"bytes_per_row": 8 * size[1], "rows_per_image": size[0]}
+        data = gpu.queue.read_texture({"texture": out}, layout, (size[1], size[0], 1))
+        return np.frombuffer(data, np.float16).reshape(*size, 4).astype(np.float32)
     return np.frombuffer(gpu.queue.read_buffer(out), np.float32).reshape(*size, 4).copy()
 
 

@@ -234,6 +234,7 @@ def test_volume_writes_what_a_viewer_has_round(fitted, carrying, room, tmp_path)
     assert document["viewpoint"] == [1.0, 2.5, -3.0]
     call("probe", "volume", carrying, "-o", tmp_path / "out", "--block", 0.5, "--update", "--shader", "wgsl")
     assert "fn wlm_update_scroll" in (tmp_path / "out" / "update" / "probe.wgsl").read_text()
+    assert all((tmp_path / "out" / "update" / name).stat().st_size for name in ("volume.js", "read.wgsl"))
     assert json.loads((tmp_path / "out" / "update" / "bundle.json").read_text())["dispatches"][0]["threads"] > 100
     assert json.loads((tmp_path / "out" / "bundle.json").read_text())["levels"][0]["block"] == 0.5
     assert "viewpoint: expected" in fails("probe", "volume", carrying, "-o", tmp_path / "no", "--at", 1, 2, "nan")

@@ -59,9 +59,11 @@ def volume(
     import numpy as np
 
     from wlm.export import export
+    from wlm.export.engines.volume import volume_module
     from wlm.probe.places import probes_of
     from wlm.probe.volume.bundle import volume_bundle
     from wlm.probe.volume.cascade import Volume
+    from wlm.probe.volume.shader import volume_glsl
     from wlm.probe.volume.update import update_bundle
     from wlm.probe.volume.walk import settle
     from wlm.system import load
@@ -72,6 +74,8 @@ def volume(
     made = Volume(known.position, light, live=known.live, normal=known.normal, block=block)
     # Without any light yet, it makes the example of the update.
     parts = {"update": update_bundle(made, model)} if update else {}
+    if update and shader == "wgsl":
+        parts["update"] = replace(parts["update"], files=volume_module(volume_glsl(made.channels)))
     lit = known.position[known.live]
     settle(made, (lit.min(0) + lit.max(0)) / 2 if at is None else np.array(at))
     show_files(output, export(replace(volume_bundle(made), parts=parts), output, shader=shader or "glsl"))

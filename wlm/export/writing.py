@@ -23,6 +23,7 @@ from typing import Any
 
 from wlm.bundle import FORMAT, INDEX_FILE, RESERVED, Bundle
 from wlm.errors import WlmError
+from wlm.export.compute import compute_shader
 from wlm.export.engines.kit import ENGINES, PROBE_ENGINES
 from wlm.export.files import write_buffer, write_reference, write_texture
 from wlm.export.shading import ENDINGS, check_language, translate
@@ -92,13 +93,17 @@ def export(
 
 
 def _write_raw(bundle: Bundle, folder: Path, language: str, exact: bool) -> None:
-    entries: dict[str, Any] = {"engine": None, "shader": None}
+    entries: dict[str, Any] = {"engine": None, "shader": None, "compute": None}
     if bundle.shader:
         if exact and not bundle.exact:
             raise WlmError(f"{bundle.name}: exact has no meaning here: the shader uses no texture filter")
         entries["shader"] = bundle.system + ENDINGS[language]
         text = translate(bundle.shader, language, [bundle.exact] if exact else [])
         (folder / entries["shader"]).write_bytes(text.encode())
+        if bundle.group:
+            entries["compute"] = f"{bundle.system}_compute{ENDINGS[language]}"
+            text = compute_shader(bundle, language, exact)
+            (folder / entries["compute"]).write_bytes(text.encode())
     entries["textures"] = {name: write_texture(folder, name, each) for name, each in bundle.textures.items()}
     entries["buffers"] = {name: write_buffer(folder, name, each) for name, each in bundle.buffers.items()}
     entries["reference"] = {name: write_reference(folder, name, each) for name, each in bundle.reference.items()}

@@ -10,6 +10,15 @@ from wlm.texels import REACH
 EXACT = "WLM_LIGHTMAP_EXACT"
 """Macro that makes the shader interpolate texels in float32 instead of with the GPU's texture filter."""
 
+GROUP_SIZE = (32, 8)
+"""Columns and rows of such a group; both divide a tile's side."""
+
+GROUP = "WLM_LIGHTMAP_GROUP"
+"""Macro for compute shaders, whose groups of invocations share the network of a tile."""
+
+GROUP_SIZE = (32, 8)
+"""Columns and rows of such a group; both divide a tile's side."""
+
 HEAD = 2
 """Groups of four floats before the records of the tiles in the table of an hour."""
 
@@ -26,13 +35,12 @@ vec4 wlm_gelu(vec4 x)
 }
 """,
     "tanh": """\
-// The tanh form of GELU, which the model was trained with; within 4.8e-4 of the exact one.
+// The tanh form of GELU, which the model was trained with, as x / (1 + exp(-2 z)), since the tanh of drivers takes
+// several times as long; within 4.8e-4 of the exact form.
 vec4 wlm_gelu(vec4 x)
 {
-    // Some drivers' tanh is a quotient of exponentials and overflows; beyond 9 it is 1 in a float anyway.
-    vec4 z = x * (0.79788456 + 0.035677408 * x * x);
-    z = clamp(z, vec4(-9.0, -9.0, -9.0, -9.0), vec4(9.0, 9.0, 9.0, 9.0));
-    return 0.5 * x * (1.0 + tanh(z));
+    vec4 z = x * (-2.3022082 - 0.10294324 * x * x); // for powers of 2, which end before a float overflows
+    return x / (1.0 + exp2(min(z, vec4(80.0, 80.0, 80.0, 80.0))));
 }
 """,
 }
@@ -51,12 +59,18 @@ _HEAD = """\
 // If WLM_LIGHTMAP_EXACT is defined, four texels are fetched and mixed in floats; otherwise the filter unit mixes four
 // texels, with about 8 bits for a position between two of them.
 //
-// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: if these are in
+{group}// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: if these are in
 // buffers change them, or define WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) before this file.
 
 {samplers}{reads}
 const int WLM_LIGHTMAP_COLUMNS = {columns}; // tiles in a row of the map
 const int WLM_LIGHTMAP_RECORD = {record}; // fours of a tile in the table, after {head} of all
+"""
+
+_ABOUT_GROUP = """\
+// Compute shaders decode faster with WLM_LIGHTMAP_GROUP defined, in groups of {columns} x {rows} texels of one tile
+// (wlm_lightmap_begin), which keep the network of the tile in {kilobytes} KB of shared memory.
+//
 """
 
 _TEXTURES = {
@@ -84,68 +98,78 @@ _NETWORK = """
 const int WLM_LIGHTMAP_FOURS = {fours}; // of {hidden} units
 
 {gelu}
-// G of eq. 4, behind the first layer's sums: two hidden layers, and a linear one whose start this returns.
-vec3 wlm_lightmap_output(vec4 a[WLM_LIGHTMAP_FOURS], int start)
+#ifdef WLM_LIGHTMAP_GROUP
+shared vec4 wlm_lightmap_weights[{weights}];
+#endif
+
+// Four floats of a network: of the group's tile, or of all networks.
+vec4 wlm_lightmap_weight(int i)
 {{
-    vec4 b[WLM_LIGHTMAP_FOURS];
-    int at = start + 4 * WLM_LIGHTMAP_FOURS * WLM_LIGHTMAP_FOURS;
-    for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++)
-        b[j] = wlm_lightmap_four(at + j);
-    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
-        vec4 x = wlm_gelu(a[i]);
-        at = start + 4 * i * WLM_LIGHTMAP_FOURS;
-        for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++) {{
-            b[j] += x.x * wlm_lightmap_four(at + j);
-            b[j] += x.y * wlm_lightmap_four(at + WLM_LIGHTMAP_FOURS + j);
-            b[j] += x.z * wlm_lightmap_four(at + 2 * WLM_LIGHTMAP_FOURS + j);
-            b[j] += x.w * wlm_lightmap_four(at + 3 * WLM_LIGHTMAP_FOURS + j);
-        }}
-    }}
-    at = start + (4 * WLM_LIGHTMAP_FOURS + 1) * WLM_LIGHTMAP_FOURS;
-    vec4 y = wlm_lightmap_four(at + 4 * WLM_LIGHTMAP_FOURS);
-    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
-        vec4 x = wlm_gelu(b[i]);
-        y += x.x * wlm_lightmap_four(at + 4 * i) + x.y * wlm_lightmap_four(at + 4 * i + 1);
-        y += x.z * wlm_lightmap_four(at + 4 * i + 2) + x.w * wlm_lightmap_four(at + 4 * i + 3);
-    }}
-    return y.xyz;
+#ifdef WLM_LIGHTMAP_GROUP
+    return wlm_lightmap_weights[i];
+#else
+    return wlm_lightmap_four(i);
+#endif
 }}
 
-// Colour of a tile of maps: `record` is the position of its record, `inner` the texel in the tile.
+// b + x W, where the rows of W are `apart` groups of four apart.
+vec4 wlm_lightmap_add(vec4 b, vec4 x, int at, int apart)
+{{
+    vec4 sum = b + x.x * wlm_lightmap_weight(at) + x.y * wlm_lightmap_weight(at + apart);
+    return sum + x.z * wlm_lightmap_weight(at + 2 * apart) + x.w * wlm_lightmap_weight(at + 3 * apart);
+}}
+
+// Colour of a tile of maps: `record` is the position of its record, `inner` the texel in the tile. G of eq. 4 has two
+// hidden layers. Four units of the first at a time are added to the second, whose array has constant indices, so that
+// it is in registers.
 vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 {{
     int row = int(tile.y);
+#ifdef WLM_LIGHTMAP_GROUP
+    int start = 0;
+#else
     int start = int(tile.z);
+#endif
+    int second = start + 5 * WLM_LIGHTMAP_FOURS;
     ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
-    vec4 a[WLM_LIGHTMAP_FOURS];
-    for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++)
-        a[j] = wlm_lightmap_entry(record + 3 + j);
-    vec4 x = texelFetch(WLM_LIGHTMAP_UV, at, 0);
-{sum}    int rest = start + 5 * WLM_LIGHTMAP_FOURS;
-{dynamic}    vec3 y = wlm_lightmap_output(a, rest);
-    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
-    vec3 colour = gain + wlm_lightmap_entry(record + 2).xyz * y;
-    return max(colour, vec3(0.0, 0.0, 0.0));
+    vec4 uv = texelFetch(WLM_LIGHTMAP_UV, at, 0);
+{inputs}    int third = second + (4 * WLM_LIGHTMAP_FOURS + 1) * WLM_LIGHTMAP_FOURS;
+    vec4 b[WLM_LIGHTMAP_FOURS];
+{biases}    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
+        vec4 a = wlm_lightmap_add(wlm_lightmap_entry(record + 3 + i), uv, start + i, WLM_LIGHTMAP_FOURS);
+{sums}        a = wlm_gelu(a);
+        int w = second + 4 * WLM_LIGHTMAP_FOURS * i;
+{products}    }}
+    vec4 y = wlm_lightmap_weight(third + 4 * WLM_LIGHTMAP_FOURS);
+{outputs}    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
+    return max(gain + wlm_lightmap_entry(record + 2).xyz * y.xyz, vec3(0.0, 0.0, 0.0));
 }}
 """
+_UNITS = {
+    "biases": "    b[{j}] = wlm_lightmap_weight(third - WLM_LIGHTMAP_FOURS + {j});\n",
+    "products": "        b[{j}] = wlm_lightmap_add(b[{j}], a, w + {j}, WLM_LIGHTMAP_FOURS);\n",
+    "outputs": "    y = wlm_lightmap_add(y, wlm_gelu(b[{j}]), third + {at}, 1);\n",
+}
+"""Lines of the network for each four units of the second layer."""
 
-_SUM = """\
-{indent}for (int j = 0; j < WLM_LIGHTMAP_FOURS; j++) {{
-{indent}    int w = start{skip} + j;
-{indent}    a[j] += x.x * wlm_lightmap_four(w) + x.y * wlm_lightmap_four(w + WLM_LIGHTMAP_FOURS);
-{indent}    a[j] += x.z * wlm_lightmap_four(w + 2 * WLM_LIGHTMAP_FOURS);
-{indent}    a[j] += x.w * wlm_lightmap_four(w + 3 * WLM_LIGHTMAP_FOURS);
-{indent}}}
+_INPUTS = """\
+    vec4 uvt = vec4(0.0, 0.0, 0.0, 0.0);
+    vec4 planes = uvt;
+    bool dynamic = int(tile.x) == 2;
+    if (dynamic) {{
+        vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
+        uvt = wlm_lightmap_volume(row, place);
+        planes = vec4(wlm_lightmap_plane(2 * row, place.x), wlm_lightmap_plane(2 * row + 1, place.y));
+        // The encoded time is in the bias.
+        second = start + 17 * WLM_LIGHTMAP_FOURS;
+    }}
 """
 
-_DYNAMIC = """\
-    if (int(tile.x) == 2) {{
-        vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
-        x = wlm_lightmap_volume(row, place);
-{uvt_sum}        x = vec4(wlm_lightmap_plane(2 * row, place.x), wlm_lightmap_plane(2 * row + 1, place.y));
-{plane_sum}        // The encoded time is in the bias.
-        rest = start + 17 * WLM_LIGHTMAP_FOURS;
-    }}
+_SUMS = """\
+        if (dynamic) {
+            a = wlm_lightmap_add(a, uvt, start + 4 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
+            a = wlm_lightmap_add(a, planes, start + 8 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
+        }
 """
 
 _MAPS = """
@@ -227,6 +251,23 @@ vec3 wlm_colour(ivec2 texel)
     vec4 tile = wlm_lightmap_entry(record);
 {kinds}    return wlm_lightmap_entry(record + 1).xyz;
 }}
+"""
+
+_BEGIN = """
+#ifdef WLM_LIGHTMAP_GROUP
+// Shares the network of a tile in a group of {invocations} invocations. Each calls it once, with a texel of the tile,
+// the same for all, and its own index, and then decodes texels of this tile only.
+void wlm_lightmap_begin(ivec2 texel, int index)
+{{
+    ivec2 place = texel / {TILE};
+    vec4 tile = wlm_lightmap_entry({head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD);
+    int kind = int(tile.x);
+    int count = kind == 1 ? {static} : kind == 2 ? {weights} : 0;
+    for (int i = index; i < count; i += {invocations})
+        wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i);
+    barrier();
+}}
+#endif
 """
 
 _MAPPED_KIND = """\
@@ -317,6 +358,9 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
         "planes": columns(2 * dynamic, profile.plane_rows, profile.plane_columns),
         "frames": columns(len(model.frames), TILE, TILE),
     }
+    wide = fours(profile)
+    rest = (4 * wide + 6) * wide + 1  # fours of a network after the weights of its first layer
+    weights = (16 if dynamic else 4) * wide + rest
     gamma, inverse = (", ".join([repr(float(number))] * 3) for number in (profile.gamma, 1.0 / profile.gamma))
     words = {
         "TILE": TILE,
@@ -325,7 +369,7 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
         "columns": model.grid.cols,
         "record": record_fours(model),
         "head": HEAD,
-        "fours": fours(profile),
+        "fours": wide,
         "hidden": profile.hidden,
         "side": side,
         "slices": slices,
@@ -341,6 +385,9 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
         "planes_height": -(-2 * dynamic // across["planes"]) * profile.plane_rows,
         "reach": REACH,
         "beyond": 2 * REACH * REACH + 1,
+        "static": 4 * wide + rest,
+        "weights": weights,
+        "invocations": GROUP_SIZE[0] * GROUP_SIZE[1],
         # repr gives the shortest decimals that are the number again, and always a point or an exponent.
         "gamma": f"vec3({gamma})",
         "inverse": f"vec3({inverse})",
@@ -349,18 +396,19 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
     kinds, images = _MAPPED_KIND if mapped else "", ""
     if "frames" in names:
         kinds, images = kinds + _FRAMES_KIND.format(**words), _FRAMES.format(**words)
-    text = _head(names, words | {"last": "wlm_radiance" if values is None else "wlm_value"})
+    group = ""
+    if mapped:
+        kilobytes = f"{16 * words['weights'] / 1024:.0f}"
+        group = _ABOUT_GROUP.format(columns=GROUP_SIZE[0], rows=GROUP_SIZE[1], kilobytes=kilobytes)
+    text = _head(names, words | {"last": "wlm_radiance" if values is None else "wlm_value", "group": group})
     if "uvt" in names:
         text += _MAPS.format(**words)
     if mapped:
-        sums = [
-            _SUM.format(indent=" " * (8 if i else 4), skip=f" + {4 * i} * WLM_LIGHTMAP_FOURS" if i else "")
-            for i in range(3)
-        ]
-        temporal = ""
-        if "uvt" in names:
-            temporal = _DYNAMIC.format(uvt_sum=sums[1], plane_sum=sums[2], **words)
-        text += _NETWORK.format(gelu=_GELU[profile.gelu], sum=sums[0], dynamic=temporal, **words)
+        units = {name: "".join(line.format(j=j, at=4 * j) for j in range(wide)) for name, line in _UNITS.items()}
+        inputs, sums = (_INPUTS.format(**words), _SUMS) if "uvt" in names else ("", "")
+        text += _NETWORK.format(gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words) + _BEGIN.format(
+            **words
+        )
     text += images + _COLOUR.format(kinds=kinds, **words) + _SOURCE.format(**words)
     if values is None:
         return text + _RADIANCE.format(**words)

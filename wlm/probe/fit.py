@@ -22,7 +22,7 @@ from wlm.probe.model import CODES, ProbeModel, Profile, box_of
 from wlm.probe.pca.model import ENOUGH, fit_components
 from wlm.system import Meter, OnProgress
 
-_MOST_LATENT = 32
+_MOST_LATENT, _MOST_HIDDEN = 32, 128  # of a fit of several hours
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps after which progress and checkpoint may be due
 
 
@@ -109,8 +109,9 @@ def compress(
         scales /= scales.max()
         even = [light / np.float32(scale or 1.0) for light, scale in zip(by_hour, scales, strict=True)]
         values = np.concatenate(even, 1)
-        longer = min(_MOST_LATENT, round(profile.latent * (1.0 + 0.5 * math.log2(hours))))
-        profile = profile.model_copy(update={"latent": longer})
+        latent = min(_MOST_LATENT, round(profile.latent * (1.0 + 0.5 * math.log2(hours))))
+        hidden = min(_MOST_HIDDEN, 8 * round(profile.hidden * (1.0 + 0.25 * math.log2(hours)) / 8))
+        profile = profile.model_copy(update={"latent": latent, "hidden": hidden})
     box = box_of(probes.position)
     stored = np.zeros((0, 3), np.uint16)
     if positions:

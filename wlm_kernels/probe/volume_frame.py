@@ -125,7 +125,6 @@ class Work:
         clock: [1], the frame's number.
         counters: [7], counts of blocks and probes in this frame.
         histogram: [TOTALS], number of blocks that wait to be decoded, by distance.
-        limit: [1], the last bin of the histogram whose blocks are gathered.
         gathered: [G], slots of the gathered blocks.
         distance: [G], squared distance of each gathered block from the viewer, in units of the block's edge.
         chosen: [B], slots of the chosen blocks, or -1.
@@ -145,7 +144,6 @@ class Work:
     clock: wp.array1d[int]
     counters: wp.array1d[int]
     histogram: wp.array1d[int]
-    limit: wp.array1d[int]
     gathered: wp.array1d[int]
     distance: wp.array1d[float]
     chosen: wp.array1d[int]
@@ -314,26 +312,28 @@ def _descend(histogram: wp.array1d[int], first: int, budget: int, before: int):
     return at, sum_before
 
 
-@wp.kernel(enable_backward=False)
-def _find_limit(work: Work):
-    budget = work.chosen.shape[0]
-    total = int(0)
-    for i in range(16):
-        total += work.histogram[_SIXTEENS + i]
-    group, before = _descend(work.histogram, _SIXTEENS, budget, 0)
-    sixteen, before_sixteen = _descend(work.histogram, _BINS + 16 * group, budget, before)
-    bin, _before = _descend(work.histogram, 16 * (16 * group + sixteen), budget, before_sixteen)
-    work.limit[0] = 16 * (16 * group + sixteen) + bin
-    work.counters[_LEFT] = total
+@wp.func
+def _limit(histogram: wp.array1d[int], budget: int) -> int:
+    """Returns the last bin of the histogram whose blocks are gathered, so that there are enough."""
+    group, before = _descend(histogram, _SIXTEENS, budget, 0)
+    sixteen, before_sixteen = _descend(histogram, _BINS + 16 * group, budget, before)
+    bin, _before = _descend(histogram, 16 * (16 * group + sixteen), budget, before_sixteen)
+    return 16 * (16 * group + sixteen) + bin
 
 
 @wp.kernel(enable_backward=False)
 def _gather(windows: Windows, side: int, work: Work):
     s = wp.tid()
+    if s == 0:
+        total = int(0)
+        for i in range(16):
+            total += work.histogram[_SIXTEENS + i]
+        work.counters[_LEFT] = total
     if int(windows.pages[s]) == _WAITING:
         level, local = _locate(windows, s)
         away = _distance(windows, level, local)
-        if _bin(away, side) <= work.limit[0]:
+        # Each thread that has a waiting block finds the limit itself, which saves a launch.
+        if _bin(away, side) <= _limit(work.histogram, work.chosen.shape[0]):
             i = wp.atomic_add(work.counters, _GATHERED, 1)
             if i < work.gathered.shape[0]:
                 work.gathered[i] = s
@@ -515,7 +515,6 @@ def select(index: Index, windows: Windows, pool: Pool, side: int, work: Work) ->
     windows in blocks."""
     device, slots = work.clock.device, windows.pages.shape
     wp.launch(_scroll, slots, inputs=[index, windows, pool, side, work], device=device)
-    wp.launch(_find_limit, 1, inputs=[work], device=device)
     wp.launch(_gather, slots, inputs=[windows, side, work], device=device)
     wp.launch(_rank, max(work.gathered.shape[0], work.histogram.shape[0]), inputs=[work], device=device)
     size = max(1, min(GROUP, pool.stamp.shape[0] // work.chosen.shape[0]))

@@ -23,6 +23,7 @@ def bytes_of(height: int, width: int, times: int, latents: Latents = SMALL) -> i
     return latent + 2 * (NETWORK + 65 * 3 * times) + 12
 
 
+@pytest.mark.slow
 def test_a_day_comes_back():
     frames = moving_light(40, 60).light.frames
     short, long = encode(frames, steps=20), encode(frames, steps=300)

@@ -25,7 +25,10 @@ def made(tmp_path_factory):
     return scene_folder(tmp_path_factory.mktemp("scene") / "scene")
 
 
-@pytest.fixture(scope="module", params=["mixed", pytest.param("rgb9e5", marks=pytest.mark.slow), "short", "apart"])
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("rgb9e5", "apart")]
+
+
+@pytest.fixture(scope="module", params=["mixed", "short", *SLOW])
 def each_form(request, tmp_path_factory):
     """The same of each way of storing colours; of one state, which has short entries, with mips; of states apart."""
     if request.param == "mixed":

@@ -11,11 +11,12 @@ import pytest
 
 _PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 _OPTIONS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+_OPTIONS += ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader")
 
 
 @pytest.fixture(scope="session")
 def browser():
-    """Headless Chromium with WebGL2 in software."""
+    """Headless Chromium with WebGL2 and WebGPU in software."""
     program = next(filter(None, map(shutil.which, _PROGRAMS)), None)
     if program is None:
         pytest.skip("no browser: install chromium-headless-shell, or chromium")

@@ -12,7 +12,16 @@ from builders.atlas_models import KINDS, MIXED, off_borders
 from builders.atlas_models import random_model as random_atlas
 from builders.exported import read_export
 from builders.probe_models import random_model as random_probes
-from builders.shader_runs import HEADS, lightmap_uniforms, run_glsl, run_hlsl, run_wgsl
+from builders.shader_runs import (
+    HEADS,
+    compile_hlsl,
+    lightmap_uniforms,
+    run_glsl,
+    run_glsl_compute,
+    run_hlsl,
+    run_wgsl,
+    run_wgsl_compute,
+)
 from builders.shader_subjects import POINTS, Subject, points_of
 from builders.smoke_shader_subjects import smoke_subjects
 from builders.synthetic import random_model as random_lightmap
@@ -29,6 +38,7 @@ from wlm.export import export
 from wlm.export.shading import LANGUAGES, translate
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.shader import GROUP_SIZE
 from wlm.lightmap.virtual.shader import sheet_words, virtual_glsl
 from wlm.lightmap.virtual.texture import VirtualTexture
 from wlm.probe.sphere import irradiance
@@ -312,6 +322,30 @@ def test_every_shader_shows_what_python_decodes(name, language, tmp_path):
     if subject.filtered is not None and (not name.startswith("atlas cascade") or language.startswith("glsl")):
         found = shown(subject, language, False, tmp_path)[..., :channels]
         np.testing.assert_allclose(found, subject.expected, rtol=0, atol=subject.filtered)
+
+
+COMPUTE = {"glsl": "#version 430\n", "glsl-es": "#version 310 es\n"}
+
+
+@pytest.mark.parametrize("language", [*COMPUTE, "wgsl", "hlsl"])
+def test_the_compute_shader_decodes_a_lightmap(language, tmp_path):
+    """All kinds of tiles, and a map whose last tiles are cut."""
+    model = random_lightmap((4, 3, 2, 1))
+    export(model, tmp_path, shader=language, exact=True)
+    text = next(tmp_path.glob("lightmap_compute.*")).read_text()
+    if language == "hlsl":
+        compile_hlsl(text, tmp_path)
+        return
+    (sheet,) = model.sheets.values()
+    expected = SheetDecoder(sheet).frame(float(model.times[2]))
+    uniforms, hour = lightmap_uniforms(tmp_path)
+    del uniforms["wlm_lightmap_valid"]  # only `wlm_source` reads it
+    bound, size = uniforms | hour(2), expected.shape[:2]
+    if language == "wgsl":
+        found = run_wgsl_compute(text, size, bound, GROUP_SIZE)
+    else:
+        found = run_glsl_compute(text, COMPUTE[language], size, bound, GROUP_SIZE)
+    np.testing.assert_allclose(found[..., :3], expected, rtol=2**-10, atol=1e-5 * expected.max())
 
 
 def test_heads_state_language_and_macros():

@@ -133,12 +133,8 @@ def _run_wgpu(made: Bundle, language: str, folder) -> dict[str, np.ndarray]:
         code, places = (_wgsl if language == "wgsl" else _hlsl)(text, step["function"], folder)
         module = gpu.create_shader_module(code=code)
         pipeline = gpu.create_compute_pipeline(layout="auto", compute={"module": module, "entry_point": "main"})
-        used = _used(text, step["function"])
-        entries = [
-            {"binding": i, "resource": {"buffer": bound[name.split("_")[-1]]}}
-            for name, i in places.items()
-            if name in used
-        ]
+        own = {name.split("_")[-1]: i for name, i in places.items()}
+        entries = [{"binding": own[name], "resource": {"buffer": bound[name]}} for name in step["buffers"]]
         group = gpu.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=entries)
         work.append((pipeline, group, step["threads"]))
     for words in _heads(made):
@@ -152,19 +148,6 @@ def _run_wgpu(made: Bundle, language: str, folder) -> dict[str, np.ndarray]:
             run.end()
         gpu.queue.submit([encoder.finish()])
     return {name: np.frombuffer(gpu.queue.read_buffer(bound[name]), np.uint32) for name in ("pages", "pool")}
-
-
-def _used(text: str, function: str) -> set[str]:
-    """The names that a function and the functions that it calls mention."""
-    found, left = set(), [function]
-    while left:
-        name = left.pop()
-        body = re.search(rf"^\S.*\b{name}\(.*\n?\{{\n(?:.*\n)*?\}}", text, re.MULTILINE)
-        if body:
-            words = set(re.findall(r"\w+", body[0])) - found
-            found |= words
-            left += words
-    return found
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,7 @@ class HlslWriter(Writer):
         "uintBitsToFloat": "asfloat",
         "floatBitsToUint": "asuint",
         "unpackHalf2x16": "wlm_halves",
+        "barrier": "GroupMemoryBarrierWithGroupSync",
         "packHalf2x16": "wlm_pack_halves",
     }
 
@@ -67,7 +68,7 @@ class HlslWriter(Writer):
         if variable.way == "uniform":
             # A float3 in an array of a constant buffer takes the space of a float4.
             return [f"cbuffer {variable.name}_values", "{", f"    {self.local(variable)};", "};"]
-        return [f"static const {self.local(variable)};"]
+        return [f"{'groupshared' if variable.way == 'shared' else 'static const'} {self.local(variable)};"]
 
     def parameter(self, variable: Variable) -> str:
         way = "" if variable.way == "in" else f"{variable.way} "

@@ -37,9 +37,9 @@ class Node:
 
 @dataclass(frozen=True)
 class Variable:
-    """A parameter, constant, local variable, texture, uniform or buffer of a GLSL type. `size` is the length of an
-    array, else None; `way` is `in`, `out` or `inout` of a parameter or local variable, or `const`, `uniform`, `buffer`
-    or, of a buffer that is written, `storage`; `value` is the initial value, or None.
+    """A parameter, constant, local or shared variable, texture, uniform or buffer of a GLSL type. `size` is the
+    length of an array, else None; `way` is `in`, `out` or `inout` of a parameter or local variable, or `const`,
+    `uniform`, `shared`, `buffer` or, of a buffer that is written, `storage`; `value` is the initial value, or None.
     """
 
     type: str
@@ -135,7 +135,7 @@ class _Reader:
             elif self.taken("layout"):
                 self._skip_round()
                 shader.items.append((self._buffer(), blank))
-            elif self.word.text in ("uniform", "const"):
+            elif self.word.text in ("uniform", "const", "shared"):
                 variable = self._variable(self.take().text)
                 tail = self._end()
                 if tail:

@@ -16,6 +16,7 @@ class WgslWriter(Writer):
         **{name: f"vec{n}{kind[0]}" for name, (kind, n) in VECTORS.items()},
         **_SCALARS,
         "unpackHalf2x16": "unpack2x16float",
+        "barrier": "workgroupBarrier",
         "packHalf2x16": "pack2x16float",
     }
     linear = "wlm_linear_clamp"
@@ -42,6 +43,8 @@ class WgslWriter(Writer):
             return [f"{self._bind(variable.name)}<storage, read_write> {variable.name}: array<{kind}>;"]
         if variable.way == "uniform":
             return [f"{self._bind(variable.name)}<uniform> {variable.name}: {self.type_of(variable)};"]
+        if variable.way == "shared":
+            return [f"var<workgroup> {variable.name}: {self.type_of(variable)};"]
         assert variable.value is not None
         return [f"const {variable.name}: {self.type_of(variable)} = {self.write(variable.value)};"]
 

@@ -20,7 +20,7 @@ from scipy.cluster.vq import kmeans2
 
 from wlm.formats.parts import Part
 from wlm.probe.model import Content, Profile
-from wlm.probe.relative import magnitudes, norms
+from wlm.probe.relative import norms
 
 ENOUGH = 0.02
 """Relative error at which no bit is added: RMS over all probes of the error divided by the probe's magnitude."""
@@ -165,7 +165,7 @@ def component_bytes(
 def fit_components(
     values: np.ndarray, most_bytes: int | None = None, hours: int = 1, *, relative: bool = True, seed: int = 0
 ) -> tuple[Components, float]:
-    """Compresses live probes to the smallest GPU buffers whose relative error is at most `ENOUGH` at each hour, or a
+    """Compresses live probes to the smallest GPU buffers whose relative error over all hours is at most `ENOUGH`, or a
     sixteenth of it if errors are not relative.
 
     Args:
@@ -181,14 +181,9 @@ def fit_components(
     values = values.astype(np.float64)
     live, numbers = values.shape
     light = norms(values)
-    unit = light[:, None]
-    if hours > 1 and relative:
-        # A probe that is dark at an hour has no error relative to its light then.
-        unit = np.where(norms(values.reshape(live, hours, -1)) > 0, magnitudes(values, hours), np.inf)
     if not relative:
         # A half float holds the logarithm of a common magnitude exactly.
         light = np.full(live, np.exp(np.float64(np.float16(np.log(light.max())))))
-        unit = light[:, None]
     some = slice(None, None, -(-live // _SAMPLE))
     bits = _WIDEST * (1 + numbers)
     if most_bytes is not None:
@@ -202,10 +197,10 @@ def fit_components(
             plans += _plans(shape, np.log(light)[some], division, bits, live, hours)
     plans = [plan for plan in plans if most_bytes is None or plan.size <= most_bytes] or [min(plans, key=_size)]
     target = enough = ENOUGH if relative else ENOUGH / 16
-    while True:  # the errors of plans are predictions, and not of each hour
+    while True:  # the errors of plans are predictions
         good = [plan for plan in plans if plan.error <= enough]
         plan = min(good, key=_size) if good else min(plans, key=lambda plan: plan.error)
-        components, error = _coded(values, light, unit, plan)
+        components, error = _coded(values, light, hours, plan)
         if error <= target or not good:
             return components, error
         enough = min(0.9 * enough * target / error, 0.99 * plan.error)
@@ -331,9 +326,8 @@ def _plans(
     return plans
 
 
-def _coded(values: np.ndarray, light: np.ndarray, unit: np.ndarray, plan: _Plan) -> tuple[Components, float]:
-    """Codes probes [V, T D] of given magnitudes; returns the components, and the largest error of an hour, in `unit`
-    [V, T]."""
+def _coded(values: np.ndarray, light: np.ndarray, hours: int, plan: _Plan) -> tuple[Components, float]:
+    """Codes probes [V, T D] of given magnitudes; returns the components and their error relative to these."""
     width, division = plan.width, plan.division
     basis = np.zeros((0, values.shape[1]), np.float16)
     if division.directions is not None:
@@ -352,13 +346,12 @@ def _coded(values: np.ndarray, light: np.ndarray, unit: np.ndarray, plan: _Plan)
     if division.directions is not None:
         pairs = zip(division.directions, _pieces(groups), strict=True)
         decoded = np.concatenate([decoded[rows] @ each for each, rows in pairs])
-    hours = unit.shape[1]
-    error = norms((magnitude * decoded - values).reshape(len(values), hours, -1)) / unit[groups.order]
+    error = norms(magnitude * decoded - values) / light
     code = np.empty((len(values), len(width)), np.uint8)
     code[groups.order] = np.stack([groups.label, *(column.code for column in columns)], 1)
     bounds = np.stack([np.stack([column.low, column.step]) for column in columns], 2).astype(np.float16)
     components = Components(values.shape[1] // hours, code, np.array(width, np.uint8), bounds, basis, hours)
-    return components, float(np.sqrt(np.square(error).mean(0).max()))
+    return components, float(np.sqrt(np.square(error).mean()))
 
 
 class _Quantised(NamedTuple):

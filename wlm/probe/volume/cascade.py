@@ -228,7 +228,7 @@ class Volume:
             return wp.array(ptr=shared.ptr, shape=shape, dtype=dtype, device=self.device)
 
         self._read_light = view((budget * probes, self.channels), float)
-        frame = {"clock": 1, "counters": 7, "limit": 1, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
+        frame = {"clock": 1, "counters": 7, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
         ranked = dict.fromkeys(("gathered", "distance"), min(frame_kernels.MOST, blocks))
         ranges = dict.fromkeys(("begin", "count"), (budget, frame_kernels.HALVES))
         by_block = dict.fromkeys(("chosen", "taken", "blocks", "picked", "noise"), budget)

@@ -25,11 +25,26 @@ _FIRST_BINDING = 2  # the shader of the probes has the first two
 _BUFFERS = ("HEAD", "INDEX", "PAGES", "POOL", "TABLES", "COUNTS", "WORK", "LIGHT")
 _READ_ONLY = ("HEAD", "INDEX")
 
+_USED = {
+    "scroll": "head index pages tables counts work",
+    "limit": "counts work",
+    "gather": "head pages counts work",
+    "rank": "counts work",
+    "allocate": "head index pages tables counts work",
+    "ranges": "head index work",
+    "weigh": "head index work light",
+    "decode": "head index work light",
+    "combine": "work light",
+    "store": "pool work light",
+}
+"""Buffers of each dispatch; the decoding one has those of the probes, too."""
+
 _ABOUT = {
     "order": "In each frame the engine writes the buffer head, then runs the functions of `dispatches` in their order, "
     "each in a compute shader whose main calls it with the index of the thread, for at least `threads` threads; a "
-    "function does nothing for further threads. Writes of a dispatch must be visible to the next one: a memory barrier "
-    "in GLSL, nothing to do in WebGPU. `shader` of this folder is an include file with all of the functions.",
+    "function does nothing for further threads, and uses `buffers`. Writes of a dispatch must be visible to the next "
+    "one: a memory barrier in GLSL, nothing to do in WebGPU. `shader` of this folder is an include file with all of "
+    "the functions.",
     "head": "See the head of the shader that reads the volume. In each frame: the word 4 is a number that rises by 1 "
     "from 1; for each level, in doubles, at = viewpoint / block - start, base = clamp(floor(at + 1/2) - floor(sides / "
     "2), low, high + 1 - sides), view = at - base - 1/2; the words 12 to 14 of the level are the base of the frame "
@@ -118,6 +133,8 @@ def update_bundle(volume: Volume, model: ProbeModel, *, frames: int = _FRAMES) -
         "combine": outputs * budget,
         "store": row_words(outputs) * budget,
     }
+    used = {name: names.split() for name, names in _USED.items()}
+    used["decode"] += [name for name in form.buffers if name != "positions"]
     words = {
         "head": HEAD_WORDS + LEVEL_WORDS * len(volume.sizes),
         "pages": -(-slots // 2),
@@ -132,7 +149,10 @@ def update_bundle(volume: Volume, model: ProbeModel, *, frames: int = _FRAMES) -
     document = {
         "about": _ABOUT,
         "budget": budget,
-        "dispatches": [{"function": f"wlm_update_{name}", "threads": count} for name, count in threads.items()],
+        "dispatches": [
+            {"function": f"wlm_update_{name}", "threads": count, "buffers": used[name]}
+            for name, count in threads.items()
+        ],
         "words": words,
         "levels": [dict(zip(names, (row[0], *(each.tolist() for each in row[1:])), strict=True)) for row in levels],
     }
