@@ -51,8 +51,10 @@ int wlm_probe_count()
 // Code of a live probe: its cluster (column 0), or that of its magnitude (1) or of a coefficient.
 uint wlm_probe_code(int probe, int column)
 {{
-    uint place = WLM_PROBE_PROBES(2 + column), last = WLM_PROBE_PROBES({first} - 1);
-    int bits = int((last & 65535u) + (last >> 16u)), width = int(place >> 16u);
+    uint place = WLM_PROBE_PROBES(2 + column);
+    uint last = WLM_PROBE_PROBES({first} - 1);
+    int bits = int((last & 65535u) + (last >> 16u));
+    int width = int(place >> 16u);
     if (width == 0)
         return 0u;
     // The bits of 32 probes end with a word.
