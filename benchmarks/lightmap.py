@@ -80,8 +80,8 @@ _QUICK_SAMPLES = 2048
 _QUICK_HOURS = (9.0, 12.0, 21.0)  # morning, noon and lamps
 _FULL_TILES = 64  # tiles of a lightmap of 1024 x 1024
 _PLAIN_STEPS = {"cpu": 10, "cuda": 1000}  # steps of the fit in plain torch that are timed
-_ALL, _PAGES = 1 << 40, 1024  # bytes of a virtual texture that holds all pages; most pages that it decodes at once
-_PAGE_FRAMES = 2  # frames after which all pages of a time are there
+ALL, PAGES = 1 << 40, 1024  # bytes of a virtual texture that holds all pages; most pages that it decodes at once
+PAGE_FRAMES = 2  # frames after which all pages of a time are there
 _LOADS = 50  # tiles that are unpacked for the time of one
 _ERROR_TIMES = 3  # the float64 path takes 30 ms for one tile at one time
 
@@ -197,7 +197,7 @@ def _repeated(model: SheetModel, count: int) -> SheetModel:
     return replace(model, width=width, height=height, mask=np.ones((height, width), bool), **arrays)
 
 
-def _view_of_all_pages(texture: VirtualTexture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def view_of_all_pages(texture: VirtualTexture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns sheet, UV and derivatives of a view that needs every page: a square of pixels for each."""
     layout, own = texture.layout, texture.layout.models[0]
     _, level, row, column = layout.place.T
@@ -208,7 +208,7 @@ def _view_of_all_pages(texture: VirtualTexture) -> tuple[np.ndarray, np.ndarray,
     return zero, *(np.repeat(part[None], STRIDE, 0).repeat(STRIDE, 1).astype(np.float32) for part in (uv, slopes))
 
 
-def _texels(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def texels_of(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns sheet, UV and derivatives at the centre of each texel of a map."""
     y, x = (np.mgrid[: shape[0], : shape[1]] + 0.5) / np.reshape(shape, (2, 1, 1))
     return np.zeros(shape, np.int32), np.stack([x, y], 2), np.zeros((*shape, 4), np.float32)
@@ -307,13 +307,13 @@ class _LightmapBench(Bench):
         """Returns the row of the pages of a virtual texture, and a call that decodes all of them."""
         self.note(f"{fit.option}: measuring the pages")
         texture, timed = (
-            VirtualTexture(fit.model, self.device, budget=_ALL, decodes=_PAGES, tolerance=1e-6) for _ in range(2)
+            VirtualTexture(fit.model, self.device, budget=ALL, decodes=PAGES, tolerance=1e-6) for _ in range(2)
         )
-        view, found, worst = _view_of_all_pages(texture), [], 0.0
+        view, found, worst = view_of_all_pages(texture), [], 0.0
         for t in self.times:
-            for _ in range(_PAGE_FRAMES):
+            for _ in range(PAGE_FRAMES):
                 texture.frame(t, *view)
-            found.append(texture.sample(*_texels(self.lightmaps.mask.shape)).light)
+            found.append(texture.sample(*texels_of(self.lightmaps.mask.shape)).light)
             if t in self.error_times:
                 worst = max(worst, self._largest_error(fit.model.light, found[-1], t))
         timed.frame(self.times[-1], *view)  # all pages are missing, so that its list has all of them

@@ -2,7 +2,8 @@
 
 The map has 1024 x 1024 texels with random maps and networks. The rows:
 
-- "ours": the fast decoder at a stored hour, 8 bits per channel, of profiles M and `standard`.
+- "ours": the fast decoder at a stored hour, 8 bits per channel, of profiles M and `standard`; and all pages of a
+  virtual texture of the map, of all mips with borders, in one list.
 - "GLSL": the exported functions in a compute shader through OpenGL, which decodes the same hour to half floats; numbers
   of networks and of the hour are in textures as exported, or by the shader's macros in storage buffers. "groups share a
   network" is the exported compute shader, with storage buffers.
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from benchmarks.lightmap import ALL, PAGE_FRAMES, PAGES, texels_of, view_of_all_pages
 from benchmarks.lightmap_run_time import _PlainCamera, large_model, random_sheet
 from benchmarks.rivals.browser_run import page_time
 from benchmarks.rivals.gl_run import Screen
@@ -35,7 +37,7 @@ from wlm.errors import WlmError
 from wlm.export.compute import compute_shader
 from wlm.export.shading import translate
 from wlm.lightmap.bundle import sheet_bundle
-from wlm.lightmap.model import LightmapModel
+from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.runtime import fast_decoder
 from wlm.lightmap.shader import GROUP_SIZE
@@ -50,6 +52,7 @@ _LEAST_SIDE = 512  # of a sheet of the view, whose camera walks in a circle of 6
 _VIEW, _QUICK_VIEW = (720, 1280), (90, 160)
 _HOURS = (0.0, 6.0, 12.0, 18.0)
 _FRAMES = 64  # of a virtual texture until its view is there
+_CELL = GROUP_SIZE[0], 2 * GROUP_SIZE[1]  # texels of a group of the exported compute shader
 _ROW = 1024  # groups of four floats in a row of a texture of numbers
 _DISPATCHES = (10, 110)  # of the two runs of WGSL
 _BUFFERS = {"networks": ("NET", 0), "hours": ("HOUR_AT", 1)}  # macro and binding of each buffer
@@ -102,7 +105,7 @@ def run(*, quick: bool, device: str, progress: Note | None = None) -> list[Row]:
     # In software OpenGL compiles the larger network for minutes.
     profiles = _PROFILES[:1] if bench.device == "cpu" else _PROFILES
     rows = [row for name in profiles for row in bench.profile_rows(name)]
-    return [*rows, *(bench.page_rows() if bench.device == "cpu" else []), *bench.read_rows()]
+    return [*rows, *(bench.browser_rows() if bench.device == "cpu" else []), *bench.read_rows()]
 
 
 class _ShaderBench(Bench):
@@ -138,9 +141,25 @@ class _ShaderBench(Bench):
             error = float(np.abs(picture[..., :3] - frame).max() / frame.max())
             figures = {"decode_ms": duration, "times_ours": duration / ours["decode_ms"], "max_error": error}
             rows.append(self.row(language, f"{name}, {option}", renderer, **figures))
-        return rows
+        return [*rows, self.pages_row(name, model, made.reference["frame"])]
 
-    def page_rows(self) -> list[Row]:
+    def pages_row(self, name: str, model: SheetModel, frame: np.ndarray) -> Row:
+        """Returns the row of all pages of a virtual texture of a map whose light at the first hour is `frame`."""
+        self.note(f"all pages of {name}")
+        whole = LightmapModel("pages", "0" * 16, model.profile, {Sheet(): model})
+        read, timed = (VirtualTexture(whole, self.device, budget=ALL, decodes=PAGES, tolerance=1e-6) for _ in range(2))
+        with read, timed:
+            view = view_of_all_pages(read)
+            for _ in range(PAGE_FRAMES):
+                read.frame(_HOURS[0], *view)
+            error = float(np.abs(read.sample(*texels_of(frame.shape[:2])).light - frame).max() / frame.max())
+            timed.frame(_HOURS[0], *view)  # all pages are missing, so that its list has all of them
+            figures = {"pages_decoded": timed.report()["decoded"], "max_error": error}
+            notes = f"all pages of all mips with borders of {read.layout.border} texels, RGB9E5, {self.mode}"
+            row = self.row("ours", f"{name}, all pages", notes, **figures)
+            return self.time_rows([(row, self.replay(timed.stages["decode"]))])[0]
+
+    def browser_rows(self) -> list[Row]:
         """Returns the rows of a tile in a browser, and of our decoder of this tile."""
         self.note("decoding a tile in Chromium")
         sheet, scene = random_sheet(TILE, np.array(_HOURS), 0, Profile.load("M")), f"a tile, {TILE} x {TILE}"
@@ -181,7 +200,7 @@ class _ShaderBench(Bench):
             else:
                 rows = _rows_of_fours(numbers[name])
                 textures[_uniform(name)] = screen.texture([rows], "R32G32B32A32_FLOAT", _ROW, len(rows))
-        picture = screen.picture(text, (self._side, self._side), textures, stored, GROUP_SIZE if groups else None)
+        picture = screen.picture(text, (self._side, self._side), textures, stored, _CELL if groups else None)
         return picture.read(), picture.time(self._repeats), screen.name
 
     @cached_property
@@ -230,7 +249,7 @@ class _ShaderBench(Bench):
             for i, each in enumerate((entries, [{"binding": 0, "resource": out.create_view()}]))
         ]
 
-        columns, rows = GROUP_SIZE if groups else (8, 8)
+        columns, rows = _CELL if groups else (8, 8)
 
         def dispatch(count: int) -> float:
             encoder = gpu.create_command_encoder()

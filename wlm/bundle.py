@@ -121,8 +121,7 @@ class Bundle:
             is no collection.
         exact: Name of the macro with which the shader fetches texels and interpolates in floats instead of using the
             texture filter; empty if the shader has no such variant.
-        group: Name of the macro with which the shader is for compute shaders whose groups share the network of a tile;
-            empty if the shader has no such variant.
+        compute: GLSL source of functions that a compute shader decodes with; empty if the system has none.
         model: The model itself, for engine kits that decode it at positions of their own, such as a grid of probes.
     """
 
@@ -136,7 +135,7 @@ class Bundle:
     files: Mapping[str, bytes] = field(default_factory=dict)
     parts: Mapping[str, "Bundle"] = field(default_factory=dict)
     exact: str = ""
-    group: str = ""
+    compute: str = ""
     model: Any = None
 
     @property

@@ -184,7 +184,7 @@ def test_a_bundle_has_a_part_for_each_sheet():
     assert list(bundle.parts) == [item["part"] for item in listed] and not bundle.textures
     light, directions = (bundle.parts[item["part"]] for item in listed[:2])
     assert directions.document["values"] == [-1.0, 1.0]
-    assert "return vec3(-1.0, -1.0, -1.0) + 2.0 * wlm_colour(texel);" in directions.shader
+    assert "return vec3(-1.0, -1.0, -1.0) + 2.0 * colour;" in directions.shader
     assert "wlm_radiance" not in directions.shader and "wlm_radiance" in light.shader
     # By the bundle alone: the texels of the tile of frames at the first time.
     (tile,) = directions.document["tiles"]

@@ -10,14 +10,16 @@ from reference.components import decode as reference_decode
 
 import wlm
 from wlm.errors import WlmError
+from wlm.formats.parts import Part
 from wlm.probe.data import from_arrays
 from wlm.probe.evaluation import evaluate
-from wlm.probe.fit import compress
+from wlm.probe.fit import compress, open_checkpoint
 from wlm.probe.gaussian import trainer as training
 from wlm.probe.gaussian.trainer import Trainer, first_gaussians, local_spread
 from wlm.probe.model import Profile, box_of
 from wlm.probe.morton import morton_order
 from wlm.probe.pca.model import ENOUGH, Components, fit_components
+from wlm.probe.selection import least_count
 
 SMALL = Profile(name="small", method="gaussians", ratio=0.1, latent=3, hidden=16, steps=60)
 RANDOM = np.random.default_rng(7)
@@ -238,17 +240,16 @@ def clustered():
     return (values * np.exp(NORMAL.normal(size=(2000, 1)))).astype(np.float32)
 
 
-@pytest.mark.parametrize("relative", [True, False])
-def test_clusters_and_bits_have_the_error_that_is_stated(relative, clustered):
-    components, error = fit_components(clustered, 14 * len(clustered), relative=relative)
+def test_clusters_and_bits_have_the_error_that_is_stated(clustered):
+    components, error = fit_components(clustered, 14 * len(clustered))
     assert components.clusters > 1 and components.nbytes <= 14 * len(clustered)
     decoded = reference_decode(components.code, components.bounds, components.basis, 0)
     scale = np.linalg.norm(clustered, axis=1)
-    found = np.linalg.norm(decoded - clustered, axis=1) / (scale if relative else scale.max())
-    assert np.sqrt(np.mean(found**2)) == pytest.approx(error, rel=1e-2)
+    found = np.linalg.norm(decoded - clustered, axis=1) / scale
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(error, rel=1e-3)
     one = np.linalg.svd(clustered / scale[:, None], full_matrices=False)[2][:12]
     rest = clustered - clustered @ one.T @ one  # what 12 directions of all probes leave, in more bytes
-    assert error < 0.5 * np.sqrt(np.mean((np.linalg.norm(rest, axis=1) / (scale if relative else scale.max())) ** 2))
+    assert error < 0.5 * np.sqrt(np.mean((np.linalg.norm(rest, axis=1) / scale) ** 2))
 
 
 def test_packed_codes_are_bits(clustered):
@@ -321,3 +322,59 @@ def test_components_that_overflow_are_not_exported():
     assert isinstance(content, Components)
     with pytest.raises(WlmError, match="cannot export: the model decodes to NaN or infinity"):
         broken.bundle()
+
+
+@pytest.mark.parametrize("power", [0.2, 1.3])
+@pytest.mark.parametrize("first", [3, 4000])
+@pytest.mark.parametrize("wanted", [7, 3900])
+def test_the_least_number_that_reaches_a_target(power, first, wanted):
+    fits = []
+
+    def error_of(count):
+        fits.append(count)
+        return (count / wanted) ** -power * 0.07
+
+    found = least_count(error_of, first, 4000, 0.07)
+    assert wanted <= found <= 1.15 * wanted + 1 and len(fits) <= 8 and max(fits) <= 4000
+    assert least_count(error_of, first, wanted // 2, 0.07) is None
+
+
+SEARCH = SMALL.override({"method": "auto", "steps": 50, "ratio": 0.05})
+
+
+def test_a_target_and_a_number_of_bytes_choose_the_model():
+    probes = synthetic(200)
+    exact = compress(probes, SEARCH, target=0.03, method="pca")
+    assert exact.method == "pca" and evaluate(exact, probes).relative_error <= 0.03 and exact.warnings == ()
+    coarse = compress(probes, SEARCH, target=0.65, method="gaussians")
+    assert coarse.method == "gaussians" and evaluate(coarse, probes).relative_error <= 0.65
+    assert coarse.content.count + coarse.content.dropped < 60 and coarse.profile.target is None
+    for most in (900, 2600):
+        model = compress(probes, SEARCH, max_bytes=most)
+        assert 0.5 * most < model.content.nbytes <= most
+        assert re.match(r"(PCA|Gaussians): .* reach [\d.]+% in [\d,]+", model.choice)
+    warning = compress(probes, SEARCH, target=0.03, max_bytes=900, method="pca").warnings[0]
+    assert re.fullmatch(r"room: target: the relative error is [\d.]+%, more than the 3.0% asked for", warning)
+    with pytest.raises(WlmError, match="room: max_bytes: expected more bytes, as no model of 200 probes fits 100"):
+        compress(probes, SEARCH, max_bytes=100)
+
+
+def test_a_search_is_resumed(tmp_path):
+    probes, out = synthetic(200), tmp_path / "a.wlm"
+    settings = SEARCH.override({"target": 0.65, "method": "gaussians", "ratio": 0.01})
+    whole = compress(probes, settings)
+    fits = []
+
+    def stop(progress):
+        fits.append(progress.done)
+        if fits.count(50) == 2 or len(fits) > 500:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compress(probes, settings, progress=stop, checkpoint=open_checkpoint(out, probes, settings, every=0))
+    resumed = open_checkpoint(out, probes, settings, resume=True)
+    assert resumed.resumed and resumed.finished(0, {"error": Part(np.float64, (1,))}) is not None
+    model = compress(probes, settings, checkpoint=resumed)
+    model.save(tmp_path / "b.wlm")
+    whole.save(out)
+    assert out.read_bytes() == (tmp_path / "b.wlm").read_bytes()

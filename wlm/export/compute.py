@@ -14,9 +14,15 @@ layout(rgba16f, binding = WLM_TARGET_BINDING) writeonly uniform highp image2D wl
 void main()
 {{
     ivec2 texel = ivec2(gl_GlobalInvocationID.xy);
+    texel.y += int(gl_WorkGroupID.y) * {rows};
     wlm_lightmap_begin(texel - ivec2(gl_LocalInvocationID.xy), int(gl_LocalInvocationIndex));
-    if (texel.x < {width} && texel.y < {height})
-        imageStore(wlm_target, texel, vec4({function}(texel), 1.0));
+    vec3 light[2];
+    wlm_lightmap_pair(texel, light);
+    for (int i = 0; i < 2; i++) {{
+        if (texel.x < {width} && texel.y < {height})
+            imageStore(wlm_target, texel, vec4(light[i], 1.0));
+        texel.y += {rows};
+    }}
 }}
 """
 
@@ -29,11 +35,16 @@ RWTexture2D<float4> wlm_target;
 [numthreads({columns}, {rows}, 1)]
 void main(uint3 group : SV_GroupID, uint3 place : SV_GroupThreadID, uint index : SV_GroupIndex)
 {{
-    int2 first = int2(group.xy) * int2({columns}, {rows});
+    int2 first = int2(group.xy) * int2({columns}, 2 * {rows});
     wlm_lightmap_begin(first, int(index));
     int2 texel = first + int2(place.xy);
-    if (texel.x < {width} && texel.y < {height})
-        wlm_target[texel] = float4({function}(texel), 1.0);
+    float3 light[2];
+    wlm_lightmap_pair(texel, light);
+    for (int i = 0; i < 2; i++) {{
+        if (texel.x < {width} && texel.y < {height})
+            wlm_target[texel] = float4(light[i], 1.0);
+        texel.y += {rows};
+    }}
 }}
 """,
     "wgsl": """
@@ -46,11 +57,16 @@ fn main(
     @builtin(local_invocation_index) index: u32,
 )
 {{
-    let first = vec2i(group.xy) * vec2i({columns}, {rows});
+    let first = vec2i(group.xy) * vec2i({columns}, 2 * {rows});
     wlm_lightmap_begin(first, i32(index));
-    let texel = first + vec2i(place.xy);
-    if (texel.x < {width} && texel.y < {height}) {{
-        textureStore(wlm_target, texel, vec4f({function}(texel), 1.0));
+    var texel = first + vec2i(place.xy);
+    var light: array<vec3f, 2>;
+    wlm_lightmap_pair(texel, &light);
+    for (var i = 0; i < 2; i++) {{
+        if (texel.x < {width} && texel.y < {height}) {{
+            textureStore(wlm_target, texel, vec4f(light[i], 1.0));
+        }}
+        texel.y += {rows};
     }}
 }}
 """,
@@ -60,15 +76,13 @@ fn main(
 def compute_shader(bundle: Bundle, language: str, exact: bool = False) -> str:
     """Returns a compute shader that decodes a lightmap at the hour of its table into a texture of half floats.
 
-    Dispatch a group for each 32 x 8 texels of the map, or of the tiles that are needed.
+    Dispatch a group for each 32 x 8 texels of the map.
 
     Args:
         bundle: Bundle of a sheet with networks.
         language: One of `wlm.export.shading.LANGUAGES`; GLSL 4.30 and GLSL ES 3.10 are without `#version`.
         exact: Whether texels are fetched and interpolated in floats, without the texture filter.
     """
-    defined = [bundle.group, *([bundle.exact] if exact else [])]
-    document, (columns, rows) = bundle.document, GROUP_SIZE
-    words = {"columns": columns, "rows": rows, "function": "wlm_value" if "values" in document else "wlm_radiance"}
-    words |= {name: document[name] for name in ("width", "height")}
-    return translate(bundle.shader, language, defined) + _MAINS[language].format(**words)
+    (columns, rows), document = GROUP_SIZE, bundle.document
+    main = _MAINS[language].format(columns=columns, rows=rows, width=document["width"], height=document["height"])
+    return translate(bundle.compute, language, [bundle.exact] if exact else []) + main

@@ -100,7 +100,7 @@ def _write_raw(bundle: Bundle, folder: Path, language: str, exact: bool) -> None
         entries["shader"] = bundle.system + ENDINGS[language]
         text = translate(bundle.shader, language, [bundle.exact] if exact else [])
         (folder / entries["shader"]).write_bytes(text.encode())
-        if bundle.group:
+        if bundle.compute:
             entries["compute"] = f"{bundle.system}_compute{ENDINGS[language]}"
             text = compute_shader(bundle, language, exact)
             (folder / entries["compute"]).write_bytes(text.encode())

@@ -18,7 +18,7 @@ from wlm.lightmap.encodings import ENCODINGS, encoding_of
 from wlm.lightmap.encodings.maps import shader_networks
 from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.profile import encode_time
-from wlm.lightmap.shader import EXACT, GROUP, HEAD, decode_glsl, record_fours
+from wlm.lightmap.shader import EXACT, HEAD, decode_glsl, record_fours
 from wlm.lightmap.sheet import Sheet
 from wlm.lightmap.tiles import TILE, TileKind
 
@@ -119,8 +119,8 @@ def sheet_bundle(sheet: Sheet, model: SheetModel, name: str, source: str, device
     if sheet.values is not None:
         frame = np.float32(sheet.values[0]) + np.float32(sheet.span) * frame
     shader = decode_glsl(model, sheet.values)
-    group = GROUP if len(networks) else ""
-    return Bundle("lightmap", name, shader, document, textures, buffers, {"frame": frame}, exact=EXACT, group=group)
+    compute = decode_glsl(model, sheet.values, pairs=True) if len(networks) else ""
+    return Bundle("lightmap", name, shader, document, textures, buffers, {"frame": frame}, exact=EXACT, compute=compute)
 
 
 def hour_tables(model: SheetModel, times: Sequence[float]) -> np.ndarray:

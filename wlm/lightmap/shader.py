@@ -13,11 +13,8 @@ EXACT = "WLM_LIGHTMAP_EXACT"
 GROUP_SIZE = (32, 8)
 """Columns and rows of such a group; both divide a tile's side."""
 
-GROUP = "WLM_LIGHTMAP_GROUP"
-"""Macro for compute shaders, whose groups of invocations share the network of a tile."""
-
-GROUP_SIZE = (32, 8)
-"""Columns and rows of such a group; both divide a tile's side."""
+GROUP_SIZE = (32, 4)
+"""Columns and rows of a group of invocations of the compute shader, each of which decodes two texels."""
 
 HEAD = 2
 """Groups of four floats before the records of the tiles in the table of an hour."""
@@ -50,16 +47,13 @@ _HEAD = """\
 // sections 3.2 to 3.4). For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below #version, in ES
 // below `precision highp` of float, int, sampler2D and sampler2DArray.
 //
-// For each stored hour that is needed: bind the table of the hour, draw the map into a texture of linear light with
-// {last}(texel), and draw that one into another, each texel from wlm_source(texel), which fills the gaps between
-// charts that a filter reads at their edges. Materials mix two of these by the time between both hours (eq. 2).
-//
+{use}//
 // Textures; row 0 is v = 0. Filters are linear, without mip levels.
 {textures}//
 // If WLM_LIGHTMAP_EXACT is defined, four texels are fetched and mixed in floats; otherwise the filter unit mixes four
 // texels, with about 8 bits for a position between two of them.
 //
-{group}// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: if these are in
+// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: if these are in
 // buffers change them, or define WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) before this file.
 
 {samplers}{reads}
@@ -67,10 +61,15 @@ const int WLM_LIGHTMAP_COLUMNS = {columns}; // tiles in a row of the map
 const int WLM_LIGHTMAP_RECORD = {record}; // fours of a tile in the table, after {head} of all
 """
 
-_ABOUT_GROUP = """\
-// Compute shaders decode faster with WLM_LIGHTMAP_GROUP defined, in groups of {columns} x {rows} texels of one tile
-// (wlm_lightmap_begin), which keep the network of the tile in {kilobytes} KB of shared memory.
-//
+_DRAWN = """\
+// For each stored hour that is needed: bind the table of the hour, draw the map into a texture of linear light with
+// {last}(texel), and draw that one into another, each texel from wlm_source(texel), which fills the gaps between
+// charts that a filter reads at their edges. Materials mix two of these by the time between both hours (eq. 2).
+"""
+_COMPUTED = """\
+// A compute shader for GLSL 4.30 and GLSL ES 3.10 and later. For each stored hour that is needed: bind the table of the
+// hour, and dispatch a group of {columns} x {rows} invocations for each {columns} x {tall} texels of the map.
+// A group keeps the network of its tile in {kilobytes} KB of shared memory.
 """
 
 _TEXTURES = {
@@ -98,25 +97,11 @@ _NETWORK = """
 const int WLM_LIGHTMAP_FOURS = {fours}; // of {hidden} units
 
 {gelu}
-#ifdef WLM_LIGHTMAP_GROUP
-shared vec4 wlm_lightmap_weights[{weights}];
-#endif
-
-// Four floats of a network: of the group's tile, or of all networks.
-vec4 wlm_lightmap_weight(int i)
-{{
-#ifdef WLM_LIGHTMAP_GROUP
-    return wlm_lightmap_weights[i];
-#else
-    return wlm_lightmap_four(i);
-#endif
-}}
-
 // b + x W, where the rows of W are `apart` groups of four apart.
 vec4 wlm_lightmap_add(vec4 b, vec4 x, int at, int apart)
 {{
-    vec4 sum = b + x.x * wlm_lightmap_weight(at) + x.y * wlm_lightmap_weight(at + apart);
-    return sum + x.z * wlm_lightmap_weight(at + 2 * apart) + x.w * wlm_lightmap_weight(at + 3 * apart);
+    vec4 sum = b + x.x * wlm_lightmap_four(at) + x.y * wlm_lightmap_four(at + apart);
+    return sum + x.z * wlm_lightmap_four(at + 2 * apart) + x.w * wlm_lightmap_four(at + 3 * apart);
 }}
 
 // Colour of a tile of maps: `record` is the position of its record, `inner` the texel in the tile. G of eq. 4 has two
@@ -125,11 +110,7 @@ vec4 wlm_lightmap_add(vec4 b, vec4 x, int at, int apart)
 vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 {{
     int row = int(tile.y);
-#ifdef WLM_LIGHTMAP_GROUP
-    int start = 0;
-#else
     int start = int(tile.z);
-#endif
     int second = start + 5 * WLM_LIGHTMAP_FOURS;
     ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
     vec4 uv = texelFetch(WLM_LIGHTMAP_UV, at, 0);
@@ -140,13 +121,13 @@ vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
 {sums}        a = wlm_gelu(a);
         int w = second + 4 * WLM_LIGHTMAP_FOURS * i;
 {products}    }}
-    vec4 y = wlm_lightmap_weight(third + 4 * WLM_LIGHTMAP_FOURS);
+    vec4 y = wlm_lightmap_four(third + 4 * WLM_LIGHTMAP_FOURS);
 {outputs}    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
     return max(gain + wlm_lightmap_entry(record + 2).xyz * y.xyz, vec3(0.0, 0.0, 0.0));
 }}
 """
 _UNITS = {
-    "biases": "    b[{j}] = wlm_lightmap_weight(third - WLM_LIGHTMAP_FOURS + {j});\n",
+    "biases": "    b[{j}] = wlm_lightmap_four(third - WLM_LIGHTMAP_FOURS + {j});\n",
     "products": "        b[{j}] = wlm_lightmap_add(b[{j}], a, w + {j}, WLM_LIGHTMAP_FOURS);\n",
     "outputs": "    y = wlm_lightmap_add(y, wlm_gelu(b[{j}]), third + {at}, 1);\n",
 }
@@ -241,6 +222,14 @@ vec3 wlm_lightmap_of_frames(vec4 tile, int record, ivec2 inner)
 }}
 """
 
+_UNMAPPED = """
+// Colour of a tile of frames, or of one colour.
+vec3 wlm_lightmap_unmapped(vec4 tile, int record, ivec2 inner)
+{{
+{frames}    return wlm_lightmap_entry(record + 1).xyz;
+}}
+"""
+
 _COLOUR = """
 // Colour of a texel of the map in gamma space, at least 0; of an empty tile 0.
 vec3 wlm_colour(ivec2 texel)
@@ -249,14 +238,16 @@ vec3 wlm_colour(ivec2 texel)
     ivec2 inner = texel - place * {TILE};
     int record = {head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD;
     vec4 tile = wlm_lightmap_entry(record);
-{kinds}    return wlm_lightmap_entry(record + 1).xyz;
+{kinds}    return wlm_lightmap_unmapped(tile, record, inner);
 }}
 """
 
-_BEGIN = """
-#ifdef WLM_LIGHTMAP_GROUP
-// Shares the network of a tile in a group of {invocations} invocations. Each calls it once, with a texel of the tile,
-// the same for all, and its own index, and then decodes texels of this tile only.
+_PAIR = """
+{gelu}
+shared vec4 wlm_lightmap_weights[{weights}];
+
+// Copies the network of a tile to the memory that a group of {invocations} invocations shares. Each calls it once, with
+// a texel of the tile, the same for all, and its own index.
 void wlm_lightmap_begin(ivec2 texel, int index)
 {{
     ivec2 place = texel / {TILE};
@@ -267,7 +258,58 @@ void wlm_lightmap_begin(ivec2 texel, int index)
         wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i);
     barrier();
 }}
-#endif
+
+// Colours of two texels of a tile of maps, {below} rows apart: `record` is the position of its record, `inner` the
+// upper texel in the tile. G of eq. 4 has two hidden layers of {hidden} units. Each weight that is read serves both
+// texels. Four units of the first layer at a time are added to the second, whose array has constant indices, so that it
+// is in registers.
+void wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner, out vec3 colour[2])
+{{
+    int row = int(tile.y);
+    ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
+    vec4 uv0 = texelFetch(WLM_LIGHTMAP_UV, at, 0);
+    vec4 uv1 = texelFetch(WLM_LIGHTMAP_UV, at + ivec2(0, {below}), 0);
+    int second = 5 * {fours};
+{inputs}    int third = second + {second_size};
+    vec4 w0;
+    vec4 w1;
+    vec4 w2;
+    vec4 w3;
+    vec4 b[2 * {fours}];
+{biases}    for (int i = 0; i < {fours}; i++) {{
+        vec4 a0 = wlm_lightmap_entry(record + 3 + i);
+        vec4 a1 = a0;
+{sums}        a0 = wlm_gelu(a0);
+        a1 = wlm_gelu(a1);
+        int w = second + 4 * {fours} * i;
+{products}    }}
+    vec4 y0 = wlm_lightmap_weights[third + 4 * {fours}];
+    vec4 y1 = y0;
+    vec4 a0;
+    vec4 a1;
+{outputs}    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
+    vec3 spread = wlm_lightmap_entry(record + 2).xyz;
+    colour[0] = max(gain + spread * y0.xyz, vec3(0.0, 0.0, 0.0));
+    colour[1] = max(gain + spread * y1.xyz, vec3(0.0, 0.0, 0.0));
+}}
+"""
+
+_PAIR_INPUTS = """\
+    vec4 uvt0 = vec4(0.0, 0.0, 0.0, 0.0);
+    vec4 uvt1 = uvt0;
+    vec4 planes0 = uvt0;
+    vec4 planes1 = uvt0;
+    if (int(tile.x) == 2) {{
+        vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
+        vec2 under = (vec2(inner) + vec2(0.5, 0.5 + {below}.0)) / {TILE}.0;
+        vec2 ut = wlm_lightmap_plane(2 * row, place.x);
+        uvt0 = wlm_lightmap_volume(row, place);
+        uvt1 = wlm_lightmap_volume(row, under);
+        planes0 = vec4(ut, wlm_lightmap_plane(2 * row + 1, place.y));
+        planes1 = vec4(ut, wlm_lightmap_plane(2 * row + 1, under.y));
+        // The encoded time is in the bias. Of a static tile these inputs are 0, whatever their weights.
+        second = 17 * {fours};
+    }}
 """
 
 _MAPPED_KIND = """\
@@ -310,19 +352,45 @@ ivec2 wlm_source(ivec2 texel)
 }}
 """
 
-_RADIANCE = """
-// Linear radiance of a texel of the map, at most 65504: a target of half floats would make more infinite.
-vec3 wlm_radiance(ivec2 texel)
+_LINEAR = {
+    "radiance": """
+// Linear radiance of a colour, at most 65504: a target of half floats would make more infinite.
+vec3 wlm_lightmap_linear(vec3 colour)
 {{
-    return min(pow(wlm_colour(texel), {gamma}), vec3(65504.0, 65504.0, 65504.0));
+    return min(pow(colour, {gamma}), vec3(65504.0, 65504.0, 65504.0));
+}}
+""",
+    "value": """
+// The values of a colour, which has no gamma: levels from 0 to 1. They mix as radiance does.
+vec3 wlm_lightmap_linear(vec3 colour)
+{{
+    return vec3({least}, {least}, {least}) + {span} * colour;
+}}
+""",
+}
+_LAST = """
+vec3 wlm_{kind}(ivec2 texel)
+{{
+    return wlm_lightmap_linear(wlm_colour(texel));
 }}
 """
 
-_VALUES = """
-// The values of a texel of the map, which has no gamma: levels from 0 to 1. They mix as radiance does.
-vec3 wlm_value(ivec2 texel)
+_PAIR_COLOURS = """
+// Linear light of a texel of the group's tile and of the one {below} rows below.
+void wlm_lightmap_pair(ivec2 texel, out vec3 light[2])
 {{
-    return vec3({least}, {least}, {least}) + {span} * wlm_colour(texel);
+    ivec2 place = texel / {TILE};
+    ivec2 inner = texel - place * {TILE};
+    int record = {head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD;
+    vec4 tile = wlm_lightmap_entry(record);
+    if (int(tile.x) == 1 || int(tile.x) == 2) {{
+        wlm_lightmap_mapped(tile, record, inner, light);
+    }} else {{
+        light[0] = wlm_lightmap_unmapped(tile, record, inner);
+        light[1] = wlm_lightmap_unmapped(tile, record, inner + ivec2(0, {below}));
+    }}
+    light[0] = wlm_lightmap_linear(light[0]);
+    light[1] = wlm_lightmap_linear(light[1]);
 }}
 """
 
@@ -339,12 +407,14 @@ def texture_names(model: SheetModel) -> list[str]:
     return [name for name in _TEXTURES if needed.get(name, True)]
 
 
-def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) -> str:
+def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *, pairs: bool = False) -> str:
     """Returns the shader of a sheet: functions to be included below `#version`.
 
     Args:
         model: The sheet; the shader depends on its settings and on the kinds of its tiles.
         values: Range to which decoded levels from 0 to 1 are mapped if the sheet is not light; None: it is radiance.
+        pairs: Whether the functions are for a compute shader, whose invocations decode two texels each; only for a
+            sheet with networks.
 
     Returns:
         Source for GLSL 3.30 and GLSL ES 3.00; it also compiles for Vulkan if the bindings are defined.
@@ -387,32 +457,62 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None) ->
         "beyond": 2 * REACH * REACH + 1,
         "static": 4 * wide + rest,
         "weights": weights,
+        "second_size": (4 * wide + 1) * wide,
+        "below": GROUP_SIZE[1],
         "invocations": GROUP_SIZE[0] * GROUP_SIZE[1],
         # repr gives the shortest decimals that are the number again, and always a point or an exponent.
         "gamma": f"vec3({gamma})",
         "inverse": f"vec3({inverse})",
     }
-    mapped = "networks" in names
-    kinds, images = _MAPPED_KIND if mapped else "", ""
-    if "frames" in names:
-        kinds, images = kinds + _FRAMES_KIND.format(**words), _FRAMES.format(**words)
-    group = ""
-    if mapped:
-        kilobytes = f"{16 * words['weights'] / 1024:.0f}"
-        group = _ABOUT_GROUP.format(columns=GROUP_SIZE[0], rows=GROUP_SIZE[1], kilobytes=kilobytes)
-    text = _head(names, words | {"last": "wlm_radiance" if values is None else "wlm_value", "group": group})
-    if "uvt" in names:
-        text += _MAPS.format(**words)
-    if mapped:
+    kind = "radiance" if values is None else "value"
+    least, span = (0.0, 1.0) if values is None else (values[0], values[1] - values[0])
+    linear = _LINEAR[kind].format(least=repr(least), span=repr(span), **words)
+    has_frames = "frames" in names
+    unmapped = _UNMAPPED.format(frames=_FRAMES_KIND.format(**words) if has_frames else "")
+    unmapped = (_FRAMES.format(**words) if has_frames else "") + unmapped
+    maps = _MAPS.format(**words) if "uvt" in names else ""
+    if pairs:
+        names.remove("valid")
+        group, rows = GROUP_SIZE
+        use = _COMPUTED.format(columns=group, rows=rows, tall=2 * rows, kilobytes=f"{weights / 64:.0f}")
+        text = _head(names, words | {"use": use}) + maps + unmapped + linear
+        inputs = ["uv", "uvt", "planes"] if maps else ["uv"]
+        lines = _pair_lines(wide, inputs)
+        more = _PAIR_INPUTS.format(**words) if maps else ""
+        text += _PAIR.format(gelu=_GELU[profile.gelu], inputs=more, **lines, **words)
+        return text + _PAIR_COLOURS.format(**words)
+    text, kinds = _head(names, words | {"use": _DRAWN.format(last=f"wlm_{kind}")}) + maps, ""
+    if "networks" in names:
         units = {name: "".join(line.format(j=j, at=4 * j) for j in range(wide)) for name, line in _UNITS.items()}
-        inputs, sums = (_INPUTS.format(**words), _SUMS) if "uvt" in names else ("", "")
-        text += _NETWORK.format(gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words) + _BEGIN.format(
-            **words
-        )
-    text += images + _COLOUR.format(kinds=kinds, **words) + _SOURCE.format(**words)
-    if values is None:
-        return text + _RADIANCE.format(**words)
-    return text + _VALUES.format(least=repr(values[0]), span=repr(values[1] - values[0]))
+        inputs, sums = (_INPUTS.format(**words), _SUMS) if maps else ("", "")
+        text += _NETWORK.format(gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words)
+        kinds = _MAPPED_KIND
+    text += unmapped + _COLOUR.format(kinds=kinds, **words) + _SOURCE.format(**words)
+    return text + linear + _LAST.format(kind=kind)
+
+
+def _pair_lines(wide: int, inputs: list[str]) -> dict[str, str]:
+    """Returns the lines of two texels' network that repeat for each four units, each with its number."""
+
+    def reads(first: str, at: int, apart: int) -> str:
+        return "".join(f"    w{k} = wlm_lightmap_weights[{first}{at + k * apart}];\n" for k in range(4))
+
+    def add(total: str, x: str) -> str:
+        return f"    {total} = {total} + {' + '.join(f'{x}.{axis} * w{k}' for k, axis in enumerate('xyzw'))};\n"
+
+    made = {"biases": "", "sums": "", "products": "", "outputs": ""}
+    for k, name in enumerate(inputs):
+        made["sums"] += reads("i + ", 4 * k * wide, wide) + add("a0", f"{name}0") + add("a1", f"{name}1")
+    for j in range(wide):
+        two = (f"b[{2 * j}]", f"b[{2 * j + 1}]")
+        made["biases"] += f"    {two[0]} = wlm_lightmap_weights[third - {wide - j}];\n    {two[1]} = {two[0]};\n"
+        made["products"] += reads("w + ", j, wide) + add(two[0], "a0") + add(two[1], "a1")
+        made["outputs"] += reads("third + ", 4 * j, 1)
+        for t in range(2):
+            made["outputs"] += f"    a{t} = wlm_gelu({two[t]});\n" + add(f"y{t}", f"a{t}")
+    for name in ("sums", "products"):
+        made[name] = "".join(f"    {line}\n" for line in made[name].splitlines())
+    return made
 
 
 def _head(names: list[str], words: dict[str, object]) -> str:

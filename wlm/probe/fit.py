@@ -14,12 +14,11 @@ from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet
-from wlm.probe.evaluation import at_hour, relative_figures
-from wlm.probe.gaussian.model import check_outputs, gaussian_bytes, gaussian_count
+from wlm.probe.gaussian.model import check_outputs
 from wlm.probe.gaussian.packing import pack_model
 from wlm.probe.gaussian.trainer import Trainer
 from wlm.probe.model import CODES, ProbeModel, Profile, box_of
-from wlm.probe.pca.model import ENOUGH, fit_components
+from wlm.probe.selection import Candidates
 from wlm.system import Meter, OnProgress
 
 _MOST_LATENT, _MOST_HIDDEN = 32, 128  # of a fit of several hours
@@ -72,6 +71,8 @@ def compress(
 
     A profile of the method "auto", as all shipped Gaussian profiles are, yields Gaussians unless principal components
     have less error in no more GPU memory, which is the case for a few hundred probes; `ProbeModel.choice` says why.
+    With `target` the result is the smallest model found that reaches it, after up to seven fits; with `max_bytes` the
+    one with the least error within them.
     Dead probes take no part in the fit: the model stores one bit per probe if any probe is dead.
 
     Several hours are fitted as one, with probes that have the numbers of all hours; those of each hour are divided by
@@ -131,70 +132,35 @@ def compress(
         **box,
     )
     even = replace(probes, values=values)
-    values = values[probes.live]
-    pca, relative = Profile(name=profile.name, method="pca"), profile.error == "relative"
-    if profile.method == "pca":
-        content = fit_components(values, None, hours, relative=relative)[0]
-        model = make(profile=pca, content=content, choice="PCA, as the profile asks")
-        return _measured(model, probes, device)[0]
-    if profile.method == "auto":
-        count = gaussian_count(profile.ratio, len(values))
-        budget = gaussian_bytes(count, profile.latent, profile.hidden, profile.columns(probes.outputs), hours)
-        components, error = fit_components(values, budget, hours)
-        if error <= ENOUGH and components.nbytes <= budget:
-            took = (
-                f"{components.count} components reach {error:.1%} of each probe's light in {components.nbytes:,} bytes"
-            )
-            choice = f"PCA: {took} of GPU memory, Gaussians take {budget:,}"
-            return _measured(make(profile=pca, content=components, choice=choice), probes, device)[0]
-    check_outputs(probes.name, profile.latent, profile.hidden, hours * probes.outputs, hours * relative, device)
     # Magnitudes follow each probe at each hour by themselves, and half floats would round a scale's logarithm.
-    of_fit = (partial(make, scales=np.ones(hours)), probes) if relative else (make, even)
-    gaussians = _fit_gaussians(*of_fit, profile, seed, device, progress, checkpoint)
-    gaussians, error = _measured(gaussians, probes, device)
-    if profile.method == "gaussians":
-        return gaussians
-    most = gaussians.content.nbytes
-    told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
-    components, _ = fit_components(values, most, hours)
-    if components.nbytes > most:
-        return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
-    rival, possible = _measured(make(profile=pca, content=components), probes, device)
-    if possible < error:
-        return replace(rival, choice=f"PCA: {components.count} components reach {possible:.1%}, {told}")
-    return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1%}")
-
-
-def _measured(model: ProbeModel, probes: ProbeSet, device: str) -> tuple[ProbeModel, float]:
-    """Returns the model with its warnings, and its relative error, the root mean square over all hours."""
-    decoder = model.decoder(device, position=probes.position)
-    warnings, squares = [], []
-    for time in probes.times.tolist() or [None]:
-        decoder.set_time(time or 0.0)
-        figures = relative_figures(decoder.decode_probes(), probes.at(time))
-        warnings += [at_hour(time) + line for line in figures["warnings"]]
-        squares.append(figures["relative_error"] ** 2)
-    return replace(model, warnings=tuple(warnings)), math.sqrt(np.nanmean(squares))
+    of_fit = (partial(make, scales=np.ones(hours)), probes) if profile.error == "relative" else (make, even)
+    trained = partial(_fit_gaussians, *of_fit, seed=seed, device=device, progress=progress, checkpoint=checkpoint)
+    candidates = Candidates(make, probes, values[probes.live], profile, device, trained, checkpoint)
+    return candidates.selected() if profile.target or profile.max_bytes else candidates.usual()
 
 
 def _fit_gaussians(
     make: Callable[..., ProbeModel],
     probes: ProbeSet,
     profile: Profile,
+    *,
     seed: int,
     device: str,
     progress: OnProgress | None,
     checkpoint: Checkpoint | None,
+    number: int = 0,
 ) -> ProbeModel:
     """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3)."""
-    box = box_of(probes.position)
+    hours, box = max(len(probes.times), 1), box_of(probes.position)
+    relative = hours * (profile.error == "relative")
+    check_outputs(probes.name, profile.latent, profile.hidden, hours * probes.outputs, relative, device)
     position, values = probes.position[probes.live], probes.values[probes.live]
     x = ((position - box["origin"]) / box["extent"]).astype(np.float32)
-    trainer = Trainer(x, values, profile, seed, device, max(len(probes.times), 1))
+    trainer = Trainer(x, values, profile, seed, device, hours)
     try:
         if checkpoint is not None:
-            checkpoint.restore(0, trainer.load)
-        _train(trainer, probes, progress, checkpoint)
+            checkpoint.restore(number, trainer.load)
+        _train(trainer, probes, progress, checkpoint, number)
         trainer.finish()
         mse = trainer.mse()
         content = trainer.quantised()
@@ -210,7 +176,9 @@ def _fit_gaussians(
     return pack_model(fitted, position, values, device)
 
 
-def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, checkpoint: Checkpoint | None) -> None:
+def _train(
+    trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, checkpoint: Checkpoint | None, number: int
+) -> None:
     steps, chunk = trainer.steps, _CHUNK["cpu" if trainer.device == "cpu" else "cuda"]
     meter = Meter(progress, "fit", steps)
     peak, live = float(np.ptp(probes.values)), probes.live.mean()  # dead probes decode exactly, and count
@@ -229,7 +197,7 @@ def _train(trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, chec
                 meter.report(step, **figures())
             except KeyboardInterrupt:
                 if checkpoint is not None:
-                    checkpoint.save({0: trainer.state()})
+                    checkpoint.save({number: trainer.state()})
                 raise
         if checkpoint is not None and checkpoint.due():
-            checkpoint.save({0: trainer.state()})
+            checkpoint.save({number: trainer.state()})

@@ -30,8 +30,12 @@ class Profile(Settings):
 
     method: Literal["auto", "gaussians", "pca"] = "auto"
     """Compression method: gaussians, pca, or auto, which takes PCA if it has less error in no more GPU memory."""
+    target: float | None = Field(None, gt=0.0, lt=1.0)
+    """Relative error to reach, in root mean square, with the fewest bytes of GPU memory; the first fit has `ratio`."""
+    max_bytes: int | None = Field(None, ge=1)
+    """Most bytes of GPU memory; Gaussians or components are as many as fit them, or as `target` needs."""
     ratio: float = Field(0.05, gt=0.0, le=1.0)
-    """Number of Gaussians per live probe, that is, per probe that holds light."""
+    """Number of Gaussians per live probe, that is, per probe that holds light; `target` and `max_bytes` override it."""
     latent: int = Field(9, ge=1, le=32)
     """Length of the latent vector of a Gaussian."""
     hidden: int = Field(64, ge=8, le=128, multiple_of=8)

@@ -38,7 +38,7 @@ from wlm_kernels.lightmap.pages import (
 from wlm_kernels.native import on_cuda
 from wlm_kernels.shared_exponent import pack_rgb9e5
 
-BLOCKS = 1024
+BLOCKS = 528
 """Blocks of a launch."""
 
 GROUP = 16

@@ -16,7 +16,9 @@ change from frame to frame.
 
 How much light has changed is known without decoding it: `Pages.change` adds up the changes between stored times. While
 the clock runs forward, a page is decoded for a time at which its light will have changed by `REFRESH` of the tolerance,
-and again when it has changed by as much since: half the error of light that is only ever late.
+and again when it has changed by as much since: half the error of light that is only ever late. A page of many samples
+is decoded for a time at which its light will have changed by `LEAD` of the tolerance, and again when it is stale: half
+as often as if it were only ever late.
 """
 
 from typing import Any
@@ -33,6 +35,8 @@ MOST = 4096  # most pages that are ranked
 SAMPLES = 4  # most samples of a texel of all decoded pages together, for each page that a frame may decode
 KEEP = 16  # frames for which a page counts as needed
 REFRESH = 0.3  # of the tolerance: change of light from which on a page is decoded again if a frame has room
+FEW = 4  # samples of a texel of such a page
+LEAD = 0.9  # of the tolerance: change of light up to the time for which a page of more samples is decoded
 VISIBLE, MISSING, STALE, AHEAD, WAITING, DECODED, GATHERED = range(7)
 """Counters of a frame: pages that are needed; pages among them without a slot, whose light has changed, that are not
 ready for the coming switch, and that wait for tiles; decoded pages; and pages that could have been decoded."""
@@ -44,6 +48,7 @@ needed any more; whether to decode pages for a coming switch; and whether light 
 _VISIBLE, _MISSING, _STALE, _AHEAD, _WAITING, _DECODED, _GATHERED = (wp.constant(i) for i in range(7))
 _ADOPT, _DROP, _PREPARE, _FORWARD = (wp.constant(i) for i in range(4))
 _MOST, _KEEP, _SAMPLES, _REFRESH = (wp.constant(i) for i in (MOST, KEEP, SAMPLES, REFRESH))
+_FEW, _LEAD = wp.constant(FEW), wp.constant(LEAD)
 _FADE = wp.constant(0.75)  # share of its pixels that a page keeps in the next frame
 _IF_OFF = wp.constant(1.0 / 64.0)  # factor of the priority in a group whose weight is 0
 _IF_EARLY = wp.constant(1.0 / 64.0)  # and of a page whose light has changed by less than the tolerance
@@ -327,7 +332,8 @@ def _score(pages: Pages, slots: Slots, tolerance: float, work: Work):
                 priority = wp.min(lag / tolerance, _IF_STALE) * area
                 wp.atomic_add(work.counters, _STALE, 1)
             elif lag > _REFRESH * tolerance:
-                priority = _IF_EARLY * lag / tolerance * area
+                if samples_of(pages.place[p][1]) <= _FEW or work.switches[group, _FORWARD] == 0:
+                    priority = _IF_EARLY * lag / tolerance * area
         if ahead >= 0:
             slots.stamp[ahead] = frame
             if slots.parts[ahead] < parts:
@@ -418,7 +424,8 @@ def _allocate(pages: Pages, slots: Slots, size: int, tolerance: float, work: Wor
                 before = int(work.clock[row, 0])
                 speed = pages.change[page, before + 1] - pages.change[page, before]
                 # The other parts of a page follow the first.
-                wanted = wp.where(part == 0, _REFRESH * tolerance, slots.mark[slot] - now)
+                early = wp.where(samples_of(place[1]) <= _FEW, _REFRESH, _LEAD) * tolerance
+                wanted = wp.where(part == 0, early, slots.mark[slot] - now)
                 if speed > 0.0:
                     share = work.clock[row, _SHARE]
                     lead = wp.clamp(wanted / speed, -share, 1.0 - share)

@@ -339,12 +339,11 @@ def test_the_compute_shader_decodes_a_lightmap(language, tmp_path):
     (sheet,) = model.sheets.values()
     expected = SheetDecoder(sheet).frame(float(model.times[2]))
     uniforms, hour = lightmap_uniforms(tmp_path)
-    del uniforms["wlm_lightmap_valid"]  # only `wlm_source` reads it
-    bound, size = uniforms | hour(2), expected.shape[:2]
+    bound, size, cell = uniforms | hour(2), expected.shape[:2], (GROUP_SIZE[0], 2 * GROUP_SIZE[1])
     if language == "wgsl":
-        found = run_wgsl_compute(text, size, bound, GROUP_SIZE)
+        found = run_wgsl_compute(text, size, bound, cell)
     else:
-        found = run_glsl_compute(text, COMPUTE[language], size, bound, GROUP_SIZE)
+        found = run_glsl_compute(text, COMPUTE[language], size, bound, cell)
     np.testing.assert_allclose(found[..., :3], expected, rtol=2**-10, atol=1e-5 * expected.max())
 
 

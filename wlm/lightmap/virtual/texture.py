@@ -362,8 +362,8 @@ class VirtualTexture:
         return np.concatenate([store.ready() for store in self._stores])
 
     def _ask(self) -> None:
-        """Starts to copy what the pages need to the host, unless an earlier copy is on its way."""
-        if self._asked or all(store.complete for store in self._stores):
+        """Starts to copy what the pages need to the host in every second frame, unless a copy is on its way."""
+        if self._frame % 2 or self._asked or all(store.complete for store in self._stores):
             return
         wp.copy(self._host, self._frame_work.asked)
         if self._arrival is not None:

@@ -163,27 +163,23 @@ def component_bytes(
 
 
 def fit_components(
-    values: np.ndarray, most_bytes: int | None = None, hours: int = 1, *, relative: bool = True, seed: int = 0
+    values: np.ndarray, most_bytes: int | None = None, hours: int = 1, enough: float = ENOUGH
 ) -> tuple[Components, float]:
-    """Compresses live probes to the smallest GPU buffers whose relative error over all hours is at most `ENOUGH`, or a
-    sixteenth of it if errors are not relative.
+    """Compresses live probes to the smallest GPU buffers whose relative error is at most `enough`, over all hours.
 
     Args:
         values: float32 [V, T D], numbers of live probes at T hours; no row is zero.
         most_bytes: Largest number of GPU bytes; None: no limit. At least one component is fitted.
         hours: T.
-        relative: Whether an error is relative to the light of its probe; if not, to that of the brightest probe.
-        seed: Seed of the clusters.
+        enough: Relative error at which no bit is added.
 
     Returns:
-        The components and their error, which is above that if `most_bytes` does not allow more.
+        The components and their relative error, which exceeds `enough` only if `most_bytes` or the widest codes do not
+        allow less.
     """
     values = values.astype(np.float64)
     live, numbers = values.shape
     light = norms(values)
-    if not relative:
-        # A half float holds the logarithm of a common magnitude exactly.
-        light = np.full(live, np.exp(np.float64(np.float16(np.log(light.max())))))
     some = slice(None, None, -(-live // _SAMPLE))
     bits = _WIDEST * (1 + numbers)
     if most_bytes is not None:
@@ -193,10 +189,10 @@ def fit_components(
     for clusters in (0, *_TRIED):
         if clusters <= max(live // _FEWEST, _FEWEST * live <= numbers):
             shape = (values / light[:, None])[some]
-            division = _divided(shape, clusters, rank, seed)
+            division = _divided(shape, clusters, rank)
             plans += _plans(shape, np.log(light)[some], division, bits, live, hours)
     plans = [plan for plan in plans if most_bytes is None or plan.size <= most_bytes] or [min(plans, key=_size)]
-    target = enough = ENOUGH if relative else ENOUGH / 16
+    target = enough
     while True:  # the errors of plans are predictions
         good = [plan for plan in plans if plan.error <= enough]
         plan = min(good, key=_size) if good else min(plans, key=lambda plan: plan.error)
@@ -235,13 +231,13 @@ class _Plan(NamedTuple):
     division: _Division
 
 
-def _divided(unit: np.ndarray, clusters: int, rank: int, seed: int) -> _Division:
+def _divided(unit: np.ndarray, clusters: int, rank: int) -> _Division:
     """Divides probes [V, D] among clusters; 0 clusters stand for the unit vectors."""
     if clusters == 0:
         return _Division(None, 0)
     label = np.zeros(len(unit), int)
     if clusters > 1:
-        label = kmeans2(unit, clusters, iter=_ROUNDS, minit="++", rng=seed)[1]
+        label = kmeans2(unit, clusters, iter=_ROUNDS, minit="++", rng=0)[1]
         for _ in range(_ROUNDS):
             label = _nearest(unit, _Division(_subspaces(unit, label, 1 + rank), rank))
     return _Division(_subspaces(unit, label, max(1, min(unit.shape[1] - 1, _MOST))), rank)

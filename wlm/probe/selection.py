@@ -1,0 +1,191 @@
+"""Chooses the method and the number of Gaussians of a fit by relative error and bytes of GPU memory."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from wlm.errors import WlmError
+from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.parts import Part
+from wlm.probe.data import ProbeSet
+from wlm.probe.evaluation import at_hour, relative_figures
+from wlm.probe.gaussian.model import gaussian_bytes, gaussian_count
+from wlm.probe.model import ProbeModel, Profile
+from wlm.probe.pca.model import ENOUGH, fit_components
+
+_REPEATED = 100  # number in the checkpoint of a fit that is repeated after a resume, since only its error was kept
+_FITS = 7  # most fits of a search
+_POWER = 0.5  # the error is about this power of the number of Gaussians, inverted, until two fits have shown it
+_MARGIN = 1.05  # factor of a guess, so that it rather reaches the target
+_CLOSE = 1.1  # a search ends when the number that reaches is at most this factor above one that does not
+
+
+class Candidates:
+    """The models of one set, fitted when they are asked for, and the choice between them by relative error."""
+
+    def __init__(
+        self,
+        make: Callable[..., ProbeModel],
+        probes: ProbeSet,
+        values: np.ndarray,
+        profile: Profile,
+        device: str,
+        trained: Callable[..., ProbeModel],
+        checkpoint: Checkpoint | None,
+    ) -> None:
+        """Keeps the arguments.
+
+        Args:
+            make: Makes a model of a profile, a content and a `choice`.
+            probes: The set.
+            values: float32 [V, T D], the numbers of its live probes for principal components.
+            profile, device: The settings, and where errors are measured.
+            trained: Fits Gaussians with a profile; `number` is that of the fit in the checkpoint.
+            checkpoint: Keeps the errors of finished fits of a search; None: nothing is kept.
+        """
+        self._make, self._probes, self._profile, self._device = make, probes, profile, device
+        self._trained, self._checkpoint, self._values = trained, checkpoint, values
+        self._live, self._hours = len(values), max(len(probes.times), 1)
+        self._models: dict[int, ProbeModel] = {}
+        self._errors: dict[int, float] = {}
+
+    def usual(self) -> ProbeModel:
+        """Returns the model for a profile that names neither a target nor a number of bytes."""
+        profile = self._profile
+        if profile.method == "pca":
+            return self._measured(self._components(None, ENOUGH, "PCA, as the profile asks")[0])[0]
+        count = gaussian_count(profile.ratio, self._live)
+        if profile.method == "auto":
+            budget = self._bytes(count)
+            model, error = self._components(budget, ENOUGH)
+            size = model.content.nbytes
+            if size <= budget and error <= ENOUGH:
+                took = f"{model.content.count} components reach {error:.1%} of each probe's light in {size:,} bytes"
+                model, _ = self._measured(model)
+                return replace(model, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
+        gaussians, error = self._measured(self._trained(profile))
+        if profile.method == "gaussians":
+            return gaussians
+        most = gaussians.content.nbytes
+        told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
+        rival, _ = self._components(most, ENOUGH)
+        if rival.content.nbytes > most:
+            return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
+        rival, possible = self._measured(rival)
+        if possible < error:
+            return replace(rival, choice=f"PCA: {rival.content.count} components reach {possible:.1%}, {told}")
+        return replace(gaussians, choice=f"Gaussians: {told}, PCA of that size reaches {possible:.1%}")
+
+    def selected(self) -> ProbeModel:
+        """Returns the smallest model found that reaches the target, or the most exact one within the bytes."""
+        profile, name = self._profile, self._probes.name
+        target, limit = profile.target or 0.0, profile.max_bytes or math.inf
+        found: list[tuple[float, int, str, ProbeModel]] = []  # error, bytes, a sentence, the model
+        most = limit
+        if profile.method != "gaussians":
+            model, error = self._measured(self._components(profile.max_bytes, target)[0])
+            size = model.content.nbytes
+            if size <= limit:
+                found.append(
+                    (error, size, f"{model.content.count} PCA components reach {error:.1%} in {size:,}", model)
+                )
+            if error <= target:
+                most = min(most, size - 1)  # more Gaussians than that would be no gain
+        if profile.method != "pca":
+            each, fixed = self._bytes(1) - self._bytes(0), self._bytes(0)
+            count = max(int(min(most, self._bytes(self._live)) - fixed) // each, 0)
+            if count and target:
+                first = gaussian_count(profile.ratio, self._live)
+                count = least_count(self._error, first, count, target) or count
+            if count:
+                error, model = self._error(count), self._gaussians(count)
+                size = model.content.nbytes
+                found.append((error, size, f"{model.content.count} Gaussians reach {error:.1%} in {size:,}", model))
+        if not found:
+            raise WlmError(f"{name}: max_bytes: expected more bytes, as no model of {self._live} probes fits {limit:,}")
+        reached = [each for each in found if each[0] <= target]
+        _, _, _, model = min(reached, key=lambda each: each[1]) if reached else min(found, key=lambda each: each[0])
+        told = "; ".join(sentence for *_, sentence, _ in found)
+        kind = "PCA" if model.method == "pca" else "Gaussians"
+        warnings = model.warnings
+        if target and not reached:
+            least = min(error for error, *_ in found)
+            missed = f"{name}: target: the relative error is {least:.1%}, more than the {target:.1%} asked for"
+            warnings = (missed, *warnings)
+        return replace(model, choice=f"{kind}: {told} bytes of GPU memory", warnings=warnings)
+
+    def _components(self, most: int | None, enough: float, choice: str = "") -> tuple[ProbeModel, float]:
+        """Returns the fewest principal components with an error of at most `enough`, or as many as fit `most` bytes;
+        and their error before ambient light is clamped."""
+        content, error = fit_components(self._values, most, self._hours, enough)
+        profile = Profile(name=self._profile.name, method="pca")
+        return self._make(profile=profile, content=content, choice=choice), error
+
+    def _bytes(self, count: int) -> int:
+        """Returns the bytes of GPU memory of `count` Gaussians."""
+        profile = self._profile
+        columns = profile.columns(self._probes.outputs)
+        return gaussian_bytes(count, profile.latent, profile.hidden, columns, self._hours)
+
+    def _error(self, count: int) -> float:
+        """Returns the relative error of a fit of `count` Gaussians; a checkpoint keeps it."""
+        if count not in self._errors:
+            number, kept = len(self._errors), self._checkpoint
+            stored = kept and kept.finished(number, {"error": Part(np.float64, (1,), least=0.0)})
+            if stored:
+                self._errors[count] = float(stored["error"][0])
+            else:
+                self._gaussians(count, number)
+                error = self._errors[count]
+                if kept is not None:
+                    kept.add_finished(number, {"error": np.array([error])})
+        return self._errors[count]
+
+    def _gaussians(self, count: int, number: int = _REPEATED) -> ProbeModel:
+        if count not in self._models:
+            sized = {"ratio": count / self._live, "target": None, "max_bytes": None}
+            model = self._trained(self._profile.model_copy(update=sized), number=number)
+            self._models[count], self._errors[count] = self._measured(model)
+        return self._models[count]
+
+    def _measured(self, model: ProbeModel) -> tuple[ProbeModel, float]:
+        """Returns the model with its warnings, and its relative error, the root mean square over all hours."""
+        decoder = model.decoder(self._device, position=self._probes.position)
+        warnings, squares = [], []
+        for time in self._probes.times.tolist() or [None]:
+            decoder.set_time(time or 0.0)
+            figures = relative_figures(decoder.decode_probes(), self._probes.at(time))
+            warnings += [at_hour(time) + line for line in figures["warnings"]]
+            squares.append(figures["relative_error"] ** 2)
+        return replace(model, warnings=tuple(warnings)), math.sqrt(np.nanmean(squares))
+
+
+def least_count(error_of: Callable[[int], float], first: int, most: int, target: float) -> int | None:
+    """Searches the smallest number of Gaussians whose error is at most `target`.
+
+    Args:
+        error_of: Fits a number of Gaussians and returns their error, which falls like a power of the number.
+        first, most: Number of the first fit, and the largest number, both at least 1.
+        target: The error.
+
+    Returns:
+        The smallest number found, within a tenth if few fits suffice; None if `most` does not reach the target.
+    """
+    low, high, count, power = 0, 0, min(first, most), _POWER
+    before: tuple[int, float] | None = None
+    for _ in range(_FITS):
+        error = error_of(count)
+        low, high = (low, count) if error <= target else (max(low, count), high)
+        if low >= most or (high and high <= max(low + 1, _CLOSE * low)):
+            break
+        if before is not None and (error - before[1]) * (count - before[0]) < 0:
+            power = min(max(math.log(error / before[1]) / math.log(before[0] / count), 0.1), 2.0)
+        before = count, error
+        guess = _MARGIN * count * (error / target) ** (1.0 / power)
+        upper = high - 1 if high else most
+        count = int(min(max(guess, low + 1, low if high else 1.5 * low), upper))
+    if not high and low < most and error_of(most) <= target:
+        return most
+    return high or None
