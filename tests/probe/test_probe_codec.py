@@ -121,7 +121,7 @@ GAUSSIANS = [
 ]
 COMPONENTS = [
     {"code": lambda part: part[:-1]},
-    {"code": put((0, 3), 255)},
+    {"width": put(0, 0)},
     {"code": put((1, 3), 255)},
     {"width": put(2, 9)},
     {"clusters": 2},
