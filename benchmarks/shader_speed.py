@@ -37,7 +37,8 @@ from wlm.errors import WlmError
 from wlm.export.compute import compute_shader
 from wlm.export.shading import translate
 from wlm.lightmap.bundle import sheet_bundle
-from wlm.lightmap.model import LightmapModel, SheetModel
+from wlm.lightmap.decode import SheetDecoder
+from wlm.lightmap.model import LightmapModel
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.runtime import fast_decoder
 from wlm.lightmap.shader import GROUP_SIZE
@@ -141,11 +142,13 @@ class _ShaderBench(Bench):
             error = float(np.abs(picture[..., :3] - frame).max() / frame.max())
             figures = {"decode_ms": duration, "times_ours": duration / ours["decode_ms"], "max_error": error}
             rows.append(self.row(language, f"{name}, {option}", renderer, **figures))
-        return [*rows, self.pages_row(name, model, made.reference["frame"])]
+        return [*rows, self.pages_row(name)]
 
-    def pages_row(self, name: str, model: SheetModel, frame: np.ndarray) -> Row:
-        """Returns the row of all pages of a virtual texture of a map whose light at the first hour is `frame`."""
+    def pages_row(self, name: str) -> Row:
+        """Returns the row of all pages of a virtual texture of a map, of at least 256 x 256 texels."""
         self.note(f"all pages of {name}")
+        model = random_sheet(max(self._side, 2 * TILE), np.array(_HOURS), 0, Profile.load(name))
+        frame = SheetDecoder(model, self.device).frame(_HOURS[0])
         whole = LightmapModel("pages", "0" * 16, model.profile, {Sheet(): model})
         read, timed = (VirtualTexture(whole, self.device, budget=ALL, decodes=PAGES, tolerance=1e-6) for _ in range(2))
         with read, timed:
