@@ -226,9 +226,38 @@ def test_few_components_are_the_best_directions():
     directions = np.linalg.qr(NORMAL.normal(size=(27, 3)))[0].T
     values = (NORMAL.normal(size=(500, 3)) @ directions).astype(np.float32)
     components, error = fit_components(values)
-    assert components.count == 3 and components.basis.shape == (3, 27) and error < ENOUGH
-    fewer, error = fit_components(values, most_bytes=components.nbytes - 1)
-    assert fewer.count == 2 and fewer.nbytes < components.nbytes and error > ENOUGH
+    assert components.clusters == 1 and components.count <= 4 and error < ENOUGH
+    fewer, error = fit_components(values, most_bytes=components.nbytes * 3 // 4)
+    assert fewer.nbytes <= components.nbytes * 3 // 4 and error > ENOUGH
+
+
+@pytest.fixture(scope="module")
+def clustered():
+    """Probes of eight kinds, each with its own directions, and a brightness of its own."""
+    basis = NORMAL.normal(size=(8, 3, 27))
+    values = 0.2 * np.einsum("vk,vkd->vd", NORMAL.normal(size=(2000, 3)), basis[np.arange(2000) % 8])
+    values += 3.0 * NORMAL.normal(size=(8, 27))[np.arange(2000) % 8]
+    return (values * np.exp(NORMAL.normal(size=(2000, 1)))).astype(np.float32)
+
+
+def test_clusters_and_bits_have_the_error_that_is_stated(clustered):
+    components, error = fit_components(clustered, 14 * len(clustered))
+    assert components.clusters > 1 and components.nbytes <= 14 * len(clustered)
+    decoded = reference_decode(components.code, components.bounds, components.basis, 0)
+    scale = np.linalg.norm(clustered, axis=1)
+    found = np.linalg.norm(decoded - clustered, axis=1) / scale
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(error, rel=1e-3)
+    one = np.linalg.svd(clustered / scale[:, None], full_matrices=False)[2][:12]
+    rest = clustered - clustered @ one.T @ one  # what 12 directions of all probes leave, in more bytes
+    assert error < 0.5 * np.sqrt(np.mean((np.linalg.norm(rest, axis=1) / scale) ** 2))
+
+
+def test_packed_codes_are_bits(clustered):
+    components = fit_components(clustered, 14 * len(clustered))[0]
+    text = "".join(format(int(word), "032b")[::-1] for word in components.packed())
+    for probe in (0, 1, 777, 1999):
+        for column, (first, width) in enumerate(components.places() + [probe * int(components.width.sum()), 0]):
+            assert int(text[first : first + width][::-1] or "0", 2) == components.code[probe, column]
 
 
 NINE = PLACES[:9]
@@ -326,8 +355,8 @@ def test_a_target_and_a_number_of_bytes_choose_the_model():
         assert re.match(r"(PCA|Gaussians): .* reach [\d.]+% in [\d,]+", model.choice)
     warning = compress(probes, SEARCH, target=0.03, max_bytes=900, method="pca").warnings[0]
     assert re.fullmatch(r"room: target: the relative error is [\d.]+%, more than the 3.0% asked for", warning)
-    with pytest.raises(WlmError, match="room: max_bytes: expected more bytes, as no model of 200 probes fits 100"):
-        compress(probes, SEARCH, max_bytes=100)
+    with pytest.raises(WlmError, match="room: max_bytes: expected more bytes, as no model of 200 probes fits 60"):
+        compress(probes, SEARCH, max_bytes=60)
 
 
 def test_a_search_is_resumed(tmp_path):

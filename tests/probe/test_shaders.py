@@ -16,6 +16,7 @@ import wlm
 from benchmarks.probe_exact import decode64
 from wlm.errors import WlmError
 from wlm.export import export
+from wlm.probe.data import from_arrays
 from wlm.probe.gaussian.shader import probe_glsl
 from wlm.probe.volume.shader import volume_glsl
 
@@ -74,11 +75,16 @@ def test_gaussians_and_lists_of_them(settings):
             np.testing.assert_allclose(got[..., kind].T, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize(("count", "coefficients"), [(200, 9), (20, 9), (30, 1)])
+@pytest.mark.parametrize(("count", "coefficients"), [(200, 9), (20, 9), (30, 1), (600, 9)])
 def test_principal_components(count, coefficients):
     probes = synthetic(count, coefficients=coefficients, dead=2)
-    made = wlm.probe.compress(probes).bundle()
-    assert (made.document["basis"], count) in ((True, 200), (False, 20), (False, 30))
+    if count == 600:
+        random, kind = np.random.default_rng(0), np.arange(count) % 8
+        values = np.einsum("vk,vkd->vd", random.normal(size=(count, 3)), random.normal(size=(8, 3, 27))[kind])
+        values += 5.0 * random.normal(size=(8, 27))[kind]
+        probes = from_arrays(probes.position, np.where(probes.live[:, None], values, 0.0))
+    made = wlm.probe.compress(probes, "pca").bundle()
+    assert made.document["basis"] == (count >= 200) and (made.document["clusters"] > 1) == (count == 600)
     assert made.document["live"] == count - 2
     main = "float values[WLM_PROBE_OUTPUTS]; wlm_probe_values(pixel.x, values); light = vec4(values[pixel.y]);"
     got = _run(made.shader, main, (probes.outputs, count - 2), dict(made.buffers))[..., 0].T

@@ -32,7 +32,7 @@ from wlm.formats.limits import NUMBERS, PROBES
 from wlm.formats.parts import Part, check_parts
 from wlm.probe.gaussian.model import Gaussians
 from wlm.probe.model import Content, ProbeModel, Profile
-from wlm.probe.pca.model import Components
+from wlm.probe.pca.model import CLUSTERS, Components
 from wlm.system import Header, Name
 
 _METHODS: dict[str, type[Content]] = {each.METHOD: each for each in (Gaussians, Components)}
@@ -45,13 +45,15 @@ _SURE, _PER_BYTE = 1 << 24, 4096
 
 
 class _Header(Header):
-    """The header of a file: `count` is the number of Gaussians or components; `profile.method` is the method used."""
+    """The header of a file: `count` is the number of Gaussians, or of components, 0 for unit vectors. The method is in
+    `profile`."""
 
     probes: int = Field(ge=1, le=PROBES)
     outputs: int = Field(27, ge=1, le=NUMBERS)
     source: str = Field(pattern="^[0-9a-f]{8}$")
     profile: Profile
-    count: int = Field(ge=1, le=PROBES)
+    count: int = Field(0, ge=0, le=PROBES)
+    clusters: int = Field(1, ge=1, le=CLUSTERS)
     dropped: int = Field(0, ge=0, le=PROBES)
     live: int | None = Field(None, ge=1, le=PROBES)
     positions: bool = False
@@ -150,9 +152,8 @@ def _table(header: _Header) -> dict[str, Part]:
         table["scales"] = Part(np.float64, (header.hours,), least=0.0, most=1.0)
     if (numbers := header.hours * header.outputs) > NUMBERS:
         raise ValueError(f"setting hours: expected at most {NUMBERS} numbers of a probe at all hours, found {numbers}")
-    return table | _METHODS[header.profile.method].table(
-        header.profile, header.outputs, header.hours, header.count, live
-    )
+    content = _METHODS[header.profile.method]
+    return table | content.table(header.profile, header.outputs, header.hours, header.count, live, header.clusters)
 
 
 def _planes(part: np.ndarray) -> bytes:

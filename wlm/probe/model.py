@@ -105,7 +105,7 @@ class Content(ABC):
 
     @abstractmethod
     def settings(self) -> dict[str, int]:
-        """Returns entries of a file's header: `count` of Gaussians or components, and `dropped` Gaussians."""
+        """Returns entries of a file's header: `count` of Gaussians or components, `clusters`, `dropped` Gaussians."""
 
     @abstractmethod
     def parts(self) -> dict[str, np.ndarray]:
@@ -117,9 +117,9 @@ class Content(ABC):
 
     @classmethod
     @abstractmethod
-    def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int) -> dict[str, Part]:
-        """Returns the types and shapes of these arrays, by name, for `count` Gaussians or components, `live` probes,
-        and `outputs` numbers of a probe at each hour.
+    def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int, clusters: int) -> dict[str, Part]:
+        """Returns the types and shapes of these arrays, by name, for `count` Gaussians, or components of each of
+        `clusters`; `live` probes; and `outputs` numbers of a probe at each hour.
 
         Raises:
             ValueError: There are more components than numbers of a probe.

@@ -195,7 +195,9 @@ class Gaussians(Content):
         return {"count": self.count, "dropped": self.dropped}
 
     @classmethod
-    def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int) -> dict[str, Part]:
+    def table(cls, profile: Profile, outputs: int, hours: int, count: int, live: int, clusters: int) -> dict[str, Part]:
+        if not count:
+            raise ValueError("setting count: expected at least one Gaussian, found none")
         channels = STORED_LATENT.start + profile.latent
         shapes = layer_shapes(profile.latent, profile.hidden, profile.columns(outputs, hours))
         weights = sum(rows * columns for rows, columns in shapes)

@@ -29,8 +29,9 @@ class ComponentDecoder(Decoder):
         super().__init__(model, device, position=position)
         content = model.content
         assert isinstance(content, Components)
-        self._code = self._put(content.code, wp.uint8)
-        self._bounds = self._put(content.bounds, float)
+        self._codes = self._put(content.packed(), wp.uint32)
+        self._place = self._put(content.places(), wp.vec2i)
+        self._bounds = self._put(np.moveaxis(content.bounds, 0, 2), wp.vec2)
         bases = [each.basis for each in self._contents()]
         self._basis = self._put(bases[0], wp.float16)
         self._keep_hours(np.stack(bases).reshape(len(bases), -1), self._basis.flatten())
@@ -78,4 +79,4 @@ class ComponentDecoder(Decoder):
 
     def read(self, numbers: wp.array, values: wp.array) -> None:
         ambient = ambient_numbers(self.channels)
-        decode_components(self._code, self._bounds, self._basis, self._row, numbers, ambient, values)
+        decode_components(self._codes, self._place, self._bounds, self._basis, self._row, numbers, ambient, values)
