@@ -16,9 +16,9 @@ import warp as wp
 
 _AHEAD = wp.constant(0.5)  # sides; distance in front of a surface at which its light is read
 _CHUNK = 4  # numbers that a GPU's thread reads: 8 bytes of a row; a point of 27 numbers takes 7 threads
-# The factor 2^112 between `small_of` and a half float, in two steps: light below 2e12 does not overflow.
-_LIFT = wp.constant(2.0**100)
-_REST = wp.constant(2.0**12)
+# The factor 2^112 between `small_of` and a half float, in two steps: light below 2^68 does not overflow.
+_LIFT = wp.constant(2.0**76)
+_REST = wp.constant(2.0**36)
 _PARTS = wp.constant(-0x70002000)  # 0x8fffe000: the bits of a half float's parts in a float
 
 vec8 = wp.types.vector(length=8, dtype=float)
