@@ -371,7 +371,8 @@ vec3 wlm_lightmap_linear(vec3 colour)
 _LAST = """
 vec3 wlm_{kind}(ivec2 texel)
 {{
-    return wlm_lightmap_linear(wlm_colour(texel));
+    vec3 colour = wlm_colour(texel);  // glslang's HLSL takes no call with textures as an argument here
+    return wlm_lightmap_linear(colour);
 }}
 """
 
