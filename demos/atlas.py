@@ -8,24 +8,22 @@ views, so that the demo ends soon.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
+from demo_command import run_command
 
 import wlm
 from wlm.atlas.colour import quantise
 from wlm.atlas.evaluation import Report, Sampler, Score, original
 from wlm.atlas.model import COLOUR_BITS, TEXELS
 from wlm.atlas.resize import fitting_size, resized
-from wlm.cli.console import quiet_warp, show_figures
+from wlm.cli.console import show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
-from wlm.interop import check_device
 from wlm.ops import raster
 from wlm.view.atlas import draw
 from wlm.view.display import white_of
@@ -129,18 +127,9 @@ def _check(name: str, figures: dict[str, float], least: tuple[float, ...]) -> No
 
 def main() -> None:
     """Reads the command line, runs the demo and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out", help="the folder to write to")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:0"')
-    args = parser.parse_args()
-    quiet_warp()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        figures = run(args.out, check_device(args.device))
-    except (WlmError, OSError) as error:
-        sys.exit(f"error: {error}")
+    out, figures = run_command(__doc__, run)
     rows = [(label, *(each[label] for each in figures.values())) for label in figures["standard"]]
-    show_figures(f"{args.out.name}/room-*.wlm", ["", *figures], rows)
+    show_figures(f"{out.name}/room-*.wlm", ["", *figures], rows)
 
 
 if __name__ == "__main__":

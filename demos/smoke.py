@@ -9,21 +9,19 @@ as a sequence of PNGs and a contact sheet, the plume also as a flip book.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from demo_command import run_command
 
-from wlm.cli.console import quiet_warp, show_figures
+from wlm.cli.console import show_figures
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume, load_volume, save_volume
 from wlm.formats.atomic import atomic_write
-from wlm.interop import check_device
 from wlm.smoke.camera import DIRECTIONS, Camera
 from wlm.smoke.data import load_frames, open_frames, write_six_way
 from wlm.smoke.flipbook.book import Shot, pack_book, write_book
@@ -40,7 +38,6 @@ from wlm.view.pictures import contact_sheet, to_bytes
 from wlm.view.smoke import picture
 from wlm_kernels.smoke.settings import March
 
-HERE = Path(__file__).resolve().parent
 SCALE, REFINE, SUBSTEPS = 0.24, 2, 4
 FRAMES, RATE = 8, 2.0  # in four seconds the jet crosses the box
 RESOLUTION = 96
@@ -183,23 +180,19 @@ def _check_solids(name: str, scene: Scene, volume: DensityVolume, at: float) -> 
             raise WlmError(f"demo: {name}: expected no smoke in an obstacle, got {density[inside].max():.3g}")
 
 
+def run(out: Path, device: str) -> dict[str, dict[str, float]]:
+    """Runs the jets and the plume, and returns the figures of each, which `report.json` has, too."""
+    figures = {name: jet(out, name, device) for name in ("jet-sphere", "jet-moving")}
+    figures["plume"] = plume(out, device)
+    atomic_write(out / "report.json", (json.dumps(figures, indent=1) + "\n").encode())
+    return figures
+
+
 def main() -> None:
     """Reads the command line, runs the demo and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out" / "smoke", help="the folder to write to")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:0"')
-    args = parser.parse_args()
-    quiet_warp()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        device = check_device(args.device)
-        figures = {name: jet(args.out, name, device) for name in ("jet-sphere", "jet-moving")}
-        figures["plume"] = plume(args.out, device)
-        atomic_write(args.out / "report.json", (json.dumps(figures, indent=1) + "\n").encode())
-    except (WlmError, OSError) as error:
-        sys.exit(f"error: {error}")
+    out, figures = run_command(__doc__, run, "smoke")
     rows = [(name, *figure) for name, values in figures.items() for figure in values.items()]
-    show_figures(str(args.out), ["", "", "value"], rows, text=[""])
+    show_figures(str(out), ["", "", "value"], rows, text=[""])
 
 
 if __name__ == "__main__":

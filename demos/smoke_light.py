@@ -7,18 +7,16 @@ Writes a contact sheet of the three under lights from four sides, and compares t
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
+from demo_command import run_command
 
-from wlm.cli.console import quiet_warp, show_figures
+from wlm.cli.console import show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
-from wlm.interop import check_device
 from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import Camera
 from wlm.smoke.network.planes import to_srgb
@@ -27,7 +25,6 @@ from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport import load_orders, scatter, trace
 from wlm.view.pictures import contact_sheet, to_bytes
 
-HERE = Path(__file__).resolve().parent
 PIXELS, SAMPLES = 96, 64
 ALBEDO = (0.97, 0.95, 0.92)  # light that was scattered more often is warmer
 SIDES = (0.0, 90.0, 180.0, 270.0)  # degrees around the plume; 0 is behind the camera
@@ -73,20 +70,17 @@ def run(out: Path, device: str) -> dict[str, float]:
     }
 
 
+def run_and_write(out: Path, device: str) -> dict[str, float]:
+    """Runs the demo and writes its figures to `light_report.json`."""
+    figures = run(out, device)
+    atomic_write(out / "light_report.json", (json.dumps(figures, indent=1) + "\n").encode())
+    return figures
+
+
 def main() -> None:
     """Reads the command line, runs the demo and prints a table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=HERE / "out" / "smoke", help="the folder to write to")
-    parser.add_argument("--device", default="cpu", help='"cpu" or "cuda:0"')
-    args = parser.parse_args()
-    quiet_warp()
-    try:
-        args.out.mkdir(parents=True, exist_ok=True)
-        figures = run(args.out, check_device(args.device))
-        atomic_write(args.out / "light_report.json", (json.dumps(figures, indent=1) + "\n").encode())
-    except (WlmError, OSError) as error:
-        sys.exit(f"error: {error}")
-    show_figures(str(args.out), ["", "value"], list(figures.items()))
+    out, figures = run_command(__doc__, run_and_write, "smoke")
+    show_figures(str(out), ["", "value"], figures.items())
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Decodes the light of a compressed model on a CPU or GPU: at the model's own probes or at any points."""
 
-import math
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -10,6 +9,7 @@ import warp as wp
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.hours import DAY, neighbours
+from wlm.probe.hours import check_time
 from wlm.probe.model import ProbeModel
 from wlm.probe.volume.light import Light
 from wlm_kernels.probe.hours import mix_hours
@@ -69,8 +69,7 @@ class Decoder(ABC):
         Raises:
             WlmError: The time is not finite.
         """
-        if not math.isfinite(time):
-            raise WlmError(f"time: expected a finite number, got {time}")
+        check_time(time)
         if self._hours is not None:
             hours, mixed = self._hours
             mix_hours(hours, *neighbours(self.model.times, DAY, time), mixed)

@@ -19,8 +19,8 @@ def hour_factors(name: str, times: np.ndarray, time: float | None) -> np.ndarray
     Raises:
         WlmError: There are several hours and no time is given, or the time is not finite.
     """
-    if time is not None and not math.isfinite(time):
-        raise WlmError(f"time: expected a finite number, got {time}")
+    if time is not None:
+        check_time(time)
     if not len(times):
         return None
     if time is None:
@@ -30,6 +30,12 @@ def hour_factors(name: str, times: np.ndarray, time: float | None) -> np.ndarray
     factors[before] += 1.0 - share
     factors[after] += share
     return factors
+
+
+def check_time(time: float) -> None:
+    """Raises a `WlmError` for a time that is not finite."""
+    if not math.isfinite(time):
+        raise WlmError(f"time: expected a finite number, got {time}")
 
 
 def listed_times(times: np.ndarray) -> str:

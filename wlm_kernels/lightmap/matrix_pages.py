@@ -25,10 +25,10 @@ from wlm_kernels.lightmap.pages import (
     gap_light,
     kind_of,
     light_of,
-    nearest_of,
     rows_of,
     sample_at,
     samples_of,
+    search_of,
     square_of,
     stored_light,
     texel_of,
@@ -171,11 +171,7 @@ def page_kernel(hidden: int) -> wp.Kernel:
                 j = flat % edge
                 inside = i < square.bottom
                 texel = texel_of(square, jobs.place[k], i, j)
-                start = wp.vec2i(texel[0], texel[1])
-                reach = int(offsets.shape[0])
-                if square.level == 0:
-                    start = nearest_of(tiles, square.sheet, texel)
-                    reach = 1
+                start, reach = search_of(tiles, square, texel, offsets.shape[0])
                 # The first offset at which a sample of the texel is valid.
                 o = int(0)
                 found = int(0)

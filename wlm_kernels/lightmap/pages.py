@@ -254,6 +254,18 @@ def texel_of(square: Square, place: wp.vec4i, i: int, j: int) -> wp.vec2i:
 
 
 @wp.func
+def search_of(tiles: Tiles, square: Square, texel: wp.vec2i, offsets: int):
+    """Returns row and column from which a texel's valid samples are searched, and at how many of the offsets: at level
+    0 those of the nearest valid texel, and 1."""
+    start = wp.vec2i(texel[0], texel[1])
+    reach = int(offsets)
+    if square.level == 0:
+        start = nearest_of(tiles, square.sheet, texel)
+        reach = 1
+    return start, reach
+
+
+@wp.func
 def tile_of(tiles: Tiles, sheet: int, y: int, x: int) -> wp.vec3i:
     """Returns the tile of a texel of a sheet, and its row and column in the tile."""
     return wp.vec3i(tiles.first[sheet] + (y // 128) * tiles.columns[sheet] + x // 128, y % 128, x % 128)
@@ -434,11 +446,7 @@ def page_kernel(hidden: int, gelu: str) -> wp.Kernel:
             gamma = tiles.gamma[square.sheet]
             samples = 1 << (2 * square.depth)
             texel = texel_of(square, jobs.place[k], i, j)
-            start = wp.vec2i(texel[0], texel[1])
-            reach = int(offsets.shape[0])
-            if square.level == 0:
-                start = nearest_of(tiles, square.sheet, texel)
-                reach = 1
+            start, reach = search_of(tiles, square, texel, offsets.shape[0])
             # The search comes first, so that the threads of a warp evaluate their networks together.
             o = int(0)
             found = int(0)

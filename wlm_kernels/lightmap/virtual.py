@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from wlm_kernels.least_recent import least_recent
 from wlm_kernels.lightmap.matrix_pages import blocks_of
 from wlm_kernels.lightmap.pages import CLOCK, Jobs, parts_of, samples_of
 from wlm_kernels.shared_exponent import unpack_rgb9e5
@@ -387,15 +388,7 @@ def _allocate(pages: Pages, slots: Slots, size: int, tolerance: float, work: Wor
         if target == 1:
             slot = pages.ahead[page]
         if slot < 0:
-            groups = (slots.owner.shape[0] + size - 1) // size
-            # There are at least as many groups as pages, so that no two pages of a frame take from one group.
-            first = (frame % groups * work.chosen.shape[0] + k) % groups * size
-            oldest = frame - _KEEP + 1
-            for i in range(first, wp.min(first + size, slots.owner.shape[0])):
-                stamp = slots.stamp[i]
-                if stamp < oldest:
-                    oldest = stamp
-                    slot = i
+            slot = least_recent(slots.stamp, size, frame, k, work.chosen.shape[0], frame - _KEEP + 1)
             if slot >= 0:
                 before = slots.owner[slot]
                 if before >= 0:

@@ -19,6 +19,7 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 import numpy as np
 import warp as wp
 
+from wlm_kernels.least_recent import least_recent
 from wlm_kernels.probe.volume import inside, wrap
 
 PROBES = 16  # most probes that contribute to a block
@@ -368,20 +369,11 @@ def _allocate(index: Index, windows: Windows, pool: Pool, size: int, work: Work)
         block = windows.bases[level] + local
         wanted = _find(index, level, block)
         work.blocks[k] = wp.vec4i(block[0], block[1], block[2], level)
-        rows = pool.stamp.shape[0]
-        if rows == 0:
+        if pool.stamp.shape[0] == 0:
             taken = wanted
         else:
             frame = work.clock[0]
-            groups = (rows + size - 1) // size
-            # There are at least as many groups as blocks, so that no two blocks of a frame take from one group.
-            first = (frame % groups * work.chosen.shape[0] + k) % groups * size
-            oldest = frame
-            for i in range(first, wp.min(first + size, rows)):
-                stamp = pool.stamp[i]
-                if stamp < oldest:
-                    oldest = stamp
-                    taken = i
+            taken = least_recent(pool.stamp, size, frame, k, work.chosen.shape[0], frame)
             if taken >= 0:
                 before = pool.owner[taken]
                 if before >= 0:
