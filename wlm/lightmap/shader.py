@@ -10,11 +10,9 @@ from wlm.texels import REACH
 EXACT = "WLM_LIGHTMAP_EXACT"
 """Macro that makes the shader interpolate texels in float32 instead of with the GPU's texture filter."""
 
-GROUP_SIZE = (32, 8)
-"""Columns and rows of such a group; both divide a tile's side."""
-
 GROUP_SIZE = (32, 4)
-"""Columns and rows of a group of invocations of the compute shader, each of which decodes two texels."""
+"""Columns and rows of a group of invocations of the compute shader, each of which decodes two texels; both divide a
+tile's side."""
 
 HEAD = 2
 """Groups of four floats before the records of the tiles in the table of an hour."""
