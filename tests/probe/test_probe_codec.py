@@ -121,15 +121,16 @@ GAUSSIANS = [
 ]
 COMPONENTS = [
     {"code": lambda part: part[:-1]},
-    {"width": put(0, 0)},
-    {"code": put((1, 3), 255)},
-    {"width": put(2, 9)},
+    {"width": put((0, 0), 0)},
+    {"code": put((0, 3), 1024)},
+    {"width": put((0, 2), 11)},
     {"clusters": 2},
     {"bounds": put((1, 0, 2), -1.0)},
     {"bounds": put((0, 0, 0), 100.0)},
     {"bounds": put((0, 0, 0), np.nan)},
-    {"basis": put((0, 0), np.inf)},
-    {"count": 28},
+    {"bounds": put((0, 0, 1), np.inf)},
+    {"basis": lambda part: part[:, :-1]},
+    {"count": 29},
     {"count": 27},
     {"live": 30},
 ]
