@@ -29,9 +29,8 @@ Only some of its tiles are on the device; the others are loaded from a file.
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -70,7 +69,9 @@ _WALK_HOURS = (18.4, 18.57)
 _LARGE, _SHEETS, _LARGE_TIMES = 4096, 4, 26
 _LARGE_BUDGET, _LARGE_TILES = 32 << 20, 24 << 20
 _SPARSE = 2  # distance along both axes of the pixels whose colours are compared
+_DECODERS: dict[str, type[EveryFrame | EveryTime]] = {"each-frame": EveryFrame, "each-time": EveryTime}
 _BLOCKS = ("bc7", "bc6h")
+_RIVALS = (*_DECODERS, *_BLOCKS)
 _METRES = 128.0  # side of a sheet of the large set
 _ALL = 1 << 40  # bytes: the pages of all levels
 _EVERY = 6  # one of so many times is measured in a quick run
@@ -83,26 +84,36 @@ Camera = Callable[[float], View]
 
 
 def run(
-    *, walked_path: str | os.PathLike[str] | None = None, quick: bool, device: str, progress: Note | None = None
+    *,
+    walked_path: str | os.PathLike[str] | None = None,
+    rival_names: Sequence[str] | None = None,
+    quick: bool,
+    device: str,
+    progress: Note | None = None,
+    done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
     """Measures the virtual texture of one set with profile M, or of the large set.
 
     Args:
         walked_path: A lightmap set that names its mesh; None: the large set.
+        rival_names: Rivals to measure: "each-frame", "each-time", "bc7", "bc6h"; None: all.
         quick: Whether to fit for 200 steps, and to draw few and small frames of a large set of 512 x 512 texels.
         device: "cpu" or "cuda:0".
         progress: Called with a line before each part of the work.
+        done: Called with all rows so far after each row.
 
     Returns:
         Three rows: a walk, and a day with 8 and with 64 pages per frame; then the rows of the rivals in the walk and
         in the day, and of a set those of formats.
 
     Raises:
-        WlmError: The set, its mesh or the device does not exist.
+        WlmError: The set, its mesh, a rival or the device does not exist.
     """
+    if unknown := set(rival_names or ()) - set(_RIVALS):
+        raise WlmError(f"--rival: expected one of {', '.join(_RIVALS)}; found {', '.join(sorted(unknown))}")
     if walked_path is None:
         side = 512 if quick else _LARGE
-        bench = _RunTime(f"{side} x {side} x {_LARGE_TIMES} x {_SHEETS}", quick, device, progress)
+        bench = _RunTime(f"{side} x {side} x {_LARGE_TIMES} x {_SHEETS}", quick, device, progress, rival_names, done)
         bench.note("making its tiles")
         with TemporaryDirectory(prefix="wlm-") as folder:
             path = Path(folder) / "large.wlm"
@@ -111,21 +122,35 @@ def run(
                 camera = _PlainCamera(side, bench.size, bench.device)
                 return bench.rows(model, camera, None, _LARGE_BUDGET, _LARGE_TILES)
     lightmaps = load(walked_path)
-    bench = _RunTime(f"{lightmaps.name}, run time", quick, device, progress)
+    bench = _RunTime(f"{lightmaps.name}, run time", quick, device, progress, rival_names, done)
     if lightmaps.light.mesh is None:
         raise WlmError(f"{lightmaps.name}: expected a set that names its mesh, for a walk through it")
     bench.note("fitting profile M")
     model = compress(lightmaps, "M", device=bench.device, **({"steps": 200} if quick else {}))
-    rows = bench.rows(model, _RoomCamera(lightmaps, bench.size, bench.device), lightmaps.light)
-    return rows + bench.format_rows(lightmaps.light)
+    return bench.rows(model, _RoomCamera(lightmaps, bench.size, bench.device), lightmaps.light)
 
 
 class _RunTime(Bench):
     """The benchmark of one set: draws frames with a virtual texture and with its rivals, times and scores them."""
 
-    def __init__(self, scene: str, quick: bool, device: str, progress: Note | None) -> None:
+    def __init__(
+        self,
+        scene: str,
+        quick: bool,
+        device: str,
+        progress: Note | None,
+        rival_names: Sequence[str] | None = None,
+        done: Callable[[list[Row]], None] | None = None,
+    ) -> None:
         super().__init__("lightmap", device, progress, scene=scene, clock="frame_ms")
         self.quick, self.size = quick, _QUICK_SIZE if quick else _SIZE
+        self._rival_names, self._done, self._rows = rival_names or _RIVALS, done, []
+
+    def _add(self, row: Row) -> None:
+        """Adds a row to those of the run, and reports these."""
+        self._rows.append(row)
+        if self._done is not None:
+            self._done(self._rows)
 
     def rows(
         self,
@@ -135,7 +160,7 @@ class _RunTime(Bench):
         budget: int = BUDGET,
         tiles: int | None = None,
     ) -> list[Row]:
-        """Returns the rows of a walk and of a day.
+        """Measures a walk and a day, with our textures and with rivals, and returns all rows of the run.
 
         Args:
             model: The compressed set.
@@ -144,42 +169,40 @@ class _RunTime(Bench):
             budget, tiles: As for `VirtualTexture`.
         """
         paths = {name: self._path(name, camera, sheet) for name in ("walk", "day")}
-        found = []
         for name, decodes in (("walk", 8), ("day", 8), ("day", 64)):
             self.note(f"{name}, {decodes} pages a frame")
             texture = VirtualTexture(model, self.device, budget=budget, decodes=decodes, tiles=tiles)
             with texture:
-                found.append(self._row(texture, camera, paths[name]))
-        return found + self.rival_rows(model, sheet, paths.values())
-
-    def rival_rows(self, model: LightmapModel, sheet: SheetFrames | None, paths: Iterable["_Path"]) -> list[Row]:
-        """Returns a row for each rival and path."""
-        paths, found = list(paths), []
-        hours = [shot.hour for path in paths for shot in path.shots.values()]
-        makers: dict[str, Callable[[], Any]] = {
-            kind.title: partial(kind, model, self.device) for kind in (EveryFrame, EveryTime)
-        }
+                self._add(self._row(texture, camera, paths[name]))
+        self.rival_rows(model, sheet, list(paths.values()))
         if sheet is not None:
-            makers |= {f"{RIVALS[name].title} resident": partial(Blocks, name, sheet, hours) for name in _BLOCKS}
-        for title, make in makers.items():
+            self.format_rows(sheet)
+        return self._rows
+
+    def rival_rows(self, model: LightmapModel, sheet: SheetFrames | None, paths: Sequence["_Path"]) -> None:
+        """Measures each rival on each path; blocks of a set without uncompressed lightmaps are left out."""
+        hours = [shot.hour for path in paths for shot in path.shots.values()]
+        for name in self._rival_names:
+            if name in _BLOCKS and sheet is None:
+                continue
+            title = f"{RIVALS[name].title} resident" if name in _BLOCKS else _DECODERS[name].title
             self.note(title)
             try:
-                rival = make()
+                rival = Blocks(name, sheet, hours) if name in _BLOCKS else _DECODERS[name](model, self.device)
             except WlmError as error:
-                found += [self.missing_row(title, path.name, error) for path in paths]
+                for path in paths:
+                    self._add(self.missing_row(title, path.name, error))
                 continue
-            found += [self._rival_row(rival, title, path) for path in paths]
-        return found
+            for path in paths:
+                self._add(self._rival_row(rival, title, path))
 
-    def format_rows(self, sheet: SheetFrames) -> list[Row]:
-        """Returns the rows of formats, of some of the uncompressed lightmaps."""
+    def format_rows(self, sheet: SheetFrames) -> None:
+        """Measures the formats, on some of the uncompressed lightmaps."""
         self.note("formats")
-        found = []
         frames = sheet.frames[:: _EVERY if self.quick else 1].astype(np.float32)
         shared = unpack_rgb9e5(pack_rgb9e5(frames))
         for method, decoded in (("RGB9E5", shared), ("RGBA8", np.stack([_as_bytes(frame) for frame in frames]))):
-            found.append(self.row("format", method, **_differences(decoded, frames, sheet.mask)))
-        return found
+            self._add(self.row("format", method, **_differences(decoded, frames, sheet.mask)))
 
     def _path(self, name: str, camera: Camera, sheet: SheetFrames | None) -> "_Path":
         count = (_WALK if name == "walk" else _DAY) // (_QUICK if self.quick else 1)
