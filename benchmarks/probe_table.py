@@ -51,7 +51,7 @@ SHARES = (1, 2, 3, 5, 7, 10)
 SMALL_SHARES = (5, 10, 25, 50, 100)
 """The same for a set of less than `SMALL` probes, of which most methods need more."""
 
-SMALL = 1600
+SMALL = 1000
 
 RIVALS: Mapping[str, Callable[..., object]] = {
     # The paper's own rival: clusters of places, nothing but half floats.

@@ -73,6 +73,6 @@ def test_every_row_has_its_figures(rows, tmp_path):
 def test_components_and_held_out_probes(rows):
     for row in rows:
         if row.method == "pca":
-            assert row["psnr"] > 40.0 and row["bytes"] < 27 * 2 * PROBES[row.scene]
+            assert row["psnr"] > 35.0 and row["bytes"] < 27 * 2 * PROBES[row.scene]
         if row.method == "held out" and row.scene == "room":  # the other has too few to be told well
             assert row["nearest_psnr"] < row["distance_psnr"] and row["half_way_psnr"] > 10.0
