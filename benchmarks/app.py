@@ -57,6 +57,13 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
     ),
     "probes_path": _option(_Path, "--probes", help="Light probe file. Default: that of the demo.", metavar="FILE"),
     "keys": _option(_Names, "--key", help="Name of an array in the file of --probes to measure. Repeatable."),
+    "table": _option(bool, "--table", False, help="Measure only our methods and rivals at equal bytes."),
+    "nearest": _option(
+        list[int] | None,
+        "--nearest",
+        help="Measure the table of only N probes around the middle. Repeatable.",
+        metavar="N",
+    ),
     "volume_only": _option(bool, "--volume-only", False, help="Measure only the cascaded probe volume."),
     "meshes_path": _option(
         _Path, "--meshes", help="Folder of a .glb, its .exr lightmaps and mask.png, or of such folders.", metavar="DIR"
@@ -94,7 +101,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "lightmap-run-time": (
         "Measure the virtual texture of lightmaps and its rivals: frames of a walk and a day through a set.",
-        ("walked_path", "quick", "device"),
+        ("walked_path", "rival_names", "quick", "device"),
     ),
     "shader-speed": (
         "Measure the exported shaders of lightmaps on a GPU, beside our decoder.",
@@ -110,7 +117,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "probe": (
         "Measure light probes: PSNR, size and decode time of profiles, decoders and rivals.",
-        ("volume_only", "rivals_only", "quick", "rivals", "device", "probes_path", "keys"),
+        ("volume_only", "table", "only", "nearest", "quick", "device", "probes_path", "keys"),
     ),
     "atlas": (
         "Measure lightmaps of meshes: PSNR, SSIM, size and decode time of profiles and their rivals.",
@@ -146,7 +153,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
 }
 # Options with which a run replaces only the rows that it measures in a result file.
-_PARTIAL = ("profiles", "rival_names", "only", "volume_only")
+_PARTIAL = ("profiles", "rival_names", "only", "volume_only", "table")
 
 
 def _add_command(name: str, summary: str, options: tuple[str, ...]) -> None:
@@ -186,8 +193,8 @@ def _measure(name: str, values: dict[str, Any]) -> None:
             write_json(json_path, rows, describe_environment(device, words), partial=partial)
 
     run = importlib.import_module(f"benchmarks.{name.replace('-', '_')}").run
-    # An ablation is written row by row, so that an interrupted run keeps its rows.
-    extra = {"done": write} if name.endswith("ablation") else {}
+    # Long runs are written row by row, so that an interrupted one keeps its rows.
+    extra = {"done": write} if "done" in inspect.signature(run).parameters else {}
     rows = run(**values, progress=note, **extra)
     write(rows)
     show_text(tables(rows))
