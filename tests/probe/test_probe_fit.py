@@ -259,18 +259,20 @@ def test_clusters_and_bits_have_the_error_that_is_stated(clustered):
 
 
 def test_the_absolute_error_counts_bright_probes(clustered):
-    bytes_, scale = 14 * len(clustered), np.sqrt(np.square(clustered, dtype=np.float64).sum(1).mean())
-    components, error = fit_components(clustered, bytes_, relative=False)
-    assert components.nbytes <= bytes_ and not components.width[:, 0].any()
-    found = np.sqrt(np.square(referred(components) - clustered).sum(1).mean()) / scale
-    assert found == pytest.approx(error, rel=1e-3)
-    relative = referred(fit_components(clustered, bytes_)[0])
-    assert found < 0.5 * np.sqrt(np.square(relative - clustered).sum(1).mean()) / scale
-    probes = from_arrays(NORMAL.random((2000, 3)), clustered)
-    model = compress(probes, "pca", error="absolute", target=0.05, max_bytes=10**6)
-    assert model.content.nbytes < 0.8 * compress(probes, "pca", target=0.05).content.nbytes
-    error = model.decoder().decode_probes() - lit(clustered)
-    assert 0.04 < np.sqrt(np.square(error).sum(1).mean()) / scale < 0.0505
+    values = clustered * np.where(np.arange(2000) % 8 < 2, 100.0, 1.0).astype(np.float32)[:, None]
+    scale = np.sqrt(np.square(values, dtype=np.float64).sum(1).mean())
+
+    def found(decoded):
+        return np.sqrt(np.square(decoded - values).sum(1).mean()) / scale
+
+    components, error = fit_components(values, 28000, relative=False)
+    assert components.nbytes <= 28000 and not components.width[:, 0].any()
+    assert found(referred(components)) == pytest.approx(error, rel=5e-3)  # half floats round the scale
+    assert error < 0.5 * found(referred(fit_components(values, 28000)[0]))
+    probes = from_arrays(NORMAL.random((2000, 3)), values)
+    model = compress(probes, "pca", error="absolute", target=0.05)
+    assert model.content.nbytes < 0.6 * compress(probes, "pca", target=0.05).content.nbytes
+    assert 0.03 < found(model.decoder().decode_probes() - lit(values) + values) < 0.0501
 
 
 def test_packed_codes_are_bits(clustered):
