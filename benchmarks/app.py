@@ -94,7 +94,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "lightmap-run-time": (
         "Measure the virtual texture of lightmaps and its rivals: frames of a walk and a day through a set.",
-        ("walked_path", "quick", "device"),
+        ("walked_path", "rival_names", "quick", "device"),
     ),
     "shader-speed": (
         "Measure the exported shaders of lightmaps on a GPU, beside our decoder.",
@@ -186,8 +186,8 @@ def _measure(name: str, values: dict[str, Any]) -> None:
             write_json(json_path, rows, describe_environment(device, words), partial=partial)
 
     run = importlib.import_module(f"benchmarks.{name.replace('-', '_')}").run
-    # An ablation is written row by row, so that an interrupted run keeps its rows.
-    extra = {"done": write} if name.endswith("ablation") else {}
+    # Long runs are written row by row, so that an interrupted one keeps its rows.
+    extra = {"done": write} if "done" in inspect.signature(run).parameters else {}
     rows = run(**values, progress=note, **extra)
     write(rows)
     show_text(tables(rows))

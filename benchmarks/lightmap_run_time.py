@@ -7,12 +7,12 @@ A row is one path of a camera at 1280 x 720 pixels, with one setting:
 - "day": a whole day, with a frame for every minute, while the camera turns slowly.
 
 `frame_ms` is the time of a frame on the device, without the gaps of the host that queues it: on CUDA a short wait is
-queued first. `current` is the share of pixels that show the page that they need, with its light changed by at most the
-tolerance; `nearly_current` also counts pages that are one level coarser. `staleness` is the relative change of a page's
-light since the time for which it was decoded, over pixels. `cached_psnr` compares views, as a screen shows them, with
-views in which every page is decoded at the frame's time; `view_psnr` and `view_flip` compare them with the uncompressed
-lightmaps, read trilinearly, and `gain` is the difference of their PSNR to that of the views with every page decoded.
-Views are compared at a quarter of their pixels.
+queued first, and a frame is not timed if the host took longer than the wait. `current` is the share of pixels that show
+the page that they need, with its light changed by at most the tolerance; `nearly_current` also counts pages that are
+one level coarser. `staleness` is the relative change of a page's light since the time for which it was decoded, over
+pixels. `cached_psnr` compares views, as a screen shows them, with views in which every page is decoded at the frame's
+time; `view_psnr` and `view_flip` compare them with the uncompressed lightmaps, read trilinearly, and `gain` is the
+difference of their PSNR to that of the views with every page decoded. Views are compared at a quarter of their pixels.
 
 The rivals of `benchmarks.rivals.lightmap_run_time` show the same views at the same times: all maps decoded in each
 frame or at each stored time, and all lightmaps as blocks of BC7 or BC6H on the GPU. `frame_ms` of a rival has no upload
@@ -29,9 +29,8 @@ Only some of its tiles are on the device; the others are loaded from a file.
 
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -70,39 +69,52 @@ _WALK_HOURS = (18.4, 18.57)
 _LARGE, _SHEETS, _LARGE_TIMES = 4096, 4, 26
 _LARGE_BUDGET, _LARGE_TILES = 32 << 20, 24 << 20
 _SPARSE = 2  # distance along both axes of the pixels whose colours are compared
+_DECODERS: dict[str, type[EveryFrame | EveryTime]] = {"each-frame": EveryFrame, "each-time": EveryTime}
 _BLOCKS = ("bc7", "bc6h")
+_RIVALS = (*_DECODERS, *_BLOCKS)
 _METRES = 128.0  # side of a sheet of the large set
 _ALL = 1 << 40  # bytes: the pages of all levels
 _EVERY = 6  # one of so many times is measured in a quick run
 _GAMMA, _BORDER = 2.2, 4  # of colours of 8 bits; of a page
 _WARMUP = 32  # frames, in which modules are loaded and the graph is captured
-_WAIT_CYCLES = 10_000_000  # of the GPU, about 5 ms: longer than the host needs to queue a frame
+_WAIT_CYCLES = 10_000_000  # of the GPU, about 5 ms: as a rule longer than the host needs to queue a frame
+_PACE_CYCLES = 30_000_000  # about 16 ms: 60 frames per second, where tiles are loaded beside the frames
 
 View = tuple[wp.array, wp.array, wp.array]
 Camera = Callable[[float], View]
 
 
 def run(
-    *, walked_path: str | os.PathLike[str] | None = None, quick: bool, device: str, progress: Note | None = None
+    *,
+    walked_path: str | os.PathLike[str] | None = None,
+    rival_names: Sequence[str] | None = None,
+    quick: bool,
+    device: str,
+    progress: Note | None = None,
+    done: Callable[[list[Row]], None] | None = None,
 ) -> list[Row]:
     """Measures the virtual texture of one set with profile M, or of the large set.
 
     Args:
         walked_path: A lightmap set that names its mesh; None: the large set.
+        rival_names: Rivals to measure: "each-frame", "each-time", "bc7", "bc6h"; None: all.
         quick: Whether to fit for 200 steps, and to draw few and small frames of a large set of 512 x 512 texels.
         device: "cpu" or "cuda:0".
         progress: Called with a line before each part of the work.
+        done: Called with all rows so far after each row.
 
     Returns:
         Three rows: a walk, and a day with 8 and with 64 pages per frame; then the rows of the rivals in the walk and
         in the day, and of a set those of formats.
 
     Raises:
-        WlmError: The set, its mesh or the device does not exist.
+        WlmError: The set, its mesh, a rival or the device does not exist.
     """
+    if unknown := set(rival_names or ()) - set(_RIVALS):
+        raise WlmError(f"--rival: expected one of {', '.join(_RIVALS)}; found {', '.join(sorted(unknown))}")
     if walked_path is None:
         side = 512 if quick else _LARGE
-        bench = _RunTime(f"{side} x {side} x {_LARGE_TIMES} x {_SHEETS}", quick, device, progress)
+        bench = _RunTime(f"{side} x {side} x {_LARGE_TIMES} x {_SHEETS}", quick, device, progress, rival_names, done)
         bench.note("making its tiles")
         with TemporaryDirectory(prefix="wlm-") as folder:
             path = Path(folder) / "large.wlm"
@@ -111,21 +123,35 @@ def run(
                 camera = _PlainCamera(side, bench.size, bench.device)
                 return bench.rows(model, camera, None, _LARGE_BUDGET, _LARGE_TILES)
     lightmaps = load(walked_path)
-    bench = _RunTime(f"{lightmaps.name}, run time", quick, device, progress)
+    bench = _RunTime(f"{lightmaps.name}, run time", quick, device, progress, rival_names, done)
     if lightmaps.light.mesh is None:
         raise WlmError(f"{lightmaps.name}: expected a set that names its mesh, for a walk through it")
     bench.note("fitting profile M")
     model = compress(lightmaps, "M", device=bench.device, **({"steps": 200} if quick else {}))
-    rows = bench.rows(model, _RoomCamera(lightmaps, bench.size, bench.device), lightmaps.light)
-    return rows + bench.format_rows(lightmaps.light)
+    return bench.rows(model, _RoomCamera(lightmaps, bench.size, bench.device), lightmaps.light)
 
 
 class _RunTime(Bench):
     """The benchmark of one set: draws frames with a virtual texture and with its rivals, times and scores them."""
 
-    def __init__(self, scene: str, quick: bool, device: str, progress: Note | None) -> None:
+    def __init__(
+        self,
+        scene: str,
+        quick: bool,
+        device: str,
+        progress: Note | None,
+        rival_names: Sequence[str] | None = None,
+        done: Callable[[list[Row]], None] | None = None,
+    ) -> None:
         super().__init__("lightmap", device, progress, scene=scene, clock="frame_ms")
         self.quick, self.size = quick, _QUICK_SIZE if quick else _SIZE
+        self._rival_names, self._done, self._rows = rival_names or _RIVALS, done, []
+
+    def _add(self, row: Row) -> None:
+        """Adds a row to those of the run, and reports these."""
+        self._rows.append(row)
+        if self._done is not None:
+            self._done(self._rows)
 
     def rows(
         self,
@@ -135,7 +161,7 @@ class _RunTime(Bench):
         budget: int = BUDGET,
         tiles: int | None = None,
     ) -> list[Row]:
-        """Returns the rows of a walk and of a day.
+        """Measures a walk and a day, with our textures and with rivals, and returns all rows of the run.
 
         Args:
             model: The compressed set.
@@ -144,42 +170,40 @@ class _RunTime(Bench):
             budget, tiles: As for `VirtualTexture`.
         """
         paths = {name: self._path(name, camera, sheet) for name in ("walk", "day")}
-        found = []
         for name, decodes in (("walk", 8), ("day", 8), ("day", 64)):
             self.note(f"{name}, {decodes} pages a frame")
             texture = VirtualTexture(model, self.device, budget=budget, decodes=decodes, tiles=tiles)
             with texture:
-                found.append(self._row(texture, camera, paths[name]))
-        return found + self.rival_rows(model, sheet, paths.values())
-
-    def rival_rows(self, model: LightmapModel, sheet: SheetFrames | None, paths: Iterable["_Path"]) -> list[Row]:
-        """Returns a row for each rival and path."""
-        paths, found = list(paths), []
-        hours = [shot.hour for path in paths for shot in path.shots.values()]
-        makers: dict[str, Callable[[], Any]] = {
-            kind.title: partial(kind, model, self.device) for kind in (EveryFrame, EveryTime)
-        }
+                self._add(self._row(texture, camera, paths[name]))
+        self.rival_rows(model, sheet, list(paths.values()))
         if sheet is not None:
-            makers |= {f"{RIVALS[name].title} resident": partial(Blocks, name, sheet, hours) for name in _BLOCKS}
-        for title, make in makers.items():
+            self.format_rows(sheet)
+        return self._rows
+
+    def rival_rows(self, model: LightmapModel, sheet: SheetFrames | None, paths: Sequence["_Path"]) -> None:
+        """Measures each rival on each path; blocks of a set without uncompressed lightmaps are left out."""
+        hours = [shot.hour for path in paths for shot in path.shots.values()]
+        for name in self._rival_names:
+            if name in _BLOCKS and sheet is None:
+                continue
+            title = f"{RIVALS[name].title} resident" if name in _BLOCKS else _DECODERS[name].title
             self.note(title)
             try:
-                rival = make()
+                rival = Blocks(name, sheet, hours) if name in _BLOCKS else _DECODERS[name](model, self.device)
             except WlmError as error:
-                found += [self.missing_row(title, path.name, error) for path in paths]
+                for path in paths:
+                    self._add(self.missing_row(title, path.name, error))
                 continue
-            found += [self._rival_row(rival, title, path) for path in paths]
-        return found
+            for path in paths:
+                self._add(self._rival_row(rival, title, path))
 
-    def format_rows(self, sheet: SheetFrames) -> list[Row]:
-        """Returns the rows of formats, of some of the uncompressed lightmaps."""
+    def format_rows(self, sheet: SheetFrames) -> None:
+        """Measures the formats, on some of the uncompressed lightmaps."""
         self.note("formats")
-        found = []
         frames = sheet.frames[:: _EVERY if self.quick else 1].astype(np.float32)
         shared = unpack_rgb9e5(pack_rgb9e5(frames))
         for method, decoded in (("RGB9E5", shared), ("RGBA8", np.stack([_as_bytes(frame) for frame in frames]))):
-            found.append(self.row("format", method, **_differences(decoded, frames, sheet.mask)))
-        return found
+            self._add(self.row("format", method, **_differences(decoded, frames, sheet.mask)))
 
     def _path(self, name: str, camera: Camera, sheet: SheetFrames | None) -> "_Path":
         count = (_WALK if name == "walk" else _DAY) // (_QUICK if self.quick else 1)
@@ -201,6 +225,7 @@ class _RunTime(Bench):
         for _ in range(_WARMUP * (1 if self.quick else 8)):
             texture.frame(path.hours[0], *camera(path.places[0]))
             texture.wait(0.1)
+        cycles = _WAIT_CYCLES if path.shots else _PACE_CYCLES  # the large set loads tiles
         times, hosts, decoded, visible = [], [], [], []
         shares, errors = _Shares(), _Errors()
         stages: dict[str, list[float]] = {}
@@ -209,7 +234,7 @@ class _RunTime(Bench):
             if frame % path.every == 1:
                 self._time_stages(texture, hour, view, stages)
             else:
-                device_ms, host_ms = self._timed(lambda hour=hour, view=view: texture.frame(hour, *view))
+                device_ms, host_ms = self._timed(lambda hour=hour, view=view: texture.frame(hour, *view), cycles)
                 times.append(device_ms)
                 hosts.append(host_ms)
             report = texture.report()
@@ -230,7 +255,7 @@ class _RunTime(Bench):
             host_ms=float(np.mean(hosts)),
             host_ms_p95=float(np.percentile(hosts, 95)),
             host_ms_max=float(np.max(hosts)),
-            **{f"{name}_ms": float(np.mean(values)) for name, values in stages.items()},
+            **{f"{name}_ms": float(np.nanmean(values)) for name, values in stages.items()},
             pages_visible=float(np.mean(visible)),
             pages_decoded=float(np.mean(decoded)),
             pages_decoded_max=float(np.max(decoded)),
@@ -254,23 +279,30 @@ class _RunTime(Bench):
     def _notes(self, path: "_Path") -> str:
         return f"{len(path.hours)} frames of {self.size[1]}x{self.size[0]} pixels"
 
-    def _timed(self, call: Callable[[], None]) -> tuple[float, float]:
-        """Returns the milliseconds of a call on the device, and those of the host to queue it."""
+    def _timed(self, call: Callable[[], None], cycles: int = _WAIT_CYCLES) -> tuple[float, float]:
+        """Returns the milliseconds of a call on the device, and those of the host to queue it.
+
+        The first are NaN if the host took longer than a wait of so many cycles, so that the device waited for it.
+        """
         if self.device == "cpu":
             start = time.perf_counter()
             call()
             duration = 1e3 * (time.perf_counter() - start)
             return duration, duration
         with interop.stream(self.device) as stream:
-            begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-            torch.cuda._sleep(_WAIT_CYCLES)
-            begin.record(stream)
+            idle, begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(3))
+            torch.cuda.synchronize()
             start = time.perf_counter()
+            idle.record(stream)
+            torch.cuda._sleep(cycles)
+            begin.record(stream)
+            queued = time.perf_counter()
             call()
-            host = 1e3 * (time.perf_counter() - start)
             end.record(stream)
+            done = time.perf_counter()
             end.synchronize()
-            return begin.elapsed_time(end), host
+            in_time = 1e3 * (done - start) < idle.elapsed_time(begin)
+            return begin.elapsed_time(end) if in_time else np.nan, 1e3 * (done - queued)
 
     def _time_stages(self, texture: VirtualTexture, hour: float, view: View, times: dict[str, list[float]]) -> None:
         """Draws a frame stage by stage, and adds the milliseconds of each stage to `times`."""
@@ -293,7 +325,7 @@ def _all_decoded(whole: VirtualTexture, hour: float, view: View) -> np.ndarray:
 
 
 def _frame_times(times: Sequence[float]) -> dict[str, float]:
-    mean, p95, most = np.mean(times), np.percentile(times, 95), np.max(times)
+    mean, p95, most = np.nanmean(times), np.nanpercentile(times, 95), np.nanmax(times)
     return {"frame_ms": float(mean), "frame_ms_p95": float(p95), "frame_ms_max": float(most)}
 
 

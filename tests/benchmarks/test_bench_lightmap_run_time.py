@@ -9,6 +9,7 @@ from builders.small_sets import moving_light, tiny_profile
 from benchmarks import Panel
 from benchmarks import lightmap_run_time as bench
 from benchmarks.rivals.lightmap_run_time import EveryFrame, EveryTime
+from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry
 from wlm.lightmap.fit import compress
 from wlm.lightmap.tiles import TileKind
@@ -53,16 +54,30 @@ def model(room):
 
 
 @pytest.fixture(scope="module")
-def run(patch):
+def counts():
+    return []
+
+
+@pytest.fixture(scope="module")
+def run(patch, counts):
     patch.setattr(bench, "_QUICK", 120)
-    run = bench._RunTime("room, run time", True, "cpu", None)
+    run = bench._RunTime("room, run time", True, "cpu", None, done=lambda rows: counts.append(len(rows)))
     run.size = SIZE
     return run
 
 
 @pytest.fixture(scope="module")
 def rows(room, model, run):
-    return [*run.rows(model, bench._RoomCamera(room, SIZE, "cpu"), room.light), *run.format_rows(room.light)]
+    return run.rows(model, bench._RoomCamera(room, SIZE, "cpu"), room.light)
+
+
+def test_every_row_is_reported_as_it_is_measured(rows, counts):
+    assert counts == list(range(1, len(rows) + 1))
+
+
+def test_an_unknown_rival():
+    with pytest.raises(WlmError, match="--rival: expected one of each-frame, each-time, bc7, bc6h; found bc1"):
+        bench.run(rival_names=["bc1"], quick=True, device="cpu")
 
 
 def test_every_row_has_its_figures(rows, tmp_path):
