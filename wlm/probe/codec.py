@@ -80,7 +80,7 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, Stored], str]:
     """
     body = np.frombuffer(pack(model), np.uint8)
     if isinstance(model.content, Regions):
-        return {"name": model.name}, {BODY: body, _REGIONS: model.content.packed}, model.source
+        return {"name": model.name}, {BODY: body, _REGIONS: model.content.packed}, model.source[:_SOURCE]
     return {}, {BODY: body}, ""
 
 

@@ -20,7 +20,7 @@ from wlm.probe.gaussian.model import check_outputs, gaussian_count
 from wlm.probe.gaussian.packing import pack_model
 from wlm.probe.gaussian.trainer import Trainer
 from wlm.probe.model import CODES, ProbeModel, Profile, box_of
-from wlm.probe.regions.model import MARGIN, Regions, box_row
+from wlm.probe.regions.model import Regions, box_row
 from wlm.probe.regions.tree import Tree
 from wlm.probe.selection import Candidates
 from wlm.system import Meter, OnProgress
@@ -84,7 +84,8 @@ def compress(
     With `target` the result is the smallest model found that reaches it, after up to seven fits; with `max_bytes` the
     one with the least error within them.
     More live probes than the setting `region` are fitted in regions, one after another, by Gaussians unless the profile
-    asks for principal components. Dead probes take no part in the fit: the model stores one bit per probe if any probe is dead.
+    asks for principal components. Dead probes take no part in the fit: the model stores one bit per probe if any
+    probe is dead.
 
     Several hours are fitted as one, with probes that have the numbers of all hours; those of each hour are divided by
     their root mean square.
@@ -164,8 +165,8 @@ def _fit_regions(
     number: int = 0,
     **options: Any,
 ) -> ProbeModel:
-    """Fits the Gaussians of each region, or those of a set of one region. `number` is that of the fit in the checkpoint;
-    `options` are those of `_fit_gaussians`."""
+    """Fits the Gaussians of each region, or of the set if it is one region. `number` is that of the fit in the
+    checkpoint; `options` are those of `_fit_gaussians`."""
     hours, live = max(len(probes.times), 1), probes.live
     profile = profile.model_copy(update={"method": "gaussians"})
     fit = partial(_fit_gaussians, meter=Meter(progress, "fit", profile.steps * tree.count), **options)
@@ -182,7 +183,8 @@ def _fit_regions(
         kept = checkpoint and checkpoint.finished(batch, _FINISHED)
         if not kept:
             own = position[owner == region]
-            margin = MARGIN * np.ptp(own, axis=0).max()
+            # The spacing of as many probes in a cube; on surfaces it is several times that of the probes.
+            margin = np.ptp(own, axis=0).max() / np.cbrt(len(own))
             near = ((position >= own.min(0) - margin) & (position <= own.max(0) + margin)).all(1)
             chosen = np.flatnonzero(live)[near]
             part = {"position": probes.position[chosen], "live": np.ones(len(chosen), bool), "normal": None}
@@ -199,7 +201,8 @@ def _fit_regions(
         packed.append(kept["packed"].tobytes())
         boxes[region], counts[region] = kept["box"], kept["count"]
     content = Regions(tree, boxes, counts, profile, probes.outputs, hours, packed, probes.name)
-    return make(profile=profile, content=content, choice=f"Gaussians, in {tree.count} regions of at most {profile.region:,} live probes")
+    choice = f"Gaussians, in {tree.count} regions of at most {profile.region:,} live probes"
+    return make(profile=profile, content=content, choice=choice)
 
 
 def _fit_gaussians(

@@ -19,7 +19,6 @@ from wlm_kernels.probe.cubes import Cubes, cube_of
 from wlm_kernels.probe.gaussians import Shape, functions
 from wlm_kernels.probe.network import THREADS, cpu_network, layer_code, probes_at_once
 
-
 _NONE = wp.constant(1 << 30)
 
 
@@ -191,7 +190,7 @@ def decode_kernels(
             # Threads past the end repeat the last point, since all threads of a block must synchronise.
             i = wp.min(block * wp.static(points) + t % wp.static(points), x.shape[0] - 1)
             f = sum_at(rows, shapes, cubes, cut, x[i], t // wp.static(points), wp.static(THREADS // points))
-            finish(f, x[i], net, gain, block, x.shape[0], wp.array1d[int](), 0, out)
+            finish(f, x[i], net, gain, block, x.shape[0], cubes.item, -1, out)
         else:
             i = wp.tid()
             decode_at(rows, shapes, cubes, cut, net, gain, x[i], out, i)

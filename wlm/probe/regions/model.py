@@ -1,7 +1,8 @@
 """The model of a set of many probes: regions of space, each with Gaussians and a network of its own.
 
-A region is a `ProbeModel` of the probes in its cell of a k-d tree and in a margin around the cell, so that the light of
-two regions agrees where they meet, to within their errors. Regions stay packed until they are needed.
+A region is a `ProbeModel` that was fitted to the probes in its cell of a k-d tree and to those in a margin around them:
+where two regions meet, their lights differ by no more than the errors of both. Regions stay packed until they are
+needed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,9 +17,6 @@ from wlm.formats.parts import Part
 from wlm.probe.gaussian.model import gaussian_bytes
 from wlm.probe.model import Content, ProbeModel, Profile
 from wlm.probe.regions.tree import Tree
-
-MARGIN = 0.04
-"""Width of the margin around a region's probes, as a share of the longest side of their box."""
 
 _MOST = 1 << 20  # regions of a file
 
@@ -41,7 +39,7 @@ class Regions(Content):
 
     METHOD: ClassVar[str] = "gaussians"
     DECODER: ClassVar[str] = "wlm.probe.regions.decode:RegionDecoder"
-    BUNDLE: ClassVar[str] = "wlm.probe.regions.bundle:region_bundle"
+    BUNDLE: ClassVar[str] = ""  # that of each region
 
     tree: Tree
     boxes: np.ndarray
@@ -121,8 +119,7 @@ class Regions(Content):
         }
 
     def parts(self) -> dict[str, np.ndarray]:
-        tree = {"axis": self.tree.axis, "plane": self.tree.plane, "child": self.tree.child}
-        return tree | {"boxes": self.boxes, "counts": self.counts}
+        return self.tree.parts() | {"boxes": self.boxes, "counts": self.counts}
 
     @classmethod
     def from_parts(

@@ -55,6 +55,10 @@ class Tree:
         """The number of regions, R."""
         return len(self.plane) + 1
 
+    def parts(self) -> dict[str, np.ndarray]:
+        """Returns the arrays by name."""
+        return {"axis": self.axis, "plane": self.plane, "child": self.child}
+
     def check(self) -> None:
         """Raises a ValueError unless every node and region is the child of exactly one earlier node."""
         expected, number = np.arange(-self.count, len(self.plane)), np.arange(len(self.plane))[:, None]

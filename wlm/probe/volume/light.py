@@ -9,7 +9,6 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm_kernels.probe import volume_frame as kernels
 
-
 ABSENT = -np.inf
 """Light of a probe that is not in memory yet; its blocks wait."""
 
