@@ -27,7 +27,7 @@ def lightmaps():
 
 @pytest.fixture(scope="module")
 def rows(lightmaps):
-    settings = {"hidden": 8, "uvt_resolution": 8, "uvt_slices": 4, "steps": 60, "samples": 128}
+    settings = {"hidden": 16, "uvt_resolution": 8, "uvt_slices": 4, "steps": 60, "samples": 128}
     # From the second on: the first is not scored.
     options = {"rivals": RIVALS, "repeats": 2}
     return run_rows(lightmaps, [Profile(name="M", **settings)], device="cpu", chosen=[1, 2, 3], **options)

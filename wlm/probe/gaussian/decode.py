@@ -114,6 +114,10 @@ class GaussianLight(Light):
         self._region = wp.zeros(0, dtype=int, device=self.device)
         self._points: dict[int, wp.array] = {}
 
+    @property
+    def time(self) -> float | None:
+        return self._decoder.time
+
     def read(self, numbers: wp.array, values: wp.array) -> None:
         count = numbers.shape[0]
         if count not in self._points:

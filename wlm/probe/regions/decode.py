@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from wlm.errors import WlmError
+from wlm.formats.hours import DAY
 from wlm.probe.decode import Decoder
 from wlm.probe.gaussian.decode import GaussianDecoder, Points
 from wlm.probe.gaussian.model import CUT, check_outputs
@@ -47,7 +48,7 @@ class RegionDecoder(Decoder):
         check_outputs(model.name, profile.latent, profile.hidden, model.outputs, relative, self.device)
         sizes = profile.latent, profile.hidden, model.outputs, relative, ambient_numbers(model.outputs)
         self._kernels = decode_kernels(*sizes, "cpu" if self.device == "cpu" else "cuda")
-        self._most, self._time = most_bytes, 0.0 if not len(model.times) else float(model.times[0])
+        self._most = most_bytes
         self._loaded: dict[int, GaussianDecoder] = {}  # the most recently needed ones last
         self._coming: dict[int, Future[ProbeModel]] = {}
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="wlm regions")
@@ -66,7 +67,7 @@ class RegionDecoder(Decoder):
 
     def set_time(self, time: float) -> None:
         check_time(time)
-        self._time = time
+        self.time = None if self.time is None else time % DAY
         for each in self._loaded.values():
             each.set_time(time)
 
@@ -89,7 +90,7 @@ class RegionDecoder(Decoder):
 
     def _put_region(self, number: int, model: ProbeModel, needed: np.ndarray) -> None:
         self._loaded[number] = made = GaussianDecoder(model, self.device)
-        made.set_time(self._time)
+        made.set_time(self.time or 0.0)
         self._entries[number] = made.region()
         for old in [each for each in self._loaded if each not in needed]:
             if self.device_bytes <= self._most:
@@ -168,6 +169,10 @@ class RegionLight(Light):
         self._regions, self._region = region, wp.array(region, dtype=int, device=self.device)
         self._x = wp.array(x, dtype=wp.vec3, device=self.device)
         self._taken: dict[int, tuple[wp.array, wp.array]] = {}
+
+    @property
+    def time(self) -> float | None:
+        return self._decoder.time
 
     @property
     def waiting(self) -> bool:
