@@ -292,7 +292,7 @@ class Volume:
 
         Raises:
             WlmError: The viewpoint is not three finite numbers, or is so far away that the coordinates of its block
-                overflow.
+                overflow; or the light of a part of the model is damaged, which is told once: it is dark from then on.
         """
         start = time.perf_counter()
         viewpoint = np.array(viewpoint, np.float64)
@@ -311,6 +311,7 @@ class Volume:
         self.frame += 1
         views = np.column_stack([at - base - 0.5, 1.0 / self._size])
         with interop.stream(self.device):
+            self.light.prepare()
             self._look(base, before, views, self.frame, self.light.time or 0.0)
             self._step()
         counters = self._frame_work.counters.numpy()
@@ -327,7 +328,7 @@ class Volume:
         frame_kernels.search(self._index, work)
         volume_weights.weigh(self._index, work)
         self.light.read(work.numbers, self._read_light)
-        frame_kernels.combine(work, self._read_light, self._pool)
+        frame_kernels.combine(work, self._read_light, windows, self._pool)
 
     def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
         """Interpolates the light at points in float32 relative to the viewer, see `wlm_kernels.probe.volume.read`.
