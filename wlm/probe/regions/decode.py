@@ -133,8 +133,8 @@ class RegionDecoder(Decoder):
         return bool(self._coming)
 
     def request(self) -> None:
-        """Has a thread read the regions that the launches since the last call needed, and moves at most one that was
-        read to the device. If it is damaged, its light is 0 from now on.
+        """Has a thread read the regions that launches since the last call needed, and moves at most one that was read
+        to the device. If it is damaged, its light is 0 from now on.
 
         Raises:
             WlmError: The region is damaged; it is only told once.
