@@ -186,7 +186,7 @@ class Volume:
         self._size = np.array(self.sizes)
         self._viewpoint: np.ndarray | None = None
         self._base = np.zeros((len(ratios), 3), np.int64)
-        self.frame = 0
+        self.frame = self._lacking = 0
         self.normal = None if normal is None else _unit(normal, position.shape)
         self._make(rows, self.normal)
         self._step = interop.StepGraph(self._work, self.device)
@@ -239,7 +239,7 @@ class Volume:
             return wp.array(ptr=shared.ptr, shape=shape, dtype=dtype, device=self.device)
 
         self._read_light = view((budget * probes, self.channels), float)
-        frame = {"clock": 1, "hour": 1, "counters": 7, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
+        frame = {"clock": 1, "hour": 1, "counters": 8, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
         ranked = dict.fromkeys(("gathered", "distance"), min(frame_kernels.MOST, blocks))
         ranges = dict.fromkeys(("begin", "count"), (budget, frame_kernels.HALVES))
         by_block = dict.fromkeys(("chosen", "taken", "blocks", "picked", "noise"), budget)
@@ -311,11 +311,12 @@ class Volume:
         self.frame += 1
         views = np.column_stack([at - base - 0.5, 1.0 / self._size])
         with interop.stream(self.device):
-            self.light.prepare()
+            if self._lacking or self.light.waiting:
+                self.light.prepare()
             self._look(base, before, views, self.frame, self.light.time or 0.0)
             self._step()
         counters = self._frame_work.counters.numpy()
-        queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
+        queued, dropped, cached, left, updated, probes, _, self._lacking = counters.tolist()
         entered = self._slots - int(kept)
         return FrameStats(entered, queued, dropped, updated, cached, left, probes, time.perf_counter() - start)
 
