@@ -347,8 +347,8 @@ def _scene(path: Path) -> Finding:
 
     with load_scene(path) as scene:
         parts = [f"{len(scene.mesh.triangle):,} triangles", count_of(scene.light.groups, "light group")]
-        if scene.probes:
-            parts.append(f"probes of {count_of(scene.probes, 'hour')}")
+        if scene.probes is not None:
+            parts.append(f"probes of {count_of(scene.probe_hours, 'hour')}")
         if scene.moving:
             parts.append(count_of(scene.moving, "moving object"))
         if scene.smoke:

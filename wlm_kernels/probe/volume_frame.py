@@ -15,7 +15,8 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 4. `search` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell; `volume_weights`
    computes weights of at most 16 of these probes.
 5. `combine` computes a block's light as the weighted sum of these probes, clamped to the range of their values, which
-   is extended by half its width on both sides, and stores it in half floats, with a factor for each row.
+   is extended by half its width on both sides, and stores it in half floats, with a factor for each row. A block whose
+   light is not in memory yet, -infinity at a probe, gives its row back and waits.
 """
 
 import numpy as np
@@ -30,16 +31,16 @@ BINS = 4096  # bins of the distance, a cube of 16
 TOTALS = BINS + BINS // 16 + BINS // 256  # with the sums over 16 bins, and over 256
 GROUP = 64  # rows of the pool from which one is chosen
 MOST = 4096  # most blocks that are ranked
-QUEUED, DROPPED, CACHED, LEFT, UPDATED, DECODED, GATHERED = range(7)
-"""Counters of a frame; the last is that of the gathered blocks."""
+QUEUED, DROPPED, CACHED, LEFT, UPDATED, DECODED, GATHERED, LACKING = range(8)
+"""Counters of a frame; the last two are of the gathered blocks, and of those whose light is not in memory yet."""
 STALE_FIRST = 4
 """A frame whose number this divides decodes stale blocks before missing ones."""
 WAITING = -2
 """Entry of the page table for a block near probes whose light is missing; -1 for a block without a probe."""
 
 _PROBES = wp.constant(PROBES)
-_QUEUED, _DROPPED, _CACHED, _LEFT, _UPDATED, _GATHERED = (
-    wp.constant(i) for i in (QUEUED, DROPPED, CACHED, LEFT, UPDATED, GATHERED)
+_QUEUED, _DROPPED, _CACHED, _LEFT, _UPDATED, _GATHERED, _LACKING = (
+    wp.constant(i) for i in (QUEUED, DROPPED, CACHED, LEFT, UPDATED, GATHERED, LACKING)
 )
 _WAITING = wp.constant(WAITING)
 _LARGEST = wp.constant(16384.0)  # of the numbers in a row of the pool: half floats hold it
@@ -133,7 +134,7 @@ class Work:
     Attributes:
         clock: [1], the frame's number.
         hour: [1], hour of the day of the light that is decoded.
-        counters: [7], counts of blocks and probes in this frame.
+        counters: [8], counts of blocks and probes in this frame.
         histogram: [TOTALS], number of blocks that wait to be decoded, by distance.
         gathered: [G], slots of the gathered blocks.
         distance: [G], rank of each gathered block: its squared distance from the viewer in units of the block's edge,
@@ -148,7 +149,7 @@ class Work:
             edge, and the probe's additional variance of noise.
         rows: [B, P], covariance of each probe with the probes before it and with itself, then 0.
         hats: [B, P], covariance of each probe with the block.
-        numbers: [B * P], index of each contributing probe in the input.
+        numbers: [B * P], index of each contributing probe in the input, or -1.
         weights: [B, P], weight of each contributing probe.
     """
 
@@ -419,7 +420,6 @@ def _allocate(index: Index, windows: Windows, pool: Pool, size: int, work: Work)
             pool.rows[wanted] = taken
             if pool.hour.shape[0] > 0:
                 pool.hour[taken] = work.hour[0]
-            windows.pages[slot] = wp.int16(taken)
             wp.atomic_add(work.counters, _UPDATED, 1)
             wp.atomic_sub(work.counters, _LEFT, 1)
     work.taken[k] = taken
@@ -463,15 +463,33 @@ def _combine(work: Work, light: wp.array2d[float]):
                 low = wp.min(low, value)
                 high = wp.max(high, value)
         room = _BEYOND * (high - low)
-        light[k * many, c] = wp.clamp(s, low - room, high + room)
+        value = wp.where(wp.isfinite(s), wp.clamp(s, low - room, high + room), wp.nan)
+        light[k * many, c] = wp.where(low == -wp.inf, low, value)
 
 
 @wp.kernel(enable_backward=False)
-def _store(work: Work, light: wp.array2d[float], pool: Pool):
+def _store(work: Work, light: wp.array2d[float], windows: Windows, pool: Pool):
     k, c = wp.tid()
     row = work.taken[k]
-    if row >= 0:
-        at = k * work.weights.shape[1]
+    at = k * work.weights.shape[1]
+    if row >= 0 and light[at, 0] == -wp.inf:
+        if c == 0:
+            slot = work.chosen[k]
+            if windows.pages[slot] >= wp.int16(0):
+                # It keeps showing its light, which is of another hour.
+                hour = pool.hour[row] + _NOON
+                pool.hour[row] = wp.where(hour < _DAY, hour, hour - _DAY)
+            else:
+                block = row
+                if pool.stamp.shape[0] > 0:
+                    block = pool.owner[row]
+                    pool.owner[row] = -1
+                    pool.stamp[row] = -1
+                pool.rows[block] = -1
+            wp.atomic_sub(work.counters, _UPDATED, 1)
+            wp.atomic_add(work.counters, _LEFT, 1)
+            wp.atomic_add(work.counters, _LACKING, 1)
+    elif row >= 0:
         most = float(0.0)
         finite = int(1)
         for j in range(light.shape[1]):
@@ -488,18 +506,30 @@ def _store(work: Work, light: wp.array2d[float], pool: Pool):
         pool.light[row, c] = wp.cast(wp.float16(number), wp.int16)
         if c == 0:
             pool.factor[row] = factor
+            windows.pages[work.chosen[k]] = wp.int16(row)
 
 
 @wp.kernel(enable_backward=False)
 def _take_rows(values: wp.array2d[float], numbers: wp.array1d[int], out: wp.array2d[float]):
     i, c = wp.tid()
-    out[i, c] = values[numbers[i], c]
+    out[i, c] = values[wp.max(numbers[i], 0), c]
 
 
 @wp.kernel(enable_backward=False)
-def _take_points(points: wp.array1d[wp.vec3], numbers: wp.array1d[int], out: wp.array1d[wp.vec3]):
+def _take_points(
+    # in:
+    points: wp.array1d[wp.vec3],
+    regions: wp.array1d[int],
+    numbers: wp.array1d[int],
+    # out:
+    out: wp.array1d[wp.vec3],
+    region: wp.array1d[int],
+):
     i = wp.tid()
-    out[i] = points[numbers[i]]
+    number = numbers[i]
+    out[i] = points[wp.max(number, 0)]
+    if region.shape[0] > 0:
+        region[i] = wp.where(number >= 0, regions[wp.max(number, 0)], -1)
 
 
 class Look:
@@ -559,24 +589,26 @@ def search(index: Index, work: Work) -> None:
     wp.launch(_find_ranges, work.count.shape, inputs=[index, work], device=work.clock.device)
 
 
-def combine(work: Work, light: wp.array, pool: Pool) -> None:
-    """Writes the light of the chosen blocks to their rows of the pool.
+def combine(work: Work, light: wp.array, windows: Windows, pool: Pool) -> None:
+    """Writes the light of the chosen blocks to their rows of the pool. Blocks with a probe of -infinity wait again.
 
     Args:
         work: Data of the frame, after `volume_weights.weigh`.
         light: float [B * P, D], light of the probes `work.numbers`, overwritten.
+        windows: The page table, in which the blocks get their rows.
         pool: The light of blocks, written.
     """
     shape = (work.chosen.shape[0], light.shape[1])
     wp.launch(_combine, shape, inputs=[work, light], device=light.device)
-    wp.launch(_store, shape, inputs=[work, light, pool], device=light.device)
+    wp.launch(_store, shape, inputs=[work, light, windows, pool], device=light.device)
 
 
 def take_rows(values: wp.array, numbers: wp.array, out: wp.array) -> None:
-    """Copies the rows of `values` [N, D] with indices `numbers` [M] to `out` [M, D]."""
+    """Copies the rows of `values` [N, D] with indices `numbers` [M] to `out` [M, D]; the index -1 yields any row."""
     wp.launch(_take_rows, out.shape, inputs=[values, numbers, out], device=out.device)
 
 
-def take_points(points: wp.array, numbers: wp.array, out: wp.array) -> None:
-    """Copies the points of `points` [N] with indices `numbers` [M] to `out` [M]."""
-    wp.launch(_take_points, out.shape, inputs=[points, numbers, out], device=out.device)
+def take_points(points: wp.array, regions: wp.array, numbers: wp.array, out: wp.array, region: wp.array) -> None:
+    """Copies the points of `points` [N] with indices `numbers` [M] to `out` [M], and of `regions` [N] to `region` [M],
+    where -1 is no point; `region` may be empty."""
+    wp.launch(_take_points, out.shape, inputs=[points, regions, numbers], outputs=[out, region], device=out.device)

@@ -61,7 +61,7 @@ def _pick(index: Index, work: Work):
         wp.atomic_add(work.counters, _DECODED, count)
         work.picked[k] = count
         work.noise[k] = _NOISE * wp.clamp(float(total) / _PROBES, 1.0, _MOST_NOISE)
-    number = int(0)
+    number = int(-1)
     if i < count:
         # Every n-th probe is taken, so that they are spread over the whole block.
         at = int(wp.int64(i) * wp.int64(total) / wp.int64(count))

@@ -186,7 +186,7 @@ class Volume:
         self._size = np.array(self.sizes)
         self._viewpoint: np.ndarray | None = None
         self._base = np.zeros((len(ratios), 3), np.int64)
-        self.frame = 0
+        self.frame = self._lacking = 0
         self.normal = None if normal is None else _unit(normal, position.shape)
         self._make(rows, self.normal)
         self._step = interop.StepGraph(self._work, self.device)
@@ -239,7 +239,7 @@ class Volume:
             return wp.array(ptr=shared.ptr, shape=shape, dtype=dtype, device=self.device)
 
         self._read_light = view((budget * probes, self.channels), float)
-        frame = {"clock": 1, "hour": 1, "counters": 7, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
+        frame = {"clock": 1, "hour": 1, "counters": 8, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
         ranked = dict.fromkeys(("gathered", "distance"), min(frame_kernels.MOST, blocks))
         ranges = dict.fromkeys(("begin", "count"), (budget, frame_kernels.HALVES))
         by_block = dict.fromkeys(("chosen", "taken", "blocks", "picked", "noise"), budget)
@@ -292,7 +292,7 @@ class Volume:
 
         Raises:
             WlmError: The viewpoint is not three finite numbers, or is so far away that the coordinates of its block
-                overflow.
+                overflow; or the light of a part of the model is damaged, which is told once: it is dark from then on.
         """
         start = time.perf_counter()
         viewpoint = np.array(viewpoint, np.float64)
@@ -311,10 +311,12 @@ class Volume:
         self.frame += 1
         views = np.column_stack([at - base - 0.5, 1.0 / self._size])
         with interop.stream(self.device):
+            if self._lacking or self.light.waiting:
+                self.light.prepare()
             self._look(base, before, views, self.frame, self.light.time or 0.0)
             self._step()
         counters = self._frame_work.counters.numpy()
-        queued, dropped, cached, left, updated, probes = counters[: frame_kernels.GATHERED].tolist()
+        queued, dropped, cached, left, updated, probes, _, self._lacking = counters.tolist()
         entered = self._slots - int(kept)
         return FrameStats(entered, queued, dropped, updated, cached, left, probes, time.perf_counter() - start)
 
@@ -327,7 +329,7 @@ class Volume:
         frame_kernels.search(self._index, work)
         volume_weights.weigh(self._index, work)
         self.light.read(work.numbers, self._read_light)
-        frame_kernels.combine(work, self._read_light, self._pool)
+        frame_kernels.combine(work, self._read_light, windows, self._pool)
 
     def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
         """Interpolates the light at points in float32 relative to the viewer, see `wlm_kernels.probe.volume.read`.

@@ -1,5 +1,6 @@
 // The network of a block of points (gaussian-probe-compression, eq. 7), after layers.cuh: the partial sums of each point's
-// Gaussians are added in shared memory, and the outputs are written in rows. Constants from wlm_kernels/probe/decode.py:
+// Gaussians are added in shared memory, and the outputs are written in rows, those of points in the region `own`, or of all
+// if it is negative. Constants from wlm_kernels/probe/decode.py:
 // OUT numbers of a point, and one output more, D = OUT + 1, if that is the magnitude; AMBIENT of them are clamped at 0.
 // The reference is benchmarks/probe_exact.py; layers.cuh gives the reason for native code.
 
@@ -27,5 +28,5 @@ for (int m = t; m < P * OUT; m += T) {
     float value = gain * E[c * LD + p];
     if (D > OUT) value *= expf(fminf(E[(D - 1) * LD + p], 0.0f));
     if (c < AMBIENT) value = fmaxf(value, 0.0f);
-    if (first + p < count) out.data[size_t(first) * OUT + m] = value;
+    if (first + p < count && (own < 0 || region.data[first + p] == own)) out.data[size_t(first) * OUT + m] = value;
 }
