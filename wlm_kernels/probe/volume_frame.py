@@ -10,8 +10,8 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 3. Each chosen block gets a row of the pool: its own, if there is one for every block near a probe; else the least
    recently used row of a group of rows: each block takes from another group, and groups take turns. A row whose block
    is in a window is never given away.
-4. `search` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell; `volume_weights`
-   computes weights of at most 16 of these probes.
+4. `volume_weights` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell, and computes
+   weights of at most 16 of these probes.
 5. `combine` computes a block's light as the weighted sum of these probes, clamped to the range of their values, which
    is extended by half its width on both sides, and stores it in half floats, with a factor for each row.
 """
@@ -20,6 +20,7 @@ import numpy as np
 import warp as wp
 
 from wlm_kernels.least_recent import least_recent
+from wlm_kernels.native import on_cuda
 from wlm_kernels.probe.volume import inside, wrap
 
 PROBES = 16  # most probes that contribute to a block
@@ -322,7 +323,7 @@ def _limit(histogram: wp.array1d[int], budget: int) -> int:
     return 16 * (16 * group + sixteen) + bin
 
 
-@wp.kernel(enable_backward=False)
+@wp.kernel(enable_backward=False, launch_bounds=(256, 4))  # with more registers too few of its threads run at once
 def _gather(windows: Windows, side: int, work: Work):
     s = wp.tid()
     if s == 0:
@@ -388,10 +389,11 @@ def _allocate(index: Index, windows: Windows, pool: Pool, size: int, work: Work)
     work.taken[k] = taken
 
 
-@wp.kernel(enable_backward=False)
-def _find_ranges(index: Index, work: Work):
-    k, j = wp.tid()
-    count = int(0)
+@wp.func
+def range_near(index: Index, work: Work, k: int, j: int) -> wp.vec2i:
+    """Returns the first index in `index`, and the number, of the probes in cell j of the reach of a chosen block k."""
+    begin = int(0)
+    end = int(0)
     if work.taken[k] >= 0:
         block = work.blocks[k]
         ratio = index.ratios[block[3]]
@@ -402,55 +404,50 @@ def _find_ranges(index: Index, work: Work):
             begin = _lower(index.key, 0, last, morton(ratio * half))
             # The cells of one half are neighbours in the list; this is the end of the last one.
             end = _lower(index.key, begin, last, morton(ratio * half + wp.vec3i(ratio - 1)) + wp.int64(1))
-            work.begin[k, j] = begin
-            count = end - begin
-    work.count[k, j] = count
+    return wp.vec2i(begin, end - begin)
+
+
+@wp.func_native(
+    on_cuda("for (int s = 16; s > 0; s /= 2) x = fmaxf(x, __shfl_xor_sync(~0u, x, s));\nreturn x;\n", "return x;")
+)
+def _most_of_warp(x: float) -> float: ...
 
 
 @wp.kernel(enable_backward=False)
-def _combine(work: Work, light: wp.array2d[float]):
-    """Writes the light of block k over that of its first probe, light[k * P]."""
-    k, c = wp.tid()
-    many = work.weights.shape[1]
-    if work.taken[k] >= 0:
-        s = float(0.0)
-        low = float(wp.inf)
-        high = -float(wp.inf)
-        for i in range(_PROBES):
-            w = float(0.0)
-            if i < many:
-                w = work.weights[k, i]
-            if w != 0.0:
-                value = light[k * many + i, c]
-                s += w * value
-                low = wp.min(low, value)
-                high = wp.max(high, value)
-        room = _BEYOND * (high - low)
-        light[k * many, c] = wp.clamp(s, low - room, high + room)
-
-
-@wp.kernel(enable_backward=False)
-def _store(work: Work, light: wp.array2d[float], pool: Pool):
-    k, c = wp.tid()
+def _combine(work: Work, light: wp.array2d[float], lanes: int, pool: Pool):
+    """Stores the light of block k; meanwhile it is in the place of that of its first probe, light[k * P]."""
+    k, lane = wp.tid()
     row = work.taken[k]
+    many = work.weights.shape[1]
+    channels = light.shape[1]
+    most = float(0.0)
     if row >= 0:
-        at = k * work.weights.shape[1]
-        most = float(0.0)
-        finite = int(1)
-        for j in range(light.shape[1]):
-            value = light[at, j]
-            most = wp.max(most, wp.abs(value))
-            if not wp.isfinite(value):
-                finite = 0
-        factor = most / _LARGEST
-        number = float(0.0)
-        if finite == 0:
-            factor = wp.nan  # whoever reads the block is told
-        elif factor > 0.0:
-            number = light[at, c] / factor
-        pool.light[row, c] = wp.cast(wp.float16(number), wp.int16)
-        if c == 0:
-            pool.factor[row] = factor
+        for c in range(lane, channels, lanes):
+            s = float(0.0)
+            low = float(wp.inf)
+            high = -float(wp.inf)
+            for i in range(_PROBES):
+                w = float(0.0)
+                if i < many:
+                    w = work.weights[k, i]
+                if w != 0.0:
+                    value = light[k * many + i, c]
+                    s += w * value
+                    low = wp.min(low, value)
+                    high = wp.max(high, value)
+            room = _BEYOND * (high - low)
+            value = wp.clamp(s, low - room, high + room)
+            light[k * many, c] = value
+            most = wp.max(most, wp.where(wp.isfinite(value), wp.abs(value), wp.inf))
+    factor = _most_of_warp(most) / _LARGEST
+    if row >= 0:
+        for c in range(lane, channels, lanes):
+            number = float(0.0)
+            if factor > 0.0 and wp.isfinite(factor):
+                number = light[k * many, c] / factor
+            pool.light[row, c] = wp.cast(wp.float16(number), wp.int16)
+        if lane == 0:
+            pool.factor[row] = wp.where(wp.isfinite(factor), factor, wp.nan)  # whoever reads the block is told
 
 
 @wp.kernel(enable_backward=False)
@@ -473,30 +470,29 @@ class Look:
     Args:
         windows, work: Every launch writes the bases and views of `windows` and `work.clock`, and resets `work.counters`
             and `work.chosen`.
+        scales: [L], 1 / edge of a block of each level.
     """
 
-    def __init__(self, windows: Windows, work: Work) -> None:
+    def __init__(self, windows: Windows, work: Work, scales: np.ndarray) -> None:
         count = max(LEVELS, work.counters.shape[0], work.chosen.shape[0])
         self._bases, self._before = np.zeros((2, LEVELS, 3), np.int32)
         self._views = np.zeros((LEVELS, 4), np.float32)
-        # The launch's arguments use these arrays' memory: building them from 80 numbers takes 20 microseconds a frame.
+        self._views[: len(scales), 3] = scales
+        # The launch reads its arguments from these arrays' memory.
         first = [Bases.from_buffer(self._bases), Bases.from_buffer(self._before), Views.from_buffer(self._views), 0]
         self._launch = wp.launch(_look, count, [*first, windows, work], device=work.clock.device, record_cmd=True)
 
-    def __call__(self, bases: np.ndarray, before: np.ndarray, views: np.ndarray, frame: int) -> None:
+    def __call__(self, bases: np.ndarray, before: np.ndarray, origins: np.ndarray, frame: int) -> None:
         """Launches the kernel on the current stream.
 
         Args:
             bases: Integers [L, 3], coordinates of the first block of each level's window.
             before: Integers [L, 3], the same of the frame before.
-            views: [L, 4], origin of the points in each window and 1 / edge of a block; see `wlm_kernels.probe.volume`.
+            origins: [L, 3], origin of the points in each window, see `wlm_kernels.probe.volume`.
             frame: Number of the frame, higher than in the frame before.
         """
         count = len(bases)
-        self._bases[:count], self._before[:count], self._views[:count] = bases, before, views
-        self._launch.set_param_at_index(0, Bases.from_buffer(self._bases))
-        self._launch.set_param_at_index(1, Bases.from_buffer(self._before))
-        self._launch.set_param_at_index(2, Views.from_buffer(self._views))
+        self._bases[:count], self._before[:count], self._views[:count, :3] = bases, before, origins
         self._launch.set_param_at_index(3, frame)
         self._launch.launch()
 
@@ -513,11 +509,6 @@ def select(index: Index, windows: Windows, pool: Pool, side: int, work: Work) ->
     wp.launch(_allocate, work.chosen.shape, inputs=[index, windows, pool, size, work], device=device)
 
 
-def search(index: Index, work: Work) -> None:
-    """Finds the probes within reach of each chosen block, as 64 ranges of the sorted probes of `index`."""
-    wp.launch(_find_ranges, work.count.shape, inputs=[index, work], device=work.clock.device)
-
-
 def combine(work: Work, light: wp.array, pool: Pool) -> None:
     """Writes the light of the chosen blocks to their rows of the pool.
 
@@ -526,9 +517,9 @@ def combine(work: Work, light: wp.array, pool: Pool) -> None:
         light: float [B * P, D], light of the probes `work.numbers`, overwritten.
         pool: The light of blocks, written.
     """
-    shape = (work.chosen.shape[0], light.shape[1])
-    wp.launch(_combine, shape, inputs=[work, light], device=light.device)
-    wp.launch(_store, shape, inputs=[work, light, pool], device=light.device)
+    lanes = 32 if light.device.is_cuda else 1
+    shape, inputs = (work.chosen.shape[0], lanes), [work, light, lanes, pool]
+    wp.launch(_combine, shape, inputs=inputs, device=light.device)
 
 
 def take_rows(values: wp.array, numbers: wp.array, out: wp.array) -> None:
