@@ -57,6 +57,13 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
     ),
     "probes_path": _option(_Path, "--probes", help="Light probe file. Default: that of the demo.", metavar="FILE"),
     "keys": _option(_Names, "--key", help="Name of an array in the file of --probes to measure. Repeatable."),
+    "table": _option(bool, "--table", False, help="Measure only our methods and rivals at equal bytes."),
+    "nearest": _option(
+        list[int] | None,
+        "--nearest",
+        help="Measure the table of only N probes around the middle. Repeatable.",
+        metavar="N",
+    ),
     "volume_only": _option(bool, "--volume-only", False, help="Measure only the cascaded probe volume."),
     "meshes_path": _option(
         _Path, "--meshes", help="Folder of a .glb, its .exr lightmaps and mask.png, or of such folders.", metavar="DIR"
@@ -110,7 +117,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "probe": (
         "Measure light probes: PSNR, size and decode time of profiles, decoders and rivals.",
-        ("volume_only", "rivals_only", "quick", "rivals", "device", "probes_path", "keys"),
+        ("volume_only", "table", "only", "nearest", "quick", "device", "probes_path", "keys"),
     ),
     "atlas": (
         "Measure lightmaps of meshes: PSNR, SSIM, size and decode time of profiles and their rivals.",
@@ -146,7 +153,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
 }
 # Options with which a run replaces only the rows that it measures in a result file.
-_PARTIAL = ("profiles", "rival_names", "only", "volume_only")
+_PARTIAL = ("profiles", "rival_names", "only", "volume_only", "table")
 
 
 def _add_command(name: str, summary: str, options: tuple[str, ...]) -> None:

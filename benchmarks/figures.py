@@ -49,6 +49,12 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "compression_ratio": Figure("CR", "%", ".1f"),  # eq. 9 of lightmap-uv-clustering-cascade
         "share_of_float32": Figure("of float32", "%", ".2f"),
         "psnr": Figure("PSNR", "dB", ".2f"),
+        "relative_error": Figure("relative error", "%", ".2f"),  # this and the next ones as in `benchmarks.probe_table`
+        "relative_db": Figure("relative error", "dB", ".2f"),
+        "held_out_psnr": Figure("held out", "dB", ".2f"),
+        "held_out_relative_db": Figure("held out, relative", "dB", ".2f"),
+        "volume_psnr": Figure("in the volume", "dB", ".2f"),
+        "volume_relative_db": Figure("in the volume, relative", "dB", ".2f"),
         "gain": Figure("gain", "dB", "+.3f"),  # PSNR minus the PSNR of another method
         "psnr_worst": Figure("worst view", "dB", ".2f"),
         "texel_psnr": Figure("texels", "dB", ".2f"),

@@ -5,10 +5,9 @@ The results table has these kinds of rows:
 - method "ours", one row for each profile: file size, time of the fit, errors of the float decode against the input,
   time to decode the whole map to 8 bits by the fast kernel, and time to unpack one tile of the file. The largest error
   is in units of radiance, against a float64 decode.
-- methods "exact" (a kernel of one texel per thread) and "strip" (the fast kernel), one row for each way to compute the
-  network's GELU, and on CUDA "matrix" (the fast kernel on matrix units), all of profile M: error of the 8-bit output
-  against the input, and largest error against a float64 decode, where 1 stands for 255 levels. Rounding to 8 bits
-  alone errs by 0.00196, half a level.
+- method "exact" (a kernel of one texel per thread), one row for each way to compute the network's GELU, and on CUDA
+  "matrix" (the fast kernel on matrix units), all of profile M: error of the 8-bit output against the input, and largest
+  error against a float64 decode, where 1 stands for 255 levels. Rounding to 8 bits alone errs by 0.00196, half a level.
 - method "texture", one row for each profile: the map as a renderer samples it, one RGB9E5 texture with all mips
   (`wlm.lightmap.runtime`): its errors, and the time to decode it.
 - method "pages", one row for each profile with networks: all pages of all mips as a virtual texture holds them, RGB9E5
@@ -57,7 +56,6 @@ from wlm.lightmap.runtime import (
     MapDecoder,
     MatrixDecoder,
     RuntimeDecoder,
-    StripDecoder,
     fast_decoder,
 )
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, place
@@ -170,7 +168,7 @@ def run_rows(
     if len(best.model.light.mapped):
         # On the CPU "fast" is "tanh".
         gelus = [gelu for gelu in _GELUS if bench.device != "cpu" or gelu != "fast"]
-        peers += [bench.option_row(best, path, gelu) for path in ("exact", "strip") for gelu in gelus]
+        peers += [bench.option_row(best, "exact", gelu) for gelu in gelus]
         if bench.device != "cpu" and best.model.profile.hidden % 16 == 0:
             peers.append(bench.option_row(best, "matrix", "fast"))
     rows = bench.time_rows(peers)
@@ -493,7 +491,7 @@ class _LightmapBench(Bench):
             elif path == "matrix":
                 decoders.append(MatrixDecoder(model, self.device))
             else:
-                decoders.append({"exact": ExactDecoder, "strip": StripDecoder}[path](model, self.device, gelu))
+                decoders.append(ExactDecoder(model, self.device, gelu))
         if (model.kind == TileKind.STATIC).any():
             decoders.append(ExactDecoder(model, self.device, gelu, TileKind.STATIC))
         if len(model.frames):

@@ -1,4 +1,4 @@
-"""Size, speed and error of compressed light probes, beside a fit in plain torch, PCA methods and an engine's packing.
+"""Size, speed and error of compressed light probes, beside a fit in plain torch; `--table` has the rivals.
 
 The results table of each set of probes has these rows, by method:
 
@@ -9,8 +9,6 @@ The results table of each set of probes has these rows, by method:
   each is a fit of its own.
 - "fit": speed of the fit by the first profile on the first set. "dense torch": the same fit in plain torch, with as
   many steps on CUDA and only a few on a CPU.
-- The rivals of `benchmarks.rivals.probe` at given percentages of the probes' size as float32, and Unreal's packing,
-  which has one size. The list of dead probes is counted for rivals too; positions are counted for no method.
 - "held out": every fifth probe is left out of a fit by the first profile, which predicts its light, as do two simple
   interpolations of the uncompressed other probes. "half-way" is the error of the full fit between probes.
 - "volume", the first profile: a viewer walks through the cascaded volume, which is filled from the original probes
@@ -21,12 +19,11 @@ The results table of each set of probes has these rows, by method:
 - "views", the first profile: pictures of balls at the probes, compared after tone mapping, see `wlm.probe.views`.
 
 The largest error of a model is measured against a float64 decode of the same model. A decode on CUDA is timed as the
-replay of a CUDA graph, so that gaps between launches do not count; rivals are decoded on the CPU.
+replay of a CUDA graph, so that gaps between launches do not count. `benchmarks.probe_table` has the rows of `--table`.
 """
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -34,13 +31,11 @@ import warp as wp
 
 from benchmarks.plot import Panel
 from benchmarks.probe_exact import decode64
-from benchmarks.rivals.probe import WEIGHT_BITS, at_bytes, unreal_packing
+from benchmarks.probe_table import RIVALS, nearest_probes, table_rows
 from benchmarks.rivals.probe_torch import DenseFit
-from benchmarks.rivals.rival import Rival
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data, exact_errors, expect_alone
 from wlm.errors import WlmError
-from wlm.formats import zstd
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet, from_arrays, load
 from wlm.probe.evaluation import Report, between_psnr, by_distance, score
@@ -55,9 +50,6 @@ from wlm.probe.volume.walk import score_volume
 PROFILES = ("standard", "compact", "paper")
 """Profiles of a run; the rows of other methods measure the first."""
 
-SHARES = (1, 2, 3, 5, 7, 10)
-"""Sizes of the rivals in a full run, in per cent of float32."""
-
 RATIOS = (0.02, 0.05, 0.10, 0.15, 0.20)
 """Gaussians as a share of the live probes, in a full run: the paper's tables 2 and 3."""
 
@@ -67,17 +59,8 @@ _DEMO_KEYS = ("12.00", "21.00")  # noon and night
 _QUICK_PROBE_STEPS = 600_000
 _QUICK_FRAMES = 60
 _DENSE_STEPS = 10  # steps of the fit in plain torch, where it is not run to its end
-_RIVALS: dict[str, tuple[str, Sequence[int | None]]] = {
-    # The paper's own rival: clusters of places, nothing but half floats.
-    "CPCA in halves": ("clustered_pca", (None,)),
-    "global PCA": ("global_pca", WEIGHT_BITS),
-    "clustered PCA": ("clustered_pca", WEIGHT_BITS),
-    "CPCA by signal": ("clustered_pca_signal", WEIGHT_BITS),
-    "moving basis": ("moving_basis", WEIGHT_BITS),
-}
-_QUICK_SHARES = (5,)
 
-PANELS = (Panel("bpp", "psnr", ("ours", "pca", *_RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
+PANELS = (Panel("bpp", "psnr", ("ours", "pca", *RIVALS)), Panel("decode_ms", "max_error", ("decode",)))
 """The panels of a plot of the rows: quality against size, and the error of a decode against its time."""
 
 
@@ -87,23 +70,27 @@ def run(
     device: str = "cpu",
     probes_path: str | os.PathLike[str] | None = None,
     keys: Sequence[str] | None = None,
-    rivals: bool = True,
-    rivals_only: bool = False,
     volume_only: bool = False,
+    table: bool = False,
+    only: Sequence[str] | None = None,
+    nearest: Sequence[int] | None = None,
     progress: Note | None = None,
+    done: Callable[[Sequence[Row]], None] | None = None,
 ) -> list[Row]:
     """Measures the compression of the light probes of one file.
 
     Args:
-        quick: Whether to make short fits at one compression ratio, measure rivals at one size and measure the demo's
-            probes at noon only: under two minutes on two CPU cores. The unfinished fits have large errors.
+        quick: Whether to make short fits at one compression ratio or size, and to measure the demo's probes at noon
+            only: under two minutes on two CPU cores. The unfinished fits have large errors.
         device: "cpu" or "cuda:0", for fits, decodes and the volume.
         probes_path: A file that `wlm.probe.load` can read; None: the checkout's `demos/data/probes/street.npz`.
         keys: Names of arrays in the file, each one a set of probes; None: the only array, or the demo's noon and night.
-        rivals: Whether to measure PCA methods and Unreal's packing, which take minutes on the CPU and need no GPU.
-        rivals_only: Whether to measure only the rivals, on the CPU, at all sizes of `SHARES`.
         volume_only: Whether to measure only the volume, filled from the original probes and from principal components.
+        table: Whether to measure only our methods and their rivals at equal bytes, see `benchmarks.probe_table`.
+        only: Names of methods of the table; None: all. Rivals take minutes on the CPU and need no GPU.
+        nearest: The table of only so many live probes around the middle of the set; None: of all probes.
         progress: Called with a line before each part of the work.
+        done: Called with all rows so far after each size of the table.
 
     Returns:
         The rows of each set, in the order in which the module's docstring lists them.
@@ -112,29 +99,24 @@ def run(
         WlmError: The file, a key or the device does not exist, options contradict each other, or a fit diverged.
     """
     if volume_only:
-        expect_alone("--volume-only", {"--quick": quick, "--no-rivals": not rivals, "--rivals-only": rivals_only})
-    if rivals_only:
-        expect_alone("--rivals-only", {"--quick": quick, "--no-rivals": not rivals, "--device": device != "cpu"})
+        expect_alone("--volume-only", {"--quick": quick, "--table": table})
+    if not table and (only or nearest):
+        raise WlmError("--only, --nearest: expected --table beside them")
     if probes_path is None:
         probes_path, keys = demo_data("probes/street.npz", "--probes FILE"), keys or _DEMO_KEYS[: 1 if quick else None]
     sets = [load(probes_path, key=key) for key in keys or (None,)]
-    if volume_only or rivals_only:
-        benches = [ProbeBench(probes, device, progress) for probes in sets]
-        return [row for bench in benches for row in (bench.volume() if volume_only else bench.rival_rows(SHARES))]
+    if volume_only:
+        return [row for probes in sets for row in ProbeBench(probes, device, progress).volume()]
     profiles = [Profile.load(name) for name in PROFILES]
     if quick:
         steps = max(200, _QUICK_PROBE_STEPS // max(int(probes.live.sum()) for probes in sets))
         profiles = [profile.model_copy(update={"steps": min(steps, profile.steps)}) for profile in profiles]
-    return run_rows(
-        sets,
-        profiles,
-        device=device,
-        ratios=() if quick else RATIOS,
-        shares=_QUICK_SHARES if quick else SHARES,
-        rivals=rivals,
-        frames=_QUICK_FRAMES if quick else None,
-        progress=progress,
-    )
+    if table:
+        sets = [nearest_probes(probes, count) if count else probes for probes in sets for count in nearest or (None,)]
+        shares = (5,) if quick else None
+        return table_rows(sets, profiles[0], device=device, only=only, shares=shares, progress=progress, done=done)
+    ratios, frames = ((), _QUICK_FRAMES) if quick else (RATIOS, None)
+    return run_rows(sets, profiles, device=device, ratios=ratios, frames=frames, progress=progress)
 
 
 def run_rows(
@@ -143,9 +125,7 @@ def run_rows(
     *,
     device: str,
     ratios: Sequence[float],
-    shares: Sequence[int],
     frames: int | None,
-    rivals: bool = True,
     repeats: int | None = None,
     progress: Note | None = None,
 ) -> list[Row]:
@@ -155,9 +135,7 @@ def run_rows(
         sets: At least one set of probes.
         profiles: At least one profile; all rows except "ours" are measured with the first one.
         ratios: Further compression ratios for the first profile; its own ratio is not measured twice.
-        shares: Sizes of the rivals, in per cent of the probes' size as float32.
         frames: Frames of the walk through the volume, at least one; None: each moves the viewer by 1/10 block.
-        rivals: Whether to measure the rivals.
         repeats: As for `Bench`.
     """
     if not sets or not profiles:
@@ -174,8 +152,6 @@ def run_rows(
         rows += bench.time_rows(peers + bench.decode_rows(first))
         if probes is sets[0]:
             rows += bench.fit_rows(first)
-        if rivals:
-            rows += bench.rival_rows(shares)
         rows.append(bench.held_out_row(first))
         rows += volume_rows(bench, probes, {"ours": first.model}, frames)
         rows += view_rows(bench, probes, first.model, VIEWS if frames is None else min(frames, VIEWS))
@@ -341,32 +317,6 @@ class ProbeBench(Bench):
         )
         return [ours, dense]
 
-    def rival_rows(self, shares: Sequence[int]) -> list[Row]:
-        """Returns the rows of rivals at sizes in per cent of the float32 probes, and of Unreal's fixed-size packing."""
-        rows = []
-        for share in shares:
-            option, size = f"{share}%", share * self.probes.float_bytes // 100
-            for name, (baseline, bits) in _RIVALS.items():
-                self.note(f"compressing: {name}, {option}")
-                encode = partial(at_bytes, baseline, budget_bytes=size - self._dead_bytes(), bits=bits)
-                rows.append(self._rival_row(name, option, encode))
-        return [*rows, self._rival_row("Unreal packing", "", unreal_packing)]
-
-    def _rival_row(self, method: str, option: str, encode: Callable[..., Rival]) -> Row:
-        try:
-            rival = encode(position=self.position, values=self.values)
-        except WlmError as error:  # nothing fits, or no L0, L1 or L2 in RGB
-            return self.missing_row(method, option, error)
-        report = score(self._all(rival.decoded), self.probes, rival.bytes + self._dead_bytes())
-        return self.row(
-            method,
-            option,
-            f"{rival.option}; on the CPU",
-            encode_seconds=rival.encode_seconds,
-            decode_ms=1e3 * rival.decode_seconds if self.device == "cpu" else None,
-            **_size_and_psnr(report, report.bytes),
-        )
-
     def _decode(
         self, decoder: GaussianDecoder, points: Points, exact: np.ndarray, size: int
     ) -> tuple[Report, dict[str, float]]:
@@ -380,10 +330,6 @@ class ProbeBench(Bench):
         values = np.zeros_like(self.probes.values)
         values[self.probes.live] = live
         return values
-
-    def _dead_bytes(self) -> int:
-        """Returns the size in bytes of the compressed list of dead probes in our file."""
-        return 0 if self.probes.live.all() else len(zstd.compress(np.packbits(~self.probes.live).tobytes()))
 
 
 def _size_and_psnr(report: Report, gpu_bytes: int) -> dict[str, float]:

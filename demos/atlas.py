@@ -21,11 +21,11 @@ from wlm.atlas.colour import quantise
 from wlm.atlas.evaluation import Report, Sampler, Score, original
 from wlm.atlas.model import COLOUR_BITS, TEXELS
 from wlm.atlas.resize import fitting_size, resized
+from wlm.atlas.views import points_at, visible_uv
 from wlm.cli.console import show_figures
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_write
 from wlm.ops import raster
-from wlm.view.atlas import draw
 from wlm.view.display import white_of
 from wlm.view.pictures import contact_sheet, encode
 
@@ -77,7 +77,13 @@ def draw_comparison(path: Path, scene: wlm.atlas.LightmappedScene, samplers: dic
     """Writes a PNG with a row for each view: the original, each decoder, and each decoder's absolute error times 8."""
     drawn = []
     for view in DRAWN:
-        pictures, hit = draw(scene, {"original": original(scene, device), **samplers}, view, 640, device)
+        hit, points = points_at(scene, *next(iter(visible_uv(scene, [view], 640, device))))
+        pictures = {}
+        for name, sampler in {"original": original(scene, device), **samplers}.items():
+            picture = torch.zeros((*hit.shape, 3), device=hit.device)
+            picture[hit] = sampler(points, 0).float()
+            pictures[name] = picture.cpu().numpy()
+        hit = hit.cpu().numpy()
         lines = hit.any(axis=1), hit.any(axis=0)
         window = tuple(slice(int(line.argmax()), len(line) - int(line[::-1].argmax())) for line in lines)
         drawn.append(({name: picture[window] for name, picture in pictures.items()}, hit[window]))

@@ -68,7 +68,7 @@ def run(out: Path, device: str) -> dict[str, float]:
     content = {"report": report.to_json(), "walk": figures}
     atomic_write(out / "street_report.json", (json.dumps(content, indent=1) + "\n").encode())
     try:
-        scene = open_scene([out / "street.wlm"], original=source, key=KEY)
+        scene = open_scene(out / "street.wlm", original=source, key=KEY)
         window = Window(scene, size=(1800, 640))
         window.screenshot(out / "street.png")
         window.close()

@@ -145,7 +145,8 @@ def at_bytes(
 ) -> Rival:
     """Searches for the settings with which one method has the least squared error within a size in bytes.
 
-    For each number of bits, numbers of components are tried from the largest down, until two in a row are no better.
+    Numbers of bits are tried in their order, until one is no better than the one before. For each, numbers of
+    components are tried from the largest down, until two in a row are no better.
     Each is tried with as many parts as fit: at most `MAX_PARTS` clusters, or `MAX_GRID` cells along the longest side.
 
     Args:
@@ -183,6 +184,7 @@ def _search(
     Returns the best result and its three settings, or None if nothing fits.
     """
     tried: list[tuple[float, Rival, tuple[int, int, int | None]]] = []
+    before = np.inf
     for number in bits:
         least, waited = np.inf, 0
         for components in range(values.shape[1], 0, -1):
@@ -196,6 +198,9 @@ def _search(
             least = min(least, error)
             if waited == _PATIENCE:
                 break
+        if least >= before < np.inf:
+            break
+        before = least
     return min(tried, key=lambda entry: (entry[0], entry[1].bytes))[1:] if tried else None
 
 

@@ -34,9 +34,14 @@ COMMANDS = [
     (["scene", "--quick"], "scene --quick --device cpu", {"quick": True}),
     (["lightmap-file", "--quick"], "lightmap-file --quick --device cpu", {"quick": True}),
     (
-        ["probe", "--no-rivals", "--probes", "a/room.npz", "--key", "sh", "--key", "sh_noon"],
-        "probe --no-rivals --device cpu --probes room.npz --key sh --key sh_noon",
-        {"keys": ["sh", "sh_noon"], "rivals": False, "quick": False, "volume_only": False},
+        ["probe", "--probes", "a/room.npz", "--key", "sh", "--key", "sh_noon"],
+        "probe --device cpu --probes room.npz --key sh --key sh_noon",
+        {"keys": ["sh", "sh_noon"], "quick": False, "volume_only": False, "table": False},
+    ),
+    (
+        ["probe", "--table", "--only", "ours", "--nearest", "8", "--nearest", "40"],
+        "probe --table --only ours --nearest 8 --nearest 40 --device cpu",
+        {"table": True, "only": ["ours"], "nearest": [8, 40]},
     ),
     (["probe", "--volume-only"], "probe --volume-only --device cpu", {"volume_only": True}),
     (
@@ -99,7 +104,8 @@ def test_some_rows_replace_those_alone(given_rows, tmp_path, monkeypatch):
         (["lightmap", "--rival", "jpeg"], "unknown method 'jpeg'"),
         (["lightmap", "--device", "tpu"], "device 'tpu'"),
         (["lightmap-ablation", "--only", "4D", "--set", "absent"], "--only: expected one of hybrid, 2D alone"),
-        (["probe", "--rivals-only", "--quick"], "--rivals-only: cannot be combined with --quick"),
+        (["probe", "--volume-only", "--table"], "--volume-only: cannot be combined with"),
+        (["probe", "--nearest", "8"], "--only, --nearest: expected --table beside them"),
         (["probe", "--probes", "absent.npz"], "No such file"),
         (["atlas", "--meshes", "absent"], "absent: no such folder"),
         (["atlas-scene"], "--set"),

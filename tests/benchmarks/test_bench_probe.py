@@ -16,7 +16,6 @@ PROFILES = [
     Profile(name="other", ratio=0.1, latent=3, hidden=8, steps=STEPS, support="sphere"),
 ]
 PCA = {"room": "27 components", "hall": "27 components"}
-RIVALS = ["CPCA in halves", "global PCA", "clustered PCA", "CPCA by signal", "moving basis"]
 
 
 def room(seed: int, name: str):
@@ -36,7 +35,7 @@ def sets():
 
 @pytest.fixture(scope="module")
 def rows(sets):
-    return run_rows(sets, PROFILES, device="cpu", ratios=(0.1, 0.2), shares=(5, 10), frames=4, repeats=1)
+    return run_rows(sets, PROFILES, device="cpu", ratios=(0.1, 0.2), frames=4, repeats=1)
 
 
 def test_every_row_has_its_figures(rows, tmp_path):
@@ -44,7 +43,6 @@ def test_every_row_has_its_figures(rows, tmp_path):
     ours = [("ours", "standard"), ("ours", "other"), ("ours", "ratio 0.20")]
     ways = ["sphere", "exact"]
     fits = [("fit", f"standard {STEPS} steps"), ("dense torch", f"standard {STEPS} steps")]
-    rivals = [(name, size) for size in ("5%", "10%") for name in RIVALS] + [("Unreal packing", "")]
     held = [("held out", "standard")]
     volume = [("volume", f"{light}, walk of 4 frames") for light in ("lossless", "ours")]
     views = [("views", f"balls, {light}") for light in KINDS]
@@ -54,7 +52,6 @@ def test_every_row_has_its_figures(rows, tmp_path):
             ("pca", PCA[scene]),
             *(("decode", way) for way in ways),
             *speed,
-            *rivals,
             *held,
             *volume,
             *views,
@@ -73,12 +70,9 @@ def test_every_row_has_its_figures(rows, tmp_path):
             assert row["psnr"] < row["light_psnr"] + 1.0 and (row["light_psnr"] == 120.0) == ("lossless" in row.option)
 
 
-def test_rivals_keep_to_the_bytes(rows):
+def test_components_and_held_out_probes(rows):
     for row in rows:
-        if row.method in RIVALS and row.figures:
-            assert row["bytes"] <= int(row.option[:-1]) / 100 * PROBES[row.scene] * 27 * 4
-            assert row["psnr"] > 5.0
         if row.method == "pca":
-            assert row["psnr"] > 40.0 and row["bytes"] < 27 * 2 * PROBES[row.scene]
+            assert row["psnr"] > 35.0 and row["bytes"] < 27 * 2 * PROBES[row.scene]
         if row.method == "held out" and row.scene == "room":  # the other has too few to be told well
             assert row["nearest_psnr"] < row["distance_psnr"] and row["half_way_psnr"] > 10.0

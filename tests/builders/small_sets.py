@@ -14,7 +14,7 @@ HOURS = (0.0, 5.0, 11.0, 13.5, 20.0)
 
 def tiny_profile(**settings) -> Profile:
     """Networks of sizes that all these tests share, so that each kernel is compiled once; no tile is frames."""
-    sizes = {"hidden": 8, "uvt_resolution": 8, "uvt_slices": 4, "plane_columns": 16, "plane_rows": 8}
+    sizes = {"hidden": 16, "uvt_resolution": 8, "uvt_slices": 4, "plane_columns": 16, "plane_rows": 8}
     return Profile(name="tiny", **sizes | {"steps": 20, "samples": 128, "frames": "never"} | settings)
 
 

@@ -146,31 +146,9 @@ def test_decode_the_lightmap(kind, inputs, request, tmp_path):
     assert "48x40" in text and np.abs(decoded - mesh.lightmap)[mesh.mask].mean() < 0.1
 
 
-def test_decode_a_view(tiles, tmp_path):
-    words = ["decode", tiles, "--view", 2, "--views", 5, "--resolution", 48]
-    text = call(*words, "-o", tmp_path / "a.exr")
-    assert "48x48" in text
-    call(*words, "-o", tmp_path / "a.png")
-    light, _ = read_exr(tmp_path / "a.exr")
-    with Image.open(tmp_path / "a.png") as image:
-        picture = np.asarray(image)
-    assert picture.shape == (48, 48, 3)
-    hit = light.any(axis=2)
-    assert 0.02 < hit.mean() < 0.9 and (picture[~hit] == 128).all()
-    # Brighter light is a brighter pixel, up to a level: the EXR's halves are rounded, the picture's light isn't.
-    order = np.argsort(light[hit][:, 0])
-    assert (np.diff(picture[hit][order, 0].astype(int)) >= -1).all()
-
-
 def test_wrong_words_of_decode(tiles, tmp_path):
     words = ["decode", tiles, "-o"]
-    assert "expected .exr for a lightmap" in fails(*words, tmp_path / "a.png")
-    for option, value in (("--views", 50), ("--resolution", 512)):
-        # Also where it is the default of a view.
-        text = fails(*words, tmp_path / "a.exr", option, value)
-        assert f"{option}: has no meaning without --view" in text
-    assert "--view: expected 0 to 49, got 50" in fails(*words, tmp_path / "a.exr", "--view", 50)
-    assert "--view: expected 0 to 4, got 5" in fails(*words, tmp_path / "a.png", "--view", 5, "--views", 5)
+    assert "expected a name that ends in .exr" in fails(*words, tmp_path / "a.png")
     assert "--sheet: expected 0 to 0, got 1" in fails(*words, tmp_path / "a.exr", "--sheet", 1)
     assert os.listdir(tmp_path) == []
 

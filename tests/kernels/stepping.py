@@ -11,7 +11,6 @@ from benchmarks import plain
 from wlm import interop
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.trainer import Targets, Trainer
-from wlm_kernels.lightmap.matrix_step import fits_matrix_units
 
 TILE = 128
 
@@ -227,8 +226,7 @@ def tolerance(trainer: Trainer) -> float:
 
     float32 gives 1e-6. On a GPU's matrix units operands are half floats, which gives 1e-3.
     """
-    halves = trainer.device != "cpu" and fits_matrix_units(trainer.inputs, trainer.hidden.shape[-1])
-    return 5e-3 if halves else 2e-5
+    return 2e-5 if trainer.device == "cpu" else 5e-3
 
 
 def problem(trainer: Trainer, case: Case, quantised: bool) -> Problem:

@@ -13,6 +13,8 @@ import wlm
 from benchmarks.probe_exact import decode64
 from wlm.probe import Profile, compress, evaluate, from_arrays, load, open_checkpoint
 from wlm.probe.hours import hour_factors
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.walk import settle
 
 TIMES = (2.0, 5.0, 6.5, 9.0, 12.0, 15.0, 17.0, 18.5, 21.0)
 TINY = Profile(name="tiny", method="gaussians", ratio=0.1, latent=1, hidden=8, steps=60)
@@ -109,6 +111,26 @@ def test_decoding_at_any_time_is_the_mix_of_the_hours(day, model, device):
         one = model.at(time).decoder().decode_probes()
         np.testing.assert_allclose(one, wanted, rtol=0, atol=1e-2 * largest)
     assert "time: expected a finite number" in error_of(decoder.set_time, np.inf)
+
+
+def test_a_volume_follows_the_hour(model, device):
+    own = model.stored_positions()
+
+    def made(time):
+        decoder = model.decoder(device)
+        decoder.set_time(time)
+        volume = Volume(own, decoder.light(own), live=model.live, tolerance=0.0)
+        settle(volume, own.mean(0))
+        return decoder, volume
+
+    decoder, volume = made(2.0)
+    before = volume.read(own).values
+    decoder.set_time(13.0 + 24.0)
+    np.testing.assert_array_equal(volume.read(own).values, before)
+    settle(volume, own.mean(0))
+    wanted = made(13.0)[1].read(own)
+    np.testing.assert_allclose(volume.read(own).values, wanted.values, atol=1e-5 * np.abs(wanted.values).max())
+    assert np.abs(wanted.values - before).max() > 0.1 * np.abs(before).max() and decoder.time == 13.0
 
 
 def test_numbers_without_magnitudes_are_mixed_linearly(model):

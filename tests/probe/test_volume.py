@@ -119,6 +119,80 @@ def test_nearest_blocks_first(device: str):
     assert {level for _, level in ranks[:90]} == {0, 1, 2, 3}
 
 
+class _Day(StoredLight):
+    """Light of an hour: that of `_field` times the hour."""
+
+    def __init__(self, position: np.ndarray, device: str) -> None:
+        self._field = _field(position)
+        super().__init__(self._field, device)
+        self.set(1.0)
+
+    def set(self, hour: float) -> None:
+        self.time = hour
+        self._values.assign(self._field * np.float32(hour))
+
+
+@pytest.mark.parametrize("rows", [400, 32768])
+def test_blocks_of_another_hour_are_decoded_again(device: str, rows: int):
+    """Missing blocks come first, in every fourth frame last; those of another hour by distance over the hours between.
+    A block shows its light until then."""
+    position = _surface(60)
+    light, here, away = _Day(position, device), np.array([3.0, 1.0, -5.0]), np.array([17.0, 1.0, 9.0])
+    volume = Volume(position, light, block=2.0, side=SIDE, budget=20, rows=rows, tolerance=0.25)
+    _settle(volume, here)
+    plain = _there(volume)
+    hours = dict.fromkeys(plain, 1.0)
+
+    def frame(at: np.ndarray, hour: float) -> FrameStats:
+        light.set(hour)
+        stats, there = volume.update(at), _there(volume)
+        entered = [name for name in there if name not in hours]
+
+        def rank(name: tuple[int, ...]) -> float:
+            late, away = abs(hours[name] - hour), np.array(name[1:]) + 0.5 - at / volume.sizes[name[0]]
+            return float((away**2).sum()) / min(late, 24 - late) ** 2
+
+        old = [name for name in there if name in hours and 0.25 < abs(hours[name] - hour) < 23.75]
+        again = sorted(old, key=rank)[: 20 - len(entered)]
+        if volume.frame % 4 == 0:
+            assert len(again) == min(len(old), 20)
+        hours.update(dict.fromkeys(entered + again, hour))
+        for name, light_of in there.items():
+            np.testing.assert_allclose(light_of, plain.setdefault(name, light_of / hour) * hours[name], rtol=2e-3)
+        left = len(old) - len(again) + len(_names(position, volume) - set(there))
+        assert (stats.updated, stats.left) == (len(entered) + len(again), left)
+        return stats
+
+    assert len(plain) > 40 and (volume.rows == 400) == (rows == 400)
+    assert frame(here, 1.2).updated == 0  # within the tolerance
+    assert frame(here, 6.0).updated == 20
+    assert frame(here, 6.5).updated == 20  # the others are 5.5 h off, the first ones half an hour
+    assert frame(away, 6.7).queued > 0
+    while frame(away, 6.7).left:
+        pass
+    assert frame(away, 6.7).updated == 0
+    frame(away, 23.9)
+    light.set(0.1)  # near midnight 0.2 h lie between
+    assert volume.update(away).left < len(_there(volume)) - 20
+
+
+def test_a_full_pool_is_decoded_again(device: str):
+    """Blocks that find no row do not keep the others from it."""
+    position = _surface(60)
+    light = _Day(position, device)
+    volume = Volume(position, light, block=2.0, side=SIDE, budget=20, rows=80)
+    for _ in range(8):
+        assert volume.update([3.0, 1.0, -5.0]).left > 0
+    before = _there(volume)
+    light.set(6.0)
+    for _ in range(4 * 4):
+        volume.update([3.0, 1.0, -5.0])
+    after = _there(volume)
+    assert set(after) == set(before) and len(before) == 80
+    for name, light_of in after.items():
+        np.testing.assert_allclose(light_of, 6.0 * before[name], rtol=2e-3)
+
+
 def test_blocks_have_the_stated_light(device: str):
     """Those that few probes decide, against a dense system; of the others the probes are spread over their reach."""
     position = _surface(250)
@@ -391,6 +465,8 @@ def test_a_wrong_viewpoint_changes_nothing(viewpoint: object):
         {"side": 3},
         {"budget": 0},
         {"rows": 63},
+        {"tolerance": 12.5},
+        {"tolerance": math.nan},
     ],
 )
 def test_wrong_settings(settings: dict):

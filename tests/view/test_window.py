@@ -5,8 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-import torch
-from builders import atlas_meshes, atlas_models, day_scenes, probe_models, probe_sets, rooms, small_sets, smoke_plumes
+from builders import atlas_meshes, atlas_models, day_scenes, probe_models, probe_sets, rooms, small_sets
 from builders.contract import FILES
 from PIL import Image
 from typer.testing import CliRunner
@@ -14,14 +13,10 @@ from typer.testing import CliRunner
 import wlm
 from wlm.cli.app import app
 from wlm.errors import WlmError
-from wlm.formats.exr import write_exr
 from wlm.formats.gltf import document_from_arrays
 from wlm.formats.gltf_writer import write_glb
 from wlm.probe.data import save_probes
 from wlm.probe.sphere import basis
-from wlm.smoke.camera import Camera
-from wlm.smoke.data import write_six_way
-from wlm.smoke.lightmaps import SixWay
 from wlm.view import rendering
 from wlm.view.display import Display, heat
 from wlm.view.opening import open_scene
@@ -42,8 +37,8 @@ def show():
         pytest.skip(str(error))
     windows = []
 
-    def opened(*files, **options):
-        windows.append(Window(open_scene(files, **options), size=SIZE))
+    def opened(file, **options):
+        windows.append(Window(open_scene(file, **options), size=SIZE))
         return windows[-1]
 
     yield opened
@@ -152,8 +147,9 @@ def test_a_lightmap_is_upright_and_not_mirrored(tmp_path, show):
     light = np.zeros((64, 64, 3), np.float32)
     light[:16, :16] = [1, 0, 0]
     light[-16:, :16] = [0, 1, 0]
-    write_exr(tmp_path / "corner.exr", light)
-    picture = scene_of(show(tmp_path / "corner.exr"))
+    profile = small_sets.tiny_profile(frames="always")
+    wlm.lightmap.compress(wlm.lightmap.from_arrays(light[None], [0.0]), profile).save(tmp_path / "corner.wlm")
+    picture = scene_of(show(tmp_path / "corner.wlm"))
     red, green = (np.argwhere(picture[..., channel] > 150 + picture[..., 2]).mean(0) for channel in (0, 1))
     height, width = picture.shape[:2]
     assert red[0] < height / 2 and red[1] < width / 2 and green[0] > height / 2 and green[1] < width / 2
@@ -175,7 +171,7 @@ def test_atlases_of_each_method(kind, tmp_path, show):
     assert np.abs(np.split(scene_of(window)[40:], 3, axis=1)[0] - decoded).max() > 20
 
 
-def test_probes_as_balls_gaussians_and_a_volume(tmp_path, show):
+def test_probes_as_balls_and_gaussians(tmp_path, show):
     model = probe_models.whole_model(probes=60, positions=True)
     model.save(tmp_path / "room.wlm")
     places = model.stored_positions()
@@ -184,10 +180,8 @@ def test_probes_as_balls_gaussians_and_a_volume(tmp_path, show):
     floor = np.array([low, [high[0], low[1], low[2]], [low[0], low[1], high[2]]])
     document, _ = document_from_arrays(floor, np.array([[0, 2, 1]]), np.zeros((3, 2)), "floor")
     write_glb(tmp_path / "floor.glb", document, [], 0)
-    np.savez(tmp_path / "walk.npz", position=low + (high - low) * np.array([[0.2], [0.5], [0.8]]))
-    options = {"mesh": tmp_path / "floor.glb", "walk": tmp_path / "walk.npz"}
-    window = show(tmp_path / "room.wlm", original=tmp_path / "room.npz", **options)
-    assert window.scene.views == ("balls", "gaussians", "volume")
+    window = show(tmp_path / "room.wlm", original=tmp_path / "room.npz", mesh=tmp_path / "floor.glb")
+    assert window.scene.views == ("balls", "gaussians")
     views = {}
     for key, name in enumerate(window.scene.views, 1):
         window.press(str(key))
@@ -196,15 +190,8 @@ def test_probes_as_balls_gaussians_and_a_volume(tmp_path, show):
         shown = {
             s.name for s in window.sliders.values() if window._widgets[s.name][0].GetRepresentation().GetVisibility()
         }
-        assert shown - {"exposure", "error"} == {"balls": set(), "gaussians": {"sigma"}, "volume": {"frame"}}[name]
+        assert shown - {"exposure", "error"} == {"balls": set(), "gaussians": {"sigma"}}[name]
     assert np.abs(views["balls"] - views["gaussians"]).max() > 40
-    assert np.abs(views["gaussians"] - views["volume"]).max() > 40
-    assert "blocks" in window._texts["caption"].GetInput()
-    before = scene_of(window)
-    drag(window, "frame", 2.2)
-    assert window.state.values["frame"] == 2.0 and changed(window, before)
-    assert "frame 2 of " in label(window, "frame")
-    window.choose("gaussians")
     before = scene_of(window)
     drag(window, "sigma", 0.3)
     assert changed(window, before)
@@ -215,12 +202,17 @@ def lit_from(direction):
     return (basis(np.asarray(direction, np.float64)[None], 9)[0][:, None] * np.ones(3)).ravel()
 
 
+def write_probes(path, position, values):
+    """Writes a model of a few probes, which it stores almost exactly, with their positions."""
+    wlm.probe.compress(wlm.probe.from_arrays(position, values), "pca", positions=True).save(path)
+
+
 @pytest.mark.parametrize(("up", "above"), [("y", (0, 1, 0)), ("z", (0, 0, 1))])
 def test_a_ball_is_bright_on_the_side_of_its_light(up, above, tmp_path, show):
     for sign in (1, -1):
         values = lit_from(sign * np.array(above))[None]
-        save_probes(tmp_path / "one.json", np.zeros((1, 3)), values)
-        ball = scene_of(show(tmp_path / "one.json", up=up)).mean(2)
+        write_probes(tmp_path / "one.wlm", np.zeros((1, 3)), values)
+        ball = scene_of(show(tmp_path / "one.wlm", up=up)).mean(2)
         inside = np.abs(ball - ball[0, 0]) > 3
         rows = np.flatnonzero(inside.any(1))
         upper, lower = (part[here].mean() for part, here in ((ball[r], inside[r]) for r in np.array_split(rows, 2)))
@@ -234,8 +226,8 @@ def test_balls_are_where_their_probes_are(up, axes, tmp_path, show):
     colours = np.array([[1, 1, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float64)
     values = np.zeros((4, 9, 3))
     values[:, 0] = colours * np.sqrt(4 * np.pi)
-    save_probes(tmp_path / "four.json", np.concatenate([np.zeros((1, 3)), 4 * axes]), values.reshape(4, 27))
-    picture = scene_of(show(tmp_path / "four.json", up=up))
+    write_probes(tmp_path / "four.wlm", np.concatenate([np.zeros((1, 3)), 4 * axes]), values.reshape(4, 27))
+    picture = scene_of(show(tmp_path / "four.wlm", up=up))
     origin, right, above, other = (
         np.argwhere((np.abs(picture - 255 * colour) < 40).all(2)).mean(0) for colour in colours
     )
@@ -251,35 +243,11 @@ def test_a_machine_without_opengl_is_one_line_and_no_crash(trial, tmp_path, monk
     monkeypatch.setattr(rendering, "_TRIAL", trial)
     monkeypatch.setattr(rendering, "_TRIAL_SECONDS", 1.0)
     rendering.require_opengl.cache_clear()
-    save_probes(tmp_path / "one.json", np.zeros((1, 3)), lit_from((0, 1, 0))[None])
+    write_probes(tmp_path / "one.wlm", np.zeros((1, 3)), lit_from((0, 1, 0))[None])
     with pytest.raises(WlmError, match="found no OpenGL that works") as error:
-        Window(open_scene([tmp_path / "one.json"]))
+        Window(open_scene(tmp_path / "one.wlm"))
     rendering.require_opengl.cache_clear()
     assert "\n" not in str(error.value)
-
-
-def six_way(path, light=1.0, size=24):
-    """Lightmaps that differ, with a camera that looks along -z."""
-    maps = torch.arange(1.0, 7.0)[:, None, None].expand(6, size, size) / 10.0 * light
-    camera = Camera.look_at((0.0, 0.0, 1.0), np.zeros(3), extent=1.0, height=size, width=size)
-    write_six_way(path, SixWay(maps.contiguous(), torch.full((size, size), 0.3), camera=camera))
-
-
-def test_six_way_lightmaps_turn_with_the_light(tmp_path, show):
-    for number, light in enumerate((1.0, 0.3), 1):
-        six_way(tmp_path / f"six_{number:04d}.exr", light)
-    window = show(tmp_path)
-    assert window.scene.panels == ("smoke", "lightmaps") and window.scene.plays == "frame"
-    seen = []
-    for turn, height in ((90.0, 0.0), (-90.0, 0.0), (0.0, 90.0), (0.0, -90.0), (0.0, 0.0), (180.0, 0.0)):
-        window.set("turn", turn)
-        window.set("height", height)
-        seen.append(scene_of(window)[40:, : SIZE[0] // 2].mean())
-    assert seen == sorted(seen)  # right, left, top, bottom, front, back, as dark to bright as they were made
-    before = scene_of(window)
-    assert label(window, "frame") == "frame 1 of 2"
-    drag(window, "frame", 2.0)
-    assert scene_of(window).mean() < before.mean()
 
 
 def test_the_error_is_that_of_the_charts_and_has_the_score_of_evaluate(lightmaps, tmp_path, show):
@@ -328,26 +296,19 @@ def test_what_has_no_picture_is_said_in_one_line(lightmaps, tmp_path):
     probe_models.whole_model(positions=False).save(tmp_path / "probe.wlm")
     probe_models.whole_model(outputs=5, positions=True).save(tmp_path / "five.wlm")
     small_sets.write_set(tmp_path / "half", small_sets.moving_light(height=64))
-    smoke_plumes.write_frames(tmp_path / "jet")
-    (tmp_path / "bad.npz").write_bytes(b"PK\x03\x04 no archive")
-    six_way(tmp_path / "a.exr", size=8)
-    six_way(tmp_path / "b.exr", size=4)
     four = lightmaps / "four.wlm"
-    for files, options, said in (
-        ([tmp_path / "bad.npz"], {}, "bad.npz"),
-        ([FILES / "smoke.wlm"], {}, "no picture of its own"),
-        ([four], {"key": "sh"}, "--key has no meaning"),
-        ([four], {"mesh": tmp_path / "absent.glb"}, "absent.glb"),
-        ([four], {"original": tmp_path / "half"}, "half: expected a lightmap of 256x256, found 128x64"),
-        ([tmp_path / "probe.wlm"], {}, "--original"),
-        ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
-        ([tmp_path / "a.exr", tmp_path / "b.exr"], {}, "expected 8x8 pixels as the first frame, found 4x4"),
-        ([tmp_path / "jet"], {}, "drawn by wlm smoke light"),
-        ([lightmaps / "quad.glb"], {}, "quad.glb: a mesh has no light of its own"),
-        ([__file__], {}, "expected a .wlm, a lightmap"),
+    for file, options, said in (
+        (FILES / "smoke.wlm", {}, "no picture of its own"),
+        (four, {"key": "sh"}, "--key has no meaning"),
+        (four, {"mesh": tmp_path / "absent.glb"}, "absent.glb"),
+        (four, {"original": tmp_path / "half"}, "half: expected a lightmap of 256x256, found 128x64"),
+        (tmp_path / "probe.wlm", {}, "--original"),
+        (tmp_path / "five.wlm", {}, "spherical harmonics"),
+        (lightmaps / "quad.glb", {}, "quad.glb: expected an artifact"),
+        (tmp_path / "none.wlm", {}, "none.wlm"),
     ):
         with pytest.raises(WlmError, match=re.escape(said)) as caught:
-            open_scene(files, **options)
+            open_scene(file, **options)
         assert "\n" not in str(caught.value)
 
 
@@ -357,9 +318,9 @@ def test_the_command_refuses_in_one_line(lightmaps, tmp_path, monkeypatch, show)
     monkeypatch.delenv("DISPLAY", raising=False)
     for options, said in (
         ([], "expected a display"),
-        (["--set", "frame=2", *out], "frame has no meaning"),
+        (["--set", "sigma=2", *out], "sigma has no meaning"),
         (["--mesh", str(lightmaps / "quad.glb"), "--set", "turn=inf", *out], "turn: expected a finite number"),
-        (["--view", "volume", *out], "--view: expected light or tiles"),
+        (["--view", "balls", *out], "--view: expected light or tiles"),
     ):
         result = CliRunner().invoke(app, ["view", str(lightmaps / "four.wlm"), *options])
         assert result.exit_code == 2 and said in result.stderr and result.stderr.count("\n") == 1, result.output

@@ -134,24 +134,13 @@ def evaluate(
 
 def decode(
     file: opt.ModelFile,
-    output: Annotated[Path, opt.output_option("OUT", "A .exr; with --view also a .png.")],
+    output: Annotated[Path, opt.output_option("OUT.exr", "The lightmap to write.")],
     sheet: Annotated[int, typer.Option(min=0, help="Number of the lightmap in the list of wlm info, from 0.")] = 0,
     state: Annotated[float, typer.Option(min=0.0, help="Number of the state, from 0; 1.5 mixes states 1 and 2.")] = 0.0,
-    view: Annotated[
-        int | None, typer.Option(min=0, help="Number, from 0, of a camera of wlm evaluate: draw its view instead.")
-    ] = None,
-    views: _Views = None,
-    resolution: _Resolution = None,
     device: opt.Device = "cpu",
 ) -> None:
-    """Decode a lightmap in its original layout, or draw a view of the scene. The original files are not needed."""
-    console.check_output(output, ".exr", ".png")
-    if view is None:
-        if output.suffix.lower() == ".png":
-            raise WlmError(f"{output}: expected .exr for a lightmap; a .png needs --view")
-        for option, value in (("views", views), ("resolution", resolution)):
-            if value is not None:
-                raise WlmError(f"--{option}: has no meaning without --view")
+    """Decode a lightmap in its original layout. The original files are not needed."""
+    console.check_output(output, ".exr")
     console.quiet_warp()
     from wlm.formats.exr import write_exr
     from wlm.system import load
@@ -160,28 +149,10 @@ def decode(
     for option, value, most in (("sheet", sheet, len(model.sheets)), ("state", state, len(model.states))):
         if value > most - 1:
             raise WlmError(f"--{option}: expected 0 to {most - 1}, got {value:g}")
-    decoder = model.decoder(device)
-    if view is None:
-        picture, covered = decoder.lightmap(sheet, state), model.scene.sheets[sheet].mask
-        write_exr(output, picture)
-    else:
-        from wlm.atlas.views import scene_views
-        from wlm.view.atlas import draw
-        from wlm.view.display import white_of
-        from wlm.view.pictures import encode, save_png
-
-        cameras = scene_views(model.scene, views or _VIEWS)
-        if view >= len(cameras):
-            raise WlmError(f"--view: expected 0 to {len(cameras) - 1}, got {view}")
-        side = resolution or _RESOLUTION
-        pictures, covered = draw(model.scene, {"ours": decoder}, cameras[view], side, decoder.device, state)
-        picture = pictures["ours"]
-        if output.suffix.lower() == ".png":
-            save_png(output, encode(picture, covered, white_of(picture[covered])))
-        else:
-            write_exr(output, picture)
-    facts = {"file": output, "size": f"{picture.shape[1]}x{picture.shape[0]}", "covered": f"{covered.mean():.1%}"}
-    inside = picture[covered]
+    light, mask = model.decoder(device).lightmap(sheet, state), model.scene.sheets[sheet].mask
+    write_exr(output, light)
+    facts = {"file": output, "size": f"{light.shape[1]}x{light.shape[0]}", "covered": f"{mask.mean():.1%}"}
+    inside = light[mask]
     if inside.size:
         facts |= {"mean": float(inside.mean()), "largest": float(inside.max())}
     console.show_facts(str(file), facts)

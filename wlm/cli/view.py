@@ -7,28 +7,22 @@ from typing import Annotated, Literal
 import typer
 from rich.markup import escape
 
-from wlm.cli.console import check_output, quiet_warp, running, show, table
-from wlm.cli.options import Key, Original, SceneFile, Time, Up
+from wlm.cli import options as opt
+from wlm.cli.console import check_output, quiet_warp, show, table
 from wlm.errors import WlmError
 
-_SLIDERS = ("hour", "frame", "turn", "height", "sigma", "exposure", "error")
+_SLIDERS = ("hour", "sigma", "exposure", "error")
 
 
 def view(
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE...",
-            help="A .wlm, an input of wlm compress, or six-way lightmaps (one .exr a frame).",
-        ),
-    ],
-    mesh: SceneFile = None,
-    original: Original = None,
-    key: Key = None,
-    time: Time = None,
+    file: opt.ModelFile,
+    mesh: opt.SceneFile = None,
+    original: opt.Original = None,
+    key: opt.Key = None,
+    time: opt.Time = None,
     view: Annotated[
         str | None,
-        typer.Option(help="Picture to show: light or tiles of lightmaps; balls, gaussians or volume of probes."),
+        typer.Option(help="Picture to show: light or tiles of lightmaps; balls or gaussians of probes."),
     ] = None,
     flat: Annotated[bool, typer.Option("--flat", help="Show a lightmap as a texture, not on its mesh.")] = False,
     sliders: Annotated[
@@ -36,36 +30,24 @@ def view(
         typer.Option(
             "--set",
             metavar="NAME=VALUE",
-            help="Slider or setting, repeatable: hour=18.5 of lightmaps; frame=1 of smoke or of --walk; turn=DEGREES "
-            "and height=DEGREES of the light of smoke, else turn of the camera; sigma=SIZE of Gaussians in standard "
-            "deviations; exposure=STOPS; error=FACTOR, 1 to 64; "
-            "block=SIDE of the finest blocks of the volume of probes.",
+            help="Slider or setting, repeatable: hour=18.5 of lightmaps; turn=DEGREES of the camera; "
+            "sigma=SIZE of Gaussians in standard deviations; exposure=STOPS; error=FACTOR, 1 to 64.",
         ),
     ] = None,
     tone: Annotated[
         Literal["clamped", "filmic"],
         typer.Option(help="Light above white: cut off (clamped), or up to 4 times white compressed (filmic)."),
     ] = "clamped",
-    walk: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Viewpoints for --view volume: a JSON list of [x, y, z], or a .npz with the array position.",
-        ),
-    ] = None,
-    up: Up = "y",
-    rate: Annotated[float, typer.Option(help="Frames per second while smoke or a walk is played.")] = 24.0,
+    up: opt.Up = "y",
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the window in pixels.")] = "1280x720",
     screenshot: Annotated[
         Path | None,
         typer.Option(metavar="OUT.png", help="Write a picture instead of opening a window; needs no display."),
     ] = None,
 ) -> None:
-    """Show lightmaps, probes or six-way lightmaps in a window; with --original, beside the original and the error."""
+    """Show compressed lightmaps or probes in a window; with --original, beside the original and the error."""
     pixels = _size(size)
     values = _values(sliders or ())
-    if not 0 < rate <= 1000:
-        raise WlmError(f"--rate: expected a number above 0, at most 1000, got {rate:g}")
     if screenshot is not None:
         check_output(screenshot, ".png")
     quiet_warp()
@@ -74,18 +56,15 @@ def view(
     from wlm.view.window import Window
 
     need("pyvista", "view")
-    options = {"mesh": mesh, "original": original, "key": key, "time": time, "walk": walk, "flat": flat, "up": up}
-    options["block"] = values.pop("block", None)
-    with running("view") as progress:
-        many = len(files) > 1 or files[0].is_dir()
-        scene = open_scene(files, **options, progress=progress if many else None)
-    window = Window(scene, size=pixels, rate=rate, off_screen=screenshot is not None)
+    options = {"mesh": mesh, "original": original, "key": key, "time": time, "flat": flat, "up": up}
+    scene = open_scene(file, **options)
+    window = Window(scene, size=pixels, off_screen=screenshot is not None)
     try:
         window.tone(tone)
-        if view is not None or walk is not None:
-            window.choose(view or "volume")
+        if view is not None:
+            window.choose(view)
         window.look()
-        if "turn" in values and "turn" not in window.sliders and not scene.flat:
+        if "turn" in values and not scene.flat:
             window.turn(values.pop("turn"))
         for name, value in values.items():
             window.set(name, value)
@@ -108,7 +87,7 @@ def _values(texts: Sequence[str]) -> dict[str, float]:
             values[name] = float(number)
         except ValueError:
             name = ""
-        if name not in (known := (*_SLIDERS, "block")):
+        if name not in (known := (*_SLIDERS, "turn")):
             raise WlmError(f"--set: expected NAME=NUMBER with a name of {', '.join(known)}, got {text!r}")
     return values
 

@@ -295,7 +295,7 @@ def _lights(path: Path) -> Finding:
 def _positions(path: Path) -> Finding:
     from wlm.probe.data import load_positions
 
-    use = "for --positions of wlm decode and --walk of wlm view"
+    use = "for --positions of wlm decode"
     return Finding(path, f"{count_of(load_positions(path), 'position')} without light, {use}")
 
 

@@ -22,6 +22,7 @@ from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, check_in
 from wlm.lightmap.trainer import Targets, TileJob
 from wlm.system import Meter, OnProgress
 from wlm.workers import each
+from wlm_kernels.lightmap.matrix_step import WIDTHS
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE
 """Number of texels, counted at each time, in a batch: 64 tiles at 26 times, 330 MB of training data."""
@@ -76,6 +77,8 @@ def compress(
     """
     worker_devices(device, workers, cluster)  # an error before the set is classified
     profile = Profile.load(profile).override(settings)
+    if device != "cpu" and profile.hidden not in WIDTHS:
+        raise WlmError(f"hidden: expected {', '.join(map(str, WIDTHS))} on a GPU, got {profile.hidden}")
     if tiles is not None and len(lightmaps.sheets) > 1:
         raise WlmError(f"{lightmaps.name}: tiles: expected a set with one sheet, found {len(lightmaps.sheets)}")
     fits = {sheet: SheetFit(own, profile.for_sheet(sheet), tiles, progress) for sheet, own in lightmaps.sheets.items()}

@@ -26,7 +26,7 @@ class Profile(Settings):
     FILES: ClassVar[str] = "lightmap"
 
     hidden: int = Field(16, ge=4, le=128)
-    """Units in each of the two hidden layers of the network."""
+    """Units in each of the two hidden layers of the network; a GPU fits networks of 16, 32, 48 and 64 units."""
     uvt_resolution: int = Field(32, ge=4, le=128, multiple_of=4)
     """Size of the feature map F_uvt along u and along v, in texels."""
     uvt_slices: int = Field(12, ge=1, le=_MOST_ALONG_TIME)

@@ -1,8 +1,8 @@
 """Decodes to 32 bits per texel at run time: all data stays on the device, and a decode only launches kernels.
 
 `wlm.lightmap.Decoder` returns arrays on the host; the decoders of this module are for a renderer's loop. Each decodes
-the tiles of one kind of one sheet, without filling gaps between charts: a `StripDecoder`, or on CUDA a `MatrixDecoder`
-for wide networks, an `ExactDecoder` for static tiles, and a `FrameDecoder`.
+the tiles of one kind of one sheet, without filling gaps between charts: an `ExactDecoder`, on CUDA a `MatrixDecoder`
+for dynamic tiles, and a `FrameDecoder`.
 
 `MapDecoder` combines them to fill one texture with the whole map: RGB9E5, which needs no bounds, so that a filter may
 read across two tiles. It adds light groups, fills gaps between charts, and its mips average only texels inside charts.
@@ -88,7 +88,12 @@ class _MapDecoder(RuntimeDecoder):
         kind: TileKind = TileKind.DYNAMIC,
         shared: bool = False,
     ) -> None:
-        """Uploads the tiles of one kind, STATIC or DYNAMIC; for other arguments and errors see `StripDecoder`."""
+        """Uploads the tiles of one kind, STATIC or DYNAMIC, and allocates all buffers; the time is initially the first
+        stored one.
+
+        `gelu` is a variant to use instead of the model's, see `wlm_kernels.mlp`; with `shared`, texels are linear
+        radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
+        """
         device, self.gelu = device_of(device), gelu_of(model, gelu)
         self._tiles = MapTiles(model, kind, device, self.gelu)
         self._states: list[decode_kernels.TimeState | None] = [None, None]
@@ -100,56 +105,6 @@ class _MapDecoder(RuntimeDecoder):
             self._states[i] = self._tiles.state(stamp, self._states[i])
 
 
-class _OneTimeDecoder(_MapDecoder):
-    """Base class of decoders whose kernels decode one time: between two, a last kernel interpolates their results."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self._early, self._late = self._empty(), self._empty()
-
-    def decode(self) -> None:
-        early, late = self._states
-        if len(self._reads) == 1:
-            self._launch(early, self.out)
-            return
-        self._launch(early, self._early)
-        self._launch(late, self._late)
-        share, arrays = self._reads[1][1], (self._early, self._late, self.out)
-        if self.shared:
-            *both, out = (array.flatten() for array in arrays)
-            output.blend_shared(*both, share, out)
-        else:
-            *both, out = (array.reshape((len(self.numbers), -1)) for array in arrays)
-            output.blend(*both, early.inverse_peak, late.inverse_peak, share, self.model.profile.gamma, out)
-
-    def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
-        raise NotImplementedError
-
-
-class StripDecoder(_OneTimeDecoder):
-    """Fast decoder of dynamic tiles, with one of the variants of GELU: one thread decodes four texels
-    (neural-dynamic-gi, section 3.5)."""
-
-    def __init__(self, model: SheetModel, device: str = "cpu", gelu: str | None = None, shared: bool = False) -> None:
-        """Uploads the dynamic tiles of a sheet and allocates all buffers; the time is initially the first stored one.
-
-        `gelu` is a variant to use instead of the model's, see `wlm_kernels.mlp`; with `shared`, texels are linear
-        radiance as RGB9E5 instead of 8-bit colour relative to `bounds`.
-        """
-        super().__init__(model, device, gelu, TileKind.DYNAMIC, shared)
-        n, resolution = len(self.numbers), model.profile.uvt_resolution
-        self._kernels = decode_kernels.strip_kernels(model.profile.hidden, self.gelu, shared)
-        self._scratch = (
-            wp.empty((n, resolution, resolution), dtype=wp.vec4, device=self.device),
-            wp.empty((n, model.profile.hidden, TILE), dtype=float, device=self.device),
-            wp.empty((n, TILE), dtype=wp.vec2, device=self.device),
-        )
-
-    def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
-        tiles = self._tiles
-        self._kernels.decode(*tiles.arguments, state, *self._scratch, tiles.places, self._rows, out)
-
-
 class MatrixDecoder(_MapDecoder):
     """Fast decoder of dynamic tiles on a GPU's matrix units (tensor cores), in half floats, with GELU by its tanh form.
 
@@ -157,7 +112,7 @@ class MatrixDecoder(_MapDecoder):
     """
 
     def __init__(self, model: SheetModel, device: str = "cuda", shared: bool = False) -> None:
-        """Uploads the dynamic tiles of a sheet; for the arguments see `StripDecoder`."""
+        """Uploads the dynamic tiles of a sheet; for the arguments see `ExactDecoder`."""
         name, profile = device_of(device), model.profile
         if name == "cpu":
             raise WlmError("device: expected cuda for MatrixDecoder, got cpu")
@@ -179,8 +134,30 @@ class MatrixDecoder(_MapDecoder):
         self._kernels.decode(stored, self._packed, hidden, states, share, places, self._rows, self.out)
 
 
-class ExactDecoder(_OneTimeDecoder):
-    """Plain decoder of static or dynamic tiles: a thread decodes a texel, in the training's order of operations."""
+class ExactDecoder(_MapDecoder):
+    """Plain decoder of static or dynamic tiles: a thread decodes a texel, in the training's order of operations.
+
+    Between two stored times, a last kernel interpolates the results of both.
+    """
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._early, self._late = self._empty(), self._empty()
+
+    def decode(self) -> None:
+        early, late = self._states
+        if len(self._reads) == 1:
+            self._launch(early, self.out)
+            return
+        self._launch(early, self._early)
+        self._launch(late, self._late)
+        share, arrays = self._reads[1][1], (self._early, self._late, self.out)
+        if self.shared:
+            *both, out = (array.flatten() for array in arrays)
+            output.blend_shared(*both, share, out)
+        else:
+            *both, out = (array.reshape((len(self.numbers), -1)) for array in arrays)
+            output.blend(*both, early.inverse_peak, late.inverse_peak, share, self.model.profile.gamma, out)
 
     def _launch(self, state: decode_kernels.TimeState, out: wp.array) -> None:
         self._tiles.launch(state, self._rows, 1 + self.shared, out)
@@ -190,7 +167,7 @@ class FrameDecoder(RuntimeDecoder):
     """Decoder of tiles that are stored as frames: one thread reads one texel of one frame, or of two to interpolate."""
 
     def __init__(self, model: SheetModel, device: str = "cpu", shared: bool = False) -> None:
-        """Uploads the frames of a sheet and allocates all buffers; for the arguments see `StripDecoder`."""
+        """Uploads the frames of a sheet and allocates all buffers; for the arguments see `ExactDecoder`."""
         device = device_of(device)
         self._tiles = FrameTiles(model, device)
         self._inverse = wp.empty(len(self._tiles.numbers), dtype=float, device=device)
@@ -204,13 +181,13 @@ class FrameDecoder(RuntimeDecoder):
         self._tiles.decode(self._time, self._rows, self.out, None if self.shared else self._inverse)
 
 
-def fast_decoder(model: SheetModel, device: str = "cpu", shared: bool = False) -> StripDecoder | MatrixDecoder:
+def fast_decoder(model: SheetModel, device: str = "cpu", shared: bool = False) -> ExactDecoder | MatrixDecoder:
     """Makes the fastest decoder of dynamic tiles: on CUDA a `MatrixDecoder` if network width and GELU allow it."""
     device = device_of(device)
     tanh = device != "cpu" and model.profile.gelu == "tanh"
     if tanh and model.profile.hidden % 16 == 0:
         return MatrixDecoder(model, device, shared)
-    return StripDecoder(model, device, "fast" if tanh else None, shared)
+    return ExactDecoder(model, device, "fast" if tanh else None, shared=shared)
 
 
 def runtime_decoders(model: SheetModel, device: str = "cpu", shared: bool = False) -> list[RuntimeDecoder]:

@@ -251,10 +251,8 @@ void wlm_lightmap_begin(ivec2 texel, int index)
     ivec2 place = texel / {TILE};
     vec4 tile = wlm_lightmap_entry({head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD);
     int kind = int(tile.x);
-    int count = kind == 1 ? {static} : kind == 2 ? {weights} : 0;
-    for (int i = index; i < count; i += {invocations})
-        wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i);
-    barrier();
+    int count = kind == 1 || kind == 2 ? {weights} : 0;
+{copies}    barrier();
 }}
 
 // Colours of two texels of a tile of maps, {below} rows apart: `record` is the position of its record, `inner` the
@@ -267,9 +265,7 @@ void wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner, out vec3 colour[2])
     ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
     vec4 uv0 = texelFetch(WLM_LIGHTMAP_UV, at, 0);
     vec4 uv1 = texelFetch(WLM_LIGHTMAP_UV, at + ivec2(0, {below}), 0);
-    int second = 5 * {fours};
-{inputs}    int third = second + {second_size};
-    vec4 w0;
+{inputs}    vec4 w0;
     vec4 w1;
     vec4 w2;
     vec4 w3;
@@ -279,9 +275,9 @@ void wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner, out vec3 colour[2])
         vec4 a1 = a0;
 {sums}        a0 = wlm_gelu(a0);
         a1 = wlm_gelu(a1);
-        int w = second + 4 * {fours} * i;
+        int w = {second} + 4 * {fours} * i;
 {products}    }}
-    vec4 y0 = wlm_lightmap_weights[third + 4 * {fours}];
+    vec4 y0 = wlm_lightmap_weights[{last}];
     vec4 y1 = y0;
     vec4 a0;
     vec4 a1;
@@ -292,22 +288,36 @@ void wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner, out vec3 colour[2])
 }}
 """
 
-_PAIR_INPUTS = """\
-    vec4 uvt0 = vec4(0.0, 0.0, 0.0, 0.0);
-    vec4 uvt1 = uvt0;
-    vec4 planes0 = uvt0;
-    vec4 planes1 = uvt0;
-    if (int(tile.x) == 2) {{
-        vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
-        vec2 under = (vec2(inner) + vec2(0.5, 0.5 + {below}.0)) / {TILE}.0;
-        vec2 ut = wlm_lightmap_plane(2 * row, place.x);
-        uvt0 = wlm_lightmap_volume(row, place);
-        uvt1 = wlm_lightmap_volume(row, under);
-        planes0 = vec4(ut, wlm_lightmap_plane(2 * row + 1, place.y));
-        planes1 = vec4(ut, wlm_lightmap_plane(2 * row + 1, under.y));
-        // The encoded time is in the bias. Of a static tile these inputs are 0, whatever their weights.
-        second = 17 * {fours};
+_COPIES = {
+    False: """\
+    for (int i = index; i < count; i += {invocations})
+        wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i);
+""",
+    True: """\
+    // A static tile has no weights of F_uvt, F_ut and F_vt: they are 0, so that all networks have the same places.
+    int skipped = kind == 1 ? {dynamic_size} : 0;
+    for (int i = index; i < count; i += {invocations}) {{
+        if (i < {static_size})
+            wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i);
+        else if (i < {static_size} + skipped)
+            wlm_lightmap_weights[i] = vec4(0.0, 0.0, 0.0, 0.0);
+        else
+            wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i - skipped);
     }}
+""",
+}
+"""Lines that copy a network, by whether a sheet has dynamic tiles."""
+
+_PAIR_INPUTS = """\
+    vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
+    vec2 under = (vec2(inner) + vec2(0.5, 0.5 + {below}.0)) / {TILE}.0;
+    // A static tile reads those of the first dynamic one, with weights that are 0. The encoded time is in the bias.
+    int own = int(tile.x) == 2 ? row : 0;
+    vec2 ut = wlm_lightmap_plane(2 * own, place.x);
+    vec4 uvt0 = wlm_lightmap_volume(own, place);
+    vec4 uvt1 = wlm_lightmap_volume(own, under);
+    vec4 planes0 = vec4(ut, wlm_lightmap_plane(2 * own + 1, place.y));
+    vec4 planes1 = vec4(ut, wlm_lightmap_plane(2 * own + 1, under.y));
 """
 
 _MAPPED_KIND = """\
@@ -428,8 +438,8 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
         "frames": columns(len(model.frames), TILE, TILE),
     }
     wide = fours(profile)
-    rest = (4 * wide + 6) * wide + 1  # fours of a network after the weights of its first layer
-    weights = (16 if dynamic else 4) * wide + rest
+    second = (17 if dynamic else 5) * wide  # fours of a network before the weights of its second layer
+    third = second + (4 * wide + 1) * wide
     gamma, inverse = (", ".join([repr(float(number))] * 3) for number in (profile.gamma, 1.0 / profile.gamma))
     words = {
         "TILE": TILE,
@@ -454,9 +464,11 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
         "planes_height": -(-2 * dynamic // across["planes"]) * profile.plane_rows,
         "reach": REACH,
         "beyond": 2 * REACH * REACH + 1,
-        "static": 4 * wide + rest,
-        "weights": weights,
-        "second_size": (4 * wide + 1) * wide,
+        "static_size": 4 * wide,
+        "dynamic_size": 12 * wide,
+        "second": second,
+        "last": third + 4 * wide,
+        "weights": third + 4 * wide + 1,
         "below": GROUP_SIZE[1],
         "invocations": GROUP_SIZE[0] * GROUP_SIZE[1],
         # repr gives the shortest decimals that are the number again, and always a point or an exponent.
@@ -473,12 +485,12 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
     if pairs:
         names.remove("valid")
         group, rows = GROUP_SIZE
-        use = _COMPUTED.format(columns=group, rows=rows, tall=2 * rows, kilobytes=f"{weights / 64:.0f}")
+        use = _COMPUTED.format(columns=group, rows=rows, tall=2 * rows, kilobytes=f"{words['weights'] / 64:.0f}")
         text = _head(names, words | {"use": use}) + maps + unmapped + linear
         inputs = ["uv", "uvt", "planes"] if maps else ["uv"]
-        lines = _pair_lines(wide, inputs)
-        more = _PAIR_INPUTS.format(**words) if maps else ""
-        text += _PAIR.format(gelu=_GELU[profile.gelu], inputs=more, **lines, **words)
+        lines = _pair_lines(wide, inputs, third)
+        lines |= {"copies": _COPIES[bool(maps)].format(**words), "inputs": _PAIR_INPUTS.format(**words) if maps else ""}
+        text += _PAIR.format(gelu=_GELU[profile.gelu], **lines, **words)
         return text + _PAIR_COLOURS.format(**words)
     text, kinds = _head(names, words | {"use": _DRAWN.format(last=f"wlm_{kind}")}) + maps, ""
     if "networks" in names:
@@ -490,7 +502,7 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
     return text + linear + _LAST.format(kind=kind)
 
 
-def _pair_lines(wide: int, inputs: list[str]) -> dict[str, str]:
+def _pair_lines(wide: int, inputs: list[str], third: int) -> dict[str, str]:
     """Returns the lines of two texels' network that repeat for each four units, each with its number."""
 
     def reads(first: str, at: int, apart: int) -> str:
@@ -504,9 +516,9 @@ def _pair_lines(wide: int, inputs: list[str]) -> dict[str, str]:
         made["sums"] += reads("i + ", 4 * k * wide, wide) + add("a0", f"{name}0") + add("a1", f"{name}1")
     for j in range(wide):
         two = (f"b[{2 * j}]", f"b[{2 * j + 1}]")
-        made["biases"] += f"    {two[0]} = wlm_lightmap_weights[third - {wide - j}];\n    {two[1]} = {two[0]};\n"
+        made["biases"] += f"    {two[0]} = wlm_lightmap_weights[{third - wide + j}];\n    {two[1]} = {two[0]};\n"
         made["products"] += reads("w + ", j, wide) + add(two[0], "a0") + add(two[1], "a1")
-        made["outputs"] += reads("third + ", 4 * j, 1)
+        made["outputs"] += reads("", third + 4 * j, 1)
         for t in range(2):
             made["outputs"] += f"    a{t} = wlm_gelu({two[t]});\n" + add(f"y{t}", f"a{t}")
     for name in ("sums", "products"):

@@ -20,6 +20,7 @@ class Decoder(ABC):
 
     Attributes:
         model, device: The model, and the name of its device.
+        time: Hour of the day of the light that is decoded, from 0 to 24; None for a model of one hour.
     """
 
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
@@ -35,6 +36,7 @@ class Decoder(ABC):
         """
         self.model, self.device = model, interop.check_device(device)
         self._arrays: list[wp.array] = []
+        self.time: float | None = float(model.times[0]) if len(model.times) else None
         self._hours: tuple[wp.array, wp.array] | None = None
         self._position = None
         if position is not None:
@@ -64,13 +66,15 @@ class Decoder(ABC):
         """Sets the time of the light that is decoded from now on; at first it is the model's first hour.
 
         Light between two hours is linear between theirs, and the day begins again after 24 hours. A model of one hour
-        has the same light at any time. On CUDA the work is queued, not awaited. A volume keeps the blocks that it has.
+        has the same light at any time. On CUDA the work is queued, not awaited. A volume decodes the blocks that it has
+        again, at most its budget in a frame, where their light is off by more than its `tolerance`.
 
         Raises:
             WlmError: The time is not finite.
         """
         check_time(time)
         if self._hours is not None:
+            self.time = time % DAY
             hours, mixed = self._hours
             mix_hours(hours, *neighbours(self.model.times, DAY, time), mixed)
 

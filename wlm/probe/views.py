@@ -109,17 +109,17 @@ def score_views(
         raise WlmError(f"views: expected at least 1, with 16 to 4096 pixels a side, got {views} with {resolution}")
     live = np.flatnonzero(probes.live)
     scene = _Scene(probes, decoded, live, count, device)
-    things = {"balls": scene.balls()} | ({} if geometry is None else {"mesh": _split(geometry)})
+    things = {"balls": ball_mesh(probes.position[live])} | ({} if geometry is None else {"mesh": _split(geometry)})
     exposure = ball_exposure(probes.values[live].reshape(len(live), count, 3))
     errors = {(thing, kind): Pictures(structural=True) for thing in things for kind in KINDS}
     meter = Meter(progress, "views", views)
-    for number, (eye, forward) in enumerate(_viewers(probes.position[live], views, up)):
+    for number, (eye, forward) in enumerate(viewers(probes.position[live], views, up)):
         scene.stand(eye)
         for thing, mesh in things.items():
-            seen, place, normal, owner = _look(mesh, eye, forward, up, resolution, device)
+            seen, place, normal, owner = look(mesh, eye, forward, up, resolution, device)
             if not seen.any():
                 continue
-            first, *others = (_shown(light, normal, seen, exposure) for light in scene.lights(place, normal, owner))
+            first, *others = (shown(light, normal, seen, exposure) for light in scene.lights(place, normal, owner))
             for kind, picture in zip(KINDS, others, strict=True):
                 errors[thing, kind].add(first, picture, seen)
         if meter.due(number + 1):
@@ -131,18 +131,28 @@ def score_views(
 
 
 @dataclass(frozen=True, eq=False)
-class _Mesh:
-    """Triangles without shared corners, vertex normals float64 [V, 3], and each triangle's probe (index or -1)."""
+class Mesh:
+    """Triangles without shared corners, vertex normals float64 [V, 3], and each triangle's live probe (index or -1)."""
 
     position: np.ndarray
     normal: np.ndarray
     owner: np.ndarray
 
 
-def _split(geometry: Geometry) -> _Mesh:
+def ball_mesh(position: np.ndarray) -> Mesh:
+    """Returns a mesh of separate balls at a subset of live probes [V, 3], evenly spaced by index."""
+    chosen = np.unique(np.linspace(0, len(position) - 1, min(len(position), _BALLS)).astype(int))
+    directions = icosphere(subdivisions=_SUBDIVISIONS).triangles.reshape(-1, 3)
+    centres = position[chosen]
+    points = centres[:, None] + ball_radius(centres) * directions
+    owner = chosen.repeat(len(directions) // 3)
+    return Mesh(points.reshape(-1, 3), np.tile(directions, (len(chosen), 1)), owner)
+
+
+def _split(geometry: Geometry) -> Mesh:
     corners = geometry.position.astype(np.float64)[geometry.triangle]
     normal = unit_or_zero(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-    return _Mesh(corners.reshape(-1, 3), normal.repeat(3, 0), np.full(len(corners), -1))
+    return Mesh(corners.reshape(-1, 3), normal.repeat(3, 0), np.full(len(corners), -1))
 
 
 class _Scene:
@@ -157,15 +167,6 @@ class _Scene:
             Volume(self._position, StoredLight(values, device), normal=self._normal, budget=_BUDGET)
             for values in self._values
         ]
-
-    def balls(self) -> _Mesh:
-        """Returns a mesh of separate balls at a subset of the probes, evenly spaced by index."""
-        chosen = np.unique(np.linspace(0, len(self._position) - 1, min(len(self._position), _BALLS)).astype(int))
-        directions = icosphere(subdivisions=_SUBDIVISIONS).triangles.reshape(-1, 3)
-        centres = self._position[chosen]
-        points = centres[:, None] + ball_radius(centres) * directions
-        owner = chosen.repeat(len(directions) // 3)
-        return _Mesh(points.reshape(-1, 3), np.tile(directions, (len(chosen), 1)), owner)
 
     def stand(self, eye: np.ndarray) -> None:
         """Moves the volumes to a viewer's position."""
@@ -190,7 +191,8 @@ class _Scene:
             yield values.reshape(len(place), self._count, 3).astype(np.float64)
 
 
-def _viewers(position: np.ndarray, views: int, up: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def viewers(position: np.ndarray, views: int, up: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields the position and the viewing direction of each viewer, for live probes at positions [V, 3]."""
     plan = [axis for axis in range(3) if axis != up]
     for number, eye in enumerate(camera_path(position, views, up=up)):
         angle = number * _GOLDEN_ANGLE
@@ -199,8 +201,8 @@ def _viewers(position: np.ndarray, views: int, up: int) -> Iterator[tuple[np.nda
         yield eye, forward
 
 
-def _look(
-    mesh: _Mesh, eye: np.ndarray, forward: np.ndarray, up: int, resolution: int, device: str
+def look(
+    mesh: Mesh, eye: np.ndarray, forward: np.ndarray, up: int, resolution: int, device: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Renders a mesh from a viewer. Returns the pixels that show it, bool [H, W], and for these P pixels the surface
     points and normals, [P, 3] each, and the indices of the surfaces' probes, [P]."""
@@ -220,7 +222,7 @@ def _look(
     return seen, place, normal, mesh.owner[number]
 
 
-def _shown(values: np.ndarray, normal: np.ndarray, seen: np.ndarray, exposure: float) -> np.ndarray:
+def shown(values: np.ndarray, normal: np.ndarray, seen: np.ndarray, exposure: float) -> np.ndarray:
     """Returns a picture, sRGB [H, W, 3], of white diffuse points lit by SH radiance [P, C, 3], at the pixels `seen`;
     the other pixels are black."""
     light = np.einsum("pc,pcd->pd", irradiance_weights(normal, values.shape[1]), values) / math.pi * exposure

@@ -1,6 +1,5 @@
-"""Draws named meshes and lines in the panels of a window; drawing a name again updates it."""
+"""Draws named meshes in the panels of a window; drawing a name again updates it."""
 
-from collections.abc import Sequence
 from types import ModuleType
 from typing import Any
 
@@ -72,15 +71,6 @@ class Canvas:
             mesh.point_data["colours"] = colours
             self._add(panel, name, mesh, scalars="colours", rgb=True, lighting=shape)
         self._drawn[panel, name][0].prop.culling = "back" if one_sided else "none"
-
-    def line(self, panel: int, name: str, points: np.ndarray, colour: str, *, closed: bool = False) -> None:
-        """Draws a line through points [N, 3]."""
-        self._add(panel, name, self._pyvista.lines_from_points(points, close=closed), color=colour, line_width=2)
-
-    def box(self, panel: int, name: str, low: np.ndarray, high: np.ndarray, colour: Sequence[float]) -> None:
-        """Draws the edges of a box between two corners [3]."""
-        mesh = self._pyvista.Box(np.stack([low, high], 1).ravel())
-        self._add(panel, name, mesh, color=colour, style="wireframe", line_width=1.5)
 
     def background(self, panel: int, colour: np.ndarray) -> None:
         """Fills a panel behind the meshes with a colour [3] in [0, 1]."""

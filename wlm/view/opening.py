@@ -1,7 +1,7 @@
-"""`open_scene`: makes the scene that a window shows from any supported file."""
+"""`open_scene`: makes the scene that a window shows of a model."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from inspect import signature
 from pathlib import Path
 from typing import Literal
@@ -9,63 +9,55 @@ from typing import Literal
 from wlm.errors import WlmError
 from wlm.formats.geometry import Geometry, read_geometry
 from wlm.formats.light import read_light
-from wlm.inspection.contents import check_options, content_of
-from wlm.system import OnProgress, load
+from wlm.inspection.contents import check_options
+from wlm.system import load, system_of
 from wlm.view.scene import Scene
 
 _Path = str | os.PathLike[str]
-_EXPECTED = "expected a .wlm, a lightmap, a set of lightmaps, light probes, or six-way lightmaps of smoke"
 
 
 def open_scene(
-    files: Sequence[_Path],
+    file: _Path,
     *,
     mesh: _Path | None = None,
     original: _Path | None = None,
     key: str | None = None,
     time: float | None = None,
-    walk: _Path | None = None,
-    block: float | None = None,
     flat: bool = False,
     up: Literal["y", "z"] = "y",
-    progress: OnProgress | None = None,
 ) -> Scene:
-    """Makes the scene of a file.
+    """Makes the scene of a model.
 
     Args:
-        files: One file or folder, or six-way lightmaps of smoke, one EXR a frame; docs/view.md lists what is shown.
+        file: A `.wlm` of lightmaps over time, lightmaps of meshes or probes; docs/view.md lists what is shown.
         mesh: Mesh file that the light belongs to; for lightmaps it needs their UVs.
         original: The input that was compressed, to compare with: a lightmap set, a lightmap, or a probe file.
         key: Name of the array to show of a probe file with several.
         time: Hour of the day to show of light probes that have several.
-        walk: File with the viewpoints of the cascaded volume, as `wlm.probe.load_positions` reads it.
-        block: Side of the cascaded volume's finest blocks; None to derive it from the probes' spacing.
         flat: Whether a lightmap is shown unwrapped, although its mesh is known.
         up: The axis that points up.
-        progress: Called about twice a second while frames of smoke are read.
+
+    Raises:
+        WlmError: The file is damaged or no such model; or an option has no meaning for it.
     """
-    options = {"mesh": mesh, "original": original, "key": key, "time": time, "walk": walk, "block": block}
-    options["flat"] = flat or None
+    options = {"mesh": mesh, "original": original, "key": key, "time": time, "flat": flat or None}
     given = {name: value for name, value in options.items() if value is not None}
-    kind, paths = content_of(files)
-    if kind not in _OPENERS:
-        raise WlmError(f"{paths[0]}: {_REASONS.get(kind, _EXPECTED)}")
-    opener = _OPENERS[kind]
-    known = signature(opener).parameters
-    check_options(Path(files[0]), tuple(given), tuple(known))
-    if "progress" in known:
-        given["progress"] = progress
-    return opener(paths, title=Path(files[0]).name, up="xyz".index(up), **given)
+    path = Path(file)
+    opener = _OPENERS.get(system_of(path))
+    if opener is None:
+        raise WlmError(f"{path}: expected a .wlm of lightmaps or probes; a smoke network has no picture of its own")
+    check_options(path, tuple(given), tuple(signature(opener).parameters))
+    return opener(path, title=path.name, up="xyz".index(up), **given)
 
 
 def _lightmap_model(
-    paths: list[Path], title: str, up: int, mesh: _Path | None = None, original: _Path | None = None, flat: bool = False
+    path: Path, title: str, up: int, mesh: _Path | None = None, original: _Path | None = None, flat: bool = False
 ) -> Scene:
     from wlm.lightmap.data import load as load_set
     from wlm.lightmap.sheet import LIGHT, first_light
     from wlm.view.surface import lightmap_scene
 
-    model = load(paths[0], "lightmap")
+    model = load(path, "lightmap")
     sheet = first_light(model.sheets)
     own, given = model.sheets[sheet], None
     if original is not None:
@@ -75,79 +67,33 @@ def _lightmap_model(
     return lightmap_scene(own, given, title=title, geometry=_mesh(mesh, flat), up=up)
 
 
-def _atlas_model(paths: list[Path], title: str, up: int, original: _Path | None = None, flat: bool = False) -> Scene:
+def _atlas_model(path: Path, title: str, up: int, original: _Path | None = None, flat: bool = False) -> Scene:
     from wlm.view.surface import atlas_scene
 
-    model, light = load(paths[0], "atlas"), None
+    model, light = load(path, "atlas"), None
     if original is not None:
         light = read_light(original)[0]
         _check_size(original, light.shape[:2], model.sheets[0].size)
-    return atlas_scene(model.scene, model, light, title=title, flat=flat, up=up)
+    return atlas_scene(model, light, title=title, flat=flat, up=up)
 
 
 def _probes(
-    paths: list[Path],
+    path: Path,
     title: str,
     up: int,
     mesh: _Path | None = None,
     original: _Path | None = None,
     key: str | None = None,
     time: float | None = None,
-    walk: _Path | None = None,
-    block: float | None = None,
 ) -> Scene:
-    from wlm.probe.data import load as load_probes
-    from wlm.probe.data import load_positions
-    from wlm.view.probe_scene import model_probes, probe_scene, set_probes
+    from wlm.view.probe_scene import model_probes, probe_scene
 
-    if content_of(paths)[0] == "probe":
-        probes = model_probes(load(paths[0], "probe").at(time), original, key, title, time)
-    else:
-        check_options(paths[0], ("original",) if original else (), ())
-        probes = set_probes(load_probes(paths[0], key=key).at(time), title)
+    probes = model_probes(load(path, "probe").at(time), original, key, title, time)
     geometry = None if mesh is None else read_geometry(mesh, with_uv=False)
-    path = None if walk is None else load_positions(walk)
-    return probe_scene(probes, title=title, geometry=geometry, walk=path, block=block, up=up)
+    return probe_scene(probes, title=title, geometry=geometry, up=up)
 
 
-def _lightmap_set(paths: list[Path], title: str, up: int, mesh: _Path | None = None, flat: bool = False) -> Scene:
-    from wlm.lightmap.data import load as load_set
-    from wlm.view.surface import lightmap_scene
-
-    return lightmap_scene(None, load_set(paths[0]).light, title=title, geometry=_mesh(mesh, flat), up=up)
-
-
-def _picture(paths: list[Path], title: str, up: int, mesh: _Path | None = None, flat: bool = False) -> Scene:
-    from wlm.atlas.data import load as load_mesh
-    from wlm.lightmap.data import from_arrays
-    from wlm.view.surface import atlas_scene, lightmap_scene
-
-    if mesh is not None:
-        return atlas_scene(load_mesh(mesh, paths[0]), title=title, flat=flat, up=up)
-    light = read_light(paths[0])[0][None, ..., :3]
-    return lightmap_scene(None, from_arrays(light, [0.0], name=title).light, title=title, up=up)
-
-
-def _six_way(paths: list[Path], title: str, up: int, progress: OnProgress | None = None) -> Scene:
-    from wlm.view.smoke_scene import six_way_scene
-
-    return six_way_scene(paths, title=title, progress=progress)
-
-
-_OPENERS: dict[str, Callable[..., Scene]] = {
-    "atlas": _atlas_model,
-    "lightmap": _lightmap_model,
-    "picture": _picture,
-    "probe": _probes,
-    "probes": _probes,
-    "set": _lightmap_set,
-    "six-way": _six_way,
-}
-_REASONS = {
-    "mesh": "a mesh has no light of its own; expected the light, with this as --mesh",
-    "smoke": "a network has no picture of its own; expected the lightmaps that it predicts",
-    "volume": "a volume of smoke is drawn by wlm smoke light; expected six-way lightmaps",
-}
+_OPENERS: dict[str, Callable[..., Scene]] = {"atlas": _atlas_model, "lightmap": _lightmap_model, "probe": _probes}
 
 
 def _mesh(mesh: _Path | None, flat: bool) -> Geometry | None:

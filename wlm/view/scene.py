@@ -52,13 +52,6 @@ class Slider:
         return float(round(value)) if self.whole else value
 
 
-def frame_slider(count: int, views: tuple[str, ...] = ()) -> tuple[Slider, ...]:
-    """Returns a tuple with a slider of frame numbers from 1 to `count`; empty for a single frame."""
-    if count < 2:
-        return ()
-    return (Slider("frame", 1, count, 1, 1, ".0f", f" of {count}", whole=True, views=views),)
-
-
 @dataclass
 class State:
     """The user's choices: values of the sliders by name, a view of the scene, and one of `wlm.view.display.TONES`."""
@@ -66,11 +59,6 @@ class State:
     values: dict[str, float]
     view: str
     tone: str = TONES[0]
-
-    @property
-    def frame(self) -> int:
-        """Index of the current frame, from 0."""
-        return int(self.values.get("frame", 1)) - 1
 
     def display(self, exposure: float) -> Display:
         """Returns how light is shown by the sliders of exposure and error; `exposure` is the factor at 0 EV."""
@@ -86,7 +74,6 @@ class Scene(ABC):
         panels: Titles of the panels from left to right.
         views: Views of the first panel; the first view is the default.
         sliders: Sliders of the scene; the window adds those of exposure and error.
-        plays: Name of the slider that playing moves; if it is None or has no effect in the view, the camera turns.
         flat: Whether the scene lies in a plane and the camera does not turn.
         up: Index of the upward axis, 0 to 2.
         room: Whether the mesh is a room, whose walls are hidden when seen from outside.
@@ -96,7 +83,6 @@ class Scene(ABC):
     panels: tuple[str, ...]
     views: tuple[str, ...] = ("light",)
     sliders: tuple[Slider, ...] = ()
-    plays: str | None = None
     flat: bool = False
     up: int = 1
     room: bool = False

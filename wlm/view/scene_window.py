@@ -38,7 +38,6 @@ def day_scene(content: Content, weights: Mapping[str, Weight] | None = None, dev
         content.title,
         ("scene",),
         sliders=sliders,
-        plays="hour",
         content=content,
         factors=factors,
         decoder=model.decoder(device),

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from wlm.atlas.data import LightmappedScene
 from wlm.atlas.model import AtlasModel, unpack_entries
 from wlm.formats.geometry import Geometry
 from wlm.lightmap.data import SheetFrames
@@ -41,11 +40,9 @@ def flat_geometry(height: int, width: int) -> Geometry:
     return Geometry(position, np.array([[0, 2, 1], [0, 3, 2]], np.uint32), uv)
 
 
-def compared(decoded: bool, original: bool) -> tuple[str, ...]:
-    """Returns the titles of the panels, left to right, for a decoded lightmap, its original, or both."""
-    if decoded and original:
-        return ("decoded", "original", "error")
-    return ("decoded",) if decoded else ("original",)
+def compared(original: bool) -> tuple[str, ...]:
+    """Returns the titles of the panels, left to right, of decoded light, with or without its original."""
+    return ("decoded", "original", "error") if original else ("decoded",)
 
 
 @dataclass(kw_only=True)
@@ -61,7 +58,7 @@ class SurfaceScene(Scene):
 
     @abstractmethod
     def lights(self, state: State) -> dict[str, np.ndarray]:
-        """Light float32 [H, W, 3] by name, "decoded" or "original" or both, with the gaps between charts filled."""
+        """Light float32 [H, W, 3] by name, "decoded" and perhaps "original", with the gaps between charts filled."""
 
     @abstractmethod
     def tile_colours(self) -> np.ndarray:
@@ -86,30 +83,27 @@ class SurfaceScene(Scene):
 
 
 def lightmap_scene(
-    model: SheetModel | None,
+    model: SheetModel,
     lightmaps: SheetFrames | None,
     *,
     title: str,
     geometry: Geometry | None = None,
     up: int = 1,
 ) -> SurfaceScene:
-    """Makes the scene of a sheet of lightmaps over time: the model, its input of the same size, or both side by side,
-    on a mesh with lightmap UVs or as a flat picture."""
-    first = model if model is not None else lightmaps
-    height, width = (model.height, model.width) if model is not None else lightmaps.mask.shape
-    times = first.times
-    low, high = (0.0, first.period) if first.period is not None else (float(times[0]), float(times[-1]))
+    """Makes the scene of a sheet of lightmaps over time, beside its input of the same size if that is given, on a mesh
+    with lightmap UVs or as a flat picture."""
+    height, width, times = model.height, model.width, model.times
+    low, high = (0.0, model.period) if model.period is not None else (float(times[0]), float(times[-1]))
     noon = float(times[len(times) // 2])
     sliders = ()
     if len(times) > 1:
-        wraps = first.period is not None
-        sliders = (Slider("hour", low, high, noon, (high - low) / 96, wraps=wraps, clock=first.period == 24.0),)
+        wraps = model.period is not None
+        sliders = (Slider("hour", low, high, noon, (high - low) / 96, wraps=wraps, clock=model.period == 24.0),)
     scene = _LightmapScene(
         title,
-        compared(model is not None, lightmaps is not None),
-        views=("light", "tiles") if model is not None else ("light",),
+        compared(lightmaps is not None),
+        views=("light", "tiles"),
         sliders=sliders,
-        plays="hour" if sliders else None,
         flat=geometry is None,
         up=up,
         room=geometry is not None and geometry.is_room,
@@ -121,38 +115,35 @@ def lightmap_scene(
         lightmaps=lightmaps,
     )
     lights = scene.lights(State({"hour": noon}, "light"))
-    scene.brightness = exposure(lights.get("original", next(iter(lights.values()))))
+    scene.brightness = exposure(lights.get("original", lights["decoded"]))
     return scene
 
 
 @dataclass(kw_only=True)
 class _LightmapScene(SurfaceScene):
-    model: SheetModel | None
+    model: SheetModel
     lightmaps: SheetFrames | None
 
     def __post_init__(self) -> None:
         self._shown: tuple[float, dict[str, np.ndarray], str] | None = None
-        self._decoder = None if self.model is None else SheetDecoder(self.model)
+        self._decoder = SheetDecoder(self.model)
         if self.lightmaps is not None:
             given = self.lightmaps
             self._axis = TimeAxis(given.times, given.period, "frames")
             self._frames = fill_gaps(given.frames, given.mask)
 
     def lights(self, state: State) -> dict[str, np.ndarray]:
-        first = self.model if self.model is not None else self.lightmaps
-        hour = state.values.get("hour", float(first.times[0]))
+        hour = state.values.get("hour", float(self.model.times[0]))
         if self._shown is None or self._shown[0] != hour:
-            lights, note = {}, ""
-            if self._decoder is not None:
-                lights["decoded"] = self._decoder.frame(hour)
+            lights, note = {"decoded": self._decoder.frame(hour)}, ""
             if self.lightmaps is not None:
                 before, after, share = self._axis.neighbours(hour)
                 mixed = (1.0 - share) * self._frames[before] + share * self._frames[after]
                 lights["original"] = mixed.astype(np.float32)
-                if self.model is not None and share == 0.0:
+                if share == 0.0:
                     score = psnr_of(self.model, self.lightmaps, before, lights["decoded"])
                     note = "" if math.isnan(score) else f"PSNR {score:.2f} dB"
-                elif share:
+                else:
                     note = f"original interpolated from {self._axis.times[before]:g} and {self._axis.times[after]:g}"
             self._shown = hour, lights, note
         return self._shown[1]
@@ -170,10 +161,6 @@ class _LightmapScene(SurfaceScene):
     def caption(self, state: State) -> str:
         self.lights(state)
         note = f"; {self._shown[2]}" if self._shown[2] else ""
-        if self.model is None:
-            count = len(self.lightmaps.times)
-            hours = f", {count} hours" if count > 1 else ""
-            return f"{self.lightmaps.name}, {self.width} × {self.height}{hours}{note}"
         size = f"{self.model.name}, {self.width} × {self.height}, profile {self.model.profile.name}"
         counts = count_kinds(self.model)
         kinds = [(kind.name.lower(), _COLOURS[kind][0]) for kind in TileKind if counts[kind.name.lower()]]
@@ -182,37 +169,28 @@ class _LightmapScene(SurfaceScene):
 
 
 def atlas_scene(
-    scene: LightmappedScene,
-    model: AtlasModel | None = None,
-    original: np.ndarray | None = None,
-    *,
-    title: str,
-    flat: bool = False,
-    up: int = 1,
+    model: AtlasModel, original: np.ndarray | None = None, *, title: str, flat: bool = False, up: int = 1
 ) -> SurfaceScene:
-    """Makes the scene of a mesh under its lightmap: the first sheet of a scene in its first state, of the model, or of
-    the input without one.
+    """Makes the scene of a mesh under its lightmap: the first sheet of a model in its first state.
 
     `original`, [H, W, 3], is the lightmap that was compressed, shown beside the decoded one; `flat` shows the lightmap
     unwrapped.
     """
-    sheet = scene.sheets[0]
+    sheet = model.scene.sheets[0]
     height, width = sheet.mask.shape
     shape = Geometry(sheet.position.astype(np.float32), sheet.triangle[sheet.active].astype(np.uint32), sheet.uv)
-    light = {"original": sheet.lightmap} if model is None else {"decoded": model.decoder().lightmap()}
-    if model is not None:
-        light["decoded"] = fill_gaps(light["decoded"], sheet.mask)
+    light = {"decoded": fill_gaps(model.decoder().lightmap(), sheet.mask)}
     if original is not None:
         light["original"] = fill_gaps(np.nan_to_num(original[..., :3], posinf=65504.0), sheet.mask)
     return _AtlasScene(
         title,
-        compared("decoded" in light, "original" in light),
-        views=("light", "tiles") if model is not None and model.method == "tiles" else ("light",),
+        compared("original" in light),
+        views=("light", "tiles") if model.method == "tiles" else ("light",),
         flat=flat,
         up=up,
         room=not flat and shape.is_room,
         geometry=flat_geometry(height, width) if flat else shape,
-        brightness=exposure(light.get("original", next(iter(light.values())))[sheet.mask]),
+        brightness=exposure(light.get("original", light["decoded"])[sheet.mask]),
         height=height,
         width=width,
         model=model,
@@ -223,7 +201,7 @@ def atlas_scene(
 
 @dataclass(kw_only=True)
 class _AtlasScene(SurfaceScene):
-    model: AtlasModel | None
+    model: AtlasModel
     light: dict[str, np.ndarray]
 
     def lights(self, state: State) -> dict[str, np.ndarray]:
@@ -242,8 +220,6 @@ class _AtlasScene(SurfaceScene):
         return colours
 
     def caption(self, state: State) -> str:
-        if self.model is None:
-            return f"{self.width} × {self.height}, input"
         size = f"textures {100 * (1.0 - self.model.compression_ratio):.1f}% of half floats"
         text = f"{self.width} × {self.height}, {size}, method {self.model.method}"
         if state.view == "tiles":

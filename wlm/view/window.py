@@ -34,16 +34,11 @@ class Window:
     """A window of a scene, with its sliders by name. `state` has the user's choices: change them with `set`, `choose`
     and `tone`; `playing` tells whether the scene is played."""
 
-    _played: float
-
-    def __init__(
-        self, scene: Scene, *, size: tuple[int, int] = (1280, 720), rate: float = 24.0, off_screen: bool = True
-    ) -> None:
-        """Makes the window, of a width and height in pixels, and draws the scene, whose frames change at `rate` a
-        second; it stays hidden if `off_screen`."""
+    def __init__(self, scene: Scene, *, size: tuple[int, int] = (1280, 720), off_screen: bool = True) -> None:
+        """Makes the window, of a width and height in pixels, and draws the scene; it stays hidden if `off_screen`."""
         pyvista = need("pyvista", "view")
         require_opengl()
-        self.scene, self.playing, self._rate = scene, False, rate
+        self.scene, self.playing = scene, False
         common = [_EXPOSURE] + [_ERROR] * ("error" in scene.panels)
         self.sliders = {slider.name: slider for slider in (*scene.sliders, *common)}
         self.state = State({name: slider.value for name, slider in self.sliders.items()}, scene.views[0])
@@ -97,23 +92,19 @@ class Window:
         self._clip()
 
     def advance(self, seconds: float) -> None:
-        """Advances the playing scene by some seconds."""
-        name = self._player()
-        if name is None:
+        """Advances the playing scene by some seconds: its hour, or else the camera's turn."""
+        slider = self.sliders.get("hour")
+        if slider is None:
             self.turn(360.0 * seconds / _SWEEP)
             return
-        slider = self.sliders[name]
-        speed = self._rate if slider.whole else (slider.high - slider.low) / _SWEEP
-        value = self._played + speed * seconds
+        value = self.state.values["hour"] + (slider.high - slider.low) / _SWEEP * seconds
         if value > slider.high:
-            value = slider.low + (value - slider.low) % (slider.high - slider.low + slider.whole)
-        self.set(name, value)
-        self._played = value
+            value = slider.low + (value - slider.low) % (slider.high - slider.low)
+        self.set("hour", value)
 
     def draw(self) -> None:
         """Redraws everything for the current state."""
         self.scene.draw(self.canvas, self.state)
-        self._played = self.state.values.get(self.scene.plays, 0.0)
         self._lay_out()
         views = self.scene.views
         chosen = "   ".join(f"[{i} {v}]" if v == self.state.view else f"{i} {v}" for i, v in enumerate(views, 1))
@@ -209,15 +200,11 @@ class Window:
         views = self.sliders[name].views
         return not views or self.state.view in views
 
-    def _player(self) -> str | None:
-        name = self.scene.plays
-        return name if name is not None and self._shows(name) else None
-
     def help(self) -> str:
         """One line about the keys that have an effect in this view."""
         moved, views = self._main(), len(self.scene.views)
         does = {
-            "space": "turns" if self._player() is None else "plays",
+            "space": "plays" if "hour" in self.sliders else "turns",
             "arrows": moved,
             "[ ]": "exposure",
             "- +": "error" if "error" in self.sliders else None,

@@ -8,16 +8,13 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.lightmap.reduce import BLOCK
 from wlm_kernels.native import native_source, on_cuda
 
-_STEP = 16  # size of a matrix product: the hidden width is a multiple of it
-_WIDEST = 64  # a block's activations and weights then fill its 48 KiB of shared memory
+BLOCK = 128  # threads of a CUDA block; the samples of a tile are a multiple of it there
 
-
-def fits_matrix_units(inputs: int, hidden: int) -> bool:
-    """Returns whether `matrix_network` supports networks with these numbers of inputs and hidden units."""
-    return inputs <= _STEP and hidden % _STEP == 0 and hidden <= _WIDEST
+WIDTHS = (16, 32, 48, 64)
+"""Numbers of hidden units: multiples of the size of a matrix product, of which the largest fills the 48 KiB of shared
+memory of a block with its activations and weights."""
 
 
 @functools.cache
@@ -32,13 +29,15 @@ def matrix_network(inputs: int, hidden: int, gelu: str) -> Any:
     It returns the gradient of the inputs of each sample, followed by the error of the output.
 
     Args:
-        inputs, hidden: I and H, the numbers of inputs and hidden units, as `fits_matrix_units` allows.
+        inputs, hidden: I and H, the numbers of inputs, at most 16, and hidden units, one of `WIDTHS`.
         gelu: "exact" or "tanh".
     """
+    if hidden not in WIDTHS:
+        raise ValueError(f"hidden: expected one of {WIDTHS} on CUDA, got {hidden}")
     vec_in, vec_hidden = wp.types.vector(inputs, float), wp.types.vector(hidden, float)
     vec_result = wp.types.vector(inputs + 3, float)
     # A row of 64 halves spans all banks: its groups of 8 are permuted to avoid bank conflicts; other rows are padded.
-    rows = {"STRIDE": hidden, "MASK": 7} if hidden == _WIDEST else {"STRIDE": hidden + 8, "MASK": 0}
+    rows = {"STRIDE": hidden, "MASK": 7} if hidden == WIDTHS[-1] else {"STRIDE": hidden + 8, "MASK": 0}
     constants = {"I": inputs, "H": hidden, "T": BLOCK, "EXACT": int(gelu == "exact"), **rows}
     code = native_source("wlm_kernels", "matrix_units") + native_source(__package__, "matrix_step", **constants)
 

@@ -4,8 +4,7 @@ It handles B random samples of each of N tiles (neural-dynamic-gi, section 3.3, 
 time, samples F_uv, F_uvt, F_ut and F_vt, adds the uniform noise of eq. 6, centres the features, runs the network,
 computes the weighted squared error and sums the gradients. `gather` turns the sums into gradient arrays.
 
-On CUDA, networks whose hidden width is a multiple of 16 up to 64 run on the matrix units in half floats
-(`matrix_step`); all other networks run in float32, as on the CPU.
+On CUDA, networks run on the matrix units in half floats (`matrix_step`), on the CPU in float32.
 
 The sums are integers or have a fixed order, so that one seed gives one result on one device. The samples of a tile only
 depend on the seed, the step and the number of the tile, so that a tile is trained to the same result in any batch.
@@ -36,11 +35,9 @@ from wlm_kernels.lightmap.features import (
     track_error,
     volume_at,
 )
-from wlm_kernels.lightmap.matrix_step import fits_matrix_units, matrix_network
-from wlm_kernels.lightmap.reduce import BLOCK, block_reduction, reload
+from wlm_kernels.lightmap.matrix_step import BLOCK, matrix_network
 
-LAUNCH_BOUNDS = (BLOCK, 2)  # two blocks per multiprocessor leave 255 registers per thread: no spills at width 16
-MATRIX_LAUNCH_BOUNDS = (BLOCK, 4)  # the maximum that fits shared memory at width 64
+LAUNCH_BOUNDS = (BLOCK, 4)  # the maximum that fits shared memory at width 64
 NOISE = wp.constant(1.0 / 256.0)  # alpha of eq. 6: one step of 8 bits
 
 
@@ -117,7 +114,7 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
 
     Args:
         temporal: Whether the tiles have F_uvt, F_ut, F_vt and the encoded time.
-        hidden: H, width of the hidden layers.
+        hidden: H, width of the hidden layers; on CUDA one of `matrix_step.WIDTHS`.
         gelu: "exact" or "tanh".
         device_kind: "cpu" or "cuda".
     """
@@ -195,56 +192,6 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             scatter_plane(acc, lane, offsets.ut, rows, columns, n, u, tau, batch.periodic, c * wp.vec2(g[8], g[9]))
             scatter_plane(acc, lane, offsets.vt, rows, columns, n, v, tau, batch.periodic, c * wp.vec2(g[10], g[11]))
 
-    @wp.struct
-    class Pass:
-        """One sample: inputs of the three layers, gradients of their outputs before activation, and the loss."""
-
-        f: vec_in
-        h1: vec_hidden
-        h2: vec_hidden
-        d1: vec_hidden
-        d2: vec_hidden
-        d3: wp.vec3
-        loss: float
-
-    @wp.func
-    def forward_backward(
-        maps: Maps,
-        hidden: wp.array2d[vec_hidden],
-        output: wp.array2d[wp.vec3],
-        batch: Batch,
-        lane: int,
-        n: int,
-        sample: Sample,
-        samples: int,
-    ) -> Pass:
-        k = sample.k
-        f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, k, sample.state)
-        a1 = first(hidden, n, f)
-        g1 = gate(a1)
-        h1 = wp.cw_mul(a1, g1)
-        a2 = second(hidden, n, h1)
-        g2 = gate(a2)
-        h2 = wp.cw_mul(a2, g2)
-        target = batch.targets[n, k, sample.flat]
-        error = third(output, n, h2) - target
-        track_error(batch, lane, n, k, target, error)
-        half = wp.cw_mul(texel_weight(batch, n, k, target), error) / (3.0 * float(samples))
-        d3 = 2.0 * half
-        reload()
-        d2 = wp.cw_mul(back_output(output, n, d3), slope(a2, g2))
-        reload()
-        d1 = wp.cw_mul(back_hidden(hidden, n, d2), slope(a1, g1))
-        p = Pass()
-        p.f = f
-        p.h1 = h1
-        p.h2 = h2
-        p.d1 = d1
-        p.d2 = d2
-        p.d3 = d3
-        p.loss = wp.dot(half, error)
-        return p
-
     options = {"enable_backward": False}
 
     @wp.kernel(module="unique", module_options=options)
@@ -286,22 +233,36 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             b = base + i
             lane = wp.where(base == 0, 0, 1)
             sample = draw_sample(batch, n, b, samples)
-            p = forward_backward(maps, hidden, output, batch, lane, n, sample, samples)
-            loss[lane, n] += p.loss
+            k = sample.k
+            f = features(maps, batch, n, sample.flat // 128, sample.flat % 128, k, sample.state)
+            a1 = first(hidden, n, f)
+            g1 = gate(a1)
+            h1 = wp.cw_mul(a1, g1)
+            a2 = second(hidden, n, h1)
+            g2 = gate(a2)
+            h2 = wp.cw_mul(a2, g2)
+            target = batch.targets[n, k, sample.flat]
+            error = third(output, n, h2) - target
+            track_error(batch, lane, n, k, target, error)
+            half = wp.cw_mul(texel_weight(batch, n, k, target), error) / (3.0 * float(samples))
+            loss[lane, n] += wp.dot(half, error)
+            d3 = 2.0 * half
+            d2 = wp.cw_mul(back_output(output, n, d3), slope(a2, g2))
+            d1 = wp.cw_mul(back_hidden(hidden, n, d2), slope(a1, g1))
             for c in range(wp.static(inputs)):
-                partial[lane, n, c] += p.d1 * p.f[c]
-            partial[lane, n, wp.static(inputs)] += p.d1
+                partial[lane, n, c] += d1 * f[c]
+            partial[lane, n, wp.static(inputs)] += d1
             for c in range(wp.static(units)):
-                partial[lane, n, wp.static(columns_2) + c] += p.d2 * p.h1[c]
-                partial_out[lane, n, c] += p.d3 * p.h2[c]
-            partial[lane, n, wp.static(columns_2 + units)] += p.d2
-            partial_out[lane, n, wp.static(units)] += p.d3
-            scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, p.d1))
+                partial[lane, n, wp.static(columns_2) + c] += d2 * h1[c]
+                partial_out[lane, n, c] += d3 * h2[c]
+            partial[lane, n, wp.static(columns_2 + units)] += d2
+            partial_out[lane, n, wp.static(units)] += d3
+            scatter(acc, lane, offsets, maps, batch, n, sample, back_input(hidden, n, d1))
 
-    elif fits_matrix_units(inputs, hidden):
+    else:
         network = matrix_network(inputs, hidden, gelu)
 
-        @wp.kernel(module="unique", module_options=options, launch_bounds=MATRIX_LAUNCH_BOUNDS)
+        @wp.kernel(module="unique", module_options=options, launch_bounds=LAUNCH_BOUNDS)
         def step(
             # in:
             maps: Maps,
@@ -332,31 +293,5 @@ def step_kernels(temporal: bool, hidden: int, gelu: str, device_kind: str) -> St
             for c in range(wp.static(inputs)):
                 g[c] = r[c]
             scatter(acc, 0, offsets, maps, batch, n, sample, g)
-
-    else:
-        reduce = block_reduction(net)
-
-        @wp.kernel(module="unique", module_options=options, launch_bounds=LAUNCH_BOUNDS)
-        def step(
-            # in:
-            maps: Maps,
-            offsets: Offsets,
-            hidden: wp.array2d[vec_hidden],
-            output: wp.array2d[wp.vec3],
-            batch: Batch,
-            samples: int,
-            base: int,
-            # out:
-            acc: wp.array2d[scalar],
-            partial: wp.array2d[float],
-            partial_out: wp.array2d[float],
-            loss: wp.array1d[float],
-        ):
-            n, b = wp.tid()
-            sample = draw_sample(batch, n, b, samples)
-            p = forward_backward(maps, hidden, output, batch, 0, n, sample, samples)
-            row = (b // wp.static(BLOCK)) * hidden.shape[0] + n
-            reduce(p.f, p.h1, p.h2, p.d1, p.d2, p.d3, p.loss, row, partial, partial_out, loss)
-            scatter(acc, 0, offsets, maps, batch, n, sample, back_input(hidden, n, p.d1))
 
     return StepKernels(inputs, hidden, device_kind, net, scalar, draw, step)

@@ -5,6 +5,8 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 
 1. `Look` copies the new windows; `select` finds for each slot its block, whether a probe is near the block, and whether
    the pool still has its light. The blocks near probes that the pool lacks wait, counted by distance to the viewer.
+   After them wait stale blocks, whose light is of another hour, by distance over the hours between; every fourth
+   frame has these first, so that neither blocks without a row nor a fast viewer keep all others stale.
 2. `select` then finds the distance within which enough blocks wait, gathers these blocks and ranks them. The nearest
    are decoded, by distances in units of their own edge; at equal distances first the finer block, then the lower slot.
 3. Each chosen block gets a row of the pool: its own, if there is one for every block near a probe; else the least
@@ -31,6 +33,8 @@ GROUP = 64  # rows of the pool from which one is chosen
 MOST = 4096  # most blocks that are ranked
 QUEUED, DROPPED, CACHED, LEFT, UPDATED, DECODED, GATHERED = range(7)
 """Counters of a frame; the last is that of the gathered blocks."""
+STALE_FIRST = 4
+"""A frame whose number this divides decodes stale blocks before missing ones."""
 WAITING = -2
 """Entry of the page table for a block near probes whose light is missing; -1 for a block without a probe."""
 
@@ -41,6 +45,8 @@ _QUEUED, _DROPPED, _CACHED, _LEFT, _UPDATED, _GATHERED = (
 _WAITING = wp.constant(WAITING)
 _LARGEST = wp.constant(16384.0)  # of the numbers in a row of the pool: half floats hold it
 _BINS = wp.constant(BINS)
+_DAY, _NOON, _SOON = (wp.constant(hours) for hours in (24.0, 12.0, 0.1))
+_STALE_FIRST = wp.constant(STALE_FIRST)
 _SIXTEENS = wp.constant(BINS + BINS // 16)
 _BEYOND = wp.constant(0.5)  # share of the probes' range by which light is extrapolated at most
 _LIMIT = wp.constant(1 << 20)  # blocks along an axis of the finest level
@@ -107,6 +113,7 @@ class Pool:
         light: [R, D], half floats, the blocks' light in units of `factor`.
         factor: [R].
         rows: [W], row of the light of each block in `Index.block`, or -1.
+        hour: [R], hour of the day of each row's light, if light changes over the day; or [0].
         stamp: [R], last frame in which the row's block was in a window; -1 for an empty row. [0] where R = W: row w is
             that of block w, and no row is given away.
         owner: [R] or [0], as `stamp`: index in `Index.block` of the row's block, or -1.
@@ -117,6 +124,7 @@ class Pool:
     stamp: wp.array1d[int]
     owner: wp.array1d[int]
     rows: wp.array1d[int]
+    hour: wp.array1d[float]
 
 
 @wp.struct
@@ -125,10 +133,12 @@ class Work:
 
     Attributes:
         clock: [1], the frame's number.
+        hour: [1], hour of the day of the light that is decoded.
         counters: [7], counts of blocks and probes in this frame.
         histogram: [TOTALS], number of blocks that wait to be decoded, by distance.
         gathered: [G], slots of the gathered blocks.
-        distance: [G], squared distance of each gathered block from the viewer, in units of the block's edge.
+        distance: [G], rank of each gathered block: its squared distance from the viewer in units of the block's edge,
+            over hours if it is stale, and more for the kind that comes second.
         chosen: [B], slots of the chosen blocks, or -1.
         taken: [B], row of the pool for each chosen block, or -1.
         blocks: [B], coordinates of each chosen block, and its level.
@@ -144,6 +154,7 @@ class Work:
     """
 
     clock: wp.array1d[int]
+    hour: wp.array1d[float]
     counters: wp.array1d[int]
     histogram: wp.array1d[int]
     gathered: wp.array1d[int]
@@ -248,12 +259,32 @@ def _distance(windows: Windows, level: int, local: wp.vec3i) -> float:
 
 
 @wp.func
-def _bin(away: float, side: int) -> int:
-    return wp.min(int(away * float(_BINS) / (3.0 * float(side * side))), _BINS - 1)
+def _rank_of(
+    windows: Windows, pool: Pool, work: Work, tolerance: float, side: int, level: int, local: wp.vec3i, row: int
+) -> float:
+    """Returns the rank among waiting blocks of a block whose light is in a row of the pool, or is missing; lower ones
+    are decoded first. It is negative if the block does not wait."""
+    rank = float(-1.0)
+    farthest = 3.0 * float(side * side)
+    stale_first = work.clock[0] % _STALE_FIRST == 0
+    if row == _WAITING:
+        rank = wp.where(stale_first, farthest, 0.0) + _distance(windows, level, local)
+    elif row >= 0 and pool.hour.shape[0] > 0:
+        late = wp.abs(work.hour[0] - pool.hour[row])
+        late = wp.where(late > _NOON, _DAY - late, late)
+        if late > tolerance:
+            share = _SOON / wp.max(late, _SOON)  # a block twice as far away comes when it is twice as late
+            rank = wp.where(stale_first, 0.0, farthest) + share * share * _distance(windows, level, local)
+    return rank
+
+
+@wp.func
+def _bin(rank: float, side: int) -> int:
+    return wp.min(int(rank * float(_BINS) / (6.0 * float(side * side))), _BINS - 1)
 
 
 @wp.kernel(enable_backward=False)
-def _look(bases: Bases, before: Bases, views: Views, frame: int, windows: Windows, work: Work):
+def _look(bases: Bases, before: Bases, views: Views, frame: int, hour: float, windows: Windows, work: Work):
     i = wp.tid()
     if i < windows.bases.shape[0]:
         windows.bases[i] = wp.vec3i(bases[i, 0], bases[i, 1], bases[i, 2])
@@ -261,6 +292,7 @@ def _look(bases: Bases, before: Bases, views: Views, frame: int, windows: Window
         windows.views[i] = wp.vec4(views[i, 0], views[i, 1], views[i, 2], views[i, 3])
     if i == 0:
         work.clock[0] = frame
+        work.hour[0] = hour
     if i < work.counters.shape[0]:
         work.counters[i] = 0
     if i < work.chosen.shape[0]:
@@ -268,7 +300,7 @@ def _look(bases: Bases, before: Bases, views: Views, frame: int, windows: Window
 
 
 @wp.kernel(enable_backward=False)
-def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
+def _scroll(index: Index, windows: Windows, pool: Pool, tolerance: float, side: int, work: Work):
     s = wp.tid()
     level, local = _locate(windows, s)
     block = windows.bases[level] + local
@@ -284,11 +316,11 @@ def _scroll(index: Index, windows: Windows, pool: Pool, side: int, work: Work):
             if row < 0:
                 row = _WAITING
         windows.pages[s] = wp.int16(row)
-    if row >= 0:
-        if pool.stamp.shape[0] > 0:
-            pool.stamp[row] = work.clock[0]
-    elif row == _WAITING:
-        bin = _bin(_distance(windows, level, local), side)
+    if row >= 0 and pool.stamp.shape[0] > 0:
+        pool.stamp[row] = work.clock[0]
+    rank = _rank_of(windows, pool, work, tolerance, side, level, local, row)
+    if rank >= 0.0:
+        bin = _bin(rank, side)
         wp.atomic_add(work.histogram, bin, 1)
         wp.atomic_add(work.histogram, _BINS + bin // 16, 1)
         wp.atomic_add(work.histogram, _SIXTEENS + bin // 256, 1)
@@ -324,22 +356,23 @@ def _limit(histogram: wp.array1d[int], budget: int) -> int:
 
 
 @wp.kernel(enable_backward=False, launch_bounds=(256, 4))  # with more registers too few of its threads run at once
-def _gather(windows: Windows, side: int, work: Work):
+def _gather(windows: Windows, pool: Pool, tolerance: float, side: int, work: Work):
     s = wp.tid()
     if s == 0:
         total = int(0)
         for i in range(16):
             total += work.histogram[_SIXTEENS + i]
         work.counters[_LEFT] = total
-    if int(windows.pages[s]) == _WAITING:
+    row = int(windows.pages[s])
+    if row == _WAITING or (row >= 0 and pool.hour.shape[0] > 0):
         level, local = _locate(windows, s)
-        away = _distance(windows, level, local)
+        rank = _rank_of(windows, pool, work, tolerance, side, level, local, row)
         # Each thread that has a waiting block finds the limit itself, which saves a launch.
-        if _bin(away, side) <= _limit(work.histogram, work.chosen.shape[0]):
+        if rank >= 0.0 and _bin(rank, side) <= _limit(work.histogram, work.chosen.shape[0]):
             i = wp.atomic_add(work.counters, _GATHERED, 1)
             if i < work.gathered.shape[0]:
                 work.gathered[i] = s
-                work.distance[i] = away
+                work.distance[i] = rank
 
 
 @wp.kernel(enable_backward=False)
@@ -372,6 +405,8 @@ def _allocate(index: Index, windows: Windows, pool: Pool, size: int, work: Work)
         work.blocks[k] = wp.vec4i(block[0], block[1], block[2], level)
         if pool.stamp.shape[0] == 0:
             taken = wanted
+        elif windows.pages[slot] >= wp.int16(0):
+            taken = int(windows.pages[slot])  # a stale block keeps its row
         else:
             frame = work.clock[0]
             taken = least_recent(pool.stamp, size, frame, k, work.chosen.shape[0], frame)
@@ -383,6 +418,8 @@ def _allocate(index: Index, windows: Windows, pool: Pool, size: int, work: Work)
                 pool.stamp[taken] = frame
         if taken >= 0:
             pool.rows[wanted] = taken
+            if pool.hour.shape[0] > 0:
+                pool.hour[taken] = work.hour[0]
             windows.pages[slot] = wp.int16(taken)
             wp.atomic_add(work.counters, _UPDATED, 1)
             wp.atomic_sub(work.counters, _LEFT, 1)
@@ -479,10 +516,12 @@ class Look:
         self._views = np.zeros((LEVELS, 4), np.float32)
         self._views[: len(scales), 3] = scales
         # The launch reads its arguments from these arrays' memory.
-        first = [Bases.from_buffer(self._bases), Bases.from_buffer(self._before), Views.from_buffer(self._views), 0]
-        self._launch = wp.launch(_look, count, [*first, windows, work], device=work.clock.device, record_cmd=True)
+        places = [Bases.from_buffer(self._bases), Bases.from_buffer(self._before), Views.from_buffer(self._views)]
+        self._launch = wp.launch(
+            _look, count, [*places, 0, 0.0, windows, work], device=work.clock.device, record_cmd=True
+        )
 
-    def __call__(self, bases: np.ndarray, before: np.ndarray, origins: np.ndarray, frame: int) -> None:
+    def __call__(self, bases: np.ndarray, before: np.ndarray, origins: np.ndarray, frame: int, hour: float) -> None:
         """Launches the kernel on the current stream.
 
         Args:
@@ -490,20 +529,22 @@ class Look:
             before: Integers [L, 3], the same of the frame before.
             origins: [L, 3], origin of the points in each window, see `wlm_kernels.probe.volume`.
             frame: Number of the frame, higher than in the frame before.
+            hour: Hour of the day of the light that is decoded; any number if light does not change.
         """
         count = len(bases)
         self._bases[:count], self._before[:count], self._views[:count, :3] = bases, before, origins
         self._launch.set_param_at_index(3, frame)
+        self._launch.set_param_at_index(4, hour)
         self._launch.launch()
 
 
-def select(index: Index, windows: Windows, pool: Pool, side: int, work: Work) -> None:
+def select(index: Index, windows: Windows, pool: Pool, tolerance: float, side: int, work: Work) -> None:
     """Finds the block of each slot of the windows, chooses the blocks to decode in this frame, and gives each a row of
     the pool; a block whose group of rows has no free one waits for a later frame. `side` is the longest side of the
-    windows in blocks."""
+    windows in blocks; light that is more than `tolerance` hours off is decoded again."""
     device, slots = work.clock.device, windows.pages.shape
-    wp.launch(_scroll, slots, inputs=[index, windows, pool, side, work], device=device)
-    wp.launch(_gather, slots, inputs=[windows, side, work], device=device)
+    wp.launch(_scroll, slots, inputs=[index, windows, pool, tolerance, side, work], device=device)
+    wp.launch(_gather, slots, inputs=[windows, pool, tolerance, side, work], device=device)
     wp.launch(_rank, max(work.gathered.shape[0], work.histogram.shape[0]), inputs=[work], device=device)
     size = max(1, min(GROUP, pool.stamp.shape[0] // work.chosen.shape[0]))
     wp.launch(_allocate, work.chosen.shape, inputs=[index, windows, pool, size, work], device=device)

@@ -96,7 +96,7 @@ def test_what_has_no_page_is_said_in_one_line(tmp_path):
         ([FILES / "lightmap.wlm"], {"key": "sh"}, "--key"),
         ([tmp_path / "probe.wlm"], {}, "--original"),
         ([tmp_path / "five.wlm"], {}, "spherical harmonics"),
-        ([tmp_path], {}, "wlm view shows inputs"),
+        ([tmp_path], {}, "expected a .wlm file"),
         ([tmp_path / "day.exr"], {}, "day.exr: expected a .wlm"),
     ):
         with pytest.raises(WlmError, match=re.escape(said)) as caught:

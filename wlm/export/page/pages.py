@@ -68,9 +68,7 @@ def make_page(
     if kind == "smoke":
         raise WlmError(f"{paths[0]}: a smoke network has no picture of its own; expected lightmaps predicted by it")
     if kind not in _PAGES:
-        raise WlmError(
-            f"{paths[0]}: expected a .wlm file, a scene or six-way EXRs; wlm view shows inputs of a compression too"
-        )
+        raise WlmError(f"{paths[0]}: expected a .wlm file, a scene or six-way EXRs")
     module, function = _PAGES[kind]
     make = getattr(import_module(module), function)
     known = signature(make).parameters

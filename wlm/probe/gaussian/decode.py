@@ -109,6 +109,10 @@ class GaussianLight:
         self._x = wp.array(decoder.model.normalise(position), dtype=wp.vec3, device=self.device)
         self._points: dict[int, wp.array] = {}
 
+    @property
+    def time(self) -> float | None:
+        return self._decoder.time
+
     def read(self, numbers: wp.array, values: wp.array) -> None:
         count = numbers.shape[0]
         if count not in self._points:

@@ -41,17 +41,13 @@ class ComponentDecoder(Decoder):
         self.count, self.channels = model.probes, model.outputs
         self._volume: Volume | None = None
 
-    def set_time(self, time: float) -> None:
-        super().set_time(time)
-        self._volume = None
-
     def decode(self, position: np.ndarray) -> np.ndarray:
         """Returns the light at any points as a renderer reads it: from the cascaded volume around a nearby viewer.
         Points that no block of the volume covers take the light of the nearest live probe."""
         points, model = check_points(position), self.model
         own = self.own_positions()
         if self._volume is None:
-            self._volume = Volume(own, self.light(own), live=model.live, budget=_BUDGET)
+            self._volume = Volume(own, self.light(own), live=model.live, budget=_BUDGET, tolerance=0.0)
         volume = self._volume
         points = np.clip(points, own.min(0), own.max(0))
         values = np.empty((len(points), model.outputs), np.float32)

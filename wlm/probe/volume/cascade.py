@@ -2,7 +2,8 @@
 
 It implements gaussian-probe-compression, section 3.4; docs/probe.md lists the departures. Blocks are stored in the rows
 of one array, the pool, which is also a cache: a block that left its window stays until its row is needed. A block
-without a probe near it is never decoded, takes no memory and is missing when light is read. A window covers no more
+without a probe near it is never decoded, takes no memory and is missing when light is read. Where light changes over
+the day, blocks of another hour are decoded again. A window covers no more
 blocks than the scene has along each axis, and stays on the scene. Light is read from the finest level that has a block
 there, as `wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights` describes the light of a block.
 
@@ -22,6 +23,7 @@ import warp as wp
 
 from wlm import interop
 from wlm.errors import WlmError
+from wlm.formats.hours import DAY
 from wlm.probe.sphere import unit_or_zero
 from wlm.probe.volume.index import BlockIndex, finest_side
 from wlm.probe.volume.light import Light
@@ -41,6 +43,9 @@ BUDGET = 64
 ROWS = 32768
 """Largest number of blocks that memory is allocated for: rows of the pool have 16-bit numbers."""
 
+TOLERANCE = 0.1
+"""Hours by which the light of a block may be off before it is decoded again."""
+
 _LONGEST = 64  # largest side of a window: 262,144 blocks per level
 _SMALLEST = 1e-30  # smallest side of a block: float32 holds it and its inverse
 _FARTHEST = 2**30  # largest coordinate of a block: int32 on the device, with room for a window
@@ -56,7 +61,7 @@ class FrameStats:
         dropped: Queued blocks that left their window before they were decoded.
         updated: Blocks decoded and written, at most `Volume.budget`.
         cached: Blocks that entered a window and were still in memory from earlier frames.
-        left: Queued blocks that still wait to be decoded.
+        left: Blocks that still wait to be decoded, missing ones and those whose light is of another hour.
         probes: Probes decoded; a probe counts once for each block that it contributes to.
         seconds: Duration of the frame in seconds, until the device has finished.
     """
@@ -109,6 +114,7 @@ class Volume:
         sizes: Side of a block at each level, in the unit of the positions.
         sides: int64 [L, 3], blocks along the axes of each level's window.
         budget: Largest number of blocks decoded per frame.
+        tolerance: Hours by which the light of a block may be off before it is decoded again.
         rows: Number of blocks that have memory.
         frame: Number of updates so far.
         channels: Numbers per probe, D.
@@ -127,6 +133,7 @@ class Volume:
         side: int = SIDE,
         budget: int = BUDGET,
         rows: int = ROWS,
+        tolerance: float = TOLERANCE,
     ) -> None:
         """Builds an empty volume on the device of the light.
 
@@ -143,6 +150,9 @@ class Volume:
             budget: Largest number of blocks decoded per frame, 1 to 1024.
             rows: Most blocks that memory is allocated for, from the budget to 32,768. If the windows have more blocks
                 near probes, the farthest ones are never decoded.
+            tolerance: Hours by which the light of a block may be off before it is decoded again, 0 to 12. Missing
+                blocks come first, except in every fourth frame; a block that is twice as far away is decoded again when
+                it is twice as many hours off.
 
         Raises:
             WlmError: A setting is out of its range.
@@ -157,7 +167,7 @@ class Volume:
             if live.shape != position.shape[:1] or live.dtype != bool:
                 raise ValueError(f"live: expected bool {list(position.shape[:1])}, got {live.dtype} {list(live.shape)}")
             self.numbers = np.flatnonzero(live)
-        _check(block, ratios, side, budget, rows)
+        _check(block, ratios, side, budget, rows, tolerance)
         lit = position[self.numbers]
         self.index = BlockIndex(lit, finest_side(lit) if block is None else block, ratios)
         self.sizes = self.index.sizes
@@ -171,12 +181,12 @@ class Volume:
             self.index.high + 1 - self.sides,
             int(self.sides.prod(1).sum()),
         )
-        self.budget, self.channels = budget, light.channels
+        self.budget, self.channels, self.tolerance = budget, light.channels, tolerance
         self.device = light.device
         self._size = np.array(self.sizes)
         self._viewpoint: np.ndarray | None = None
         self._base = np.zeros((len(ratios), 3), np.int64)
-        self.frame = self._left = 0
+        self.frame, self._left, self._hour = 0, 0, 0.0
         self.normal = None if normal is None else _unit(normal, position.shape)
         self._make(rows, self.normal)
         self._step = interop.LaunchGraph(self._work, self.device)
@@ -219,7 +229,8 @@ class Volume:
             pages=int(slots.sum()),
         )
         given = 0 if rows == blocks else rows
-        tables = {"rows": blocks, "stamp": given, "owner": given}
+        dated = 0 if self.light.time is None else rows
+        tables = {"rows": blocks, "stamp": given, "owner": given, "hour": dated}
         self._pool = struct("pool", frame_kernels.Pool, -1, light=(rows, self.channels), factor=rows, **tables)
         # The light of the probes takes the place of their covariances, which are not used any more.
         shared = wp.zeros(budget * probes * max(self.channels, frame_kernels.PROBES), dtype=float, device=self.device)
@@ -228,7 +239,7 @@ class Volume:
             return wp.array(ptr=shared.ptr, shape=shape, dtype=dtype, device=self.device)
 
         self._read_light = view((budget * probes, self.channels), float)
-        frame = {"clock": 1, "counters": 7, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
+        frame = {"clock": 1, "hour": 1, "counters": 7, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
         ranked = dict.fromkeys(("gathered", "distance"), min(frame_kernels.MOST, blocks))
         ranges = dict.fromkeys(("begin", "count"), (budget, frame_kernels.HALVES))
         by_block = dict.fromkeys(("chosen", "taken", "blocks", "picked", "noise"), budget)
@@ -298,11 +309,12 @@ class Volume:
         base = np.minimum(np.maximum(base, self.index.low), self._last)
         # Before the first frame the windows are where they share no block with those of the frame.
         before = self._base if self._viewpoint is not None else base + self.sides
+        hour = self.light.time or 0.0
         # Where no window moves and no block waits, the launches would change nothing, not even which row is the oldest.
-        still = self._left == 0 and np.array_equal(base, before)
-        self._viewpoint, self._base = viewpoint, base
+        still = self._left == 0 and hour == self._hour and np.array_equal(base, before)
+        self._viewpoint, self._base, self._hour = viewpoint, base, hour
         self.frame += 1
-        self._look(base, before, at - base - 0.5, self.frame)
+        self._look(base, before, at - base - 0.5, self.frame, hour)
         entered = queued = dropped = cached = updated = probes = 0
         if not still:
             self._step()
@@ -316,7 +328,7 @@ class Volume:
     def _work(self) -> None:
         """Chooses missing blocks, finds and weights the probes near them, and writes the blocks' light to the pool."""
         work, windows = self._frame_work, self._windows
-        frame_kernels.select(self._index, windows, self._pool, int(self.sides.max()), work)
+        frame_kernels.select(self._index, windows, self._pool, self.tolerance, int(self.sides.max()), work)
         if self.index.count and (self.device != "cpu" or (work.taken.numpy() >= 0).any()):
             volume_weights.weigh(self._index, work)
             self.light.read(work.numbers, self._read_light)
@@ -398,7 +410,7 @@ def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     return unit_or_zero(normal).astype(np.float32)
 
 
-def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, rows: int) -> None:
+def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, rows: int, tolerance: float) -> None:
     """Checks that the settings are in their ranges."""
     if block is not None and not _SMALLEST <= block <= 1.0 / _SMALLEST:
         raise WlmError(f"volume block: expected a side from {_SMALLEST:g} to {1.0 / _SMALLEST:g}, got {block:g}")
@@ -413,3 +425,5 @@ def _check(block: float | None, ratios: Sequence[int], side: int, budget: int, r
         raise WlmError(f"volume budget: expected 1 to 1024 blocks a frame, got {budget}")
     if not budget <= rows <= ROWS:
         raise WlmError(f"volume rows: expected from the budget of {budget} to {ROWS} blocks, got {rows}")
+    if not 0 <= tolerance <= DAY / 2:
+        raise WlmError(f"volume tolerance: expected 0 to {DAY / 2:g} hours, got {tolerance}")

@@ -17,11 +17,15 @@ class Light(Protocol):
         device: "cpu" or "cuda:N".
         count: Number of probes, N.
         channels: Numbers per probe, D.
+        time: Hour of the day of the light that `read` writes, from 0 to 24; None if it never changes.
     """
 
     device: str
     count: int
     channels: int
+
+    @property
+    def time(self) -> float | None: ...
 
     def read(self, numbers: wp.array, values: wp.array) -> None:
         """Writes the light of some probes; on CUDA the work is queued, not awaited.
@@ -36,6 +40,8 @@ class Light(Protocol):
 
 class StoredLight:
     """Light of probes in an array: the input of a fit, or an engine's own probes."""
+
+    time = None
 
     def __init__(self, values: np.ndarray, device: str = "cpu") -> None:
         """Uploads the probes.
