@@ -42,13 +42,12 @@ from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data, expect_alone
 from wlm.errors import WlmError
 from wlm.formats import zstd
-from wlm.lightmap.codec import tile_sizes
 from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings import encoding_of
 from wlm.lightmap.evaluation import bits_per_texel, count_kinds
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.model import SheetModel
+from wlm.lightmap.model import PACKED_KINDS, SheetModel
 from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.runtime import (
     ExactDecoder,
@@ -214,11 +213,11 @@ def texels_of(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def _load_ms(model: SheetModel) -> float | None:
     """Returns the median time in ms to unpack one tile of the file on the CPU; None if no tile has packed data."""
-    numbers = np.flatnonzero(tile_sizes(model)).tolist()
+    numbers = model.numbers(*PACKED_KINDS).tolist()
     if not numbers:
         return None
     packed = [(number, encoding_of(model.kind[number])) for number in numbers]
-    frames = [(number, encoding, zstd.compress(*encoding.pack(model, number))) for number, encoding in packed]
+    frames = [(number, encoding, zstd.compress(encoding.pack(model, number))) for number, encoding in packed]
     seconds = []
     for number, encoding, frame in frames * max(1, _LOADS // len(frames)):
         start = time.perf_counter()

@@ -234,12 +234,11 @@ def make(args: argparse.Namespace) -> None:
             wlm.smoke.write_six_way(out / "smoke" / f"smoke_{number:02}.exr", six)
     if "probes" in args.parts:
         points, found = make_probes(mesh, albedo, sets)
-        for hour, values in found.items():
-            probes = wlm.probe.from_arrays(points, values.astype(np.float32), name=f"{hour:g} h")
-            name = f"probes_{hour:05.2f}h.wlm".replace(".", "_", 1)
-            model = wlm.probe.compress(probes, args.probes, positions=True, device=args.device)
-            size = model.save(out / name)
-            print(f"{name}: {len(points)} probes, {size} bytes, {wlm.probe.evaluate(model, probes).psnr:.1f} dB")
+        values = np.stack(list(found.values())).astype(np.float32)
+        probes = wlm.probe.from_arrays(points, values, times=list(found), name="street")
+        model = wlm.probe.compress(probes, args.probes, positions=True, device=args.device)
+        size = model.save(out / "probes.wlm")
+        print(f"probes.wlm: {len(points)} probes, {size} bytes, {wlm.probe.evaluate(model, probes).psnr:.1f} dB")
     if "light" in args.parts:
         settings = {"steps": args.steps} if args.steps else {}
         both = wlm.lightmap.from_groups(sets, "street")

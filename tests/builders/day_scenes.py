@@ -67,12 +67,12 @@ def write_scene(folder: Path, **changes: Any) -> Path:
     write_glb(folder / "car.glb", [square([[-0.4, 0, 0], [0.4, 0, 0], [0.4, 0.6, 0], [-0.4, 0.6, 0]], SQUARE)])
     model().save(folder / "room.wlm")
     y, x, z = np.mgrid[0:4, -2:3, -2:3].reshape(3, -1)
-    for hour, radiance in LIGHT.items():
-        values = np.zeros((len(x), 9, 3))
-        values[:, 0] = radiance * np.sqrt(4 * np.pi)  # the first coefficient of even light
-        values[:, 1] = 1e-3 * np.random.default_rng(0).standard_normal((len(x), 3))  # components need some variance
-        probes = wlm.probe.from_arrays(np.stack([x, y, z], 1).astype(float), values.reshape(len(x), 27))
-        wlm.probe.compress(probes, "pca", positions=True).save(folder / f"probes_{hour:g}.wlm")
+    values = np.zeros((len(LIGHT), len(x), 9, 3))
+    values[:, :, 0] = np.array(list(LIGHT.values()))[:, None, None] * np.sqrt(4 * np.pi)  # that of even light
+    values[:, :, 1] = 1e-3 * np.random.default_rng(0).standard_normal((len(x), 3))  # components need some variance
+    position = np.stack([x, y, z], 1).astype(float)
+    probes = wlm.probe.from_arrays(position, values.reshape(len(LIGHT), len(x), 27), times=list(LIGHT))
+    wlm.probe.compress(probes, "pca", positions=True).save(folder / "probes.wlm")
     (folder / "smoke").mkdir()
     camera = Camera.look_at((0, 0, 4), (0, 0, 0), extent=1.0, height=8, width=8)
     for number in (1, 2):
@@ -91,7 +91,7 @@ def write_file(path: Path, **changes: Any) -> Path:
         "title": "a room",
         "mesh": "room.glb",
         "light": "room.wlm",
-        "probes": [{"hour": hour, "file": f"probes_{hour:g}.wlm"} for hour in LIGHT],
+        "probes": "probes.wlm",
         "sky": [
             {"hour": 0, "colour": [0.0, 0.0, 0.1], "exposure": 1.0},
             {"hour": 12, "colour": [0.5, 0.6, 0.8], "exposure": -1.0},

@@ -3,7 +3,6 @@
 import numpy as np
 
 from wlm.formats.bc7 import pack_mode6
-from wlm.lightmap.encodings.frames import clear_unneeded, needed_blocks
 from wlm.lightmap.model import LightmapModel, SheetModel
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.sheet import LIGHT
@@ -48,8 +47,6 @@ def random_sheet(
     mask = np.ones((height, width), bool) if mask is None else mask
     framed = np.flatnonzero(kind == TileKind.FRAMES)
     frames = any_blocks(len(framed), len(times), 32, 32, seed=seed)
-    for i, number in enumerate(framed.tolist()):
-        frames[i] = clear_unneeded(frames[i], needed_blocks(mask, number))
     ranges = np.sort(rng.uniform(0.0, 1.5, (len(framed), len(times), 2, 3)), axis=2)
     return SheetModel(
         name="random",

@@ -9,7 +9,7 @@ import texture2ddecoder
 from builders.synthetic import any_blocks
 
 from wlm.errors import WlmError
-from wlm.formats.bc7 import SHARES, decode_image, encode_image, pack_mode6, unpack_mode6
+from wlm.formats.bc7 import SHARES, decode_image, encode_image, pack_mode6
 
 ROWS, COLUMNS = 64, 96
 
@@ -20,13 +20,6 @@ def _parameters(*shape: int) -> tuple[np.ndarray, np.ndarray]:
     upper = rng.integers(0, 128, (*shape, 2, 4), np.uint8)
     parity = rng.integers(0, 2, (*shape, 2, 1), np.uint8)
     return upper << 1 | parity, rng.integers(0, 16, (*shape, 16), np.uint8)
-
-
-def _mode_6(*shape: int) -> np.ndarray:
-    """Any 128 bits are a valid block once the mode's 7 are set."""
-    blocks = np.random.default_rng(6).integers(0, 256, (*shape, 16), np.uint8)
-    blocks[..., 0] = blocks[..., 0] & 0x80 | 0x40
-    return blocks
 
 
 @pytest.mark.parametrize("blocks", [any_blocks(ROWS, COLUMNS, seed=3), pack_mode6(*_parameters(ROWS, COLUMNS))])
@@ -61,15 +54,6 @@ def test_packing_keeps_the_texels():
     assert np.array_equal(decode_image(blocks), image)
 
 
-def test_unpacking_gives_back_what_was_packed():
-    endpoints, indices = _parameters(1000)
-    indices[:, 0] &= 7
-    found = unpack_mode6(pack_mode6(endpoints, indices))
-    assert np.array_equal(found[0], endpoints) and np.array_equal(found[1], indices)
-    blocks = _mode_6(1000)
-    assert np.array_equal(pack_mode6(*unpack_mode6(blocks)), blocks)
-
-
 def test_views_several_images_and_no_blocks_at_all_work():
     blocks = any_blocks(2, 6, 4)
     images = decode_image(blocks[:, ::2, ::-1])
@@ -77,18 +61,6 @@ def test_views_several_images_and_no_blocks_at_all_work():
     assert np.array_equal(images[1], decode_image(np.ascontiguousarray(blocks[1, ::2, ::-1])))
     assert decode_image(np.empty((0, 3, 16), np.uint8)).shape == (0, 12, 4)
     assert pack_mode6(np.empty((0, 2, 4), np.uint8), np.empty((0, 16), np.uint8)).shape == (0, 16)
-
-
-@pytest.mark.parametrize("mode", [0, 1, 2, 3, 4, 5, 7])
-def test_another_mode_is_named(mode):
-    blocks = _mode_6(3, 4)
-    blocks[1, 2, 0] = 0xFF << mode & 0xFF
-    with pytest.raises(WlmError, match=f"^BC7 block 6: expected mode 6, found mode {mode}$"):
-        unpack_mode6(blocks)
-    blocks[1, 2, 0] = 0
-    with pytest.raises(WlmError, match="block 6: expected mode 6, found a reserved mode"):
-        unpack_mode6(blocks)
-    assert not decode_image(blocks)[4:8, 8:12, :3].any()
 
 
 def test_an_encoded_picture_is_near(monkeypatch):

@@ -1,4 +1,4 @@
-"""Files of lightmaps and packed tiles: what is saved comes back, unread texels cost little, and damage is one line."""
+"""Files of lightmaps and packed tiles: what is saved comes back, and damage is one line."""
 
 import dataclasses
 
@@ -14,11 +14,8 @@ from reference.levels import put_on_levels
 import wlm
 from wlm.formats import zstd
 from wlm.formats.artifact import read_artifact
-from wlm.formats.bc7 import decode_image
-from wlm.lightmap.codec import part_bytes, tile_sizes
-from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings import encoding_of
-from wlm.lightmap.encodings.maps import Reads, clear_unread, tile_bytes
+from wlm.lightmap.encodings.maps import tile_bytes
 from wlm.lightmap.model import PACKED, LightmapModel
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.sheet import LIGHT
@@ -32,18 +29,17 @@ def test_what_is_written_comes_back(tmp_path, kinds, period, share):
     mask = None if share is None else np.random.default_rng(0).random(shape) < share
     model = random_model(kinds, mask=mask, period=period, metric_weight=0.25, time_axis="paper")
     size = model.save(tmp_path / "a.wlm")
-    assert size == (tmp_path / "a.wlm").stat().st_size == model.file_bytes() == sum(part_bytes(model, size).values())
+    assert size == (tmp_path / "a.wlm").stat().st_size == model.file_bytes()
     assert_same(wlm.load(tmp_path / "a.wlm"), model)
     assert ("0.tiles" in read_artifact(tmp_path / "a.wlm").parts) == (max(kinds) >= 2)
 
 
 @pytest.mark.parametrize("times", [(0.0, 1e-9), (18.45, 18.55), (7.0,), (1e6, 1e6 + 1e-4)])
-def test_times_stay_apart_and_close(tmp_path, times):
+def test_times_come_back(tmp_path, times):
     model = random_model((3, 0), times=times, period=None)
     model.save(tmp_path / "a.wlm")
     back = wlm.load(tmp_path / "a.wlm").times
-    np.testing.assert_allclose(back, times, rtol=2e-7)
-    assert (np.diff(back) > 0).all()
+    assert back.tolist() == list(times)
 
 
 @pytest.mark.parametrize("kind", [3, 2])
@@ -67,11 +63,6 @@ def _file_of(sheet) -> LightmapModel:
     return LightmapModel("random", "0123456789abcdef", sheet.profile, {LIGHT: sheet})
 
 
-def reads_of(used: np.ndarray, sheet) -> Reads:
-    p = sheet.profile
-    return Reads.of(used, sheet.axis, p.uvt_resolution, p.uvt_slices, p.plane_columns, p.plane_rows)
-
-
 @pytest.mark.parametrize("part", ["uv", "uvt"])
 def test_any_block_of_mode_6_comes_back(tmp_path, part):
     sheet = random_sheet((3, 0))
@@ -84,50 +75,6 @@ def test_any_block_of_mode_6_comes_back(tmp_path, part):
     other = _file_of(dataclasses.replace(sheet, **{part: words.view(np.uint8)}))
     assert "BC7 blocks of mode 6" in error_of(other.save, tmp_path / "b")
     assert not (tmp_path / "b").exists()
-
-
-def test_what_is_not_read_costs_nothing(tmp_path):
-    used = np.zeros((128, 128), bool)
-    used[:108, :50] = True
-    # Two times read two slices of four and three rows of six each, and so of the planes.
-    model = random_sheet((3, 0), times=(6.0, 18.0), mask=used[:108].copy(), columns=1, uvt_resolution=32, uvt_slices=4)
-    model = dataclasses.replace(model, mask=np.pad(used, ((0, 128), (0, 0)))[:236, :119])
-    reads = reads_of(used, model)
-    parts = {name: getattr(model, name)[0] for name in ("uv", "uvt", "ut", "vt")}
-    cleared = clear_unread(parts, used, reads)
-    texels, expected = decode_image(cleared["uv"]), decode_image(model.uv[0])
-    assert np.array_equal(texels[used], expected[used])
-    # Columns 50 and 51 share blocks with valid texels, later ones have none of their own.
-    assert not cleared["uv"][:, 13:, 1:].any() and not cleared["uvt"][:, :, 4:, 1:].any()
-    again = clear_unread(cleared, used, reads)
-    assert all(np.array_equal(again[name], values) for name, values in cleared.items())
-    less = dataclasses.replace(model, **{name: values[None] for name, values in cleared.items()})
-    _file_of(less).save(tmp_path / "a.wlm")
-    assert_same(wlm.load(tmp_path / "a.wlm"), _file_of(less))
-    assert tile_sizes(less)[0] < 0.5 * tile_sizes(model)[0]
-    for time in (6.0, 7.5, 18.0):
-        light, same = SheetDecoder(less).frame(time), SheetDecoder(model).frame(time)
-        assert np.array_equal(light[model.mask], same[model.mask]) and light[model.mask].any()
-
-
-@pytest.mark.parametrize(("count", "period", "rows"), [(6, 24.0, 12), (7, 24.0, 14), (7, None, 14), (13, 24.0, 14)])
-def test_what_is_not_read_changes_no_light(count, period, rows):
-    used = np.zeros((128, 128), bool)
-    used[20:31, 70:75] = True
-    mask = np.pad(used, ((0, 128), (0, 0)))[:236, :119]
-    times = tuple(np.linspace(0.0, 23.0, 7))
-    model = random_sheet((3, 0), columns=1, times=times, period=period, uvt_slices=count, plane_rows=2 * count)
-    model = dataclasses.replace(model, mask=mask)
-    reads = reads_of(used, model)
-    assert reads.rows.sum() == rows and reads.columns.sum() < 16 and reads.texels.sum() < 10
-    other = {name: getattr(model, name) ^ np.uint8(255) for name in ("ut", "vt")}
-    for name, columns in zip(("ut", "vt"), reads.columns, strict=True):
-        read = reads.rows[:, None] & columns
-        other[name][0][read] = getattr(model, name)[0][read]
-    other["uvt"] = np.roll(model.uvt, 1, 1)
-    other["uvt"][0, reads.slices] = model.uvt[0, reads.slices]
-    one, two = (SheetDecoder(each) for each in (model, dataclasses.replace(model, **other)))
-    assert all(np.array_equal(one.frame(time)[mask], two.frame(time)[mask]) for time in (*times, 11.0))
 
 
 def _changed(tmp_path, **parts) -> str:
@@ -155,12 +102,11 @@ def test_a_frame_of_another_length_is_one_line(tmp_path, size):
 
 def test_tiles_with_wrong_content_are_one_line(tmp_path):
     sheet = random_model((3, 2, 1, 0)).sheets[LIGHT]
-    for place, byte, words in ((1, 128, "expected endpoints of 7 bits"), (-1, 0x7F, "expected finite numbers in the")):
-        content = bytearray(b"".join(encoding_of(3).pack(sheet, 0)))
+    wrong = (0, 1, "maps: expected BC7 blocks of mode 6"), (-1, 0x7F, "expected finite numbers in the")
+    for place, byte, words in wrong:
+        content = bytearray(encoding_of(3).pack(sheet, 0))
         content[place] = byte
-        if place < 0:
-            half = len(content) - sheet.net[0].size
-            content[half - 1] = 0xFF  # with the high byte a NaN
+        content[-2] = 0xFF  # with the high byte a NaN
         line = _changed(tmp_path, tiles=lambda tiles, content=content: [zstd.compress(bytes(content)), tiles[1]])
         assert f"a.wlm: sheet random: tile 0: {words}" in line
 
@@ -171,9 +117,7 @@ def test_each_tile_is_read_alone(tmp_path):
     model.save(tmp_path / "a.wlm")
     pieces, (sheet,) = read_artifact(tmp_path / "a.wlm").pieces["0.tiles"], model.sheets.values()
     data = zstd.decompress(pieces[2], encoding_of(4).packed_size(sheet, 2), "tile 2")
-    assert data == b"".join(encoding_of(4).pack(sheet, 2))
-    assert tile_sizes(sheet).tolist() == tile_sizes(wlm.load(tmp_path / "a.wlm").light).tolist()
-    assert tile_sizes(sheet).tolist() == [*map(len, pieces), 0]
+    assert data == encoding_of(4).pack(sheet, 2)
 
 
 def _on_levels(model):

@@ -72,7 +72,7 @@ def stored(model, tmp_path):
     body = artifact.tensors[BODY].tobytes()
     length = struct.unpack_from("<H", body)[0]
     header = json.loads(body[2 : 2 + length])
-    table = codec._table(codec._Header.model_validate(header))
+    table = codec._table(codec._Header.model_validate(header), type(model.content))
     parts = codec._split(body[2 + length :], table, len(body))
 
     def read(header, parts):

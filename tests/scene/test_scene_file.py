@@ -26,7 +26,7 @@ def edited(room: Path, old: str, new: str) -> Path:
 
 def test_the_content_is_that_of_the_files(scene):
     assert scene.title == "a room" and scene.light.groups == ("sky", "sun")
-    assert [hour for hour, _ in scene.probes] == [0.0, 12.0] and list(scene.originals) == [12.0, 22.0]
+    assert scene.probe_hours.tolist() == [0.0, 12.0] and list(scene.originals) == [12.0, 22.0]
     assert [len(puff.files) for puff in scene.smoke] == [2]
     np.testing.assert_array_equal(scene.mesh.colour, np.repeat([day_scenes.FLOOR, day_scenes.WALL], 4, 0).astype("f4"))
     np.testing.assert_allclose(scene.mesh.normal, np.repeat([[0, 1, 0], [0, 0, 1]], 4, 0))
@@ -83,7 +83,7 @@ def test_smoke_plays_again(scene):
         ("smoke:\n", "smok:\n", "unknown key 'smok'; did you mean 'smoke'"),
         ("second: 2", "second: 9", "camera: expected rows of rising second"),
         ("last: 29", "last: 5", "day.last: expected a later hour"),
-        ("file: probes_12.wlm", "file: room.wlm", "expected an artifact of probe"),
+        ("probes: probes.wlm", "probes: room.wlm", "expected an artifact of probe"),
         ("smoke\n", "car.glb\n", "smoke.0.files: expected a folder of six-way lightmaps"),
         ("original_12.00h.exr", "room.glb", "originals.0: expected an hour"),
     ],
@@ -95,9 +95,8 @@ def test_one_line_names_the_key(room, old, new, line):
 
 
 def test_probes_are_needed_by_what_they_light(room):
-    rows = "probes:\n- file: probes_0.wlm\n  hour: 0.0\n- file: probes_12.wlm\n  hour: 12.0\n"
-    with pytest.raises(WlmError, match="probes: expected at least one entry"):
-        wlm.scene.load(edited(room, rows, ""))
+    with pytest.raises(WlmError, match="probes: expected a file of probes"):
+        wlm.scene.load(edited(room, "probes: probes.wlm\n", ""))
 
 
 def test_inspect_describes_the_scene_and_names_the_command(room):

@@ -21,10 +21,10 @@ def street():
 def test_no_file_is_missing_or_left_over(street):
     files = {file for file in FOLDER.rglob("*") if file.is_file()}
     used = {street.path, *street.originals.values(), FOLDER / "README.md"}
-    used |= {FOLDER / name for name in ("street.wlm", "street.glb", "car.glb", "van.glb")}
-    used |= {file for puff in street.smoke for file in puff.files} | set(FOLDER.glob("probes_*.wlm"))
+    used |= {FOLDER / name for name in ("street.wlm", "probes.wlm", "street.glb", "car.glb", "van.glb")}
+    used |= {file for puff in street.smoke for file in puff.files}
     assert files == used
-    assert len(street.probes) == len(list(FOLDER.glob("probes_*.wlm")))
+    assert len(street.probe_hours) == 10
     assert sum(file.stat().st_size for file in files) <= MOST_BYTES
 
 

@@ -220,13 +220,15 @@ def export(
 
 def info(file: opt.ModelFile, as_json: opt.AsJson = False, device: opt.Device = "cpu") -> None:
     """Show what a file of lightmaps contains, and its memory on a device."""
-    from wlm.lightmap.codec import group_sizes
 
     def facts(model: "LightmapModel") -> dict[str, Any]:
         if not as_json:
             return _facts(model)
         sheets = [vars(sheet) | _sheet(own) for sheet, own in model.sheets.items()]
-        groups = [{"name": name, **sizes} for name, sizes in group_sizes(model).items()]
+        groups = [
+            {"name": name, "times": times.tolist(), "GPU_bytes": size}
+            for name, (times, size) in model.group_sizes().items()
+        ]
         return _facts(model) | {"times": model.times.tolist(), "groups": groups, "sheets": sheets}
 
     model = models.describe(file, "lightmap", device, as_json, facts)
@@ -293,21 +295,18 @@ def _sheet(model: "SheetModel") -> dict[str, Any]:
 
 
 def _show_sheets(model: "LightmapModel") -> None:
-    from wlm.lightmap.codec import group_sizes, sheet_bytes
-
     if len(model.groups) > 1:
-        rows = console.table("light groups", ["group", "times", "bytes on disk", "GPU bytes"])
-        for name, facts in group_sizes(model).items():
-            rows.add_row(escape(name), str(len(facts["times"])), f"{facts['bytes']:,}", f"{facts['GPU_bytes']:,}")
+        rows = console.table("light groups", ["group", "times", "GPU bytes"])
+        for name, (times, memory) in model.group_sizes().items():
+            rows.add_row(escape(name), str(len(times)), f"{memory:,}")
         console.show(rows)
-    sizes = sheet_bytes(model)
-    columns = ["sheet", "values", "size", "bytes on disk", "GPU bytes", "tiles"]
+    columns = ["sheet", "values", "size", "GPU bytes", "tiles"]
     rows = console.table("sheets", columns, text=["values", "tiles"])
     for sheet, own in model.sheets.items():
         facts = _sheet(own)
         tiles = ", ".join(f"{count} {kind}" for kind, count in facts["tiles"].items())
         size = f"{facts['width']}x{facts['height']}"
-        rows.add_row(escape(sheet.label), sheet.encoding, size, f"{sizes[sheet]:,}", f"{facts['GPU_bytes']:,}", tiles)
+        rows.add_row(escape(sheet.label), sheet.encoding, size, f"{facts['GPU_bytes']:,}", tiles)
     console.show(rows)
 
 
@@ -316,10 +315,10 @@ def _show_report(file: Path, report: "Report") -> None:
     rows = console.table(
         str(file), ["", *columns, "bytes on disk", "bits per texel on disk", "bits per texel on the GPU"]
     )
-    sheets = {escape(sheet.label): own for sheet, own in report.sheets.items()} if len(report.sheets) > 1 else {}
-    for name, own in {f"wlm {escape(report.profile)}": report, **sheets}.items():
-        sizes = (f"{own.bytes:,}", f"{own.bpp:.3f}", f"{own.memory_bpp:.3f}")
-        rows.add_row(name, *_cells(own, _SCORES), *sizes)
+    sizes = (f"{report.bytes:,}", f"{report.bpp:.3f}", f"{report.memory_bpp:.3f}")
+    rows.add_row(f"wlm {escape(report.profile)}", *_cells(report, _SCORES), *sizes)
+    for sheet, own in report.sheets.items() if len(report.sheets) > 1 else ():
+        rows.add_row(escape(sheet.label), *_cells(own, _SCORES), "", "", f"{own.memory_bpp:.3f}")
     rows.add_section()
     light = report.light
     scores = (light.psnr_by_time, light.ssim_by_time, light.flip_by_time)

@@ -117,7 +117,7 @@ def _write_raw(bundle: Bundle, folder: Path, language: str, exact: bool) -> None
 
 def _write_kit(bundle: Bundle, folder: Path, engine: str, device: str, options: dict[str, Any]) -> None:
     """Writes the kit of a bundle, or of each part of a collection that contains light, in a subfolder each."""
-    if not bundle.parts:
+    if not bundle.parts or bundle.system == "probe":  # a kit of probes decodes all regions
         module = _KITS.get(bundle.system, "")
         if not module or (engine not in ENGINES and "{engine}" not in module):
             raise WlmError(

@@ -15,7 +15,6 @@ import math
 import numpy as np
 from PIL import Image
 
-from wlm.errors import WlmError
 from wlm.formats.hdr_blocks import need
 
 BLOCK_BYTES = 16
@@ -124,24 +123,6 @@ def pack_mode6(endpoints: np.ndarray, indices: np.ndarray) -> np.ndarray:
     return words.view(np.uint8)
 
 
-def unpack_mode6(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reads the endpoints, uint8 [..., 2, 4], and indices, uint8 [..., 16], of blocks; the inverse of `pack_mode6`."""
-    if blocks.dtype != np.uint8 or blocks.shape[-1:] != (BLOCK_BYTES,):
-        raise ValueError(f"blocks: expected uint8 [..., 16], got {blocks.dtype} {blocks.shape}")
-    words = np.ascontiguousarray(blocks).view("<u8").astype(np.uint64)
-    low, high = words[..., 0], words[..., 1]
-    foreign = (low & np.uint64((1 << _MODE_BITS) - 1)) != _MODE_6
-    if np.any(foreign):
-        place = int(np.flatnonzero(foreign)[0])
-        raise WlmError(f"BC7 block {place}: expected mode 6, found {_mode_name(int(low.flat[place]))}")
-    parity = np.stack([low >> np.uint64(63), high & np.uint64(1)], axis=-1)
-    upper = (low[..., None, None] >> _ENDPOINT_SHIFTS) & np.uint64(0x7F)
-    endpoints = (upper << np.uint64(1)) | parity[..., None]
-    indices = (high[..., None] >> _INDEX_SHIFTS) & np.uint64(0xF)
-    indices[..., 0] &= np.uint64(0x7)
-    return endpoints.astype(np.uint8), indices.astype(np.uint8)
-
-
 def decode_image(blocks: np.ndarray) -> np.ndarray:
     """Decodes images of blocks of any mode, uint8 [..., R, C, 16], bit-exactly to RGBA, uint8 [..., 4 R, 4 C, 4].
 
@@ -177,8 +158,3 @@ def _words(endpoints: np.ndarray, indices: np.ndarray) -> tuple[np.ndarray, np.n
     low |= np.uint64(_MODE_6) | ((wide[..., 0, 0] & np.uint64(1)) << np.uint64(63))
     high = np.bitwise_or.reduce(indices.astype(np.uint64) << _INDEX_SHIFTS, axis=-1)
     return low, high | (wide[..., 1, 0] & np.uint64(1))
-
-
-def _mode_name(low: int) -> str:
-    byte = low & 0xFF
-    return f"mode {(byte & -byte).bit_length() - 1}" if byte else "a reserved mode"

@@ -253,12 +253,8 @@ def _model(path: Path) -> Finding:
     if system == "probe" and not model.has_positions:
         return Finding(path, f"{what}, without positions", command("info", path))
     if system == "lightmap" and len(model.groups) > 1:
-        # This imports the encodings of tiles.
-        from wlm.lightmap.codec import group_sizes
-
         sizes = (
-            f"{name} {facts['bytes']:,} bytes at {count_of(facts['times'], 'time')}"
-            for name, facts in group_sizes(model).items()
+            f"{name} {size:,} bytes at {count_of(times, 'time')}" for name, (times, size) in model.group_sizes().items()
         )
         what = f"{what}; {count_of(model.groups, 'light group')}: {', '.join(sizes)}"
     return Finding(path, what, command("web", path, "-o", "PAGE.html"))
@@ -351,8 +347,8 @@ def _scene(path: Path) -> Finding:
 
     with load_scene(path) as scene:
         parts = [f"{len(scene.mesh.triangle):,} triangles", count_of(scene.light.groups, "light group")]
-        if scene.probes:
-            parts.append(f"probes of {count_of(scene.probes, 'hour')}")
+        if scene.probes is not None:
+            parts.append(f"probes of {count_of(scene.probe_hours, 'hour')}")
         if scene.moving:
             parts.append(count_of(scene.moving, "moving object"))
         if scene.smoke:

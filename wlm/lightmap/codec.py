@@ -31,8 +31,7 @@ from wlm.lightmap.tiles import TileGrid, TileKind
 from wlm.system import Header, Name
 from wlm.workers import each
 
-_ROUNDING = 2e-7  # relative, of stored times
-_TIMES = Part((np.float32, np.float64), (None,))
+_TIMES = Part(np.float64, (None,))
 _BYTES = Part(np.uint8, (None,))
 _Word = Annotated[Name, Field(min_length=1, max_length=MOST_NAME)]
 
@@ -50,6 +49,7 @@ class _SheetHeader(Header):
 
 
 class _Header(Header):
+    tiles: Literal["plain"]  # the form of tiles
     name: Name
     period: float | None = Field(gt=0)
     profile: Profile
@@ -67,7 +67,7 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, Content], st
     masks, groups = set(), set[str]()
     for number, (sheet, own) in enumerate(model.sheets.items()):
         if sheet.group not in groups:
-            parts[f"{number}.times" if groups else "times"] = _shortened(own.times)
+            parts[f"{number}.times" if groups else "times"] = own.times
         groups.add(sheet.group)
         headers.append(
             ({} if sheet.group == BASE else {"group": sheet.group})
@@ -88,8 +88,8 @@ def encode(model: LightmapModel) -> tuple[dict[str, Any], dict[str, Content], st
             stored["mask"] = np.frombuffer(zstd.compress(np.packbits(own.mask).tobytes()), np.uint8)
         masks.add(key)
         parts |= {f"{number}.{name}": value for name, value in stored.items()}
-    settings = {"name": model.name, "period": model.period, "profile": model.profile.changes(), "sheets": headers}
-    return settings, parts, model.source
+    settings = {"tiles": "plain", "name": model.name, "period": model.period, "sheets": headers}
+    return settings | {"profile": model.profile.changes()}, parts, model.source
 
 
 def decode(artifact: Artifact) -> LightmapModel:
@@ -98,6 +98,8 @@ def decode(artifact: Artifact) -> LightmapModel:
     Raises:
         WlmError, ValueError: A setting or a part is missing or wrong, or they do not fit each other.
     """
+    if "tiles" not in artifact.settings:
+        raise ValueError("setting tiles: missing, as in files of an earlier version: compress the input again")
     header = check_settings(_Header, artifact.settings, "setting ")
     sheets = [Sheet(item.atlas, item.layer, tuple(item.channels), item.encoding, item.group) for item in header.sheets]
     if len(set(sheets)) < len(sheets):
@@ -161,60 +163,11 @@ def decode(artifact: Artifact) -> LightmapModel:
     return LightmapModel(name=header.name, source=artifact.source, profile=header.profile, sheets=models)
 
 
-def part_bytes(model: LightmapModel, file_bytes: int) -> dict[str, int]:
-    """Returns the size in bytes of each part of a model's file, summed over all sheets, largest part first.
-
-    `tiles` is the size of the packed tiles, and `header` that of the file's header with the tiles' sizes and digests.
-
-    Raises:
-        ValueError: `file_bytes` is less than the sum of the parts.
-    """
-    parts: dict[str, int] = {}
-    for name, value in encode(model)[1].items():
-        name = name.rpartition(".")[2]
-        parts[name] = parts.get(name, 0) + _bytes_of(value)
-    parts["header"] = file_bytes - sum(parts.values())
-    if parts["header"] < 0:
-        raise ValueError(f"file_bytes: expected at least {file_bytes - parts['header']} bytes, got {file_bytes}")
-    return dict(sorted(((name, size) for name, size in parts.items() if size), key=lambda part: -part[1]))
-
-
-def sheet_bytes(model: LightmapModel) -> dict[Sheet, int]:
-    """Returns each sheet's bytes in the file; the mask that an atlas's sheets share counts for the first of them."""
-    sizes = [0] * len(model.sheets)
-    for name, value in encode(model)[1].items():
-        number, _, own = name.partition(".")
-        if own:
-            sizes[int(number)] += _bytes_of(value)
-    return dict(zip(model.sheets, sizes, strict=True))
-
-
-def group_sizes(model: LightmapModel) -> dict[str, dict[str, Any]]:
-    """Returns for each light group its `times`, its `bytes` in the file, and its `GPU_bytes`, by the group's name.
-
-    The mask of an atlas counts for the first group.
-    """
-    sizes = sheet_bytes(model)
-    result: dict[str, dict[str, Any]] = {}
-    for sheet, own in model.sheets.items():
-        facts = result.setdefault(sheet.group, {"times": own.times.tolist(), "bytes": 0, "GPU_bytes": 0})
-        facts["bytes"] += sizes[sheet]
-        facts["GPU_bytes"] += own.memory_bytes
-    return result
-
-
-def tile_sizes(sheet: SheetModel) -> np.ndarray:
-    """Returns the size in bytes of each tile's zstd frame, int [tiles]; 0 for tiles without a zstd frame."""
-    sizes, packed = np.zeros(len(sheet.kind), int), _packed(sheet)
-    sizes[sheet.numbers(*PACKED_KINDS)] = packed.sizes if isinstance(packed, Pieces) else [len(tile) for tile in packed]
-    return sizes
-
-
 def _packed(sheet: SheetModel) -> Sequence[bytes]:
     """Returns a zstd frame for each packed tile: those of the file if they were not read, else packed now."""
 
     def pack(number: int) -> bytes:
-        return zstd.compress(*encoding_of(sheet.kind[number]).pack(sheet, number))
+        return zstd.compress(encoding_of(sheet.kind[number]).pack(sheet, number))
 
     return list(each(pack, sheet.numbers(*PACKED_KINDS).tolist())) if sheet.pieces is None else sheet.pieces
 
@@ -245,20 +198,12 @@ def _by_sheet(tensors: Mapping[str, Content], count: int) -> list[dict[str, Cont
     return parts
 
 
-def _shortened(times: np.ndarray) -> np.ndarray:
-    """Returns the times as float32 if they stay distinct and change by at most `_ROUNDING`, else unchanged."""
-    short = times.astype(np.float32)
-    distinct = len(times) < 2 or np.all(np.diff(short) > 0)
-    return short if distinct and np.allclose(short, times, rtol=_ROUNDING, atol=0) else times
-
-
 def _read_times(arrays: Mapping[str, np.ndarray], period: float | None) -> np.ndarray:
     """Returns the stored times of a group from the part `times`, float64 [T]."""
-    stamps = check_part(arrays, "times", _TIMES).astype(np.float64)
+    stamps = check_part(arrays, "times", _TIMES)
     times = stamps.tolist()
     if len(times) < 1 or not math.isfinite(times[-1] - times[0]) or not all(a < b for a, b in pairwise(times)):
         raise ValueError("part times: expected finite times that increase")
-    # A file may hold a time that was rounded up to the period.
-    if period is not None and not (times[0] >= 0 and times[-1] <= period * (1 + _ROUNDING)):
+    if period is not None and not (times[0] >= 0 and times[-1] <= period):
         raise ValueError(f"part times: expected 0 to the period {period:g}, found {times[0]:g} to {times[-1]:g}")
     return stamps

@@ -14,7 +14,6 @@ import numpy as np
 
 from wlm import system
 from wlm.errors import WlmError
-from wlm.lightmap.codec import part_bytes, sheet_bytes
 from wlm.lightmap.data import LightmapSet, SheetFrames
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.group_scores import SumScore, score_sums
@@ -45,8 +44,6 @@ class SheetReport(ShownScore, Summary):
     too. PSNR is in dB, 120 for an exact tile; SSIM is in [-1, 1] and FLIP in [0, 1].
 
     Attributes:
-        bytes: Bytes of the sheet in the file; the mask that an atlas's sheets share counts for the first of them.
-        bpp: `bytes` as bits per texel and time, see `bits_per_texel`.
         memory_bpp: Bits per texel and time in the memory of a GPU, see `SheetModel.memory_bytes`.
         tiles: Number of tiles that are not empty.
         not_scored: Number of pairs that are not scored, by reason: `empty` (no valid texel), `not_held` (valid texels,
@@ -56,8 +53,6 @@ class SheetReport(ShownScore, Summary):
         held_out: Scores at the times of the input that the model does not store; None if it stores all.
     """
 
-    bytes: int
-    bpp: float
     memory_bpp: float
     tiles: int
     not_scored: dict[str, int]
@@ -76,7 +71,6 @@ class Report(system.Report):
         bytes: Size of the file on disk.
         bpp: Bits in the file per texel and time, all layers together.
         memory_bpp: Bits in the memory of a GPU per texel and time, all layers together.
-        parts: Bytes of the file by part, see `wlm.lightmap.codec.part_bytes`.
         times: float64 [T], the stored times of the first sheet of light.
         device: Device on which the model was decoded.
         seconds: Wall-clock time to decode and score everything; scoring takes most of it.
@@ -97,7 +91,6 @@ class Report(system.Report):
     bytes: int
     bpp: float
     memory_bpp: float
-    parts: dict[str, int]
     times: np.ndarray
     device: str
     seconds: float
@@ -152,7 +145,6 @@ def evaluate(
         WlmError: The set and the model differ in sheets or size, the set lacks a time of the model, no tile of the
             model has a valid texel, there is no such device, a metric is unknown, the number of views is negative, or
             `all_lights` has other sheets.
-        ValueError: `file_bytes` is smaller than the model's parts.
     """
     start = time.perf_counter()
     for sheet in lightmaps.sheets.keys() ^ model.sheets.keys():
@@ -161,7 +153,7 @@ def evaluate(
             f"{lightmaps.name}: expected the same sheets as in the file {model.name}; only {owner} has {sheet.label}"
         )
     whole, lightmaps = lightmaps, stored_part(model, lightmaps)
-    sizes, reports, warnings = sheet_bytes(model), {}, []
+    reports, warnings = {}, []
     if lightmaps.source != model.source:
         warnings.append(
             f"{lightmaps.name}: not the input of the file: its source is {model.source}, this is {lightmaps.source}"
@@ -170,7 +162,7 @@ def evaluate(
     for sheet, own in model.sheets.items():
         chosen = [metric for metric in metrics if not (sheet.linear and metric == "flip")]
         count = 0 if sheet.linear or "seen" not in metrics else views
-        report = _score(own, lightmaps.sheets[sheet], sizes[sheet], device, chosen, count, meter, done)
+        report = _score(own, lightmaps.sheets[sheet], device, chosen, count, meter, done)
         done += len(own.times)
         plain = [metric for metric in chosen if metric != "seen"]
         held_out = score_held_out(own, lightmaps.sheets[sheet], whole.sheets[sheet], device, plain)
@@ -186,7 +178,6 @@ def evaluate(
         bytes=file_bytes,
         bpp=8 * file_bytes / texels,
         memory_bpp=8 * model.memory_bytes / texels,
-        parts=part_bytes(model, file_bytes),
         times=model.light.times,
         device=device,
         seconds=time.perf_counter() - start,
@@ -200,7 +191,6 @@ def evaluate(
 def _score(
     model: SheetModel,
     lightmaps: SheetFrames,
-    size: int,
     device: str,
     metrics: Sequence[str],
     views: int,
@@ -224,7 +214,7 @@ def _score(
             lost.add(lightmaps.frames[i][window][valid], decoded[window][valid], _place(tile, stamp))
         if meter.due(done := before + i + 1):
             meter.report(done)
-    report = _sheet_report(model, lightmaps, size, frames, tally.score())
+    report = _sheet_report(model, lightmaps, frames, tally.score())
     return replace(report, warnings=report.warnings + warnings + lost.warnings(model.name, *_LOST))
 
 
@@ -319,7 +309,7 @@ def scored_mask(model: SheetModel, lightmaps: SheetFrames) -> np.ndarray:
 
 
 def _sheet_report(
-    model: SheetModel, lightmaps: SheetFrames, size: int, frames: Sequence[FrameMetrics], shown: ShownScore
+    model: SheetModel, lightmaps: SheetFrames, frames: Sequence[FrameMetrics], shown: ShownScore
 ) -> SheetReport:
     summary, warnings = summarise(frames, model.times), []
     left_out = _left_out(model, lightmaps, summary)
@@ -329,8 +319,6 @@ def _sheet_report(
     return SheetReport(
         **vars(summary),
         **vars(shown),
-        bytes=size,
-        bpp=bits_per_texel(model, lightmaps.mask, size),
         memory_bpp=bits_per_texel(model, lightmaps.mask, model.memory_bytes),
         tiles=int(np.count_nonzero(model.kind)),
         not_scored=left_out,

@@ -13,12 +13,12 @@ from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet, SheetFrames
 from wlm.lightmap.dispatch import Batch, Dispatch, Parts, start_workers, worker_devices
-from wlm.lightmap.encodings.frames import choose_frames, encode_frames, missing_encoder, needed_blocks
-from wlm.lightmap.encodings.maps import Reads, check_packable, clear_unread
+from wlm.lightmap.encodings.frames import choose_frames, encode_frames, missing_encoder
+from wlm.lightmap.encodings.maps import check_packable
 from wlm.lightmap.evaluation import lost_light
 from wlm.lightmap.model import LightmapModel, SheetModel, decode_scale, encode_scale, part_table
 from wlm.lightmap.profile import Profile
-from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, check_index, classify, cut, split, valid_texels
+from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, check_index, classify, cut, split
 from wlm.lightmap.trainer import Targets, TileJob
 from wlm.system import Meter, OnProgress
 from wlm.workers import each
@@ -232,8 +232,8 @@ class SheetFit:
         framed_rows = np.flatnonzero(self.kinds == TileKind.FRAMES)
         meter = Meter(progress, "frames", len(framed_rows))
         for i, number in enumerate(self.index[framed_rows].tolist()):
-            tile, needed = split(lightmaps, profile.gamma, [number]), needed_blocks(lightmaps.mask, number)
-            self.model.frames[i], self.model.ranges[i] = encode_frames(tile.colour[0], tile.mask[0], needed)
+            tile = split(lightmaps, profile.gamma, [number])
+            self.model.frames[i], self.model.ranges[i] = encode_frames(tile.colour[0], tile.mask[0])
             if meter.due(i + 1):
                 meter.report(i + 1)
 
@@ -271,18 +271,12 @@ class SheetFit:
 
     def store(self, batch: Batch, parts: Parts) -> None:
         """Copies the maps and networks of a finished batch into the model."""
-        dynamic = batch.kind == TileKind.DYNAMIC
-        maps, settings = ("uv", "uvt", "ut", "vt") if dynamic else ("uv",), self.model.profile
-        sizes = settings.uvt_resolution, settings.uvt_slices, settings.plane_columns, settings.plane_rows
-        for i, row in enumerate(batch.rows):
-            used = valid_texels(self.model.mask, int(self.index[row]))
-            reads = Reads.of(used, self._axis, *sizes) if dynamic else None
-            cleared = clear_unread({name: parts[name][i] for name in maps}, used, reads)
-            self.model.uv[np.searchsorted(self._mapped, row)] = cleared.pop("uv")
-            for name, values in cleared.items():
-                getattr(self.model, name)[batch.first + i] = values
-        nets = self.model.net if dynamic else self.model.net_static
-        nets[batch.first : batch.first + len(batch.rows)] = parts["net"]
+        dynamic, model = batch.kind == TileKind.DYNAMIC, self.model
+        model.uv[np.searchsorted(self._mapped, batch.rows)] = parts["uv"]
+        arrays = ("uvt", "ut", "vt", "net") if dynamic else ("net",)
+        for name in arrays:
+            stored = getattr(model, name if dynamic else "net_static")
+            stored[batch.first : batch.first + len(batch.rows)] = parts[name]
 
     def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool:
         """Copies a batch that a checkpoint holds as finished into the model; returns False if it does not hold it."""

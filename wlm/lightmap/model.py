@@ -337,6 +337,13 @@ class LightmapModel(Model):
         """Bytes that all sheets together take on a GPU."""
         return sum(own.memory_bytes for own in self.sheets.values())
 
+    def group_sizes(self) -> dict[str, tuple[np.ndarray, int]]:
+        """Returns for each light group its stored times, float64 [T], and the bytes that it takes on a GPU."""
+        result: dict[str, tuple[np.ndarray, int]] = {}
+        for sheet, own in self.sheets.items():
+            result[sheet.group] = own.times, result.get(sheet.group, (own.times, 0))[1] + own.memory_bytes
+        return result
+
     def check(self) -> None:
         """Reads and checks all tiles of the file that the model was loaded from, without keeping them.
 

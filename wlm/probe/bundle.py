@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pkgutil import resolve_name
+from typing import Any
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.probe.conventions import CANONICAL
 from wlm.probe.model import ProbeModel
+from wlm.probe.regions.model import Regions
 from wlm.probe.sphere import sh_count
 
 _ABOUT = {
@@ -25,6 +27,12 @@ _ABOUT = {
     "* code / 65535.",
 }
 
+_ABOUT_REGIONS = {
+    "regions": "The folders region-0, region-1 and so on are models of their own, with the same shader. The region of "
+    "a position, which is clamped to origin ... origin + extent * size: from node n = 0 on, n = child[n][1 if "
+    "position[axis[n]] >= plane[n] else 0] while n >= 0; the region is -1 - n.",
+}
+
 
 def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:
     """Returns a model's buffers, shader and description for a GPU; the layout depends on the compression method.
@@ -38,10 +46,19 @@ def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:
         model stores them; and `hours` if it has several. `reference` has M decoded examples, to test a shader with:
         `values`, float32 [M, D], and for Gaussians their points `position`, float64 [M, 3], or for principal
         components their indices `live` among the live probes, int32 [M]; and of several hours `mixed`, float32 [M, D].
+        A model in regions has them in `parts`, one for each region.
 
     Raises:
         WlmError: The device does not exist, the decoded light is not finite, or a number exceeds float32.
     """
+    positions = {"positions": np.ascontiguousarray(model.positions, "<u2")} if model.has_positions else {}
+    if isinstance(content := model.content, Regions):
+        parts = {
+            f"region-{number}": bundle(content.region(number), device=device) for number in range(content.tree.count)
+        }
+        tree = {name: part.tolist() for name, part in content.tree.parts().items()}
+        document = {"about": _ABOUT | _ABOUT_REGIONS, "tree": tree} | _described(model)
+        return Bundle("probe", model.name, "", document, buffers=positions, parts=parts)
     decoder, make = model.decoder(device), resolve_name(model.content.BUNDLE)
     forms = [make(model.at(time), decoder) for time in (model.times if len(model.times) else [None])]
     form, hours, times = forms[0], {}, {}
@@ -54,8 +71,12 @@ def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:
         form = replace(form, reference=form.reference | {"mixed": mixed})
     if not np.isfinite(form.reference["values"]).all():
         raise WlmError(f"{model.name}: cannot export: the model decodes to NaN or infinity")
-    document = {
-        "about": form.document["about"] | _ABOUT,
+    document = form.document | {"about": form.document["about"] | _ABOUT} | times | _described(model)
+    return replace(form, document=document, buffers=form.buffers | positions | hours)
+
+
+def _described(model: ProbeModel) -> dict[str, Any]:
+    return {
         "source": model.source,
         "method": model.method,
         "probes": model.probes,
@@ -66,7 +87,4 @@ def bundle(model: ProbeModel, *, device: str = "cpu") -> Bundle:
         "extent": model.extent,
         "size": model.size.tolist(),
         "dead": np.flatnonzero(model.dead).tolist(),
-        **times,
     }
-    positions = {"positions": np.ascontiguousarray(model.positions, "<u2")} if model.has_positions else {}
-    return replace(form, document=form.document | document, buffers=form.buffers | positions | hours)

@@ -11,13 +11,17 @@ parts      to the end: one zstd frame of all arrays (parts), in the order in whi
            of each array are split into planes, first the lowest byte of every number
 =========  =======================================================================================================
 
+A model in regions (`wlm.probe.regions`) is an artifact with two parts: `body`, which is the index, and `regions`, whose
+pieces are the bodies of the regions, each with a digest of its own. They are read when they are needed.
+
 Signed integers are stored as 2 n for n >= 0 and -2 n - 1 otherwise, so that small magnitudes have empty high planes.
 """
 
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +30,7 @@ from pydantic import Field
 from wlm.config import check_settings
 from wlm.formats import zstd
 from wlm.formats.artifact import Artifact
+from wlm.formats.artifact import Content as Stored
 from wlm.formats.compact import BODY
 from wlm.formats.hours import DAY
 from wlm.formats.limits import NUMBERS, PROBES
@@ -33,10 +38,12 @@ from wlm.formats.parts import Part, check_parts
 from wlm.probe.gaussian.model import Gaussians
 from wlm.probe.model import Content, ProbeModel, Profile
 from wlm.probe.pca.model import CLUSTERS, Components
+from wlm.probe.regions.model import Regions
 from wlm.system import Header, Name
 
 _METHODS: dict[str, type[Content]] = {each.METHOD: each for each in (Gaussians, Components)}
 
+_REGIONS = "regions"
 _LENGTH = struct.Struct("<H")
 _FARTHEST = 1e150
 _SOURCE = 8  # hexadecimal digits of the source
@@ -45,8 +52,8 @@ _SURE, _PER_BYTE = 1 << 24, 4096
 
 
 class _Header(Header):
-    """The header of a file: `count` is the number of Gaussians, or of components, 0 for unit vectors. The method is in
-    `profile`."""
+    """The header of a file: `count` is the number of Gaussians, of regions, or of components, 0 for unit vectors. The
+    method is in `profile`."""
 
     probes: int = Field(ge=1, le=PROBES)
     outputs: int = Field(27, ge=1, le=NUMBERS)
@@ -64,12 +71,21 @@ class _NameHeader(Header):
     name: Name = ""
 
 
-def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
-    """Encodes a model for `wlm.formats.artifact`: returns no settings, one array of bytes, and an empty source hash.
+def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, Stored], str]:
+    """Encodes a model for `wlm.formats.artifact`: its settings, arrays and pieces, and the hash of the input; for a
+    model without regions no settings, one array of bytes, and an empty hash.
 
     Raises:
         ValueError: The model's Gaussians have not been quantised to integers.
     """
+    body = np.frombuffer(pack(model), np.uint8)
+    if isinstance(model.content, Regions):
+        return {"name": model.name}, {BODY: body, _REGIONS: model.content.packed}, model.source[:_SOURCE]
+    return {}, {BODY: body}, ""
+
+
+def pack(model: ProbeModel) -> bytes:
+    """Returns the body of a model's file, or, of a model in regions, the index of these; errors as for `encode`."""
     live = int(model.live.sum())
     header: dict[str, Any] = {"probes": model.probes}
     if model.outputs != _Header.model_fields["outputs"].default:
@@ -88,19 +104,24 @@ def encode(model: ProbeModel) -> tuple[dict[str, Any], dict[str, np.ndarray], st
         # Differences from probe to probe, modulo 2^16: on a lattice they repeat, which zstd compresses well.
         parts["positions"] = np.diff(model.positions, axis=0, prepend=np.zeros((1, 3), np.uint16)).T
     text = json.dumps(header, separators=(",", ":")).encode()
-    table = _table(_Header.model_validate(header))
+    table = _table(_Header.model_validate(header), type(model.content))
     frame = zstd.compress(b"".join(_planes(parts[name]) for name in table))
-    return {}, {BODY: np.frombuffer(_LENGTH.pack(len(text)) + text + frame, np.uint8)}, ""
+    return _LENGTH.pack(len(text)) + text + frame
 
 
 def decode(artifact: Artifact) -> ProbeModel:
     """Restores the model that `encode` stored, bit for bit, except that the input's hash keeps only 8 of 16 digits.
+    Regions are not read.
 
     Raises:
         WlmError, ValueError: A setting or an array is missing or wrong, or they contradict each other.
     """
     name = check_settings(_NameHeader, artifact.settings, "setting ").name
-    body = artifact.tensors[BODY].tobytes()
+    return unpack(artifact.tensors[BODY].tobytes(), name, artifact.pieces.get(_REGIONS))
+
+
+def unpack(body: bytes, name: str, regions: Sequence[bytes] | None = None) -> ProbeModel:
+    """Restores a model from what `pack` returned, and its regions, if it has any; errors as for `decode`."""
     start = _LENGTH.size + (_LENGTH.unpack_from(body)[0] if len(body) >= _LENGTH.size else len(body))
     if start > len(body):
         raise ValueError("expected a header and compressed arrays, found fewer bytes than the header's length")
@@ -113,7 +134,8 @@ def decode(artifact: Artifact) -> ProbeModel:
         raise ValueError(f"setting method: expected {' or '.join(_METHODS)}, found {header.profile.method}")
     if header.live is not None and header.live >= header.probes:
         raise ValueError(f"setting live: expected fewer live probes than {header.probes}, found {header.live}")
-    table = _table(header)
+    kind: type[Content] = _METHODS[header.profile.method] if regions is None else Regions
+    table = _table(header, kind)
     stored = check_parts(_split(body[start:], table, len(body)), table)
     box = stored["box"]
     origin, extent, size = box[:3].copy(), float(box[3]), box[4:].copy()
@@ -131,7 +153,11 @@ def decode(artifact: Artifact) -> ProbeModel:
     times, scales = stored.get("times", np.zeros(0)), stored.get("scales", np.ones(1))
     if not ((np.diff(times) > 0).all() and (times < DAY).all()):
         raise ValueError("part times: expected increasing hours of the day, from 0 to less than 24")
-    content = _METHODS[profile.method].from_parts(profile, outputs, header.hours, stored, header.dropped)
+    content = kind.from_parts(profile, outputs, header.hours, stored, header.dropped)
+    if isinstance(content, Regions):
+        if regions is None or len(regions) != content.tree.count:
+            raise ValueError(f"part {_REGIONS}: expected {content.tree.count} pieces, found {len(regions or ())}")
+        content = replace(content, packed=regions, name=name)
     known = {"times": times, "scales": scales}
     place = {"origin": origin, "extent": extent, "size": size, "positions": positions}
     return ProbeModel(
@@ -139,7 +165,7 @@ def decode(artifact: Artifact) -> ProbeModel:
     )
 
 
-def _table(header: _Header) -> dict[str, Part]:
+def _table(header: _Header, kind: type[Content]) -> dict[str, Part]:
     """Returns the types and shapes of a file's arrays, by name."""
     live = header.probes if header.live is None else header.live
     table = {"box": Part(np.float64, (7,))}
@@ -152,8 +178,7 @@ def _table(header: _Header) -> dict[str, Part]:
         table["scales"] = Part(np.float64, (header.hours,), least=0.0, most=1.0)
     if (numbers := header.hours * header.outputs) > NUMBERS:
         raise ValueError(f"setting hours: expected at most {NUMBERS} numbers of a probe at all hours, found {numbers}")
-    content = _METHODS[header.profile.method]
-    return table | content.table(header.profile, header.outputs, header.hours, header.count, live, header.clusters)
+    return table | kind.table(header.profile, header.outputs, header.hours, header.count, live, header.clusters)
 
 
 def _planes(part: np.ndarray) -> bytes:

@@ -23,6 +23,8 @@ class Decoder(ABC):
         time: Hour of the day of the light that is decoded, from 0 to 24; None for a model of one hour.
     """
 
+    time: float | None = None
+
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
         """Stores the model after checking the arguments.
 
@@ -36,7 +38,7 @@ class Decoder(ABC):
         """
         self.model, self.device = model, interop.check_device(device)
         self._arrays: list[wp.array] = []
-        self.time: float | None = float(model.times[0]) if len(model.times) else None
+        self.time = float(model.times[0]) if len(model.times) else None
         self._hours: tuple[wp.array, wp.array] | None = None
         self._position = None
         if position is not None:

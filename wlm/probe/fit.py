@@ -12,16 +12,26 @@ import numpy as np
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
+from wlm.formats.parts import Part
 from wlm.metrics import psnr_from_mse
+from wlm.probe.codec import pack
 from wlm.probe.data import ProbeSet
-from wlm.probe.gaussian.model import check_outputs
+from wlm.probe.gaussian.model import check_outputs, gaussian_count
 from wlm.probe.gaussian.packing import pack_model
 from wlm.probe.gaussian.trainer import Trainer
 from wlm.probe.model import CODES, ProbeModel, Profile, box_of
+from wlm.probe.regions.model import Regions, box_row
+from wlm.probe.regions.tree import Tree
 from wlm.probe.selection import Candidates
 from wlm.system import Meter, OnProgress
 
 _MOST_LATENT, _MOST_HIDDEN = 32, 128  # of a fit of several hours
+_BATCHES = 1_000_000  # numbers in the checkpoint for the regions of a fit; those below are of fits without regions
+_FINISHED = {
+    "packed": Part(np.uint8, (None,)),
+    "box": Part(np.float64, (7,)),
+    "count": Part(np.int32, (2,), least=0),
+}
 _CHUNK = {"cpu": 5, "cuda": 500}  # steps after which progress and checkpoint may be due
 
 
@@ -73,7 +83,9 @@ def compress(
     have less error in no more GPU memory, which is the case for a few hundred probes; `ProbeModel.choice` says why.
     With `target` the result is the smallest model found that reaches it, after up to seven fits; with `max_bytes` the
     one with the least error within them.
-    Dead probes take no part in the fit: the model stores one bit per probe if any probe is dead.
+    More live probes than the setting `region` are fitted in regions, one after another, by Gaussians unless the profile
+    asks for principal components. Dead probes take no part in the fit: the model stores one bit per probe if any
+    probe is dead.
 
     Several hours are fitted as one, with probes that have the numbers of all hours; those of each hour are divided by
     their root mean square.
@@ -132,11 +144,65 @@ def compress(
         **box,
     )
     even = replace(probes, values=values)
+    tree = Tree.split(probes.position[probes.live], profile.region)
     # Magnitudes follow each probe at each hour by themselves, and half floats would round a scale's logarithm.
     of_fit = (partial(make, scales=np.ones(hours)), probes) if profile.error == "relative" else (make, even)
-    trained = partial(_fit_gaussians, *of_fit, seed=seed, device=device, progress=progress, checkpoint=checkpoint)
-    candidates = Candidates(make, probes, values[probes.live], profile, device, trained, checkpoint)
+    trained = partial(
+        _fit_regions, *of_fit, tree=tree, seed=seed, device=device, progress=progress, checkpoint=checkpoint
+    )
+    candidates = Candidates(make, probes, values[probes.live], profile, device, trained, checkpoint, tree.count)
     return candidates.selected() if profile.target or profile.max_bytes else candidates.usual()
+
+
+def _fit_regions(
+    make: Callable[..., ProbeModel],
+    probes: ProbeSet,
+    profile: Profile,
+    *,
+    tree: Tree,
+    checkpoint: Checkpoint | None,
+    progress: OnProgress | None,
+    number: int = 0,
+    **options: Any,
+) -> ProbeModel:
+    """Fits the Gaussians of each region, or of the set if it is one region. `number` is that of the fit in the
+    checkpoint; `options` are those of `_fit_gaussians`."""
+    hours, live = max(len(probes.times), 1), probes.live
+    profile = profile.model_copy(update={"method": "gaussians"})
+    fit = partial(_fit_gaussians, meter=Meter(progress, "fit", profile.steps * tree.count), **options)
+    if tree.count == 1:
+        return fit(make, probes, profile, checkpoint=checkpoint, batch=number, before=0)
+    position = probes.position[live]
+    owner = tree.regions_of(position)
+    # All regions together have as many Gaussians as one fit would have.
+    share = np.cumsum(np.bincount(owner)) / len(owner) * gaussian_count(profile.ratio, len(owner))
+    wanted = np.maximum(np.diff(np.rint(share), prepend=0.0), 1.0)
+    packed, boxes, counts = [], np.zeros((tree.count, 7)), np.zeros((tree.count, 2), np.int32)
+    for region in range(tree.count):
+        batch = (number + 1) * _BATCHES + region
+        kept = checkpoint and checkpoint.finished(batch, _FINISHED)
+        if not kept:
+            own = position[owner == region]
+            # The spacing of as many probes in a cube; on surfaces it is several times that of the probes.
+            margin = np.ptp(own, axis=0).max() / np.cbrt(len(own))
+            near = ((position >= own.min(0) - margin) & (position <= own.max(0) + margin)).all(1)
+            chosen = np.flatnonzero(live)[near]
+            part = {"position": probes.position[chosen], "live": np.ones(len(chosen), bool), "normal": None}
+            near_set = replace(probes, values=probes.values[chosen], **part)
+            sized = profile.model_copy(update={"ratio": min(wanted[region] / len(chosen), 1.0)})
+            bare = {"probes": len(chosen), "dead": np.zeros(0, bool), "positions": np.zeros((0, 3), np.uint16)}
+            of_region = partial(make, **bare, **box_of(near_set.position))
+            before = profile.steps * region
+            model = fit(of_region, near_set, sized, checkpoint=checkpoint, batch=batch, before=before)
+            count = np.array([model.content.settings()[name] for name in ("count", "dropped")], np.int32)
+            kept = {"packed": np.frombuffer(pack(model), np.uint8), "box": box_row(model), "count": count}
+            if checkpoint is not None:
+                checkpoint.add_finished(batch, kept)
+        packed.append(kept["packed"].tobytes())
+        boxes[region], counts[region] = kept["box"], kept["count"]
+    content = Regions(tree, boxes, counts, profile, probes.outputs, hours, packed, probes.name)
+    choice = f"Gaussians, in {tree.count} regions of at most {profile.region:,} live probes"
+    return make(profile=profile, content=content, choice=choice)
 
 
 def _fit_gaussians(
@@ -146,11 +212,13 @@ def _fit_gaussians(
     *,
     seed: int,
     device: str,
-    progress: OnProgress | None,
+    meter: Meter,
     checkpoint: Checkpoint | None,
-    number: int = 0,
+    batch: int,
+    before: int,
 ) -> ProbeModel:
-    """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3)."""
+    """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3). `batch` is the fit's number in
+    the checkpoint; `meter` counts the steps from `before` on."""
     hours, box = max(len(probes.times), 1), box_of(probes.position)
     relative = hours * (profile.error == "relative")
     check_outputs(probes.name, profile.latent, profile.hidden, hours * probes.outputs, relative, device)
@@ -159,8 +227,8 @@ def _fit_gaussians(
     trainer = Trainer(x, values, profile, seed, device, hours)
     try:
         if checkpoint is not None:
-            checkpoint.restore(number, trainer.load)
-        _train(trainer, probes, progress, checkpoint, number)
+            checkpoint.restore(batch, trainer.load)
+        _train(trainer, probes, meter, before, checkpoint, batch)
         trainer.finish()
         mse = trainer.mse()
         content = trainer.quantised()
@@ -168,19 +236,14 @@ def _fit_gaussians(
         trainer.close()
     if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
         raise WlmError(f"{probes.name}: the fit diverged; use smaller learning rates than profile {profile.name}")
-    fitted = make(
-        profile=profile.model_copy(update={"method": "gaussians"}),
-        content=content,
-        choice="Gaussians, as the profile asks",
-    )
+    fitted = make(profile=profile, content=content, choice="Gaussians, as the profile asks")
     return pack_model(fitted, position, values, device)
 
 
 def _train(
-    trainer: Trainer, probes: ProbeSet, progress: OnProgress | None, checkpoint: Checkpoint | None, number: int
+    trainer: Trainer, probes: ProbeSet, meter: Meter, before: int, checkpoint: Checkpoint | None, batch: int
 ) -> None:
     steps, chunk = trainer.steps, _CHUNK["cpu" if trainer.device == "cpu" else "cuda"]
-    meter = Meter(progress, "fit", steps)
     peak, live = float(np.ptp(probes.values)), probes.live.mean()  # dead probes decode exactly, and count
 
     def figures() -> dict[str, float]:
@@ -192,12 +255,12 @@ def _train(
     for start in range(trainer.step, steps, chunk):
         step = min(start + chunk, steps)
         trainer.run(step - start)
-        if meter.due(step):
+        if meter.due(before + step):
             try:
-                meter.report(step, **figures())
+                meter.report(before + step, **figures())
             except KeyboardInterrupt:
                 if checkpoint is not None:
-                    checkpoint.save({number: trainer.state()})
+                    checkpoint.save({batch: trainer.state()})
                 raise
         if checkpoint is not None and checkpoint.due():
-            checkpoint.save({number: trainer.state()})
+            checkpoint.save({batch: trainer.state()})

@@ -46,6 +46,8 @@ class Profile(Settings):
     """Support of a Gaussian: ellipsoid, at three standard deviations, or sphere, of its longest half axis (eq. 6)."""
     optimiser: Literal["adam", "adan"] = "adam"
     """Optimiser of the Gaussians; the network is always trained by Adam."""
+    region: int = Field(20_000, ge=2)
+    """Most live probes of a region; Gaussians of larger sets are fitted in regions, each with a network of its own."""
     steps: int = Field(12000, ge=10)
     """Number of training steps; each step runs over all probes."""
     centre_rate: float = Field(1e-3, gt=0.0, lt=1.0)
@@ -93,6 +95,10 @@ class Content(ABC):
     @abstractmethod
     def nbytes(self) -> int:
         """The bytes of the content's GPU buffers, as `wlm.probe.bundle` makes them."""
+
+    def check(self) -> None:
+        """Reads and checks what a file still holds; raises a WlmError for what is damaged."""
+        return
 
     @abstractmethod
     def at(self, factors: np.ndarray, scales: np.ndarray) -> Self:
@@ -188,6 +194,9 @@ class ProbeModel(Model):
     def live(self) -> np.ndarray:
         """Which probes hold light, bool [N]."""
         return ~self.dead if len(self.dead) else np.ones(self.probes, bool)
+
+    def check(self) -> None:
+        self.content.check()
 
     @property
     def has_positions(self) -> bool:

@@ -34,6 +34,7 @@ class Candidates:
         device: str,
         trained: Callable[..., ProbeModel],
         checkpoint: Checkpoint | None,
+        regions: int,
     ) -> None:
         """Keeps the arguments.
 
@@ -44,10 +45,11 @@ class Candidates:
             profile, device: The settings, and where errors are measured.
             trained: Fits Gaussians with a profile; `number` is that of the fit in the checkpoint.
             checkpoint: Keeps the errors of finished fits of a search; None: nothing is kept.
+            regions: Number of regions, each with a network.
         """
         self._make, self._probes, self._profile, self._device = make, probes, profile, device
         self._trained, self._checkpoint, self._values = trained, checkpoint, values
-        self._live, self._hours = len(values), max(len(probes.times), 1)
+        self._live, self._hours, self._regions = len(values), max(len(probes.times), 1), regions
         self._models: dict[int, ProbeModel] = {}
         self._errors: dict[int, float] = {}
 
@@ -56,6 +58,8 @@ class Candidates:
         profile = self._profile
         if profile.method == "pca":
             return self._measured(self._components(None, ENOUGH, "PCA, as the profile asks")[0])[0]
+        if profile.method == "auto" and self._regions > 1:
+            return self._measured(self._trained(profile))[0]
         count = gaussian_count(profile.ratio, self._live)
         if profile.method == "auto":
             budget = self._bytes(count)
@@ -95,7 +99,8 @@ class Candidates:
                 most = min(most, size - 1)  # more Gaussians than that would be no gain
         if profile.method != "pca":
             each, fixed = self._bytes(1) - self._bytes(0), self._bytes(0)
-            count = max(int(min(most, self._bytes(self._live)) - fixed) // each, 0)
+            count = int(min(most, self._bytes(self._live)) - fixed) // each
+            count = count if count >= self._regions else 0
             if count and target:
                 first = gaussian_count(profile.ratio, self._live)
                 count = least_count(self._error, first, count, target) or count
@@ -126,8 +131,8 @@ class Candidates:
     def _bytes(self, count: int) -> int:
         """Returns the bytes of GPU memory of `count` Gaussians."""
         profile = self._profile
-        columns = profile.columns(self._probes.outputs)
-        return gaussian_bytes(count, profile.latent, profile.hidden, columns, self._hours)
+        sizes = profile.latent, profile.hidden, profile.columns(self._probes.outputs), self._hours
+        return gaussian_bytes(count, *sizes) + (self._regions - 1) * gaussian_bytes(0, *sizes)
 
     def _error(self, count: int) -> float:
         """Returns the relative error of a fit of `count` Gaussians; a checkpoint keeps it."""

@@ -108,7 +108,7 @@ class Scene:
         title: Title.
         mesh: The mesh under the lightmaps.
         light: Lightmaps over time, of one atlas, with any number of light groups.
-        probes: Hours and probes of L2 radiance, all at the same positions; empty if nothing needs them.
+        probes: Probes of L2 radiance over the day, with their positions; None if nothing needs them.
         moving, smoke: Moving objects, and smoke.
         sky: float64 [S, 5], rows of hour, R, G, B radiance of the background, and exposure in stops.
         camera: float64 [C, 8], rows of second, eye, target, and vertical field of view in degrees.
@@ -120,13 +120,20 @@ class Scene:
     title: str
     mesh: Mesh
     light: LightmapModel
-    probes: tuple[tuple[float, ProbeModel], ...]
+    probes: ProbeModel | None
     moving: tuple[Moving, ...]
     smoke: tuple[Puff, ...]
     sky: np.ndarray
     camera: np.ndarray
     day: Day
     originals: dict[float, Path]
+
+    @property
+    def probe_hours(self) -> np.ndarray:
+        """The hours of the probes, float64 [T]; 0 for probes of one unnamed hour, none without probes."""
+        if self.probes is None:
+            return np.zeros(0)
+        return self.probes.times if len(self.probes.times) else np.zeros(1)
 
     def hour_at(self, second: float) -> float:
         """Returns the hour of a second of the film, from `day.first`; hours of the next day are 24 and more."""
@@ -188,10 +195,6 @@ def load(path: str | os.PathLike[str]) -> Scene:
             raise WlmError(f"{path}: {key}: there is no file or folder {found}")
         return found
 
-    probes = [(row.hour, _probes(file(f"probes.{i}.file", row.file), row.hour)) for i, row in enumerate(given.probes)]
-    for i, (_, model) in enumerate(probes[1:], 1):
-        if not np.array_equal(model.positions, probes[0][1].positions):
-            raise WlmError(f"{path}: probes.{i}.file: expected probes at the positions of {given.probes[0].file}")
     moving = [
         Moving(read_mesh(file(f"moving.{i}.mesh", row.mesh)), np.array(row.path), row.seconds)
         for i, row in enumerate(given.moving)
@@ -209,7 +212,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
         path=path,
         title=given.title,
         mesh=read_mesh(file("mesh", given.mesh), with_uv=True),
-        probes=tuple(probes),
+        probes=None if given.probes is None else _probes(file("probes", given.probes)),
         moving=tuple(moving),
         smoke=tuple(smoke),
         sky=np.array([(row.hour, *row.colour, row.exposure) for row in given.sky]),
@@ -229,8 +232,8 @@ def _light(path: Path) -> LightmapModel:
     return model
 
 
-def _probes(path: Path, hour: float) -> ProbeModel:
-    model: Any = load_model(path, "probe").at(hour)
+def _probes(path: Path) -> ProbeModel:
+    model: Any = load_model(path, "probe")
     if model.outputs != _SH or not model.has_positions:
         positions = "with" if model.has_positions else "without"
         raise WlmError(

@@ -26,13 +26,6 @@ class _Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Probes(_Part):
-    """A file of probes, `.wlm`, with spherical harmonics of radiance at an hour."""
-
-    hour: _Hour
-    file: _Name
-
-
 class Sky(_Part):
     """The background at an hour, linear R, G, B radiance, and the exposure in stops."""
 
@@ -109,7 +102,7 @@ class SceneFile(_Part):
     title: str = Field(max_length=200)
     mesh: _Name
     light: _Name
-    probes: Annotated[tuple[Probes, ...], Field(max_length=100), _rising("hour")] = ()
+    probes: _Name | None = None
     sky: Annotated[tuple[Sky, ...], Field(min_length=1, max_length=1000), _rising("hour")]
     moving: Annotated[tuple[MovingObject, ...], Field(max_length=100)] = ()
     smoke: Annotated[tuple[Smoke, ...], Field(max_length=100)] = ()
@@ -119,6 +112,6 @@ class SceneFile(_Part):
 
     @model_validator(mode="after")
     def _lit(self) -> SceneFile:
-        if (self.moving or self.smoke) and not self.probes:
-            raise PydanticCustomError("probes", "expected at least one entry, since probes light moving and smoke")
+        if (self.moving or self.smoke) and self.probes is None:
+            raise PydanticCustomError("probes", "expected a file of probes, since they light moving and smoke")
         return self

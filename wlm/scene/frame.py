@@ -130,7 +130,7 @@ class Renderer:
         books = {files: _book(files, self._device) for files in {puff.files for puff in scene.smoke}}
         self._smoke = [books[puff.files] for puff in scene.smoke]
         with interop.stream(self.device):
-            self._probes = DayProbes(scene.probes, self.device) if scene.moving or scene.smoke else None
+            self._probes = DayProbes(scene, self.device) if scene.moving or scene.smoke else None
             meshes = [scene.mesh, *(moving.mesh for moving in scene.moving)]
             firsts = np.cumsum([0, *(len(mesh.position) for mesh in meshes)])
             triangle = [mesh.triangle + first for mesh, first in zip(meshes, firsts, strict=False)]
@@ -161,7 +161,7 @@ class Renderer:
         height, width = self.samples * self.height, self.samples * self.width
         with interop.stream(self.device), torch.no_grad():
             with self._timed(stages, "objects"):
-                smoke_light = self._move(second, hour, view)
+                smoke_light = self._move(second, hour, view, complete)
             with self._timed(stages, "triangles"):
                 raster = rasterize(view(self._position), self._triangle, height, width, derivative=True)
                 uv, slope = interpolate(self._uv, self._triangle, raster, derivatives=True)
@@ -205,7 +205,7 @@ class Renderer:
         parts["meshes"] = sum(part.nbytes for part in mesh)
         if self._probes is not None:
             parts["probes: volume"] = self._probes.volume.memory_bytes
-            parts["probes: light"] = 4 * self._probes.volume.light.count * self._probes.volume.channels
+            parts["probes: light"] = self._probes.decoder.device_bytes
         if self._smoke:
             parts["smoke"] = sum(book.nbytes for book in set(self._smoke))
         return parts
@@ -238,8 +238,9 @@ class Renderer:
         tangent = math.tan(math.radians(fov) / 2.0)
         return _View(eye, axes, np.array([self.height / self.width, 1.0]) / tangent)
 
-    def _move(self, second: float, hour: float, view: _View) -> np.ndarray:
-        """Places the moving objects, and lights their vertices by the irradiance at their centres.
+    def _move(self, second: float, hour: float, view: _View, complete: bool) -> np.ndarray:
+        """Places the moving objects, and lights their vertices by the irradiance at their centres. `complete` waits for
+        the light of the hour.
 
         Returns:
             SH of radiance at the centres of the squares of smoke, float32 [N, 9, 3].
@@ -249,7 +250,7 @@ class Renderer:
         moving = [(each, each.pose(second)) for each in self.scene.moving]
         centres = [each.centre(pose) for each, pose in moving]
         centres += [puff.position + 0.5 * puff.size * view.axes[1] for puff in self.scene.smoke]
-        coefficients = self._probes.at(np.stack(centres), hour, view.eye)
+        coefficients = self._probes.at(np.stack(centres), hour, view.eye, complete=complete)
         for i, (each, pose) in enumerate(moving):
             place = slice(*self._firsts[i + 1 : i + 3])
             position, radiance = each.lit(pose, coefficients[i])

@@ -3,57 +3,59 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
 from wlm.formats.hours import DAY
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.virtual.clock import Clock
-from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import basis, coefficient_bands
 from wlm.probe.volume.cascade import Volume
-from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.walk import settle
+from wlm.scene.content import Scene
 from wlm.smoke.camera import VECTORS
 
-_ROWS, _SIDE = 4096, 16  # blocks that have memory, and blocks along an axis of a window
+SIDE = 16
+"""Blocks along an axis of a window of the volume."""
+
+_BUDGET = 512  # blocks decoded in a frame
 _SQUARED = np.array([2.0 * math.pi / 3.0, math.pi / 2.0, 4.0 * math.pi / 15.0])
 
 
 class DayProbes:
-    """Probes at hours of a day on a device. A block of the volume has the light of all hours, so that a block that was
-    decoded stays valid while the hour changes.
+    """Probes over the day on a device, whose light at any hour a volume decodes around the viewer.
 
     Attributes:
-        volume: The volume; its numbers are those of the first hour, then of the second, and so on.
+        decoder: The decoder of the probes.
+        volume: The volume. A frame decodes at most its budget of blocks for a new hour.
     """
 
-    def __init__(self, probes: Sequence[tuple[float, ProbeModel]], device: str = "cpu") -> None:
-        """Decodes all probes: rising hours with models of 27 numbers a probe, all at the same positions."""
-        decoders = [model.decoder(device) for _, model in probes]
-        light = StoredLight(np.concatenate([decoder.decode_probes() for decoder in decoders], 1), device)
-        live = np.logical_and.reduce([model.live for _, model in probes])
-        self.volume = Volume(decoders[0].own_positions(), light, live=live, rows=_ROWS, side=_SIDE)
-        self._clock = Clock(TimeAxis(np.array([hour for hour, _ in probes]), DAY, "frames"))
+    def __init__(self, scene: Scene, device: str = "cpu") -> None:
+        """Loads the probes of a scene that has some."""
+        assert scene.probes is not None
+        self.decoder = scene.probes.decoder(device)
+        own = self.decoder.own_positions()
+        light, live = self.decoder.light(own), scene.probes.live
+        self.volume = Volume(own, light, live=live, side=SIDE, budget=_BUDGET, tolerance=0.0)
+        self._clock = Clock(TimeAxis(scene.probe_hours, DAY, "frames"))
         self._settled = False
 
-    def at(self, points: np.ndarray, hour: float, viewpoint: np.ndarray) -> np.ndarray:
+    def at(self, points: np.ndarray, hour: float, viewpoint: np.ndarray, *, complete: bool = False) -> np.ndarray:
         """Returns SH coefficients of radiance at points [M, 3] and any hour, float32 [M, 9, 3].
 
-        Between the hours of two files they are mixed linearly, except across a switch of a lamp
-        (`wlm.lightmap.virtual.clock`): until its end, the light is that before it. The volume is finest around
-        `viewpoint`, [3].
+        Light is that of the hour, except across a switch of a lamp (`wlm.lightmap.virtual.clock`): until its end, it is
+        the light before it. The volume is finest around `viewpoint`, [3]. With `complete`, and at the first call, all
+        of it has the light of the hour; otherwise blocks may be some frames behind.
         """
-        if self._settled:
+        axis = self._clock.axis
+        before = axis.neighbours(hour)[0]
+        self.decoder.set_time(float(axis.times[before]) if before in self._clock.switches else hour)
+        if self._settled and not complete:
             self.volume.update(viewpoint)
         else:
             settle(self.volume, viewpoint)
             self._settled = True
-        before, after, share = self._clock.axis.neighbours(hour)
-        share = 0.0 if before in self._clock.switches else share
-        values = self.volume.read(points).values.reshape(len(points), -1, 9, 3)
-        return (1.0 - share) * values[:, before] + share * values[:, after]
+        return self.volume.read(points).values.reshape(len(points), 9, 3)
 
 
 def six_lights(coefficients: np.ndarray, axes: np.ndarray) -> np.ndarray:

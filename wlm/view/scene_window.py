@@ -41,7 +41,7 @@ def day_scene(content: Content, weights: Mapping[str, Weight] | None = None, dev
         content=content,
         factors=factors,
         decoder=model.decoder(device),
-        probes=DayProbes(content.probes, device) if content.moving else None,
+        probes=DayProbes(content, device) if content.moving else None,
         base=fill_gaps(colours, raster.triangle.numpy() >= 0),
     )
 
@@ -71,7 +71,7 @@ class _DayScene(Scene):
             return
         poses = [each.pose(second) for each in content.moving]
         centres = [each.centre(pose) for each, pose in zip(content.moving, poses, strict=True)]
-        light = self.probes.at(np.stack(centres), hour, content.camera_at(second)[0])
+        light = self.probes.at(np.stack(centres), hour, content.camera_at(second)[0], complete=True)
         for i, (each, pose, own) in enumerate(zip(content.moving, poses, light, strict=True)):
             position, radiance = each.lit(pose, own)
             canvas.coloured(0, f"moving {i}", position, each.mesh.triangle, display.picture(radiance))

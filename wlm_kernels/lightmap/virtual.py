@@ -33,7 +33,7 @@ from wlm_kernels.shared_exponent import unpack_rgb9e5
 
 GROUP = 32  # slots from which one is chosen
 MOST = 4096  # most pages that are ranked
-SAMPLES = 3  # most samples of a texel of all decoded pages together, for each page that a frame may decode
+SAMPLES = 2.5  # most samples of a texel of all decoded pages together, for each page that a frame may decode
 KEEP = 16  # frames for which a page counts as needed
 REFRESH = 0.3  # of the tolerance: change of light from which on a page is decoded again if a frame has room
 FEW = 4  # samples of a texel of such a page
@@ -371,7 +371,7 @@ def _rank(work: Work):
                 better += 1
                 cost += work.cost[j]
         most = work.chosen.shape[0]
-        if better == 0 or (better < most and cost + work.cost[i] <= _SAMPLES * most):
+        if better == 0 or (better < most and float(cost + work.cost[i]) <= _SAMPLES * float(most)):
             work.chosen[better] = code
 
 

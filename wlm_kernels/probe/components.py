@@ -32,7 +32,9 @@ def _decode_components(
     out: wp.array2d[float],
 ):
     i, d = wp.tid()
-    probe = row[numbers[i]]
+    probe = int(-1)
+    if numbers[i] >= 0:
+        probe = row[numbers[i]]
     total = float(0.0)
     if probe >= 0:
         count = bounds.shape[1] - 1
@@ -74,7 +76,7 @@ def decode_components(
             coefficient, and the step between codes.
         basis: float16 [C K, D], the directions of each cluster; empty: the coefficients are the probe's numbers, K = D.
         row: int [N], place of each probe in `codes`; -1 for a dead probe (without light), which decodes to 0.
-        numbers: int [M], indices of the probes to decode, below N.
+        numbers: int [M], indices of the probes to decode, below N; -1 decodes to 0.
         ambient: Number of the first numbers of a probe that are clamped at 0.
         out: float [M, D], the probes' numbers, written.
     """

@@ -1,5 +1,8 @@
 """Decodes light at points: sums Gaussians and evaluates a network in one launch (gaussian-probe-compression, eq. 5-7).
 
+Points may lie in several regions, each with Gaussians and a network of its own. A block of threads then decodes the
+regions of its points one after another, so points are best sorted by region.
+
 On CUDA a block of 128 threads decodes 32 points after another: four threads share the Gaussians that a point's cube
 lists, and the network of 16 points is evaluated together on the matrix units (`native/decode.cuh`), from arrays that
 `DecodeKernels.pack` arranges. On the CPU a thread decodes one point. The reference is `benchmarks/probe_exact.py`.
@@ -20,6 +23,19 @@ from wlm_kernels.probe.network import cpu_network
 _THREADS = 128
 _POINTS = 32  # of a block of threads on CUDA
 _BLOCKS = 1056  # most blocks of a launch, which take turns
+_NONE = wp.constant(1 << 30)
+
+
+@wp.struct
+class Region:
+    """What decodes the points of a region; the attributes are those of `DecodeKernels.launch`, `net` is empty if the
+    region is not in memory, and `gain` then stands for each of the light's numbers."""
+
+    rows: wp.array2d[float]
+    shapes: wp.array1d[Shape]
+    cubes: Cubes
+    net: wp.array1d[float]
+    gain: float
 
 
 @dataclass(frozen=True)
@@ -34,6 +50,7 @@ class DecodeKernels:
     device_kind: str
     words: int
     _kernel: Any
+    _regional: Any
     _pack: Any
 
     def pack(self, rows, shapes, net):
@@ -79,10 +96,26 @@ class DecodeKernels:
             x: vec3 [M], the points in normalised coordinates.
             out: float [M, D], the light at the points, written.
         """
-        count = x.shape[0]
-        dims = (min(-(-count // _POINTS), _BLOCKS), _THREADS) if self.device_kind == "cuda" else count
         inputs = [rows, shapes, cubes, cut, net, gain, x]
-        wp.launch(self._kernel, dims, inputs=inputs, outputs=[out], device=x.device, block_dim=_THREADS)
+        wp.launch(self._kernel, self._dims(x), inputs=inputs, outputs=[out], device=x.device, block_dim=_THREADS)
+
+    def launch_regions(self, table, region, cut, x, asked, out) -> None:
+        """Decodes the light at M points in several of R regions.
+
+        Args:
+            table: Region [R].
+            region: int [M], region of each point; negative: no light is written.
+            cut: As for `launch`.
+            x: vec3 [M], the points in the normalised coordinates of their regions.
+            asked: int [R], set to 1 for each region that has a point.
+            out: float [M, D], the light at the points, written.
+        """
+        inputs, outputs = [table, region, cut, x], [asked, out]
+        wp.launch(self._regional, self._dims(x), inputs=inputs, outputs=outputs, device=x.device, block_dim=_THREADS)
+
+    def _dims(self, x) -> tuple[int, ...]:
+        blocks = min(-(-x.shape[0] // _POINTS), _BLOCKS)
+        return (blocks, _THREADS) if self.device_kind == "cuda" else x.shape
 
 
 @functools.cache
@@ -101,17 +134,50 @@ def decode_kernels(
     """
     columns = outputs + relative
     if device_kind == "cpu":
-        return DecodeKernels(device_kind, 0, _cpu_kernel(latent, hidden, columns, outputs, ambient), None)
+        return DecodeKernels(device_kind, 0, *_cpu_kernels(latent, hidden, columns, outputs, ambient), None)
     sizes = {"L": latent, "H": hidden, "D": columns, "OUT": outputs, "AMBIENT": ambient}
     layout = native_source(__package__, "decode_layout", **sizes)
-    return DecodeKernels(device_kind, _words(latent, hidden, columns), _cuda_kernel(layout), _pack_kernel(layout))
+    return DecodeKernels(device_kind, _words(latent, hidden, columns), *_cuda_kernels(layout), _pack_kernel(layout))
 
 
-def _cpu_kernel(latent: int, hidden: int, columns: int, outputs: int, ambient: int) -> Any:
+def _cpu_kernels(latent: int, hidden: int, columns: int, outputs: int, ambient: int) -> tuple[Any, Any]:
     fn, network = functions(latent), cpu_network(latent, hidden, columns)
     add, vec_latent, forward, vec_in = fn.add, fn.vec_latent, network.forward, network.vec_in
+    options = {"enable_backward": False, "max_unroll": 1}
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False, "max_unroll": 1})
+    @wp.func
+    def decode_at(
+        rows: wp.array2d[float],
+        shapes: wp.array1d[Shape],
+        cubes: Cubes,
+        cut: float,
+        net: wp.array1d[float],
+        gain: float,
+        x: wp.vec3,
+        out: wp.array2d[float],
+        i: int,
+    ):
+        cube = cube_of(cubes, x)
+        f = vec_latent()
+        for j in range(cubes.start[cube], cubes.start[cube + 1]):
+            k = cubes.item[j]
+            f = add(f, shapes[k], rows, k, x, cut)
+        v = vec_in()
+        for c in range(wp.static(latent)):
+            v[c] = f[c]
+        for c in range(3):
+            v[wp.static(latent) + c] = x[c]
+        _h1, _h2, y = forward(net, v)
+        light = float(gain)
+        if wp.static(columns > outputs):
+            light *= wp.exp(wp.min(y[wp.static(columns - 1)], 0.0))
+        for c in range(wp.static(outputs)):
+            value = light * y[c]
+            if c < wp.static(ambient):
+                value = wp.max(value, 0.0)
+            out[i, c] = value
+
+    @wp.kernel(module="unique", module_options=options)
     def decode(
         # in:
         rows: wp.array2d[float],
@@ -125,34 +191,38 @@ def _cpu_kernel(latent: int, hidden: int, columns: int, outputs: int, ambient: i
         out: wp.array2d[float],
     ):
         i = wp.tid()
-        cube = cube_of(cubes, x[i])
-        f = vec_latent()
-        for j in range(cubes.start[cube], cubes.start[cube + 1]):
-            k = cubes.item[j]
-            f = add(f, shapes[k], rows, k, x[i], cut)
-        v = vec_in()
-        for c in range(wp.static(latent)):
-            v[c] = f[c]
-        for c in range(3):
-            v[wp.static(latent) + c] = x[i][c]
-        _h1, _h2, y = forward(net, v)
-        light = float(gain)
-        if wp.static(columns > outputs):
-            light *= wp.exp(wp.min(y[wp.static(columns - 1)], 0.0))
-        for c in range(wp.static(outputs)):
-            value = light * y[c]
-            if c < wp.static(ambient):
-                value = wp.max(value, 0.0)
-            out[i, c] = value
+        decode_at(rows, shapes, cubes, cut, net, gain, x[i], out, i)
 
-    return decode
+    @wp.kernel(module="unique", module_options=options)
+    def regional(
+        # in:
+        table: wp.array1d[Region],
+        region: wp.array1d[int],
+        cut: float,
+        x: wp.array1d[wp.vec3],
+        # out:
+        asked: wp.array1d[int],
+        out: wp.array2d[float],
+    ):
+        i = wp.tid()
+        r = region[i]
+        if r >= 0:
+            asked[r] = 1
+            own = table[r]
+            if own.net.shape[0] > 0:
+                decode_at(own.rows, own.shapes, own.cubes, cut, own.net, own.gain, x[i], out, i)
+            else:
+                for c in range(wp.static(outputs)):
+                    out[i, c] = own.gain
+
+    return decode, regional
 
 
-def _cuda_kernel(layout: str) -> Any:
-    constants = {"T": _THREADS, "P": _POINTS}
-    units = native_source("wlm_kernels", "matrix_units")
+def _cuda_kernels(layout: str) -> tuple[Any, Any]:
+    code = layout + native_source(__package__, "decode", T=_THREADS, P=_POINTS)
+    options, share = {"enable_backward": False}, _THREADS // _POINTS
 
-    @wp.func_native(units + layout + native_source(__package__, "decode", **constants))
+    @wp.func_native(native_source("wlm_kernels", "matrix_units") + code)
     def decode_block(
         rows: wp.array2d[float],
         count: int,
@@ -166,10 +236,22 @@ def _cuda_kernel(layout: str) -> Any:
         block: int,
         fresh: int,
         points: int,
+        region: wp.array1d[int],
+        own: int,
         out: wp.array2d[float],
     ): ...
 
-    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    @wp.func
+    def next_region(region: wp.array1d[int], first: int, after: int) -> int:
+        """Returns the lowest region above `after` among the points of a block; a large number if there is none."""
+        found = int(_NONE)
+        for j in range(first, wp.min(first + wp.static(_POINTS), region.shape[0])):
+            r = region[j]
+            if r > after:
+                found = wp.min(found, r)
+        return found
+
+    @wp.kernel(module="unique", module_options=options)
     def decode(
         # in:
         rows: wp.array2d[float],
@@ -184,18 +266,57 @@ def _cuda_kernel(layout: str) -> Any:
     ):
         block, t = wp.tid()
         fresh = int(1)
-        while block * wp.static(_POINTS) < x.shape[0]:
+        count = x.shape[0]
+        while block * wp.static(_POINTS) < count:
             # Threads past the end repeat the last point, since all threads of a block must synchronise.
-            at = x[wp.min(block * wp.static(_POINTS) + t // wp.static(_THREADS // _POINTS), x.shape[0] - 1)]
+            at = x[wp.min(block * wp.static(_POINTS) + t // share, count - 1)]
             cube = cube_of(cubes, at)
             begin = cubes.start[cube]
             end = cubes.start[cube + 1]
-            count = shapes.shape[0]
-            decode_block(rows, count, cubes.item, begin, end, cut, net, gain, at, block, fresh, x.shape[0], out)
+            k = shapes.shape[0]
+            decode_block(
+                rows, k, cubes.item, begin, end, cut, net, gain, at, block, fresh, count, cubes.item, -1, out
+            )
             fresh = 0
             block += _BLOCKS
 
-    return decode
+    @wp.kernel(module="unique", module_options=options)
+    def regional(
+        # in:
+        table: wp.array1d[Region],
+        region: wp.array1d[int],
+        cut: float,
+        x: wp.array1d[wp.vec3],
+        # out:
+        asked: wp.array1d[int],
+        out: wp.array2d[float],
+    ):
+        block, t = wp.tid()
+        count = x.shape[0]
+        while block * wp.static(_POINTS) < count:
+            first = block * wp.static(_POINTS)
+            i = wp.min(first + t // share, count - 1)
+            r = next_region(region, first, -1)
+            while r < table.shape[0]:
+                if t == 0:
+                    asked[r] = 1
+                own = table[r]
+                if own.net.shape[0] > 0:
+                    cube = cube_of(own.cubes, x[i])
+                    begin = own.cubes.start[cube]
+                    end = own.cubes.start[cube + 1]
+                    k = own.shapes.shape[0]
+                    item = own.cubes.item
+                    decode_block(
+                        own.rows, k, item, begin, end, cut, own.net, own.gain, x[i], block, 1, count, region, r, out
+                    )
+                elif region[i] == r and t % share == 0:
+                    for c in range(out.shape[1]):
+                        out[i, c] = own.gain
+                r = next_region(region, first, r)
+            block += _BLOCKS
+
+    return decode, regional
 
 
 def _words(latent: int, hidden: int, columns: int) -> int:

@@ -15,7 +15,8 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 4. `volume_weights` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell, and computes
    weights of at most 16 of these probes.
 5. `combine` computes a block's light as the weighted sum of these probes, clamped to the range of their values, which
-   is extended by half its width on both sides, and stores it in half floats, with a factor for each row.
+   is extended by half its width on both sides, and stores it in half floats, with a factor for each row. A block whose
+   light is not in memory yet, -infinity at a probe, gives its row back and waits.
 """
 
 import numpy as np
@@ -149,7 +150,7 @@ class Work:
             edge, and the probe's additional variance of noise.
         rows: [B, P], covariance of each probe with the probes before it and with itself, then 0.
         hats: [B, P], covariance of each probe with the block.
-        numbers: [B * P], index of each contributing probe in the input.
+        numbers: [B * P], index of each contributing probe in the input, or -1.
         weights: [B, P], weight of each contributing probe.
     """
 
@@ -420,7 +421,6 @@ def _allocate(index: Index, windows: Windows, pool: Pool, size: int, work: Work)
             pool.rows[wanted] = taken
             if pool.hour.shape[0] > 0:
                 pool.hour[taken] = work.hour[0]
-            windows.pages[slot] = wp.int16(taken)
             wp.atomic_add(work.counters, _UPDATED, 1)
             wp.atomic_sub(work.counters, _LEFT, 1)
     work.taken[k] = taken
@@ -451,13 +451,14 @@ def _most_of_warp(x: float) -> float: ...
 
 
 @wp.kernel(enable_backward=False)
-def _combine(work: Work, light: wp.array2d[float], lanes: int, pool: Pool):
+def _combine(work: Work, light: wp.array2d[float], lanes: int, windows: Windows, pool: Pool):
     """Stores the light of block k; meanwhile it is in the place of that of its first probe, light[k * P]."""
     k, lane = wp.tid()
     row = work.taken[k]
     many = work.weights.shape[1]
     channels = light.shape[1]
     most = float(0.0)
+    absent = float(0.0)
     if row >= 0:
         for c in range(lane, channels, lanes):
             s = float(0.0)
@@ -473,11 +474,32 @@ def _combine(work: Work, light: wp.array2d[float], lanes: int, pool: Pool):
                     low = wp.min(low, value)
                     high = wp.max(high, value)
             room = _BEYOND * (high - low)
-            value = wp.clamp(s, low - room, high + room)
+            value = float(wp.inf)
+            if low == -wp.inf:
+                absent = 1.0
+            elif wp.isfinite(s):
+                value = wp.clamp(s, low - room, high + room)
             light[k * many, c] = value
-            most = wp.max(most, wp.where(wp.isfinite(value), wp.abs(value), wp.inf))
+            most = wp.max(most, wp.abs(value))
+    absent = _most_of_warp(absent)
     factor = _most_of_warp(most) / _LARGEST
-    if row >= 0:
+    if row >= 0 and absent > 0.0:
+        if lane == 0:
+            slot = work.chosen[k]
+            if windows.pages[slot] >= wp.int16(0):
+                # It keeps showing its light, which is of another hour.
+                hour = pool.hour[row] + _NOON
+                pool.hour[row] = wp.where(hour < _DAY, hour, hour - _DAY)
+            else:
+                block = row
+                if pool.stamp.shape[0] > 0:
+                    block = pool.owner[row]
+                    pool.owner[row] = -1
+                    pool.stamp[row] = -1
+                pool.rows[block] = -1
+            wp.atomic_sub(work.counters, _UPDATED, 1)
+            wp.atomic_add(work.counters, _LEFT, 1)
+    elif row >= 0:
         for c in range(lane, channels, lanes):
             number = float(0.0)
             if factor > 0.0 and wp.isfinite(factor):
@@ -485,18 +507,30 @@ def _combine(work: Work, light: wp.array2d[float], lanes: int, pool: Pool):
             pool.light[row, c] = wp.cast(wp.float16(number), wp.int16)
         if lane == 0:
             pool.factor[row] = wp.where(wp.isfinite(factor), factor, wp.nan)  # whoever reads the block is told
+            windows.pages[work.chosen[k]] = wp.int16(row)
 
 
 @wp.kernel(enable_backward=False)
 def _take_rows(values: wp.array2d[float], numbers: wp.array1d[int], out: wp.array2d[float]):
     i, c = wp.tid()
-    out[i, c] = values[numbers[i], c]
+    out[i, c] = values[wp.max(numbers[i], 0), c]
 
 
 @wp.kernel(enable_backward=False)
-def _take_points(points: wp.array1d[wp.vec3], numbers: wp.array1d[int], out: wp.array1d[wp.vec3]):
+def _take_points(
+    # in:
+    points: wp.array1d[wp.vec3],
+    regions: wp.array1d[int],
+    numbers: wp.array1d[int],
+    # out:
+    out: wp.array1d[wp.vec3],
+    region: wp.array1d[int],
+):
     i = wp.tid()
-    out[i] = points[numbers[i]]
+    number = numbers[i]
+    out[i] = points[wp.max(number, 0)]
+    if region.shape[0] > 0:
+        region[i] = wp.where(number >= 0, regions[wp.max(number, 0)], -1)
 
 
 class Look:
@@ -550,24 +584,26 @@ def select(index: Index, windows: Windows, pool: Pool, tolerance: float, side: i
     wp.launch(_allocate, work.chosen.shape, inputs=[index, windows, pool, size, work], device=device)
 
 
-def combine(work: Work, light: wp.array, pool: Pool) -> None:
-    """Writes the light of the chosen blocks to their rows of the pool.
+def combine(work: Work, light: wp.array, windows: Windows, pool: Pool) -> None:
+    """Writes the light of the chosen blocks to their rows of the pool. Blocks with a probe of -infinity wait again.
 
     Args:
         work: Data of the frame, after `volume_weights.weigh`.
         light: float [B * P, D], light of the probes `work.numbers`, overwritten.
+        windows: The page table, in which the blocks get their rows.
         pool: The light of blocks, written.
     """
     lanes = 32 if light.device.is_cuda else 1
-    shape, inputs = (work.chosen.shape[0], lanes), [work, light, lanes, pool]
+    shape, inputs = (work.chosen.shape[0], lanes), [work, light, lanes, windows, pool]
     wp.launch(_combine, shape, inputs=inputs, device=light.device)
 
 
 def take_rows(values: wp.array, numbers: wp.array, out: wp.array) -> None:
-    """Copies the rows of `values` [N, D] with indices `numbers` [M] to `out` [M, D]."""
+    """Copies the rows of `values` [N, D] with indices `numbers` [M] to `out` [M, D]; the index -1 yields any row."""
     wp.launch(_take_rows, out.shape, inputs=[values, numbers, out], device=out.device)
 
 
-def take_points(points: wp.array, numbers: wp.array, out: wp.array) -> None:
-    """Copies the points of `points` [N] with indices `numbers` [M] to `out` [M]."""
-    wp.launch(_take_points, out.shape, inputs=[points, numbers, out], device=out.device)
+def take_points(points: wp.array, regions: wp.array, numbers: wp.array, out: wp.array, region: wp.array) -> None:
+    """Copies the points of `points` [N] with indices `numbers` [M] to `out` [M], and of `regions` [N] to `region` [M],
+    where -1 is no point; `region` may be empty."""
+    wp.launch(_take_points, out.shape, inputs=[points, regions, numbers], outputs=[out, region], device=out.device)

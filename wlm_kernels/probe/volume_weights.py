@@ -103,7 +103,7 @@ def _pick(index: Index, work: Work):
         wp.atomic_add(work.counters, _DECODED, count)
         work.picked[k] = count
         work.noise[k] = _noise(total)
-    number = int(0)
+    number = int(-1)
     if i < count:
         # Every n-th probe is taken, so that they are spread over the whole block.
         at = int(wp.int64(i) * wp.int64(total) / wp.int64(count))
@@ -194,7 +194,7 @@ def _weigh_by_warp(index: Index, work: Work):
     picked = _pick_of_warp(range_near(index, work, k, 2 * lane), range_near(index, work, k, 2 * lane + 1), most)
     count = picked[1]
     x = wp.vec4()
-    number = int(0)
+    number = int(-1)
     if lane < count:
         x = _placed(index, work.blocks[k], picked[0])
         number = index.number[picked[0]]

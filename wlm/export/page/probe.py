@@ -80,6 +80,8 @@ def probe_page(
     places = position[live].astype(np.float32)
     decoded = model.decoder(position=position).decode_probes()[live]
     made = bundle(model)
+    if made.parts:
+        raise WlmError(f"{model.name}: cannot be a page, which decodes one region, found {len(made.parts)}")
     shader = made.shader
     arrays = {name: made.buffers[name] for name in _BUFFERS if name in made.buffers}
     if "probes" in arrays:

@@ -24,14 +24,18 @@ from wlm.lightmap.model import SheetModel
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.sheet import first_light
 from wlm.lightmap.virtual.clock import Clock
+from wlm.probe.model import ProbeModel
+from wlm.probe.volume.cascade import Volume
+from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.walk import settle
 from wlm.scene import Mesh, Scene, load
-from wlm.scene.probes import DayProbes
+from wlm.scene.probes import SIDE
 from wlm.system import OnProgress
 from wlm.texels import fill_gaps, repair
 
 _PATH_RATE = 20  # positions of the camera's path a second
 _PLACES = 64  # places on the path of a moving object at which its light is stored
+_ROWS = 4096  # blocks of light that have memory
 _FIRST_HOUR = 12.0  # of the page; an hour with an original if there is one
 _FIRST_SIDE = 512  # most texels along a side of the light of the first picture
 _FILMIC = 1  # of the tones of the script
@@ -52,12 +56,12 @@ def _page(scene: Scene, progress: OnProgress | None) -> Page:
     for entry, own in zip(described, groups.values(), strict=True):
         times = [*own.times.tolist(), float(own.times[0]) + (own.period or 0.0)]
         entry["lightmap"]["switches"] = [times[i : i + 2] for i in Clock(own.axis).switches]
-    probes = DayProbes(scene.probes) if scene.moving or scene.smoke else None
+    probes = _day_volume(scene.probes) if scene.moving or scene.smoke else None
     parts, moving = _moving(scene, probes)
     arrays |= _mesh("mesh", scene.mesh, "uv") | parts
     parts, smoke = _smoke(scene, probes, progress)
     arrays |= parts
-    hours = np.array([hour for hour, _ in scene.probes])
+    hours = scene.probe_hours
     film = np.arange(int(np.ceil(scene.day.seconds * _PATH_RATE)) + 1) / _PATH_RATE
     arrays["path"] = np.array([np.hstack(scene.camera_at(float(second))) for second in film], np.float32)
     manifest: dict[str, Any] = {
@@ -98,7 +102,7 @@ def _page(scene: Scene, progress: OnProgress | None) -> Page:
         ("lightmaps", f"{model.width} × {model.height}, {len(manifest['times'])} hours"),
         ("light groups", ", ".join(groups)),
         ("triangles", f"{len(scene.mesh.triangle):,}"),
-        ("probes", f"{scene.probes[0][1].probes:,} at {len(scene.probes)} hours" if scene.probes else "none"),
+        ("probes", f"{scene.probes.probes:,} at {len(hours)} hours" if scene.probes else "none"),
     ]
     scripts = [filled("lightmap_table.js").rstrip("\n"), asset("lightmap.js")]
     note = "Lightmaps over time, decoded on this GPU; moving objects and smoke are lit by probes."
@@ -111,7 +115,7 @@ def _mesh(name: str, mesh: Mesh, further: str) -> dict[str, np.ndarray]:
     return {f"{name}_{part}": values for part, values in parts.items()}
 
 
-def _moving(scene: Scene, probes: DayProbes | None) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
+def _moving(scene: Scene, probes: Volume | None) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
     """Returns the arrays of moving objects, with the coefficients [hours, places, 27] along their paths, and rows."""
     arrays, rows = dict[str, np.ndarray](), []
     for i, each in enumerate(scene.moving):
@@ -122,7 +126,7 @@ def _moving(scene: Scene, probes: DayProbes | None) -> tuple[dict[str, np.ndarra
 
 
 def _smoke(
-    scene: Scene, probes: DayProbes | None, progress: OnProgress | None
+    scene: Scene, probes: Volume | None, progress: OnProgress | None
 ) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
     """Returns the arrays of smoke, with the coefficients [hours, 1, 27] at its middle, and rows of the manifest."""
     arrays, rows = dict[str, np.ndarray](), []
@@ -136,12 +140,23 @@ def _smoke(
     return arrays, rows
 
 
-def _probe_light(probes: DayProbes, places: Sequence[np.ndarray]) -> np.ndarray:
+def _day_volume(model: ProbeModel) -> Volume:
+    """Returns a volume whose blocks have the light of all hours, so that none is decoded for each hour."""
+    decoder, light = model.decoder(), []
+    for time in model.times.tolist() or [0.0]:
+        decoder.set_time(time)
+        light.append(decoder.decode_probes())
+    return Volume(
+        decoder.own_positions(), StoredLight(np.concatenate(light, 1)), live=model.live, side=SIDE, rows=_ROWS
+    )
+
+
+def _probe_light(probes: Volume, places: Sequence[np.ndarray]) -> np.ndarray:
     """Returns coefficients at places [M, 3], float32 [hours of the probes, M, 27], each from a volume around it."""
     light = []
     for place in places:
-        settle(probes.volume, place)
-        light.append(probes.volume.read(place[None]).values.reshape(-1, 27))
+        settle(probes, place)
+        light.append(probes.read(place[None]).values.reshape(-1, 27))
     return np.stack(light, 1)
 
 

@@ -46,9 +46,9 @@ class Encoding(ABC):
         """Returns the number of bytes that `pack` gives for a tile: 0, unless a subclass overrides both."""
         return 0
 
-    def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
-        """Returns a tile's maps and network, or its frames, as byte arrays, each of which is compressed on its own."""
-        return []
+    def pack(self, sheet: SheetModel, number: int) -> bytes:
+        """Returns a tile's maps and network, or its frames, as bytes."""
+        return b""
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:  # noqa: B027
         """Writes a tile, given as the bytes of `pack`, uint8, into the arrays of a sheet.

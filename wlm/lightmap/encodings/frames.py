@@ -19,14 +19,12 @@ import warp as wp
 from wlm.bundle import Texture
 from wlm.errors import WlmError
 from wlm.formats import bc7
-from wlm.formats.bc7 import BLOCK_BYTES
 from wlm.formats.folder import rounded
 from wlm.lightmap.encodings.base import DeviceTiles, Encoding, side_by_side
 from wlm.lightmap.encodings.maps import tile_bytes
 from wlm.lightmap.model import BLOCKS, SheetModel
 from wlm.lightmap.profile import Profile
-from wlm.lightmap.tiles import TILE, TileGrid, TileKind
-from wlm.texels import REACH
+from wlm.lightmap.tiles import TILE, TileKind
 from wlm_kernels.lightmap import frames as frame_kernels
 
 EXTRA = "frames"
@@ -34,9 +32,6 @@ EXTRA = "frames"
 
 _ENCODER = "ispc_texcomp"
 _RANGE_BYTES = 2 * 3 * 2  # two half floats for each channel of a frame
-
-_BLACK = np.zeros(BLOCK_BYTES, np.uint8)
-_BLACK[0] = 1 << 6  # a block of mode 6 whose other bits are 0
 
 
 def missing_encoder(count: int) -> str | None:
@@ -61,33 +56,11 @@ def choose_frames(kinds: np.ndarray, times: int, profile: Profile) -> np.ndarray
     return chosen & (profile.frames != "never")
 
 
-def needed_blocks(mask: np.ndarray, number: int) -> np.ndarray:
-    """Returns which 4x4 blocks of a tile a filter may read, bool [32, 32]: those within `REACH` of the mask [H, W]."""
-    y, x = TileGrid.of(*mask.shape).origin(number)
-    near = np.zeros((TILE + 2 * REACH, TILE + 2 * REACH), bool)
-    part = mask[max(y - REACH, 0) : y + TILE + REACH, max(x - REACH, 0) : x + TILE + REACH]
-    top, left = REACH - min(y, REACH), REACH - min(x, REACH)
-    near[top : top + part.shape[0], left : left + part.shape[1]] = part
-    for axis in () if part.all() or not part.any() else (0, 1):
-        shifted = [np.roll(near, step, axis) for step in range(-REACH, REACH + 1)]
-        near = np.logical_or.reduce(shifted)
-    near = near[REACH:-REACH, REACH:-REACH]
-    near[mask.shape[0] - y :] = False
-    near[:, mask.shape[1] - x :] = False
-    return near.reshape(BLOCKS, 4, BLOCKS, 4).any((1, 3))
-
-
-def clear_unneeded(blocks: np.ndarray, needed: np.ndarray) -> np.ndarray:
-    """Replaces blocks [T, 32, 32, 16] of a tile by black ones where `needed`, bool [32, 32], is false."""
-    return np.where(needed[..., None], blocks, _BLACK)
-
-
-def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def encode_frames(colour: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Encodes the frames of a tile at T times: colour float32 [T, 128, 128, 3], in gamma space, gaps filled.
 
-    `valid`, bool [128, 128], is true where a texel of the tile is valid; `needed`, bool [32, 32], is from
-    `needed_blocks`. Returns BC7 blocks, uint8 [T, 32, 32, 16], and the least and greatest colour of each frame, float16
-    [T, 2, 3].
+    `valid`, bool [128, 128], is true where a texel of the tile is valid. Returns BC7 blocks, uint8 [T, 32, 32, 16], and
+    the least and greatest colour of each frame, float16 [T, 2, 3].
     """
     texels = colour[:, valid]
     ranges = np.stack([round_half(texels.min(1), -np.inf), round_half(texels.max(1), np.inf)], 1)
@@ -95,7 +68,7 @@ def encode_frames(colour: np.ndarray, valid: np.ndarray, needed: np.ndarray) -> 
     span = np.where(greatest > least, greatest - least, np.float32(1.0))
     levels = np.clip((colour - least) / span, 0.0, 1.0).reshape(-1, TILE, 3)
     blocks = bc7.encode_image((levels * 255.0 + 0.5).astype(np.uint8), EXTRA)
-    return clear_unneeded(blocks.reshape(len(colour), BLOCKS, BLOCKS, -1), needed), ranges
+    return blocks.reshape(len(colour), BLOCKS, BLOCKS, -1), ranges
 
 
 def round_half(values: np.ndarray, toward: float) -> np.ndarray:
@@ -159,31 +132,23 @@ class FrameTiles(DeviceTiles):
 
 
 class Frames(Encoding):
-    """Stores a tile as BC7 blocks at each time; blocks that no filtered read touches are left out of the file."""
+    """Stores a tile as BC7 blocks at each time."""
 
     kinds = (TileKind.FRAMES,)
     codes = (3,)
 
     def packed_size(self, sheet: SheetModel, number: int) -> int:
-        return len(sheet.times) * int(needed_blocks(sheet.mask, number).sum()) * BLOCK_BYTES
+        return len(sheet.times) * TILE * TILE
 
-    def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
-        blocks, needed = sheet.frames[sheet.row(number)], needed_blocks(sheet.mask, number)
-        if not np.array_equal(blocks, clear_unneeded(blocks, needed)):
-            raise WlmError(f"frames: tile {number}: expected black BC7 blocks where no filter reads, found others")
-        kept = blocks[:, needed]
-        _check_modes(kept, number)
-        # The times of a block come one after another: they resemble each other more than neighbouring blocks do.
-        return [kept.swapaxes(0, 1).tobytes()]
+    def pack(self, sheet: SheetModel, number: int) -> bytes:
+        blocks = sheet.frames[sheet.row(number)]
+        _check_modes(blocks, number)
+        return blocks.tobytes()
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:
-        needed, blocks = needed_blocks(sheet.mask, number).ravel(), sheet.frames[sheet.row(number)]
-        _check_modes(data.reshape(-1, BLOCK_BYTES), number)
-        # A block is copied as two words, which is several times faster than 16 bytes.
-        times, kept = len(sheet.times), data.view("<u8")
-        out = blocks.reshape(times, -1, BLOCK_BYTES).view("<u8")
-        out[:, ~needed] = _BLACK.view("<u8")
-        out[:, needed] = kept.reshape(-1, times, 2).swapaxes(0, 1)
+        blocks = sheet.frames[sheet.row(number)]
+        blocks[...] = data.reshape(blocks.shape)
+        _check_modes(blocks, number)
 
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
         return [FrameTiles(sheet, device)] if len(sheet.frames) else []

@@ -1,15 +1,12 @@
 """Encoding of tiles as feature maps and a network; static tiles have F_uv, dynamic tiles F_uv, F_uvt, F_ut and F_vt.
 
-In the file each tile is one zstd frame (`wlm.lightmap.codec`). Before packing, the blocks of BC7 mode 6 are split into
-bytes that a general packer models well: eight bytes with the endpoints, and eight with the indices. The fit sets texels
-of the maps that no valid texel of the lightmap reads at a stored time to zero, so that they take almost no bytes.
+In the file each tile is one zstd frame (`wlm.lightmap.codec`) of its maps, as a GPU holds them, and its network.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,22 +14,17 @@ import warp as wp
 
 from wlm.bundle import Texture
 from wlm.errors import WlmError
-from wlm.formats.bc7 import BLOCK_BYTES, pack_mode6, unpack_mode6
 from wlm.formats.folder import rounded
 from wlm.lightmap.encodings.base import DeviceTiles, Encoding, inverse_of, side_by_side
 from wlm.lightmap.model import SheetModel, decode_scale
-from wlm.lightmap.profile import Profile, TimeAxis, encode_time
+from wlm.lightmap.profile import Profile
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm_kernels import mlp
 from wlm_kernels.lightmap import decode as decode_kernels
 from wlm_kernels.lightmap.levels import LEVELS
 
-_SLACK = 1e-4  # of a texel: float32 may round a position to either side of a texel's middle
 _SQRT_12 = math.sqrt(12.0)  # features in [0, 1] enter the network as (f - 1/2) sqrt(12)
-_MODE_6 = np.uint64(1 << 6)
-_LOW_7 = np.uint64(127)
-_END_SHIFTS = (7 + 7 * np.arange(8)).astype(np.uint64)  # R0 R1 G0 G1 B0 B1 A0 A1 in the low half of a block
-_LAST_BIT = np.uint64(63)  # of the low half: the P bit of the first endpoint
+_MODE_BITS, _MODE_6 = 127, 64  # of the first byte of a BC7 block, and their value in mode 6
 _MAPS, _TEMPORAL = 4, 12  # network inputs from textures, of static and of dynamic tiles; the encoded time follows
 
 
@@ -51,126 +43,21 @@ def tile_bytes(profile: Profile, temporal: bool) -> int:
     return size
 
 
-# ---- texels that decoding reads ----
-
-
-@dataclass(frozen=True, eq=False)
-class Reads:
-    """Which texels of a dynamic tile's temporal maps are read when its valid texels are decoded at the evaluated times:
-    slices of F_uvt, bool [S], and texels in each of them, bool [R, R]; rows of F_ut and F_vt, bool [rows], and columns
-    of each, bool [2, columns].
-    """
-
-    slices: np.ndarray
-    texels: np.ndarray
-    rows: np.ndarray
-    columns: np.ndarray
-
-    @classmethod
-    def of(cls, used: np.ndarray, axis: TimeAxis, resolution: int, slices: int, columns: int, rows: int) -> Reads:
-        """Finds what the valid texels (`used`, bool [128, 128]) of a tile read from maps of the given sizes."""
-        centres = (np.arange(TILE) + 0.5) / TILE
-        across = _cells(centres, resolution).astype(np.int64)
-        along = _cells(centres, columns)
-        # Only stored times are evaluated if light between them is mixed as radiance.
-        read_slices, read_rows = (
-            _cells(encode_time(axis)[0], count, axis.periodic).any(0)
-            if axis.interpolation == "radiance"
-            else np.ones(count, bool)
-            for count in (slices, rows)
-        )
-        return cls(
-            read_slices,
-            across.T @ used @ across > 0,
-            read_rows,
-            np.stack([along[used.any(axis)].any(0) for axis in (0, 1)]),
-        )
-
-
-def _cells(places: np.ndarray, count: int, periodic: bool = False) -> np.ndarray:
-    """Returns which of an axis's `count` texels a linear filter reads at positions in [0, 1], bool [places, count]."""
-    x = np.asarray(places, np.float64) * count - 0.5
-    first, last = np.floor(x - _SLACK), np.floor(x + _SLACK) + 1
-    cells = np.zeros((len(x), count), bool)
-    for step in range(3):
-        cell = np.minimum(first + step, last).astype(np.int64)
-        cells[np.arange(len(x)), cell % count if periodic else cell.clip(0, count - 1)] = True
-    return cells
-
-
-def clear_unread(parts: Mapping[str, np.ndarray], used: np.ndarray, reads: Reads | None) -> dict[str, np.ndarray]:
-    """Zeroes the map texels that no valid texel (`used`, bool [128, 128]) reads; the decoded light does not change.
-
-    `parts` has the map `uv`, uint8 [32, 32, 16], and for a dynamic tile, which has `reads`, also `uvt`, `ut` and `vt`.
-    """
-    result = dict(parts)
-    result["uv"] = _cleared(parts["uv"].reshape(-1, BLOCK_BYTES), _by_block(used)).reshape(parts["uv"].shape)
-    if reads is None:
-        return result
-    texels = (reads.slices[:, None, None] & _by_block(reads.texels)).reshape(-1, 16)
-    result["uvt"] = _cleared(parts["uvt"].reshape(-1, BLOCK_BYTES), texels).reshape(parts["uvt"].shape)
-    for name, columns in zip(("ut", "vt"), reads.columns, strict=True):
-        result[name] = parts[name] * (reads.rows[:, None] & columns)[..., None]
-    return result
-
-
-def _by_block(texels: np.ndarray) -> np.ndarray:
-    h, w = texels.shape
-    return texels.reshape(h // 4, 4, w // 4, 4).swapaxes(1, 2).reshape(-1, 16)
-
-
-def _cleared(blocks: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Returns BC7 blocks, uint8 [n, 16], in which the texels that are not `used`, bool [n, 16], are set to zero."""
-    ends, indices = _unpacked(blocks)
-    ends, indices = ends * used.any(1)[:, None, None], indices * used
-    # The first index of a block is below 8, which fixes the order of its endpoints; if it is unused, they are sorted.
-    swapped = ~used[:, 0] & (ends[:, 0].sum(1, dtype=int) > ends[:, 1].sum(1, dtype=int))
-    ends[swapped] = ends[swapped][:, ::-1]
-    indices[swapped] = (15 - indices[swapped]) * used[swapped]
-    return pack_mode6(ends, indices)
-
-
 # ---- bytes of a tile in the file ----
 
 
 def check_packable(parts: Mapping[str, np.ndarray], profile: Profile, dynamic: bool) -> None:
     """Raises WlmError unless a trainer's maps are BC7 mode 6 and its weights are exact in the profile's `net_bits`."""
     for name in ("uv", "uvt") if dynamic else ("uv",):
-        _unpacked(parts[name].reshape(-1, BLOCK_BYTES))
+        _check_mode(parts[name])
     if profile.net_bits == 8:
         for net in parts["net"]:
             pack_network(net, profile.inputs(dynamic), profile.hidden)
 
 
-def _unpacked(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        return unpack_mode6(blocks)
-    except WlmError as error:
-        raise WlmError("maps: expected BC7 blocks of mode 6, found another mode") from error
-
-
-def _split_blocks(blocks: np.ndarray) -> list[np.ndarray]:
-    """Splits blocks of mode 6, uint8 [..., 16], into bytes of endpoints and of indices, uint8 [n, 8] each."""
-    # The P bit of the first endpoint is the top bit of the first byte; that of the second is with the indices.
-    low, high = np.ascontiguousarray(blocks).reshape(-1, BLOCK_BYTES).view("<u8").T
-    if ((low & _LOW_7) != _MODE_6).any():
+def _check_mode(blocks: np.ndarray) -> None:
+    if ((blocks[..., 0] & _MODE_BITS) != _MODE_6).any():
         raise WlmError("maps: expected BC7 blocks of mode 6, found another mode")
-    ends = ((low[:, None] >> _END_SHIFTS) & _LOW_7).astype(np.uint8)
-    ends[:, 0] |= (low >> _LAST_BIT).astype(np.uint8) << 7
-    return [ends, np.ascontiguousarray(high).view(np.uint8).reshape(-1, 8)]
-
-
-def _join_blocks(data: np.ndarray) -> np.ndarray:
-    ends, indices = data.reshape(2, -1, 8)
-    if (ends[:, 1:] > 127).any():
-        raise ValueError("expected endpoints of 7 bits, found larger values")
-    words = np.empty((len(ends), 2), "<u8")
-    wide = ends.astype(np.uint64)
-    words[:, 0] = _MODE_6 | (wide[:, 0] >> np.uint64(7)) << _LAST_BIT
-    for i, shift in enumerate(_END_SHIFTS):
-        words[:, 0] |= (wide[:, i] & _LOW_7) << shift
-    words[:, 1] = np.ascontiguousarray(indices).view("<u8")[:, 0]
-    return words.view(np.uint8)
 
 
 def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
@@ -189,14 +76,14 @@ def pack_network(net: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
             raise WlmError("net: expected weights that 8 bits store exactly (net_bits is 8), found others")
         whole.append(q.astype(np.int8).ravel())
         halves += [most, bias]
-    return np.concatenate([np.concatenate(whole).view(np.uint8), _apart(np.concatenate(halves))])
+    return np.concatenate([np.concatenate(whole).view(np.uint8), np.concatenate(halves).view(np.uint8)])
 
 
 def unpack_network(data: np.ndarray, inputs: int, hidden: int) -> np.ndarray:
     """Inverts `pack_network`: converts its bytes to the network's parameters, float16 [P]."""
     shapes = (inputs, hidden), (hidden, hidden), (hidden, 3)
     count = sum(rows * units for rows, units in shapes)
-    whole, halves = data[:count].view(np.int8), _together(data[count:])
+    whole, halves = data[:count].view(np.int8), data[count:].view("<f2")
     parts, at, place = [], 0, 0
     for rows, units in shapes:
         most, bias = halves[place : place + 2 * units].reshape(2, units)
@@ -212,15 +99,6 @@ def _layers(net: np.ndarray, inputs: int, hidden: int) -> list[tuple[np.ndarray,
     split = (inputs + hidden + 2) * hidden
     rows, output = net[:split].reshape(-1, hidden), net[split:].reshape(-1, 3)
     return [(rows[:inputs], rows[inputs]), (rows[inputs + 1 : -1], rows[-1]), (output[:-1], output[-1])]
-
-
-def _apart(halves: np.ndarray) -> np.ndarray:
-    """Returns the low bytes of all half floats, then all high bytes: similar bytes side by side compress better."""
-    return np.ascontiguousarray(halves, "<f2").view(np.uint8).reshape(-1, 2).T.ravel()
-
-
-def _together(data: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(data.reshape(2, -1).T).view("<f2").ravel()
 
 
 # ---- tiles on a device ----
@@ -374,37 +252,34 @@ class Maps(Encoding):
     def packed_size(self, sheet: SheetModel, number: int) -> int:
         return tile_bytes(sheet.profile, bool(sheet.kind[number] == TileKind.DYNAMIC))
 
-    def pack(self, sheet: SheetModel, number: int) -> list[bytes]:
-        dynamic, row, profile = sheet.kind[number] == TileKind.DYNAMIC, sheet.row(number), sheet.profile
-        pieces = _split_blocks(sheet.uv[sheet.map_row(number)])
-        if dynamic:
-            pieces += [*_split_blocks(sheet.uvt[row]), sheet.ut[row], sheet.vt[row]]
-        net = sheet.net[row] if dynamic else sheet.net_static[row]
-        wide = profile.net_bits == 16
-        pieces.append(_apart(net) if wide else pack_network(net, profile.inputs(bool(dynamic)), profile.hidden))
-        return [piece.tobytes() for piece in pieces]
+    def pack(self, sheet: SheetModel, number: int) -> bytes:
+        net, maps = self._arrays(sheet, number)
+        for blocks in maps[:2]:
+            _check_mode(blocks)
+        if sheet.profile.net_bits == 8:
+            net = pack_network(net, sheet.profile.inputs(len(maps) > 1), sheet.profile.hidden)
+        return b"".join(part.tobytes() for part in (*maps, net))
 
     def unpack(self, sheet: SheetModel, number: int, data: np.ndarray) -> None:
-        dynamic, row, profile = sheet.kind[number] == TileKind.DYNAMIC, sheet.row(number), sheet.profile
+        net, maps = self._arrays(sheet, number)
         at = 0
-
-        def fill(values: np.ndarray, blocks: bool) -> None:
-            nonlocal at
-            piece = data[at : at + values.size]
-            values[...] = (_join_blocks(piece) if blocks else piece).reshape(values.shape)
+        for values in maps:
+            values[...] = data[at : at + values.size].reshape(values.shape)
             at += values.size
-
-        fill(sheet.uv[sheet.map_row(number)], True)
-        if dynamic:
-            fill(sheet.uvt[row], True)
-            fill(sheet.ut[row], False)
-            fill(sheet.vt[row], False)
-        net = sheet.net if dynamic else sheet.net_static
+        for blocks in maps[:2]:
+            _check_mode(blocks)
+        rest, profile = data[at:], sheet.profile
         wide = profile.net_bits == 16
-        rest = data[at:]
-        net[row] = _together(rest) if wide else unpack_network(rest, profile.inputs(bool(dynamic)), profile.hidden)
-        if not np.isfinite(net[row]).all():
+        net[:] = rest.view("<f2") if wide else unpack_network(rest, profile.inputs(len(maps) > 1), profile.hidden)
+        if not np.isfinite(net).all():
             raise ValueError("expected finite numbers in the network, found NaN or infinity")
+
+    def _arrays(self, sheet: SheetModel, number: int) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Returns the network of a tile, and its maps in their order in the file, as views of a sheet's arrays."""
+        row, uv = sheet.row(number), sheet.uv[sheet.map_row(number)]
+        if sheet.kind[number] == TileKind.STATIC:
+            return sheet.net_static[row], [uv]
+        return sheet.net[row], [uv, sheet.uvt[row], sheet.ut[row], sheet.vt[row]]
 
     def upload(self, sheet: SheetModel, device: str, gelu: str) -> list[DeviceTiles]:
         kinds = [kind for kind in (TileKind.DYNAMIC, TileKind.STATIC) if (sheet.kind == kind).any()]

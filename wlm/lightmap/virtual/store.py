@@ -37,7 +37,7 @@ from wlm_kernels.lightmap.virtual import KEEP
 _CHUNK = 64  # tiles that are read at once
 _NOTHING = 1.0 / 1024.0  # weight of a coarse texel without a valid texel
 _DARK = 0.01  # of a tile's brightest time: changes of less light than that are not relative to it
-_UPLOADS = 8  # most loaded tiles that are copied to the device in a frame
+_UPLOADS = 16  # most loaded tiles that are copied to the device at once, in every second frame
 _ALIGNED = 64  # bytes; the first of an array in a pool
 _REQUESTS = 64  # most tiles that wait for the loader
 

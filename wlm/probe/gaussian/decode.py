@@ -8,10 +8,11 @@ from wlm.probe.gaussian.model import CUT, Gaussians, check_outputs
 from wlm.probe.model import ProbeModel, check_points
 from wlm.probe.morton import morton_order
 from wlm.probe.sphere import ambient_numbers
+from wlm.probe.volume.light import Light
 from wlm_kernels.probe import cubes as probe_cubes
 from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import volume_frame as frame_kernels
-from wlm_kernels.probe.decode import decode_kernels
+from wlm_kernels.probe.decode import Region, decode_kernels
 
 
 class Points:
@@ -19,15 +20,19 @@ class Points:
 
     Attributes:
         x: vec3 [M], the points relative to the probes' box, sorted along a Z-curve (Morton order).
+        region: int [M], region of each point, by which they are sorted first; [0] for a model without regions.
         order: int [M], index in the input of each point of `x`.
-        out: float [M, D], written by `GaussianDecoder.run`.
+        out: float [M, D], written by the decoder's `run`.
     """
 
-    def __init__(self, position: np.ndarray, model: ProbeModel, device: str) -> None:
-        x = model.normalise(position)
+    def __init__(self, x: np.ndarray, outputs: int, device: str, region: np.ndarray | None = None) -> None:
         self.order = morton_order(x)
-        self.x = wp.array(x[self.order], dtype=wp.vec3, device=device)
-        self.out = wp.zeros((len(x), model.outputs), dtype=float, device=device)
+        region = np.zeros(0, np.int32) if region is None else region
+        if len(region):
+            self.order = self.order[np.argsort(region[self.order], kind="stable")]
+            region = region[self.order]
+        self.x, self.region = wp.array(x[self.order], dtype=wp.vec3, device=device), wp.array(region, device=device)
+        self.out = wp.zeros((len(x), outputs), dtype=float, device=device)
 
     def values(self) -> np.ndarray:
         """Returns the decoded light, float32 [M, D], in the order of the input."""
@@ -73,9 +78,16 @@ class GaussianDecoder(Decoder):
         if self._hours is not None:
             self._kernels.pack_network(self._net, self._packed)
 
+    def region(self) -> Region:
+        """Returns what decodes the model's points as one region of several."""
+        made = Region()
+        made.rows, made.shapes, made.cubes, made.net = self._rows, self._shapes, self._cubes, self._packed
+        made.gain = self._gain
+        return made
+
     def points(self, position: np.ndarray) -> Points:
         """Uploads points that will be decoded often; arguments and errors are those of `decode`."""
-        return Points(check_points(position), self.model, self.device)
+        return Points(self.model.normalise(check_points(position)), self.model.outputs, self.device)
 
     def run(self, points: Points) -> None:
         """Decodes uploaded points into `Points.out`; on CUDA the work is queued, not awaited."""
@@ -100,13 +112,14 @@ class GaussianDecoder(Decoder):
         return GaussianLight(self, check_points(position))
 
 
-class GaussianLight:
-    """Decodes the light of Gaussians at positions that a volume requests; implements `wlm.probe.volume.light.Light`."""
+class GaussianLight(Light):
+    """Decodes the light of Gaussians at positions that a volume requests."""
 
     def __init__(self, decoder: GaussianDecoder, position: np.ndarray) -> None:
         self._decoder = decoder
         self.device, self.channels, self.count = decoder.device, decoder.model.outputs, len(position)
         self._x = wp.array(decoder.model.normalise(position), dtype=wp.vec3, device=self.device)
+        self._region = wp.zeros(0, dtype=int, device=self.device)
         self._points: dict[int, wp.array] = {}
 
     @property
@@ -117,5 +130,5 @@ class GaussianLight:
         count = numbers.shape[0]
         if count not in self._points:
             self._points[count] = wp.zeros(count, dtype=wp.vec3, device=self.device)
-        frame_kernels.take_points(self._x, numbers, self._points[count])
+        frame_kernels.take_points(self._x, self._region, numbers, self._points[count], self._region)
         self._decoder.launch(self._points[count], values)

@@ -9,15 +9,15 @@ from wlm.probe.model import ProbeModel, check_points
 from wlm.probe.pca.model import Components
 from wlm.probe.sphere import ambient_numbers
 from wlm.probe.volume.cascade import SIDE, Volume
-from wlm.probe.volume.light import at_probes
+from wlm.probe.volume.light import Light, at_probes
 from wlm.probe.volume.walk import settle
 from wlm_kernels.probe.components import decode_components
 
 _BUDGET = 1024  # blocks that the volume decodes per frame; many, since all are awaited
 
 
-class ComponentDecoder(Decoder):
-    """A model of principal components on a device, stored packed; implements `wlm.probe.volume.light.Light`.
+class ComponentDecoder(Decoder, Light):
+    """A model of principal components on a device, stored packed, and the light of its probes for a volume.
 
     Attributes:
         count: Number of probes, N.

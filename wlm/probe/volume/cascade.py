@@ -295,7 +295,7 @@ class Volume:
 
         Raises:
             WlmError: The viewpoint is not three finite numbers, or is so far away that the coordinates of its block
-                overflow.
+                overflow; or the light of a part of the model is damaged, which is told once: it is dark from then on.
         """
         start = time.perf_counter()
         viewpoint = np.array(viewpoint, np.float64)
@@ -314,6 +314,7 @@ class Volume:
         still = self._left == 0 and hour == self._hour and np.array_equal(base, before)
         self._viewpoint, self._base, self._hour = viewpoint, base, hour
         self.frame += 1
+        self.light.prepare()
         self._look(base, before, at - base - 0.5, self.frame, hour)
         entered = queued = dropped = cached = updated = probes = 0
         if not still:
@@ -332,7 +333,7 @@ class Volume:
         if self.index.count and (self.device != "cpu" or (work.taken.numpy() >= 0).any()):
             volume_weights.weigh(self._index, work)
             self.light.read(work.numbers, self._read_light)
-            frame_kernels.combine(work, self._read_light, self._pool)
+            frame_kernels.combine(work, self._read_light, windows, self._pool)
         if self._counts is not work.counters:
             wp.copy(self._counts, work.counters)
 

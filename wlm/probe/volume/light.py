@@ -9,6 +9,9 @@ from wlm import interop
 from wlm.errors import WlmError
 from wlm_kernels.probe import volume_frame as kernels
 
+ABSENT = -np.inf
+"""Light of a probe that is not in memory yet; its blocks wait."""
+
 
 class Light(Protocol):
     """A source of the light of N probes.
@@ -27,18 +30,32 @@ class Light(Protocol):
     @property
     def time(self) -> float | None: ...
 
+    @property
+    def waiting(self) -> bool:
+        """Whether light that was asked for is still coming."""
+        return False
+
+    def prepare(self, numbers: np.ndarray | None = None) -> None:
+        """Brings light into memory: that of the probes `numbers`, int [M], at once; None, before a frame: what earlier
+        frames lacked, as far as it has come.
+
+        Raises:
+            WlmError: A part of the model is damaged.
+        """
+        return
+
     def read(self, numbers: wp.array, values: wp.array) -> None:
-        """Writes the light of some probes; on CUDA the work is queued, not awaited.
+        """Writes the light of some probes, or `ABSENT`; on CUDA the work is queued, not awaited.
 
         The first call for M probes may allocate memory, so only later calls can be captured in a CUDA graph.
 
         Args:
-            numbers: int [M], indices of probes.
+            numbers: int [M], indices of probes; -1: no probe, nothing is written or it has no meaning.
             values: float [M, D], written.
         """
 
 
-class StoredLight:
+class StoredLight(Light):
     """Light of probes in an array: the input of a fit, or an engine's own probes."""
 
     time = None
@@ -80,6 +97,7 @@ def at_probes(light: Light, numbers: np.ndarray) -> np.ndarray:
     if len(numbers) == 0:
         return np.zeros((0, light.channels), np.float32)
     with interop.stream(light.device):
+        light.prepare(numbers)
         on_device = wp.array(np.asarray(numbers, np.int32), dtype=int, device=light.device)
         values = wp.empty((len(numbers), light.channels), dtype=float, device=light.device)
         light.read(on_device, values)

@@ -102,6 +102,8 @@ def update_bundle(volume: Volume, model: ProbeModel, *, frames: int = _FRAMES) -
     if volume.frame:
         raise WlmError("volume: cannot export its update: expected one that has not been updated")
     form, outputs, rows = model.bundle(), volume.channels, volume.rows
+    if form.parts:
+        raise WlmError(f"volume: cannot export its update: expected one region, {model.name} has {len(form.parts)}")
     most, slots = min(MOST, blocks), int(volume.sides.prod(1).sum())
     ranked = 1 + 8 * budget
     ranges = ranked + 2 * most

@@ -115,7 +115,7 @@ def settle(volume: Volume, viewpoint: np.ndarray) -> int:
     while left and idle < _TURNS:
         stats = volume.update(viewpoint)
         left, frames = stats.left, frames + 1
-        idle = 0 if stats.updated else idle + 1
+        idle = 0 if stats.updated or volume.light.waiting else idle + 1
     return frames
 
 

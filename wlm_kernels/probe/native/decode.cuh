@@ -1,4 +1,4 @@
-// Decodes P points with a block of T threads, behind matrix_units.cuh
+// Decodes P points with a block of T threads, or if `own` is not negative those of the region `own`, behind matrix_units.cuh
 // and decode_layout.cuh: T / P neighbouring threads share the Gaussians that a
 // point's cube lists (gaussian-probe-compression, eq. 5); then a warp evaluates the network (eq. 7) of 16 points on the
 // matrix units. Constants and the packed arrays are of wlm_kernels/probe/decode.py; the reference is
@@ -15,6 +15,7 @@ constexpr bool KEPT = WORDS <= 8192;
 __shared__ uint4 kept[KEPT ? WORDS / 4 : 1];
 __shared__ __align__(16) float inputs[P][16 * KI + 8], outputs[P / 16][16][40];
 const int t = threadIdx.x, share = t % SHARE, point = t / SHARE;
+if (!fresh || own >= 0) __syncthreads();  // a call before still reads what is shared
 if (KEPT && fresh)
     for (int m = t; m < WORDS / 4; m += T)
         asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(unsigned(__cvta_generic_to_shared(kept + m))),
@@ -62,7 +63,6 @@ if (begin + share < end) {
         next_k = after;
     }
 }
-if (!fresh) __syncthreads();  // the inputs of the points before are still read
 #pragma unroll
 for (int c = 0; c < 16 * KI; ++c) {
     float sum = c < L ? f[c < L ? c : 0] : c < I ? x[c < I && c >= L ? c - L : 0] : 0.0f;
@@ -146,7 +146,8 @@ if (warp < P / 16) {
         for (int m = lane; m < 16 * width; m += 32) {
             const int p = m / width, c = from + m % width;
             const float value = outputs[warp][p][c + FIRST - 8 * start];
-            if (top + p < points) out.data[size_t(top + p) * OUT + c] = c < AMBIENT ? fmaxf(value, 0.0f) : value;
+            if (top + p < points && (own < 0 || region.data[top + p] == own))
+                out.data[size_t(top + p) * OUT + c] = c < AMBIENT ? fmaxf(value, 0.0f) : value;
         }
         __syncwarp();
     }
