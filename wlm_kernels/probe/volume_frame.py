@@ -32,16 +32,16 @@ BINS = 4096  # bins of the distance, a cube of 16
 TOTALS = BINS + BINS // 16 + BINS // 256  # with the sums over 16 bins, and over 256
 GROUP = 64  # rows of the pool from which one is chosen
 MOST = 4096  # most blocks that are ranked
-QUEUED, DROPPED, CACHED, LEFT, UPDATED, DECODED, GATHERED = range(7)
-"""Counters of a frame; the last is that of the gathered blocks."""
+QUEUED, DROPPED, CACHED, LEFT, UPDATED, DECODED, GATHERED, LACKING = range(8)
+"""Counters of a frame; the last two are of the gathered blocks, and of those whose light is not in memory yet."""
 STALE_FIRST = 4
 """A frame whose number this divides decodes stale blocks before missing ones."""
 WAITING = -2
 """Entry of the page table for a block near probes whose light is missing; -1 for a block without a probe."""
 
 _PROBES = wp.constant(PROBES)
-_QUEUED, _DROPPED, _CACHED, _LEFT, _UPDATED, _GATHERED = (
-    wp.constant(i) for i in (QUEUED, DROPPED, CACHED, LEFT, UPDATED, GATHERED)
+_QUEUED, _DROPPED, _CACHED, _LEFT, _UPDATED, _GATHERED, _LACKING = (
+    wp.constant(i) for i in (QUEUED, DROPPED, CACHED, LEFT, UPDATED, GATHERED, LACKING)
 )
 _WAITING = wp.constant(WAITING)
 _LARGEST = wp.constant(16384.0)  # of the numbers in a row of the pool: half floats hold it
@@ -135,7 +135,7 @@ class Work:
     Attributes:
         clock: [1], the frame's number.
         hour: [1], hour of the day of the light that is decoded.
-        counters: [7], counts of blocks and probes in this frame.
+        counters: [8], counts of blocks and probes in this frame.
         histogram: [TOTALS], number of blocks that wait to be decoded, by distance.
         gathered: [G], slots of the gathered blocks.
         distance: [G], rank of each gathered block: its squared distance from the viewer in units of the block's edge,
@@ -499,6 +499,7 @@ def _combine(work: Work, light: wp.array2d[float], lanes: int, windows: Windows,
                 pool.rows[block] = -1
             wp.atomic_sub(work.counters, _UPDATED, 1)
             wp.atomic_add(work.counters, _LEFT, 1)
+            wp.atomic_add(work.counters, _LACKING, 1)
     elif row >= 0:
         for c in range(lane, channels, lanes):
             number = float(0.0)

@@ -77,9 +77,13 @@ class RegionDecoder(Decoder):
         Raises:
             WlmError: A region is damaged; those before it are loaded.
         """
-        for number in regions.tolist():
-            if not self._touch(number):
+        missing = [number for number in regions.tolist() if not self._touch(number)]
+        try:
+            for number in missing:
                 self._put_region(number, self._content.region(number), regions)
+        finally:
+            if missing:
+                self._table.assign(self._entries)
 
     def _touch(self, number: int) -> bool:
         """Returns whether a region is loaded, and makes it the most recent one."""
@@ -97,7 +101,6 @@ class RegionDecoder(Decoder):
                 break
             del self._loaded[old]
             self._entries[old] = _absent(ABSENT)
-        self._table.assign(self._entries)
 
     def points(self, position: np.ndarray) -> Points:
         """Uploads points that will be decoded often, and loads their regions; arguments and errors as for `decode`."""
@@ -106,7 +109,8 @@ class RegionDecoder(Decoder):
         return Points(x, self.model.outputs, self.device, region)
 
     def run(self, points: Points) -> None:
-        """Decodes uploaded points into `Points.out`; on CUDA the work is queued, not awaited."""
+        """Decodes uploaded points into `Points.out`: -infinity where others took the place of their region. On CUDA the
+        work is queued, not awaited."""
         self.launch(points.x, points.region, points.out)
 
     def launch(self, x: wp.array, region: wp.array, out: wp.array) -> None:
@@ -133,8 +137,8 @@ class RegionDecoder(Decoder):
         return bool(self._coming)
 
     def request(self) -> None:
-        """Has a thread read the regions that the launches since the last call needed, and moves at most one that was
-        read to the device. If it is damaged, its light is 0 from now on.
+        """Has a thread read the regions that launches since the last call needed, and moves at most one that was read
+        to the device. If it is damaged, its light is 0 from now on.
 
         Raises:
             WlmError: The region is damaged; it is only told once.
@@ -151,8 +155,9 @@ class RegionDecoder(Decoder):
                 self._put_region(number, coming.result(), asked)
             except WlmError:
                 self._entries[number] = _absent(0.0)
-                self._table.assign(self._entries)
                 raise
+            finally:
+                self._table.assign(self._entries)
 
     def _inside(self, position: np.ndarray) -> np.ndarray:
         model = self.model

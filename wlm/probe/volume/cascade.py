@@ -186,7 +186,7 @@ class Volume:
         self._size = np.array(self.sizes)
         self._viewpoint: np.ndarray | None = None
         self._base = np.zeros((len(ratios), 3), np.int64)
-        self.frame, self._left, self._hour = 0, 0, 0.0
+        self.frame, self._left, self._lacking, self._hour = 0, 0, 0, 0.0
         self.normal = None if normal is None else _unit(normal, position.shape)
         self._make(rows, self.normal)
         self._step = interop.LaunchGraph(self._work, self.device)
@@ -239,7 +239,7 @@ class Volume:
             return wp.array(ptr=shared.ptr, shape=shape, dtype=dtype, device=self.device)
 
         self._read_light = view((budget * probes, self.channels), float)
-        frame = {"clock": 1, "hour": 1, "counters": 7, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
+        frame = {"clock": 1, "hour": 1, "counters": 8, "histogram": frame_kernels.TOTALS, "numbers": budget * probes}
         ranked = dict.fromkeys(("gathered", "distance"), min(frame_kernels.MOST, blocks))
         ranges = dict.fromkeys(("begin", "count"), (budget, frame_kernels.HALVES))
         by_block = dict.fromkeys(("chosen", "taken", "blocks", "picked", "noise"), budget)
@@ -314,7 +314,8 @@ class Volume:
         still = self._left == 0 and hour == self._hour and np.array_equal(base, before)
         self._viewpoint, self._base, self._hour = viewpoint, base, hour
         self.frame += 1
-        self.light.prepare()
+        if self._lacking or self.light.waiting:
+            self.light.prepare()
         self._look(base, before, at - base - 0.5, self.frame, hour)
         entered = queued = dropped = cached = updated = probes = 0
         if not still:
@@ -322,7 +323,7 @@ class Volume:
             entered = self._slots - int(np.maximum(self.sides - np.abs(base - before), 0).prod(1).sum())
         wp.synchronize_stream(self.device)
         if not still:
-            queued, dropped, cached, self._left, updated, probes = self._counts.numpy()[: frame_kernels.GATHERED].tolist()
+            queued, dropped, cached, self._left, updated, probes, _, self._lacking = self._counts.numpy().tolist()
         seconds = time.perf_counter() - start
         return FrameStats(entered, queued, dropped, updated, cached, self._left, probes, seconds)
 
