@@ -205,8 +205,8 @@ class StepKernels:
         Args:
             groups, shapes, used, by_gaussian, cut: The same as for `touch` and `shapes`.
             grad_f: float [L, N], gradient with respect to the result of `features`; 0 from index `groups.count` on.
-            sums: float [S, K, 9 + L], written: S partial sums of `GaussianFunctions.accumulate`, S = `PARTS` on CUDA and
-                1 on the CPU.
+            sums: float [S, K, 9 + L], written: S partial sums of `GaussianFunctions.accumulate`, S = `PARTS` on CUDA
+                and 1 on the CPU.
             base, count: Index of the first Gaussian and number of Gaussians of this launch, on the CPU alone; default
                 all.
         """
