@@ -274,9 +274,7 @@ def _cuda_kernels(layout: str) -> tuple[Any, Any]:
             begin = cubes.start[cube]
             end = cubes.start[cube + 1]
             k = shapes.shape[0]
-            decode_block(
-                rows, k, cubes.item, begin, end, cut, net, gain, at, block, fresh, count, cubes.item, -1, out
-            )
+            decode_block(rows, k, cubes.item, begin, end, cut, net, gain, at, block, fresh, count, cubes.item, -1, out)
             fresh = 0
             block += _BLOCKS
 
