@@ -2,7 +2,7 @@
 
 Each method has a table of its own:
 
-- "lattice": a copy of an array, and steps of the lattice Boltzmann solver with each storage, collision operator and
+- "lattice": a copy of an array, and steps of the lattice Boltzmann solver with each storage and
   kind of boundary. The bytes that a step must move, over its time, are stated as a share of the copy's bandwidth.
   "moving sphere" also marks the sphere's cells and finds its boundary links again at each step.
 - "lattice storage": difference of velocities stored in 16 and in 32 bits, relative to the speed of a jet's inlet, and
@@ -152,22 +152,19 @@ class SmokeBench(Bench):
 
 
 def lattice_rows(bench: SmokeBench) -> list[Row]:
-    """Times a memory copy, and steps of the fluid solver with each boundary, storage and collision operator."""
+    """Times a memory copy, and steps of the fluid solver with each boundary and storage."""
     bench.note("timing the fluid solver")
     cells, small = bench.sizes.lattice, bench.sizes.small
     cases = {
         "float32, periodic": (cells, {"faces": "periodic"}),
         "float32, six walls": (cells, {"faces": "walls"}),
         "float32, all boundaries": (cells, {}),
-        "float32, all boundaries, BGK": (cells, {"operator": "bgk"}),
         "float32, all boundaries, D3Q27": (cells, {"lattice": "D3Q27"}),
         "float16, periodic": (cells, {"faces": "periodic", "storage": "float16"}),
         "float16, all boundaries": (cells, {"storage": "float16"}),
         f"float32, all boundaries, {small}³": (small, {}),
         f"float16, all boundaries, {small}³": (small, {"storage": "float16"}),
     }
-    if not bench.sizes.every:
-        del cases["float32, all boundaries, BGK"]
     chunk, calls = bench.sizes.chunk, {}
     floats = _COPIED[bench.device.split(":")[0]]
     source = torch.zeros(floats, device=bench.device)

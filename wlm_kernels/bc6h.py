@@ -7,7 +7,7 @@ then chosen by their error in linear light. The most precise mode that can repre
 A block has one line in colour space for all texels, or two lines, to which one of 32 partitions assigns the texels. The
 one line and the two best partitions are encoded, and the encoding with the least error is kept.
 
-The tables are those of `wlm.formats.bc6h`, whose decoder is the reference.
+The tables are those of `wlm.formats.bc6h`; imagecodecs' decoder is the reference.
 """
 
 import warp as wp

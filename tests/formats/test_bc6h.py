@@ -1,4 +1,4 @@
-"""BC6H: every mode as an independent decoder reads it, and our encoder against another."""
+"""BC6H: our encoder as an independent decoder reads it, and against another."""
 
 import imagecodecs
 import numpy as np
@@ -6,18 +6,12 @@ import pytest
 import torch
 
 from benchmarks.rivals.lightmap_blocks import ispc_bc6h
-from wlm.formats.bc6h import MODES, decode_bc6h
+from wlm.formats.bc6h import MODES
 from wlm.ops.bc6h import bc6h_blocks
 
 
 def _other(blocks: np.ndarray) -> np.ndarray:
     return imagecodecs.bcn_decode(blocks.tobytes(), 6, shape=(4 * len(blocks), 4, 3)).reshape(-1, 16, 3)
-
-
-def test_blocks_of_every_mode_and_of_none_decode_as_elsewhere():
-    blocks = np.random.default_rng(0).integers(0, 256, (32 * 200, 16), np.uint8)
-    blocks[:, 0] = blocks[:, 0] & 0xE0 | np.arange(len(blocks)) % 32
-    np.testing.assert_array_equal(decode_bc6h(blocks).view(np.uint16), _other(blocks).view(np.uint16))
 
 
 def _pictures() -> np.ndarray:
@@ -42,7 +36,7 @@ def test_the_encoder_says_what_its_blocks_hold_and_is_better_than_another(device
     assert len({int(number) & 31 for number in blocks[:, 0]}) > len(MODES)  # of most modes
     row = light.astype(np.float16).reshape(-1, 4, 4, 3).transpose(1, 0, 2, 3).reshape(4, -1, 3)
     data = np.frombuffer(ispc_bc6h(row), np.uint8).reshape(-1, 16)
-    theirs = decode_bc6h(data).astype(np.float32)
+    theirs = _other(data).astype(np.float32)
 
     def decibels(found: np.ndarray) -> float:
         """Returns the PSNR of errors relative to the brightest value of each block."""

@@ -41,7 +41,7 @@ LATENTS = (1, 9, 12, 32)
 LATTICE_STEPS = (
     {"lattice": "D3Q19", "solids": True, "walls": (True, True, True)},
     {"lattice": "D3Q19", "solids": True, "storage": "float16"},
-    {"lattice": "D3Q19", "operator": "bgk", "forced": True},
+    {"lattice": "D3Q19", "forced": True},
     {"lattice": "D3Q27", "solids": True, "forced": True},
     {"lattice": "D3Q27", "storage": "float16", "eddies": False},
     {"lattice": "D2Q9"},

@@ -18,7 +18,8 @@ from wlm.probe.gaussian import trainer as training
 from wlm.probe.gaussian.trainer import Trainer, first_gaussians, local_spread
 from wlm.probe.model import Profile, box_of
 from wlm.probe.morton import morton_order
-from wlm.probe.pca.model import ENOUGH, Components, fit_components
+from wlm.probe.pca.fit import ENOUGH, fit_components
+from wlm.probe.pca.model import Components, unit_of
 from wlm.probe.selection import least_count
 
 SMALL = Profile(name="small", method="gaussians", ratio=0.1, latent=3, hidden=16, steps=60)
@@ -206,6 +207,13 @@ def test_a_bright_probe_costs_the_others_nothing():
     assert wlm.probe.evaluate(model, bright).warnings == []
 
 
+def referred(content, ambient=0):
+    """The light of a content by the reference."""
+    return reference_decode(
+        content.cluster, content.code, content.bounds, content.basis, unit_of(content.basis), ambient
+    )
+
+
 @pytest.mark.parametrize("outputs", [1, 3, 5, 27])
 def test_the_decode_is_that_of_the_formula(outputs, device):
     values = NORMAL.normal(size=(60, outputs)).astype(np.float32) * np.exp(NORMAL.normal(size=(60, 1)))
@@ -215,9 +223,7 @@ def test_the_decode_is_that_of_the_formula(outputs, device):
         model = wlm.probe.compress(probes, profile)
         content = model.content
         exact = np.zeros((60, outputs))
-        exact[model.live] = reference_decode(
-            content.code, content.bounds, content.basis, 3 if outputs in (3, 27) else 0
-        )
+        exact[model.live] = referred(content, 3 if outputs in (3, 27) else 0)
         decoded = model.decoder(device).decode_probes()
         np.testing.assert_allclose(decoded, exact, rtol=0, atol=3e-6 * np.abs(exact).max())
 
@@ -243,7 +249,7 @@ def clustered():
 def test_clusters_and_bits_have_the_error_that_is_stated(clustered):
     components, error = fit_components(clustered, 14 * len(clustered))
     assert components.clusters > 1 and components.nbytes <= 14 * len(clustered)
-    decoded = reference_decode(components.code, components.bounds, components.basis, 0)
+    decoded = referred(components)
     scale = np.linalg.norm(clustered, axis=1)
     found = np.linalg.norm(decoded - clustered, axis=1) / scale
     assert np.sqrt(np.mean(found**2)) == pytest.approx(error, rel=1e-3)
@@ -252,12 +258,37 @@ def test_clusters_and_bits_have_the_error_that_is_stated(clustered):
     assert error < 0.5 * np.sqrt(np.mean((np.linalg.norm(rest, axis=1) / scale) ** 2))
 
 
+def test_the_absolute_error_counts_bright_probes(clustered):
+    light = np.where(np.arange(2000) % 8 < 2, 100.0, 1.0) / np.linalg.norm(clustered, axis=1)
+    values = clustered * light.astype(np.float32)[:, None]
+    scale = np.sqrt(np.square(values, dtype=np.float64).sum(1).mean())
+
+    def found(decoded):
+        return np.sqrt(np.square(decoded - values).sum(1).mean()) / scale
+
+    components, error = fit_components(values, 4500, enough=0.0, relative=False)
+    assert components.nbytes <= 4500 and not components.width[:, 0].any()
+    assert found(referred(components)) == pytest.approx(error, rel=5e-3)  # half floats round the scale
+    assert error < 0.5 * found(referred(fit_components(values, 4500, enough=0.0)[0]))
+    probes = from_arrays(NORMAL.random((2000, 3)), values)
+    model = compress(probes, "pca", error="absolute", target=0.05)
+    assert model.content.nbytes < 0.6 * compress(probes, "pca", target=0.05).content.nbytes
+    assert 0.03 < found(model.decoder().decode_probes() - lit(values) + values) < 0.0501
+
+
 def test_packed_codes_are_bits(clustered):
     components = fit_components(clustered, 14 * len(clustered))[0]
-    text = "".join(format(int(word), "032b")[::-1] for word in components.packed())
+    assert np.ptp(components.bits) > 0, "clusters differ in their bits"
+    group, index, codes = ("".join(format(int(word), "032b")[::-1] for word in part) for part in components.packed())
+    length, bits = components.bits[components.cluster], (components.clusters - 1).bit_length()
     for probe in (0, 1, 777, 1999):
-        for column, (first, width) in enumerate(components.places() + [probe * int(components.width.sum()), 0]):
-            assert int(text[first : first + width][::-1] or "0", 2) == components.code[probe, column]
+        own, first = components.cluster[probe], int(length[:probe].sum())
+        assert int(index[probe * bits : (probe + 1) * bits][::-1], 2) == own
+        begin = int(group[probe // 32 * 32 : probe // 32 * 32 + 32][::-1], 2)
+        assert begin == length[: probe // 32 * 32].sum()
+        for code, width in zip(components.code[probe].tolist(), components.width[own].tolist(), strict=True):
+            assert int(codes[first : first + width][::-1] or "0", 2) == code
+            first += width
 
 
 NINE = PLACES[:9]
@@ -304,8 +335,8 @@ def test_light_between_probes_is_read_from_a_volume(tmp_path):
 
 def test_the_choice_is_by_error_at_equal_gpu_bytes():
     # Light that is smooth over thousands of probes suits Gaussians; white noise suits neither, and stays PCA's.
-    smooth = synthetic(600)
-    model = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.02, latent=3, hidden=16, steps=600))
+    smooth = synthetic(1500)
+    model = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.01, latent=3, hidden=8, steps=600))
     assert model.method == "gaussians" and model.choice.startswith("Gaussians: ")
     assert model.profile.method == "gaussians"
     unfinished = wlm.probe.compress(smooth, Profile(name="tiny", ratio=0.3, latent=3, hidden=16, steps=10))

@@ -95,10 +95,10 @@ def test_decoding_at_any_time_is_the_mix_of_the_hours(day, model, device):
             net = np.concatenate([layer.ravel() for layer in (*shared, np.einsum("t,rtd->rd", factors, hours))])
             one = dataclasses.replace(model.at(2.0), content=dataclasses.replace(content, hours=1, net=net))
             return decode64(one, model.stored_positions()) * model.live[:, None]
-        basis = (content.basis if len(content.basis) else np.eye(content.count)).reshape(-1, 9, 3).astype(np.float64)
-        basis = np.einsum("t,ktd->kd", factors * model.scales, basis)
+        basis = content.basis if len(content.basis) else np.eye(content.count)[None]
+        basis = np.einsum("t,cktd->ckd", factors * model.scales, basis.reshape(*basis.shape[:2], 9, 3).astype(float))
         values = np.zeros((150, 3))
-        values[model.live] = reference_decode(content.code, content.bounds, basis, 3)
+        values[model.live] = reference_decode(content.cluster, content.code, content.bounds, basis, 1.0, 3)
         return values
 
     largest = max(np.abs(exact(row)).max() for row in np.eye(9))

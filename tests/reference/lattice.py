@@ -2,7 +2,7 @@
 
     f = equilibrium(c, w, rho, u)
     while True:
-        f = stream(box, collide(box, f, operator, viscosity, smagorinsky, force))
+        f = stream(box, collide(box, f, viscosity, smagorinsky, force))
 
 It shares no code with the kernels: streaming finds for each cell and direction where the population comes from, and
 collision uses Hermite polynomials.
@@ -63,7 +63,7 @@ def fields(box: Box, f: np.ndarray, force: np.ndarray) -> tuple[np.ndarray, np.n
     return rho, (f @ box.c + 0.5 * force) / rho[..., None]
 
 
-def collide(box: Box, f: np.ndarray, operator: str, viscosity: float, smagorinsky: float, force) -> np.ndarray:
+def collide(box: Box, f: np.ndarray, viscosity: float, smagorinsky: float, force) -> np.ndarray:
     """The populations that leave each cell, from those that have arrived."""
     c, w, fluid = box.c, box.w, box.solid == 0
     traceless = np.einsum("qa,qb->qab", c, c) - CS2 * np.eye(3) * c.any(0)
@@ -81,10 +81,7 @@ def collide(box: Box, f: np.ndarray, operator: str, viscosity: float, smagorinsk
     axes = np.diag(c.any(0).astype(float))
     shear = stress - axes * np.trace(stress, axis1=1, axis2=2)[:, None, None] / np.trace(axes)
     out = np.empty_like(f)
-    if operator == "bgk":
-        out[fluid] = after + keep * (came - f_eq)
-    else:
-        out[fluid] = after + keep * w * np.einsum("qab,nab->nq", traceless, shear) / (2 * CS2**2)
+    out[fluid] = after + keep * w * np.einsum("qab,nab->nq", traceless, shear) / (2 * CS2**2)
     return out
 
 

@@ -18,13 +18,12 @@ class Air:
 
     Attributes:
         box: The domain and its boundaries.
-        operator, viscosity, smagorinsky: As for `reference.collide`.
+        viscosity, smagorinsky: As for `reference.collide`.
         ramp: Steps in which inlets rise.
         force: [X, Y, Z, 3], if no other is given.
     """
 
     box: reference.Box
-    operator: str
     viscosity: float
     smagorinsky: float
     ramp: int
@@ -50,9 +49,8 @@ class Air:
 
     def step(self, f: np.ndarray, done: int, inlet: np.ndarray | None = None, force=None) -> np.ndarray:
         """The populations that arrive after one more step than `done`; `inlet` is the velocity at face -x."""
-        left = reference.collide(
-            self.box, f, self.operator, self.viscosity, self.smagorinsky, self.force if force is None else force
-        )
+        force = self.force if force is None else force
+        left = reference.collide(self.box, f, self.viscosity, self.smagorinsky, force)
         if inlet is not None:
             risen = min(1.0, (done + 2) / max(self.ramp, 1))
             self.box.faces["-x"] = ("inlet", risen**2 * (3 - 2 * risen) * inlet)

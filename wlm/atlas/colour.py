@@ -3,7 +3,7 @@
 RGB9E5 takes 32 bits a texel, and all GPUs filter it; half floats take 64, since desktop GPUs support them with four
 channels but not with three. Both block formats take 16 bytes for 4x4 texels, 8 bits per texel.
 (lightmap-uv-clustering-cascade, section 4.4, counts 6 bits per texel for ASTC 4x4; the format takes 8, as we count.)
-ASTC needs the optional packages of the extra `atlas`.
+ASTC, and decoding of BC6H, need the optional packages of the extra `atlas`.
 
 Half floats represent the decoded texels of every format exactly.
 """
@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from wlm.atlas.model import BLOCK_SIDE
 from wlm.errors import WlmError
-from wlm.formats import bc6h, hdr_blocks
+from wlm.formats import hdr_blocks
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.shared_exponent import LARGEST, pack_rgb9e5, unpack_rgb9e5
 from wlm.ops.bc6h import bc6h_blocks
@@ -120,8 +120,7 @@ def decode(blocks: np.ndarray, height: int, width: int, codec: str) -> np.ndarra
         raise ValueError(f"blocks: expected shape uint8 [{rows * columns}, 16], got {blocks.dtype} {blocks.shape}")
     size = (rows * BLOCK_SIDE, columns * BLOCK_SIDE)
     if codec == "bc6h":
-        cells = bc6h.decode_bc6h(blocks).reshape(rows, columns, BLOCK_SIDE, BLOCK_SIDE, 3)
-        texels = cells.transpose(0, 2, 1, 3, 4).reshape(*size, 3)
+        texels = hdr_blocks.decode_bc6h(blocks.tobytes(), *size, _EXTRA)
     else:
         texels = _astc().decode(blocks.tobytes(), *size)
     texels = texels[:height, :width].astype(np.float32)

@@ -177,7 +177,7 @@ class DifferentiableLattice:
         flow.n, flow.bounded = wp.vec3i(*setup.shape), setup.bounded
         flow.walled = wp.vec3i(*(int(wall) for wall in setup.spec.walls))
         flow.tau, flow.eddy, flow.axes = setup.tau, setup.eddy, 2 if setup.spec.lattice == "D2Q9" else 3
-        flow.regularised, flow.solid, flow.forces = int(setup.spec.operator == "regularised"), setup.solid, forces
+        flow.solid, flow.forces = setup.solid, forces
         return flow
 
     def _collide(self, work: "_Work", f: wp.array, done: int, forces: wp.array, out: wp.array) -> None:

@@ -125,7 +125,7 @@ def blown_up(key: int, shape: tuple[int, int, int]) -> WlmError:
     indices = tuple(int(a) for a in np.unravel_index(cell, shape))
     return WlmError(
         f"lattice: blew up in step {step} at cell {indices}: {cause}; expected speeds below {MAX_SPEED} and a"
-        f" viscosity at which the operator is stable: use a shorter step, a larger viscosity or smagorinsky=0.17"
+        f" viscosity at which the flow is stable: use a shorter step, a larger viscosity or smagorinsky=0.17"
     )
 
 
@@ -138,8 +138,7 @@ class Lattice:
     Args:
         shape: Cells along x, y and z.
         viscosity: Kinematic viscosity in square cells per step; above 0.
-        operator: Collision operator, "bgk" or "regularised", see `wlm_kernels.fluid.lattice`.
-        smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the default operator is stable at viscosity 1e-6.
+        smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the flow is stable at viscosity 1e-6.
         storage: "float32" or "float16", which halves memory and traffic. With float16 the velocities of a jet differ
             by less than 0.2% of its speed (RMS, before the chaotic flows diverge), and the total mass drifts by about
             3e-5 in 5,000 steps.
@@ -163,7 +162,6 @@ class Lattice:
         shape: tuple[int, int, int],
         *,
         viscosity: float,
-        operator: str = "regularised",
         smagorinsky: float = 0.17,
         storage: str = "float32",
         lattice: str = "D3Q19",
@@ -177,7 +175,7 @@ class Lattice:
         if ramp < 0:
             raise ValueError(f"ramp: expected at least 0 steps, got {ramp}")
         self.device = wp.get_device(device)
-        spec = Spec(lattice, operator, storage, eddies=smagorinsky > 0.0)
+        spec = Spec(lattice, storage, eddies=smagorinsky > 0.0)
         needed = self.bytes_needed(self.shape, storage, lattice)
         require_free("lattice", self.shape, needed, self.device, "fewer cells or storage='float16'")
         self._n, self._cells = wp.vec3i(*self.shape), math.prod(self.shape)

@@ -1,4 +1,4 @@
-"""BC6H blocks, unsigned, of all fourteen modes: their layout, and an exact decoder.
+"""The layout of unsigned BC6H blocks of all fourteen modes.
 
 A block of 128 bits stores 4 x 4 texels of RGB half floats: one line in colour space, or two lines and the number of the
 partition that assigns texels to them. From the lowest bit, a block contains the mode's number; the endpoints w and x of
@@ -11,11 +11,7 @@ Khronos' Data Format Specification 1.3, chapter 20.2 ("BC6H"), specifies the for
 
 import numpy as np
 
-from wlm.formats.bc7 import ANCHORS, PARTITIONS, SHARES
-
-BLOCK_BYTES = 16
-SIDE = 4
-"""Texels along a block."""
+from wlm.formats.bc7 import ANCHORS, PARTITIONS
 
 # For each mode, from the format's mode 1 to mode 14: its number; bits of w; bits of the others' red, green and blue;
 # and the fields after the number, from the lowest bit. "rw0-9" is bits 0 to 9 of w's red, "rw15-10" is bits 15 down to
@@ -112,76 +108,3 @@ MASKS = np.array([sum((int(word) >> 2 * i & 1) << i for i in range(16)) for word
 
 SECOND_ANCHORS = np.ascontiguousarray(ANCHORS[1, :32, 0])
 """int32 [32]: the anchor texel of the second line."""
-
-_PIECE = 1 << 15  # blocks decoded at once
-_RESERVED = -1
-
-
-def _rows() -> np.ndarray:
-    """Returns int [32]: for the lowest five bits of a block the row of its mode in `MODES`, or `_RESERVED`."""
-    rows = np.full(32, _RESERVED, np.int64)
-    for row, (number, bits) in enumerate(MODES[:, :2]):
-        rows[np.arange(number, 32, 1 << bits)] = row
-    return rows
-
-
-_ROWS = _rows()
-
-
-def decode_bc6h(blocks: np.ndarray) -> np.ndarray:
-    """Decodes unsigned BC6H blocks, uint8 [B, 16], bit-exactly to half [B, 16, 3], texels row by row.
-
-    Blocks of a reserved mode are black.
-    """
-    if blocks.dtype != np.uint8 or blocks.ndim != 2 or blocks.shape[1] != BLOCK_BYTES:
-        raise ValueError(f"blocks: expected uint8 [B, 16], got {blocks.dtype} {blocks.shape}")
-    texels = np.zeros((len(blocks), SIDE * SIDE, 3), np.float16)
-    row = _ROWS[blocks[:, 0] & 31]
-    for mode in range(len(MODES)):
-        members = np.flatnonzero(row == mode)
-        for first in range(0, len(members), _PIECE):
-            part = members[first : first + _PIECE]
-            texels[part] = _decode_mode(blocks[part], mode)
-    return texels
-
-
-def _decode_mode(blocks: np.ndarray, mode: int) -> np.ndarray:
-    bits = np.unpackbits(blocks, axis=1, bitorder="little").astype(np.int32)
-    fields = np.zeros((PARTITION + 1, len(blocks)), np.int32)
-    for place in np.flatnonzero(LAYOUT[mode] >= 0):
-        code = LAYOUT[mode, place]
-        fields[code >> 4] |= bits[:, place] << (code & 15)
-    count = 4 if mode < TWO_LINES else 2
-    # [channel, endpoint, block]
-    endpoint = fields[:PARTITION].reshape(3, 4, -1)[:, :count]
-    _, _, differences, width, *others = MODES[mode].tolist()
-    if differences:
-        sign = 1 << (np.array(others, np.int32) - 1)[:, None, None]
-        signed = (endpoint[:, 1:] ^ sign) - sign
-        endpoint[:, 1:] = (signed + endpoint[:, :1]) & ((1 << width) - 1)
-    if width < 15:
-        whole = ((endpoint << 16) + 0x8000) >> width
-        whole = np.where(endpoint == 0, 0, np.where(endpoint == (1 << width) - 1, 0xFFFF, whole))
-    else:
-        whole = endpoint
-    texel = np.arange(SIDE * SIDE)
-    if mode < TWO_LINES:
-        partition = fields[PARTITION]
-        line = MASKS[partition][:, None] >> texel & 1
-        anchor = (texel == 0) | (texel == SECOND_ANCHORS[partition][:, None])
-        index_bits = 3
-    else:
-        line = np.zeros((len(blocks), texel.size), np.int32)
-        anchor = np.broadcast_to(texel == 0, line.shape)
-        index_bits = 4
-    own = index_bits - anchor
-    last = np.cumsum(own, axis=1)
-    place = 128 - last[:, -1:] + last - own
-    block = np.arange(len(blocks))[:, None]
-    index = np.zeros_like(line)
-    for bit in range(index_bits):
-        index |= np.where(bit < own, bits[block, np.minimum(place + bit, 127)] << bit, 0)
-    share = SHARES[index_bits - 2][index]
-    low, high = (whole[:, 2 * line + end, block] for end in (0, 1))
-    mixed = ((64 - share) * low + share * high + 32) >> 6
-    return np.moveaxis(((mixed * 31) >> 6).astype(np.uint16).view(np.float16), 0, -1)

@@ -19,7 +19,7 @@ BODY = "body"
 """Name of the only part."""
 
 _MAGIC = b"wlm"
-_VERSION = 5
+_VERSION = 6
 _DIGEST = 4
 _START = 4 + _DIGEST
 

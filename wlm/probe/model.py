@@ -23,7 +23,7 @@ CODES = 65535
 
 
 class Profile(Settings):
-    """Settings of a fit. All except `method` are about the Gaussians."""
+    """Settings of a fit. All except `method`, `target`, `max_bytes` and `error` are about the Gaussians."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
     FILES: ClassVar[str] = "probe"
@@ -31,7 +31,7 @@ class Profile(Settings):
     method: Literal["auto", "gaussians", "pca"] = "auto"
     """Compression method: gaussians, pca, or auto, which takes PCA if it has less error in no more GPU memory."""
     target: float | None = Field(None, gt=0.0, lt=1.0)
-    """Relative error to reach, in root mean square, with the fewest bytes of GPU memory; the first fit has `ratio`."""
+    """Error to reach, in root mean square, with the fewest bytes of GPU memory; the first fit has `ratio`."""
     max_bytes: int | None = Field(None, ge=1)
     """Most bytes of GPU memory; Gaussians or components are as many as fit them, or as `target` needs."""
     ratio: float = Field(0.05, gt=0.0, le=1.0)
@@ -41,7 +41,7 @@ class Profile(Settings):
     hidden: int = Field(64, ge=8, le=128, multiple_of=8)
     """Width of both hidden layers of the network."""
     error: Literal["relative", "absolute"] = "relative"
-    """Error that is minimised: relative to each probe's light, or absolute (eq. 8), which neglects dark probes."""
+    """Error that counts: relative to each probe's light, or absolute (eq. 8), which neglects dark probes."""
     support: Literal["ellipsoid", "sphere"] = "ellipsoid"
     """Support of a Gaussian: ellipsoid, at three standard deviations, or sphere, of its longest half axis (eq. 6)."""
     optimiser: Literal["adam", "adan"] = "adam"
@@ -150,7 +150,7 @@ class ProbeModel(Model):
     Attributes:
         name: Name of the set.
         source: Hash of the input, 16 hexadecimal digits; a file stores the first 8.
-        profile: Settings of the fit, with the method that was used; PCA has no other settings.
+        profile: Settings of the fit, with the method that was used; PCA has no other settings but `error`.
         probes: Number of probes, N.
         outputs: Numbers per probe at one hour, D: 27 for second-order spherical harmonics in three colours.
         origin: float64 [3], lowest corner of the probes' bounding box, in the unit of the positions.

@@ -1,4 +1,4 @@
-"""Chooses the method and the number of Gaussians of a fit by relative error and bytes of GPU memory."""
+"""Chooses the method and the number of Gaussians of a fit by error and bytes of GPU memory."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from wlm.probe.data import ProbeSet
 from wlm.probe.evaluation import at_hour, relative_figures
 from wlm.probe.gaussian.model import gaussian_bytes, gaussian_count
 from wlm.probe.model import ProbeModel, Profile
-from wlm.probe.pca.model import ENOUGH, fit_components
+from wlm.probe.pca.fit import ENOUGH, fit_components
 
 _REPEATED = 100  # number in the checkpoint of a fit that is repeated after a resume, since only its error was kept
 _FITS = 7  # most fits of a search
@@ -23,7 +23,7 @@ _CLOSE = 1.1  # a search ends when the number that reaches is at most this facto
 
 
 class Candidates:
-    """The models of one set, fitted when they are asked for, and the choice between them by relative error."""
+    """The models of one set, fitted when they are asked for, and the choice between them by error."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class Candidates:
         if profile.method == "gaussians":
             return gaussians
         most = gaussians.content.nbytes
-        told = f"Gaussians reach a relative error of {error:.1%} in {most:,} bytes of GPU memory"
+        told = f"Gaussians reach an error of {error:.1%} in {most:,} bytes of GPU memory"
         rival, _ = self._components(most, ENOUGH)
         if rival.content.nbytes > most:
             return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
@@ -117,15 +117,16 @@ class Candidates:
         warnings = model.warnings
         if target and not reached:
             least = min(error for error, *_ in found)
-            missed = f"{name}: target: the relative error is {least:.1%}, more than the {target:.1%} asked for"
+            missed = f"{name}: target: the {profile.error} error is {least:.1%}, more than the {target:.1%} asked for"
             warnings = (missed, *warnings)
         return replace(model, choice=f"{kind}: {told} bytes of GPU memory", warnings=warnings)
 
     def _components(self, most: int | None, enough: float, choice: str = "") -> tuple[ProbeModel, float]:
         """Returns the fewest principal components with an error of at most `enough`, or as many as fit `most` bytes;
         and their error before ambient light is clamped."""
-        content, error = fit_components(self._values, most, self._hours, enough)
-        profile = Profile(name=self._profile.name, method="pca")
+        relative = self._profile.error == "relative"
+        content, error = fit_components(self._values, most, self._hours, enough, relative=relative)
+        profile = Profile(name=self._profile.name, method="pca", error=self._profile.error)
         return self._make(profile=profile, content=content, choice=choice), error
 
     def _bytes(self, count: int) -> int:
@@ -135,7 +136,7 @@ class Candidates:
         return gaussian_bytes(count, *sizes) + (self._regions - 1) * gaussian_bytes(0, *sizes)
 
     def _error(self, count: int) -> float:
-        """Returns the relative error of a fit of `count` Gaussians; a checkpoint keeps it."""
+        """Returns the error of a fit of `count` Gaussians; a checkpoint keeps it."""
         if count not in self._errors:
             number, kept = len(self._errors), self._checkpoint
             stored = kept and kept.finished(number, {"error": Part(np.float64, (1,), least=0.0)})
@@ -156,14 +157,20 @@ class Candidates:
         return self._models[count]
 
     def _measured(self, model: ProbeModel) -> tuple[ProbeModel, float]:
-        """Returns the model with its warnings, and its relative error, the root mean square over all hours."""
-        decoder = model.decoder(self._device, position=self._probes.position)
+        """Returns the model with its warnings, and its error, the root mean square over all hours: of the live probes'
+        relative errors, or of their errors as a share of the root mean square light of the hour."""
+        decoder, live = model.decoder(self._device, position=self._probes.position), self._probes.live
         warnings, squares = [], []
         for time in self._probes.times.tolist() or [None]:
             decoder.set_time(time or 0.0)
-            figures = relative_figures(decoder.decode_probes(), self._probes.at(time))
+            decoded, probes = decoder.decode_probes(), self._probes.at(time)
+            figures = relative_figures(decoded, probes)
             warnings += [at_hour(time) + line for line in figures["warnings"]]
-            squares.append(figures["relative_error"] ** 2)
+            error = figures["relative_error"]
+            if self._profile.error == "absolute":
+                values = probes.values[live].astype(np.float64)
+                error = np.linalg.norm(decoded[live] - values) / (np.linalg.norm(values) or math.nan)
+            squares.append(error**2)
         return replace(model, warnings=tuple(warnings)), math.sqrt(np.nanmean(squares))
 
 

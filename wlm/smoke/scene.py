@@ -118,13 +118,12 @@ class Air(_Settings):
         viscosity: Kinematic viscosity in square metres per second; 1.5e-5 for air.
         speed: Speed in metres per second that equals `lattice_speed`; null: that of the fastest inlet or obstacle.
         lattice_speed: Speed in cells per step. Errors grow with its square, the number of steps with its inverse.
-        operator, smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
+        smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
     """
 
     viscosity: _Positive = 1.5e-5
     speed: _Positive | None = None
     lattice_speed: float = Field(0.1, gt=0.0, le=0.3)
-    operator: Literal["bgk", "regularised"] = "regularised"
     smagorinsky: _NotNegative = 0.17
     storage: Literal["float32", "float16"] = "float32"
 

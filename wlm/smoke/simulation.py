@@ -200,7 +200,6 @@ def _make_lattice(scene: Scene, device: str) -> Lattice:
     lattice = Lattice(
         grid.cells,
         viscosity=domain.viscosity(air.viscosity),
-        operator=air.operator,
         smagorinsky=air.smagorinsky,
         storage=air.storage,
         device=device,

@@ -12,11 +12,11 @@ Collision, with Kupershtokh's exact difference for a force F; the velocity of th
 
     f* = f_eq(rho, u + F / rho) + R(f - f_eq(rho, u))
 
-- "bgk": R multiplies every population by 1 - 1 / tau, where tau = 1/2 + 3 nu.
-- "regularised": R also projects onto the second-order Hermite part, the stress (Latt and Chopard 2006), and relaxes the
-  trace of the stress, which only damps sound, in one step: a bulk viscosity of 1/9 (1/6 in two dimensions). Relaxed
-  like the rest, the trace changes its sign at every step at viscosities near 0 and does not decay: in a jet past a
-  sphere a flutter of period 2 grew to a third of the velocity in 10,000 steps, at viscosities 1e-6 and 1e-4.
+R projects onto the second-order Hermite part, the stress (Latt and Chopard 2006), multiplies it by 1 - 1 / tau, where
+tau = 1/2 + 3 nu, and relaxes the trace of the stress, which only damps sound, in one step: a bulk viscosity of 1/9 (1/6
+in two dimensions). Relaxed like the rest, the trace changes its sign at every step at viscosities near 0 and does not
+decay: in a jet past a sphere a flutter of period 2 grew to a third of the velocity in 10,000 steps, at viscosities 1e-6
+and 1e-4.
 
 Smagorinsky's eddy viscosity nu_t = C^2 |S| adds what the grid cannot resolve; with |S| from the non-equilibrium stress
 Pi it becomes tau = (tau_0 + sqrt(tau_0^2 + 18 sqrt(2) C^2 |Pi| / rho)) / 2.
@@ -32,8 +32,6 @@ from typing import Any
 import warp as wp
 
 from wlm_kernels.fluid.lattice_sets import PAIRS, STORAGES, cell_of, lattice, memory_functions
-
-OPERATORS = ("bgk", "regularised")
 
 CAUSES = ("the density is not positive", "the speed exceeds that of sound", "not a number")
 """Reasons why a run stops, in the order of their codes."""
@@ -68,7 +66,6 @@ class Spec:
 
     Attributes:
         lattice: "D2Q9", "D3Q19" or "D3Q27".
-        operator: One of `OPERATORS`.
         storage: "float32" or "float16".
         eddies: Whether Smagorinsky's C is above 0.
         solids: Whether any cell may be solid.
@@ -78,7 +75,6 @@ class Spec:
     """
 
     lattice: str
-    operator: str = "regularised"
     storage: str = "float32"
     eddies: bool = True
     solids: bool = False
@@ -88,12 +84,8 @@ class Spec:
 
     def __post_init__(self) -> None:
         lattice(self.lattice)
-        for name, value, allowed in (
-            ("operator", self.operator, OPERATORS),
-            ("storage", self.storage, tuple(STORAGES)),
-        ):
-            if value not in allowed:
-                raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {value!r}")
+        if self.storage not in STORAGES:
+            raise ValueError(f"storage: expected one of {', '.join(STORAGES)}, got {self.storage!r}")
 
 
 @functools.cache
@@ -126,9 +118,7 @@ def _relax(spec: Spec) -> Any:
         return out
 
     @wp.func
-    def relax(
-        g: vec, drho: float, j: wp.vec3, diagonal: wp.vec3, off: wp.vec3, force: wp.vec3, tau: float, eddy: float
-    ) -> vec:
+    def relax(drho: float, j: wp.vec3, diagonal: wp.vec3, off: wp.vec3, force: wp.vec3, tau: float, eddy: float) -> vec:
         rho = 1.0 + drho
         # The only division by the density in the step.
         inverse = 1.0 / rho
@@ -146,9 +136,8 @@ def _relax(spec: Spec) -> Any:
             norm2 = wp.dot(neq_diagonal, neq_diagonal) + 2.0 * wp.dot(neq_off, neq_off)
             tau_eddy = 0.5 * (tau + wp.sqrt(tau * tau + eddy * inverse * wp.sqrt(norm2)))
         keep = 1.0 - 1.0 / tau_eddy
-        if wp.static(spec.operator == "regularised"):
-            mean = wp.static(1.0 / axes) * (neq_diagonal[0] + neq_diagonal[1] + neq_diagonal[2])
-            neq_diagonal -= wp.vec3(mean, mean, wp.static(0.0 if flat else 1.0) * mean)
+        mean = wp.static(1.0 / axes) * (neq_diagonal[0] + neq_diagonal[1] + neq_diagonal[2])
+        neq_diagonal -= wp.vec3(mean, mean, wp.static(0.0 if flat else 1.0) * mean)
         # The equilibrium after the force has acted; rho (u + F / rho) is j + F.
         momentum = wp.vec3(j)
         if wp.static(spec.forced):
@@ -156,9 +145,6 @@ def _relax(spec: Spec) -> Any:
         after = inverse * momentum
         after_diagonal = wp.cw_mul(momentum, after)
         after_off = wp.vec3(momentum[0] * after[1], momentum[0] * after[2], momentum[1] * after[2])
-        if wp.static(spec.operator == "bgk"):
-            equilibrium = hermite(drho, j, eq_diagonal, eq_off)
-            return hermite(drho, momentum, after_diagonal, after_off) + keep * (g - equilibrium)
         return hermite(drho, momentum, after_diagonal + keep * neq_diagonal, after_off + keep * neq_off)
 
     return relax
@@ -224,8 +210,8 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         push = wp.vec3()
         if wp.static(spec.forced):
             push = forces[i]
-        g = relax(g, drho, j, diagonal, off, push, tau, eddy)
+        left = relax(drho, j, diagonal, off, push, tau, eddy)
         for q in range(wp.static(count_q)):
-            put(out, q, i, g[q])
+            put(out, q, i, left[q])
 
     return step

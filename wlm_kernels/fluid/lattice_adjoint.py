@@ -29,7 +29,6 @@ class Flow:
         tau: Relaxation time, 1/2 + 3 nu.
         eddy: `lattice.eddy_factor`; 0: no eddy viscosity.
         axes: Number of dimensions, 2 or 3.
-        regularised: 1 for the operator "regularised", 0 for "bgk".
         solid: uint8 [N], number of the body of each cell, 0 for fluid; [0] without solids.
         forces: vec3 [N], acceleration of each cell's fluid; [0] without a force.
     """
@@ -40,7 +39,6 @@ class Flow:
     tau: float
     eddy: float
     axes: int
-    regularised: int
     solid: wp.array1d[wp.uint8]
     forces: wp.array1d[wp.vec3]
 
@@ -109,7 +107,6 @@ def _step(
     on_j = wp.vec3()
     square = wp.vec3()
     on_off = wp.vec3()
-    product = float(0.0)
     for q in range(t.w.shape[0]):
         along, cell = _pulled(t, flow, i, p, q)
         g = f[along, cell]
@@ -118,9 +115,7 @@ def _step(
         j += g * c
         diagonal += g * wp.cw_mul(c, c)
         off += g * _mixed(c)
-        wide = on_out[q, i]
-        product += wide * g
-        wide *= t.w[q]
+        wide = t.w[q] * on_out[q, i]
         on_rest += wide
         on_j += 3.0 * wide * c
         square += 4.5 * wide * wp.cw_mul(c, c)
@@ -147,30 +142,13 @@ def _step(
     on_momentum = on_j + inverse * (2.0 * wp.cw_mul(momentum, on_diagonal) + _times_mixed(momentum, on_off))
     on_inverse = wp.dot(wp.cw_mul(momentum, momentum), on_diagonal) + wp.dot(_mixed(momentum), on_off)
     on_drho = float(on_rest)
-    to_j = wp.vec3(on_momentum)
-    to_eq = wp.vec3()
-    to_eq_off = wp.vec3()
-    to_stress = wp.vec3()
-    to_shear = wp.vec3()
-    on_keep = float(0.0)
-    straight = float(0.0)
-    if flow.regularised != 0:
-        ones = wp.vec3(1.0, 1.0, wp.where(flat, 0.0, 1.0))
-        part = 1.0 / float(flow.axes)
-        trace = part * (stress[0] + stress[1] + stress[2])
-        on_keep = wp.dot(stress - trace * ones, on_diagonal) + wp.dot(shear, on_off)
-        mean = part * wp.dot(ones, on_diagonal)
-        to_stress = keep * (on_diagonal - mean * wp.vec3(1.0, 1.0, 1.0))
-        to_shear = keep * on_off
-    else:
-        straight = keep
-        same = drho * on_rest + wp.dot(j, on_j)
-        same += inverse * (wp.dot(wp.cw_mul(j, j), on_diagonal) + wp.dot(_mixed(j), on_off))
-        on_keep = product - same
-        on_drho -= keep * on_rest
-        to_j -= keep * on_j
-        to_eq = -keep * on_diagonal
-        to_eq_off = -keep * on_off
+    ones = wp.vec3(1.0, 1.0, wp.where(flat, 0.0, 1.0))
+    part = 1.0 / float(flow.axes)
+    trace = part * (stress[0] + stress[1] + stress[2])
+    on_keep = wp.dot(stress - trace * ones, on_diagonal) + wp.dot(shear, on_off)
+    mean = part * wp.dot(ones, on_diagonal)
+    to_stress = keep * (on_diagonal - mean * wp.vec3(1.0, 1.0, 1.0))
+    to_shear = keep * on_off
     if norm > 0.0:
         on_square_root = on_keep / (tau * tau) * 0.25 / root
         on_inverse += on_square_root * flow.eddy * norm
@@ -180,10 +158,8 @@ def _step(
     if flat:
         to_stress[2] = 0.0
     on_drho -= (to_stress[0] + to_stress[1] + to_stress[2]) / 3.0
-    to_eq -= to_stress
-    to_eq_off -= to_shear
-    to_j += inverse * (2.0 * wp.cw_mul(j, to_eq) + _times_mixed(j, to_eq_off))
-    on_inverse += wp.dot(wp.cw_mul(j, j), to_eq) + wp.dot(_mixed(j), to_eq_off)
+    to_j = on_momentum - inverse * (2.0 * wp.cw_mul(j, to_stress) + _times_mixed(j, to_shear))
+    on_inverse -= wp.dot(wp.cw_mul(j, j), to_stress) + wp.dot(_mixed(j), to_shear)
     on_drho -= inverse * inverse * on_inverse
     if on_forces.shape[0] > 0:
         on_forces[i] += on_momentum
@@ -192,7 +168,7 @@ def _step(
         along, cell = _pulled(t, flow, i, p, q)
         c = _direction(t, q)
         g = on_drho + wp.dot(c, to_j) + wp.dot(wp.cw_mul(c, c), to_stress) + wp.dot(_mixed(c), to_shear)
-        on_f[along, cell] = g + straight * on_out[q, i]
+        on_f[along, cell] = g
 
 
 @wp.kernel

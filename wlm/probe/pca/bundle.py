@@ -7,14 +7,15 @@ from wlm.probe.decode import Decoder
 from wlm.probe.glsl import buffer_glsl, clamp_glsl, sh_glsl
 from wlm.probe.model import ProbeModel
 from wlm.probe.sphere import sh_count
+from wlm_kernels.probe.components import GROUP
 
 _REFERENCES = 64
 
 _ABOUT = {
-    "probe": "values = m * sum over k of c_k * b_k, with the magnitude m = exp(low_0 + step_0 * code_0) and the "
-    "coefficients c_k = low_k + step_k * code_k for k from 1 to the number of components; low, step and b are those of "
-    "the probe's cluster. Of spherical harmonics the first three values are clamped at 0. Codes have the bits that the "
-    "buffer states. The basis vectors b_k are half floats, or the unit vectors where basis is false.",
+    "probe": "values = m * sum over k from 1 of c_k * b_k, with the magnitude m = exp(low_0 + step_0 * code_0) and the "
+    "coefficients c_k = low_k + step_k * code_k; low, step and b, and the number of codes and their bits, are those of "
+    "the probe's cluster. Of spherical harmonics the first three values are clamped at 0. The directions b_k are "
+    "integers divided by 127, half floats if the model has several hours, or the unit vectors where basis is false.",
     "live": "The buffer probes holds live probes only, in the order of compression: live probe i is probe i of the set "
     "less the dead probes before it.",
     "between": "To read light between probes, fill a volume from them, or take the nearest probes.",
@@ -23,80 +24,86 @@ _ABOUT = {
 
 _TEMPLATE = """\
 // Decodes light probes from principal components. For GLSL 4.30 and later, with or without Vulkan; include it below
-// #version. It fits every model of {outputs} numbers per probe and {count} components{unit}. The document
-// has the formula; see "about" there.
+// #version. It fits every model of {outputs} numbers per probe and such directions. The document has the
+// formula; see "about" there.
 //
 // Buffer probes, 32-bit words, little-endian:
-//   0    number of live probes, an integer
-//   1    number of clusters C, an integer
-//   2    {columns} words, one for each code of a probe: its first bit among those of the probe (16 bits), and its width
-//   {first}   for each cluster {numbers} words: the lowest value and the step of the magnitude's logarithm and of each
-//        coefficient, half floats
-//   {first} + {numbers} C   for each cluster {count_basis} basis vectors of {words} words: half floats, two in a word,
-//        the low half first
-//   {first} + {stride} C   the bits of one probe after another, from the lowest bit of a word: its cluster, the code of
-//        its magnitude, and those of its coefficients
+//   number of live probes V; number of clusters C; bits b of a cluster's number; number of codes Q of all clusters
+//   C words, one for each cluster: its first code (16 bits), and the bits of its probes (16 bits)
+//   Q words: the lowest value and the step of each code, half floats; the first code of a cluster is that of the
+//        magnitude's logarithm, the others are those of the coefficients
+//   Q bytes, padded to words: bits of each code
+//   {words} (Q - C) words: the direction of each coefficient; {directions}
+//   G words for G = ceil(V / {group}) groups of {group} probes: where the codes of the group begin, in bits
+//   b G words: the numbers of the probes' clusters, b bits each
+//   the codes of one probe after another, from the lowest bit of a word
 //
 // It is a storage buffer, unless WLM_PROBE_PROBES(i) is defined before this file as another way to read word i.
 
 {buffers}
 const int WLM_PROBE_OUTPUTS = {outputs};
-const int WLM_PROBE_COMPONENTS = {count};
 
 int wlm_probe_count()
 {{
     return int(WLM_PROBE_PROBES(0));
 }}
 
-// Code of a live probe: its cluster (column 0), or that of its magnitude (1) or of a coefficient.
-uint wlm_probe_code(int probe, int column)
+// Integer of some bits, fewer than 32, at a place in the bits that begin with a word.
+uint wlm_probe_code(int word, uint bit, int width)
 {{
-    uint place = WLM_PROBE_PROBES(2 + column);
-    uint last = WLM_PROBE_PROBES({first} - 1);
-    int bits = int((last & 65535u) + (last >> 16u));
-    int width = int(place >> 16u);
     if (width == 0)
         return 0u;
-    // The bits of 32 probes end with a word.
-    int bit = probe % 32 * bits + int(place & 65535u);
-    int word = {first} + {stride} * int(WLM_PROBE_PROBES(1)) + probe / 32 * bits + bit / 32;
-    uint code = WLM_PROBE_PROBES(word) >> uint(bit % 32);
-    if (bit % 32 + width > 32)
-        code |= WLM_PROBE_PROBES(word + 1) << uint(32 - bit % 32);
+    word += int(bit >> 5u);
+    int shift = int(bit & 31u);
+    uint code = WLM_PROBE_PROBES(word) >> uint(shift);
+    if (shift + width > 32)
+        code |= WLM_PROBE_PROBES(word + 1) << uint(32 - shift);
     return code & ((1u << uint(width)) - 1u);
-}}
-
-// Logarithm of the magnitude of a live probe of a cluster (number 0), or one of its coefficients.
-float wlm_probe_number(int probe, int cluster, int number)
-{{
-    vec2 bounds = unpackHalf2x16(WLM_PROBE_PROBES({first} + cluster * {numbers} + number));
-    return bounds.x + bounds.y * float(wlm_probe_code(probe, 1 + number));
 }}
 
 // The numbers of a live probe.
 void wlm_probe_values(int probe, out float values[WLM_PROBE_OUTPUTS])
 {{
-    int cluster = int(wlm_probe_code(probe, 0));
-    float magnitude = exp(wlm_probe_number(probe, cluster, 0));
-{body}{clamp}
+    int clusters = int(WLM_PROBE_PROBES(1)), b = int(WLM_PROBE_PROBES(2)), codes = int(WLM_PROBE_PROBES(3));
+    int bounds = 4 + clusters, widths = bounds + codes, basis = widths + (codes + 3) / 4;
+    int group = basis + (codes - clusters) * {words}, index = group + (wlm_probe_count() + {group} - 1) / {group};
+    int data = index + (index - group) * b;
+    uint bit = WLM_PROBE_PROBES(group + probe / {group});
+    for (int other = probe - probe % {group}; other < probe; ++other)
+        bit += WLM_PROBE_PROBES(4 + int(wlm_probe_code(index, uint(other * b), b))) >> 16u;
+    int cluster = int(wlm_probe_code(index, uint(probe * b), b));
+    int first = int(WLM_PROBE_PROBES(4 + cluster) & 65535u);
+    int end = cluster + 1 < clusters ? int(WLM_PROBE_PROBES(5 + cluster) & 65535u) : codes;
+    float magnitude = 0.0;
+    for (int d = 0; d < WLM_PROBE_OUTPUTS; ++d)
+        values[d] = 0.0;
+    for (int k = first; k < end; ++k) {{
+        int width = int(WLM_PROBE_PROBES(widths + k / 4) >> uint(k % 4 * 8) & 255u);
+        vec2 limits = unpackHalf2x16(WLM_PROBE_PROBES(bounds + k));
+        float number = limits.x + limits.y * float(wlm_probe_code(data, bit, width));
+        bit += uint(width);
+        if (k == first) {{
+            magnitude = exp(number);
+            continue;
+        }}
+{body}
+    }}{clamp}
 }}
 """
 
 _BASIS = """\
-    int basis = {first} + {numbers} * int(WLM_PROBE_PROBES(1)) + cluster * {basis_words};
-    for (int d = 0; d < WLM_PROBE_OUTPUTS; ++d)
-        values[d] = 0.0;
-    for (int k = 0; k < WLM_PROBE_COMPONENTS; ++k) {{
-        float coefficient = magnitude * wlm_probe_number(probe, cluster, 1 + k);
+        number *= magnitude{unit};
         for (int d = 0; d < WLM_PROBE_OUTPUTS; ++d) {{
-            vec2 pair = unpackHalf2x16(WLM_PROBE_PROBES(basis + k * {words} + d / 2));
-            values[d] += coefficient * (d % 2 == 0 ? pair.x : pair.y);
-        }}
-    }}"""
+            uint word = WLM_PROBE_PROBES(basis + (k - cluster - 1) * {words} + d / {per_word});
+            values[d] += number * {number};
+        }}"""
 
-_UNIT = """\
-    for (int d = 0; d < WLM_PROBE_OUTPUTS; ++d)
-        values[d] = magnitude * wlm_probe_number(probe, cluster, 1 + d);"""
+_UNIT = "        values[k - 1] = magnitude * number;"
+
+_KINDS = {
+    "int8": {"per_word": 4, "unit": " / 127.0", "number": "float(int(word << uint(24 - d % 4 * 8)) >> 24)"},
+    "float16": {"per_word": 2, "unit": "", "number": "(d % 2 == 0 ? unpackHalf2x16(word).x : unpackHalf2x16(word).y)"},
+}
 
 
 def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
@@ -104,51 +111,47 @@ def component_bundle(model: ProbeModel, decoder: Decoder) -> Bundle:
     content = model.content
     values = decoder.decode_probes()[model.live]
     chosen = np.unique(np.linspace(0, len(values) - 1, min(len(values), _REFERENCES)).astype(int))
-    halves = np.zeros((len(content.basis), -(-model.outputs // 2) * 2), "<f2")
-    halves[:, : model.outputs] = content.basis
-    place = content.places()
+    used, kind = content.used, content.basis.dtype.name if len(content.basis) else ""
+    rows = content.basis[used[:, 1:]] if kind else np.zeros((0, model.outputs), np.int8)
+    rows = np.pad(rows, ((0, 0), (0, -model.outputs % _KINDS[rows.dtype.name]["per_word"])))
+    columns = used.sum(1)
     words = [
-        np.array([len(content.code), content.clusters], "<u4"),
-        (place[:, 0] | place[:, 1] << 16).astype("<u4"),
-        np.ascontiguousarray(np.moveaxis(content.bounds, 0, 2), "<f2").reshape(-1).view("<u4"),
-        halves.reshape(-1).view("<u4"),
-        content.packed(),
+        np.array([len(values), content.clusters, (content.clusters - 1).bit_length(), columns.sum()], "<u4"),
+        (np.cumsum(columns) - columns | content.bits << 16).astype("<u4"),
+        np.ascontiguousarray(np.moveaxis(content.bounds, 0, 2)[used], "<f2").reshape(-1).view("<u4"),
+        np.pad(content.width[used], (0, -columns.sum() % 4)).view("<u4"),
+        rows.reshape(-1).view("<u4"),
+        *content.packed(),
     ]
-    has_basis = bool(len(content.basis))
-    shader = component_glsl(content.count, model.outputs, has_basis)
-    document = {"about": _ABOUT, "live": len(values), "components": content.count, "basis": has_basis}
+    document = {"about": _ABOUT, "live": len(values), "components": content.count, "basis": bool(kind)}
     document["clusters"] = content.clusters
-    first = 4 + content.count + content.clusters * (1 + content.count)
-    document["hour"] = {"buffer": "probes", "first_word": first, "words": halves.size // 2}
+    document["hour"] = {"buffer": "probes", "first_word": sum(map(len, words[:4])), "words": len(words[4])}
     reference = {"live": chosen.astype(np.int32), "values": values[chosen]}
     buffers = {"probes": np.concatenate(words)}
+    shader = component_glsl(model.outputs, kind)
     return Bundle("probe", model.name, shader, document, buffers=buffers, reference=reference)
 
 
-def component_glsl(count: int, outputs: int, basis: bool) -> str:
+def component_glsl(outputs: int, kind: str) -> str:
     """Returns the GLSL for models with the given sizes: functions to be included below `#version`.
 
     Args:
-        count: Number of components of a cluster.
         outputs: Numbers per probe.
-        basis: Whether the model stores a basis; if not, its directions are the unit vectors.
+        kind: Type of the directions that the model stores, "int8" or "float16"; "" if they are the unit vectors.
 
     Returns:
         GLSL 4.30, which is also valid Vulkan GLSL.
     """
-    words = -(-outputs // 2)
-    layout = {"first": 4 + count, "words": words, "numbers": 1 + count, "basis_words": count * words}
-    layout["stride"] = layout["numbers"] + (layout["basis_words"] if basis else 0)
+    form = _KINDS.get(kind, {"per_word": 1})
+    words = -(-outputs // form["per_word"]) if kind else 0
     text = _TEMPLATE.format(
         buffers=buffer_glsl("probe", "probes", 0),
         outputs=outputs,
-        count=count,
-        columns=2 + count,
-        count_basis=count if basis else 0,
-        unit="" if basis else ", without a basis",
+        words=words,
+        group=GROUP,
+        directions=f"{form['per_word']} {kind} in a word, from the lowest bits" if kind else "unit vectors",
         clamp=clamp_glsl(outputs),
-        body=_BASIS.format(**layout) if basis else _UNIT,
-        **layout,
+        body=_BASIS.format(words=words, **form) if kind else _UNIT,
     )
     coefficients = sh_count(outputs)
     if coefficients is None:

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from wlm.probe.decode import Decoder
 from wlm.probe.model import ProbeModel, check_points
-from wlm.probe.pca.model import Components
+from wlm.probe.pca.model import Components, unit_of
 from wlm.probe.sphere import ambient_numbers
 from wlm.probe.volume.cascade import SIDE, Volume
 from wlm.probe.volume.light import Light, at_probes
@@ -27,13 +27,20 @@ class ComponentDecoder(Decoder, Light):
     def __init__(self, model: ProbeModel, device: str = "cpu", *, position: np.ndarray | None = None) -> None:
         """Loads a model of principal components; arguments and errors are those of `wlm.probe.decode.Decoder`."""
         super().__init__(model, device, position=position)
-        content = model.content
+        forms = self._contents()
+        content, used = forms[0], forms[0].used
         assert isinstance(content, Components)
-        self._codes = self._put(content.packed(), wp.uint32)
-        self._place = self._put(content.places(), wp.vec2i)
-        self._bounds = self._put(np.moveaxis(content.bounds, 0, 2), wp.vec2)
-        bases = [each.basis for each in self._contents()]
-        self._basis = self._put(bases[0], wp.float16)
+        columns = used.sum(1)
+        table = np.zeros((content.clusters + 1, 2), np.int32)
+        table[1:, 0], table[:-1, 1] = np.cumsum(columns), content.bits
+        self._index_bits = (content.clusters - 1).bit_length()
+        self._words = [self._put(words, wp.uint32) for words in content.packed()]
+        self._tables = [self._put(table, wp.vec2i), self._put(content.width[used], wp.uint8)]
+        self._tables.append(self._put(np.moveaxis(content.bounds, 0, 2)[used], wp.vec2))
+        own = used[:, 1:] if len(content.basis) else np.zeros(0, bool)
+        bases = [each.basis[own].reshape(-1, model.outputs) for each in forms]
+        self._basis = self._put(bases[0], wp.dtype_from_numpy(bases[0].dtype))
+        self._unit = unit_of(content.basis)
         self._keep_hours(np.stack(bases).reshape(len(bases), -1), self._basis.flatten())
         live = model.live
         row = np.where(live, np.cumsum(live) - 1, -1)
@@ -74,5 +81,7 @@ class ComponentDecoder(Decoder, Light):
         return self
 
     def read(self, numbers: wp.array, values: wp.array) -> None:
+        group, index, codes = self._words
+        words = group, index, self._index_bits, codes
         ambient = ambient_numbers(self.channels)
-        decode_components(self._codes, self._place, self._bounds, self._basis, self._row, numbers, ambient, values)
+        decode_components(*words, *self._tables, self._basis, self._unit, self._row, numbers, ambient, values)
