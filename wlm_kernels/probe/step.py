@@ -17,14 +17,12 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.native import native_source, on_cuda
+from wlm_kernels.native import native_source
 from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions, shape_of, touches
 
 GROUP = 64  # probes
-SPLITS = 8  # threads that share a probe's sum on CUDA; one thread for each of 15,000 probes leaves most of a GPU idle
-PARTS = 4  # blocks of threads that share a Gaussian's gradient on CUDA, since some Gaussians reach most probes
-_COLLECTORS = 256  # threads of such a block
-_ADDERS = 4  # threads that add the partial gradients of a weight on CUDA
+SPLITS = 4  # threads that share a probe's sum on CUDA; one thread for each of 15,000 probes leaves most of a GPU idle
+_COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA
 
 # Range of the logarithm of a scale, in the normalised frame.
 LOG_SCALES = wp.constant(wp.vec2(-9.21, 1.39))  # 1e-4 to 4
@@ -205,13 +203,12 @@ class StepKernels:
         Args:
             groups, shapes, used, by_gaussian, cut: The same as for `touch` and `shapes`.
             grad_f: float [L, N], gradient with respect to the result of `features`; 0 from index `groups.count` on.
-            sums: float [S, K, 9 + L], written: S partial sums of `GaussianFunctions.accumulate`, S = `PARTS` on CUDA
-                and 1 on the CPU.
+            sums: float [K, 9 + L], the sums of `GaussianFunctions.accumulate`, written.
             base, count: Index of the first Gaussian and number of Gaussians of this launch, on the CPU alone; default
                 all.
         """
         gaussians = used.shape[0]
-        dims = (PARTS, gaussians, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
+        dims = (gaussians, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
         inputs = [groups, shapes, used, by_gaussian, grad_f, cut, base]
         wp.launch(self._collect, dims, inputs=inputs, outputs=[sums], device=sums.device, block_dim=_COLLECTORS)
 
@@ -223,14 +220,13 @@ class StepKernels:
             rows: float [K, 10 + L], parameters of the Gaussians, updated.
             used: float [K, 10 + L], parameters at which the gradients were taken.
             shapes: Shape [K], made from `used`.
-            sums: float [S, K, 9 + L], result of `collect`.
+            sums: float [K, 9 + L], result of `collect`.
             moments: float [4, K, 10 + L], Adan's or Adam's running means for the Gaussians, updated.
             net: float [P], weights of the network, updated.
             net_moments: float [2, P], Adam's running means for the network, updated.
             partial: float [B, P], partial gradients with respect to `net`, see `network.NetworkKernels.launch`.
         """
-        adders = _ADDERS if self.device_kind == "cuda" else 1
-        numbers = net.shape[0] * adders + (rows.size if optimiser.move else 0)
+        numbers = net.shape[0] + (rows.size if optimiser.move else 0)
         inputs, outputs = [optimiser, used, shapes, sums, partial], [rows, moments, net, net_moments]
         wp.launch(self._update, numbers, inputs=inputs, outputs=outputs, device=net.device)
 
@@ -292,16 +288,12 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
         g = i // GROUP
         x = groups.x[i]
         f = vec_latent()
-        turn = int(0)
-        for w in range(by_group.shape[1]):
+        for w in range(first, by_group.shape[1], stride):
             bits = by_group[g, w]
             while bits != wp.uint32(0):
                 k = w * 32 + next_bit(bits)
                 bits = bits & (bits - wp.uint32(1))
-                # The threads that share the probe take the Gaussians in turn.
-                turn += 1
-                if turn % stride == first:
-                    f = add(f, shapes[k], used, k, x, cut)
+                f = add(f, shapes[k], used, k, x, cut)
         return f
 
     @wp.func
@@ -376,50 +368,34 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
         cut: float,
         base: int,
         # out:
-        sums: wp.array3d[float],
+        sums: wp.array2d[float],
     ):
         if wp.static(cuda):
-            part, k, t = wp.tid()
-            first = part + PARTS * (t // GROUP)
-            stride = PARTS * _COLLECTORS // GROUP
-            s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, first, stride, t % GROUP, GROUP)
-            block_sum(s, part * used.shape[0] + k, sums)
+            k, t = wp.tid()
+            s = sums_of(
+                groups, shapes, used, by_gaussian, grad_f, cut, k, t // GROUP, _COLLECTORS // GROUP, t % GROUP, GROUP
+            )
+            block_sum(s, k, sums)
         else:
             k = base + wp.tid()
             s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, 0, 1, 0, 1)
             for c in range(wp.static(SHAPE_NUMBERS + latent)):
-                sums[0, k, c] = s[c]
+                sums[k, c] = s[c]
 
-    return StepKernels(device_kind, shapes_kernel, features, collect, update_kernel(latent, device_kind))
+    return StepKernels(device_kind, shapes_kernel, features, collect, update_kernel(latent))
 
 
 def _block_sum(vec_sums, numbers: int):
 
     @wp.func_native(native_source(__package__, "block_sum", N=numbers, WARPS=_COLLECTORS // 32))
-    def block_sum(v: vec_sums, k: int, out: wp.array3d[float]): ...
+    def block_sum(v: vec_sums, k: int, out: wp.array2d[float]): ...
 
     return block_sum
 
 
-@wp.func_native(
-    on_cuda(
-        """
-const unsigned own = 15u << (threadIdx.x & 28);
-x += __shfl_xor_sync(own, x, 1);
-return x + __shfl_xor_sync(own, x, 2);
-""",
-        "return x;",
-    )
-)
-def _sum_of_four(x: float) -> float:
-    """Returns the sum of the numbers of four neighbouring threads on CUDA."""
-    ...
-
-
 @functools.cache
-def update_kernel(latent: int, device_kind: str):
-    """Builds (once) the kernel for an Adam step of Gaussians and network; arguments as for `step_kernels`."""
-    adders, parts = (_ADDERS, PARTS) if device_kind == "cuda" else (1, 1)
+def update_kernel(latent: int):
+    """Builds (once) the kernel for an Adam step of Gaussians and network, for latent vectors of length `latent`."""
     fn = functions(latent)
     vec_sums, chain = fn.vec_sums, fn.chain
     channels = LATENT + latent
@@ -430,7 +406,7 @@ def update_kernel(latent: int, device_kind: str):
         o: Optimiser,
         used: wp.array2d[float],
         shapes: wp.array1d[Shape],
-        sums: wp.array3d[float],
+        sums: wp.array2d[float],
         partial: wp.array2d[float],
         # out:
         rows: wp.array2d[float],
@@ -438,48 +414,41 @@ def update_kernel(latent: int, device_kind: str):
         net: wp.array1d[float],
         net_moments: wp.array2d[float],
     ):
-        i = wp.tid() // adders
-        own = wp.tid() % adders
+        i = wp.tid()
         t = o.control[0]
         rate = o.schedule[t - 1]
         if i < net.shape[0]:
             g = float(0.0)
-            whole = partial.shape[0] // (8 * adders) * (8 * adders)
-            for b in range(own, whole, 8 * adders):
+            whole = partial.shape[0] // 8 * 8
+            for b in range(0, whole, 8):
                 # Eight loads are in flight at once.
                 part = _vec8()
                 for u in range(8):
-                    part[u] = partial[b + u * adders, i]
+                    part[u] = partial[b + u, i]
                 for u in range(8):
                     g += part[u]
-            for b in range(whole + own, partial.shape[0], adders):
+            for b in range(whole, partial.shape[0]):
                 g += partial[b, i]
-            if wp.static(adders > 1):
-                g = _sum_of_four(g)
             m = ADAM[0] * net_moments[0, i] + (1.0 - ADAM[0]) * g
             v = ADAM[1] * net_moments[1, i] + (1.0 - ADAM[1]) * g * g
+            net_moments[0, i] = m
+            net_moments[1, i] = v
             mean = m / (1.0 - wp.pow(ADAM[0], float(t)))
             spread = wp.sqrt(v / (1.0 - wp.pow(ADAM[1], float(t))))
-            if own == 0:
-                net_moments[0, i] = m
-                net_moments[1, i] = v
-                net[i] = net[i] - rate * o.net_rate * mean / (spread + EPSILON)
+            net[i] = net[i] - rate * o.net_rate * mean / (spread + EPSILON)
         else:
-            place = wp.tid() - net.shape[0] * adders
-            k = place // wp.static(channels)
-            c = place % wp.static(channels)
+            k = (i - net.shape[0]) // wp.static(channels)
+            c = (i - net.shape[0]) % wp.static(channels)
             g = float(0.0)
             if c < LATENT:
                 # The values that the step used, since other threads are changing the rows.
                 s = vec_sums()
-                for p in range(parts):
-                    for a in range(SHAPE_NUMBERS):
-                        s[a] += sums[p, k, a]
+                for a in range(SHAPE_NUMBERS):
+                    s[a] = sums[k, a]
                 gradient = chain(s, shapes[k], used, k)
                 g = gradient[c]
             else:
-                for p in range(parts):
-                    g += sums[p, k, SHAPE_NUMBERS + c - LATENT]
+                g = sums[k, SHAPE_NUMBERS + c - LATENT]
             beta1 = wp.where(o.adan != 0, ADAN[0], ADAM[0])
             beta2 = ADAN[1]
             beta3 = wp.where(o.adan != 0, ADAN[2], ADAM[1])

@@ -12,8 +12,8 @@ The launches of a frame have fixed sizes, so that a CUDA graph can contain them:
 3. Each chosen block gets a row of the pool: its own, if there is one for every block near a probe; else the least
    recently used row of a group of rows: each block takes from another group, and groups take turns. A row whose block
    is in a window is never given away.
-4. `volume_weights` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell, and computes
-   weights of at most 16 of these probes.
+4. `search` finds the probes within a block's reach, as 64 ranges of the probes sorted by cell; `volume_weights`
+   computes weights of at most 16 of these probes.
 5. `combine` computes a block's light as the weighted sum of these probes, clamped to the range of their values, which
    is extended by half its width on both sides, and stores it in half floats, with a factor for each row. A block whose
    light is not in memory yet, -infinity at a probe, gives its row back and waits.
@@ -23,7 +23,6 @@ import numpy as np
 import warp as wp
 
 from wlm_kernels.least_recent import least_recent
-from wlm_kernels.native import on_cuda
 from wlm_kernels.probe.volume import inside, wrap
 
 PROBES = 16  # most probes that contribute to a block
@@ -356,7 +355,7 @@ def _limit(histogram: wp.array1d[int], budget: int) -> int:
     return 16 * (16 * group + sixteen) + bin
 
 
-@wp.kernel(enable_backward=False, launch_bounds=(256, 4))  # with more registers too few of its threads run at once
+@wp.kernel(enable_backward=False)
 def _gather(windows: Windows, pool: Pool, tolerance: float, side: int, work: Work):
     s = wp.tid()
     if s == 0:
@@ -426,11 +425,10 @@ def _allocate(index: Index, windows: Windows, pool: Pool, size: int, work: Work)
     work.taken[k] = taken
 
 
-@wp.func
-def range_near(index: Index, work: Work, k: int, j: int) -> wp.vec2i:
-    """Returns the first index in `index`, and the number, of the probes in cell j of the reach of a chosen block k."""
-    begin = int(0)
-    end = int(0)
+@wp.kernel(enable_backward=False)
+def _find_ranges(index: Index, work: Work):
+    k, j = wp.tid()
+    count = int(0)
     if work.taken[k] >= 0:
         block = work.blocks[k]
         ratio = index.ratios[block[3]]
@@ -441,50 +439,41 @@ def range_near(index: Index, work: Work, k: int, j: int) -> wp.vec2i:
             begin = _lower(index.key, 0, last, morton(ratio * half))
             # The cells of one half are neighbours in the list; this is the end of the last one.
             end = _lower(index.key, begin, last, morton(ratio * half + wp.vec3i(ratio - 1)) + wp.int64(1))
-    return wp.vec2i(begin, end - begin)
-
-
-@wp.func_native(
-    on_cuda("for (int s = 16; s > 0; s /= 2) x = fmaxf(x, __shfl_xor_sync(~0u, x, s));\nreturn x;\n", "return x;")
-)
-def _most_of_warp(x: float) -> float: ...
+            work.begin[k, j] = begin
+            count = end - begin
+    work.count[k, j] = count
 
 
 @wp.kernel(enable_backward=False)
-def _combine(work: Work, light: wp.array2d[float], lanes: int, windows: Windows, pool: Pool):
-    """Stores the light of block k; meanwhile it is in the place of that of its first probe, light[k * P]."""
-    k, lane = wp.tid()
-    row = work.taken[k]
+def _combine(work: Work, light: wp.array2d[float]):
+    """Writes the light of block k over that of its first probe, light[k * P]."""
+    k, c = wp.tid()
     many = work.weights.shape[1]
-    channels = light.shape[1]
-    most = float(0.0)
-    absent = float(0.0)
-    if row >= 0:
-        for c in range(lane, channels, lanes):
-            s = float(0.0)
-            low = float(wp.inf)
-            high = -float(wp.inf)
-            for i in range(_PROBES):
-                w = float(0.0)
-                if i < many:
-                    w = work.weights[k, i]
-                if w != 0.0:
-                    value = light[k * many + i, c]
-                    s += w * value
-                    low = wp.min(low, value)
-                    high = wp.max(high, value)
-            room = _BEYOND * (high - low)
-            value = float(wp.inf)
-            if low == -wp.inf:
-                absent = 1.0
-            elif wp.isfinite(s):
-                value = wp.clamp(s, low - room, high + room)
-            light[k * many, c] = value
-            most = wp.max(most, wp.abs(value))
-    absent = _most_of_warp(absent)
-    factor = _most_of_warp(most) / _LARGEST
-    if row >= 0 and absent > 0.0:
-        if lane == 0:
+    if work.taken[k] >= 0:
+        s = float(0.0)
+        low = float(wp.inf)
+        high = -float(wp.inf)
+        for i in range(_PROBES):
+            w = float(0.0)
+            if i < many:
+                w = work.weights[k, i]
+            if w != 0.0:
+                value = light[k * many + i, c]
+                s += w * value
+                low = wp.min(low, value)
+                high = wp.max(high, value)
+        room = _BEYOND * (high - low)
+        value = wp.where(wp.isfinite(s), wp.clamp(s, low - room, high + room), wp.nan)
+        light[k * many, c] = wp.where(low == -wp.inf, low, value)
+
+
+@wp.kernel(enable_backward=False)
+def _store(work: Work, light: wp.array2d[float], windows: Windows, pool: Pool):
+    k, c = wp.tid()
+    row = work.taken[k]
+    at = k * work.weights.shape[1]
+    if row >= 0 and light[at, 0] == -wp.inf:
+        if c == 0:
             slot = work.chosen[k]
             if windows.pages[slot] >= wp.int16(0):
                 # It keeps showing its light, which is of another hour.
@@ -501,13 +490,22 @@ def _combine(work: Work, light: wp.array2d[float], lanes: int, windows: Windows,
             wp.atomic_add(work.counters, _LEFT, 1)
             wp.atomic_add(work.counters, _LACKING, 1)
     elif row >= 0:
-        for c in range(lane, channels, lanes):
-            number = float(0.0)
-            if factor > 0.0 and wp.isfinite(factor):
-                number = light[k * many, c] / factor
-            pool.light[row, c] = wp.cast(wp.float16(number), wp.int16)
-        if lane == 0:
-            pool.factor[row] = wp.where(wp.isfinite(factor), factor, wp.nan)  # whoever reads the block is told
+        most = float(0.0)
+        finite = int(1)
+        for j in range(light.shape[1]):
+            value = light[at, j]
+            most = wp.max(most, wp.abs(value))
+            if not wp.isfinite(value):
+                finite = 0
+        factor = most / _LARGEST
+        number = float(0.0)
+        if finite == 0:
+            factor = wp.nan  # whoever reads the block is told
+        elif factor > 0.0:
+            number = light[at, c] / factor
+        pool.light[row, c] = wp.cast(wp.float16(number), wp.int16)
+        if c == 0:
+            pool.factor[row] = factor
             windows.pages[work.chosen[k]] = wp.int16(row)
 
 
@@ -585,6 +583,11 @@ def select(index: Index, windows: Windows, pool: Pool, tolerance: float, side: i
     wp.launch(_allocate, work.chosen.shape, inputs=[index, windows, pool, size, work], device=device)
 
 
+def search(index: Index, work: Work) -> None:
+    """Finds the probes within reach of each chosen block, as 64 ranges of the sorted probes of `index`."""
+    wp.launch(_find_ranges, work.count.shape, inputs=[index, work], device=work.clock.device)
+
+
 def combine(work: Work, light: wp.array, windows: Windows, pool: Pool) -> None:
     """Writes the light of the chosen blocks to their rows of the pool. Blocks with a probe of -infinity wait again.
 
@@ -594,9 +597,9 @@ def combine(work: Work, light: wp.array, windows: Windows, pool: Pool) -> None:
         windows: The page table, in which the blocks get their rows.
         pool: The light of blocks, written.
     """
-    lanes = 32 if light.device.is_cuda else 1
-    shape, inputs = (work.chosen.shape[0], lanes), [work, light, lanes, windows, pool]
-    wp.launch(_combine, shape, inputs=inputs, device=light.device)
+    shape = (work.chosen.shape[0], light.shape[1])
+    wp.launch(_combine, shape, inputs=[work, light], device=light.device)
+    wp.launch(_store, shape, inputs=[work, light, windows, pool], device=light.device)
 
 
 def take_rows(values: wp.array, numbers: wp.array, out: wp.array) -> None:

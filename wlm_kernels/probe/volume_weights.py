@@ -17,8 +17,7 @@ probe's noise. A block thus takes its light from probes on its own side of a wal
 
 import warp as wp
 
-from wlm_kernels.native import native_source, on_cuda
-from wlm_kernels.probe.volume_frame import DECODED, HALVES, PROBES, Index, Row, Work, cell_of, range_near
+from wlm_kernels.probe.volume_frame import DECODED, HALVES, PROBES, Index, Row, Work, cell_of
 
 wp.set_module_options({"max_unroll": 1})  # a system of 16 unrolled would take minutes to compile
 
@@ -50,47 +49,6 @@ def _overlap(x: float, y: float) -> float:
     return 0.0
 
 
-@wp.func
-def _noise(total: int) -> float:
-    return _NOISE * wp.clamp(float(total) / _PROBES, 1.0, _MOST_NOISE)
-
-
-@wp.func
-def _placed(index: Index, block: wp.vec4i, p: int) -> wp.vec4:
-    """Returns the entry of `Work.places` for a probe in `index`."""
-    ratio = index.ratios[block[3]]
-    middle = ratio * (2 * wp.vec3i(block[0], block[1], block[2]) + wp.vec3i(1, 1, 1))
-    cell = cell_of(index.key[p]) - middle
-    place = index.place[p]
-    x = wp.vec3(float(cell[0]) + place[0], float(cell[1]) + place[1], float(cell[2]) + place[2]) * (0.5 / float(ratio))
-    behind = float(0.0)
-    if index.normal.shape[0] > 0:
-        behind = wp.max(wp.dot(index.normal[p], x), 0.0)
-    return wp.vec4(x[0], x[1], x[2], _DOUBT * behind * behind)
-
-
-@wp.func
-def _hat(x: wp.vec4) -> float:
-    """Returns the covariance of a probe with its block."""
-    hat = (1.0 - wp.abs(x[0])) * (1.0 - wp.abs(x[1])) * (1.0 - wp.abs(x[2]))
-    return hat + _SMOOTH * wp.exp(-wp.length(wp.vec3(x[0], x[1], x[2])) / _LENGTH)
-
-
-@wp.func
-def _covariance(x: wp.vec4, y: wp.vec4) -> float:
-    d = wp.vec3(x[0] - y[0], x[1] - y[1], x[2] - y[2])
-    s = _overlap(x[0], y[0]) * _overlap(x[1], y[1]) * _overlap(x[2], y[2])
-    return s + _SMOOTH * wp.exp(-wp.length(d) / _LENGTH)
-
-
-@wp.kernel(enable_backward=False)
-def _search(index: Index, work: Work):
-    k, j = wp.tid()
-    near = range_near(index, work, k, j)
-    work.begin[k, j] = near[0]
-    work.count[k, j] = near[1]
-
-
 @wp.kernel(enable_backward=False)
 def _pick(index: Index, work: Work):
     k, i = wp.tid()
@@ -102,7 +60,7 @@ def _pick(index: Index, work: Work):
     if i == 0:
         wp.atomic_add(work.counters, _DECODED, count)
         work.picked[k] = count
-        work.noise[k] = _noise(total)
+        work.noise[k] = _NOISE * wp.clamp(float(total) / _PROBES, 1.0, _MOST_NOISE)
     number = int(-1)
     if i < count:
         # Every n-th probe is taken, so that they are spread over the whole block.
@@ -114,7 +72,18 @@ def _pick(index: Index, work: Work):
             if p < 0 and at < passed + here:
                 p = work.begin[k, j] + at - passed
             passed += here
-        work.places[k, i] = _placed(index, work.blocks[k], p)
+        block = work.blocks[k]
+        ratio = index.ratios[block[3]]
+        middle = ratio * (2 * wp.vec3i(block[0], block[1], block[2]) + wp.vec3i(1, 1, 1))
+        cell = cell_of(index.key[p]) - middle
+        place = index.place[p]
+        x = wp.vec3(float(cell[0]) + place[0], float(cell[1]) + place[1], float(cell[2]) + place[2]) * (
+            0.5 / float(ratio)
+        )
+        behind = float(0.0)
+        if index.normal.shape[0] > 0:
+            behind = wp.max(wp.dot(index.normal[p], x), 0.0)
+        work.places[k, i] = wp.vec4(x[0], x[1], x[2], _DOUBT * behind * behind)
         number = index.number[p]
     work.numbers[k * most + i] = number
 
@@ -124,10 +93,14 @@ def _relate(work: Work):
     k, i = wp.tid()
     if i < work.picked[k]:
         x = work.places[k, i]
-        work.hats[k, i] = _hat(x)
+        hat = (1.0 - wp.abs(x[0])) * (1.0 - wp.abs(x[1])) * (1.0 - wp.abs(x[2]))
+        work.hats[k, i] = hat + _SMOOTH * wp.exp(-wp.length(wp.vec3(x[0], x[1], x[2])) / _LENGTH)
         row = Row()
         for j in range(i + 1):
-            s = _covariance(x, work.places[k, j])
+            y = work.places[k, j]
+            d = wp.vec3(x[0] - y[0], x[1] - y[1], x[2] - y[2])
+            s = _overlap(x[0], y[0]) * _overlap(x[1], y[1]) * _overlap(x[2], y[2])
+            s += _SMOOTH * wp.exp(-wp.length(d) / _LENGTH)
             if i == j:
                 s += work.noise[k] + x[3]
             row[j] = s
@@ -174,51 +147,10 @@ def _weigh(work: Work):
         work.weights[k, i] = weight
 
 
-@wp.func_native(on_cuda(native_source(__package__, "pick_of_warp"), "return wp::vec_t<3, int>();"))
-def _pick_of_warp(a: wp.vec2i, b: wp.vec2i, most: int) -> wp.vec3i: ...
-
-
-@wp.func_native(on_cuda("return __shfl_sync(~0u, x, lane);\n", "return x;"))
-def _of_lane(x: float, lane: int) -> float: ...
-
-
-@wp.func_native(on_cuda(native_source(__package__, "solve_of_warp", N=PROBES), "return hat;"))
-def _solve_of_warp(row: Row, hat: float, count: int) -> float: ...
-
-
-@wp.kernel(enable_backward=False)
-def _weigh_by_warp(index: Index, work: Work):
-    """Does all of this with a warp for each block, on CUDA."""
-    k, lane = wp.tid()
-    most = work.weights.shape[1]
-    picked = _pick_of_warp(range_near(index, work, k, 2 * lane), range_near(index, work, k, 2 * lane + 1), most)
-    count = picked[1]
-    x = wp.vec4()
-    number = int(-1)
-    if lane < count:
-        x = _placed(index, work.blocks[k], picked[0])
-        number = index.number[picked[0]]
-    row = Row()
-    for j in range(count):
-        s = _covariance(x, wp.vec4(_of_lane(x[0], j), _of_lane(x[1], j), _of_lane(x[2], j), 0.0))
-        if lane == j:
-            s += _noise(picked[2]) + x[3]
-        row[j] = s
-    weight = _solve_of_warp(row, _hat(x), count)
-    if lane < most:
-        work.numbers[k * most + lane] = number
-        work.weights[k, lane] = weight
-    if lane == 0:
-        wp.atomic_add(work.counters, _DECODED, count)
-
-
 def weigh(index: Index, work: Work) -> None:
-    """Finds the probes near each chosen block, chooses at most 16 of them, and computes their weights."""
-    device, blocks = work.clock.device, work.chosen.shape[0]
-    if device.is_cuda:
-        wp.launch(_weigh_by_warp, (blocks, 32), inputs=[index, work], block_dim=32, device=device)
-        return
-    wp.launch(_search, work.count.shape, inputs=[index, work], device=device)
-    wp.launch(_pick, work.weights.shape, inputs=[index, work], device=device)
-    wp.launch(_relate, work.weights.shape, inputs=[work], device=device)
-    wp.launch(_weigh, blocks, inputs=[work], device=device)
+    """Chooses, for each block, at most 16 of the probes that `volume_frame.search` found, and computes their weights.
+    There are three launches, since only the last one, the longest, is limited to one thread per block."""
+    device = work.clock.device
+    wp.launch(_pick, work.weights.shape, inputs=[index, work], block_dim=32, device=device)
+    wp.launch(_relate, work.weights.shape, inputs=[work], block_dim=32, device=device)
+    wp.launch(_weigh, work.chosen.shape, inputs=[work], block_dim=32, device=device)

@@ -332,6 +332,7 @@ class Volume:
         work, windows = self._frame_work, self._windows
         frame_kernels.select(self._index, windows, self._pool, self.tolerance, int(self.sides.max()), work)
         if self.index.count and (self.device != "cpu" or (work.taken.numpy() >= 0).any()):
+            frame_kernels.search(self._index, work)
             volume_weights.weigh(self._index, work)
             self.light.read(work.numbers, self._read_light)
             frame_kernels.combine(work, self._read_light, windows, self._pool)

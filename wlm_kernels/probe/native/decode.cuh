@@ -32,14 +32,12 @@ auto load = [&](float* v, int k) {
 };
 float f[L] = {};
 if (begin + share < end) {
-    int i = begin + share, k = items.data[i], next_k = items.data[min(i + SHARE, end - 1)];
-    float v[4 * R], next[4 * R];
-    load(v, k);
+    int i = begin + share, k = items.data[i];
+    float v[4 * R];
     while (i < end) {
-        // The next Gaussian is loaded while this one is summed.
-        load(next, next_k);
+        load(v, k);
         i += SHARE;
-        const int after = items.data[min(i + SHARE, end - 1)];
+        const int next_k = items.data[min(i, end - 1)];
         const float r[3] = {x[0] - v[0], x[1] - v[1], x[2] - v[2]};
         float u[3];
         #pragma unroll
@@ -57,10 +55,7 @@ if (begin + share < end) {
         const float w = inside ? __expf(-0.5f * d2) : 0.0f;
         #pragma unroll
         for (int c = 0; c < L; ++c) f[c] += w * v[14 + c];
-        #pragma unroll
-        for (int c = 0; c < 4 * R; ++c) v[c] = next[c];
         k = next_k;
-        next_k = after;
     }
 }
 #pragma unroll
