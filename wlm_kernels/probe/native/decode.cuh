@@ -1,13 +1,12 @@
-// Decodes P points with a block of T threads, or if `own` is not negative those of the region `own`, behind matrix_units.cuh
-// and decode_layout.cuh: T / P neighbouring threads share the Gaussians that a
-// point's cube lists (gaussian-probe-compression, eq. 5); then a warp evaluates the network (eq. 7) of 16 points on the
-// matrix units. Constants and the packed arrays are of wlm_kernels/probe/decode.py; the reference is
-// benchmarks/probe_exact.py. The code is native for the matrix units and for loads of 16 bytes: a thread's Gaussians lie
-// scattered, and loads of single floats would keep the load units busy for most of the time.
+// Decodes P points with a block of T threads, or those of them in the region `own` if that is not negative. T / P neighbouring
+// threads share the Gaussians that a point's cube lists (gaussian-probe-compression, eq. 5); then a warp evaluates the network
+// (eq. 7) of 16 points on the matrix units. Behind matrix_units.cuh and decode_layout.cuh; constants and the packed arrays are
+// of wlm_kernels/probe/decode.py, the reference is benchmarks/probe_exact.py. The code is native for the matrix units and for
+// loads of 16 bytes: a thread's Gaussians lie scattered, and loads of single floats would keep the load units busy.
 //
-// Inputs and activations are pairs of half floats, the rounded number and the rest, so that products have nearly the
-// precision of float32. Weights of the hidden layers are half floats in every model; those of the last layer, which may be
-// mixed from two hours, are pairs too.
+// Inputs and activations are pairs of half floats, the rounded number and the rest, so that products have nearly the precision
+// of float32; sums of Gaussians are clamped at the largest half float. Weights of the hidden layers are half floats in every
+// model; those of the last layer, which may be mixed from two hours, are pairs too.
 
 constexpr int SHARE = T / P;
 constexpr int R = (14 + L + 3) / 4, MOST = KI > KH ? KI : KH;
