@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy import linalg
 from scipy.spatial.transform import Rotation
 
 from wlm.probe.gaussian.decode import GaussianDecoder
@@ -184,8 +183,8 @@ class _Search:
         moved, latent, weight, feed = whole * step[:start], rows[:, STORED_LATENT], None, None
         if len(rows) <= _TOGETHER:
             weight = torch.cat(list(self._weights(moved)))
-            square = (weight.T @ weight).cpu().numpy()
-            latent = _fitted(square, (weight.T @ self._latent).cpu().numpy(), latent, _OF_LATENTS)
+            square = weight.T @ weight
+            latent = _fitted(square, weight.T @ self._latent, self._put(latent), _OF_LATENTS)
             feed = _feed(square, _OF_LATENTS)
         latent = _fed(latent, np.tile(step[STORED_LATENT], (len(rows), 1)), feed, CODES // 2)
         net_step = [steps.first * each for each in self._of_first]
@@ -196,8 +195,8 @@ class _Search:
         wanted = [*self._inside, self._wanted]
         for number, layer in enumerate(self._layers):
             own = net_step[: latents + 4] if number == 0 else np.full(len(layer), net_step[latents + 3 + number])
-            square = (inputs.T @ inputs).cpu().numpy()
-            fitted = _fitted(square, (inputs.T @ wanted[number]).cpu().numpy(), layer, _OF_LAYERS)
+            square = inputs.T @ inputs
+            fitted = _fitted(square, inputs.T @ wanted[number], self._put(layer), _OF_LAYERS)
             net.append(_fed(fitted, np.repeat(own[:, None], layer.shape[1], 1), _feed(square, _OF_LAYERS), LARGEST))
             result = inputs @ self._put(net[-1] * own[:, None])
             inputs = _with_one(result.sigmoid())
@@ -244,16 +243,16 @@ def stored_step(step: float) -> float:
     return float(np.array(bits << 16, np.uint32).view(np.float32))
 
 
-def _fitted(square: np.ndarray, right: np.ndarray, before: np.ndarray, share: float) -> np.ndarray:
+def _fitted(square: torch.Tensor, right: torch.Tensor, before: torch.Tensor, share: float) -> np.ndarray:
     """Solves normal equations with ridge regularisation towards the solution `before`."""
     ridge = _ridge(square, share)
-    return linalg.solve(square + ridge * np.eye(len(square)), right + ridge * before, assume_a="pos")
+    return torch.linalg.solve(square + ridge, right + ridge @ before).cpu().numpy()
 
 
-def _feed(square: np.ndarray, share: float) -> np.ndarray:
+def _feed(square: torch.Tensor, share: float) -> np.ndarray:
     """Returns the upper Cholesky factor of the inverse of a symmetric matrix plus `share` of a ridge, [I, I]."""
-    inverse = linalg.inv(square + _ridge(square, share) * np.eye(len(square)))
-    return linalg.cholesky(0.5 * (inverse + inverse.T))
+    inverse = torch.linalg.inv(square + _ridge(square, share))
+    return torch.linalg.cholesky(0.5 * (inverse + inverse.T), upper=True).cpu().numpy()
 
 
 def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
@@ -267,8 +266,10 @@ def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: i
     return whole
 
 
-def _ridge(square: np.ndarray, share: float) -> float:
-    return max(share * float(np.trace(square)) / len(square), np.finfo(np.float32).tiny)
+def _ridge(square: torch.Tensor, share: float) -> torch.Tensor:
+    """Returns `share` of the mean of the diagonal, times the unit matrix."""
+    least = max(share * float(square.trace()) / len(square), np.finfo(np.float32).tiny)
+    return least * torch.eye(len(square), dtype=square.dtype, device=square.device)
 
 
 def _with_one(inputs: torch.Tensor) -> torch.Tensor:
