@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.interop import StepGraph, check_device, no_collection, stream, to_warp
+from wlm.interop import LaunchGraph, StepGraph, check_device, no_collection, stream, to_warp
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -112,6 +112,16 @@ def test_each_call_of_a_step_graph_is_one_step(device, warmup):
         graph()
         assert torch.all(total == count * (count + 1) / 2)
         assert graph.captured == (device != "cpu" and count > warmup)
+
+
+def test_each_call_of_a_launch_graph_is_one_step(device):
+    amount, total = (wp.full(8, float(value), dtype=float, device=device) for value in (2, 0))
+    graph = LaunchGraph(
+        lambda: wp.launch(_add, dim=8, inputs=[amount], outputs=[total], device=device), device, warmup=2
+    )
+    for count in range(1, 8):
+        graph()
+        assert (total.numpy() == 2 * count).all()
 
 
 def test_a_step_graph_passes_an_error_on_and_wants_a_warm_up(device):

@@ -153,6 +153,7 @@ class StepGraph:
         self._device = device
         self._eager_left = warmup
         self._graph: torch.cuda.CUDAGraph | None = None
+        self._launches: wp.Graph | None = None
 
     @property
     def captured(self) -> bool:
@@ -185,6 +186,23 @@ class StepGraph:
         ):
             self._step()
         return graph
+
+
+class LaunchGraph(StepGraph):
+    """A repeated step of Warp launches without torch. It runs on Warp's current stream: to change streams, as `stream`
+    does, takes longer than many a step."""
+
+    def __call__(self) -> None:
+        """Executes the step once; on CUDA it is queued and the call returns immediately."""
+        if self._device == "cpu" or self._eager_left > 0:
+            self._eager_left -= 1
+            self._step()
+            return
+        if self._launches is None:
+            with no_collection(), wp.ScopedCapture(self._device, force_module_load=False) as capture:
+                self._step()
+            self._launches = capture.graph
+        wp.capture_launch(self._launches)
 
 
 @cache

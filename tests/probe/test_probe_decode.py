@@ -4,14 +4,16 @@ import math
 
 import numpy as np
 import pytest
+import warp as wp
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from benchmarks import probe_exact as exact
 from benchmarks.probe_exact import decode64
 from wlm.errors import WlmError
 from wlm.probe.gaussian.decode import GaussianDecoder
-from wlm.probe.gaussian.model import CUT, check_outputs
-from wlm_kernels.probe.network import most_outputs
+from wlm.probe.gaussian.model import CUT, check_outputs, layer_shapes, split_layers
+from wlm_kernels.probe.decode import decode_kernels
+from wlm_kernels.probe.network import most_outputs, padded
 
 RANDOM = np.random.default_rng(11)
 
@@ -45,6 +47,37 @@ def test_against_float64(settings, device):
     model = random_model(**settings)
     position = points(130, model)
     close(GaussianDecoder(model, device).decode(position), model, position)
+
+
+@pytest.mark.parametrize("sizes", [(9, 64, 27, True), (1, 8, 3, False), (14, 24, 9, True)])
+def test_packed_network(sizes):
+    """The weights lie where the lanes of a warp read them, and the last layer's have twice a half float's precision."""
+    latent, hidden, outputs, relative = sizes
+    kernels = decode_kernels(*sizes, 3, "cuda")
+    shapes = layer_shapes(latent, hidden, padded(outputs + relative))
+    net = RANDOM.normal(size=sum(rows * columns for rows, columns in shapes)).astype(np.float32)
+    layers = split_layers(net, shapes)
+    layers[2] = layers[2][:, : outputs + relative]
+    if relative:
+        layers[2] = np.roll(layers[2], 1, axis=1)
+    packed = wp.zeros(kernels.words, dtype=float, device="cpu")
+    wp.launch(kernels._pack, packed.shape, inputs=[wp.array(net, dtype=float, device="cpu")], outputs=[packed])
+    rest, tiles = packed.numpy(), [-(-(latent + 3) // 16), -(-hidden // 16), -(-(outputs + relative) // 8)]
+    found = []
+    for down, across in ((tiles[0], tiles[1]), (tiles[1], tiles[1]), (tiles[1], tiles[2])):
+        own, rest = np.split(rest, [128 * down * across])
+        # Tile, lane / 4 and lane % 4, two pairs of words, of which each has two numbers.
+        own = own.view(np.float16).reshape(down, across, 8, 4, 2, 2, 2).astype(np.float32)
+        if len(found) < 2:
+            found.append(own.transpose(0, 5, 3, 6, 1, 4, 2).reshape(16 * down, 16 * across))
+        else:
+            found.append(own.sum(4).transpose(0, 4, 3, 5, 1, 2).reshape(16 * down, 8 * across))
+    biases = np.split(rest, np.cumsum([each.shape[1] for each in found[:2]]))
+    for layer, weights, bias, error in zip(layers, found, biases, (6e-4, 6e-4, 1e-6), strict=True):
+        rows, columns = layer.shape
+        np.testing.assert_allclose(weights[: rows - 1, :columns], layer[:-1], rtol=error, atol=1e-7)
+        np.testing.assert_array_equal(bias[:columns], layer[-1])
+        assert not weights[rows - 1 :].any() and not weights[:, columns:].any() and not bias[columns:].any()
 
 
 def test_far_from_the_origin(device):

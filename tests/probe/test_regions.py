@@ -109,11 +109,11 @@ def test_light_is_continuous_where_regions_meet():
     assert np.sqrt(np.square(jump).mean()) < 2.0 * error < 0.02
 
 
-def test_a_file_is_read_region_by_region(model, path, damaged):
+def test_a_file_is_read_region_by_region(device, model, path, damaged):
     loaded = wlm.load(path, "probe")
     position = loaded.stored_positions()
-    decoder = loaded.decoder(position=position)
-    values = model.decoder(position=position).decode_probes()
+    decoder = loaded.decoder(device, position=position)
+    values = model.decoder(device, position=position).decode_probes()
     np.testing.assert_array_equal(decoder.decode_probes(), values)
     assert not values[~model.live].any() and loaded.file_bytes() == path.stat().st_size
     sizes = [model.content.region(number).content.nbytes for number in range(8)]
@@ -123,8 +123,8 @@ def test_a_file_is_read_region_by_region(model, path, damaged):
         alone = loaded.content.region(number)
         np.testing.assert_array_equal(alone.normalise(position[owner == number]), x[owner == number])
         here = (owner == number) & loaded.live
-        np.testing.assert_array_equal(alone.decoder().decode(position[here]), values[here])
-    broken = wlm.load(damaged, "probe").decoder(position=position)
+        np.testing.assert_array_equal(alone.decoder(device).decode(position[here]), values[here])
+    broken = wlm.load(damaged, "probe").decoder(device, position=position)
     np.testing.assert_array_equal(broken.decode(position[owner == 0]), decoder.decode(position[owner == 0]))
     with pytest.raises(WlmError, match=rf"^{damaged}: region 7: the file is damaged here[^\n]*$"):
         broken.decode_probes()
@@ -158,17 +158,18 @@ def test_memory_is_limited_to_what_is_needed(model):
     assert decoder.decode(position[:0]).shape == (0, 27)
 
 
-def test_a_volume_loads_the_regions_that_it_touches(model):
+def test_a_volume_loads_the_regions_that_it_touches(device, model):
     position = model.stored_positions()
-    decoder = model.decoder(position=position, most_bytes=1)
+    decoder = model.decoder(device, position=position, most_bytes=1)
     light = decoder.light(position)
     settings = {"live": model.live, "block": 0.5, "side": 4, "ratios": (1, 2), "budget": 16}
-    volume, other = Volume(position, light, **settings), None
+    volume = Volume(position, light, **settings)
     first = volume.update(position[0])
     assert (first.updated, first.cached) == (0, 0) and first.left == first.queued > 0
     settle(volume, position[0])
     assert 1 <= len(decoder.loaded) < 8
-    other = Volume(position, StoredLight(model.decoder(position=position).decode_probes()), **settings)
+    decoded = model.decoder(device, position=position).decode_probes()
+    other = Volume(position, StoredLight(decoded, device), **settings)
     for viewpoint in (position[0], position[-1], position[0]):
         settle(volume, viewpoint)
         settle(other, viewpoint)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -273,6 +274,24 @@ def test_any_way_leads_to_the_same_volume(device: str):
     _same(walked, fresh)
     points = viewpoint + random.uniform(-70, 70, (500, 3))
     np.testing.assert_array_equal(walked.read(points).values, fresh.read(points).values)
+
+
+def test_a_frame_without_change_is_left_out_without_effect(device: str):
+    """Neither the light nor the rows that are given away next depend on frames in which the viewer hardly moves."""
+    position = _surface(1500)
+    random = np.random.default_rng(6)
+    usual, full = (_volume(position, device, budget=256, rows=900) for _ in range(2))
+    ran, step = [], usual._step
+    usual._step = lambda: (ran.append(usual.frame), step())
+    for _ in range(40):
+        viewpoint = random.uniform(-60, 60, 3) * [1.0, 0.1, 1.0]
+        for moved in (0.0, 0.0, 0.0, 0.0, 0.01):
+            full._left = 1
+            stats = (each.update(viewpoint + moved) for each in (usual, full))
+            assert len({replace(each, seconds=0.0) for each in stats}) == 1
+    assert 40 <= len(ran) < 160
+    for got, want in zip(usual.state(), full.state(), strict=True):
+        np.testing.assert_array_equal(got, want)
 
 
 def test_no_read_of_a_block_that_is_not_there(device: str):

@@ -166,7 +166,7 @@ def matrix_kernels(hidden: int, resolution: int, shared: bool = False) -> Matrix
 
 def _native(*names: str, **constants: int) -> str:
     """Returns the code of a native function from its parts, with integer constants."""
-    units = native_source(__package__, "matrix_units", **constants)
+    units = native_source("wlm_kernels", "matrix_units", **constants)
     return units + "".join(native_source(__package__, name) for name in names)
 
 

@@ -39,7 +39,7 @@ def matrix_network(inputs: int, hidden: int, gelu: str) -> Any:
     # A row of 64 halves spans all banks: its groups of 8 are permuted to avoid bank conflicts; other rows are padded.
     rows = {"STRIDE": hidden, "MASK": 7} if hidden == WIDTHS[-1] else {"STRIDE": hidden + 8, "MASK": 0}
     constants = {"I": inputs, "H": hidden, "T": BLOCK, "EXACT": int(gelu == "exact"), **rows}
-    code = native_source(__package__, "matrix_units") + native_source(__package__, "matrix_step", **constants)
+    code = native_source("wlm_kernels", "matrix_units") + native_source(__package__, "matrix_step", **constants)
 
     @wp.func_native(on_cuda(code, f"return wp::vec_t<{inputs + 3}, float>();"))
     def network(

@@ -3,22 +3,26 @@
 Points may lie in several regions, each with Gaussians and a network of its own. A block of threads then decodes the
 regions of its points one after another, so points are best sorted by region.
 
-On CUDA a block of 128 threads decodes up to 64 points: several threads share the Gaussians that a point's cube lists,
-their sums are added in shared memory, and the network runs on all points together (`native/layers.cuh`, then
-`native/decode.cuh`). On the CPU a thread decodes one point. The reference is `benchmarks/probe_exact.py`.
+On CUDA a block of 128 threads decodes 32 points after another: four threads share the Gaussians that a point's cube
+lists, and the network of 16 points is evaluated together on the matrix units (`native/decode.cuh`), from arrays that
+`DecodeKernels.pack` arranges. On the CPU a thread decodes one point. The reference is `benchmarks/probe_exact.py`.
 """
 
 import functools
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from wlm_kernels.native import native_source
 from wlm_kernels.probe.cubes import Cubes, cube_of
-from wlm_kernels.probe.gaussians import Shape, functions
-from wlm_kernels.probe.network import THREADS, cpu_network, layer_code, probes_at_once
+from wlm_kernels.probe.gaussians import LATENT, Shape, functions
+from wlm_kernels.probe.network import cpu_network
 
+_THREADS = 128
+_POINTS = 32  # of a block of threads on CUDA
+_BLOCKS = 1056  # most blocks of a launch, which take turns
 _NONE = wp.constant(1 << 30)
 
 
@@ -36,33 +40,64 @@ class Region:
 
 @dataclass(frozen=True)
 class DecodeKernels:
-    """The kernel that decodes light at points, for one size of network and one kind of device.
+    """The kernels that decode light at points, for one size of network and one kind of device.
 
     Attributes:
         device_kind: "cpu" or "cuda".
-        points: Points per block of threads on CUDA.
+        words: Length of the network that `pack` arranges for CUDA.
     """
 
     device_kind: str
-    points: int
+    words: int
     _kernel: Any
     _regional: Any
+    _pack: Any
+
+    def pack(self, rows, shapes, net):
+        """Arranges Gaussians and a network as `launch` takes them: in new arrays on CUDA, unchanged on the CPU.
+
+        Args:
+            rows: float [K, 10 + L], parameters of the K Gaussians, see `gaussians`.
+            shapes: Shape [K], made from the rows.
+            net: float [P], weights of the network, see `network`; on CUDA those of the hidden layers are rounded to
+                half floats, as files hold them.
+
+        Returns:
+            The arrays `rows` and `net` of `launch`.
+        """
+        if self.device_kind == "cpu":
+            return rows, net
+        shape, latent = shapes.numpy(), rows.numpy()[:, LATENT:]
+        parts = shape["centre"], shape["radius"], shape["whiten"], shape["slender"], latent
+        record = np.concatenate([part.reshape(len(latent), -1) for part in parts], 1)
+        record = np.pad(record, ((0, 0), (0, -record.shape[1] % 4)))
+        # The rests of W follow behind all Gaussians, in twelve numbers each.
+        rest = np.pad(shape["rest"].reshape(len(latent), 9), ((0, 0), (0, 3))).ravel()
+        rest = np.pad(rest, (0, -len(rest) % record.shape[1])).reshape(-1, record.shape[1])
+        packed = wp.empty(self.words, dtype=float, device=net.device)
+        self.pack_network(net, packed)
+        return wp.array(np.concatenate([record, rest]), dtype=float, device=net.device), packed
+
+    def pack_network(self, net, packed) -> None:
+        """Arranges a network again, after its weights changed; arguments as `pack` takes and returns them. On the CPU
+        there is nothing to do."""
+        if self.device_kind == "cuda":
+            wp.launch(self._pack, self.words, inputs=[net], outputs=[packed], device=net.device)
 
     def launch(self, rows, shapes, cubes, cut, net, gain, x, out) -> None:
         """Decodes the light at M points, D numbers (light coefficients) for each.
 
         Args:
-            rows: float [K, 10 + L], parameters of the K Gaussians, see `gaussians`.
+            rows, net: The result of `pack`.
             shapes: Shape [K], made from the rows with this cut.
             cubes: `cubes.Cubes` of the shapes; points outside use the list of the nearest cube.
             cut: Radius of a support in standard deviations.
-            net: float [P], weights of the network, see `network`.
             gain: Factor by which the network's outputs are multiplied.
             x: vec3 [M], the points in normalised coordinates.
             out: float [M, D], the light at the points, written.
         """
         inputs = [rows, shapes, cubes, cut, net, gain, x]
-        wp.launch(self._kernel, self._dims(x), inputs=inputs, outputs=[out], device=x.device, block_dim=THREADS)
+        wp.launch(self._kernel, self._dims(x), inputs=inputs, outputs=[out], device=x.device, block_dim=_THREADS)
 
     def launch_regions(self, table, region, cut, x, asked, out) -> None:
         """Decodes the light at M points in several of R regions.
@@ -76,17 +111,18 @@ class DecodeKernels:
             out: float [M, D], the light at the points, written.
         """
         inputs, outputs = [table, region, cut, x], [asked, out]
-        wp.launch(self._regional, self._dims(x), inputs=inputs, outputs=outputs, device=x.device, block_dim=THREADS)
+        wp.launch(self._regional, self._dims(x), inputs=inputs, outputs=outputs, device=x.device, block_dim=_THREADS)
 
     def _dims(self, x) -> tuple[int, ...]:
-        return (-(-x.shape[0] // self.points), THREADS) if self.device_kind == "cuda" else x.shape
+        blocks = min(-(-x.shape[0] // _POINTS), _BLOCKS)
+        return (blocks, _THREADS) if self.device_kind == "cuda" else x.shape
 
 
 @functools.cache
 def decode_kernels(
     latent: int, hidden: int, outputs: int, relative: bool, ambient: int, device_kind: str
 ) -> DecodeKernels:
-    """Builds the kernel for one size of network; later calls return the same kernel.
+    """Builds the kernels for one size of network; later calls return the same kernels.
 
     Args:
         latent: Length L of a latent vector, at least 1.
@@ -96,53 +132,18 @@ def decode_kernels(
         ambient: Number of the first numbers that are clamped at 0.
         device_kind: "cpu" or "cuda".
     """
-    fn = functions(latent)
-    add, vec_latent = fn.add, fn.vec_latent
     columns = outputs + relative
-    points = probes_at_once(latent, hidden, columns)
-    cuda = device_kind == "cuda"
-    options = {"enable_backward": False, "max_unroll": 32 if cuda else 1}
-    network = cpu_network(latent, hidden, columns)
-    forward, vec_in = network.forward, network.vec_in
-    code = layer_code(latent, hidden, columns, points)
-    finish = _finish(code + native_source(__package__, "decode", OUT=outputs, AMBIENT=ambient), vec_latent)
+    if device_kind == "cpu":
+        return DecodeKernels(device_kind, 0, *_cpu_kernels(latent, hidden, columns, outputs, ambient), None)
+    sizes = {"L": latent, "H": hidden, "D": columns, "OUT": outputs, "AMBIENT": ambient}
+    layout = native_source(__package__, "decode_layout", **sizes)
+    return DecodeKernels(device_kind, _words(latent, hidden, columns), *_cuda_kernels(layout), _pack_kernel(layout))
 
-    @wp.func
-    def sum_at(
-        rows: wp.array2d[float],
-        shapes: wp.array1d[Shape],
-        cubes: Cubes,
-        cut: float,
-        x: wp.vec3,
-        first: int,
-        stride: int,
-    ) -> vec_latent:
-        cube = cube_of(cubes, x)
-        f = vec_latent()
-        end = cubes.start[cube + 1]
-        i = cubes.start[cube] + first
-        if i < end:
-            k = cubes.item[i]
-            shape = shapes[k]
-            while i < end:
-                i += stride
-                # The next Gaussian is loaded while this one is summed.
-                next_k = cubes.item[wp.min(i, end - 1)]
-                next_shape = shapes[next_k]
-                f = add(f, shape, rows, k, x, cut)
-                k = next_k
-                shape = next_shape
-        return f
 
-    @wp.func
-    def next_region(region: wp.array1d[int], first: int, after: int) -> int:
-        """Returns the lowest region above `after` among the points of a block; a large number if there is none."""
-        found = int(_NONE)
-        for j in range(first, wp.min(first + wp.static(points), region.shape[0])):
-            r = region[j]
-            if r > after:
-                found = wp.min(found, r)
-        return found
+def _cpu_kernels(latent: int, hidden: int, columns: int, outputs: int, ambient: int) -> tuple[Any, Any]:
+    fn, network = functions(latent), cpu_network(latent, hidden, columns)
+    add, vec_latent, forward, vec_in = fn.add, fn.vec_latent, network.forward, network.vec_in
+    options = {"enable_backward": False, "max_unroll": 1}
 
     @wp.func
     def decode_at(
@@ -156,7 +157,11 @@ def decode_kernels(
         out: wp.array2d[float],
         i: int,
     ):
-        f = sum_at(rows, shapes, cubes, cut, x, 0, 1)
+        cube = cube_of(cubes, x)
+        f = vec_latent()
+        for j in range(cubes.start[cube], cubes.start[cube + 1]):
+            k = cubes.item[j]
+            f = add(f, shapes[k], rows, k, x, cut)
         v = vec_in()
         for c in range(wp.static(latent)):
             v[c] = f[c]
@@ -164,7 +169,7 @@ def decode_kernels(
             v[wp.static(latent) + c] = x[c]
         _h1, _h2, y = forward(net, v)
         light = float(gain)
-        if wp.static(relative):
+        if wp.static(columns > outputs):
             light *= wp.exp(wp.min(y[wp.static(columns - 1)], 0.0))
         for c in range(wp.static(outputs)):
             value = light * y[c]
@@ -173,7 +178,7 @@ def decode_kernels(
             out[i, c] = value
 
     @wp.kernel(module="unique", module_options=options)
-    def kernel(
+    def decode(
         # in:
         rows: wp.array2d[float],
         shapes: wp.array1d[Shape],
@@ -185,15 +190,8 @@ def decode_kernels(
         # out:
         out: wp.array2d[float],
     ):
-        if wp.static(cuda):
-            block, t = wp.tid()
-            # Threads past the end repeat the last point, since all threads of a block must synchronise.
-            i = wp.min(block * wp.static(points) + t % wp.static(points), x.shape[0] - 1)
-            f = sum_at(rows, shapes, cubes, cut, x[i], t // wp.static(points), wp.static(THREADS // points))
-            finish(f, x[i], net, gain, block, x.shape[0], cubes.item, -1, out)
-        else:
-            i = wp.tid()
-            decode_at(rows, shapes, cubes, cut, net, gain, x[i], out, i)
+        i = wp.tid()
+        decode_at(rows, shapes, cubes, cut, net, gain, x[i], out, i)
 
     @wp.kernel(module="unique", module_options=options)
     def regional(
@@ -206,50 +204,137 @@ def decode_kernels(
         asked: wp.array1d[int],
         out: wp.array2d[float],
     ):
-        if wp.static(cuda):
-            block, t = wp.tid()
-            i = wp.min(block * wp.static(points) + t % wp.static(points), x.shape[0] - 1)
-            r = next_region(region, block * wp.static(points), -1)
-            while r < table.shape[0]:
-                if t == 0:
-                    asked[r] = 1
-                own = table[r]
-                if own.net.shape[0] > 0:
-                    f = sum_at(
-                        own.rows, own.shapes, own.cubes, cut, x[i], t // wp.static(points), wp.static(THREADS // points)
-                    )
-                    finish(f, x[i], own.net, own.gain, block, x.shape[0], region, r, out)
-                elif region[i] == r and t < wp.static(points):
-                    for c in range(wp.static(outputs)):
-                        out[i, c] = own.gain
-                r = next_region(region, block * wp.static(points), r)
-        else:
-            i = wp.tid()
-            r = region[i]
-            if r >= 0:
-                asked[r] = 1
-                own = table[r]
-                if own.net.shape[0] > 0:
-                    decode_at(own.rows, own.shapes, own.cubes, cut, own.net, own.gain, x[i], out, i)
-                else:
-                    for c in range(wp.static(outputs)):
-                        out[i, c] = own.gain
+        i = wp.tid()
+        r = region[i]
+        if r >= 0:
+            asked[r] = 1
+            own = table[r]
+            if own.net.shape[0] > 0:
+                decode_at(own.rows, own.shapes, own.cubes, cut, own.net, own.gain, x[i], out, i)
+            else:
+                for c in range(wp.static(outputs)):
+                    out[i, c] = own.gain
 
-    return DecodeKernels(device_kind, points, kernel, regional)
+    return decode, regional
 
 
-def _finish(code: str, vec_latent):
-    @wp.func_native(code)
-    def finish(
-        f: vec_latent,
-        x: wp.vec3,
+def _cuda_kernels(layout: str) -> tuple[Any, Any]:
+    code = layout + native_source(__package__, "decode", T=_THREADS, P=_POINTS)
+    options, share = {"enable_backward": False}, _THREADS // _POINTS
+
+    @wp.func_native(native_source("wlm_kernels", "matrix_units") + code)
+    def decode_block(
+        rows: wp.array2d[float],
+        count: int,
+        items: wp.array1d[int],
+        begin: int,
+        end: int,
+        cut: float,
         net: wp.array1d[float],
         gain: float,
+        x: wp.vec3,
         block: int,
-        count: int,
+        fresh: int,
+        points: int,
         region: wp.array1d[int],
         own: int,
         out: wp.array2d[float],
     ): ...
 
-    return finish
+    @wp.func
+    def next_region(region: wp.array1d[int], first: int, after: int) -> int:
+        """Returns the lowest region above `after` among the points of a block; a large number if there is none."""
+        found = int(_NONE)
+        for j in range(first, wp.min(first + wp.static(_POINTS), region.shape[0])):
+            r = region[j]
+            if r > after:
+                found = wp.min(found, r)
+        return found
+
+    @wp.kernel(module="unique", module_options=options)
+    def decode(
+        # in:
+        rows: wp.array2d[float],
+        shapes: wp.array1d[Shape],
+        cubes: Cubes,
+        cut: float,
+        net: wp.array1d[float],
+        gain: float,
+        x: wp.array1d[wp.vec3],
+        # out:
+        out: wp.array2d[float],
+    ):
+        block, t = wp.tid()
+        fresh = int(1)
+        count = x.shape[0]
+        while block * wp.static(_POINTS) < count:
+            # Threads past the end repeat the last point, since all threads of a block must synchronise.
+            at = x[wp.min(block * wp.static(_POINTS) + t // share, count - 1)]
+            cube = cube_of(cubes, at)
+            begin = cubes.start[cube]
+            end = cubes.start[cube + 1]
+            k = shapes.shape[0]
+            decode_block(rows, k, cubes.item, begin, end, cut, net, gain, at, block, fresh, count, cubes.item, -1, out)
+            fresh = 0
+            block += _BLOCKS
+
+    @wp.kernel(module="unique", module_options=options)
+    def regional(
+        # in:
+        table: wp.array1d[Region],
+        region: wp.array1d[int],
+        cut: float,
+        x: wp.array1d[wp.vec3],
+        # out:
+        asked: wp.array1d[int],
+        out: wp.array2d[float],
+    ):
+        block, t = wp.tid()
+        count = x.shape[0]
+        while block * wp.static(_POINTS) < count:
+            first = block * wp.static(_POINTS)
+            i = wp.min(first + t // share, count - 1)
+            r = next_region(region, first, -1)
+            while r < table.shape[0]:
+                if t == 0:
+                    asked[r] = 1
+                own = table[r]
+                if own.net.shape[0] > 0:
+                    cube = cube_of(own.cubes, x[i])
+                    begin = own.cubes.start[cube]
+                    end = own.cubes.start[cube + 1]
+                    k = own.shapes.shape[0]
+                    item = own.cubes.item
+                    decode_block(
+                        own.rows, k, item, begin, end, cut, own.net, own.gain, x[i], block, 1, count, region, r, out
+                    )
+                elif region[i] == r and t % share == 0:
+                    for c in range(out.shape[1]):
+                        out[i, c] = own.gain
+                r = next_region(region, first, r)
+            block += _BLOCKS
+
+    return decode, regional
+
+
+def _words(latent: int, hidden: int, columns: int) -> int:
+    """Returns the length of a packed network; see `native/decode_layout.cuh`."""
+    inputs, units, last = -(-(latent + 3) // 16), -(-hidden // 16), -(-columns // 8)
+    return 128 * units * (inputs + units + last) + 32 * units + 8 * last
+
+
+def _pack_kernel(layout: str) -> Any:
+    @wp.func_native(layout + native_source(__package__, "decode_pack"))
+    def word(net: wp.array1d[float], m: int) -> float: ...
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def pack(
+        # in:
+        net: wp.array1d[float],
+        # out:
+        packed: wp.array1d[float],
+    ):
+        m = wp.tid()
+        packed[m] = word(net, m)
+
+    return pack

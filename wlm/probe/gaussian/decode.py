@@ -55,8 +55,8 @@ class GaussianDecoder(Decoder):
         assert isinstance(content, Gaussians)
         check_outputs(model.name, content.latent, content.hidden, model.outputs, content.relative, self.device)
         self._gain = content.gain
-        self._rows = self._put(content.rows(), float)
-        self._shapes = gaussian_sum.shapes(self._rows, CUT, content.support)
+        rows = wp.array(content.rows(), dtype=float, device=self.device)
+        self._shapes = gaussian_sum.shapes(rows, CUT, content.support)
         self._cubes = probe_cubes.build(self._shapes, np.zeros(3, np.float32), model.size.astype(np.float32))
         self.pairs = self._cubes.item.shape[0]
         shared = np.concatenate([layer.ravel() for layer in content.layers()[:2]])
@@ -65,15 +65,23 @@ class GaussianDecoder(Decoder):
         last = last.reshape(len(last), -1).astype(np.float32)
         self._net = self._put(np.concatenate([shared.astype(np.float32), last[0]]), float)
         self._keep_hours(last, self._net[len(shared) :])
-        self._arrays += [self._shapes, self._cubes.start, self._cubes.item]
         kind = "cpu" if self.device == "cpu" else "cuda"
         sizes = content.latent, content.hidden, model.outputs, content.relative, ambient_numbers(model.outputs)
         self._kernels = decode_kernels(*sizes, kind)
+        self._rows, self._packed = self._kernels.pack(rows, self._shapes, self._net)
+        self._arrays += [self._rows, self._shapes, self._cubes.start, self._cubes.item]
+        if self._packed is not self._net:
+            self._arrays.append(self._packed)
+
+    def set_time(self, time: float) -> None:
+        super().set_time(time)
+        if self._hours is not None:
+            self._kernels.pack_network(self._net, self._packed)
 
     def region(self) -> Region:
         """Returns what decodes the model's points as one region of several."""
         made = Region()
-        made.rows, made.shapes, made.cubes, made.net = self._rows, self._shapes, self._cubes, self._net
+        made.rows, made.shapes, made.cubes, made.net = self._rows, self._shapes, self._cubes, self._packed
         made.gain = self._gain
         return made
 
@@ -88,7 +96,7 @@ class GaussianDecoder(Decoder):
     def launch(self, x: wp.array, out: wp.array) -> None:
         """Decodes vec3 [M], points relative to the probes' box, into float [M, D]; on CUDA it is only queued."""
         if x.shape[0]:
-            self._kernels.launch(self._rows, self._shapes, self._cubes, CUT, self._net, self._gain, x, out)
+            self._kernels.launch(self._rows, self._shapes, self._cubes, CUT, self._packed, self._gain, x, out)
 
     def decode(self, position: np.ndarray) -> np.ndarray:
         points = self.points(position)

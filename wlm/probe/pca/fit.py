@@ -137,7 +137,7 @@ def fit_components(
         best = _refined(unit, logarithm, label, target, _LAST)
     while True:  # the errors of plans are predictions
         components, error = _coded(values, light, hours, best)
-        if error <= enough or not 0.0 < best.error <= target.error:
+        if error <= enough or best.error > target.error or not best.error:
             return components, error
         target = target._replace(error=min(0.9 * target.error * enough / error, 0.99 * best.error))
         best = _planned(best.table, target)

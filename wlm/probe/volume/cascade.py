@@ -186,10 +186,10 @@ class Volume:
         self._size = np.array(self.sizes)
         self._viewpoint: np.ndarray | None = None
         self._base = np.zeros((len(ratios), 3), np.int64)
-        self.frame = self._lacking = 0
+        self.frame, self._left, self._lacking, self._hour = 0, 0, 0, 0.0
         self.normal = None if normal is None else _unit(normal, position.shape)
         self._make(rows, self.normal)
-        self._step = interop.StepGraph(self._work, self.device)
+        self._step = interop.LaunchGraph(self._work, self.device)
 
     def _make(self, rows: int, normal: np.ndarray | None) -> None:
         """Allocates all arrays on the device."""
@@ -248,7 +248,10 @@ class Volume:
         contents = {**frame, **ranked, **ranges, **by_block, **by_probe, "rows": covariances}
         self._frame_work = struct("work", frame_kernels.Work, 0, **contents)
         self._bytes["work"] += shared.capacity
-        self._look = frame_kernels.Look(self._windows, self._frame_work)
+        self._counts = counters = self._frame_work.counters
+        if self.device != "cpu":
+            self._counts = wp.zeros(counters.shape, dtype=int, device="cpu", pinned=True)  # quick to read
+        self._look = frame_kernels.Look(self._windows, self._frame_work, 1.0 / self._size)
         self._nowhere = wp.zeros(0, dtype=wp.vec3, device=self.device)
         self._shared = shared  # the views of it do not keep it alive
 
@@ -306,30 +309,35 @@ class Volume:
         base = np.minimum(np.maximum(base, self.index.low), self._last)
         # Before the first frame the windows are where they share no block with those of the frame.
         before = self._base if self._viewpoint is not None else base + self.sides
-        kept = np.maximum(self.sides - np.abs(base - before), 0).prod(1).sum()
-        self._viewpoint, self._base = viewpoint, base
+        hour = self.light.time or 0.0
+        # Where no window moves and no block waits, the launches would change nothing, not even which row is the oldest.
+        still = self._left == 0 and hour == self._hour and np.array_equal(base, before)
+        self._viewpoint, self._base, self._hour = viewpoint, base, hour
         self.frame += 1
-        views = np.column_stack([at - base - 0.5, 1.0 / self._size])
-        with interop.stream(self.device):
-            if self._lacking or self.light.waiting:
-                self.light.prepare()
-            self._look(base, before, views, self.frame, self.light.time or 0.0)
+        if self._lacking or self.light.waiting:
+            self.light.prepare()
+        self._look(base, before, at - base - 0.5, self.frame, hour)
+        entered = queued = dropped = cached = updated = probes = 0
+        if not still:
             self._step()
-        counters = self._frame_work.counters.numpy()
-        queued, dropped, cached, left, updated, probes, _, self._lacking = counters.tolist()
-        entered = self._slots - int(kept)
-        return FrameStats(entered, queued, dropped, updated, cached, left, probes, time.perf_counter() - start)
+            entered = self._slots - int(np.maximum(self.sides - np.abs(base - before), 0).prod(1).sum())
+        wp.synchronize_stream(self.device)
+        if not still:
+            queued, dropped, cached, self._left, updated, probes, _, self._lacking = self._counts.numpy().tolist()
+        seconds = time.perf_counter() - start
+        return FrameStats(entered, queued, dropped, updated, cached, self._left, probes, seconds)
 
     def _work(self) -> None:
         """Chooses missing blocks, finds and weights the probes near them, and writes the blocks' light to the pool."""
         work, windows = self._frame_work, self._windows
         frame_kernels.select(self._index, windows, self._pool, self.tolerance, int(self.sides.max()), work)
-        if self.index.count == 0 or (self.device == "cpu" and not (work.taken.numpy() >= 0).any()):
-            return
-        frame_kernels.search(self._index, work)
-        volume_weights.weigh(self._index, work)
-        self.light.read(work.numbers, self._read_light)
-        frame_kernels.combine(work, self._read_light, windows, self._pool)
+        if self.index.count and (self.device != "cpu" or (work.taken.numpy() >= 0).any()):
+            frame_kernels.search(self._index, work)
+            volume_weights.weigh(self._index, work)
+            self.light.read(work.numbers, self._read_light)
+            frame_kernels.combine(work, self._read_light, windows, self._pool)
+        if self._counts is not work.counters:
+            wp.copy(self._counts, work.counters)
 
     def read(self, points: np.ndarray, normals: np.ndarray | None = None) -> Reading:
         """Interpolates the light at points in float32 relative to the viewer, see `wlm_kernels.probe.volume.read`.

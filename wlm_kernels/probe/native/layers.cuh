@@ -1,5 +1,5 @@
 // The network's forward pass for a block of T threads (gaussian-probe-compression, eq. 7): the beginning of a function's
-// body, which network.cuh and decode.cuh continue. The reference is benchmarks/probe_exact.py.
+// body, which network.cuh continues. The reference is tests/reference/probe_network.py.
 //
 // It declares the rows X (inputs), A and B (hidden layers) and E (outputs) of P probes in shared memory, and
 // forward(in, rows, weights, out), a hidden layer, and last(in, weights, put), which calls put(c, p, value) for every
