@@ -168,6 +168,19 @@ def test_a_set_is_smaller_than_its_hours(day):
     assert together.file_bytes() < 0.6 * sum(one.file_bytes() for one in alone)
 
 
+def test_a_target_is_that_of_every_hour(day):
+    """Of light over the day alone, 2% would leave the dark hours with more error."""
+    light = day.values.reshape(150, 9, 3).swapaxes(0, 1).copy()
+    light[7] *= np.geomspace(0.02, 1.0, 150)[:, None]  # lamps that reach some probes
+    lamps = from_arrays(day.position, light, times=TIMES)
+    plain, found = compress(lamps, "pca"), compress(lamps, TINY.model_copy(update={"method": "auto", "target": 0.02}))
+
+    def error(model):
+        return np.sqrt(np.mean([hour["relative_error"] ** 2 for hour in evaluate(model, lamps).hours]))
+
+    assert found.method == "pca" and error(found) <= 0.02 < error(plain)
+
+
 def test_the_bundle_has_the_words_of_all_hours(model):
     made = model.bundle()
     document, place = made.document, made.document["hour"]

@@ -19,6 +19,7 @@ _REPEATED = 100  # number in the checkpoint of a fit that is repeated after a re
 _FITS = 7  # most fits of a search
 _POWER = 0.5  # the error is about this power of the number of Gaussians, inverted, until two fits have shown it
 _MARGIN = 1.05  # factor of a guess, so that it rather reaches the target
+_TRIES, _LESS = 3, 0.9  # fits of components with a smaller error over the day, and a factor, so that one suffices
 _CLOSE = 1.1  # a search ends when the number that reaches is at most this factor above one that does not
 
 
@@ -57,7 +58,7 @@ class Candidates:
         """Returns the model for a profile that names neither a target nor a number of bytes."""
         profile = self._profile
         if profile.method == "pca":
-            return self._measured(self._components(None, ENOUGH, "PCA, as the profile asks")[0])[0]
+            return self._measured(self._fitted(None, ENOUGH, "PCA, as the profile asks")[0])[0]
         if profile.method == "auto" and self._regions > 1:
             return self._measured(self._trained(profile))[0]
         count = gaussian_count(profile.ratio, self._live)
@@ -70,11 +71,11 @@ class Candidates:
                 model, _ = self._measured(model)
                 return replace(model, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
         gaussians, error = self._measured(self._trained(profile))
-        if profile.method == "gaussians":
+        if profile.method != "auto":
             return gaussians
         most = gaussians.content.nbytes
         told = f"Gaussians reach an error of {error:.1%} in {most:,} bytes of GPU memory"
-        rival, _ = self._components(most, ENOUGH)
+        rival = model if size <= most else self._components(most, ENOUGH)[0]
         if rival.content.nbytes > most:
             return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
         rival, possible = self._measured(rival)
@@ -121,9 +122,24 @@ class Candidates:
             warnings = (missed, *warnings)
         return replace(model, choice=f"{kind}: {told} bytes of GPU memory", warnings=warnings)
 
-    def _components(self, most: int | None, enough: float, choice: str = "") -> tuple[ProbeModel, float]:
-        """Returns the fewest principal components with an error of at most `enough`, or as many as fit `most` bytes;
-        and their error before ambient light is clamped."""
+    def _components(self, most: int | None, enough: float) -> tuple[ProbeModel, float]:
+        """Returns the fewest principal components found with an error of at most `enough`, over all hours relative to
+        the light of each hour, or as many as fit `most` bytes; and their error."""
+        model, fitted = self._fitted(most, enough)
+        if self._hours == 1:
+            return model, fitted
+        error, day = self._measured(model)[1], enough
+        for _ in range(_TRIES):
+            if error <= enough or fitted > day:
+                break
+            day *= _LESS * enough / error  # a dark hour needs a smaller error of the day
+            model, fitted = self._fitted(most, day)
+            error = self._measured(model)[1]
+        return model, error
+
+    def _fitted(self, most: int | None, enough: float, choice: str = "") -> tuple[ProbeModel, float]:
+        """Returns the fewest principal components whose error, relative to light over the day, is at most `enough`, or
+        as many as fit `most` bytes; and their error before ambient light is clamped."""
         relative = self._profile.error == "relative"
         content, error = fit_components(self._values, most, self._hours, enough, relative=relative)
         profile = Profile(name=self._profile.name, method="pca", error=self._profile.error)
