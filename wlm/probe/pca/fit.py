@@ -21,7 +21,7 @@ ENOUGH = 0.02
 
 _TRIED = ((8, 16, 32, 64), (4, 1))  # numbers of clusters, each way until there is no gain
 _FEWEST = 8  # probes per cluster, in the mean; smaller sets have unit vectors, unless their probes have many numbers
-_MEANS, _SUBSPACES, _PRICED, _LAST = 5, 3, 3, 2  # rounds of k-means, with subspaces, with prices, and of all probes
+_MEANS, _SUBSPACES, _PRICED, _LAST = 5, 3, 3, 4  # rounds of k-means, with subspaces, with prices, and of all probes
 _RANK = 8  # dimension of a subspace before there are prices
 _MOST = 64  # directions of a cluster
 _SAMPLE = 1 << 13  # probes from which clusters are chosen
