@@ -284,8 +284,8 @@ def test_packed_codes_are_bits(clustered):
     for probe in (0, 1, 777, 1999):
         own, first = components.cluster[probe], int(length[:probe].sum())
         assert int(index[probe * bits : (probe + 1) * bits][::-1], 2) == own
-        begin = int(group[probe // 32 * 32 : probe // 32 * 32 + 32][::-1], 2)
-        assert begin == length[: probe // 32 * 32].sum()
+        begin = int(group[probe // 64 * 32 : probe // 64 * 32 + 32][::-1], 2)
+        assert begin == length[: probe // 64 * 64].sum()
         for code, width in zip(components.code[probe].tolist(), components.width[own].tolist(), strict=True):
             assert int(codes[first : first + width][::-1] or "0", 2) == code
             first += width

@@ -71,11 +71,11 @@ class Candidates:
                 model, _ = self._measured(model)
                 return replace(model, choice=f"PCA: {took} of GPU memory, Gaussians take {budget:,}")
         gaussians, error = self._measured(self._trained(profile))
-        if profile.method == "gaussians":
+        if profile.method != "auto":
             return gaussians
         most = gaussians.content.nbytes
         told = f"Gaussians reach an error of {error:.1%} in {most:,} bytes of GPU memory"
-        rival, _ = self._components(most, ENOUGH)
+        rival = model if size <= most else self._components(most, ENOUGH)[0]
         if rival.content.nbytes > most:
             return replace(gaussians, choice=f"Gaussians: {told}, less than one PCA component takes")
         rival, possible = self._measured(rival)

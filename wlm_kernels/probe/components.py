@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-GROUP = wp.constant(32)
+GROUP = wp.constant(64)
 """Probes that share the place of their first bit."""
 
 
@@ -45,10 +45,14 @@ def _decode_components(
         probe = row[numbers[i]]
     total = float(0.0)
     if probe >= 0:
-        bit = group[probe / GROUP]
-        for other in range(probe - probe % GROUP, probe):
-            before = _code(index, wp.uint32(other * index_bits), index_bits)
-            bit += wp.uint32(cluster[before][1])
+        # From the nearer end of the group.
+        place = probe % GROUP
+        half = place / (GROUP / 2)
+        bit = group[probe / GROUP + half]
+        begin = probe - place + half * place
+        for other in range(begin, begin + wp.where(half == 0, place, GROUP - place)):
+            bits = cluster[_code(index, wp.uint32(other * index_bits), index_bits)][1]
+            bit += wp.uint32(wp.where(half == 0, bits, -bits))
         own = _code(index, wp.uint32(probe * index_bits), index_bits)
         first = cluster[own][0]
         last = cluster[own + 1][0]
@@ -90,8 +94,8 @@ def decode_components(
     """Decodes light probes to their D numbers (light coefficients).
 
     Args:
-        group: uint32 [ceil(V / GROUP)], first bit of each group of probes in `codes`.
-        index: uint32 words, the clusters of V probes, of `index_bits` bits each.
+        group: uint32 [ceil(V / GROUP) + 1], first bit of each group of probes in `codes`, and the end of the last one.
+        index: uint32 words, the clusters of V probes, of `index_bits` bits each, and 0 up to the end of the last group.
         index_bits: Bits of a cluster's number.
         codes: uint32 words, the bits of V probes one after another, from the lowest bit of a word: for each probe the
             code of its magnitude, and those of its coefficients.

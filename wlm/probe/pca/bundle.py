@@ -34,8 +34,9 @@ _TEMPLATE = """\
 //        magnitude's logarithm, the others are those of the coefficients
 //   Q bytes, padded to words: bits of each code
 //   {words} (Q - C) words: the direction of each coefficient; {directions}
-//   G words for G = ceil(V / {group}) groups of {group} probes: where the codes of the group begin, in bits
-//   b G words: the numbers of the probes' clusters, b bits each
+//   G + 1 words for G = ceil(V / {group}) groups of {group} probes: where the codes of the group begin, in bits, and
+//        the end of the last one, which is filled up with probes of cluster 0, without codes
+//   {group_words} b G words: the numbers of the probes' clusters, b bits each
 //   the codes of one probe after another, from the lowest bit of a word
 //
 // It is a storage buffer, unless WLM_PROBE_PROBES(i) is defined before this file as another way to read word i.
@@ -66,11 +67,17 @@ void wlm_probe_values(int probe, out float values[WLM_PROBE_OUTPUTS])
 {{
     int clusters = int(WLM_PROBE_PROBES(1)), b = int(WLM_PROBE_PROBES(2)), codes = int(WLM_PROBE_PROBES(3));
     int bounds = 4 + clusters, widths = bounds + codes, basis = widths + (codes + 3) / 4;
-    int group = basis + (codes - clusters) * {words}, index = group + (wlm_probe_count() + {group} - 1) / {group};
-    int data = index + (index - group) * b;
-    uint bit = WLM_PROBE_PROBES(group + probe / {group});
-    for (int other = probe - probe % {group}; other < probe; ++other)
-        bit += WLM_PROBE_PROBES(4 + int(wlm_probe_code(index, uint(other * b), b))) >> 16u;
+    int group = basis + (codes - clusters) * {words}, groups = (wlm_probe_count() + {group} - 1) / {group};
+    int index = group + groups + 1, data = index + groups * {group_words} * b;
+    // From the nearer end of the group.
+    int place = probe % {group}, half_group = place / ({group} / 2);
+    uint bit = WLM_PROBE_PROBES(group + probe / {group} + half_group);
+    int begin = half_group == 0 ? probe - place : probe;
+    int end_group = half_group == 0 ? probe : probe - place + {group};
+    for (int other = begin; other < end_group; ++other) {{
+        uint bits = WLM_PROBE_PROBES(4 + int(wlm_probe_code(index, uint(other * b), b))) >> 16u;
+        bit = half_group == 0 ? bit + bits : bit - bits;
+    }}
     int cluster = int(wlm_probe_code(index, uint(probe * b), b));
     int first = int(WLM_PROBE_PROBES(4 + cluster) & 65535u);
     int end = cluster + 1 < clusters ? int(WLM_PROBE_PROBES(5 + cluster) & 65535u) : codes;
@@ -149,6 +156,7 @@ def component_glsl(outputs: int, kind: str) -> str:
         outputs=outputs,
         words=words,
         group=GROUP,
+        group_words=GROUP // 32,
         directions=f"{form['per_word']} {kind} in a word, from the lowest bits" if kind else "unit vectors",
         clamp=clamp_glsl(outputs),
         body=_BASIS.format(words=words, **form) if kind else _UNIT,

@@ -21,12 +21,12 @@ ENOUGH = 0.02
 
 _TRIED = ((8, 16, 32, 64), (4, 1))  # numbers of clusters, each way until there is no gain
 _FEWEST = 8  # probes per cluster, in the mean; smaller sets have unit vectors, unless their probes have many numbers
-_MEANS, _SUBSPACES, _PRICED, _LAST = 8, 4, 4, 2  # rounds of k-means, with subspaces, with prices, and of all probes
+_MEANS, _SUBSPACES, _PRICED, _LAST = 5, 3, 3, 2  # rounds of k-means, with subspaces, with prices, and of all probes
 _RANK = 8  # dimension of a subspace before there are prices
 _MOST = 64  # directions of a cluster
 _SAMPLE = 1 << 13  # probes from which clusters are chosen
 _MADE_UP = 1 / 16  # of the rounding of the magnitude, that coefficients in unit vectors do not make up for
-_NARROW, _SHARES = 6, (1.0, 0.75, 0.55, 0.4)  # fewer bits may be worth more if they cover only a share of the range
+_NARROW, _SHARES = 5, (1.0, 0.75, 0.5)  # fewer bits may be worth more if they cover only a share of the range
 _CHEAP, _DEAR, _HALVINGS = -80.0, 40.0, 48  # exponents of prices, and the steps of their bisection
 
 
@@ -187,7 +187,7 @@ def _tabled(unit: np.ndarray, logarithm: np.ndarray, label: np.ndarray, *, ident
         inside = np.concatenate([each @ own[1:].T for each, own in zip(away, directions, strict=True)])
         rest = max(sum(float(np.square(each).sum()) for each in away) - float(np.square(inside).sum()), 0.0)
         columns[1:] = inside.T
-    found = [[_quantised(column, clusters, width) for width in range(WIDEST + 1)] for column in columns]
+    found = [[_quantised(column, clusters, width, rough=True) for width in range(WIDEST + 1)] for column in columns]
     error, low, step = (np.array([[each[i] for each in row] for row in found]).transpose(2, 0, 1) for i in (1, 2, 3))
     if identity:
         error[:, 0] *= _MADE_UP
@@ -318,11 +318,12 @@ class _Quantised(NamedTuple):
     values: np.ndarray
 
 
-def _quantised(numbers: np.ndarray, clusters: _Clusters, width: int) -> _Quantised:
+def _quantised(numbers: np.ndarray, clusters: _Clusters, width: int, *, rough: bool = False) -> _Quantised:
     """Quantises numbers [V], in the order of their clusters, over their range in each cluster, or over the share of it
-    that has the least squared error."""
+    that has the least squared error. `rough` codes are not rounded where they are wide, and their error is a mean."""
     label, start = clusters.label, clusters.start
-    mean = np.add.reduceat(numbers, start) / np.diff(start, append=len(numbers))
+    counts = np.diff(start, append=len(numbers))
+    mean = np.add.reduceat(numbers, start) / counts
     if width == 0:
         low = mean.astype(np.float16).astype(np.float64)
         error = np.add.reduceat(np.square(low[label] - numbers), start)
@@ -332,6 +333,8 @@ def _quantised(numbers: np.ndarray, clusters: _Clusters, width: int) -> _Quantis
     for share in _SHARES if width < _NARROW else _SHARES[:1]:
         low = -_half_above(-(mean + share * below))
         step = _half_above((mean + share * above - low) / (2**width - 1))
+        if rough and width >= _NARROW:
+            return _Quantised(numbers, counts * np.square(step) / 12, low, step, numbers)
         code = np.divide(numbers - low[label], step[label], out=np.zeros_like(numbers), where=step[label] > 0)
         code = np.clip(np.rint(code), 0, 2**width - 1)
         values = low[label] + code * step[label]

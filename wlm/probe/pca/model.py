@@ -141,12 +141,12 @@ class Components(Content):
         return cls(outputs, cluster, code, width, stored["bounds"], basis, hours)
 
     def packed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the buffers of a GPU with a word for the first bit of each `GROUP` of probes, uint32; the clusters of
-        each group, as words; and the codes of all probes one after another, from the lowest bit of a word, uint32."""
-        length = self.bits[self.cluster]
-        first = np.cumsum(length) - length
+        """Returns the buffers of a GPU with a word for the first bit of each `GROUP` of probes and for the end of the
+        last one, uint32; the clusters of each group, as words; and the codes of all probes one after another, from the
+        lowest bit of a word, uint32. The last group is filled up with cluster 0, without codes."""
+        padded = np.pad(self.cluster, (0, -len(self.cluster) % GROUP))
+        first = np.append(0, np.cumsum(self.bits[padded]))
         index = (self.clusters - 1).bit_length()
-        padded = np.pad(self.cluster, (0, -len(length) % GROUP))
         width = self.width[self.cluster]
         codes = _bits(self.code, width)
         return first[::GROUP].astype("<u4"), _bits(padded[:, None], np.full_like(padded, index)[:, None]), codes
@@ -175,5 +175,5 @@ def component_bytes(
     """Returns the bytes of the GPU buffers of V = `live` probes with `bits` bits of codes together, for `columns` codes
     of all C `clusters` together; see `wlm.probe.pca.bundle`, and for several hours `wlm.probe.bundle`."""
     row = -(-outputs // 2) * (hours + 1) if hours > 1 else 0 if identity else -(-outputs // 4)
-    groups = -(-live // GROUP) * (1 + (clusters - 1).bit_length())
+    groups = 1 + -(-live // GROUP) * (1 + (clusters - 1).bit_length() * GROUP // 32)
     return 4 * (4 + clusters + columns + -(-columns // 4) + (columns - clusters) * row + groups + -(-bits // 32))
