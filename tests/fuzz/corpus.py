@@ -225,7 +225,7 @@ def _settings(folder: Path) -> None:
         "cells: 20\nguide: six\nzoom: [0.8, 1.2]\nmoving: 0.25\nleast_coverage: 0.01\n"
     )
     (folder / "day.yaml").write_text(
-        "title: day\nmesh: a.glb\nlight: a.wlm\nprobes: [{hour: 6, file: b.wlm}]\n"
+        "title: day\nmesh: a.glb\nlight: a.wlm\nprobes: b.wlm\n"
         "sky: [{hour: 0, colour: [0, 0, 0.1], exposure: 2}, {hour: 12, colour: [1, 1, 1], exposure: -1}]\n"
         "moving: [{mesh: c.glb, path: [[0, 0, 0], [1, 0, 0]], seconds: 8}]\n"
         "smoke: [{files: smoke, position: [0, 1, 0], size: 0.5, rate: 20}]\n"
