@@ -150,7 +150,7 @@ class ProbeModel(Model):
     Attributes:
         name: Name of the set.
         source: Hash of the input, 16 hexadecimal digits; a file stores the first 8.
-        profile: Settings of the fit, with the method that was used; PCA has no other settings but `error`.
+        profile: Settings of the fit, with the method that was used; PCA has no other settings.
         probes: Number of probes, N.
         outputs: Numbers per probe at one hour, D: 27 for second-order spherical harmonics in three colours.
         origin: float64 [3], lowest corner of the probes' bounding box, in the unit of the positions.

@@ -142,7 +142,7 @@ class Candidates:
         as many as fit `most` bytes; and their error before ambient light is clamped."""
         relative = self._profile.error == "relative"
         content, error = fit_components(self._values, most, self._hours, enough, relative=relative)
-        profile = Profile(name=self._profile.name, method="pca")  # no setting of the fit matters to a decoder
+        profile = Profile(name=self._profile.name, method="pca")
         return self._make(profile=profile, content=content, choice=choice), error
 
     def _bytes(self, count: int) -> int:
