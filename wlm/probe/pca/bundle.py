@@ -65,12 +65,19 @@ uint wlm_probe_code(int word, uint bit, int width)
 // The numbers of a live probe.
 void wlm_probe_values(int probe, out float values[WLM_PROBE_OUTPUTS])
 {{
-    int clusters = int(WLM_PROBE_PROBES(1)), b = int(WLM_PROBE_PROBES(2)), codes = int(WLM_PROBE_PROBES(3));
-    int bounds = 4 + clusters, widths = bounds + codes, basis = widths + (codes + 3) / 4;
-    int group = basis + (codes - clusters) * {words}, groups = (wlm_probe_count() + {group} - 1) / {group};
-    int index = group + groups + 1, data = index + groups * {group_words} * b;
+    int clusters = int(WLM_PROBE_PROBES(1));
+    int b = int(WLM_PROBE_PROBES(2));
+    int codes = int(WLM_PROBE_PROBES(3));
+    int bounds = 4 + clusters;
+    int widths = bounds + codes;
+    int basis = widths + (codes + 3) / 4;
+    int group = basis + (codes - clusters) * {words};
+    int groups = (wlm_probe_count() + {group} - 1) / {group};
+    int index = group + groups + 1;
+    int data = index + groups * {group_words} * b;
     // From the nearer end of the group.
-    int place = probe % {group}, half_group = place / ({group} / 2);
+    int place = probe % {group};
+    int half_group = place / ({group} / 2);
     uint bit = WLM_PROBE_PROBES(group + probe / {group} + half_group);
     int begin = half_group == 0 ? probe - place : probe;
     int end_group = half_group == 0 ? probe : probe - place + {group};
