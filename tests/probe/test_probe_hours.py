@@ -169,7 +169,7 @@ def test_a_set_is_smaller_than_its_hours(day):
 
 
 def test_a_target_is_that_of_every_hour(day):
-    """Of light over the day alone, 2% would leave the dark hours with more error."""
+    """With 2% of light over the day alone, a fit would leave the dark hours with more error."""
     light = day.values.reshape(150, 9, 3).swapaxes(0, 1).copy()
     light[7] *= np.geomspace(0.02, 1.0, 150)[:, None]  # lamps that reach some probes
     lamps = from_arrays(day.position, light, times=TIMES)

@@ -195,7 +195,7 @@ def test_a_full_pool_is_decoded_again(device: str):
 
 
 def test_blocks_have_the_stated_light(device: str):
-    """Those that few probes decide, against a dense system; of the others the probes are spread over their reach."""
+    """Blocks that few probes decide, against a dense system; of the others the probes are spread over their reach."""
     position = _surface(250)
     values = _field(position)
     volume = _volume(position, device, budget=1024)

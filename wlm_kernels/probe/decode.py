@@ -28,7 +28,7 @@ _NONE = wp.constant(1 << 30)
 
 @wp.struct
 class Region:
-    """What decodes the points of a region; the attributes are those of `DecodeKernels.launch`, `net` is empty if the
+    """The model of a region on the device; the attributes are those of `DecodeKernels.launch`, `net` is empty if the
     region is not in memory, and `gain` then stands for each of the light's numbers."""
 
     rows: wp.array2d[float]

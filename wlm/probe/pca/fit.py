@@ -31,7 +31,7 @@ _CHEAP, _DEAR, _HALVINGS = -80.0, 40.0, 48  # exponents of prices, and the steps
 
 
 class _Target(NamedTuple):
-    """What is wanted of V probes of D numbers at each of T hours: bytes at most, and the error that is enough."""
+    """The wanted size and error of V probes of D numbers at T hours: most bytes, and an error that is enough."""
 
     live: int
     outputs: int
