@@ -1,5 +1,7 @@
 """Decodes Gaussians on a device (gaussian-probe-compression, eq. 5 to 7 and section 5.3.2)."""
 
+from abc import abstractmethod
+
 import numpy as np
 import warp as wp
 
@@ -41,7 +43,29 @@ class Points:
         return result
 
 
-class GaussianDecoder(Decoder):
+class PointDecoder(Decoder):
+    """A decoder of light at any points, which are uploaded and then decoded."""
+
+    @abstractmethod
+    def points(self, position: np.ndarray) -> Points:
+        """Uploads points that will be decoded often; arguments and errors are those of `decode`."""
+
+    @abstractmethod
+    def run(self, points: Points) -> None:
+        """Decodes uploaded points into `Points.out`; on CUDA the work is queued, not awaited."""
+
+    def decode(self, position: np.ndarray) -> np.ndarray:
+        points = self.points(position)
+        self.run(points)
+        return points.values()
+
+    def decode_probes(self) -> np.ndarray:
+        values = self.decode(self.own_positions())
+        values[~self.model.live] = 0.0
+        return values
+
+
+class GaussianDecoder(PointDecoder):
     """A model of Gaussians on a device, with a list of the Gaussians that reach each cube of a grid.
 
     Attributes:
@@ -86,27 +110,15 @@ class GaussianDecoder(Decoder):
         return made
 
     def points(self, position: np.ndarray) -> Points:
-        """Uploads points that will be decoded often; arguments and errors are those of `decode`."""
         return Points(self.model.normalise(check_points(position)), self.model.outputs, self.device)
 
     def run(self, points: Points) -> None:
-        """Decodes uploaded points into `Points.out`; on CUDA the work is queued, not awaited."""
         self.launch(points.x, points.out)
 
     def launch(self, x: wp.array, out: wp.array) -> None:
         """Decodes vec3 [M], points relative to the probes' box, into float [M, D]; on CUDA it is only queued."""
         if x.shape[0]:
             self._kernels.launch(self._rows, self._shapes, self._cubes, CUT, self._packed, self._gain, x, out)
-
-    def decode(self, position: np.ndarray) -> np.ndarray:
-        points = self.points(position)
-        self.run(points)
-        return points.values()
-
-    def decode_probes(self) -> np.ndarray:
-        values = self.decode(self.own_positions())
-        values[~self.model.live] = 0.0
-        return values
 
     def light(self, position: np.ndarray) -> "GaussianLight":
         return GaussianLight(self, check_points(position))

@@ -7,8 +7,7 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.formats.hours import DAY
-from wlm.probe.decode import Decoder
-from wlm.probe.gaussian.decode import GaussianDecoder, Points
+from wlm.probe.gaussian.decode import GaussianDecoder, PointDecoder, Points
 from wlm.probe.gaussian.model import CUT, check_outputs
 from wlm.probe.hours import check_time
 from wlm.probe.model import ProbeModel, check_points
@@ -22,7 +21,7 @@ MEMORY = 256 << 20
 """Bytes of regions that stay on the device by default; a million probes take about a tenth."""
 
 
-class RegionDecoder(Decoder):
+class RegionDecoder(PointDecoder):
     """A model in regions on a device.
 
     Regions are read from the file when they are needed first, and leave the device when others need their memory, the
@@ -103,7 +102,7 @@ class RegionDecoder(Decoder):
             self._entries[old] = _absent(ABSENT)
 
     def points(self, position: np.ndarray) -> Points:
-        """Uploads points that will be decoded often, and loads their regions; arguments and errors as for `decode`."""
+        """Uploads points and loads their regions; see `PointDecoder.points`."""
         region, x = self._content.place(self._inside(position))
         self.load(np.unique(region))
         return Points(x, self.model.outputs, self.device, region)
@@ -117,16 +116,6 @@ class RegionDecoder(Decoder):
         """Decodes points as `wlm_kernels.probe.decode.DecodeKernels.launch_regions` does."""
         if x.shape[0]:
             self._kernels.launch_regions(self._table, region, CUT, x, self._asked, out)
-
-    def decode(self, position: np.ndarray) -> np.ndarray:
-        points = self.points(position)
-        self.run(points)
-        return points.values()
-
-    def decode_probes(self) -> np.ndarray:
-        values = self.decode(self.own_positions())
-        values[~self.model.live] = 0.0
-        return values
 
     def light(self, position: np.ndarray) -> "RegionLight":
         return RegionLight(self, *self._content.place(self._inside(position)))
