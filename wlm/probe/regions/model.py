@@ -19,6 +19,7 @@ from wlm.probe.model import Content, ProbeModel, Profile
 from wlm.probe.regions.tree import Tree
 
 _MOST = 1 << 20  # regions of a file
+_SIZES = ("latent", "hidden", "error", "support")  # settings that all regions share
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +134,3 @@ class Regions(Content):
 def box_row(model: ProbeModel) -> np.ndarray:
     """Returns the box of a model as a row of `Regions.boxes`, float64 [7]."""
     return np.array([*model.origin, model.extent, *model.size])
-
-
-_SIZES = ("latent", "hidden", "error", "support")
