@@ -29,6 +29,7 @@ from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet, from_arrays
 from wlm.probe.fit import compress
 from wlm.probe.model import ProbeModel, Profile
+from wlm.probe.morton import morton_order
 from wlm.probe.relative import relative_errors
 from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight
@@ -45,9 +46,11 @@ _WAVES = 6
 
 
 def many_probes(count: int) -> ProbeSet:
-    """Returns a set of random positions with smooth light, 27 numbers each; the same one for the same count."""
+    """Returns a set of random positions along a Z-curve with smooth light, 27 numbers each; the same one for the same
+    count."""
     random = np.random.default_rng(1)
-    position = random.uniform(0, 1, (count, 3)) * _BOX * np.cbrt(count / 1e6)
+    place = random.uniform(0, 1, (count, 3))
+    position = place[morton_order(place)] * _BOX * np.cbrt(count / 1e6)
     waves = np.random.default_rng(0)
     values = np.zeros((count, 27), np.float32)
     values[:, :3] = 1.0
@@ -126,7 +129,6 @@ def _rows(bench: Bench, probes: ProbeSet, profile: Profile, frames: int) -> Iter
         row = bench.row("speed", "decode", f"all live probes, {bench.mode}", probes=len(position))
         timing = bench.time({"decode": bench.replay(lambda: decoder.run(points))})["decode"]
         yield row.with_timing(timing).with_figures(point_rate=len(position) / timing.median_ms / 1e6)
-        del decoder, points
         for name in ("lossless", "ours"):
             bench.note(f"walking through the volume: {name}")
             yield _volume_row(bench, probes, None if name == "lossless" else model, name, frames)
