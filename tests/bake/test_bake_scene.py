@@ -20,10 +20,11 @@ from wlm.bake.lightmaps import BakedLightmaps, write_lightmaps
 from wlm.bake.probes import BakedProbes, place_probes, write_probes
 from wlm.bake.settings import Lamp, LightmapSettings, ProbeSettings
 from wlm.bake.texels import place_texels
-from wlm.bake.work import open_task
+from wlm.bake.work import each_hour, open_checkpoint, open_task
 from wlm.cli import app
 from wlm.errors import WlmError
 from wlm.formats.gltf import read_gltf, vertex_normals
+from wlm.formats.parts import Part
 from wlm.inspection import inspect
 from wlm.lightmap import load
 from wlm.probe.data import load as load_probes
@@ -158,6 +159,29 @@ def test_probes_are_in_a_lattice():
     assert len(lattice) == 4 * 3 * 2 and lattice.min(0).tolist() == [0.5, 0.5, -1.5]
     with pytest.raises(WlmError, match="probes.spacing: expected at most 1,048,576"):
         place_probes(ProbeSettings(spacing=0.001), geometry)
+
+
+def test_finished_hours_are_kept(tmp_path):
+    shutil.copytree(ROOM, tmp_path / "room")
+    task = open_task(tmp_path / "room" / "room.yaml")
+    table, made = {"light": Part(np.float32, (1,))}, []
+
+    def make(hour, report):
+        if len(made) == 2:
+            raise KeyboardInterrupt
+        made.append(hour)
+        return {"light": np.full(1, hour, np.float32)}
+
+    output = tmp_path / "set"
+    with pytest.raises(KeyboardInterrupt):
+        each_hour([6, 12, 18], open_checkpoint(output, task, "lightmaps", "cpu"), table, make, None)
+    made.clear()
+    results = each_hour([6, 12, 18], open_checkpoint(output, task, "lightmaps", "cpu", resume=True), table, make, None)
+    assert made == [18] and [float(each["light"][0]) for each in results] == [6, 12, 18]
+    changed = replace(task, scene=task.scene.model_copy(update={"samples": 8}))
+    said = "set.partial: the checkpoint is of another fit: it was made with scene samples=256, not 8"
+    with pytest.raises(WlmError, match=said):
+        open_checkpoint(output, changed, "lightmaps", "cpu", resume=True)
 
 
 def test_what_is_written_is_a_set(tmp_path):

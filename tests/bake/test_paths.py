@@ -19,7 +19,7 @@ from wlm.bake.lightmaps import bake_lightmaps
 from wlm.bake.probes import bake_probes
 from wlm.bake.settings import BakeScene, Daylight, Lamp, ProbeSettings, Sky
 from wlm.bake.texels import place_texels
-from wlm.bake.work import open_task
+from wlm.bake.work import open_checkpoint, open_task
 from wlm.errors import WlmError
 
 DEVICE = os.environ.get("WLM_BAKE_DEVICE", "cpu")
@@ -143,7 +143,7 @@ def test_harmonics_of_a_lamp_have_its_direction():
     assert light[:8] == pytest.approx(up, abs=1e-4)
 
 
-def test_the_demos_room(tmp_path):
+def test_a_bake_goes_on_where_it_was_stopped(tmp_path):
     pytest.importorskip("uvunwrap")
     shutil.copytree(ROOM, tmp_path / "room")
     path = tmp_path / "room" / "room.yaml"
@@ -152,8 +152,20 @@ def test_the_demos_room(tmp_path):
         " lightmap: {resolution: 64, unwrap: true, padding: 1, supersample: 2},"
         " lamps: [{material: lamp, radiance: [9, 9, 9], lit: [18, 23]}]}"
     )
-    task = open_task(path)
+    task, output = open_task(path), tmp_path / "set"
     whole = bake_lightmaps(task, device=DEVICE)
+
+    def stop(progress):
+        if progress.done > 100:  # the first hour is kept by now
+            raise KeyboardInterrupt
+
+    checkpoint = open_checkpoint(output, task, "lightmaps", DEVICE)
+    with pytest.raises(KeyboardInterrupt):
+        bake_lightmaps(task, device=DEVICE, checkpoint=checkpoint, progress=stop)
+    again = open_checkpoint(output, task, "lightmaps", DEVICE, resume=True)
+    assert again.resumed
+    resumed = bake_lightmaps(task, device=DEVICE, checkpoint=again)
+    assert (resumed.light == whole.light).all() and (resumed.noise == whole.noise).all()
     # What lies under the boxes is within them, and has its neighbours' light.
     hidden = whole.back > 0.5
     assert hidden.any() and not whole.mask[hidden].any() and (whole.light[1, hidden].max(-1) > 0).all()

@@ -9,6 +9,7 @@ _PLACES = {
     "BakeScene": "wlm.bake.settings",
     "bake_lightmaps": "wlm.bake.lightmaps",
     "bake_probes": "wlm.bake.probes",
+    "open_checkpoint": "wlm.bake.work",
     "open_task": "wlm.bake.work",
     "write_lightmaps": "wlm.bake.lightmaps",
     "write_probes": "wlm.bake.probes",

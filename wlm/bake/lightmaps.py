@@ -12,11 +12,13 @@ from wlm.bake.geometry import Geometry, check_lamps, read_geometry
 from wlm.bake.texels import Texels, place_texels
 from wlm.bake.work import Task, each_hour, noise_share
 from wlm.errors import WlmError, one_line
+from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.exr import HALF_MAX, write_exr, write_planes
 from wlm.formats.folder import compact_json, staged
 from wlm.formats.gltf_writer import write_glb
 from wlm.formats.hdr_blocks import need
 from wlm.formats.mask import write_mask
+from wlm.formats.parts import Part
 from wlm.system import OnProgress
 from wlm.texels import fill_gaps
 
@@ -58,15 +60,18 @@ class BakedLightmaps:
         ]
 
 
-def bake_lightmaps(task: Task, *, device: str = "cpu", progress: OnProgress | None = None) -> BakedLightmaps:
+def bake_lightmaps(
+    task: Task, *, device: str = "cpu", checkpoint: Checkpoint | None = None, progress: OnProgress | None = None
+) -> BakedLightmaps:
     """Bakes the lightmap of a scene at each of its hours.
 
     All hours use the same random numbers, so that remaining noise doesn't flicker between them.
 
     Args:
         task: The scene, from `wlm.bake.work.open_task`.
+        checkpoint: From `wlm.bake.work.open_checkpoint`; None: the bake can't be resumed.
         device: "cpu" or "cuda" (the first GPU).
-        progress: Called from time to time.
+        progress: Called from time to time; a KeyboardInterrupt that it raises leaves a written checkpoint.
 
     Raises:
         WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, lacks lightmap UVs or they overlap, or
@@ -90,7 +95,13 @@ def bake_lightmaps(task: Task, *, device: str = "cpu", progress: OnProgress | No
         light, noise = (np.minimum(values, HALF_MAX) for values in (gathered.mean, gathered.noise))
         return {"light": light, "noise": noise, "back": gathered.back}
 
-    results = each_hour(hours, make, progress)
+    count = len(texels.index)
+    table = {
+        "light": Part(np.float32, (count, 3), least=0.0),
+        "noise": Part(np.float32, (count, 3), least=0.0),
+        "back": Part(np.float32, (count,), least=0.0, most=1.0),
+    }
+    results = each_hour(hours, checkpoint, table, make, progress)
     back = np.mean([each["back"] for each in results], axis=0)
     visible = back <= _HIDDEN
     if not visible.any():

@@ -12,10 +12,13 @@ from wlm.bake.settings import ProbeSettings
 from wlm.bake.work import Task, each_hour, noise_share
 from wlm.errors import WlmError
 from wlm.formats.atomic import atomic_path
+from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.parts import Part
 from wlm.probe.conventions import CANONICAL
 from wlm.system import OnProgress
 
 _MOST = 1 << 20
+_NUMBERS = 27
 _HIDDEN = 0.25  # share of rays that hit back faces above which a probe counts as inside an object and is 0
 
 
@@ -50,11 +53,13 @@ def place_probes(settings: ProbeSettings, geometry: Geometry) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
 
 
-def bake_probes(task: Task, *, device: str = "cpu", progress: OnProgress | None = None) -> BakedProbes:
+def bake_probes(
+    task: Task, *, device: str = "cpu", checkpoint: Checkpoint | None = None, progress: OnProgress | None = None
+) -> BakedProbes:
     """Bakes a scene's probes at each of its hours.
 
     Args:
-        task, device, progress: As for `wlm.bake.bake_lightmaps`.
+        task, device, checkpoint, progress: As for `wlm.bake.bake_lightmaps`.
 
     Raises:
         WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, there are too many probes, or a lamp
@@ -76,9 +81,15 @@ def bake_probes(task: Task, *, device: str = "cpu", progress: OnProgress | None 
         gathered = harmonics(world, position, tracing, report=report)
         return {"values": gathered.mean, "noise": gathered.noise, "back": gathered.back}
 
-    results = each_hour(hours, make, progress)
+    count = len(position)
+    table = {
+        "values": Part(np.float32, (count, _NUMBERS)),
+        "noise": Part(np.float32, (count, _NUMBERS), least=0.0),
+        "back": Part(np.float32, (count,), least=0.0, most=1.0),
+    }
+    results = each_hour(hours, checkpoint, table, make, progress)
     hidden = np.mean([each["back"] for each in results], axis=0) > _HIDDEN
-    shape = (len(hours), len(position), 9, 3)
+    shape = (len(hours), count, 9, 3)
     values = np.stack([np.where(hidden[:, None], 0.0, each["values"]) for each in results]).astype(np.float32)
     noise = np.stack([each["noise"] for each in results])
     return BakedProbes(tuple(hours), position, values.reshape(shape), noise.reshape(shape))

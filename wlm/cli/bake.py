@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from wlm.cli.console import check_output, exclusive, note, quiet_warp, running, show, table
-from wlm.cli.options import Device, Trust, output_option
+from wlm.cli.console import check_output, exclusive, note, note_start, quiet_warp, running, show, table
+from wlm.cli.options import Device, Resume, Trust, output_option
 
 app = typer.Typer(help="Make inputs by path tracing: lightmaps and probes, by Mitsuba (extra `bake`).")
 
@@ -24,19 +24,26 @@ def lightmaps(
     scene: _Scene,
     output: Annotated[Path, output_option("DIR", "Folder to write the set to.")],
     device: Device = "cpu",
+    resume: Resume = False,
     trust: Trust = False,
 ) -> None:
-    """Bake a lightmap for each hour into a set for wlm compress."""
+    """Bake a lightmap for each hour into a set for wlm compress.
+
+    Finished hours are kept in DIR.partial; repeat the command with --resume to continue with the next hour.
+    """
     quiet_warp()
     from wlm.bake.lightmaps import FORMAT, INDEX, bake_lightmaps, write_lightmaps
-    from wlm.bake.work import open_task
+    from wlm.bake.work import open_checkpoint, open_task
     from wlm.formats.folder import claim
 
     claim(output, INDEX, FORMAT)
     task = open_task(scene, trust)
-    with running("bake") as progress:
-        baked = bake_lightmaps(task, device=device, progress=progress)
+    checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
+    note_start(checkpoint, resume, "from the beginning")
+    with running("bake", checkpoint.path, "percent", whole=False) as progress:
+        baked = bake_lightmaps(task, device=device, checkpoint=checkpoint, progress=progress)
         files = write_lightmaps(output, task, baked)
+        checkpoint.remove()
     rows = table(str(output), ["hour", "mean", "largest", "relative noise"])
     for hour, light, error in zip(baked.hours, baked.light, baked.error, strict=True):
         seen = light[baked.mask].astype("float32")
@@ -52,18 +59,25 @@ def probes(
     scene: _Scene,
     output: Annotated[Path, output_option("OUT.npz", "The file to write.")],
     device: Device = "cpu",
+    resume: Resume = False,
     trust: Trust = False,
 ) -> None:
-    """Bake SH probes for each hour into a file for wlm compress."""
+    """Bake SH probes for each hour into a file for wlm compress.
+
+    Finished hours are kept in OUT.npz.partial; repeat the command with --resume to continue with the next hour.
+    """
     check_output(output, ".npz")
     quiet_warp()
     from wlm.bake.probes import bake_probes, write_probes
-    from wlm.bake.work import open_task
+    from wlm.bake.work import open_checkpoint, open_task
 
     task = open_task(scene, trust)
-    with running("bake") as progress:
-        baked = bake_probes(task, device=device, progress=progress)
+    checkpoint = open_checkpoint(output, task, "probes", device, resume=resume)
+    note_start(checkpoint, resume, "from the beginning")
+    with running("bake", checkpoint.path, "percent", whole=False) as progress:
+        baked = bake_probes(task, device=device, checkpoint=checkpoint, progress=progress)
         write_probes(output, baked)
+        checkpoint.remove()
     rows = table(str(output), ["hour", "probes", "lit probes", "mean L00", "relative noise"])
     for hour, values, error in zip(baked.hours, baked.values, baked.error, strict=True):
         lit = values.any(axis=(1, 2))

@@ -24,6 +24,7 @@ from wlm.formats.lock import locked
 from wlm.formats.stderr import captured_stderr
 
 if TYPE_CHECKING:
+    from wlm.formats.checkpoint import Checkpoint
     from wlm.system import OnProgress, Progress
 
 _PLAIN_WIDTH = 10_000  # characters of a line in a file or a pipe, so that no cell of a table wraps
@@ -119,6 +120,12 @@ def note_warnings(warnings: Iterable[str]) -> None:
     """Prints warnings to stderr, a line each."""
     for warning in warnings:
         note(f"warning: {warning}")
+
+
+def note_start(checkpoint: "Checkpoint", resume: bool, start: str) -> None:
+    """Prints a line if `--resume` was given but there is no checkpoint, so that the work begins at `start`."""
+    if resume and not checkpoint.resumed:
+        note(f"{checkpoint.path}: there is nothing to resume; starting {start}")
 
 
 def show_text(text: str) -> None:

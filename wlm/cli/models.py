@@ -37,8 +37,7 @@ def fit(
     console.note_warnings(data.warnings)
     shared = {"seed": seed, "device": device}
     checkpoint = package.open_checkpoint(output, data, checked, resume=resume, every=every, **shared)
-    if resume and not checkpoint.resumed:
-        console.note(f"{checkpoint.path}: there is nothing to resume; starting at step 0")
+    console.note_start(checkpoint, resume, "at step 0")
     start = time.perf_counter()
     with console.running("fit", checkpoint.path) as progress:
         model = package.compress(data, checked, progress=progress, checkpoint=checkpoint, **shared, **options)
