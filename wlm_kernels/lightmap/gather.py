@@ -175,22 +175,10 @@ def update_net(
         mean_loss: float [N], running mean of each tile's loss, updated.
         control: int [1], number of the step; increased by 1.
     """
-    clear = int(partial.device.is_cpu)
+    clear, sums = int(partial.device.is_cpu), (partial, partial_out, loss)
     wp.launch(
         _update_net,
         max(hidden.shape[0], output.shape[0], mean_loss.shape[0]),
-        inputs=[
-            rates,
-            clear,
-            partial,
-            partial_out,
-            loss,
-            adam,
-            adam_out,
-            hidden,
-            output,
-            mean_loss,
-            control,
-        ],
+        inputs=[rates, clear, *sums, adam, adam_out, hidden, output, mean_loss, control],
         device=partial.device,
     )
