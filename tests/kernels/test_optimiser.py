@@ -76,7 +76,7 @@ def test_integer_sums_are_those_of_floats(device: str):
     """A GPU's sums of the maps, in steps of 2^-40, wherever they are updated."""
     random, results = np.random.default_rng(0), []
     values, sums = random.uniform(-0.2, 1.2, 48).astype(np.float32), random.normal(size=48).astype(np.float32)
-    schedule = array(np.array([[1.0, 0.1, 0.1]], np.float32), wp.vec3, device)
+    schedule = array(np.array([[1.0, 10.0, 10.0]], np.float32), wp.vec3, device)
     for scalar, stored in ((float, sums), (wp.int64, np.round(sums * 2.0**40).astype(np.int64))):
         adam, maps, acc = gather.Adam(), array(values, float, device), array(stored[None], scalar, device)
         adam.decay, adam.epsilon = wp.vec2(0.9, 0.99), 1e-8

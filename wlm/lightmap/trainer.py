@@ -293,7 +293,7 @@ class Trainer:
         share = np.linspace(0.0, 1.0, self.steps)
         values = final_rate + (1.0 - final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
         done = np.arange(1, self.steps + 1)
-        corrections = 1.0 - _MOMENTUM**done, np.sqrt(1.0 - self._decay**done)
+        corrections = 1.0 / (1.0 - _MOMENTUM**done), 1.0 / np.sqrt(1.0 - self._decay**done)
         return wp.array(np.stack([values, *corrections], 1).astype(np.float32), dtype=wp.vec3, device=self.device)
 
     def _draw(self, seed: int) -> None:

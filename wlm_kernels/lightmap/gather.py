@@ -40,13 +40,13 @@ class Adam:
 
 @wp.func
 def moved(adam: Adam, i: int, value: float, grad: float, rate: float, corrections: wp.vec2) -> float:
-    """Returns parameter i, now `value`, after Adam's step t, and updates its moments. `corrections` are 1 - decay[0]^t
-    and sqrt(1 - decay[1]^t), since the moments began at 0."""
+    """Returns parameter i, now `value`, after Adam's step t, and updates its moments. `corrections` are
+    1 / (1 - decay[0]^t) and 1 / sqrt(1 - decay[1]^t), since the moments began at 0."""
     first = adam.decay[0] * adam.first[i] + (1.0 - adam.decay[0]) * grad
     second = adam.decay[1] * adam.second[i] + (1.0 - adam.decay[1]) * grad * grad
     adam.first[i] = first
     adam.second[i] = second
-    return value - rate / corrections[0] * first / (wp.sqrt(second) / corrections[1] + adam.epsilon)
+    return value - rate * corrections[0] * first / (wp.sqrt(second) * corrections[1] + adam.epsilon)
 
 
 @wp.kernel
