@@ -68,8 +68,7 @@ class _Table(NamedTuple):
             its bits.
         low, step: Their codes, of the same shape.
         rest: Sum of squared errors that no number of bits removes.
-        rounding: float64 [C], sum of the squared errors that rounded directions leave in each dimension that they do not
-            span.
+        rounding: float64 [C], sum of the squared errors by rounded directions in each dimension that these do not span.
     """
 
     clusters: _Clusters
