@@ -125,7 +125,8 @@ def blown_up(key: int, shape: tuple[int, int, int]) -> WlmError:
     indices = tuple(int(a) for a in np.unravel_index(cell, shape))
     return WlmError(
         f"lattice: blew up in step {step} at cell {indices}: {cause}; expected speeds below {MAX_SPEED} and a"
-        f" viscosity at which the flow is stable: use a shorter step, a larger viscosity or smagorinsky=0.17"
+        f" viscosity at which the flow is stable: use a shorter step, such as by a larger air.speed, a larger"
+        " viscosity or smagorinsky=0.17"
     )
 
 
@@ -137,8 +138,8 @@ class Lattice:
 
     Args:
         shape: Cells along x, y and z.
-        viscosity: Kinematic viscosity in square cells per step; above 0.
-        smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the flow is stable at viscosity 1e-6.
+        viscosity: Kinematic viscosity in square cells per step.
+        smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the flow is stable at viscosity 0.
         storage: "float32" or "float16", which halves memory and traffic. With float16 the velocities of a jet differ
             by less than 0.2% of its speed (RMS, before the chaotic flows diverge), and the total mass drifts by about
             3e-5 in 5,000 steps.
@@ -169,9 +170,9 @@ class Lattice:
         ramp: int = 0,
     ) -> None:
         self.shape = _checked_shape(shape, lattice)
-        for name, value, least in (("viscosity", viscosity, 1e-12), ("smagorinsky", smagorinsky, 0.0)):
-            if not (math.isfinite(value) and value >= least):
-                raise ValueError(f"{name}: expected a number of at least {least:g}, got {value}")
+        for name, value in (("viscosity", viscosity), ("smagorinsky", smagorinsky)):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}: expected a number of at least 0, got {value}")
         if ramp < 0:
             raise ValueError(f"ramp: expected at least 0 steps, got {ramp}")
         self.device = wp.get_device(device)
@@ -411,8 +412,9 @@ class Lattice:
             "steps": np.array(self.steps, np.int64),
         }
 
-    def load(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continues from the state of a lattice with the same settings, faces and force.
+    def load(self, state: Mapping[str, np.ndarray], factor: float = 1.0) -> None:
+        """Continues from the state of a lattice with the same settings, faces and force, and a step that is `factor`
+        times as long, to which the settings of this lattice are converted.
 
         The following steps are the same as without the interruption: bit for bit on a CPU; on a GPU except for
         rounding, since outlets sum in any order.
@@ -432,7 +434,7 @@ class Lattice:
             state = check_parts(state, table)
         except ValueError as error:
             raise WlmError(f"lattice state: {error}") from error
-        self._prepare()
+        self._convert_settings(factor)
         self._velocity.assign(state["bodies"])
         self._begun, self._done, self._graph = True, int(state["steps"]), None
         self._clock.fill_(self._done)
@@ -443,6 +445,43 @@ class Lattice:
         now.assign(state["populations"])
         spare.zero_()
         self._find_links()
+
+    def change_step(self, factor: float) -> None:
+        """Changes the duration of a step by a factor, between two steps, with all settings and the state.
+
+        Velocity, pressure and viscous stress stay the same in SI units, up to rounding. The force and the velocity of
+        bodies are converted with the state; a caller that sets them must set converted ones from then on.
+
+        Args:
+            factor: New duration over old one; `steps` divided by it must be a whole number.
+
+        Raises:
+            ValueError: The factor is not above 0, or there is no whole number of steps.
+            WlmError: An inlet, a wall or a body becomes faster than `MAX_SPEED`.
+        """
+        done = round(self.steps / factor) if math.isfinite(factor) and factor > 0.0 else -1
+        if done < 0 or not math.isclose(done * factor, self.steps):
+            raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
+        self._prepare()
+        now, spare = self._buffers
+        where = [self._tables, self._n, self._bounded, self._walled]
+        inputs = [*where, now, self._solid, self._forces, self._tau, self._eddy, factor]
+        self._launch(self._fluid_kernels.convert, self._cells, inputs, [spare])
+        self._done, self._graph = done, None
+        self._clock.fill_(done)
+        if self._buffers[0] is now:
+            self._f.reverse()
+        self._velocity.assign(factor * self._velocity.numpy())
+        self._convert_settings(factor)
+
+    def _convert_settings(self, factor: float) -> None:
+        self._tau, self._rise = 0.5 + factor * (self._tau - 0.5), self._rise * factor
+        for name, face in self._faces.items():
+            fastest = factor * float(np.linalg.norm(face.velocity, axis=-1).max())
+            _check_speed(fastest, f"face {name!r}")
+            self._faces[name] = replace(face, velocity=factor * face.velocity, excess=factor**2 * face.excess)
+        self._links = None if factor != 1.0 else self._links
+        self._prepare()
 
     def setup(self) -> Setup:
         """Returns the settings with copies of the links, solids and force, which no later change affects."""

@@ -21,9 +21,11 @@ from wlm_kernels.fluid.lattice_sets import (
     equilibrium,
     index_of,
     memory_functions,
+    opposite,
     owned,
     wrapped,
 )
+from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
 wp.set_module_options({"enable_backward": False})
 
@@ -103,13 +105,15 @@ def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position, scale: float) -> No
 class FluidKernels:
     """Kernels for one lattice and storage type, with one thread per cell: `fields` computes the density minus 1 and the
     velocity, `start` sets the equilibrium of given ones; for each cell that becomes fluid, `neighbours` computes the
-    means of the fluid around it, and `uncover` sets the equilibrium of these.
+    means of the fluid around it, and `uncover` sets the equilibrium of these; `convert` converts all cells to another
+    time step.
     """
 
     fields: wp.Kernel
     start: wp.Kernel
     neighbours: wp.Kernel
     uncover: wp.Kernel
+    convert: wp.Kernel
 
 
 @functools.cache
@@ -118,6 +122,7 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
     memory = memory_functions(lattice_name, storage, walls)
     gather, moments, load, store = memory.gather, memory.moments, memory.load, memory.store
     stored = STORAGES[storage][0]
+    flat = velocity_set(lattice_name).axes == 2
     options = {"enable_backward": False, "max_unroll": 32}
 
     @wp.kernel(module="unique", module_options=options)
@@ -223,4 +228,62 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
             if not owned(n, bounded, walled, p - t.c[q]):
                 store(f, q, index_of(n, wrapped(n, p - t.c[q])), value)
 
-    return FluidKernels(fields, start, neighbours, uncover)
+    @wp.kernel(module="unique", module_options=options)
+    def convert(
+        # in:
+        t: Tables,
+        n: wp.vec3i,
+        bounded: wp.vec3i,
+        walled: wp.vec3i,
+        f: wp.array2d[stored],
+        solid: wp.array1d[wp.uint8],
+        forces: wp.array1d[wp.vec3],
+        tau: float,
+        eddy: float,
+        factor: float,
+        # out:
+        out: wp.array2d[stored],
+    ):
+        i = wp.tid()
+        if solid.shape[0] > 0:
+            if solid[i] != wp.uint8(0):
+                return
+        p = cell_of(n, i)
+        g = gather(f, n, p)
+        drho, j, diagonal, off = moments(g)
+        u = j / (1.0 + drho)
+        third = drho / 3.0
+        diagonal -= wp.cw_mul(j, u) + wp.vec3(third, third, third)
+        if wp.static(flat):
+            diagonal = wp.vec3(diagonal[0], diagonal[1], 0.0)
+        off -= wp.vec3(j[0] * u[1], j[0] * u[2], j[1] * u[2])
+        norm2 = wp.dot(diagonal, diagonal) + 2.0 * wp.dot(off, off)
+        tau_eddy = 0.5 * (tau + wp.sqrt(tau * tau + eddy * wp.sqrt(norm2) / (1.0 + drho)))
+        push = wp.vec3()
+        if forces.shape[0] > 0:
+            push = forces[i]
+        # The speed scales with the step, the pressure with its square, the stress with the strain and the viscosity.
+        after = factor * factor * drho
+        j = factor * (1.0 + after) / (1.0 + drho) * (j + 0.5 * push) - 0.5 * factor * factor * push
+        u = j / (1.0 + after)
+        ratio = factor * (0.5 + factor * (tau_eddy - 0.5)) / tau_eddy
+        diagonal = wp.cw_mul(j, u) + ratio * diagonal
+        off = wp.vec3(j[0] * u[1], j[0] * u[2], j[1] * u[2]) + ratio * off
+        for q in range(t.w.shape[0]):
+            c = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
+            stress = 4.5 * wp.dot(diagonal, wp.cw_mul(c, c)) - 1.5 * (diagonal[0] + diagonal[1] + diagonal[2])
+            stress += 9.0 * (off[0] * c[0] * c[1] + off[1] * c[0] * c[2] + off[2] * c[1] * c[2])
+            value = t.w[q] * (after + 3.0 * wp.dot(c, j) + stress)
+            source = p - t.c[q]
+            if crosses(n, walled, source):
+                store(out, opposite(q), i, value)
+            else:
+                k = index_of(n, wrapped(n, source))
+                store(out, q, k, value)
+                if solid.shape[0] > 0 and not crosses(n, bounded, source):
+                    if solid[k] != wp.uint8(0):
+                        # The population that left towards the body, from which a wall's velocity sends it back.
+                        wall = load(f, q, k) - load(f, opposite(q), i)
+                        store(out, opposite(q), i, value - factor * wall)
+
+    return FluidKernels(fields, start, neighbours, uncover, convert)
