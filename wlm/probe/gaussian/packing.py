@@ -47,6 +47,7 @@ _NEAR = 0.85  # the search ends at this share of the allowed growth of the error
 _TRIES = 8
 _FINEST = 1 / 64  # of the natural steps, where no tried step is fine enough
 _AGAIN, _LESS = 3, 0.7  # attempts, and the factor of the allowed growth if probes that were left out lost more
+_ROWS = 64  # rows of a matrix that are rounded before the rows behind them change
 _OF_LATENTS, _OF_LAYERS = 1e-4, 1e-5  # ridge of the least squares, as a share of the mean square
 
 
@@ -264,12 +265,18 @@ def _feed(square: torch.Tensor, share: float) -> np.ndarray:
 
 def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
     """Divides numbers [I, O] by steps and rounds them to -most to most, row by row; later rows make up for errors."""
+    if feed is None:
+        return np.clip(np.rint(numbers / step), -most, most)
     numbers, whole = numbers.copy(), np.empty_like(numbers)
-    for row in range(len(numbers)):
-        whole[row] = np.clip(np.rint(numbers[row] / step[row]), -most, most)
-        if feed is not None:
-            over = (numbers[row] - whole[row] * step[row]) / feed[row, row]
-            numbers[row + 1 :] -= np.outer(feed[row, row + 1 :], over)
+    for start in range(0, len(numbers), _ROWS):
+        # Rows behind these make up for all of them at once.
+        part = slice(start, start + _ROWS)
+        own, over = numbers[part], np.empty_like(numbers[part])
+        for row, (left, size, factor) in enumerate(zip(own, step[part], feed[part, part], strict=True)):
+            whole[start + row] = np.rint(left / size).clip(-most, most)
+            over[row] = (left - whole[start + row] * size) / factor[row]
+            own[row + 1 :] -= factor[row + 1 :, None] * over[row]
+        numbers[start + _ROWS :] -= feed[part, start + _ROWS :].T @ over
     return whole
 
 

@@ -453,7 +453,7 @@ def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
     Returns:
         float64 [N], positive: the standard deviation over each probe and its eight nearest, plus a small floor.
     """
-    near = cKDTree(x).query(x, k=min(_NEIGHBOURS, len(x)))[1].reshape(len(x), -1)
+    near = cKDTree(x).query(x, k=min(_NEIGHBOURS, len(x)), workers=-1)[1].reshape(len(x), -1)
     # In pieces: all neighbours' numbers at once would be nine times the set.
     pieces = (near[start : start + _PIECE] for start in range(0, len(near), _PIECE))
     spread = np.concatenate([np.sqrt(values[piece].astype(np.float64).var(1).sum(1)) for piece in pieces])
@@ -493,7 +493,7 @@ def first_gaussians(
 
 def _kmeans(x: np.ndarray, centre: np.ndarray, rounds: int) -> np.ndarray:
     for _ in range(rounds):
-        label = cKDTree(centre).query(x)[1]
+        label = cKDTree(centre).query(x, workers=-1)[1]
         size = np.bincount(label, minlength=len(centre))
         total = np.stack([np.bincount(label, x[:, axis], len(centre)) for axis in range(3)], 1)
         # A centre that is nearest to no probe keeps its position.
