@@ -57,6 +57,8 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
     ),
     "probes_path": _option(_Path, "--probes", help="Light probe file. Default: that of the demo.", metavar="FILE"),
     "keys": _option(_Names, "--key", help="Name of an array in the file of --probes to measure. Repeatable."),
+    "speed": _option(bool, "--speed", False, help="Measure only the speed of a fit, a decode and a volume."),
+    "many": _option(int | None, "--many", help="Measure --speed on so many random probes.", metavar="N", min=1),
     "table": _option(bool, "--table", False, help="Measure only our methods and rivals at equal bytes."),
     "nearest": _option(
         list[int] | None,
@@ -117,7 +119,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "probe": (
         "Measure light probes: PSNR, size and decode time of profiles, decoders and rivals.",
-        ("volume_only", "table", "only", "nearest", "quick", "device", "probes_path", "keys"),
+        ("volume_only", "speed", "many", "table", "only", "nearest", "quick", "device", "probes_path", "keys"),
     ),
     "atlas": (
         "Measure lightmaps of meshes: PSNR, SSIM, size and decode time of profiles and their rivals.",
@@ -153,7 +155,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
 }
 # Options with which a run replaces only the rows that it measures in a result file.
-_PARTIAL = ("profiles", "rival_names", "only", "volume_only", "table")
+_PARTIAL = ("profiles", "rival_names", "only", "volume_only", "speed", "table")
 
 
 def _add_command(name: str, summary: str, options: tuple[str, ...]) -> None:

@@ -117,6 +117,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "torch_forward_ms": Figure("torch forward", "ms", ".3g"),
         "torch_backward_ms": Figure("torch backward", "ms", ".3g"),
         "times_ours": Figure("times ours", form=".3g"),
+        "point_rate": Figure("points", "G/s", ".2f"),
         "bandwidth": Figure("bandwidth", "GB/s", ".4g"),
         "mlups": Figure("MLUPS"),  # million lattice cells a second
         "voxel_rate": Figure("voxels", "M/s"),
@@ -155,6 +156,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "update_ms": Figure("update", "ms", ".3g"),
         "update_decode_ms": Figure("of it decode", "ms", ".3g"),
         "blocks": Figure("blocks", form=".3g"),
+        "blocks_waiting": Figure("waiting", form=".3g"),
         "probes_decoded": Figure("probes decoded", form=".3g"),
         "memory": Figure("memory", "MiB", ".1f"),
         "memory_before": Figure("of it before the file is opened", "MiB", ".1f"),

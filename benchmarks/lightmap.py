@@ -38,6 +38,7 @@ from benchmarks.lightmap_exact import bound64, colour_tile64, decode_tile64
 from benchmarks.plot import Panel
 from benchmarks.rivals.lightmap import RIVALS, check_rival, encode_set, usual
 from benchmarks.rivals.lightmap_torch import PlainFit
+from benchmarks.rivals.whole_map import WholeMap
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data, expect_alone
 from wlm.errors import WlmError
@@ -52,7 +53,6 @@ from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.runtime import (
     ExactDecoder,
     FrameDecoder,
-    MapDecoder,
     MatrixDecoder,
     RuntimeDecoder,
     fast_decoder,
@@ -284,7 +284,7 @@ class _LightmapBench(Bench):
     def texture_row(self, fit: Fit) -> tuple[Row, Callable[[], object]]:
         """Returns the row of the RGB9E5 texture that a renderer samples, and a call that decodes the texture."""
         self.note(f"{fit.option}: measuring the texture")
-        decoder = MapDecoder(fit.model.light, self.device)
+        decoder = WholeMap(fit.model.light, self.device)
 
         def frame(t: float) -> np.ndarray:
             decoder.set_time(t)

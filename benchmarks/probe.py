@@ -19,7 +19,8 @@ The results table of each set of probes has these rows, by method:
 - "views", the first profile: pictures of balls at the probes, compared after tone mapping, see `wlm.probe.views`.
 
 The largest error of a model is measured against a float64 decode of the same model. A decode on CUDA is timed as the
-replay of a CUDA graph, so that gaps between launches do not count. `benchmarks.probe_table` has the rows of `--table`.
+replay of a CUDA graph, so that gaps between launches do not count. `benchmarks.probe_table` has the rows of `--table`,
+`benchmarks.probe_speed` those of `--speed`.
 """
 
 import os
@@ -31,6 +32,7 @@ import warp as wp
 
 from benchmarks.plot import Panel
 from benchmarks.probe_exact import decode64
+from benchmarks.probe_speed import many_probes, speed_rows
 from benchmarks.probe_table import RIVALS, nearest_probes, table_rows
 from benchmarks.rivals.probe_torch import DenseFit
 from benchmarks.rows import Row
@@ -71,6 +73,8 @@ def run(
     probes_path: str | os.PathLike[str] | None = None,
     keys: Sequence[str] | None = None,
     volume_only: bool = False,
+    speed: bool = False,
+    many: int | None = None,
     table: bool = False,
     only: Sequence[str] | None = None,
     nearest: Sequence[int] | None = None,
@@ -86,11 +90,13 @@ def run(
         probes_path: A file that `wlm.probe.load` can read; None: the checkout's `demos/data/probes/street.npz`.
         keys: Names of arrays in the file, each one a set of probes; None: the only array, or the demo's noon and night.
         volume_only: Whether to measure only the volume, filled from the original probes and from principal components.
+        speed: Whether to measure only the speed of the first profile, see `benchmarks.probe_speed`.
+        many: The speed of a set of so many random probes, in place of those of the file; None: of the file's.
         table: Whether to measure only our methods and their rivals at equal bytes, see `benchmarks.probe_table`.
         only: Names of methods of the table; None: all. Rivals take minutes on the CPU and need no GPU.
         nearest: The table of only so many live probes around the middle of the set; None: of all probes.
         progress: Called with a line before each part of the work.
-        done: Called with all rows so far after each size of the table.
+        done: Called with all rows so far after each row of `speed` and each size of the table.
 
     Returns:
         The rows of each set, in the order in which the module's docstring lists them.
@@ -99,18 +105,27 @@ def run(
         WlmError: The file, a key or the device does not exist, options contradict each other, or a fit diverged.
     """
     if volume_only:
-        expect_alone("--volume-only", {"--quick": quick, "--table": table})
+        expect_alone("--volume-only", {"--quick": quick, "--table": table, "--speed": speed})
     if not table and (only or nearest):
         raise WlmError("--only, --nearest: expected --table beside them")
-    if probes_path is None:
+    if many:
+        expect_alone("--many", {"--table": table, "--probes": probes_path, "--key": keys})
+        if not speed:
+            raise WlmError("--many: expected --speed beside it")
+    if speed:
+        expect_alone("--speed", {"--table": table})
+    if probes_path is None and not many:
         probes_path, keys = demo_data("probes/street.npz", "--probes FILE"), keys or _DEMO_KEYS[: 1 if quick else None]
-    sets = [load(probes_path, key=key) for key in keys or (None,)]
+    sets = [many_probes(many)] if many else [load(probes_path, key=key) for key in keys or (None,)]
     if volume_only:
         return [row for probes in sets for row in ProbeBench(probes, device, progress).volume()]
     profiles = [Profile.load(name) for name in PROFILES]
     if quick:
         steps = max(200, _QUICK_PROBE_STEPS // max(int(probes.live.sum()) for probes in sets))
         profiles = [profile.model_copy(update={"steps": min(steps, profile.steps)}) for profile in profiles]
+    if speed:
+        frames = _QUICK_FRAMES if quick else None
+        return speed_rows(sets, profiles[0], device=device, frames=frames, progress=progress, done=done)
     if table:
         sets = [nearest_probes(probes, count) if count else probes for probes in sets for count in nearest or (None,)]
         shares = (5,) if quick else None

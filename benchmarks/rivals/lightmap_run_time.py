@@ -13,11 +13,11 @@ import warp as wp
 
 from benchmarks.rivals.lightmap import RIVALS
 from benchmarks.rivals.rival import need_bc
+from benchmarks.rivals.whole_map import WholeMap
 from wlm import interop
 from wlm.formats.shared_exponent import unpack_rgb9e5
 from wlm.lightmap.data import SheetFrames
 from wlm.lightmap.model import LightmapModel
-from wlm.lightmap.runtime import MapDecoder
 from wlm.lightmap.tiles import TILE
 from wlm.texels import nearest_valid
 from wlm.workers import cores
@@ -56,10 +56,10 @@ class EveryFrame:
     _buffers = 1
 
     def __init__(self, model: LightmapModel, device: str) -> None:
-        """Uploads all tiles and allocates the textures; for errors see `MapDecoder`."""
+        """Uploads all tiles and allocates the textures."""
         self._device = interop.check_device(device)
         with interop.stream(self._device):
-            self._decoders = [MapDecoder(own, self._device) for own in model.sheets.values()]
+            self._decoders = [WholeMap(own, self._device) for own in model.sheets.values()]
         self._times, self._mask = model.times, model.light.mask
         texels = sum(level.size for decoder in self._decoders for level in decoder.levels)
         self.memory = {"tiles": model.memory_bytes, "texture": self._buffers * 4 * texels}

@@ -43,6 +43,11 @@ COMMANDS = [
         "probe --table --only ours --nearest 8 --nearest 40 --device cpu",
         {"table": True, "only": ["ours"], "nearest": [8, 40]},
     ),
+    (
+        ["probe", "--speed", "--many", "900"],
+        "probe --speed --many 900 --device cpu",
+        {"speed": True, "many": 900, "probes_path": None},
+    ),
     (["probe", "--volume-only"], "probe --volume-only --device cpu", {"volume_only": True}),
     (
         ["atlas", "--quick", "--meshes", "a/Cube", "--profile", "astc"],

@@ -5,6 +5,7 @@ import pytest
 from builders.bench_rows import check_outputs, keys
 
 from benchmarks.probe import PANELS, run_rows
+from benchmarks.probe_speed import many_probes, speed_rows
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
 from wlm.probe.views import KINDS
@@ -76,3 +77,17 @@ def test_components_and_held_out_probes(rows):
             assert row["psnr"] > 35.0 and row["bytes"] < 27 * 2 * PROBES[row.scene]
         if row.method == "held out" and row.scene == "room":  # the other has too few to be told well
             assert row["nearest_psnr"] < row["distance_psnr"] and row["half_way_psnr"] > 10.0
+
+
+def test_speed_of_a_set_in_one_region_and_in_several(sets):
+    counts, several = [], PROFILES[0].model_copy(update={"region": 100, "ratio": 0.2})
+    speed = speed_rows(
+        [sets[0], many_probes(250)], several, device="cpu", frames=5, done=lambda rows: counts.append(len(rows))
+    )
+    options = ("fit", "decode", "volume, lossless", "volume, ours")
+    assert counts == list(range(1, 9)) and keys(speed) == [("speed", option) for option in options] * 2
+    for row, probes in ((speed[0], 270), (speed[4], 250)):
+        assert row["probes"] == probes and row["psnr"] > 10.0 and row["gaussians"] <= 0.2 * probes
+        assert row.notes == "profile standard, regions: 4"
+    assert all(row["update_ms"] <= row["update_ms_max"] and row["frames"] == 5 for row in speed if "vol" in row.option)
+    assert np.array_equal(many_probes(250).values, many_probes(250).values)

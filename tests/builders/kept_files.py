@@ -107,7 +107,7 @@ def _opened(path: Path, system: str) -> Checkpoint:
 def _lightmap_running() -> Kept:
     _, trainer = lightmap_fit()
     content = _written(lambda path: Checkpoint(path, "lightmap", {}, "0f").save({0: trainer.state()}))
-    ranges = {"control": (0, 21), "adam_net.0.exp_avg_sq": (0, -1.0), "adam_maps.0.step": ((), 9.0)}
+    ranges = {"control": (0, 21), "adam_hidden.exp_avg_sq": (0, -1.0)}
     return Kept(
         content,
         lambda path: _opened(path, "lightmap").restore(0, trainer.load),

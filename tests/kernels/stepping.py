@@ -90,10 +90,9 @@ def trainer(case: Case, device: str, seed: int = 3, spread: bool = True) -> Trai
         for key, values in _clear_values(result).items():
             result.views[key].copy_(torch.from_numpy(values))
         random = np.random.default_rng(8)
-        with torch.no_grad():
-            for values in (result.hidden, result.output):
-                noise = random.uniform(-0.3, 0.3, tuple(values.shape)).astype(np.float32)
-                values += torch.from_numpy(noise).to(values.device)
+        for values in (result.hidden, result.output):
+            noise = random.uniform(-0.3, 0.3, tuple(values.shape)).astype(np.float32)
+            values += torch.from_numpy(noise).to(values.device)
     return result
 
 
@@ -138,12 +137,10 @@ def draw(trainer: Trainer, quantised: bool) -> tuple[np.ndarray, np.ndarray]:
 
 def drawn_noise(trainer: Trainer, quantised: bool) -> np.ndarray:
     """The noise of the coming step, centred as the features are: the features where all maps are 1/2."""
-    maps = trainer.maps.detach().clone()
-    with torch.no_grad():
-        trainer.maps.fill_(0.5)
+    maps = trainer.maps.clone()
+    trainer.maps.fill_(0.5)
     noise = draw(trainer, False)[1]
-    with torch.no_grad():
-        trainer.maps.copy_(maps)
+    trainer.maps.copy_(maps)
     noise[..., 12:] = 0.0  # the encoded time, which has none
     return np.zeros_like(noise) if quantised else noise
 
@@ -157,17 +154,20 @@ class Step:
 
 
 def fused_step(trainer: Trainer, quantised: bool) -> Step:
-    """Does one step; the parameters move only after their gradients are computed."""
+    """Does one step; its gradients are the sums that its second half takes."""
     before = trainer.losses().astype(np.float64)
     with interop.stream(trainer.device):
-        trainer._step(quantised, True)
+        trainer._add_gradients(quantised)
+        flat, hidden, output = (
+            values.sum(0).cpu().numpy() for values in (trainer._acc, trainer._partial, trainer._partial_out)
+        )
+        trainer._update(True)
+    flat = flat if trainer.device == "cpu" else (flat * 2.0**-40).astype(np.float32)
     grads, at = {}, 0
-    flat = trainer.maps_grad.cpu().numpy()
     for key, view in trainer.views.items():
         grads[key] = flat[at : at + view.numel()].reshape(tuple(view.shape)).copy()
         at += view.numel()
-    grads["hidden"] = trainer.hidden.grad.cpu().numpy().copy()
-    grads["output"] = trainer.output.grad.cpu().numpy().copy()
+    grads |= {"hidden": hidden, "output": output}
     # A running mean that takes a fiftieth of each step.
     return Step((trainer.losses() - before) * 50.0 + before, grads)
 

@@ -123,7 +123,7 @@ COMPONENTS = [
     {"code": lambda part: part[:-1]},
     {"width": put((0, 0), 0)},
     {"code": put((0, 3), 1024)},
-    {"width": put((0, 2), 11)},
+    {"width": put((0, 2), 17)},
     {"clusters": 2},
     {"bounds": put((1, 0, 2), -1.0)},
     {"bounds": put((0, 0, 0), 100.0)},

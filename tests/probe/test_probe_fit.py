@@ -276,6 +276,13 @@ def test_the_absolute_error_counts_bright_probes(clustered):
     assert 0.03 < found(model.decoder().decode_probes() - lit(values) + values) < 0.0501
 
 
+@pytest.mark.parametrize("live", (9, 40, 300))
+def test_more_bytes_have_less_error(live, clustered):
+    values = clustered[:live]
+    errors = [fit_components(values, share * values.nbytes // 8, enough=0.0)[1] for share in (2, 4, 8)]
+    assert errors[0] > errors[1] >= errors[2] and errors[2] < 1e-4
+
+
 def test_packed_codes_are_bits(clustered):
     components = fit_components(clustered, 14 * len(clustered))[0]
     assert np.ptp(components.bits) > 0, "clusters differ in their bits"

@@ -1,17 +1,16 @@
 """`wlm smoke train` and `export-onnx`, and `wlm evaluate` and `info` for networks."""
 
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
 from wlm.cli import console
 from wlm.cli.options import AsJson, CheckpointEvery, Device, ModelFile, ReportFile, Resume, Seed, output_option
 from wlm.cli.settings import Generated, with_settings
 
 if TYPE_CHECKING:
-    from wlm.smoke.evaluation import Comparison
     from wlm.smoke.model import SmokeModel
 
 
@@ -98,9 +97,6 @@ def export_onnx(
 
 def evaluate(
     network: ModelFile,
-    smoke: Annotated[
-        list[Path] | None, typer.Argument(metavar="SMOKE...", help="Volumes (.npz, .nvdb, .vdb) to score as well.")
-    ] = None,
     resolution: Annotated[int, typer.Option(min=8, max=4096, help="Edge of the test images in pixels.")] = 512,
     cells: Annotated[
         int | None,
@@ -109,28 +105,40 @@ def evaluate(
     json_path: ReportFile = None,
     device: Device = "cpu",
 ) -> None:
-    """Measure a network on smoke that it was not trained on.
+    """Measure a network on simulated smoke that it was not trained on.
 
-    The test smoke is simulated and scored at half, full and twice its density. PSNR compares lightmaps in sRGB. Flicker
-    is the change between frames that motion does not explain, relative to the reference's flicker.
+    PSNR compares lightmaps in sRGB. Flicker is the change between frames that motion does not explain, relative to the
+    reference's flicker.
     """
     if json_path is not None:
         console.check_output(json_path, ".json")
     console.quiet_warp()
     from wlm.interop import check_device
     from wlm.smoke.codec import open_network
-    from wlm.smoke.evaluation import compare
+    from wlm.smoke.evaluation import evaluate
+    from wlm.smoke.network.planes import PLANES
 
     device = check_device(device)
     model = open_network(network)
     sizes = {"resolution": resolution, "cells": model.dataset.cells if cells is None else cells}
-    settings = model.dataset.model_copy(update=sizes)
+    # Almost empty frames are not scored.
+    settings = model.dataset.model_copy(update=sizes | {"kept_empty": 0.0})
     with console.running("evaluate") as progress:
-        comparisons = compare(model, settings, smoke or (), device=device, progress=progress)
+        report = evaluate(model, settings, device=device, progress=progress)
     if json_path is not None:
         content = {"network": _facts(network, model), "device": device, **sizes}
-        console.write_json(json_path, content | {"sets": [comparison.to_json() for comparison in comparisons]})
-    _show_comparisons(network, comparisons)
+        console.write_json(json_path, content | report.to_json())
+    facts: dict[str, Any] = {
+        "images": 2 * report.samples,
+        "PSNR, dB": report.psnr,
+        "lowest, dB": report.lowest,
+        "highest, dB": report.highest,
+        "flicker relative to the reference": report.flicker_ratio,
+    }
+    if not isnan(report.guide_psnr):
+        facts["PSNR of its guide, the coarse march, dB"] = report.guide_psnr
+    planes = zip(PLANES, report.planes, strict=True)
+    console.show_facts(str(network), facts | {f"PSNR of {name}, dB": value for name, value in planes})
 
 
 def info(file: ModelFile, as_json: AsJson = False) -> None:
@@ -154,26 +162,3 @@ def _facts(path: Path, model: "SmokeModel") -> dict[str, Any]:
     training = {name: model.summary[name] for name in names if name in model.summary}
     settings = model.settings.model_dump(mode="json")
     return {"name": path.stem, **settings, "parameters": parameter_count(model.network), **training}
-
-
-def _show_comparisons(path: Path, comparisons: "list[Comparison]") -> None:
-    from wlm.smoke.network.planes import PLANES
-
-    scores = console.table(
-        str(path), ["smoke", "method", "PSNR, dB", "lowest, dB", "highest, dB", "relative flicker"], text=["method"]
-    )
-    planes = console.table(f"{path}: PSNR of each plane, dB", ["smoke", "method", *PLANES], text=["method"])
-    for comparison in comparisons:
-        smoke = escape(comparison.name)
-        for name, score in comparison.methods.items():
-            decibels = (console.number(value, ".2f") for value in (score.psnr, score.lowest, score.highest))
-            scores.add_row(smoke, name, *decibels, console.number(score.flicker_ratio, ".3f"))
-            planes.add_row(smoke, name, *(console.number(value, ".2f") for value in score.planes))
-            smoke = ""
-        scores.add_section()
-        planes.add_section()
-    console.show(scores)
-    console.show(planes)
-    for comparison in comparisons:
-        if comparison.half_loss is not None:
-            console.note(f"{comparison.name}: half floats lose {comparison.half_loss:.3f} dB")

@@ -372,7 +372,7 @@ class LightmapModel(Model):
         return layer_sheets(self.name, self.sheets, name, atlas)
 
     def maps(self, sheet: Sheet | None = None) -> dict[str, SheetModel]:
-        """Returns a sheet in all light groups that have it, by group, for `wlm.lightmap.runtime.MapDecoder`.
+        """Returns a sheet in all light groups that have it, by group.
 
         Args:
             sheet: The sheet of any of the groups; None: the first sheet of radiance.

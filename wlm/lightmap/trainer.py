@@ -19,35 +19,16 @@ from wlm.lightmap.tiles import TILE, TileCut
 from wlm.workers import each
 from wlm_kernels.lightmap import blocks, features, gather, levels
 from wlm_kernels.lightmap import step as lightmap_step
-from wlm_kernels.lightmap.gather import gather_maps, gather_net, update_maps, update_net
 
-# The parts of a state: attributes of a trainer, and of each parameter of torch's Adam.
+# The parts of a state, besides Adam's moments: attributes of a trainer.
 _STATE = ("maps", "hidden", "output", "loss", "control")
-_ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
 
 _MOMENTUM = 0.9  # Adam's decay of gradients
 _ADAM_EPSILON = 1e-8  # the loss is a mean over the samples and channels of a tile
-_VECTOR = 16  # numbers in the widest vector of a CPU that torch uses (AVX-512)
 _CHUNK = {"cpu": 5, "cuda": 50}  # steps between two looks at the clock
 
 CPU_LANES = 2
 """Number of CPU threads, which sum gradients separately; fixed, so that results do not depend on the cores."""
-
-
-def _padded(count: int) -> int:
-    # Torch's fused Adam handles the remainder after whole vectors in a separate loop, which rounds differently on some
-    # CPUs: without a remainder, a tile is the same in any batch.
-    return -(-count // _VECTOR) * _VECTOR
-
-
-def _parameter(shape: tuple[int, ...], device: str) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns a flat, padded tensor of zeros for the optimiser, and a view of it with `shape`; both have gradients."""
-    count = math.prod(shape)
-    stored = torch.zeros(_padded(count), device=device).requires_grad_()
-    stored.grad = torch.zeros_like(stored)
-    view = stored.detach()[:count].view(shape).requires_grad_()
-    view.grad = stored.grad[:count].view(shape)
-    return stored, view
 
 
 class Targets:
@@ -152,7 +133,7 @@ class Trainer:
         tiles: N, the number of tiles.
         inputs: Number of inputs of the network.
         views: The maps by name, as `wlm_kernels.lightmap.features.Maps` has them: views of `maps`.
-        maps, maps_grad: float32 [M], all M parameters of the maps, padded, and their gradients.
+        maps: float32 [M], all M parameters of the maps.
         hidden, output: The networks, see `wlm_kernels.mlp`.
         loss: float32 [N], running mean of each tile's loss over about 50 steps.
         control: int32 [1], number of steps done.
@@ -211,14 +192,13 @@ class Trainer:
         """Allocates maps of these shapes, networks of a hidden width, and all arrays that a training step writes."""
         device, n = self.device, self.tiles
         lengths = {key: math.prod(shape) for key, shape in shapes.items()}
-        total = _padded(sum(lengths.values()))
+        total = sum(lengths.values())
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(shape, dtype=dtype, device=device)
 
-        self.maps, self.maps_grad = zeros(total), zeros(total)
-        stored_hidden, self.hidden = _parameter((n, self.inputs + hidden + 2, hidden), device)
-        stored_output, self.output = _parameter((n, hidden + 1, 3), device)
+        self.maps = zeros(total)
+        self.hidden, self.output = zeros(n, self.inputs + hidden + 2, hidden), zeros(n, hidden + 1, 3)
         self.views, at = {}, 0
         self._offsets = features.Offsets()
         for key, shape in shapes.items():
@@ -231,8 +211,8 @@ class Trainer:
             setattr(maps, key, interop.to_warp(view, types.get(key, wp.float32)))
         self._maps = maps
 
-        lanes = 1 if self._cuda else CPU_LANES
-        parts = self._samples // lightmap_step.BLOCK if self._cuda else CPU_LANES
+        self._lanes = lanes = 1 if self._cuda else CPU_LANES
+        parts = self._samples // lightmap_step.BLOCK if self._cuda else lanes
         self._acc = zeros(lanes, total, dtype=torch.int64 if self._cuda else torch.float32)
         self._partial = zeros(parts, *self.hidden.shape)
         self._partial_out = zeros(parts, *self.output.shape)
@@ -240,21 +220,11 @@ class Trainer:
         self.loss = zeros(n)
         self.control = zeros(1, dtype=torch.int32)
         self._tracked = zeros(lanes if self._track else 0, n, len(self.axis.times), 2)
-        rates = zeros(4)
-        self._rates = rates[:2]
-        wrap = interop.to_warp
-        self._moments, self._adams = {}, {}
-        if self._cuda:
-            named = {"maps": self.maps, "hidden": self.hidden, "output": self.output}
-            adams = [self._moments_of(*item) for item in named.items()]
-        else:
-            maps = self.maps.detach().requires_grad_()
-            maps.grad = self.maps_grad
-            options = {"lr": 1.0, "betas": (_MOMENTUM, self._decay), "eps": _ADAM_EPSILON, "fused": True}
-            for name, values in (("adam_maps", [maps]), ("adam_net", [stored_hidden, stored_output])):
-                self._adams[name] = torch.optim.Adam(values, **options)
+        self._rates, self._moments = zeros(4), {}
+        named = {"maps": self.maps, "hidden": self.hidden, "output": self.output}
+        adams = [self._moments_of(*item) for item in named.items()]
 
-        vec = self._kernels.net.vec_hidden
+        vec, wrap = self._kernels.net.vec_hidden, interop.to_warp
         # CUDA stores whole tiles of scalars; the CPU adds whole columns.
         shaped = (
             (wrap(self._partial.view(-1, hidden)), wrap(self._partial_out.view(-1, 3)), wrap(self._loss_parts.view(-1)))
@@ -262,7 +232,7 @@ class Trainer:
             else (wrap(self._partial, vec), wrap(self._partial_out, wp.vec3), wrap(self._loss_parts))
         )
         # Kernels read the networks, or the networks on 8-bit levels.
-        nets = self.hidden.detach(), self.output.detach()
+        nets = self.hidden, self.output
         self._on_levels = tuple(torch.empty_like(values) for values in nets)
         self._nets = [(wrap(values[0], vec), wrap(values[1], wp.vec3)) for values in (nets, self._on_levels)]
         self._levels_args = tuple(wrap(values) for values in (*nets, *self._on_levels))
@@ -272,20 +242,13 @@ class Trainer:
             wrap(self._partial_out.view(parts, -1)),
             wrap(self._loss_parts),
         )
-        net_grads = wrap(self.hidden.grad.view(-1)), wrap(self.output.grad.view(-1))
-        maps = wrap(self.maps), wrap(self.maps_grad)
-        if self._cuda:
-            # The last arguments of `update_maps` and `update_net`.
-            self._maps_update = (wrap(self._acc), adams[0], *maps, wrap(rates))
-            flat = (wrap(values.view(-1)) for values in nets)
-            moved = *adams[1:], *flat, wrap(self.loss), wrap(self.control)
-            self._net_update = (*net_sums, wrap(rates), *moved, *net_grads)
-        else:
-            self._maps_sums = (wrap(self._acc), *maps)
-            self._net_sums, self._net_outs = net_sums, (*net_grads, wrap(self.loss), wrap(self._rates))
+        # The last arguments of `update_maps` and `update_net`.
+        self._maps_update = wrap(self._acc), adams[0], wrap(self.maps), wrap(self._rates)
+        flat = (wrap(values.view(-1)) for values in nets)
+        self._net_update = *net_sums, wrap(self._rates), *adams[1:], *flat, wrap(self.loss), wrap(self.control)
 
     def _moments_of(self, name: str, values: torch.Tensor) -> gather.Adam:
-        """Returns the state of the optimiser (Adam) on the GPU for one array of parameters, with all moments 0."""
+        """Returns the state of the optimiser (Adam) for one array of parameters, with all moments 0."""
         adam = gather.Adam()
         adam.decay = wp.vec2(_MOMENTUM, self._decay)
         adam.epsilon = _ADAM_EPSILON
@@ -330,7 +293,7 @@ class Trainer:
         share = np.linspace(0.0, 1.0, self.steps)
         values = final_rate + (1.0 - final_rate) * 0.5 * (1.0 + np.cos(np.pi * share))
         done = np.arange(1, self.steps + 1)
-        corrections = 1.0 - _MOMENTUM**done, np.sqrt(1.0 - self._decay**done)
+        corrections = 1.0 / (1.0 - _MOMENTUM**done), 1.0 / np.sqrt(1.0 - self._decay**done)
         return wp.array(np.stack([values, *corrections], 1).astype(np.float32), dtype=wp.vec3, device=self.device)
 
     def _draw(self, seed: int) -> None:
@@ -349,9 +312,8 @@ class Trainer:
             o[i, :hidden] = random.uniform(-1, 1, (hidden, 3)) / math.sqrt(hidden)
         for key, values in maps.items():
             self.views[key].copy_(torch.from_numpy(values))
-        with torch.no_grad():
-            self.hidden.copy_(torch.from_numpy(w))
-            self.output.copy_(torch.from_numpy(o))
+        self.hidden.copy_(torch.from_numpy(w))
+        self.output.copy_(torch.from_numpy(o))
 
     @property
     def step(self) -> int:
@@ -377,32 +339,32 @@ class Trainer:
             torch.set_num_threads(threads)
 
     def _step(self, quantised: bool, move_maps: bool) -> None:
+        self._add_gradients(quantised)
+        self._update(move_maps)
+
+    def _add_gradients(self, quantised: bool) -> None:
         self.batch.quantised = int(quantised)
         on_levels = quantised and self._integers
         if on_levels:
             levels.put_on_levels(*self._levels_args)
         hidden, output = self._nets[on_levels]
         args = (self._maps, self._offsets, hidden, output, self.batch, self._samples, *self._launch_sums)
-        rates = self._first_rates
-        if self._cuda:
-            self._kernels.launch(*args)
-            update_maps(self._schedule, rates, self.batch.control, move_maps, *self._maps_update)
-            update_net(*self._net_update)
-            return
-        span = self._samples // CPU_LANES
+        span = self._samples // self._lanes
         self._share(lambda lane: self._kernels.launch(*args, lane * span, span))
-        part = -(-self.maps.numel() // CPU_LANES)
-        counts = [min(part, self.maps.numel() - lane * part) for lane in range(CPU_LANES)]
-        self._share(lambda lane: gather_maps(*self._maps_sums, lane * part, counts[lane]))
-        gather_net(*self._net_sums, self._schedule, rates, self.batch.control, *self._net_outs)
-        for (name, adam), rate in zip(self._adams.items(), self._rates, strict=True):
-            adam.param_groups[0]["lr"] = float(rate)
-            if move_maps or name != "adam_maps":
-                adam.step()
+
+    def _update(self, move_maps: bool) -> None:
+        args = (self._schedule, self._first_rates, self.batch.control, move_maps, *self._maps_update)
+        total = self.maps.numel()
+        span = -(-total // self._lanes)
+        self._share(lambda lane: gather.update_maps(*args, lane * span, min(span, total - lane * span)))
+        gather.update_net(*self._net_update)
 
     def _share(self, work: Callable[[int], None]) -> None:
-        """Runs `work(i)` for i below `CPU_LANES`, each in its own thread; kernel launches release Python's lock."""
-        list(self._pool.map(work, range(CPU_LANES)))
+        """Runs `work(i)` for each lane i, each in its own thread; kernel launches release Python's lock."""
+        if self._pool is None:
+            work(0)
+        else:
+            list(self._pool.map(work, range(self._lanes)))
 
     def losses(self) -> np.ndarray:
         """Returns the running mean of each tile's loss over about 50 steps, float32 [N]."""
@@ -419,7 +381,7 @@ class Trainer:
 
     def quantised(self) -> dict[str, np.ndarray]:
         """Returns maps and networks as the file stores them, by their names in `SheetModel` (always `net`)."""
-        nets = self.hidden.detach(), self.output.detach()
+        nets = self.hidden, self.output
         if self._integers:
             nets = self._on_levels
             with interop.stream(self.device):
@@ -449,7 +411,7 @@ class Trainer:
     def check(self) -> None:
         """Checks that the fit has not diverged."""
         broken = ~torch.isfinite(self.loss)
-        for values in (*self.views.values(), self.hidden.detach().half(), self.output.detach().half()):
+        for values in (*self.views.values(), self.hidden.half(), self.output.half()):
             broken |= ~torch.isfinite(values.reshape(self.tiles, -1)).all(1)
         if bool(broken.any()):
             tile = self.numbers[broken.cpu().numpy()][0]
@@ -461,11 +423,8 @@ class Trainer:
         """Returns all arrays that later steps depend on, by name."""
         self.check()
         result = {key: getattr(self, key) for key in _STATE} | self._moments
-        for name, adam in self._adams.items():
-            for i, values in enumerate(adam.state.values()):
-                result |= {f"{name}.{i}.{key}": values[key] for key in _ADAM_STATE}
-        # Copies; numbers keep no dimension.
-        return {key: np.array(value.detach().cpu().numpy()) for key, value in result.items()}
+        # Copies.
+        return {key: np.array(value.cpu().numpy()) for key, value in result.items()}
 
     def table(self, step: int) -> dict[str, Part]:
         """Returns the types and shapes of the arrays that `state` returns after `step` steps, by name."""
@@ -473,17 +432,6 @@ class Trainer:
         table["control"] = Part(np.int32, (1,), least=step, most=step)
         for key, values in self._moments.items():
             table[key] = Part(np.float32, tuple(values.shape), least=0.0 if key.endswith("_sq") else None)
-        for name, adam in self._adams.items():
-            # Maps that are frozen from the start have no state of an optimiser.
-            if step == 0 or (name == "adam_maps" and self.stage(0) == 2):
-                continue
-            for i, parameter in enumerate(adam.param_groups[0]["params"]):
-                shape = tuple(parameter.shape)
-                table |= {
-                    f"{name}.{i}.step": Part(np.float32, (), least=0, most=step),
-                    f"{name}.{i}.exp_avg": Part(np.float32, shape),
-                    f"{name}.{i}.exp_avg_sq": Part(np.float32, shape, least=0.0),
-                }
         return table
 
     def load(self, state: dict[str, np.ndarray]) -> None:
@@ -495,15 +443,11 @@ class Trainer:
         done = check_part(state, "control", Part(np.int32, (1,), least=0, most=self.steps))
         parts = check_parts(state, self.table(int(done[0])))
         values = {name: torch.tensor(part, device=self.device) for name, part in parts.items()}
-        with interop.stream(self.device), torch.no_grad():
+        with interop.stream(self.device):
             for key in _STATE:
                 getattr(self, key).copy_(values[key])
             for key, moments in self._moments.items():
                 moments.copy_(values[key])
-            for name, adam in self._adams.items():
-                for i, parameter in enumerate(adam.param_groups[0]["params"]):
-                    if f"{name}.{i}.step" in values:
-                        adam.state[parameter] = {key: values[f"{name}.{i}.{key}"] for key in _ADAM_STATE}
 
     def close(self) -> None:
         """Ends the trainer's threads."""

@@ -3,10 +3,8 @@
 All errors are measured in sRGB, as encoded for the network, like the paper's PSNR (section 5).
 """
 
-import copy
 import math
-import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +17,7 @@ from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import DIRECTIONS
 from wlm.smoke.decode import Decoder
 from wlm.smoke.model import SmokeModel
-from wlm.smoke.network.dataset import make_validation, pool_of_volume
+from wlm.smoke.network.dataset import make_validation
 from wlm.smoke.network.losses import residual
 from wlm.smoke.network.planes import GUIDES, OPACITY_PLANE, PLANES, Pool
 from wlm.smoke.network.settings import DatasetSettings
@@ -27,12 +25,6 @@ from wlm.system import Meter, OnProgress
 
 Method = Callable[[Pool, slice], torch.Tensor]
 """Function that predicts planes [n, 2, 8, H, W] of both frames of a slice of a pool; `score` clamps them."""
-
-NETWORK, HALF, COARSE = "network", "network, half floats", "coarse march"
-"""Names of the methods in a `Comparison`."""
-
-DENSITIES = (0.5, 1.0, 2.0)
-"""Factors of the density, those of the paper's ablation (figure 5)."""
 
 _BATCH = 8  # samples
 _STILL = 1e-4  # a flicker up to this, a fortieth of a level of 8 bits, counts as none
@@ -77,15 +69,18 @@ class Report(Score):
     """The score of a network as it runs in use: through its `Decoder`, one image at a time.
 
     Attributes:
+        guide_psnr: PSNR of the guiding maps alone, if they are lightmaps by a coarse march; NaN for the paper's kind.
         samples: Number of samples.
         bytes: Size of the network's file in bytes.
     """
 
+    guide_psnr: float
     samples: int
     bytes: int
 
     def to_json(self) -> dict[str, Any]:
-        return super().to_json() | {"samples": self.samples, "bytes": self.bytes}
+        own = {"guide_psnr": self.guide_psnr, "samples": self.samples, "bytes": self.bytes}
+        return super().to_json() | system.plain(own)
 
 
 def evaluate(
@@ -115,13 +110,16 @@ def evaluate(
     """
     device = check_device(device)
     if not isinstance(data, Pool):
-        settings = _with_guide(data or model.dataset, model.settings.guide)
+        settings = (data or model.dataset).model_copy(update={"guide": model.settings.guide})
         data = make_validation(settings, device, test=True, progress=progress)
         if not len(data):
             raise WlmError("test set: expected frames with smoke, found only frames without")
     pool = data.to(device)
-    scores = score(_at_run_time(model, device, pool, half), pool, progress=progress)
-    return Report(**vars(scores), samples=len(pool), bytes=model.file_bytes() if file_bytes is None else file_bytes)
+    height, width = pool.guides.shape[-2:]
+    scores = score(of_decoder(Decoder(model, device, height=height, width=width, half=half)), pool, progress=progress)
+    guide = score(coarse, pool).psnr if model.settings.guide == "six" else math.nan
+    size = model.file_bytes() if file_bytes is None else file_bytes
+    return Report(**vars(scores), guide_psnr=guide, samples=len(pool), bytes=size)
 
 
 def of_network(network: torch.nn.Module) -> Method:
@@ -186,92 +184,9 @@ def score(method: Method, pool: Pool, *, batch: int = _BATCH, progress: OnProgre
     return Score(sum(images) / len(images), min(images), max(images), planes, *means, tuple(images))
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Scores of several methods, by name, on one test set of a number of samples, each a pair of frames in one view."""
-
-    name: str
-    samples: int
-    methods: dict[str, Score]
-
-    @property
-    def half_loss(self) -> float | None:
-        """PSNR in dB that is lost by computing in half floats; None if the network was not scored in half floats."""
-        half = self.methods.get(HALF)
-        return None if half is None else self.methods[NETWORK].psnr - half.psnr
-
-    def to_json(self) -> dict[str, Any]:
-        """Returns the scores as JSON values."""
-        methods = {name: scores.to_json() for name, scores in self.methods.items()}
-        return {"name": self.name, "samples": self.samples, "half_loss": self.half_loss, "methods": methods}
-
-
-def compare(
-    model: SmokeModel,
-    settings: DatasetSettings | None = None,
-    volumes: Sequence[str | os.PathLike[str]] = (),
-    *,
-    densities: Sequence[float] = DENSITIES,
-    device: str = "cpu",
-    progress: OnProgress | None = None,
-) -> list[Comparison]:
-    """Scores a network, and the coarse march if that is its guide, on a test set at several densities and on volumes.
-
-    Args:
-        model: The network.
-        settings: Settings of the test set; None: those of the network's training.
-        volumes: Files of further volumes, each a test set of its own; see `pool_of_volume`.
-        densities: Factors by which the extinction of the test set is multiplied.
-        device: "cpu", "cuda" or "cuda:N".
-        progress: Called after each test set, with the PSNR of the network as the figure "PSNR dB".
-
-    Returns:
-        One comparison for each density, then one for each volume.
-
-    Raises:
-        WlmError: The device does not exist, the model lacks its settings, there is not enough memory, a volume cannot
-            be read, or no frame has smoke.
-    """
-    device, guide = check_device(device), model.settings.guide
-    settings = _with_guide(settings or model.dataset, guide)
-    network = copy.deepcopy(model.network).to(device)
-
-    def pools() -> Iterator[tuple[str, Pool]]:
-        # Almost empty frames of the test set are not scored.
-        filled = settings.model_copy(update={"kept_empty": 0.0})
-        for scale in densities:
-            yield f"density x {scale:g}", make_validation(filled, device, test=True, scale=scale)
-        for path in volumes:
-            yield os.fspath(path), pool_of_volume(path, settings, device=device)
-
-    meter = Meter(progress, "evaluate", len(densities) + len(volumes))
-    comparisons = []
-    for name, pool in pools():
-        if not len(pool):
-            raise WlmError(f"{name}: expected frames with smoke, found only frames without")
-        methods = {NETWORK: of_network(network)}
-        if device != "cpu":
-            methods[HALF] = _at_run_time(model, device, pool)
-        if guide == "six":
-            methods[COARSE] = coarse
-        scores = {method: score(function, pool) for method, function in methods.items()}
-        comparisons.append(Comparison(name, len(pool), scores))
-        meter.report(len(comparisons), PSNR_dB=scores[NETWORK].psnr)
-    return comparisons
-
-
 def coarse(pool: Pool, part: slice) -> torch.Tensor:
     """Predicts the guiding maps themselves, for `score`; they must be of kind "six", a coarse march of six lights."""
     six = GUIDES["six"]
     if pool.guides.shape[2] != len(six):
         raise ValueError(f"pool: expected guiding maps of kind six with {len(six)} planes, got {pool.guides.shape[2]}")
     return pool.guides[part][:, :, [six.index(name) for name in PLANES]].float()
-
-
-def _at_run_time(model: SmokeModel, device: str, pool: Pool, half: bool = True) -> Method:
-    height, width = pool.guides.shape[-2:]
-    return of_decoder(Decoder(model, device, height=height, width=width, half=half))
-
-
-def _with_guide(settings: DatasetSettings, kind: str) -> DatasetSettings:
-    return settings.model_copy(update={"guide": kind})

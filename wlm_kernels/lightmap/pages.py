@@ -3,7 +3,7 @@
 A page is read texel by texel at the coordinates of its sheet, so that its border continues into the neighbouring tiles.
 A texel of level L has the mean light of the valid ones of the 2^L x 2^L texels below it, its samples. A texel without
 a valid sample, in a gap between charts, takes the light of the nearest one that has one: at level 0 within `FAR`
-texels, at others within two, as `wlm.lightmap.runtime.MapDecoder` does. Farther away it takes that of a coarse texel.
+texels, at others within two. Farther away it takes that of a coarse texel.
 
 From level `COARSE_LEVEL` on, texels are means of a table of `COARSE` x `COARSE` texels of each tile at each time, so
 that a page of a whole map does not need its tiles. This table is itself decoded by the same kernel (`direct`). A page

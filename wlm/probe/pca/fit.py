@@ -68,6 +68,7 @@ class _Table(NamedTuple):
             its bits.
         low, step: Their codes, of the same shape.
         rest: Sum of squared errors that no number of bits removes.
+        rounding: float64 [C], sum of the squared errors by rounded directions in each dimension that these do not span.
     """
 
     clusters: _Clusters
@@ -76,6 +77,7 @@ class _Table(NamedTuple):
     low: np.ndarray
     step: np.ndarray
     rest: float
+    rounding: np.ndarray
 
 
 class _Plan(NamedTuple):
@@ -120,7 +122,7 @@ def fit_components(
     some = slice(None, None, -(-live // _SAMPLE))
     best = None
     if live <= max(_FEWEST, numbers) * _FEWEST:
-        best = _planned(_tabled(unit, logarithm, np.zeros(live, int), identity=True), target)
+        best = _planned(_tabled(unit, logarithm, np.zeros(live, int), hours, identity=True), target)
     for counts in _TRIED:
         for clusters in counts:
             if clusters > max(live // _FEWEST, 1):
@@ -176,10 +178,12 @@ def _directions(unit: np.ndarray, count: int) -> np.ndarray:
     return np.concatenate([mean[None], vectors[:count]])
 
 
-def _tabled(unit: np.ndarray, logarithm: np.ndarray, label: np.ndarray, *, identity: bool = False) -> _Table:
+def _tabled(
+    unit: np.ndarray, logarithm: np.ndarray, label: np.ndarray, hours: int, *, identity: bool = False
+) -> _Table:
     """Measures the errors of all numbers of bits for probes [V, D] in given clusters."""
     clusters = _Clusters.of(label)
-    order, rest, directions = clusters.order, 0.0, None
+    order, rest, directions, rounding = clusters.order, 0.0, None, np.zeros(label.max() + 1)
     columns = [logarithm[order], *unit[order].T]
     if not identity:
         directions = np.stack([_directions(unit[rows], _MOST) for rows in clusters.rows])
@@ -191,7 +195,10 @@ def _tabled(unit: np.ndarray, logarithm: np.ndarray, label: np.ndarray, *, ident
     error, low, step = (np.array([[each[i] for each in row] for row in found]).transpose(2, 0, 1) for i in (1, 2, 3))
     if identity:
         error[:, 0] *= _MADE_UP
-    return _Table(clusters, directions, error, low, step, rest)
+    if directions is not None and hours == 1:
+        energy = np.concatenate([np.bincount(label)[:, None], error[:, 1:, 0]], 1)
+        rounding = (energy * np.square(np.abs(directions).max(2) / LEVELS) / 12).sum(1)
+    return _Table(clusters, directions, error, low, step, rest, rounding)
 
 
 def _priced(table: _Table, price: float, target: _Target) -> _Plan:
@@ -214,6 +221,7 @@ def _priced(table: _Table, price: float, target: _Target) -> _Plan:
     columns = int(used.sum()) + (0 if identity else len(width))  # of the means, too
     sizes = target.live, target.outputs, columns, len(width), bits, target.hours
     error = table.rest + np.take_along_axis(table.error, width[..., None], 2).sum()
+    error += (table.rounding * np.maximum(target.hours * target.outputs - used.sum(1), 0)).sum()
     return _Plan(width, price, component_bytes(*sizes, identity=identity), float(np.sqrt(error / probes)), table)
 
 
@@ -235,10 +243,10 @@ def _planned(table: _Table, target: _Target) -> _Plan:
 
 def _refined(unit: np.ndarray, logarithm: np.ndarray, label: np.ndarray, target: _Target, rounds: int) -> _Plan:
     """Moves probes to the clusters that are cheapest for them, and returns the best plan of some rounds."""
-    plans = [_planned(_tabled(unit, logarithm, label), target)]
+    plans = [_planned(_tabled(unit, logarithm, label, target.hours), target)]
     for _ in range(rounds - 1):
         label = _cheapest(unit, logarithm, plans[-1])
-        plans.append(_planned(_tabled(unit, logarithm, label), target))
+        plans.append(_planned(_tabled(unit, logarithm, label, target.hours), target))
     return min(plans, key=lambda plan: _worth(plan, target))
 
 

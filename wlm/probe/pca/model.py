@@ -24,7 +24,7 @@ from wlm_kernels.probe.components import GROUP
 CLUSTERS = 256
 """Largest number of clusters."""
 
-WIDEST = 10
+WIDEST = 16
 """Largest number of bits of a code."""
 
 LEVELS = 127

@@ -9,7 +9,6 @@ Lengths are shares of the box's edge, so that a smaller grid gives the same imag
 network must be made with `DatasetSettings.look` of the settings that it was trained with.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import NamedTuple
@@ -20,7 +19,6 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
-from wlm.fluid.volume import load_volume
 from wlm.interop import check_device, no_collection, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.motion import motion
@@ -37,7 +35,6 @@ ATTEMPTS = 8
 
 _EXTENT = 1.1  # image edge of a fixed view over the box's edge
 _EARLY = 0.35  # factor of the warmup for sources that stop early
-_BRIGHT = 0.99  # quantile of a volume's non-empty voxels that represents its density
 
 
 def make_pool(
@@ -65,54 +62,12 @@ def make_validation(
     device: str = "cpu",
     *,
     test: bool = False,
-    scale: float = 1.0,
     progress: OnProgress | None = None,
 ) -> Pool:
     """Makes the samples of the validation or, with `test_seed`, the test set; each pair of frames is rendered from all
-    fixed views. No training round uses the sequences of these sets.
-
-    The extinction of the smoke is multiplied by `scale`; 0.5 and 2 in the paper's ablation.
-    """
+    fixed views. No training round uses the sequences of these sets."""
     seed = settings.test_seed if test else settings.validation_seed
-    return _Maker(settings, seed, True, device, scale).pool(0, settings.validation_sequences, progress)
-
-
-def pool_of_volume(
-    path: str | os.PathLike[str],
-    settings: DatasetSettings,
-    *,
-    device: str = "cpu",
-    extinction: float | None = None,
-    emission: float = 1.0,
-) -> Pool:
-    """Makes samples of a volume from a file, one from each fixed view, to test a network on other smoke.
-
-    Args:
-        path: A `.npz`, `.nvdb` or `.vdb` volume for `load_volume`.
-        settings: Settings of views and marches; lengths in them are shares of the volume's longest edge.
-        device: "cpu", "cuda" or "cuda:N".
-        extinction: Extinction at density 1 per unit of length; None: such that dense smoke is as opaque as in training.
-        emission: Emission at temperature 1 per unit of length.
-
-    Returns:
-        The samples. The two frames of a sample are the same, and their motion and sequence number are 0.
-    """
-    volume = load_volume(path, extinction=1.0, emission=emission, device=check_device(device))
-    if extinction is None:
-        density = volume.density[volume.density > 0]
-        if not len(density):
-            raise WlmError(f"{path}: density is zero everywhere, so no extinction can be chosen from it")
-        edge = volume.voxel * max(volume.shape)
-        extinction = settings.extinction / (edge * float(np.quantile(density.float().cpu().numpy(), _BRIGHT)))
-    volume = replace(volume, extinction=extinction)
-    cameras = fixed_cameras(settings, volume.origin, volume.voxel * np.asarray(volume.shape))
-    guides, targets = [], []
-    for number, camera in enumerate(cameras):
-        guides.append(render_guide(volume, camera, settings.guide, settings.look(volume.shape, number)).half())
-        targets.append(encode_lightmaps(bake(volume, camera, step=settings.reference_step, estimate=False)).half())
-    pairs = [torch.stack([torch.stack(parts)] * 2, 1) for parts in (guides, targets)]
-    still = torch.zeros((len(cameras), 2, *pairs[0].shape[-2:]), dtype=torch.float16, device=pairs[0].device)
-    return Pool(*pairs, still, torch.zeros(len(cameras), dtype=torch.int64, device=pairs[0].device))
+    return _Maker(settings, seed, True, device).pool(0, settings.validation_sequences, progress)
 
 
 def fixed_cameras(settings: DatasetSettings, origin: Sequence[float] | np.ndarray, size: np.ndarray) -> list[Camera]:
@@ -133,8 +88,8 @@ class _Shot(NamedTuple):
 class _Maker:
     """Simulates and renders the samples of a training, validation or test set."""
 
-    def __init__(self, settings: DatasetSettings, seed: int, validation: bool, device: str, scale: float = 1.0) -> None:
-        self._settings, self._seed, self._validation, self._scale = settings, seed, validation, scale
+    def __init__(self, settings: DatasetSettings, seed: int, validation: bool, device: str) -> None:
+        self._settings, self._seed, self._validation = settings, seed, validation
         self._device = check_device(device)
 
     def pool(self, first: int, count: int, progress: OnProgress | None) -> Pool:
@@ -224,7 +179,7 @@ class _Maker:
         if self._validation:
             seeds = random.integers(2**30, size=settings.views)
             cameras = fixed_cameras(settings, scene.grid.origin, scene.grid.size)
-            return [_Shot(camera, self._scale, int(seed)) for camera, seed in zip(cameras, seeds, strict=True)]
+            return [_Shot(camera, 1.0, int(seed)) for camera, seed in zip(cameras, seeds, strict=True)]
         shots = []
         turn = random.uniform(0.0, 360.0)
         for number in range(settings.views_a_frame):
