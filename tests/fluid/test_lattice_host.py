@@ -51,10 +51,12 @@ def test_speed_and_density_are_reported(device: str):
     with pytest.raises(WlmError, match="the speed exceeds that of sound"):
         box.set_flow(np.full((*SHAPE, 3), 0.4))
         box.step()
+        box.check()
     box = Lattice(SHAPE, viscosity=0.02, device=device)
     box.set_flow(density=-0.1)
     with pytest.raises(WlmError, match=r"step 0 at cell \(0, 0, 0\): the density is not positive"):
         box.step()
+        box.check()
 
 
 def test_blow_up_stops_the_run_soon(device: str):

@@ -200,7 +200,7 @@ class Lattice:
         self._prepared = False
         self._graph: wp.Graph | None = None
         # Steps that this object launched itself; replays of a user's CUDA graph are counted only by the clock.
-        self._done, self._begun = 0, False
+        self._done, self._unchecked, self._begun = 0, 0, False
 
     @staticmethod
     def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
@@ -334,7 +334,8 @@ class Lattice:
     # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Advances the air by a number of steps, and runs `check` after every `CHECK_EVERY` of them.
+        """Advances the air by a number of steps, and runs `check` after every `CHECK_EVERY` of them, and on a CPU at
+        the end.
 
         During the capture of a CUDA graph it does not check: call `check` between replays of the graph. The number of
         steps, and the number of steps done before the capture, must then be multiples of `period`.
@@ -354,10 +355,12 @@ class Lattice:
         self._begun = True
         run = self._run_in_graphs if self.device.is_cuda and steps >= _GRAPH_FROM else self._run
         while steps > 0:
-            chunk = min(steps, CHECK_EVERY)
+            chunk = min(steps, CHECK_EVERY - self._unchecked)
             run(chunk)
             steps -= chunk
-            self.check()
+            self._unchecked += chunk
+            if self._unchecked == CHECK_EVERY or self.device.is_cpu:
+                self.check()
 
     @property
     def steps(self) -> int:
@@ -370,7 +373,7 @@ class Lattice:
         Raises:
             WlmError: The flow has blown up; the message names the first step, the cell and the cause.
         """
-        key = int(self._trouble.numpy()[0])
+        key, self._unchecked = int(self._trouble.numpy()[0]), 0
         if key == QUIET:
             return
         raise blown_up(key, self.shape)
