@@ -11,7 +11,7 @@ import trimesh
 from builders.checks import error_of
 from builders.gltf_scene import Thing, box, write_scene
 from builders.rooms import write_room
-from builders.textures import make_ktx2
+from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from wlm.atlas.coverage import covered_texels, touched_texels
@@ -93,11 +93,13 @@ def test_a_lightmap_of_any_format(tmp_path):
     texels = _lightmap()
     texels[5] = np.inf  # outside the chart
     (tmp_path / "a.ktx2").write_bytes(make_ktx2(106, WIDTH, HEIGHT, [texels.tobytes()], scheme=3))
+    (tmp_path / "a.dds").write_bytes(make_dds(6, WIDTH, HEIGHT, texels.tobytes()))
     (tmp_path / "a.hdr").write_bytes(imagecodecs.rgbe_encode(_lightmap(), header=True))
     expected = load(glb, light)
-    mesh = load(glb, tmp_path / "a.ktx2")
-    assert mesh.warnings == ()
-    np.testing.assert_array_equal(mesh.sheets[0].lightmap, expected.sheets[0].lightmap)
+    for name in ("a.ktx2", "a.dds"):
+        mesh = load(glb, tmp_path / name)
+        assert mesh.warnings == ()
+        np.testing.assert_array_equal(mesh.sheets[0].lightmap, expected.sheets[0].lightmap)
     mesh = load(glb, tmp_path / "a.hdr")
     np.testing.assert_allclose(mesh.sheets[0].lightmap, expected.sheets[0].lightmap, rtol=2**-7)
 

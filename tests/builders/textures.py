@@ -26,3 +26,10 @@ def make_ktx2(
         index.insert(0, struct.pack("<3Q", at + len(body), len(stored), len(level)))
         body += stored
     return b"\xabKTX 20\xbb\r\n\x1a\n" + head + b"".join(index) + descriptor + words + body
+
+
+def make_dds(number: int, width: int, height: int, data: bytes, code: bytes = b"DX10", mips: int = 1) -> bytes:
+    """A DDS file, with the DX10 header where the code says so."""
+    head = struct.pack("<4s 7I 44x", b"DDS ", 124, 0x21007, height, width, 0, 0, mips)
+    head += struct.pack("<2I 4s 20x 5I", 32, 4, code, 0x401008 if mips > 1 else 0x1000, 0, 0, 0, 0)
+    return head + (struct.pack("<5I", number, 3, 0, 1, 0) if code == b"DX10" else b"") + data

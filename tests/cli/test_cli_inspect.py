@@ -135,7 +135,7 @@ def kinds() -> dict[str, dict[str, bytes]]:
         "strips.tif",
         "levels.jpg",
         "mask-grey.png",
-        "bc6h-zlib.ktx2",
+        "bc6h.dds",
     )
     return {
         "arrays": {".npz": small_npz(other=np.ones(3))},
@@ -287,13 +287,13 @@ def test_what_is_damaged_is_said_and_nothing_stops(tmp_path):
     write_set(tmp_path / "set")
     data = sorted((tmp_path / "set").glob("*.exr"))[0].read_bytes()
     sorted((tmp_path / "set").glob("*.exr"))[1].unlink()
-    for suffix in ("exr", "ktx2", "hdr", "npz", "glb", "lmbake", "wlm", "nvdb", "json", "png"):
+    for suffix in ("exr", "ktx2", "dds", "hdr", "npz", "glb", "lmbake", "wlm", "nvdb", "json", "png"):
         (tmp_path / f"empty.{suffix}").write_bytes(b"")
     (tmp_path / "cut.exr").write_bytes(data[: len(data) // 2])
     (tmp_path / "link").symlink_to(tmp_path)
     os.mkfifo(tmp_path / "pipe.exr")
     text = told(tmp_path)
-    assert text.count("cannot be read") == 11 and "is missing" in text and "pipe" not in text and "link" not in text
+    assert text.count("cannot be read") == 12 and "is missing" in text and "pipe" not in text and "link" not in text
     (tmp_path / "empty").mkdir()
     assert told(tmp_path / "empty") == ".: no known kind of file -> "
 

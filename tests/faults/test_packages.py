@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.gltf_maker import GltfMaker
 
 from wlm.errors import WlmError, broken_package
 from wlm.formats.exr import write_exr
@@ -30,6 +31,8 @@ COMMANDS = (
     ("mitsuba", "OSError", ("bake", "lightmaps", BAKE, "-o", "out")),
     ("pyvista", "ImportError", ("view", FILES / "lightmap.wlm")),
     ("imagecodecs", "AttributeError", ("compress", CORPUS / "mesh.glb", CORPUS / "runs.hdr", "-o", "out.wlm")),
+    ("DracoPy", "SyntaxError", ("compress", "KHR_draco_mesh_compression.gltf", "a.exr", "-o", "out.wlm")),
+    ("meshopt", "OSError", ("compress", "EXT_meshopt_compression.gltf", "a.exr", "-o", "out.wlm")),
     ("UnityPy", "AttributeError", ("compress", "a.asset", "-o", "out.wlm")),
     ("ispc_texcomp", "OSError", ("compress", SET, "--profile", "frames", "-o", "out.wlm")),
     ("uvunwrap", "ImportError", ("compress", CORPUS / "mesh.glb", "a.exr", "--profile", "cascade", "-o", "out.wlm")),
@@ -62,6 +65,17 @@ def test_a_command_whose_package_is_broken_ends_in_one_line(tmp_path):
     packages.mkdir(), folder.mkdir()
     for package, fault, _ in COMMANDS:
         broken(packages, package, fault)
+    maker = GltfMaker()
+    view = {"buffer": 0, "byteLength": 4, "byteStride": 4, "count": 1, "mode": "ATTRIBUTES"}
+    for name in ("KHR_draco_mesh_compression", "EXT_meshopt_compression"):
+        primitive = {"attributes": {"POSITION": 0}, "extensions": {name: {"bufferView": 0, "attributes": {}}}}
+        maker.content |= {
+            "extensionsUsed": [name],
+            "meshes": [{"primitives": [primitive]}],
+            "bufferViews": [{"buffer": 0, "byteLength": 4, "extensions": {name: view}}],
+            "buffers": [{"byteLength": 4, "uri": "data:;base64,AAAAAA=="}],
+        }
+        (folder / f"{name}.gltf").write_text(json.dumps(maker.content))
     write_exr(folder / "a.exr", np.ones((8, 8, 3), np.float32))
     (folder / "a.asset").write_bytes(bytes(64))
     (folder / "a.ply").write_text("ply\n")

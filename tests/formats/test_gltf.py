@@ -195,17 +195,6 @@ def test_instances_are_refused_by_name(tmp_path, key):
     assert "uses the extension EXT_mesh_gpu_instancing" in text and "gltf-transform uninstance" in text
 
 
-@pytest.mark.parametrize("name", ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"])
-def test_compressed_meshes_are_refused_unless_they_are_stored_plainly_too(tmp_path, name):
-    maker = Maker()
-    maker.content["extensionsUsed"] = [name]
-    assert len(_read(maker, tmp_path)) == 1
-    maker.content["extensionsRequired"] = [name]
-    assert f"uses the extension {name}, which is not read here: unpack" in error_of(
-        read_gltf, maker.save(tmp_path / "a.glb")
-    )
-
-
 WRONG = [
     (["asset", "version", "1.0"], "asset.version: expected 2.0, found 1.0"),
     (["scene", 7], "scenes[7]: the file has 1 scenes"),

@@ -101,6 +101,7 @@ def write(path: Path, content: object) -> Path:
         (load_volume, ".vdb"),
         (read_light, ".hdr"),
         (read_light, ".ktx2"),
+        (read_light, ".dds"),
         (lambda path: read_flipbook((path, path), "unity", rows=2, columns=2), ".tga"),
         (lambda path: read_mask(path, "a.exr", (4, 4)), ".png"),
     ],
@@ -373,7 +374,7 @@ def test_a_set_names_files_of_its_folder(tmp_path):
         ({"entries": [{"time_hours": 0, "file": "\ud800"}]}, "cannot read the lightmap: the name has"),
         (
             {"entries": [{"time_hours": 0, "file": "set.json"}]},
-            "expected a lightmap, EXR, Radiance (.hdr), PFM, TIFF of floats or KTX2, found other",
+            "expected a lightmap, EXR, Radiance (.hdr), PFM, TIFF of floats, KTX2 or DDS, found other",
         ),
     ],
 )
@@ -421,6 +422,8 @@ def test_textures_that_claim_more_than_they_hold(tmp_path):
         struct.pack_into("<3Q", content, 80, len(content), stored or len(packed), 4 * side * side)
         return sparse(content + packed, len(content) + (stored or len(packed)))
 
+    dds = bytearray((CORPUS / "shared.dds").read_bytes())
+    struct.pack_into("<2I", dds, 12, 1 << 16, 1 << 16)
     wide = b"#?RADIANCE\n\n-Y 16384 +X 16384\n" + b"abcd\1\1\1\x7f\1\1\1\x7f" * 16384
     for make in (
         lambda: ktx2(16384, b"\0" * 16),
@@ -428,7 +431,7 @@ def test_textures_that_claim_more_than_they_hold(tmp_path):
         lambda: ktx2(4096, b"", 1 << 40),
         lambda: write(tmp_path / "a", wide),
         lambda: sparse(b"#?RADIANCE\n"),
-        lambda: ktx2(1 << 16, b""),
+        lambda: sparse(dds),
     ):
         path = make()
         with little_memory():

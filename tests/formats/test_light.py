@@ -1,4 +1,4 @@
-"""Light in KTX2 files: every code of every format, orientations, supercompression, and what is refused."""
+"""Light in KTX2 and DDS files: every code of every format, orientations, supercompression, and what is refused."""
 
 import struct
 import sys
@@ -9,7 +9,7 @@ import pytest
 import texture2ddecoder
 import tifffile
 from builders.checks import error_of
-from builders.textures import make_ktx2
+from builders.textures import make_dds, make_ktx2
 
 from benchmarks.rivals.lightmap_blocks import ispc_bc6h
 from wlm.formats.channels import read_encoded
@@ -20,6 +20,8 @@ from wlm.formats.light import read_light
 RGB, RGBA = ("R", "G", "B"), ("R", "G", "B", "A")
 # Byte offsets, from the specifications.
 FORMAT, HEIGHT, LAYERS, FACES, SCHEME, DESCRIPTOR_AT, LEVEL = 12, 24, 32, 36, 44, 48, 80
+DDS_SIZE, DDS_HEIGHT, DDS_FLAGS, DDS_CODE, DDS_CAPS2 = 4, 12, 80, 84, 112
+DXGI, MISC, ARRAY = 128, 136, 140
 
 
 def _read(path, content):
@@ -43,49 +45,61 @@ def _exponents(codes, mantissa, bias=15):
     return np.where(e == 31, np.where(m == 0, np.inf, np.nan), values)
 
 
-def test_every_code_of_11_11_10(tmp_path):
+@pytest.mark.parametrize("make", [lambda *a: make_ktx2(122, *a[:2], [a[2]]), lambda *a: make_dds(26, *a)])
+def test_every_code_of_11_11_10(tmp_path, make):
     red = np.arange(2048).reshape(32, 64)
     green, blue = red[::-1], red[:, ::-1] % 1024
     words = (red | green << 11 | blue << 22).astype("<u4")
-    pixels, names = _read(tmp_path / "a", make_ktx2(122, 64, 32, [words.tobytes()]))
+    pixels, names = _read(tmp_path / "a", make(64, 32, words.tobytes()))
     assert names == RGB
     expected = np.stack([_exponents(red, 6), _exponents(green, 6), _exponents(blue, 5)], -1)
     np.testing.assert_array_equal(pixels, expected)
 
 
-def test_every_code_of_a_shared_exponent(tmp_path):
+@pytest.mark.parametrize("make", [lambda *a: make_ktx2(123, *a[:2], [a[2]]), lambda *a: make_dds(67, *a)])
+def test_every_code_of_a_shared_exponent(tmp_path, make):
     exponent, red = np.mgrid[:32, :512]
     green, blue = 511 - red, (red * 7 + exponent) % 512
     words = (red | green << 9 | blue << 18 | exponent << 27).astype("<u4")
-    pixels, names = _read(tmp_path / "a", make_ktx2(123, 512, 32, [words.tobytes()]))
+    pixels, names = _read(tmp_path / "a", make(512, 32, words.tobytes()))
     assert names == RGB
     np.testing.assert_array_equal(pixels, np.stack([red, green, blue], -1) * 2.0 ** (exponent - 24.0)[..., None])
     assert pixels.max() == 65408  # the largest of the format
 
 
 @pytest.mark.parametrize(
-    ("channels", "kind", "number"), [(3, "<f2", 90), (4, "<f2", 97), (3, "<f4", 106), (4, "<f4", 109)]
+    ("channels", "kind", "number", "others"),
+    [
+        (3, "<f2", 90, []),
+        (4, "<f2", 97, [(10, b"DX10"), (0, struct.pack("<I", 113))]),
+        (3, "<f4", 106, [(6, b"DX10")]),
+        (4, "<f4", 109, [(2, b"DX10"), (0, struct.pack("<I", 116))]),
+    ],
 )
-def test_plain_floats(tmp_path, channels, kind, number):
+def test_plain_floats(tmp_path, channels, kind, number, others):
     if kind == "<f2":
         values = np.arange(65536, dtype=np.uint16).view("<f2").reshape(128, 512)
     else:
         values = np.geomspace(1e-45, 3e38, 65536, dtype="<f4").reshape(128, 512)
         values[0, :5] = np.nan, np.inf, -np.inf, -0.0, -1.5
     light = np.stack([np.roll(values, 5 * i, 1) for i in range(channels)], -1)
-    pixels, names = _read(tmp_path / "a", make_ktx2(number, 512, 128, [light.tobytes()]))
-    assert names == (RGB, RGBA)[channels == 4]
-    np.testing.assert_array_equal(pixels, light.astype(np.float32))
+    files = [make_ktx2(number, 512, 128, [light.tobytes()])]
+    files += [make_dds(dxgi, 512, 128, light.tobytes(), code) for dxgi, code in others]
+    for content in files:
+        pixels, names = _read(tmp_path / "a", content)
+        assert names == (RGB, RGBA)[channels == 4]
+        np.testing.assert_array_equal(pixels, light.astype(np.float32))
 
 
 def test_bc6h_by_two_decoders(tmp_path):
     light = np.random.default_rng(3).random((8, 12, 3)).repeat(4, 0).repeat(3, 1).astype(np.float16)
     blocks = ispc_bc6h(light)
     bgra = np.frombuffer(texture2ddecoder.decode_bc6(blocks, 36, 32), np.uint8).reshape(32, 36, 4)
-    pixels, names = _read(tmp_path / "a", make_ktx2(143, 34, 31, [blocks]))
-    assert names == RGB and pixels.shape == (31, 34, 3)
-    assert abs(255 * pixels.clip(0, 1) - bgra[:31, :34, 2::-1]).max() <= 1.0
-    assert abs(pixels - light[:31, :34]).mean() < 0.02
+    for content in (make_ktx2(143, 34, 31, [blocks]), make_dds(95, 34, 31, blocks)):
+        pixels, names = _read(tmp_path / "a", content)
+        assert names == RGB and pixels.shape == (31, 34, 3)
+        assert abs(255 * pixels.clip(0, 1) - bgra[:31, :34, 2::-1]).max() <= 1.0
+        assert abs(pixels - light[:31, :34]).mean() < 0.02
 
 
 def test_bc6h_reaches_the_ends_and_goes_below_zero(tmp_path):
@@ -95,9 +109,10 @@ def test_bc6h_reaches_the_ends_and_goes_below_zero(tmp_path):
     pixels = _read(tmp_path / "a", make_ktx2(143, 8, 8, [blocks]))[0]
     assert (pixels[:4, :4] > 65000).all() and np.isfinite(pixels).all()
     draw = np.random.default_rng(0).integers(0, 256, (64, 16), np.uint8)
-    pixels = _read(tmp_path / "a", make_ktx2(144, 32, 32, [draw.tobytes()]))[0]
-    np.testing.assert_array_equal(pixels, imagecodecs.bcn_decode(draw.tobytes(), -6, shape=(32, 32, 3)))
-    assert pixels.min() < -100 and pixels.max() > 100
+    for content in (make_ktx2(144, 32, 32, [draw.tobytes()]), make_dds(96, 32, 32, draw.tobytes())):
+        pixels = _read(tmp_path / "a", content)[0]
+        np.testing.assert_array_equal(pixels, imagecodecs.bcn_decode(draw.tobytes(), -6, shape=(32, 32, 3)))
+        assert pixels.min() < -100 and pixels.max() > 100
 
 
 @pytest.mark.parametrize("block", ASTC_BLOCKS[::4])
@@ -124,6 +139,8 @@ def test_the_largest_level_alone_is_read(tmp_path, scheme):
     pixels, names = _read(tmp_path / "a", make_ktx2(97, 6, 4, levels, scheme))
     assert names == RGBA
     np.testing.assert_array_equal(pixels, _light(4, 6, 4))
+    pixels = _read(tmp_path / "a", make_dds(10, 6, 4, b"".join(levels), mips=3))[0]
+    np.testing.assert_array_equal(pixels, _light(4, 6, 4))
 
 
 @pytest.mark.parametrize("orientation", ["rd", "ru", "ld", "lu"])
@@ -149,11 +166,10 @@ def test_kinds_are_told_by_content(tmp_path):
             "a PNG: state what light its numbers stand for with --encoding (linear, srgb, rgbm, ...)",
         ),
         (b"\xabKTX 11\xbb\r\n\x1a\n", "a KTX file of version 1"),
-        (b"DDS |\0\0\0", "a DDS: convert it to a .hdr, for example with texconv"),
     ):
         (tmp_path / "a.exr").write_bytes(content)
         message = error_of(read_light, tmp_path / "a.exr")
-        expected = "expected a lightmap, EXR, Radiance (.hdr), PFM, TIFF of floats or KTX2, found "
+        expected = "expected a lightmap, EXR, Radiance (.hdr), PFM, TIFF of floats, KTX2 or DDS, found "
         assert message == f"{tmp_path / 'a.exr'}: {expected}{found}"
 
 
@@ -193,11 +209,32 @@ def test_other_orders_are_refused(tmp_path, pairs, words):
     assert words in error_of(read_light, tmp_path / "a.ktx2")
 
 
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (DDS_SIZE, 125, "header size: expected 124, found 125"),
+        (DDS_HEIGHT, 4, "5 x 4 texels of R16G16B16A16_FLOAT: the file is cut short: expected 308 bytes, found 268"),
+        (DDS_FLAGS, 0x40, "pixel format: expected DX10, or FourCC 113 (A16B16G16R16F) or 116 (A32B32G32R32F), found"),
+        (DDS_CODE, 0x31545844, "found FourCC DXT1"),
+        (DDS_CAPS2, 0xFE00, "expected a 2D texture, found a cube"),
+        (DXGI, 98, "found 98 (BC7_UNORM)"),
+        (MISC, 4, "DX10 flags: expected no cube, found 0x4"),
+        (ARRAY, 6, "array size: expected 1 (no array), found 6"),
+    ],
+)  # fmt: skip
+def test_a_wrong_field_of_dds_is_named(tmp_path, at, value, words):
+    content = bytearray(make_dds(10, 5, 3, _light(3, 5, 4).tobytes()))
+    struct.pack_into("<I", content, at, value)
+    (tmp_path / "a.dds").write_bytes(content)
+    message = error_of(read_light, tmp_path / "a.dds")
+    assert message.startswith(f"{tmp_path / 'a.dds'}: ") and words in message
+
+
 def test_a_missing_package_is_named_with_the_file(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "imagecodecs", None)
-    (tmp_path / "a.ktx2").write_bytes(make_ktx2(143, 4, 4, [bytes(16)]))
-    words = "a.ktx2: cannot decode the texels: atlas: imagecodecs is missing; needs the extra: pip install 'wlm[atlas]'"
-    assert words in error_of(read_light, tmp_path / "a.ktx2")
+    (tmp_path / "a.dds").write_bytes(make_dds(95, 4, 4, bytes(16)))
+    words = "a.dds: cannot decode the texels: atlas: imagecodecs is missing; needs the extra: pip install 'wlm[atlas]'"
+    assert words in error_of(read_light, tmp_path / "a.dds")
 
 
 def test_pfm_of_either_byte_order_and_of_grey(tmp_path):

@@ -12,7 +12,7 @@ import tifffile
 import warp as wp
 from builders import atlas_meshes, bench_rows, probe_layouts, probe_sets, smoke_plumes
 from builders.godot_bakes import Writer, bake, probes
-from builders.textures import make_ktx2
+from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from benchmarks import Row, write_json
@@ -99,6 +99,9 @@ def _textures(folder: Path) -> None:
         "bc6h-zlib.ktx2": make_ktx2(143, *size, [blocks], 3, {"KTXorientation": "ru", "KTXswizzle": "rgba"}),
         "half-mips.ktx2": make_ktx2(97, *size, half),
         "astc.ktx2": make_ktx2(1000066000, *size, [blocks]),
+        "shared.dds": make_dds(67, *size, words[0].tobytes()),
+        "bc6h.dds": make_dds(96, *size, blocks),
+        "float-legacy.dds": make_dds(0, *size, _pixels(4).tobytes(), b"\x74\0\0\0"),
     }.items():
         (folder / name).write_bytes(content)
 

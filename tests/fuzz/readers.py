@@ -47,7 +47,7 @@ from . import models, used
 from .containers import vary_exr, vary_glb, vary_gltf, vary_npz, vary_png
 from .mutate import NAMES, corrupt, vary_json, vary_numbers, vary_text
 from .reader import Reader, check_finite, corpus
-from .textures import vary_ktx2, vary_radiance
+from .textures import vary_dds, vary_ktx2, vary_radiance
 
 _PROFILES = Path(__file__).resolve().parents[2] / "configs"
 
@@ -490,6 +490,7 @@ _ALL = (
     Reader("webp", "a.webp", corpus("levels.webp"), corrupt, _levels),
     Reader("ktx2", "a.ktx2", corpus(*_KTX2), vary_ktx2, _light_file),
     Reader("inspect", "a.json", corpus("set.json", "probes.json", "positions.json"), _json, _inspect),
+    Reader("dds", "a.dds", corpus("shared.dds", "bc6h.dds", "float-legacy.dds"), vary_dds, _light_file),
     Reader("exr-six-way", "a.exr", corpus("six-way.exr"), functools.partial(vary_exr, note="wlm"), _six_way),
     Reader("png-mask", "mask.png", corpus("mask-grey.png", "mask-palette.png", "mask-rgba.png"), vary_png, _mask),
     Reader("png-flipbook", "a.png", corpus("flipbook.png"), vary_png, _flipbook),

@@ -78,3 +78,22 @@ def vary_ktx2(draw: Random, data: bytes) -> bytes:
     if draw.random() < 0.2:
         struct.pack_into("<Q", result, 96, len(texels))
     return bytes(result) + packed
+
+
+_DDS_WORDS = [(at, 4) for at in (4, 8, 12, 16, 20, 24, 28, 76, 80, 84, 88, 108, 112, 128, 132, 136, 140, 144)]
+_DXGI = (2, 6, 10, 26, 67, 94, 95, 96, 98)
+
+
+def vary_dds(draw: Random, data: bytes) -> bytes:
+    """Changes words of the headers, the format, the size or the texels."""
+    kind = draw.randrange(4)
+    if kind == 0:
+        return vary_numbers(draw, data, [place for place in _DDS_WORDS if sum(place) <= len(data)])
+    result = bytearray(data)
+    if kind == 1:
+        struct.pack_into("<I", result, 128, draw.choice(_DXGI))
+    if kind <= 2:
+        sides = draw.choice(((1, 120), (120, 1), (10, 12), (3, 3), (65536, 65536), (16384, 16384), (65536, 1), (0, 0)))
+        struct.pack_into("<2I", result, 12, *sides)
+        return bytes(result)
+    return data[:148] + corrupt(draw, data[148:])

@@ -34,7 +34,7 @@ LIGHTS = (
     "wide.exr",
     "plain.hdr",
     "light.pfm",
-    "bc6h-zlib.ktx2",
+    "bc6h.dds",
     "half-mips.ktx2",
     "nan.exr",
     "layers.exr",

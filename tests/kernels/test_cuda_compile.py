@@ -23,7 +23,7 @@ from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
-from wlm_kernels.smoke import depth_lattice, diffusion, march_six, marches, path, planes
+from wlm_kernels.smoke import depth_lattice, diffusion, march_six, marches, naf_block, path, planes
 from wlm_kernels.smoke import march as smoke_march
 
 KERNELS = Path(wlm_kernels.__file__).parent
@@ -96,6 +96,10 @@ def _advection(bricks: bool, solids: bool, stored: type) -> list:
     return _members(carry, list(advection_sources.source_kernels(stored).values()))
 
 
+def _planes(half: bool) -> list:
+    return _members(planes.kernels(5, 8, half, True), [planes._encode_six, planes._decode])
+
+
 def _cases(name: str, build: Callable, quick: list[tuple], *axes: tuple) -> Iterator:
     """Gives one case for each combination of arguments; the combinations in `quick` are in every run."""
     for i, values in enumerate(itertools.product(*axes)):
@@ -123,7 +127,10 @@ FACTORIES = [
         ("float32", "float16"),
     ),
     *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
-    *_cases("planes", lambda: [planes._encode_six, planes._decode], []),
+    *_cases("planes", _planes, [], BOTH),
+    *_cases(
+        "naf_block", lambda of: naf_block.kernels(*of, True), [((128, True),)], ((24, False), (24, True), (128, True))
+    ),
 ]
 
 

@@ -1,4 +1,4 @@
-"""Patches: samples, dominant colours, orders, distances and edges against float64 NumPy."""
+"""Patches: samples, dominant colours, orders, distances and bounds against float64 NumPy."""
 
 import numpy as np
 import pytest
@@ -101,26 +101,38 @@ def _ints(values: np.ndarray, device: str) -> wp.array:
     return wp.array(np.asarray(values, np.int32), dtype=int, device=device)
 
 
+def _graph(samples, patches, threshold: float, colour_threshold: float, device: str):
+    """The graph, and the number that each of its nodes had."""
+    bounds = graphs.bounds(samples, patches, int(patches.numpy()["level"].max()) + 1)
+    return graphs.graph(samples, patches, bounds, graphs.rule(threshold, colour_threshold, device))
+
+
 @pytest.mark.parametrize(("threshold", "contrast"), [(0.003, 0.02), (0.003, 0.2), (0.03, 0.2), (0.03, 1.0), (0.1, 1.0)])
 def test_neighbours(device: str, threshold: float, contrast: float):
-    """Edges of the naive matrix; some pairs need samples, for others ranges do."""
+    """Degrees, rows and remaining degrees of the naive matrix; some pairs need samples, for others bounds do."""
     count = 44
     image, (corners, level) = _image(contrast=contrast), _triangles(count, seed=3)
     samples, patches, _ = _sampled(image, corners, level, device)
-    rule = graphs.rule(threshold, 0.09, device)
-    want = reference.adjacency([_smallest(patch) for patch in _unpacked(samples, level)], threshold, 0.09)
+    graph, number = _graph(samples, patches, threshold, 0.09, device)
+    split = [_smallest(patch) for patch in _unpacked(samples, level)]
+    want = reference.adjacency([split[t] for t in number], threshold, 0.09)
+
     edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     for begin in range(0, count, 32):
-        graphs.find_edges(samples, patches, rule, begin, min(begin + 32, count), edge)
+        graphs.find_edges(graph, begin, min(begin + 32, count), edge)
     np.testing.assert_array_equal(edge.numpy() != 0, want)
+    few = np.arange(5, count, 3)
+    part, edge = graphs.part(graph, few), wp.zeros((len(few), len(few)), dtype=wp.uint8, device=device)
+    graphs.find_edges(part, 0, len(few), edge)
+    np.testing.assert_array_equal(edge.numpy() != 0, want[np.ix_(few, few)])
 
-    heads = np.array([40, 5])
+    heads = np.array([5, 40])
     joined = wp.empty(count, dtype=int, device=device)
+    low = wp.array(graph.means[heads], dtype=float, device=device)
     nodes = _ints(np.arange(count), device)
-    for begin in range(0, count, 32):
-        graphs.join(samples, patches, rule, nodes, begin, min(begin + 32, count), _ints(heads, device), joined)
+    graphs.join(graph, nodes, 0, count, _ints(heads, device), low, _ints(np.array([1, 0]), device), joined)
     like = want[heads] | (heads[:, None] == np.arange(count))
-    np.testing.assert_array_equal(joined.numpy(), np.where(like[0], 0, np.where(like[1], 1, 2)))
+    np.testing.assert_array_equal(joined.numpy(), np.where(like[1], 0, np.where(like[0], 1, 2)))
 
 
 @pytest.mark.parametrize(("step", "alike"), [(50, True), (51, False)])
@@ -137,7 +149,7 @@ def test_the_threshold_itself_is_not_alike(device: str, step: int, alike: bool, 
     for name in ("low", "high"):
         patch[name][1] = patch[name][0] + step * 0x010101
     samples = wp.array(grey, dtype=int, device=device)
-    patches, rule = wp.array(patch, dtype=kernels.Patch, device=device), graphs.rule(0.2, 2.0, device)
+    graph, _ = _graph(samples, wp.array(patch, dtype=kernels.Patch, device=device), 0.2, 2.0, device)
     edge = wp.zeros((2, 2), dtype=wp.uint8, device=device)
-    graphs.find_edges(samples, patches, rule, 0, 2, edge)
+    graphs.find_edges(graph, 0, 2, edge)
     assert edge.numpy().tolist() == [[0, int(alike)], [int(alike), 0]]

@@ -12,7 +12,7 @@ from builders.checks import error_of
 from builders.layered_sets import write_set_json, write_unity
 from builders.small_sets import load_sheet as load
 from builders.small_sets import sheet_from_arrays as from_arrays
-from builders.textures import make_ktx2
+from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 import wlm
@@ -260,7 +260,7 @@ def test_malformed_set_names_the_field(tmp_path, changes, expected):
 
 def test_path_that_does_not_exist(tmp_path):
     assert "nowhere" in error_of(load, tmp_path / "nowhere")
-    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .pfm, .tif, .tiff), found none" in error_of(
+    assert "expected a set.json or lightmaps (.exr, .hdr, .ktx2, .dds, .pfm, .tif, .tiff), found none" in error_of(
         load, tmp_path
     )
 
@@ -287,7 +287,7 @@ def test_plain_folder_may_mix_formats(tmp_path):
     (tmp_path / "m_2h.hdr").write_bytes(imagecodecs.rgbe_encode(frames[1], header=True))
     texels = np.concatenate([frames[2], alpha], -1, dtype=np.float16)
     (tmp_path / "m_3h.ktx2").write_bytes(make_ktx2(97, WIDTH, HEIGHT, [texels.tobytes()], scheme=2))
-    (tmp_path / "m_4h.KTX2").write_bytes(make_ktx2(106, WIDTH, HEIGHT, [frames[3].astype("<f4").tobytes()]))
+    (tmp_path / "m_4h.DDS").write_bytes(make_dds(6, WIDTH, HEIGHT, frames[3].astype("<f4").tobytes()))
     lightmaps = load(tmp_path)
     expected = frames.copy()
     expected[1] = read_light(tmp_path / "m_2h.hdr")[0]
@@ -297,7 +297,7 @@ def test_plain_folder_may_mix_formats(tmp_path):
     message = error_of(load, tmp_path, mask="alpha")
     assert "m_2h.hdr: expected a channel A for the mask, found the channels R, G, B" in message
     (tmp_path / "m_2h.hdr").unlink()
-    (tmp_path / "m_4h.KTX2").unlink()
+    (tmp_path / "m_4h.DDS").unlink()
     np.testing.assert_array_equal(load(tmp_path, mask="alpha").mask, alpha[..., 0] > 0)
 
 

@@ -397,6 +397,15 @@ def test_a_target_and_a_number_of_bytes_choose_the_model():
         compress(probes, SEARCH, max_bytes=60)
 
 
+def test_the_network_takes_at_most_half_of_the_bytes():
+    probes = synthetic(200)
+    settings = Profile(name="x", method="gaussians", steps=10, latent=4, hidden=40)
+    models = {most: compress(probes, settings, max_bytes=most) for most in (2000, 3000, 10000, 20000)}
+    assert [model.content.hidden for model in models.values()] == [16, 16, 32, 40]
+    assert all(model.content.nbytes <= most for most, model in models.items())
+    assert models[10000].profile.hidden == 32 and compress(probes, settings).content.hidden == 40
+
+
 def test_a_search_is_resumed(tmp_path):
     probes, out = synthetic(200), tmp_path / "a.wlm"
     settings = SEARCH.override({"target": 0.65, "method": "gaussians", "ratio": 0.01})

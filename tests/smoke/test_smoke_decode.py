@@ -1,4 +1,4 @@
-"""The network at run time: a decoder gives the network's planes, and hard smoke gives valid lightmaps."""
+"""The network at run time: folded weights give the same planes, and hard smoke gives valid lightmaps."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def _expected(model: SmokeModel, guide: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("size", [(32, 32), (17, 23), (1, 9), (1, 1)])
 @pytest.mark.parametrize("settings", [{}, {"stem": 2}, {"adapters": False, "stem": 2}, {"guide": "six", "stem": 2}])
-def test_a_decoder_gives_the_planes_of_its_network(settings, size):
+def test_folded_weights_give_the_same_planes(settings, size):
     model = random_model(**settings)
     decoder = model.decoder(height=size[0], width=size[1])
     for seed in range(2):

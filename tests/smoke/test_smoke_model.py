@@ -102,8 +102,7 @@ def test_switches_change_what_they_should():
 def test_an_adapter_changes_its_own_planes_alone():
     guides = small_pool().guides[:1, 0].float()
     network = _network()
-    with torch.no_grad():
-        before = network(guides)
+    before = network(guides)
     for head, group in zip(network.heads, ADAPTERS, strict=True):
         bias = head.bias.detach().clone()
         with torch.no_grad():

@@ -186,7 +186,7 @@ def load(
 
     Args:
         mesh_path: A `.glb`, `.gltf`, `.obj` or `.ply` file.
-        lights_path: One lightmap (EXR, Radiance, KTX2: see `wlm.formats.light`; or PNG), row 0 at v = 0 of glTF
+        lights_path: One lightmap (EXR, Radiance, KTX2, DDS: see `wlm.formats.light`; or PNG), row 0 at v = 0 of glTF
             and v = 1 of other formats; or a list of lightmaps, a folder of them or a Godot bake, see
             `wlm.atlas.listing`; None: the lightmaps that the glTF file names itself, see `wlm.atlas.materials`.
         mask_path: With one lightmap, a PNG of its size; a texel belongs to a chart where any colour channel is above

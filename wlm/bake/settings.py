@@ -64,7 +64,7 @@ class Sky(_Settings):
 
     Attributes:
         radiance: Radiance from all directions, or, with `file`, a factor of the environment map.
-        file: An equirectangular environment map (`.exr`, `.hdr` or `.ktx2`), twice as wide as high: the top row
+        file: An equirectangular environment map (`.exr`, `.hdr`, `.ktx2` or `.dds`), twice as wide as high: the top row
             is +y, the middle column -z, columns to the right of it turn towards +x; None for no map.
     """
 

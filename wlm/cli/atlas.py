@@ -20,7 +20,7 @@ _Lights = Annotated[
     Path | None,
     typer.Argument(
         metavar="LIGHTMAPS",
-        help="Lightmap (EXR, HDR, PFM, TIFF, KTX2, or a PNG with --encoding), a folder of them, a .lmbake, or a "
+        help="Lightmap (EXR, HDR, PFM, TIFF, KTX2, DDS, or a PNG with --encoding), a folder of them, a .lmbake, or a "
         ".json that lists them; default those that the glTF file names.",
     ),
 ]

@@ -22,7 +22,7 @@ _Set = Annotated[
     Path,
     typer.Argument(
         metavar="SET",
-        help="A set.json, a folder of lightmaps (.exr, .hdr, .pfm, .tif, .ktx2), or folders of Unity bakes.",
+        help="A set.json, a folder of lightmaps (.exr, .hdr, .pfm, .tif, .ktx2, .dds), or folders of Unity bakes.",
     ),
 ]
 _Times = Annotated[

@@ -20,14 +20,14 @@ import numpy as np
 _WAIT = 120.0  # wall-clock limit in seconds
 
 
-def run_child(reader: ModuleType, data: bytes) -> dict[str, np.ndarray]:
-    """Runs the function `main` of a module on data in a limited process; returns its arrays by name.
+def run_child(reader: ModuleType, data: bytes, *arguments: str) -> dict[str, np.ndarray]:
+    """Runs the function `main` of a module on data and arguments in a limited process; returns its arrays by name.
 
     Raises:
         ValueError: The process raised an error, crashed or exceeded a limit, or could not be started.
     """
     # With -P, a module beside the program cannot replace a package.
-    command = [sys.executable, "-P", __file__, str(reader.__file__)]
+    command = [sys.executable, "-P", __file__, str(reader.__file__), *arguments]
     try:
         run = subprocess.run(command, input=data, capture_output=True, timeout=_WAIT, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -57,5 +57,5 @@ if __name__ == "__main__":
     importlib.import_module(_reader["PACKAGE"])
     _limit(_reader["MEMORY"], _reader["SECONDS"])
     with contextlib.redirect_stdout(io.StringIO()):  # libraries print messages about data that they cannot read
-        _arrays = _reader["main"](sys.stdin.buffer.read())
+        _arrays = _reader["main"](sys.stdin.buffer.read(), *sys.argv[2:])
     np.savez(sys.stdout.buffer, **_arrays)

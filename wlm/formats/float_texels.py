@@ -6,7 +6,7 @@ packages decode blocks.
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import BinaryIO
@@ -95,6 +95,21 @@ def check_fields(path: str | os.PathLike[str], *fields: tuple[str, object, bool,
     for field, found, fits, expected in fields:
         if not fits:
             raise WlmError(f"{path}: {field}: expected {expected}, found {found}")
+
+
+def layout_of(
+    path: str | os.PathLike[str],
+    field: str,
+    number: int,
+    layouts: Mapping[int, tuple[str, Layout]],
+    others: Mapping[str, int],
+    expected: str,
+) -> tuple[str, Layout]:
+    """Returns the name and the layout of a format by its number."""
+    if number not in layouts:
+        name = next((f" ({name})" for name, written in others.items() if written == number), "")
+        raise WlmError(f"{path}: {field}: expected {expected}, found {number}{name}")
+    return layouts[number]
 
 
 def read_part(path: str | os.PathLike[str], file: BinaryIO, start: int, size: int, part: str) -> bytes:

@@ -22,7 +22,7 @@ external images                       copies embed them; an image that is missin
 a buffer outside the file's folder    error, unless the file is trusted; an image there keeps its URI
 more corners and vertices than        error, unless the file is trusted (`wlm.formats.limits`)
 the limits
-Draco, meshopt                        error that names the extension, if the file has no other data
+Draco, meshopt                        decompressed, with the extra `gltf` (`gltf_packed`)
 GPU instances                         error that names the extension
 a file missing or damaged             error that names the file, and the field
 ====================================  ================================================================
@@ -44,6 +44,7 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 
 from wlm.errors import WlmError, one_line
+from wlm.formats.gltf_packed import is_fallback, unpack
 from wlm.formats.limits import CORNERS, CORNERS_A_BYTE, JSON_BYTES, MESH_BYTES, SURE_CORNERS, Budget
 from wlm.formats.reading import damaged, named_file, parse_json, read_file
 
@@ -64,13 +65,7 @@ _OVERHEAD = 512  # cost of a primitive under a node, in corners
 _LARGEST_TRANSFORM = 1e9  # magnitude of the numbers of a texture transform
 _MOVES, _UNMOVED = {"matrix", "translation", "rotation", "scale"}, np.eye(4)
 _UV_NAME = re.compile(r"TEXCOORD_(0|[1-9]\d{0,3})")
-_UNPACK = "unpack the file first, for example with gltf-transform copy"
-_REFUSED = {
-    "EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance",
-    "KHR_draco_mesh_compression": _UNPACK,
-    "EXT_meshopt_compression": _UNPACK,
-    "KHR_meshopt_compression": _UNPACK,
-}
+_REFUSED = {"EXT_mesh_gpu_instancing": "make its instances nodes first, for example with gltf-transform uninstance"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +148,10 @@ def parse_gltf(
         if version.partition(".")[0] != "2":
             raise WlmError(f"{path}: asset.version: expected 2.0, found {version}")
         for name in (*content.get("extensionsUsed", []), *content.get("extensionsRequired", [])):
-            # A file that does not require a compression holds the data without it too.
-            if name in _REFUSED and (_REFUSED[name] != _UNPACK or name in content.get("extensionsRequired", [])):
+            if name in _REFUSED:
                 raise WlmError(f"{path}: uses the extension {name}, which is not read here: {_REFUSED[name]}")
         buffers = _load_buffers(path, content.get("buffers", []), binary, trust)
+        content, buffers = unpack(path, content, buffers, COMPONENTS)
         held = len(text) + sum(map(len, buffers))
         most = CORNERS if trust else min(CORNERS, max(SURE_CORNERS, CORNERS_A_BYTE * held))
         document = GltfDocument(str(path), content, buffers, trust, most)
@@ -562,7 +557,9 @@ def _load_buffers(
     loaded = []
     for number, buffer in enumerate(buffers):
         uri, length, where = buffer.get("uri"), buffer["byteLength"], f"{path}: buffers[{number}]"
-        if uri is None:
+        if is_fallback(buffer):
+            data, length = b"", 0
+        elif uri is None:
             if number or binary is None:
                 raise WlmError(f"{where}: expected a uri; only buffers[0] of a .glb with a binary chunk has none")
             data = binary

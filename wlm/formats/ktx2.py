@@ -207,10 +207,7 @@ def _read(path: str | os.PathLike[str], volume: bool, notes: list[str]) -> tuple
         number, _, width, height, depth, layers, faces, _, scheme = fields[1:10]
         descriptor, pairs = fields[10:12], fields[12:14]
         start, stored, size = fields[16:19]
-        if number not in _LAYOUTS:
-            name = next((f" ({name})" for name, other in (VK_FORMATS | _OTHERS).items() if other == number), "")
-            raise WlmError(f"{path}: vkFormat: expected {_EXPECTED}, found {number}{name}")
-        name, layout = _LAYOUTS[number]
+        name, layout = texels.layout_of(path, "vkFormat", number, _LAYOUTS, VK_FORMATS | _OTHERS, _EXPECTED)
         check_fields(
             path,
             ("pixelHeight", height, height > 0, "at least 1 (2D)"),

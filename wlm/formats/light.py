@@ -6,15 +6,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from wlm.errors import WlmError
-from wlm.formats import ktx2, pfm, radiance, tiff
+from wlm.formats import dds, ktx2, pfm, radiance, tiff
 from wlm.formats.exr import read_exr
 from wlm.formats.exr_header import MAGIC as EXR_MAGIC
 from wlm.formats.reading import open_file
 
-SUFFIXES = (".exr", ".hdr", ".ktx2", ".pfm", ".tif", ".tiff")
+SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds", ".pfm", ".tif", ".tiff")
 """Suffixes by which pictures of light are found in a folder."""
 
-EXPECTED = "EXR, Radiance (.hdr), PFM, TIFF of floats or KTX2"
+EXPECTED = "EXR, Radiance (.hdr), PFM, TIFF of floats, KTX2 or DDS"
 """Names of the formats, for messages."""
 
 _Notes = list[str]
@@ -35,6 +35,7 @@ _READERS: dict[bytes, Callable[[str | os.PathLike[str], _Notes], tuple[np.ndarra
     EXR_MAGIC: read_exr,
     radiance.MAGIC: radiance.read_radiance,
     ktx2.MAGIC: ktx2.read_ktx2,
+    dds.MAGIC: lambda path, notes: dds.read_dds(path),
     **dict.fromkeys(pfm.MAGIC, pfm.read_pfm),
     **dict.fromkeys(tiff.MAGIC, _read_tiff),
 }
@@ -45,7 +46,6 @@ _OTHERS = {
     b"\xff\xd8\xff": f"a JPEG{_STATE_IT}",
     b"RIFF": f"a WebP or another RIFF file{_STATE_IT}",
     b"\xabKTX 11": "a KTX file of version 1",
-    b"DDS ": "a DDS: convert it to a .hdr, for example with texconv",
     b"II+\0": "a BigTIFF",
     b"MM\0+": "a BigTIFF",
     b"QLIT": "the coloured light of a Quake map",

@@ -63,7 +63,7 @@ CORNERS = 1 << 28
 """Largest number of drawn corners and vertices."""
 
 PICTURE_SIDE = 65_536
-"""Longest side of a lightmap file (EXR, Radiance, PFM, TIFF, KTX2), in texels."""
+"""Longest side of a lightmap file (EXR, Radiance, PFM, TIFF, KTX2, DDS), in texels."""
 
 PICTURE_TEXELS = 1 << 28
 """Most texels of a lightmap file: 16384 x 16384, the largest texture of most GPUs."""

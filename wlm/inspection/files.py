@@ -364,10 +364,12 @@ def _checkpoint(path: Path) -> Finding:
 
 
 def _unity_asset(path: Path) -> Finding:
-    if not len(read_lighting_data(path).position):
-        return Finding(path, "lighting data of Unity: no light probes")
+    data = read_lighting_data(path)
+    rectangles = f"{len(data.rectangles)} rectangles of renderers in lightmaps, without names"
+    if not len(data.position):
+        return Finding(path, f"lighting data of Unity: no light probes, {rectangles}")
     found = _probes(path)
-    return replace(found, what=f"lighting data of Unity: {found.what}")
+    return replace(found, what=f"lighting data of Unity: {found.what}; {rectangles}")
 
 
 class _Kind(NamedTuple):

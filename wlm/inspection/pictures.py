@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from wlm.errors import WlmError, one_line
-from wlm.formats import ktx2, pfm, radiance
+from wlm.formats import dds, ktx2, pfm, radiance
 from wlm.formats.channels import read_channels
 from wlm.formats.exr import HALF_MAX, read_header
 from wlm.formats.exr_header import MAGIC as EXR_MAGIC
@@ -29,7 +29,7 @@ _TEXTURE = re.compile(r"(^|[_. -])(rlt|bbf|tlr|rtbk?|lbt?f|tlrb)(?=[_. -]|$)", r
 
 @dataclass(frozen=True)
 class Picture:
-    """Facts from the header of a picture: its kind, "EXR", "Radiance", "PFM", "TIFF" or "KTX2", or one that is
+    """Facts from the header of a picture: its kind, "EXR", "Radiance", "PFM", "TIFF", "KTX2" or "DDS", or one that is
     no light without an encoding, "PNG", "JPEG", "WebP" or "TGA"; and its size in texels and the names of its channels,
     0 and empty if the beginning of the file does not state them.
     """
@@ -46,7 +46,7 @@ class Picture:
 
     @property
     def is_light(self) -> bool:
-        """Whether the format can store linear light: EXR, Radiance, PFM, TIFF or KTX2."""
+        """Whether the format can store linear light: EXR, Radiance, PFM, TIFF, KTX2 or DDS."""
         return self.kind not in ("PNG", "JPEG", "WebP", "TGA")
 
     @property
@@ -79,10 +79,12 @@ def picture_of(path: Path) -> Picture | None:
         return Picture("PFM", *pfm.header_of(path, head)[:2])
     for kind, magic, form, at in (
         ("KTX2", ktx2.MAGIC, "<2I", 20),
+        ("DDS", dds.MAGIC, "<2I", 12),
         ("PNG", PNG_MAGIC, ">2I", 16),
     ):
         if head.startswith(magic) and len(head) >= at + 8:
-            width, height = struct.unpack_from(form, head, at)
+            first, second = struct.unpack_from(form, head, at)
+            width, height = (second, first) if kind == "DDS" else (first, second)
             check_sides(str(path), width, height)
             return Picture(kind, width, height)
     other = level_kind(path, head)

@@ -236,7 +236,7 @@ def load(
 
     The keys of a `set.json` are described in docs/formats.md. File names in it are relative to its folder.
 
-    The files of a plain folder that end in `.exr`, `.hdr`, `.pfm`, `.tif` or `.ktx2` are read in natural order
+    The files of a plain folder that end in `.exr`, `.hdr`, `.pfm`, `.tif`, `.ktx2` or `.dds` are read in natural order
     of their names ("2" before "10"). Without `times`, the hours are read from the names if every name ends in one
     (`wlm.formats.hours`); if all are within a day, the period is 24. A `mask.png` among them is the mask unless `mask`
     says otherwise.

@@ -26,9 +26,9 @@ from wlm.lightmap.sheet import BASE, LIGHT, MOST_CHANNELS, MOST_NAME, MOST_SHEET
 SET_FILE = "set.json"
 
 # Names that Unity gives: Lightmap-0_comp_light.exr, Lightmap-0_comp_dir.png, Lightmap-0_comp_shadowmask.png.
-_UNITY = re.compile(r"(.+)_comp_(light|dir|shadowmask)(\.exr|\.hdr|\.png|\.ktx2)", re.IGNORECASE)
+_UNITY = re.compile(r"(.+)_comp_(light|dir|shadowmask)(\.exr|\.hdr|\.png|\.ktx2|\.dds)", re.IGNORECASE)
 _UNITY_ENCODING = {"light": "radiance", "dir": "unit", "shadowmask": "unit"}
-_UNITY_SUFFIXES = (".exr", ".hdr", ".ktx2", ".png")  # the first format that all states have is read
+_UNITY_SUFFIXES = (".exr", ".hdr", ".ktx2", ".dds", ".png")  # the first format that all states have is read
 
 _MASK_WORDS = ("all", "alpha")
 _GIVEN = "the times given, in the order of the names"

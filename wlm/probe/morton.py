@@ -7,11 +7,17 @@ from wlm_kernels.probe.volume_frame import SPREAD
 _CELLS = 1023  # along an axis of the unit cube
 
 
-def morton_keys(cell: np.ndarray) -> np.ndarray:
-    """Returns Morton keys, uint64 [M], of cells int64 [M, 3] below 2 ** 21: the interleaved bits of x, y and z."""
-    bits = cell.astype(np.uint64)
+def spread_bits(numbers: np.ndarray) -> np.ndarray:
+    """Returns whole numbers below 2 ** 21, of any shape, with two zeros between each two bits, uint64."""
+    bits = numbers.astype(np.uint64)
     for shift, mask in zip((32, 16, 8, 4, 2), SPREAD, strict=True):
         bits = (bits | bits << np.uint64(shift)) & np.uint64(mask)
+    return bits
+
+
+def morton_keys(cell: np.ndarray) -> np.ndarray:
+    """Returns Morton keys, uint64 [M], of cells int64 [M, 3] below 2 ** 21: the interleaved bits of x, y and z."""
+    bits = spread_bits(cell)
     return bits[:, 0] | bits[:, 1] << np.uint64(1) | bits[:, 2] << np.uint64(2)
 
 

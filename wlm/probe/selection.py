@@ -20,6 +20,7 @@ _FITS = 7  # most fits of a search
 _POWER = 0.5  # the error is about this power of the number of Gaussians, inverted, until two fits have shown it
 _MARGIN = 1.05  # factor of a guess, so that it rather reaches the target
 _TRIES, _LESS = 3, 0.9  # fits of components with a smaller error over the day, and a factor, so that one suffices
+_NETWORK, _NARROWER = 0.5, 16  # most of the bytes that a network takes before its layers get narrower by so many units
 _CLOSE = 1.1  # a search ends when the number that reaches is at most this factor above one that does not
 
 
@@ -99,6 +100,7 @@ class Candidates:
             if error <= target:
                 most = min(most, size - 1)  # more Gaussians than that would be no gain
         if profile.method != "pca":
+            self._narrow(limit)
             each, fixed = self._bytes(1) - self._bytes(0), self._bytes(0)
             count = int(min(most, self._bytes(self._live)) - fixed) // each
             count = count if count >= self._regions else 0
@@ -121,6 +123,12 @@ class Candidates:
             missed = f"{name}: target: the {profile.error} error is {least:.1%}, more than the {target:.1%} asked for"
             warnings = (missed, *warnings)
         return replace(model, choice=f"{kind}: {told} bytes of GPU memory", warnings=warnings)
+
+    def _narrow(self, limit: float) -> None:
+        """Makes the network narrower until it leaves enough of the bytes to Gaussians."""
+        while self._bytes(0) > _NETWORK * limit and self._profile.hidden > _NARROWER:
+            hidden = (self._profile.hidden - 1) // _NARROWER * _NARROWER
+            self._profile = self._profile.model_copy(update={"hidden": hidden})
 
     def _components(self, most: int | None, enough: float) -> tuple[ProbeModel, float]:
         """Returns the fewest principal components found with an error of at most `enough`, over all hours relative to

@@ -1,18 +1,56 @@
 """The graph of similar patches (lightmap-uv-clustering-cascade, section 3.2). A patch stores the colours of a triangle.
 
-Two patches are alike, which is an edge of the graph, if their distance is below a threshold, lambda. For most pairs the
-ranges of their colours decide; the samples of the others are compared until their sum reaches the threshold.
+Two patches are alike if their distance is below a threshold, lambda. For most pairs, lower and upper bounds of the
+distance (`Bounds`) decide, so that all samples are compared for few pairs only. The bounds are float32 with a margin
+above their rounding errors, and so never change a result. Patches are sorted by mean colour: if two means differ by
+lambda or more, the patches can't be alike and are not compared.
 
 Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`), which does the same with the distances of
 all pairs.
 """
 
 import math
+from dataclasses import dataclass
 from fractions import Fraction
 
+import numpy as np
 import warp as wp
 
-from wlm_kernels.atlas.patches import BINS, SIZES, Patch, channel, distance_sum, samples_of
+from wlm_kernels.atlas.patches import (
+    BINS,
+    SIZES,
+    Patch,
+    channel,
+    distance_sum,
+    samples_of,
+    spread,
+    turned,
+)
+
+# The margin exceeds the rounding of a bound in float32: 6e-8 of up to 765 levels, a few dozen times.
+_MARGIN = wp.constant(4.0e-3)
+
+
+@wp.struct
+class Bounds:
+    """Quantities of one patch that bound the distance Dist between two patches on one lattice, in 8-bit colour levels.
+
+    A sample (i, j, k) of a lattice of size n has the weights w = (i, j, k) / (n - 1) of the vertices v, and the colours
+    T in one patch and T' in the other. L = sum of w_v C_v is the linear function that fits T best by least squares.
+
+    - From below: the sum over v of |mean of w_v (T - T')| is at most the mean of |T - T'|.
+    - From above: the mean of |T - T'| is at most the sum of the means of |T - L|, of |T' - L'| and, for each vertex v,
+      of w_v |C_v - C'_v|. The mean of w_v is 1/3.
+
+    Attributes:
+        moment: Row v: the mean over the samples of w_v T.
+        corner: Row v: C_v, the colour of L at vertex v.
+        residual: Mean over the samples of |T - L|, summed over the channels.
+    """
+
+    moment: wp.mat33
+    corner: wp.mat33
+    residual: float
 
 
 @wp.struct
@@ -21,16 +59,77 @@ class Rule:
 
     Attributes:
         colour: Largest squared distance of the two dominant colours, in bins of the colour histogram.
-        level: The mean difference of the samples, summed over the channels, must be below this number of levels, which
-            is rounded up to a whole one.
+        level: The mean difference of the samples, summed over the channels, must be below this number of levels.
+        whole: `level` rounded up to a whole number.
         same: [len(SIZES)], for two patches of this size: threshold of the sum of all samples' differences, in levels.
         mixed: [len(SIZES)], the same for patches of two sizes, by the larger size n, in 1 / (n - 1) of a level.
     """
 
     colour: int
-    level: int
+    level: float
+    whole: int
     same: wp.array1d[int]
     mixed: wp.array1d[int]
+
+
+@wp.kernel(enable_backward=False)
+def _bounds(
+    # in:
+    samples: wp.array1d[int],
+    patches: wp.array1d[Patch],
+    # out:
+    bounds: wp.array2d[Bounds],
+):
+    """Computes the `Bounds` of one patch on one lattice per thread; none for lattices smaller than the patch's own."""
+    t, level = wp.tid()
+    p = patches[t]
+    if level < p.level:
+        return
+    steps = 1 << level
+    moment = wp.mat33d()
+    across = wp.float64(0.0)
+    count = wp.float64(0.0)
+    for j in range(steps + 1):
+        for i in range(steps + 1 - j):
+            w = wp.vec3d(wp.float64(i), wp.float64(j), wp.float64(steps - i - j))
+            moment += wp.outer(w, wp.vec3d(spread(samples, p, i, j, level)))
+            across += w[0] * w[1]
+            count += wp.float64(1.0)
+    # The matrix of the normal equations has one number on its diagonal and one everywhere else.
+    scale = wp.float64(steps)
+    all = scale * scale * count / wp.float64(3.0)
+    mean = (moment[0] + moment[1] + moment[2]) * (across / all)
+    corner = wp.matrix_from_rows(moment[0] - mean, moment[1] - mean, moment[2] - mean) / (
+        all - wp.float64(3.0) * across
+    )
+    residual = wp.float64(0.0)
+    for j in range(steps + 1):
+        for i in range(steps + 1 - j):
+            w = wp.vec3d(wp.float64(i), wp.float64(j), wp.float64(steps - i - j))
+            d = wp.vec3d(spread(samples, p, i, j, level)) / scale - w * corner
+            residual += wp.abs(d[0]) + wp.abs(d[1]) + wp.abs(d[2])
+    f = Bounds()
+    f.moment = wp.mat33(moment / (scale * scale * count))
+    f.corner = wp.mat33(corner * scale)
+    f.residual = float(residual / count)
+    bounds[t, level] = f
+
+
+@wp.func
+def _row_differences(a: wp.mat33, b: wp.mat33) -> wp.mat33:
+    """Returns the matrix of the differences |a_v - b_u| of rows v of a and rows u of b, summed over the channels."""
+    out = wp.mat33()
+    for v in range(3):
+        for u in range(3):
+            out[v, u] = wp.abs(a[v, 0] - b[u, 0]) + wp.abs(a[v, 1] - b[u, 1]) + wp.abs(a[v, 2] - b[u, 2])
+    return out
+
+
+@wp.func
+def _along(m: wp.mat33, order: int) -> float:
+    """Returns the sum of m[p[k], k] over k, where p is the permutation `ORDERS[order]`."""
+    p = turned(wp.vec3i(0, 1, 2), order)
+    return m[p[0], 0] + m[p[1], 1] + m[p[2], 2]
 
 
 @wp.func
@@ -43,8 +142,12 @@ def _near(rule: Rule, a: int, b: int) -> bool:
 
 
 @wp.func
-def _alike(samples: wp.array1d[int], a: Patch, b: Patch, rule: Rule) -> bool:
-    """Tests whether two patches are alike: Dist is below lambda in some order of the vertices (eq. 3 and 4)."""
+def _alike(
+    samples: wp.array1d[int], patches: wp.array1d[Patch], bounds: wp.array2d[Bounds], rule: Rule, x: int, y: int
+) -> bool:
+    """Tests whether patches x and y are alike: Dist is below lambda in some order of the vertices (eq. 3 and 4)."""
+    a = patches[x]
+    b = patches[y]
     if not _near(rule, a.colour, b.colour):
         return False
     # Interpolation stays within a patch's range, so bounds from two ranges are valid for all samples and orders.
@@ -55,22 +158,67 @@ def _alike(samples: wp.array1d[int], a: Patch, b: Patch, rule: Rule) -> bool:
         down = channel(b.high, c) - channel(a.low, c)
         most += wp.max(up, down)
         least += wp.max(0, wp.max(-up, -down))
-    if most < rule.level:
+    if most < rule.whole:
         return True
-    if least >= rule.level:
+    if least >= rule.whole:
         return False
-    large = a
-    small = b
+    large = x
+    small = y
     if a.level < b.level:
-        large = b
-        small = a
-    limit = rule.mixed[large.level]
-    if a.level == b.level:
-        limit = rule.same[large.level]
+        large = y
+        small = x
+    level = wp.max(a.level, b.level)
+    f = bounds[large, level]
+    g = bounds[small, level]
+    below = _row_differences(f.moment, g.moment)
+    above = _row_differences(f.corner, g.corner)
+    undecided = int(0)
+    first = int(0)
+    closest = float(wp.inf)
     for order in range(6):
-        if distance_sum(samples, large, small, order, limit) < limit:
+        bound = _along(above, order) / 3.0 + f.residual + g.residual
+        if bound < rule.level - _MARGIN:
             return True
+        if bound < closest:
+            closest = bound
+            first = order
+        if _along(below, order) < rule.level + _MARGIN:
+            undecided += 1 << order
+    if undecided == 0:
+        return False
+    limit = rule.mixed[level]
+    if a.level == b.level:
+        limit = rule.same[level]
+    for i in range(6):
+        # The likeliest order comes first: if the patches are alike in it, the others need no comparison.
+        order = (first + i) % 6
+        if ((undecided >> order) & 1) == 1:
+            if distance_sum(samples, patches[large], patches[small], order, limit) < limit:
+                return True
     return False
+
+
+@wp.kernel(enable_backward=False)
+def _spans(
+    # in:
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    # out:
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+):
+    """Writes a patch's least and greatest mean colour (sum of the channels) on its own lattice and all larger ones."""
+    i = wp.tid()
+    least = float(wp.inf)
+    most = float(-wp.inf)
+    for level in range(patches[i].level, bounds.shape[1]):
+        moment = bounds[i, level].moment
+        sum = moment[0] + moment[1] + moment[2]
+        mean = sum[0] + sum[1] + sum[2]
+        least = wp.min(least, mean)
+        most = wp.max(most, mean)
+    low[i] = least
+    high[i] = most
 
 
 @wp.kernel(enable_backward=False)
@@ -78,16 +226,21 @@ def _edges(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
     rule: Rule,
+    low: wp.array1d[float],
+    high: wp.array1d[float],
     offset: int,
     # out:
     edge: wp.array2d[wp.uint8],
 ):
     """Finds the edges between one patch per thread and all later patches, so that each pair is tested once."""
     a = offset + wp.tid()
-    own = patches[a]
-    for b in range(a + 1, patches.shape[0]):
-        if _alike(samples, own, patches[b], rule):
+    last = high[a] + rule.level + _MARGIN
+    for b in range(a + 1, low.shape[0]):
+        if low[b] > last:
+            break
+        if _alike(samples, patches, bounds, rule, a, b):
             edge[a, b] = wp.uint8(1)
             edge[b, a] = wp.uint8(1)
 
@@ -97,20 +250,30 @@ def _join(
     # in:
     samples: wp.array1d[int],
     patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
     rule: Rule,
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+    reach: float,
     nodes: wp.array1d[int],
     offset: int,
     heads: wp.array1d[int],
+    head_low: wp.array1d[float],
+    rank: wp.array1d[int],
     # out:
     joined: wp.array1d[int],
 ):
+    """Finds for one node per thread the least rank of a group whose representative is alike; H if none of H is."""
     i = offset + wp.tid()
-    own = patches[nodes[i]]
-    best = int(heads.shape[0])
-    for k in range(heads.shape[0]):
-        if _alike(samples, patches[heads[k]], own, rule):
-            best = k
+    a = nodes[i]
+    margin = rule.level + _MARGIN
+    best = int(rank.shape[0])
+    for k in range(wp.lower_bound(head_low, low[a] - margin - reach), heads.shape[0]):
+        if head_low[k] > high[a] + margin:
             break
+        if rank[k] < best:
+            if _alike(samples, patches, bounds, rule, heads[k], a):
+                best = rank[k]
     joined[i] = best
 
 
@@ -121,7 +284,8 @@ def rule(threshold: float, colour_threshold: float, device) -> Rule:
     total = Fraction(str(threshold)) * 765  # three channels of 255 levels
     out = Rule()
     out.colour = math.floor((Fraction(str(colour_threshold)) * BINS) ** 2)
-    out.level = math.ceil(total)
+    out.level = float(total)
+    out.whole = math.ceil(total)
     same = [math.ceil(total * samples_of(size)) for size in SIZES]
     mixed = [math.ceil(total * samples_of(size) * (size - 1)) for size in SIZES]
     out.same = wp.array(same, dtype=int, device=device)
@@ -129,15 +293,74 @@ def rule(threshold: float, colour_threshold: float, device) -> Rule:
     return out
 
 
-def find_edges(samples, patches, rule: Rule, begin: int, end: int, edge) -> None:
-    """Finds the edges between the patches `begin` to `end` - 1 and all later ones. For an edge between a and b it
-    writes 1 to `edge`, uint8 [M, M], at (a, b) and at (b, a); all of `edge` must be 0 before."""
-    inputs = [samples, patches, rule, begin]
+def bounds(samples, patches, levels: int):
+    """Returns the `Bounds` [F, levels] of F patches on the lattices of the sizes `SIZES[:levels]`."""
+    out = wp.empty((patches.shape[0], levels), dtype=Bounds, device=samples.device)
+    wp.launch(_bounds, out.shape, inputs=[samples, patches], outputs=[out], device=samples.device)
+    return out
+
+
+@dataclass(frozen=True)
+class Graph:
+    """The similarity graph of M patches (eq. 5), sorted by `low`. Its edges are computed when they are needed.
+
+    Attributes:
+        samples: The samples of all patches.
+        patches, bounds: The M patches, which are the graph's nodes, and their `Bounds`.
+        rule: Thresholds below which two patches are alike.
+        low, high: float [M], a patch's least and greatest mean colour on any lattice, in levels. If two patches are
+            alike, their means on the larger one's lattice differ by less than `rule.level`.
+        means: float32 [M], copy of `low` in the CPU's memory.
+        reach: The largest difference of `high` and `low` in any patch.
+    """
+
+    samples: wp.array
+    patches: wp.array
+    bounds: wp.array
+    rule: Rule
+    low: wp.array
+    high: wp.array
+    means: np.ndarray
+    reach: float
+
+    def _inputs(self) -> list:
+        return [self.samples, self.patches, self.bounds, self.rule]
+
+
+def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
+    """Makes the graph of M patches. Also returns the index in `patches` of each of its nodes, int64 [M]."""
+    count, device = patches.shape[0], samples.device
+    low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
+    wp.launch(_spans, count, inputs=[patches, bounds], outputs=[low, high], device=device)
+    least, most = low.numpy(), high.numpy()
+    order = np.argsort(least, kind="stable")
+    spans = [wp.array(values[order], dtype=float, device=device) for values in (least, most)]
+    reach = float((most - least).max(initial=0.0))
+    return Graph(samples, *_taken(patches, bounds, order), rule, *spans, least[order], reach), order
+
+
+def part(whole: Graph, nodes: np.ndarray) -> Graph:
+    """Makes the subgraph of N nodes, whose numbers `nodes`, int [N], must ascend."""
+    spans = [wp.array(values.numpy()[nodes], dtype=float, device=values.device) for values in (whole.low, whole.high)]
+    taken = _taken(whole.patches, whole.bounds, nodes)
+    return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.reach)
+
+
+def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
+    pairs = (patches, Patch), (bounds, Bounds)
+    return tuple(wp.array(each.numpy()[nodes], dtype=kind, device=each.device) for each, kind in pairs)
+
+
+def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
+    """Finds the edges between the nodes `begin` to `end` - 1 and all later ones. For an edge between a and b it writes
+    1 to `edge`, uint8 [M, M], at (a, b) and at (b, a); all of `edge` must be 0 before."""
+    inputs = [*graph._inputs(), graph.low, graph.high, begin]
     wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge], device=edge.device)
 
 
-def join(samples, patches, rule: Rule, nodes, begin: int, end: int, heads, joined) -> None:
-    """Finds for each of the patches `nodes[begin:end]` the first of H representatives `heads`, int [H], that it is
-    like, and writes its index in `heads` to `joined`, int [N], or H if there is none."""
-    inputs = [samples, patches, rule, nodes, begin, heads]
+def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
+    """Finds for each of the nodes `nodes[begin:end]` the first of H groups whose representative it is like, and writes
+    the group's rank to `joined`, int [N], or H if there is none. `heads`, int [H], are the representatives in ascending
+    order; `head_low` is the `low` of each, and `rank` its place in the order in which groups are tried."""
+    inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
     wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)

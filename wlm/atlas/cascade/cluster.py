@@ -98,11 +98,15 @@ def cluster(
     excluded |= bright.numpy() != 0
 
     included = np.flatnonzero(~excluded)
-    groups = _groups(samples, patches, graphs.rule(threshold, colour_threshold, device), included, progress)
+    nodes = wp.array(patches.numpy()[included], dtype=kernels.Patch, device=device)
+    bounds = graphs.bounds(samples, nodes, int(level.max(initial=0)) + 1)
+    graph, order = graphs.graph(samples, nodes, bounds, graphs.rule(threshold, colour_threshold, device))
+    number = included[order]  # the triangle of each node
+    groups = _groups(graph, number, progress)
     head = np.arange(count, dtype=np.int32)  # the representative of each triangle
-    heads = [first for first, _ in groups]
-    for first, members in groups:
-        head[members] = first
+    heads = [number[node] for node, _ in groups]
+    for node, members in groups:
+        head[number[members]] = number[node]
     single = head == np.arange(count)
     single[heads] = False
     representative = np.concatenate([np.array(heads, np.int64), np.flatnonzero(single)]).astype(np.int32)
@@ -138,83 +142,79 @@ def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
     return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
 
 
-def _groups(
-    samples: wp.array, patches: wp.array, rule: graphs.Rule, left: np.ndarray, progress: OnProgress | None
-) -> list[tuple[int, np.ndarray]]:
-    """Forms groups of alike triangles out of those with the ascending numbers `left`; returns the representative and
-    all members of each group of several. The triangle with the most edges becomes representative."""
-    count, drawn = len(left), np.empty(len(patches), np.int64)
-    drawn[left] = np.random.default_rng(0).permutation(count)  # the order in which triangles get into samples
+def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None) -> list[tuple[int, np.ndarray]]:
+    """Forms groups of alike triangles; returns the node of the representative and all members of each group of several.
+    The node with the most edges becomes representative; of equals, that with the least `number`, int [M]."""
+    count = len(number)
+    left = np.arange(count)
+    drawn = np.random.default_rng(0).permutation(count)  # the order in which nodes get into samples
     groups: list[tuple[int, np.ndarray]] = []
     comparing, clustering = Meter(progress, "compare patches", count), Meter(progress, "cluster", count)
     while True:
         sample = left if len(left) <= SAMPLE else np.sort(left[np.argsort(drawn[left])[:SAMPLE]])
-        edge = _edges(samples, patches, rule, sample, comparing, count - len(left))
-        formed = [(int(sample[node]), sample[members]) for node, members in _greedy(edge)]
+        part = graph if len(sample) == count else graphs.part(graph, sample)
+        edge = _edges(part, comparing, count - len(left))
+        formed = [(int(sample[node]), sample[members]) for node, members in _greedy(edge, number[sample])]
         if len(sample) == len(left):
             groups += formed
             clustering.report(count)
             return groups
-        # Triangles that are like no other in the sample may be like one outside it.
+        # Nodes that are like no other in the sample may be like one outside it.
         alone = np.setdiff1d(sample, np.concatenate([np.empty(0, np.int64), *(members for _, members in formed)]))
-        heads = np.concatenate([np.array([head for head, _ in formed], np.int64), alone])
+        heads = np.concatenate([np.array([node for node, _ in formed], np.int64), alone])
         rest = np.setdiff1d(left, sample, assume_unique=True)
-        joined = _joined(samples, patches, rule, rest, heads, clustering, count - len(left))
+        joined = _joined(graph, rest, heads, clustering, count - len(left))
         order = np.argsort(joined, kind="stable")
         ends = np.searchsorted(joined[order], np.arange(len(heads) + 1))
-        members = [members for _, members in formed] + [np.array([head]) for head in alone]
-        for rank, head in enumerate(heads.tolist()):
+        members = [members for _, members in formed] + [np.array([node]) for node in alone]
+        for rank, node in enumerate(heads.tolist()):
             found = rest[order[ends[rank] : ends[rank + 1]]]
             if len(found) or rank < len(formed):
-                groups.append((head, np.concatenate([members[rank], found])))
+                groups.append((node, np.concatenate([members[rank], found])))
         left = rest[joined == len(heads)]
 
 
-def _joined(
-    samples: wp.array,
-    patches: wp.array,
-    rule: graphs.Rule,
-    triangles: np.ndarray,
-    heads: np.ndarray,
-    meter: Meter,
-    done: int,
-) -> np.ndarray:
+def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Meter, done: int) -> np.ndarray:
     """Finds for each of N triangles the index in `heads` of the first representative whose light is alike, int [N];
     `len(heads)` where none is."""
-    device, joined = patches.device, wp.empty(len(triangles), dtype=int, device=patches.device)
-    each, first = (wp.array(values.astype(np.int32), dtype=int, device=device) for values in (triangles, heads))
+    device, by_mean = graph.patches.device, np.argsort(heads, kind="stable")
+
+    def on_device(values: np.ndarray) -> wp.array:
+        return wp.array(values.astype(np.int32), dtype=int, device=device)
+
+    low = wp.array(graph.means[heads[by_mean]], dtype=float, device=device)
+    inputs = on_device(heads[by_mean]), low, on_device(by_mean)
+    each, joined = on_device(nodes), wp.empty(len(nodes), dtype=int, device=device)
     piece = max(_PAIRS_AT_ONCE // len(heads), 1)
-    for begin in range(0, len(triangles), piece):
-        graphs.join(samples, patches, rule, each, begin, min(begin + piece, len(triangles)), first, joined)
+    for begin in range(0, len(nodes), piece):
+        graphs.join(graph, each, begin, min(begin + piece, len(nodes)), *inputs, joined)
         wp.synchronize_device(device)
         if meter.due(done):
             meter.report(done)
     return joined.numpy()
 
 
-def _edges(
-    samples: wp.array, patches: wp.array, rule: graphs.Rule, triangles: np.ndarray, meter: Meter, done: int
-) -> np.ndarray:
+def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
     """Compares the light of all pairs of M triangles: uint8 [M, M], 1 where two are alike, which is an edge."""
-    count, device = len(triangles), patches.device
-    nodes = wp.array(patches.numpy()[triangles], dtype=kernels.Patch, device=device)
+    count, device = graph.patches.shape[0], graph.patches.device
     edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     piece = max(_PAIRS_AT_ONCE // max(count, 1), 1)
     for begin in range(0, count, piece):
         end = min(begin + piece, count)
-        graphs.find_edges(samples, nodes, rule, begin, end, edge)
+        graphs.find_edges(graph, begin, end, edge)
         wp.synchronize_device(device)
         if meter.due(done + end):
             meter.report(done + end)
     return edge.numpy()
 
 
-def _greedy(edge: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Yields the representative (the node with most edges, of equals the first) and the sorted members of each group of
-    several."""
+def _greedy(edge: np.ndarray, number: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yields the representative (the triangle with most edges) and the sorted members of each group of several."""
     degree = edge.sum(1, dtype=np.int64)
-    remains = np.ones(len(edge), bool)
-    while len(degree) and degree[node := degree.argmax()] > 0:
+    remains = np.ones(len(number), bool)
+    # Among equals the lowest number comes first.
+    order = np.argsort(number, kind="stable")
+    while len(order) and degree[node := order[degree[order].argmax()]] > 0:
         members = np.flatnonzero(remains & (edge[node] != 0))
         members = np.sort(np.append(members, node))
         yield int(node), members

@@ -45,7 +45,7 @@ _START = {
 
 
 class ChannelNorm(nn.Module):
-    """Layer norm over the channels of each pixel, [N, C, H, W]."""
+    """Layer norm over the channels of each pixel, [N, C, H, W]; torch's norm needs channels contiguous in memory."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -55,9 +55,7 @@ class ChannelNorm(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         if torch.is_grad_enabled():
             return _Norm.apply(x, self.weight, self.bias)
-        # Its sums are in float32, also of half floats.
-        rows, weights = x.permute(0, 2, 3, 1), (self.weight.flatten(), self.bias.flatten())
-        return F.layer_norm(rows, weights[0].shape, *weights, EPSILON).permute(0, 3, 1, 2)
+        return torch.addcmul(self.bias.to(x.dtype), _normalised(x)[0], self.weight.to(x.dtype))
 
 
 def _normalised(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
