@@ -157,8 +157,7 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
 class Solver:
     """Simulates smoke in the air of a lattice.
 
-    Set the faces of the lattice beforehand; the solver sets the solids of the lattice and its force. With a moving
-    obstacle each step waits for the device.
+    Set the faces of the lattice beforehand; the solver sets the solids of the lattice and its force.
 
     Args:
         lattice: The air.
@@ -398,8 +397,8 @@ class Solver:
     def load(self, path: str | os.PathLike[str]) -> None:
         """Continues from a checkpoint of a solver and a lattice with the same settings.
 
-        The following steps are the same as without the interruption: bit for bit on a CPU; on a GPU except for
-        rounding, since outlets sum in any order. With bricks, the threshold allows small differences.
+        The following steps are the same as without the interruption, bit for bit. With bricks, the threshold allows
+        small differences.
 
         Raises:
             WlmError: The file is damaged or belongs to another simulation; the message names the difference.
