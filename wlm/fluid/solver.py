@@ -447,7 +447,7 @@ class Solver:
         self._note_checkpoint(path, air["steps"])
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Continues from a checkpoint of a solver with the same grids, with the duration of its steps.
+        """Continues from a checkpoint of a solver with the same grids and as many obstacles, in steps of its duration.
 
         With the same settings the following steps are the same as without the interruption, bit for bit; with bricks
         the threshold allows small differences. Other sources, obstacles, rates and boundaries act from now on.
@@ -464,9 +464,9 @@ class Solver:
             raise WlmError(f"{path}: duration: expected about {self.duration:.3g} for a step, found {duration}")
         state, now = artifact.tensors, self._fields[0]
         field = Part(wp.dtype_to_numpy(self.density.dtype), self.density.shape, least=0)
-        # NaN before the first step, when no obstacle has been placed. Other obstacles are placed in the next step.
-        nowhere = np.isnan(placed := state.get("placed", np.zeros(0))).all()
-        table = {"density": field, "placed": Part(np.float64, (*placed.shape[:1], 2, 3), finite=not nowhere)}
+        # NaN before the first step, when no obstacle has been placed.
+        nowhere = np.isnan(state.get("placed", 0.0)).all()
+        table = {"density": field, "placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
         table["velocity"] = Part(np.float32, (*self.lattice.shape, 3))
         if self.temperature is not None:
             table["temperature"] = field
@@ -487,9 +487,7 @@ class Solver:
         self._velocity.assign(parts["velocity"])
         if self.temperature is not None:
             now.temperature.assign(parts["temperature"].ravel())
-        self._placed = np.full(self._placed.shape, np.nan)
-        if placed.shape == self._placed.shape:
-            self._placed = np.array(placed)
+        self._placed = np.array(parts["placed"])
         self._done = self.steps
         if self.obstacles:
             # Before the first step the lattice has no solid.
@@ -498,8 +496,6 @@ class Solver:
             else:
                 self._solid.zero_()
             advection_places.mark_walls(self._box, self._solid.flatten(), self._walls[0])
-        elif air["solid"].any():
-            self.lattice.set_solid(np.zeros(self.lattice.shape, np.uint8))
         if self._bricks is not DENSE:
             self._bricks.busy.fill_(1)
         self._note_checkpoint(path, air["steps"])
