@@ -66,6 +66,9 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
         help="Measure the table of only N probes around the middle. Repeatable.",
         metavar="N",
     ),
+    "lit_path": _option(
+        _Path, "--mesh", help="Measure only fits to pictures of this mesh, which the probes light.", metavar="FILE.glb"
+    ),
     "volume_only": _option(bool, "--volume-only", False, help="Measure only the cascaded probe volume."),
     "meshes_path": _option(
         _Path, "--meshes", help="Folder of a .glb, its .exr lightmaps and mask.png, or of such folders.", metavar="DIR"
@@ -91,6 +94,7 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
     "json_path": _option(_Path, "--json", help="Result file to write, with the machine.", metavar="FILE.json"),
 }
 _MESHES = ("meshes_path", "mesh_path", "lightmap_paths", "mask_path")
+_PROBES = ("volume_only", "speed", "lit_path", "table")
 # The help text and the options of each measuring command, in the order in which result files state them.
 _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "lightmap": (
@@ -119,7 +123,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "probe": (
         "Measure light probes: PSNR, size and decode time of profiles, decoders and rivals.",
-        ("volume_only", "speed", "many", "table", "only", "nearest", "quick", "device", "probes_path", "keys"),
+        (*_PROBES, "many", "only", "nearest", "quick", "device", "probes_path", "keys"),
     ),
     "atlas": (
         "Measure lightmaps of meshes: PSNR, SSIM, size and decode time of profiles and their rivals.",
@@ -155,7 +159,7 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
 }
 # Options with which a run replaces only the rows that it measures in a result file.
-_PARTIAL = ("profiles", "rival_names", "only", "volume_only", "speed", "table")
+_PARTIAL = ("profiles", "rival_names", "only", *_PROBES)
 
 
 def _add_command(name: str, summary: str, options: tuple[str, ...]) -> None:

@@ -20,7 +20,7 @@ The results table of each set of probes has these rows, by method:
 
 The largest error of a model is measured against a float64 decode of the same model. A decode on CUDA is timed as the
 replay of a CUDA graph, so that gaps between launches do not count. `benchmarks.probe_table` has the rows of `--table`,
-`benchmarks.probe_speed` those of `--speed`.
+`benchmarks.probe_speed` those of `--speed`, and `benchmarks.probe_pictures` those of `--mesh`.
 """
 
 import os
@@ -32,12 +32,14 @@ import warp as wp
 
 from benchmarks.plot import Panel
 from benchmarks.probe_exact import decode64
+from benchmarks.probe_pictures import picture_rows
 from benchmarks.probe_speed import many_probes, speed_rows
 from benchmarks.probe_table import RIVALS, nearest_probes, table_rows
 from benchmarks.rivals.probe_torch import DenseFit
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data, exact_errors, expect_alone
 from wlm.errors import WlmError
+from wlm.formats.geometry import read_geometry
 from wlm.metrics import psnr_from_mse
 from wlm.probe.data import ProbeSet, from_arrays, load
 from wlm.probe.evaluation import Report, between_psnr, by_distance, score
@@ -75,6 +77,7 @@ def run(
     volume_only: bool = False,
     speed: bool = False,
     many: int | None = None,
+    lit_path: str | os.PathLike[str] | None = None,
     table: bool = False,
     only: Sequence[str] | None = None,
     nearest: Sequence[int] | None = None,
@@ -92,11 +95,12 @@ def run(
         volume_only: Whether to measure only the volume, filled from the original probes and from principal components.
         speed: Whether to measure only the speed of the first profile, see `benchmarks.probe_speed`.
         many: The speed of a set of so many random probes, in place of those of the file; None: of the file's.
+        lit_path: A mesh that the probes light: measure only fits to its pictures, see `benchmarks.probe_pictures`.
         table: Whether to measure only our methods and their rivals at equal bytes, see `benchmarks.probe_table`.
         only: Names of methods of the table; None: all. Rivals take minutes on the CPU and need no GPU.
         nearest: The table of only so many live probes around the middle of the set; None: of all probes.
         progress: Called with a line before each part of the work.
-        done: Called with all rows so far after each row of `speed` and each size of the table.
+        done: Called with all rows so far after each row of `speed`, each fit to pictures and each size of the table.
 
     Returns:
         The rows of each set, in the order in which the module's docstring lists them.
@@ -105,7 +109,7 @@ def run(
         WlmError: The file, a key or the device does not exist, options contradict each other, or a fit diverged.
     """
     if volume_only:
-        expect_alone("--volume-only", {"--quick": quick, "--table": table, "--speed": speed})
+        expect_alone("--volume-only", {"--quick": quick, "--table": table, "--speed": speed, "--mesh": lit_path})
     if not table and (only or nearest):
         raise WlmError("--only, --nearest: expected --table beside them")
     if many:
@@ -114,6 +118,8 @@ def run(
             raise WlmError("--many: expected --speed beside it")
     if speed:
         expect_alone("--speed", {"--table": table})
+    if lit_path:
+        expect_alone("--mesh", {"--speed": speed, "--table": table, "--many": many})
     if probes_path is None and not many:
         probes_path, keys = demo_data("probes/street.npz", "--probes FILE"), keys or _DEMO_KEYS[: 1 if quick else None]
     sets = [many_probes(many)] if many else [load(probes_path, key=key) for key in keys or (None,)]
@@ -130,6 +136,9 @@ def run(
         sets = [nearest_probes(probes, count) if count else probes for probes in sets for count in nearest or (None,)]
         shares = (5,) if quick else None
         return table_rows(sets, profiles[0], device=device, only=only, shares=shares, progress=progress, done=done)
+    if lit_path:
+        geometry = read_geometry(lit_path, with_uv=False)
+        return picture_rows(sets, profiles[0], geometry, device=device, progress=progress, done=done)
     ratios, frames = ((), _QUICK_FRAMES) if quick else (RATIOS, None)
     return run_rows(sets, profiles, device=device, ratios=ratios, frames=frames, progress=progress)
 

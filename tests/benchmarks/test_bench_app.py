@@ -43,6 +43,7 @@ COMMANDS = [
         "probe --table --only ours --nearest 8 --nearest 40 --device cpu",
         {"table": True, "only": ["ours"], "nearest": [8, 40]},
     ),
+    (["probe", "--mesh", "a/b.glb"], "probe --mesh b.glb --device cpu", {"lit_path": Path("a/b.glb"), "table": False}),
     (
         ["probe", "--speed", "--many", "900"],
         "probe --speed --many 900 --device cpu",

@@ -5,7 +5,9 @@ import pytest
 from builders.bench_rows import check_outputs, keys
 
 from benchmarks.probe import PANELS, run_rows
+from benchmarks.probe_pictures import picture_rows
 from benchmarks.probe_speed import many_probes, speed_rows
+from wlm.formats.geometry import Geometry
 from wlm.probe.data import from_arrays
 from wlm.probe.model import Profile
 from wlm.probe.views import KINDS
@@ -77,6 +79,18 @@ def test_components_and_held_out_probes(rows):
             assert row["psnr"] > 35.0 and row["bytes"] < 27 * 2 * PROBES[row.scene]
         if row.method == "held out" and row.scene == "room":  # the other has too few to be told well
             assert row["nearest_psnr"] < row["distance_psnr"] and row["half_way_psnr"] > 10.0
+
+
+def test_fits_to_pictures_stand_beside_plain_ones(sets):
+    floor = Geometry(np.array([[0, 0, 0], [9, 0, 0], [0, 0, 9]], np.float32), np.array([[0, 1, 2]], np.uint32))
+    counts = []
+    rows = picture_rows(sets[:1], PROFILES[0], floor, device="cpu", views=2, done=lambda rows: counts.append(len(rows)))
+    options = ["fit", *(f"{drawn}, {light}" for drawn in ("balls", "mesh") for light in KINDS)]
+    assert counts == [7, 14]
+    assert keys(rows) == [(name, option) for name in ("plain fit", "fit to pictures") for option in options]
+    for plain, pictured in zip(rows[:7], rows[7:], strict=True):
+        assert plain["psnr"] > 5.0 and (plain["psnr"] == pictured["psnr"]) == ("lossless" in plain.option)
+    assert rows[0]["bytes"] == rows[7]["bytes"] and 0.0 < rows[0]["relative_error"] < 1.0
 
 
 def test_speed_of_a_set_in_one_region_and_in_several(sets):

@@ -81,6 +81,16 @@ def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
     assert wlm.load(other).source == data.load(room, convention="godot").source[:8] != model.source
 
 
+def test_a_fit_to_pictures_takes_a_mesh(room, profile, tmp_path):
+    mesh, out = tmp_path / "floor.obj", tmp_path / "a.wlm"
+    mesh.write_text("v 0 0 0\nv 8 0 0\nv 8 0 6\nv 0 0 6\nf 1 2 3 4\n")
+    files = []
+    for words in ((), ("--mesh", mesh)):
+        call("compress", room, "-o", out, "--profile", profile, "--method", "gaussians", *words)
+        files.append(out.read_bytes())
+    assert files[0] != files[1]
+
+
 def test_warnings_of_the_set_are_shown(profile, tmp_path):
     probes = synthetic(20)
     values = probes.values.reshape(-1, 9, 3).copy()
@@ -197,6 +207,7 @@ def test_info_says_what_is_in_the_file(fitted, carrying):
         (["compress", "absent.npz", "-o", "{tmp}/a.wlm"], "absent.npz: no such file or folder"),
         (["compress", "{set}", "-o", "{set}"], "ends in .wlm"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--ratio", "0"], "--ratio: expected"),
+        (["compress", "{set}", "-o", "{tmp}/a.wlm", "--mesh", "absent.glb"], "absent.glb"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--key", "noon"], "expected values named noon"),
         (["compress", "{set}", "-o", "{tmp}/a.wlm", "--convention", "quake"], "convention"),
         (["decode", "{fit}", "-o", "{tmp}/f.npz"], "stores no positions"),

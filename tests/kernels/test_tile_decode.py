@@ -22,11 +22,7 @@ def _table(height: int, width: int, size: int, largest: int, seed: int = 0) -> t
 def _decode(uv, height: int, width: int, size: int, lut: np.ndarray, texels: np.ndarray, device: str) -> np.ndarray:
     uv = array(np.asarray(uv, np.float32), wp.vec2, device)
     out = wp.full(len(uv), wp.vec3(-1.0), dtype=wp.vec3, device=device)
-    sheet = array([[height, width, 0, 0, *lut.shape[:2], 0]], int, device)
-    one = array([[0.0] * 3, [1.0] * 3], wp.vec3, device)
-    textures = array(lut, wp.uint16, device), *[array(texels[None], wp.vec3h, device)] * 2
-    row = wp.zeros(len(uv), dtype=int, device=device)
-    decode.decode(uv, row, sheet, size, one, *textures, 16, out)
+    decode.decode(uv, height, width, size, array(lut, wp.uint16, device), array(texels[None], wp.vec3h, device), out)
     return out.numpy()
 
 

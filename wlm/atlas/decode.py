@@ -42,8 +42,6 @@ class Decoder:
                 self._blocks = self._halves(model.block_texels)
             self._lut = wp.array(np.ascontiguousarray(model.lut), dtype=wp.uint16, device=self.device)
             self._sheets = wp.array(model.table(), dtype=int, device=self.device)
-            # Tiles of one lightmap have no constant and one component.
-            self._one = wp.array([[0.0] * 3, [1.0] * 3], dtype=wp.vec3, device=self.device)
         else:
             lut = (model.lut / np.float32(LUT_STEPS)).astype(np.float32)
             self._texels = wp.array(model.texels[0].astype(np.float32), dtype=float, device=self.device)
@@ -101,8 +99,9 @@ class Decoder:
         CUDA the work is queued, not awaited."""
         model = self.model
         if model.method == "tiles":
-            row = torch.zeros(len(out), dtype=torch.int32, device=out.device)
-            self._read_tiles(uv, row, self._one, out)
+            size, tile = model.sheets[0].size, model.profile.tile
+            textures = self._lut, self._texels, interop.to_warp(out, wp.vec3), self._blocks
+            decode.decode(uv, *size, tile, *textures, model.first_block_code)
         else:
             if model.lut.size:
                 place = torch.empty((len(out), 2), device=out.device)
@@ -145,13 +144,11 @@ class Decoder:
         out = torch.empty((len(uv), 3), dtype=torch.float32, device=uv.device)
         if len(uv):
             factor = wp.array(factors, dtype=wp.vec3, device=self.device)
-            self._read_tiles(interop.to_warp(uv, wp.vec2), row, factor, out)
+            points = interop.to_warp(uv, wp.vec2), interop.to_warp(row)
+            textures = self._lut, self._texels, self._blocks, self.model.first_block_code
+            table = self._sheets, self.model.profile.tile, factor
+            decode.decode_shared(*points, *table, *textures, interop.to_warp(out, wp.vec3))
         return out
-
-    def _read_tiles(self, uv: wp.array, row: torch.Tensor, factor: wp.array, out: torch.Tensor) -> None:
-        textures = self._lut, self._texels, self._blocks, self.model.first_block_code
-        table = interop.to_warp(row), self._sheets, self.model.profile.tile, factor
-        decode.decode(uv, *table, *textures, interop.to_warp(out, wp.vec3))
 
     def _between(self, uv: torch.Tensor, row: torch.Tensor, factors: np.ndarray, level: torch.Tensor) -> torch.Tensor:
         """Returns light at N UVs, float32 [N, 3], interpolated between two mip levels of `row`; `level` 0 is `row`."""

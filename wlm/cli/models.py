@@ -21,12 +21,14 @@ def fit(
     device: str,
     resume: bool,
     every: float,
+    inputs: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> tuple[Any, Any, dict[str, Any]]:
     """Compresses an input into a file; shows progress, keeps a checkpoint, and prints warnings.
 
     The package of the system has `Profile`, `compress` and `open_checkpoint`. `load` reads the input, after the
-    settings, which replace those of the profile, have been checked; `options` are further options of `compress`.
+    settings, which replace those of the profile, have been checked; `options` are further options of `compress`, and
+    `inputs` of `open_checkpoint` too.
     Returns the input, the model, and the first facts of the result's table.
     """
     console.check_output(output, ".wlm")
@@ -35,7 +37,7 @@ def fit(
     checked = package.Profile.load(profile).override(settings, "--")
     data = load()
     console.note_warnings(data.warnings)
-    shared = {"seed": seed, "device": device}
+    shared = {"seed": seed, "device": device} | dict(inputs or {})
     checkpoint = package.open_checkpoint(output, data, checked, resume=resume, every=every, **shared)
     console.note_start(checkpoint, resume, "at step 0")
     start = time.perf_counter()

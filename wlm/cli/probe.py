@@ -57,6 +57,7 @@ def compress(
     positions: Annotated[
         bool, typer.Option("--positions", help="Also store the positions of the probes, 16 bits per axis.")
     ] = False,
+    mesh: opt.SceneFile = None,
     key: _Keys = None,
     convention: _Convention = None,
     order: _Order = None,
@@ -68,6 +69,7 @@ def compress(
 ) -> None:
     """Compress light probes into one file: Gaussians and a small network, or principal components for small sets.
 
+    With --method gaussians, --mesh also minimises the error of pictures of the mesh and of balls at the probes.
     The fit is saved in OUT.wlm.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume to
     continue exactly.
     """
@@ -77,10 +79,12 @@ def compress(
 
         return load(probes, key=key or None, convention=convention, order=order, axes=axes)
 
+    from wlm.formats.geometry import read_geometry
     from wlm.probe.hours import listed_times
 
+    inputs = {} if mesh is None else {"geometry": read_geometry(mesh, with_uv=False)}
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every, "positions": positions}
-    data, model, facts = models.fit("probe", load, output, profile, settings, **options)
+    data, model, facts = models.fit("probe", load, output, profile, settings, inputs=inputs, **options)
     size = facts["bytes on disk"]
     facts |= {
         "share of float32": f"{size / data.float_bytes:.2%}",

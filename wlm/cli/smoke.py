@@ -107,7 +107,7 @@ def simulate(
         "frames": scene.frames,
         "cells of the air": " x ".join(map(str, scene.grid.cells)),
         "voxels of the smoke": " x ".join(map(str, scene.grid.shape)),
-        "steps per frame": scene.steps,
+        "steps per frame": round(1.0 / (scene.rate * solver.duration)),
     }
     if figures:
         facts |= {"smoke in the last frame": figures["smoke"], "seconds per frame": figures["frame s"]}

@@ -1,5 +1,6 @@
 """Compresses a checked probe set to a model."""
 
+import hashlib
 import math
 import os
 from collections.abc import Callable
@@ -12,12 +13,14 @@ import numpy as np
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
+from wlm.formats.geometry import Geometry
 from wlm.formats.parts import Part
 from wlm.metrics import psnr_from_mse
 from wlm.probe.codec import pack
 from wlm.probe.data import ProbeSet
 from wlm.probe.gaussian.model import check_outputs, gaussian_count
 from wlm.probe.gaussian.packing import pack_model
+from wlm.probe.gaussian.pictures import Pixels, seen_pixels
 from wlm.probe.gaussian.trainer import Trainer
 from wlm.probe.model import CODES, ProbeModel, Profile, box_of
 from wlm.probe.regions.model import Regions, box_row
@@ -42,6 +45,7 @@ def open_checkpoint(
     *,
     seed: int = 0,
     device: str = "cpu",
+    geometry: Geometry | None = None,
     resume: bool = False,
     every: float = EVERY,
 ) -> Checkpoint:
@@ -49,7 +53,7 @@ def open_checkpoint(
 
     Args:
         output: The model's file, which is written when the fit is finished.
-        probes, profile, seed: The arguments of `compress`; the checkpoint is only valid for them.
+        probes, profile, seed, geometry: The arguments of `compress`; the checkpoint is only valid for them.
         device: Only its kind matters: a fit can continue on another GPU.
         resume: Whether to continue from the file, if it exists.
         every: Seconds between two saves of a running fit; 0: after every few steps.
@@ -57,8 +61,10 @@ def open_checkpoint(
     Raises:
         WlmError: With `resume`: the file is damaged or of another fit; the message names the difference.
     """
+    mesh = b"" if geometry is None else geometry.position.tobytes() + geometry.triangle.tobytes()
     fit = {
         "input": probes.source,
+        "mesh": hashlib.blake2b(mesh, digest_size=8).hexdigest(),
         "profile": Profile.load(profile).model_dump(mode="json"),
         "seed": int(seed),
         "device": "cpu" if device == "cpu" else "cuda",
@@ -75,6 +81,7 @@ def compress(
     progress: OnProgress | None = None,
     checkpoint: Checkpoint | None = None,
     positions: bool = False,
+    geometry: Geometry | None = None,
     **overrides: Any,
 ) -> ProbeModel:
     """Compresses a probe set.
@@ -100,6 +107,8 @@ def compress(
         checkpoint: From `open_checkpoint` for the same settings, or None. A running fit is saved there, and an
             interrupted one is resumed from there.
         positions: Whether the model stores the probes' positions, 16 bits per axis; not needed if the engine has them.
+        geometry: A mesh that the probes light, for the method "gaussians": the fit also minimises the error of pictures
+            of it and of balls at the probes. None: only that of the probes.
         overrides: Settings that replace the profile's, such as `steps=500`.
 
     Returns:
@@ -107,11 +116,13 @@ def compress(
 
     Raises:
         WlmError: The profile, a setting or the device does not exist, there are too many numbers per probe, the
-            checkpoint is of another fit, or the fit diverged.
+            checkpoint is of another fit, the mesh cannot be seen or used, or the fit diverged.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
     profile = Profile.load(profile).override(overrides)
     device = interop.check_device(device)
+    if geometry is not None and profile.method != "gaussians":
+        raise WlmError(f"mesh: expected the method gaussians, which alone is fitted to pictures, got {profile.method}")
     if not probes.live.any():
         raise WlmError(f"{probes.name}: every probe is dark: there is nothing to fit")
     hours = max(len(probes.times), 1)
@@ -147,9 +158,9 @@ def compress(
     tree = Tree.split(probes.position[probes.live], profile.region)
     # Magnitudes follow each probe at each hour by themselves, and half floats would round a scale's logarithm.
     of_fit = (partial(make, scales=np.ones(hours)), probes) if profile.error == "relative" else (make, even)
-    trained = partial(
-        _fit_regions, *of_fit, tree=tree, seed=seed, device=device, progress=progress, checkpoint=checkpoint
-    )
+    pixels = None if geometry is None else seen_pixels(of_fit[1], geometry, device)
+    shared = {"seed": seed, "device": device, "progress": progress, "checkpoint": checkpoint}
+    trained = partial(_fit_regions, *of_fit, tree=tree, pixels=pixels, **shared)
     candidates = Candidates(make, probes, values[probes.live], profile, device, trained, checkpoint, tree.count)
     return candidates.selected() if profile.target or profile.max_bytes else candidates.usual()
 
@@ -162,6 +173,7 @@ def _fit_regions(
     tree: Tree,
     checkpoint: Checkpoint | None,
     progress: OnProgress | None,
+    pixels: Pixels | None,
     number: int = 0,
     **options: Any,
 ) -> ProbeModel:
@@ -171,7 +183,7 @@ def _fit_regions(
     profile = profile.model_copy(update={"method": "gaussians"})
     fit = partial(_fit_gaussians, meter=Meter(progress, "fit", profile.steps * tree.count), **options)
     if tree.count == 1:
-        return fit(make, probes, profile, checkpoint=checkpoint, batch=number, before=0)
+        return fit(make, probes, profile, checkpoint=checkpoint, batch=number, before=0, pixels=pixels)
     position = probes.position[live]
     owner = tree.regions_of(position)
     # All regions together have as many Gaussians as one fit would have.
@@ -192,8 +204,9 @@ def _fit_regions(
             sized = profile.model_copy(update={"ratio": min(wanted[region] / len(chosen), 1.0)})
             bare = {"probes": len(chosen), "dead": np.zeros(0, bool), "positions": np.zeros((0, 3), np.uint16)}
             of_region = partial(make, **bare, **box_of(near_set.position))
-            before = profile.steps * region
-            model = fit(of_region, near_set, sized, checkpoint=checkpoint, batch=batch, before=before)
+            seen = None if pixels is None else pixels.of(np.flatnonzero(near))
+            place = {"batch": batch, "before": profile.steps * region}
+            model = fit(of_region, near_set, sized, checkpoint=checkpoint, pixels=seen, **place)
             count = np.array([model.content.settings()[name] for name in ("count", "dropped")], np.int32)
             kept = {"packed": np.frombuffer(pack(model), np.uint8), "box": box_row(model), "count": count}
             if checkpoint is not None:
@@ -216,6 +229,7 @@ def _fit_gaussians(
     checkpoint: Checkpoint | None,
     batch: int,
     before: int,
+    pixels: Pixels | None,
 ) -> ProbeModel:
     """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3). `batch` is the fit's number in
     the checkpoint; `meter` counts the steps from `before` on."""
@@ -224,7 +238,7 @@ def _fit_gaussians(
     check_outputs(probes.name, profile.latent, profile.hidden, hours * probes.outputs, relative, device)
     position, values = probes.position[probes.live], probes.values[probes.live]
     x = ((position - box["origin"]) / box["extent"]).astype(np.float32)
-    trainer = Trainer(x, values, profile, seed, device, hours)
+    trainer = Trainer(x, values, profile, seed, device, hours, pixels)
     try:
         if checkpoint is not None:
             checkpoint.restore(batch, trainer.load)
@@ -237,7 +251,7 @@ def _fit_gaussians(
     if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
         raise WlmError(f"{probes.name}: the fit diverged; use smaller learning rates than profile {profile.name}")
     fitted = make(profile=profile, content=content, choice="Gaussians, as the profile asks")
-    return pack_model(fitted, position, values, device)
+    return pack_model(fitted, position, values, device, pixels is not None)
 
 
 def _train(

@@ -41,11 +41,13 @@ from wlm.texels import filmic, to_srgb
 VIEWS, RESOLUTION = 50, 128
 """Default number of viewers, and pixels along a side of a view."""
 
+NEIGHBOURS = 8
+"""Number of the nearest probes that light a point of the mesh."""
+
 KINDS = ("decoded", "lossless, volume", "decoded, volume")
 
 _BALLS = 256
 _SUBDIVISIONS = 2  # of a ball's icosahedron: 162 points
-_NEIGHBOURS = 8
 _GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 _DOWN = 0.2  # downward part of the viewing direction
 _BUDGET = 1024  # blocks decoded per frame; many, since all are awaited
@@ -109,7 +111,7 @@ def score_views(
         raise WlmError(f"views: expected at least 1, with 16 to 4096 pixels a side, got {views} with {resolution}")
     live = np.flatnonzero(probes.live)
     scene = _Scene(probes, decoded, live, count, device)
-    things = {"balls": ball_mesh(probes.position[live])} | ({} if geometry is None else {"mesh": _split(geometry)})
+    things = {"balls": ball_mesh(probes.position[live])} | ({} if geometry is None else {"mesh": separate(geometry)})
     exposure = ball_exposure(probes.values[live].reshape(len(live), count, 3))
     errors = {(thing, kind): Pictures(structural=True) for thing in things for kind in KINDS}
     meter = Meter(progress, "views", views)
@@ -149,7 +151,8 @@ def ball_mesh(position: np.ndarray) -> Mesh:
     return Mesh(points.reshape(-1, 3), np.tile(directions, (len(chosen), 1)), owner)
 
 
-def _split(geometry: Geometry) -> Mesh:
+def separate(geometry: Geometry) -> Mesh:
+    """Returns the triangles of a scene with flat normals and without shared corners."""
     corners = geometry.position.astype(np.float64)[geometry.triangle]
     normal = unit_or_zero(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     return Mesh(corners.reshape(-1, 3), normal.repeat(3, 0), np.full(len(corners), -1))
@@ -185,7 +188,7 @@ class _Scene:
         else:
             if self._normal is not None:
                 ahead = normal
-            near, weight = nearest_weights(self._tree, place, _NEIGHBOURS)
+            near, weight = nearest_weights(self._tree, place, NEIGHBOURS)
             direct = [np.einsum("pk,pkd->pd", weight, values[near]) for values in self._values]
         for values in (*direct, *(volume.read(place, ahead).values for volume in self._volumes)):
             yield values.reshape(len(place), self._count, 3).astype(np.float64)

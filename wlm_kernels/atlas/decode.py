@@ -4,8 +4,9 @@ A lightmap is cut into tiles of size B. Tile (i, j) spans the lightmap's texel c
 to (j + 1) B along y. Its entry in the lookup texture gives a rectangle of the colour texture, or of a second colour
 texture that consists of blocks of 4 x 4 texels. The rectangle's outermost samples lie on the tile's borders.
 
-Many lightmaps and lighting states may share tiles: light is a sum of components, each times a factor of the lighting
-state, and the rectangles of a tile's components lie beside each other (`wlm.atlas.model`).
+`decode` reads the tiles of one lightmap. `decode_shared` reads tiles that many lightmaps and lighting states share:
+light is a sum of components, each times a factor of the lighting state, and the rectangles of a tile's components lie
+beside each other (`wlm.atlas.model`).
 
 `benchmarks/atlas_exact.py` computes the same in float64 NumPy and is easier to read.
 """
@@ -71,6 +72,53 @@ def _bilinear(pages: wp.array3d[wp.vec3h], page: int, right: int, x: Axis, y: Ax
     return wp.lerp(top, bottom, y.share)
 
 
+@wp.kernel
+def _decode(
+    # in:
+    uv: wp.array1d[wp.vec2],
+    height: int,
+    width: int,
+    size: int,
+    lut: wp.array3d[wp.uint16],
+    texels: wp.array3d[wp.vec3h],
+    blocks: wp.array3d[wp.vec3h],
+    first_block_code: int,
+    # out:
+    out: wp.array1d[wp.vec3],
+):
+    i = wp.tid()
+    u = uv[i]
+    across = tile_place(u[0], width, size, lut.shape[1])
+    down = tile_place(u[1], height, size, lut.shape[0])
+    row, column = int(down[0]), int(across[0])
+    entry = lut[row, column, 0]
+    x = axis_at(entry, across[1], first_block_code)
+    y = axis_at(lut[row, column, 1], down[1], first_block_code)
+    if (int(entry) & _SIDE_MASK) < first_block_code:
+        out[i] = _bilinear(texels, 0, 0, x, y)
+    else:
+        out[i] = _bilinear(blocks, 0, 0, x, y)
+
+
+def decode(uv, height: int, width: int, size: int, lut, texels, out, blocks=None, first_block_code=16) -> None:
+    """Writes the light of a lightmap that is stored as tiles, at N points.
+
+    Args:
+        uv: vec2 [N], coordinates (u, v), u right and v down, clamped to [0, 1]. The light at NaN is NaN.
+        height, width: Size of the lightmap in texels.
+        size: B, number of texels along a tile.
+        lut: uint16 [ty, tx, 2], for each tile an entry for x and one for y: (first texel of the rectangle) << 4 |
+            (number of its texels - 1).
+        texels: vec3h [1, Hp, Wp], the colour texture.
+        out: vec3 [N], written.
+        blocks: vec3h [1, Hb, Wb], the second colour texture, with sides that are multiples of 4; None if there is none.
+        first_block_code: An entry whose low 4 bits are at least this number refers to the second texture and counts
+            blocks of 4 texels: (first block) << 4 | (`first_block_code` + number of blocks - 1). With 16 no entry does.
+    """
+    inputs = [uv, height, width, size, lut, texels, texels if blocks is None else blocks, first_block_code]
+    wp.launch(_decode, uv.shape, inputs=inputs, outputs=[out], device=uv.device)
+
+
 @wp.func
 def _in_block(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
     """Returns the texels and weight at `place` (0 to 1) along one axis of the 4 x 4 block with which `entry` begins."""
@@ -78,7 +126,7 @@ def _in_block(entry: wp.uint16, place: float, first_block_code: int) -> Axis:
 
 
 @wp.kernel
-def _decode(
+def _decode_shared(
     # in:
     uv: wp.array1d[wp.vec2],
     sheet: wp.array1d[int],
@@ -143,8 +191,8 @@ def _decode(
     out[i] = total
 
 
-def decode(uv, sheet, sheets, size: int, factor, lut, texels, blocks, first_block_code: int, out) -> None:
-    """Writes the light of tiles at N points in one lighting state.
+def decode_shared(uv, sheet, sheets, size: int, factor, lut, texels, blocks, first_block_code: int, out) -> None:
+    """Writes the light of tiles that many lightmaps and lighting states share, at N points in one lighting state.
 
     Args:
         uv: vec2 [N], coordinates (u, v), u right and v down, clamped to [0, 1]. The light at NaN is NaN.
@@ -154,15 +202,13 @@ def decode(uv, sheet, sheets, size: int, factor, lut, texels, blocks, first_bloc
         size: B, number of texels along a tile.
         factor: vec3 [C], the factors of the lighting state. Each group of tiles whose light changes alike has its own
             factors: a constant, followed by one factor for each component.
-        lut: uint16 [ty, tx, 4], for each tile an entry for x and one for y of its first component, (first texel of the
-            rectangle) << 4 | (number of its texels - 1); the index of its constant in `factor`; and page << 12 | number
-            of coarse components << 8 | number of components. A coarse component is a single block. With one component
-            and one page: [ty, tx, 2], only the entries.
+        lut: uint16 [ty, tx, 4], for each tile the entries for x and y of its first component, as for `decode`; the
+            index of its constant in `factor`; and page << 12 | number of coarse components << 8 | number of components.
+            A coarse component is a single block. With one component and one page: [ty, tx, 2], only the entries.
         texels: vec3h [pages, Hp, Wp], the colour texture; the components of a tile follow each other along a row.
         blocks: vec3h [pages, Hb, Wb], the second colour texture, in blocks of 4 x 4 texels.
-        first_block_code: An entry whose low 4 bits are at least this number refers to the second texture and counts
-            blocks of 4 texels: (first block) << 4 | (`first_block_code` + number of blocks - 1). With 16 no entry does.
+        first_block_code: As for `decode`.
         out: vec3 [N], written.
     """
     inputs = [uv, sheet, sheets, size, factor, lut, texels, blocks, first_block_code]
-    wp.launch(_decode, uv.shape, inputs=inputs, outputs=[out], device=uv.device)
+    wp.launch(_decode_shared, uv.shape, inputs=inputs, outputs=[out], device=uv.device)

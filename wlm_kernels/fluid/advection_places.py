@@ -375,21 +375,19 @@ def _list(
 ):
     b = wp.tid()
     at = cell_of(box.bricks, b)
-    edge = 2 * bricks.rings + 1
     needed = int(0)
-    for k in range(edge * edge * edge):
-        x = at[0] + k // (edge * edge) - bricks.rings
-        y = at[1] + k // edge % edge - bricks.rings
-        z = at[2] + k % edge - bricks.rings
-        if box.periodic[0] != 0:
-            x = (x % box.bricks[0] + box.bricks[0]) % box.bricks[0]
-        if box.periodic[1] != 0:
-            y = (y % box.bricks[1] + box.bricks[1]) % box.bricks[1]
-        if box.periodic[2] != 0:
-            z = (z % box.bricks[2] + box.bricks[2]) % box.bricks[2]
-        exists = x >= 0 and x < box.bricks[0] and y >= 0 and y < box.bricks[1] and z >= 0 and z < box.bricks[2]
-        if exists:
-            needed = wp.max(needed, bricks.busy[index_of(box.bricks, wp.vec3i(x, y, z))])
+    # Nested loops need no division.
+    for dx in range(-bricks.rings, bricks.rings + 1):
+        for dy in range(-bricks.rings, bricks.rings + 1):
+            for dz in range(-bricks.rings, bricks.rings + 1):
+                near = at + wp.vec3i(dx, dy, dz)
+                exists = bool(True)
+                for a in range(3):
+                    if box.periodic[a] != 0:
+                        near[a] = (near[a] % box.bricks[a] + box.bricks[a]) % box.bricks[a]
+                    exists = exists and near[a] >= 0 and near[a] < box.bricks[a]
+                if exists:
+                    needed = wp.max(needed, bricks.busy[index_of(box.bricks, near)])
     if needed != 0:
         bricks.listed[wp.atomic_add(bricks.count, 0, 1)] = b
     elif bricks.active[b] != 0:

@@ -2,9 +2,10 @@
 
 Numbers that are rounded later compensate for the rounding of earlier ones. The latents are fitted again to the rounded
 Gaussians, so that their weighted sums at the probes hardly change; each layer of the network is fitted to the original
-inputs of the next layer, the last layer to the probes. Within a matrix, rows are rounded one by one, and later rows
-compensate for the rounding error of each row (Frantar et al., OPTQ: Accurate Quantization for Generative Pre-trained
-Transformers, 2023). Steps are chosen so that one more bit reduces the error about equally in each group of numbers.
+inputs of the next layer, the last layer to the probes, or to its original results after a fit to pictures. Within a
+matrix, rows are rounded one by one, and later rows compensate for the rounding error of each row (Frantar et al., OPTQ:
+Accurate Quantization for Generative Pre-trained Transformers, 2023). Steps are chosen so that one more bit reduces the
+error about equally in each group of numbers.
 """
 
 import math
@@ -46,10 +47,13 @@ _NEAR = 0.85  # the search ends at this share of the allowed growth of the error
 _TRIES = 8
 _FINEST = 1 / 64  # of the natural steps, where no tried step is fine enough
 _AGAIN, _LESS = 3, 0.7  # attempts, and the factor of the allowed growth if probes that were left out lost more
+_ROWS = 64  # rows of a matrix that are rounded before the rows behind them change
 _OF_LATENTS, _OF_LAYERS = 1e-4, 1e-5  # ridge of the least squares, as a share of the mean square
 
 
-def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, device: str) -> ProbeModel:
+def pack_model(
+    model: ProbeModel, position: np.ndarray, values: np.ndarray, device: str, pictured: bool = False
+) -> ProbeModel:
     """Quantises a fitted model to integers.
 
     Args:
@@ -57,6 +61,7 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
         position: float64 [N, 3], positions of the live probes.
         values: float32 [N, T D], the numbers of these probes at T hours, without the model's `scales`.
         device: Device on which results are compared with the fit.
+        pictured: Whether the fit minimised the error of pictures too, which to fit layers to the probes would raise.
 
     Returns:
         The coarsest model found that loses at most `DROP` dB; if none does, a model with fine steps.
@@ -76,7 +81,7 @@ def pack_model(model: ProbeModel, position: np.ndarray, values: np.ndarray, devi
         decoded = GaussianDecoder(plain, device).decode_hours(position).astype(np.float64)
         return float(np.square((decoded - values) / unit).mean())
 
-    search = _Search(content, model.normalise(position[many]), wanted[many], faint, device)
+    search = _Search(content, model.normalise(position[many]), wanted[many], faint, device, pictured)
     growth = 10.0 ** (DROP / 10.0) - 1.0
     most = (1.0 + growth) * (error(model) + faint)
     for _ in range(_AGAIN):
@@ -115,7 +120,9 @@ class _Steps(NamedTuple):
 class _Search:
     """Finds the integers of a model for given steps, and the error that they cause."""
 
-    def __init__(self, content: Gaussians, x: np.ndarray, wanted: np.ndarray, faint: float, device: str) -> None:
+    def __init__(
+        self, content: Gaussians, x: np.ndarray, wanted: np.ndarray, faint: float, device: str, pictured: bool
+    ) -> None:
         self._sphere = content.support == "sphere"
         self._x = torch.from_numpy(x.astype(np.float64)).to(device)
         self._wanted = self._put(wanted)
@@ -131,7 +138,8 @@ class _Search:
             self._inside.append(inputs @ self._put(layer))
             inputs = _with_one(self._inside[-1].sigmoid())
         self._faint = faint
-        self._base = self._error(inputs @ self._put(self._layers[2]))
+        result = inputs @ self._put(self._layers[2])
+        self._base, self._aim = self._error(result), result if pictured else self._wanted
         # Change of the first layer's sums by one unit of each latent, and by one unit of its weight.
         first = self._layers[0][: self._latent.shape[1]]
         self._of_latent = 1.0 / _positive(np.linalg.norm(first, axis=1))
@@ -184,20 +192,19 @@ class _Search:
         if len(rows) <= _TOGETHER:
             weight = torch.cat(list(self._weights(moved)))
             square = weight.T @ weight
-            latent = _fitted(square, weight.T @ self._latent, self._put(latent), _OF_LATENTS)
-            feed = _feed(square, _OF_LATENTS)
+            latent, feed = _fitted(square, weight.T @ self._latent, self._put(latent), _OF_LATENTS)
         latent = _fed(latent, np.tile(step[STORED_LATENT], (len(rows), 1)), feed, CODES // 2)
         net_step = [steps.first * each for each in self._of_first]
         net_step += [steps.position] * 4 + [steps.second, steps.third]
         net_step = np.array([stored_step(each) for each in net_step])
         inputs = self._inputs(self._latents(moved, latent * step[STORED_LATENT], weight))
         net = []
-        wanted = [*self._inside, self._wanted]
+        wanted = [*self._inside, self._aim]
         for number, layer in enumerate(self._layers):
             own = net_step[: latents + 4] if number == 0 else np.full(len(layer), net_step[latents + 3 + number])
             square = inputs.T @ inputs
-            fitted = _fitted(square, inputs.T @ wanted[number], self._put(layer), _OF_LAYERS)
-            net.append(_fed(fitted, np.repeat(own[:, None], layer.shape[1], 1), _feed(square, _OF_LAYERS), LARGEST))
+            fitted, own_feed = _fitted(square, inputs.T @ wanted[number], self._put(layer), _OF_LAYERS)
+            net.append(_fed(fitted, np.repeat(own[:, None], layer.shape[1], 1), own_feed, LARGEST))
             result = inputs @ self._put(net[-1] * own[:, None])
             inputs = _with_one(result.sigmoid())
         numbers = np.concatenate([whole, latent], 1).astype(np.int64)
@@ -243,33 +250,34 @@ def stored_step(step: float) -> float:
     return float(np.array(bits << 16, np.uint32).view(np.float32))
 
 
-def _fitted(square: torch.Tensor, right: torch.Tensor, before: torch.Tensor, share: float) -> np.ndarray:
-    """Solves normal equations with ridge regularisation towards the solution `before`."""
-    ridge = _ridge(square, share)
-    return torch.linalg.solve(square + ridge, right + ridge @ before).cpu().numpy()
-
-
-def _feed(square: torch.Tensor, share: float) -> np.ndarray:
-    """Returns the upper Cholesky factor of the inverse of a symmetric matrix plus `share` of a ridge, [I, I]."""
-    inverse = torch.linalg.inv(square + _ridge(square, share))
-    return torch.linalg.cholesky(0.5 * (inverse + inverse.T), upper=True).cpu().numpy()
+def _fitted(
+    square: torch.Tensor, right: torch.Tensor, before: torch.Tensor, share: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solves normal equations with ridge regularisation, `share` of the mean of the diagonal, towards the solution
+    `before`. Returns the solution and the upper Cholesky factor of the inverse of the regularised matrix, [I, I]."""
+    ridge = max(share * float(square.trace()) / len(square), np.finfo(np.float32).tiny)
+    one = torch.eye(len(square), dtype=square.dtype, device=square.device)
+    # A = R R^T with upper R, so that A^-1 = U^T U with U = R^-1.
+    root = torch.linalg.cholesky((square + ridge * one).flip(0, 1)).flip(0, 1)
+    upper = torch.linalg.solve_triangular(root, one, upper=True)
+    return (upper.T @ (upper @ (right + ridge * before))).cpu().numpy(), upper.cpu().numpy()
 
 
 def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
     """Divides numbers [I, O] by steps and rounds them to -most to most, row by row; later rows make up for errors."""
+    if feed is None:
+        return np.clip(np.rint(numbers / step), -most, most)
     numbers, whole = numbers.copy(), np.empty_like(numbers)
-    for row in range(len(numbers)):
-        whole[row] = np.clip(np.rint(numbers[row] / step[row]), -most, most)
-        if feed is not None:
-            over = (numbers[row] - whole[row] * step[row]) / feed[row, row]
-            numbers[row + 1 :] -= np.outer(feed[row, row + 1 :], over)
+    for start in range(0, len(numbers), _ROWS):
+        # Rows behind these make up for all of them at once.
+        part = slice(start, start + _ROWS)
+        own, over = numbers[part], np.empty_like(numbers[part])
+        for row, (left, size, factor) in enumerate(zip(own, step[part], feed[part, part], strict=True)):
+            whole[start + row] = np.rint(left / size).clip(-most, most)
+            over[row] = (left - whole[start + row] * size) / factor[row]
+            own[row + 1 :] -= factor[row + 1 :, None] * over[row]
+        numbers[start + _ROWS :] -= feed[part, start + _ROWS :].T @ over
     return whole
-
-
-def _ridge(square: torch.Tensor, share: float) -> torch.Tensor:
-    """Returns `share` of the mean of the diagonal, times the unit matrix."""
-    least = max(share * float(square.trace()) / len(square), np.finfo(np.float32).tiny)
-    return least * torch.eye(len(square), dtype=square.dtype, device=square.device)
 
 
 def _with_one(inputs: torch.Tensor) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 import math
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ from wlm.probe.gaussian.model import (
     layer_shapes,
     split_layers,
 )
+from wlm.probe.gaussian.pictures import PictureLoss, Pixels
 from wlm.probe.model import Profile
 from wlm.probe.morton import morton_order
 from wlm.probe.relative import magnitudes, with_magnitude
@@ -38,6 +40,7 @@ FINAL_RATE = 1e-3
 """Final learning rate as a share of the initial one; it falls along half a cosine."""
 
 _QUANTISE_FROM, _FREEZE_FROM = 5 / 6, 11 / 12  # share of the steps at which the second and the third stage begin
+_PICTURES_FROM = 1 / 2  # share of the steps from which on the error of pictures is minimised too
 _FIRST_LATENT = 0.1  # standard deviation of the first latents
 _PRUNE = 1e-4  # largest change by dropped Gaussians, as a share of the range of the decoded numbers
 _STATE = ("rows", "net", "moments", "net_moments", "bounds", "control", "loss")
@@ -55,7 +58,8 @@ class Trainer:
 
     A step runs over all probes (eq. 8); for a relative error, the loss is of the numbers of `with_magnitude`, one more
     than a probe has. There are three stages: first the Gaussians are trained freely; then their numbers are rounded to
-    codes in each step (section 3.3); then the Gaussians are fixed, and only the network is trained.
+    codes in each step (section 3.3); then the Gaussians are fixed, and only the network is trained. With pixels of
+    pictures, half of the loss is their error in the second half of the steps.
 
     Attributes:
         device: "cpu" or "cuda:N".
@@ -67,7 +71,14 @@ class Trainer:
     """
 
     def __init__(
-        self, x: np.ndarray, values: np.ndarray, profile: Profile, seed: int, device: str, hours: int = 1
+        self,
+        x: np.ndarray,
+        values: np.ndarray,
+        profile: Profile,
+        seed: int,
+        device: str,
+        hours: int = 1,
+        pixels: Pixels | None = None,
     ) -> None:
         """Starts a fit.
 
@@ -78,7 +89,9 @@ class Trainer:
             seed: Seed of the fit; the same seed gives the same result on one device.
             device: "cpu" or "cuda:N".
             hours: T.
+            pixels: Pixels whose error is minimised, too; None: only that of the probes is.
         """
+        light = values
         self.device, self._cuda = device, device != "cpu"
         self.steps, self._name, self._support = profile.steps, profile.name, profile.support
         self._hours = hours
@@ -94,6 +107,9 @@ class Trainer:
         order = morton_order(x)
         x, values = x[order], values[order]
         self._upload(x, values)
+        self._pictures = None
+        if pixels is not None:
+            self._pictures = PictureLoss(pixels.of(order), light[order], self.relative, hours, self._unit, device)
         self._allocate(*_first_numbers(x, values, profile, np.random.default_rng(seed)))
         rates = np.empty(LATENT.start + self._latent)
         rates[CENTRE], rates[SCALE], rates[ROTATION] = profile.centre_rate, profile.scale_rate, profile.rotation_rate
@@ -109,7 +125,8 @@ class Trainer:
         self.needed = np.ones(self.count, bool)
         self.dropped_change = 0.0
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
-        self._stages = [interop.StepGraph(lambda stage=s: self._step(stage), device, warmup=1) for s in range(3)]
+        stages = [partial(self._step, stage, pictured) for pictured in (False, True) for stage in range(3)]
+        self._stages = [interop.StepGraph(step, device, warmup=1) for step in stages]
         self._entered = 0
         # Loaded before two threads launch kernels, since two threads must not load a module at once.
         self._step_kernels.load(device)
@@ -136,6 +153,7 @@ class Trainer:
         # Squared errors are measured in units of the largest variance of a channel.
         self._unit = float(max(spread.max() ** 2, np.finfo(np.float64).tiny))
         self._weight = self._put(spread**2 / self._unit / (n * d), float)
+        self._scaling = self._put(self.mean, float), self._put(spread, float)
 
     def _allocate(self, rows: np.ndarray, net: np.ndarray) -> None:
         count, channels = rows.shape
@@ -188,7 +206,8 @@ class Trainer:
                 stage = self.stage(step)
                 while self._entered < stage:
                     self._enter(self._entered + 1)
-                self._stages[stage]()
+                pictured = self._pictures is not None and step >= round(_PICTURES_FROM * self.steps)
+                self._stages[stage + 3 * pictured]()
 
     def _enter(self, stage: int) -> None:
         """Starts stage 1 (sets the codes' range) or 2 (freezes the Gaussians; drops those that hardly matter)."""
@@ -212,7 +231,7 @@ class Trainer:
         self._step_kernels.shapes(a["rows"], a["bounds"], int(quantised), self._levels, CUT, sphere, *used)
         probe_step.touch(self._groups, self._shapes, self._by_group, self._by_gaussian)
 
-    def _step(self, stage: int) -> None:
+    def _step(self, stage: int, pictured: bool) -> None:
         a, t = self._arrays, self._tensors
         move = stage < 2
         t["control"].add_(1)
@@ -223,13 +242,29 @@ class Trainer:
             # The two threads on the CPU add to these arrays.
             t["partial"].zero_()
             t["loss"].zero_()
-        network = (self._groups, a["f"], self._target, self._weight, a["net"], a["grad_f"], a["partial"], a["loss"])
-        self._share(self._groups.x.shape[0], lambda *lane: self._network.launch(*network, *lane))
+        if pictured:
+            self._network_and_pictures()
+        else:
+            network = (self._groups, a["f"], self._target, self._weight, a["net"], a["grad_f"], a["partial"], a["loss"])
+            self._share(self._groups.x.shape[0], lambda *lane: self._network.launch(*network, *lane))
         if move:
             self._collect()
         self._optimiser.keep, self._optimiser.move = int(stage > 0), int(move)
         moving = [a[name] for name in ("sums", "moments", "net", "net_moments", "partial")]
         self._step_kernels.update(self._optimiser, a["rows"], a["used"], self._shapes, *moving)
+
+    def _network_and_pictures(self) -> None:
+        """Computes the gradients of half the error of the probes and half that of the pictures."""
+        t, n = self._tensors, self._probes
+        f, net = (tensor.detach().requires_grad_() for tensor in (t["f"].sum(0)[:, :n], t["net"]))
+        outputs = self._outputs_of(f, net)
+        target, weight, mean, spread = (wp.to_torch(a) for a in (self._target, self._weight, *self._scaling))
+        loss = (weight * (outputs - target[:, :n].T).square()).sum()
+        total = 0.5 * (loss + self._pictures(mean + spread * outputs))
+        grad_f, grad_net = torch.autograd.grad(total, (f, net))
+        t["grad_f"][:, :n].copy_(grad_f)
+        t["partial"].zero_()[0].copy_(grad_net)
+        t["loss"].zero_()[0].copy_(loss.detach())
 
     def _collect(self) -> None:
         a = self._arrays
@@ -286,10 +321,12 @@ class Trainer:
 
     def _decoded(self) -> torch.Tensor:
         """Returns the network's output at all probes before it is scaled to the probes' numbers, float32 [N, D]."""
-        first, second, third = split_layers(self._tensors["net"], self._layers)
+        return self._outputs_of(self._tensors["f"].sum(0)[:, : self._probes], self._tensors["net"])
+
+    def _outputs_of(self, f: torch.Tensor, net: torch.Tensor) -> torch.Tensor:
+        first, second, third = split_layers(net, self._layers)
         x = wp.to_torch(self._groups.x)[: self._probes]
-        h = torch.cat([self._tensors["f"].sum(0).T[: self._probes], x], 1)
-        h = torch.sigmoid(h @ first[:-1] + first[-1])
+        h = torch.sigmoid(torch.cat([f.T, x], 1) @ first[:-1] + first[-1])
         h = torch.sigmoid(h @ second[:-1] + second[-1])
         return (h @ third[:-1] + third[-1])[:, : self._outputs]
 
@@ -416,7 +453,7 @@ def local_spread(x: np.ndarray, values: np.ndarray) -> np.ndarray:
     Returns:
         float64 [N], positive: the standard deviation over each probe and its eight nearest, plus a small floor.
     """
-    near = cKDTree(x).query(x, k=min(_NEIGHBOURS, len(x)))[1].reshape(len(x), -1)
+    near = cKDTree(x).query(x, k=min(_NEIGHBOURS, len(x)), workers=-1)[1].reshape(len(x), -1)
     # In pieces: all neighbours' numbers at once would be nine times the set.
     pieces = (near[start : start + _PIECE] for start in range(0, len(near), _PIECE))
     spread = np.concatenate([np.sqrt(values[piece].astype(np.float64).var(1).sum(1)) for piece in pieces])
@@ -456,7 +493,7 @@ def first_gaussians(
 
 def _kmeans(x: np.ndarray, centre: np.ndarray, rounds: int) -> np.ndarray:
     for _ in range(rounds):
-        label = cKDTree(centre).query(x)[1]
+        label = cKDTree(centre).query(x, workers=-1)[1]
         size = np.bincount(label, minlength=len(centre))
         total = np.stack([np.bincount(label, x[:, axis], len(centre)) for axis in range(3)], 1)
         # A centre that is nearest to no probe keeps its position.
