@@ -52,7 +52,7 @@ QUIET = (1 << 62) - 1
 """Key of an error while there is none."""
 
 # fast_math's approximate quotients and roots affect only the stress, by 1e-7 of it, not density and momentum.
-_OPTIONS = {"enable_backward": False, "max_unroll": 32, "fast_math": True}
+OPTIONS = {"enable_backward": False, "max_unroll": 32, "fast_math": True}
 
 # A key is (step * 2^31 + cell) * 4 + cause, so that the smallest key is that of the first cell in the first step.
 _CELLS = wp.constant(wp.int64(1 << 31))
@@ -163,18 +163,22 @@ def _relax(spec: Spec) -> Any:
 
 
 @functools.cache
+def mirror_tables(lattice_name: str) -> tuple[list[list[int]], list[list[int]]]:
+    """Returns for each velocity of a lattice the rows of its opposite with some of its components mirrored, where bit a
+    of the index is that of axis a; and the axes that it goes up along, and down along, as bits."""
+    c = lattice(lattice_name).c
+    rows = [[c.index(tuple(v if m >> a & 1 else -v for a, v in enumerate(each))) for m in range(8)] for each in c]
+    return rows, [[sum(1 << a for a in range(3) if sign * v[a] > 0) for sign in (1, -1)] for v in c]
+
+
+@functools.cache
 def _elements(spec: Spec, far: bool) -> Any:
     """Builds (once) a function that returns the elements that a cell reads or writes, in a far step or at home; see
     `lattice_links.element_of`, which does the same for one element of any lattice."""
     memory, c = memory_functions(spec.lattice, spec.storage, spec.wide), lattice(spec.lattice).c
     element, count = memory.element, len(c)
     stored, indices = STORAGES[spec.storage][0], wp.types.vector(count, memory.index)
-    # Rows of a velocity's opposite with some of its components mirrored: bit a of the index is that of axis a.
-    rows = [
-        [c.index(tuple(v if m >> a & 1 else -v for a, v in enumerate(velocity))) for m in range(8)] for velocity in c
-    ]
-    # The axes that a velocity goes up along, and down along, as bits.
-    signs = [[sum(1 << a for a in range(3) if sign * v[a] > 0) for sign in (1, -1)] for v in c]
+    rows, signs = mirror_tables(spec.lattice)
 
     @wp.func
     def elements_at_home(f: wp.array2d[stored], b: Boundaries, i: int, word: wp.uint32) -> indices:
@@ -225,33 +229,15 @@ def _elements(spec: Spec, far: bool) -> Any:
 
 
 @functools.cache
-def step_kernel(spec: Spec, reads: bool, writes: bool) -> wp.Kernel:
-    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell.
+def collision_functions(spec: Spec, settled: bool) -> tuple[Any, Any]:
+    """Builds (once) `wp.func`s for a cell: `collide` computes from the stored populations that it reads those that
+    leave it, and the density minus 1 and the velocity that they have; `send_out` then writes what outlets send back.
 
-    Args:
-        spec: The settings.
-        reads: Whether populations are read far, see `lattice_links`.
-        writes: Whether they are written far. In place it is the same as `reads`. If only `writes` is true, both arrays
-            have the populations that arrive, with what links add to them except for that step's: `settle` adds it.
-
-    Args of the kernel, for N cells and Q velocities:
-        t: The velocity set.
-        b: The boundaries; `net` is used.
-        f: [Q, N], the populations.
-        tau: Relaxation time, 1/2 + 3 nu.
-        eddy: `eddy_factor`, used if `spec.eddies`.
-        forces: vec3 [N], acceleration of each cell's fluid in cells per step squared, used if `spec.forced`.
-        parity: 0 or 1: `clock[parity]` is the number of steps done; the step writes one more to the other element.
-        clock: int [2], counts steps.
-        trouble: int64 [1], lowered to the key of the first cell in which the flow blew up, see `trouble_of`.
-        out: [Q, N], the populations after the step; `f` itself in place.
+    `settled`: the populations that are read are complete, see `lattice_links`.
     """
     memory, relax = memory_functions(spec.lattice, spec.storage, spec.wide), _relax(spec)
-    elements_read, elements_written = _elements(spec, reads), _elements(spec, writes)
-    moments, peek, poke = memory.moments, memory.peek, memory.poke
-    load, store, vec = memory.load, memory.store, memory.vec
-    stored, count = STORAGES[spec.storage][0], len(lattice(spec.lattice).c)
-    settled = reads != writes
+    moments, load, store, vec = memory.moments, memory.load, memory.store, memory.vec
+    stored = STORAGES[spec.storage][0]
 
     @wp.func
     def add_terms(t: Tables, b: Boundaries, i: int, word: wp.uint32, done: int):
@@ -287,7 +273,74 @@ def step_kernel(spec: Spec, reads: bool, writes: bool) -> wp.Kernel:
                     store(f, q, i, v)
         wp.atomic_add(b.net, (done + 1) % 3, fixed_point(net))
 
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.func
+    def collide(
+        t: Tables,
+        b: Boundaries,
+        g: vec,
+        i: int,
+        word: wp.uint32,
+        tau: float,
+        eddy: float,
+        forces: wp.array1d[wp.vec3],
+        done: int,
+        trouble: wp.array1d[wp.int64],
+    ):
+        drho, j, diagonal, off = moments(g)
+        if wp.static(spec.bounded and not settled):
+            if (word & TERMS) != wp.uint32(0):
+                more, more_j, more_diagonal, more_off = add_terms(t, b, i, word, done)
+                drho += more
+                j += more_j
+                diagonal += more_diagonal
+                off += more_off
+        rho = 1.0 + drho
+        j2 = wp.dot(j, j)
+        if not (rho > 0.0 and j2 < _SOUND2 * rho * rho):
+            code = int(1)
+            if not (j2 >= 0.0):
+                code = 2
+            elif rho <= 0.0:
+                code = 0
+            key = wp.int64(done) * _CELLS + wp.int64(i)
+            wp.atomic_min(trouble, 0, key * _CODES + wp.int64(code))
+        push = wp.vec3()
+        if wp.static(spec.forced):
+            push = forces[i]
+        return relax(drho, j, diagonal, off, push, tau, eddy), drho, (j + push) / rho
+
+    return collide, send_out
+
+
+@functools.cache
+def step_kernel(spec: Spec, reads: bool, writes: bool) -> wp.Kernel:
+    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell.
+
+    Args:
+        spec: The settings.
+        reads: Whether populations are read far, see `lattice_links`.
+        writes: Whether they are written far. In place it is the same as `reads`. If only `writes` is true, both arrays
+            have the populations that arrive, with what links add to them except for that step's: `settle` adds it.
+
+    Args of the kernel, for N cells and Q velocities:
+        t: The velocity set.
+        b: The boundaries; `net` is used.
+        f: [Q, N], the populations.
+        tau: Relaxation time, 1/2 + 3 nu.
+        eddy: `eddy_factor`, used if `spec.eddies`.
+        forces: vec3 [N], acceleration of each cell's fluid in cells per step squared, used if `spec.forced`.
+        parity: 0 or 1: `clock[parity]` is the number of steps done; the step writes one more to the other element.
+        clock: int [2], counts steps.
+        trouble: int64 [1], lowered to the key of the first cell in which the flow blew up, see `trouble_of`.
+        out: [Q, N], the populations after the step; `f` itself in place.
+    """
+    memory, settled = memory_functions(spec.lattice, spec.storage, spec.wide), reads != writes
+    elements_read, elements_written = _elements(spec, reads), _elements(spec, writes)
+    collide, send_out = collision_functions(spec, settled)
+    peek, poke, vec = memory.peek, memory.poke, memory.vec
+    stored, count = STORAGES[spec.storage][0], len(lattice(spec.lattice).c)
+
+    @wp.kernel(module="unique", module_options=OPTIONS)
     def step(
         # in:
         t: Tables,
@@ -315,34 +368,13 @@ def step_kernel(spec: Spec, reads: bool, writes: bool) -> wp.Kernel:
         g = vec()
         for q in range(wp.static(count)):
             g[q] = float(peek(f, elements[q]))
-        drho, j, diagonal, off = moments(g)
-        if wp.static(spec.bounded and not settled):
-            if (word & TERMS) != wp.uint32(0):
-                more, more_j, more_diagonal, more_off = add_terms(t, b, i, word, clock[parity])
-                drho += more
-                j += more_j
-                diagonal += more_diagonal
-                off += more_off
-        rho = 1.0 + drho
-        j2 = wp.dot(j, j)
-        if not (rho > 0.0 and j2 < _SOUND2 * rho * rho):
-            code = int(1)
-            if not (j2 >= 0.0):
-                code = 2
-            elif rho <= 0.0:
-                code = 0
-            key = wp.int64(clock[parity]) * _CELLS + wp.int64(i)
-            wp.atomic_min(trouble, 0, key * _CODES + wp.int64(code))
-        push = wp.vec3()
-        if wp.static(spec.forced):
-            push = forces[i]
-        left = relax(drho, j, diagonal, off, push, tau, eddy)
+        left, drho, u = collide(t, b, g, i, word, tau, eddy, forces, clock[parity], trouble)
         if wp.static(settled):
             elements = elements_written(f, b, i, word)
         for q in range(wp.static(count)):
             poke(out, elements[q], out.dtype(left[wp.static(((q - 1) ^ 1) + 1 if q else 0)]))
         if wp.static(spec.bounded):
             if (word & OUTFLOW) != wp.uint32(0):
-                send_out(t, b, out, i, word, drho, (j + push) / rho, clock[parity])
+                send_out(t, b, out, i, word, drho, u, clock[parity])
 
     return step
