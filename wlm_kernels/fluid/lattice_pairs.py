@@ -10,9 +10,9 @@ import functools
 
 import warp as wp
 
-from wlm_kernels.fluid.lattice import OPTIONS, Spec, collision_functions, mirror_tables
-from wlm_kernels.fluid.lattice_links import OUTFLOW, SOLID, Boundaries, is_link, word_of
-from wlm_kernels.fluid.lattice_sets import Tables, cell_of, lattice, memory_functions
+from wlm_kernels.fluid.lattice import OPTIONS, Spec, collision, mirror_tables
+from wlm_kernels.fluid.lattice_links import SOLID, Boundaries, is_link, word_of
+from wlm_kernels.fluid.lattice_sets import cell_of, lattice, memory_functions
 
 BLOCK = 128
 
@@ -66,15 +66,16 @@ def pair_kernel(spec: Spec, far: bool) -> wp.Kernel:
     and more up to a multiple of 32. Arguments are those of the kernel of `lattice.step_kernel`, without the last.
     """
     memory, c = memory_functions(spec.lattice, spec.storage, spec.wide), lattice(spec.lattice).c
-    collide, send_out = collision_functions(spec, False)
+    collide = collision(spec)
     element, index, vec, count = memory.element, memory.index, memory.vec, len(c)
-    indices, (rows, signs) = wp.types.vector(count, index), mirror_tables(spec.lattice)
+    indices, words = wp.types.vector(count, index), wp.types.vector(count, wp.uint32)
+    rows, signs = mirror_tables(spec.lattice)
 
     @wp.func_native("return *reinterpret_cast<const unsigned*>(f.data + k);")
     def peek_pair(f: wp.array2d[wp.float16], k: index) -> wp.uint32: ...
 
-    @wp.func_native("return *reinterpret_cast<const unsigned short*>(f.data + k);")
-    def peek(f: wp.array2d[wp.float16], k: index) -> wp.uint32: ...
+    @wp.func_native("return loads ? *reinterpret_cast<const unsigned short*>(f.data + k) : 0u;")
+    def peek_if(f: wp.array2d[wp.float16], k: index, loads: bool) -> wp.uint32: ...
 
     @wp.func_native(_POKE)
     def poke(f: wp.array2d[wp.float16], k: index, pair: wp.uint32, first: bool, second: bool): ...
@@ -87,7 +88,6 @@ def pair_kernel(spec: Spec, far: bool) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
     def step(
         # in:
-        t: Tables,
         b: Boundaries,
         f: wp.array2d[wp.float16],
         tau: float,
@@ -103,20 +103,9 @@ def pair_kernel(spec: Spec, far: bool) -> wp.Kernel:
         done = clock[parity]
         if thread == 0:
             clock[1 - parity] = done + 1
-            b.net[(done + 2) % 3] = wp.int64(0)
+            b.net[0] = wp.int64(0)
         n = b.n
         i = wp.min(2 * thread, f.shape[1] - 2)
-        word = wp.uint32(0)
-        word2 = wp.uint32(0)
-        if wp.static(spec.bounded):
-            word = word_of(b, i)
-            word2 = word_of(b, i + 1)
-        if 2 * thread >= f.shape[1]:
-            word = SOLID
-            word2 = SOLID
-        # The words of the cells before and after the pair.
-        word_before = _before(word2)
-        word_after = _after(word)
         p = cell_of(n, i)
         down = wp.vec3i()
         up = wp.vec3i()
@@ -151,13 +140,13 @@ def pair_kernel(spec: Spec, far: bool) -> wp.Kernel:
                 mirror_after = 4
                 z_after = n[2] - 1
 
-        g = vec()
-        g2 = vec()
-        # The elements of a far step: that of the pair there, and that of the half beside it.
+        # The elements of a far step: that of the pair there, and that of the half beside it. All are loaded at once.
         at = indices()
         beside = indices()
+        pairs = words()
+        halves = words()
         for q in range(wp.static(count)):
-            pair = wp.uint32(0)
+            at[q] = element(f, wp.static(q), i)
             if wp.static(far and q > 0):
                 line = (x[wp.static(1 - c[q][0])] * n[1] + y[wp.static(1 - c[q][1])]) * n[2]
                 row = int(wp.static(rows[q][0]))
@@ -171,41 +160,53 @@ def pair_kernel(spec: Spec, far: bool) -> wp.Kernel:
                                 row = wp.where(crossed == wp.static(m), wp.static(rows[q][m]), row)
                             edge_row = wp.where(edge == wp.static(m), wp.static(rows[q][m]), edge_row)
                 at[q] = element(f, row, line + p[2])
-                pair = peek_pair(f, at[q])
                 if wp.static(c[q][2] > 0):
                     beside[q] = element(f, edge_row, line + z_before)
-                    other = _before(pair) >> _HALF
-                    if begins:
-                        other = peek(f, beside[q])
-                    pair = other | (pair << _HALF)
+                    halves[q] = peek_if(f, beside[q], begins)
                 if wp.static(c[q][2] < 0):
                     beside[q] = element(f, edge_row, line + z_after)
-                    other = _after(pair) << _HALF
-                    if ends:
-                        other = peek(f, beside[q]) << _HALF
-                    pair = (pair >> _HALF) | other
-                if wp.static(spec.bounded):
-                    if is_link(word | word2, wp.static(q)):
-                        own = peek_pair(f, element(f, wp.static(q), i))
-                        if is_link(word, wp.static(q)):
-                            pair = (pair & ~_LOW) | (own & _LOW)
-                        if is_link(word2, wp.static(q)):
-                            pair = (pair & _LOW) | (own & ~_LOW)
-            else:
-                pair = peek_pair(f, element(f, wp.static(q), i))
+                    halves[q] = peek_if(f, beside[q], ends)
+            pairs[q] = peek_pair(f, at[q])
+        word = wp.uint32(0)
+        word2 = wp.uint32(0)
+        if wp.static(spec.bounded):
+            word = word_of(b, i)
+            word2 = word_of(b, i + 1)
+        if 2 * thread >= f.shape[1]:
+            word = SOLID
+            word2 = SOLID
+        # The words of the cells before and after the pair.
+        word_before = _before(word2)
+        word_after = _after(word)
+        g = vec()
+        g2 = vec()
+        for q in range(wp.static(count)):
+            pair = pairs[q]
+            if wp.static(far and c[q][2] > 0):
+                other = _before(pair) >> _HALF
+                if begins:
+                    other = halves[q]
+                pair = other | (pair << _HALF)
+            if wp.static(far and c[q][2] < 0):
+                other = _after(pair)
+                if ends:
+                    other = halves[q]
+                pair = (pair >> _HALF) | (other << _HALF)
+            if wp.static(far and q > 0 and spec.bounded):
+                if is_link(word | word2, wp.static(q)):
+                    own = peek_pair(f, element(f, wp.static(q), i))
+                    if is_link(word, wp.static(q)):
+                        pair = (pair & ~_LOW) | (own & _LOW)
+                    if is_link(word2, wp.static(q)):
+                        pair = (pair & _LOW) | (own & ~_LOW)
             g[q] = _first(pair)
             g2[q] = _second(pair)
         left = vec()
         left2 = vec()
-        drho = float(0.0)
-        drho2 = float(0.0)
-        u = wp.vec3()
-        u2 = wp.vec3()
         if (word & SOLID) == wp.uint32(0):
-            left, drho, u = collide(t, b, g, i, word, tau, eddy, forces, done, trouble)
+            left = collide(g, i, tau, eddy, forces, done, trouble)
         if (word2 & SOLID) == wp.uint32(0):
-            left2, drho2, u2 = collide(t, b, g2, i + 1, word2, tau, eddy, forces, done, trouble)
-
+            left2 = collide(g2, i + 1, tau, eddy, forces, done, trouble)
         for q in range(wp.static(count)):
             back = wp.static(((q - 1) ^ 1) + 1 if q else 0)
             pair = _pack(left[back], left2[back])
@@ -231,11 +232,6 @@ def pair_kernel(spec: Spec, far: bool) -> wp.Kernel:
             else:
                 solid = (word & SOLID) != wp.uint32(0)
                 solid2 = (word2 & SOLID) != wp.uint32(0)
-                poke(f, element(f, wp.static(q), i), pair, not solid, not solid2)
-        if wp.static(spec.bounded):
-            if (word & OUTFLOW) != wp.uint32(0):
-                send_out(t, b, f, i, word, drho, u, done)
-            if (word2 & OUTFLOW) != wp.uint32(0):
-                send_out(t, b, f, i + 1, word2, drho2, u2, done)
+                poke(f, at[q], pair, not solid, not solid2)
 
     return step
