@@ -232,7 +232,7 @@ def test_sixteen_bits(lattice: str, device: str):
 
 @pytest.mark.parametrize("faces", ["tunnel", "slip", "open tunnel"])
 def test_sixteen_bits_at_boundaries(faces: str, device: str):
-    """An even number of cells along z, which a GPU steps in pairs; a row of them is longer than a warp."""
+    """Bodies that move at faces, with rows of cells that are longer than a warp."""
     solid = np.zeros((5, 4, 70), int)
     solid[2, 1:3, 30:33], solid[3, 2, 63:] = 1, 1
     settings = {"storage": "float16", "smagorinsky": 0.0, "shape": solid.shape, "faces": BOXES[faces]}

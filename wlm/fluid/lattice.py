@@ -20,8 +20,6 @@ from wlm_kernels.fluid import lattice_links
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
 from wlm_kernels.fluid.lattice_fields import FluidKernels, fluid_kernels
 from wlm_kernels.fluid.lattice_links import BLOCK, BOUNCE, INLET, OUTLET, PRESSURE, SLIP, Boundaries
-from wlm_kernels.fluid.lattice_pairs import BLOCK as PAIR_BLOCK
-from wlm_kernels.fluid.lattice_pairs import pair_kernel
 from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, Tables, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
@@ -569,12 +567,8 @@ class Lattice:
                 inputs = [self._tables, self._boundaries, int(self._moving), self._clock]
                 self._launch(self._kernels.settle, size, inputs, [self._f])
             inputs = [self._boundaries, self._f, self._tau, self._eddy, self._forces, self._done % 2]
-            outputs = [self._clock, self._trouble]
-            if self.device.is_cuda and self._f.dtype == wp.float16 and self.shape[2] % 2 == 0:
-                threads, settings = -(-self._cells // 64) * 32, {"block_dim": PAIR_BLOCK, "device": self.device}
-                wp.launch(pair_kernel(self._spec, far), threads, inputs=inputs, outputs=outputs, **settings)
-            else:
-                self._launch(step_kernel(self._spec, far, far), self._cells, inputs, [*outputs, self._f])
+            outputs = [self._clock, self._trouble, self._f]
+            self._launch(step_kernel(self._spec, far, far), self._cells, inputs, outputs)
             if self._outlets:
                 inputs = [self._tables, self._boundaries, int(far)]
                 self._launch(self._kernels.send_out, self._boundaries.kind.shape[0], inputs, [self._f])
