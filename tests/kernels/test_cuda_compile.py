@@ -14,7 +14,7 @@ import warp as wp
 
 import wlm_kernels
 from wlm_kernels import mlp
-from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields, lattice_pairs
+from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.lightmap import matrix_decode, matrix_pages, pages
 from wlm_kernels.lightmap import step as lightmap_step
@@ -91,11 +91,6 @@ def _lattice_step(settings: dict) -> list:
     return [lattice.step_kernel(spec, *far) for far in ((True, True), (False, False), (False, True))]
 
 
-def _lattice_pairs(settings: dict) -> list:
-    spec = lattice.Spec(**({"lattice": "D3Q19", "storage": "float16"} | settings))
-    return [lattice_pairs.pair_kernel(spec, far) for far in BOTH]
-
-
 def _advection(bricks: bool, solids: bool, stored: type) -> list:
     carry = [advection.carry_kernel(correcting, stored, bricks, solids, not solids) for correcting in BOTH]
     return _members(carry, list(advection_sources.source_kernels(stored).values()))
@@ -124,9 +119,6 @@ FACTORIES = [
     *_cases("probe_network", _probe_network, [((9, 64, 27),)], ((9, 64, 27), (1, 8, 3), (12, 48, 12), (12, 128, 75))),
     *_cases("smoke", _smoke, [], FLOATS),
     *_cases("lattice_step", _lattice_step, [], LATTICE_STEPS),
-    *_cases(
-        "lattice_pairs", _lattice_pairs, [], ({"bounded": True, "slips": True}, {"lattice": "D3Q27", "wide": True})
-    ),
     *_cases(
         "lattice_fields",
         lambda name, storage: _members(lattice_fields.fluid_kernels(name, storage)),

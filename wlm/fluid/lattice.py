@@ -123,7 +123,8 @@ def blown_up(key: int, shape: tuple[int, int, int]) -> WlmError:
     indices = tuple(int(a) for a in np.unravel_index(cell, shape))
     return WlmError(
         f"lattice: blew up in step {step} at cell {indices}: {cause}; expected speeds below {MAX_SPEED} and a"
-        f" viscosity at which the flow is stable: use a shorter step, a larger viscosity or smagorinsky=0.17"
+        f" viscosity at which the flow is stable: use a shorter step, such as by a larger air.speed, a larger"
+        " viscosity or smagorinsky=0.17"
     )
 
 
@@ -135,8 +136,8 @@ class Lattice:
 
     Args:
         shape: Cells along x, y and z.
-        viscosity: Kinematic viscosity in square cells per step; above 0.
-        smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the flow is stable at viscosity 1e-6.
+        viscosity: Kinematic viscosity in square cells per step.
+        smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the flow is stable at viscosity 0.
         storage: "float32" or "float16", which halves memory and traffic. With float16 the velocities of a jet differ
             by less than 0.2% of its speed (RMS, before the chaotic flows diverge), and the total mass drifts by about
             3e-5 in 5,000 steps.
@@ -167,9 +168,9 @@ class Lattice:
         ramp: int = 0,
     ) -> None:
         self.shape = _checked_shape(shape, lattice)
-        for name, value, least in (("viscosity", viscosity, 1e-12), ("smagorinsky", smagorinsky, 0.0)):
-            if not (math.isfinite(value) and value >= least):
-                raise ValueError(f"{name}: expected a number of at least {least:g}, got {value}")
+        for name, value in (("viscosity", viscosity), ("smagorinsky", smagorinsky)):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}: expected a number of at least 0, got {value}")
         if ramp < 0:
             raise ValueError(f"ramp: expected at least 0 steps, got {ramp}")
         self.device = wp.get_device(device)
@@ -431,8 +432,9 @@ class Lattice:
             "steps": np.array(self.steps, np.int64),
         }
 
-    def load(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continues from the state of a lattice with the same settings, faces and force.
+    def load(self, state: Mapping[str, np.ndarray], factor: float = 1.0) -> None:
+        """Continues from the state of a lattice with the same settings, faces and force, and a step that is `factor`
+        times as long, to which the settings of this lattice are converted.
 
         The following steps are the same as without the interruption, bit for bit.
 
@@ -451,6 +453,7 @@ class Lattice:
             state = check_parts(state, table)
         except ValueError as error:
             raise WlmError(f"lattice state: {error}") from error
+        self._convert_settings(factor)
         self._begun, self._done, self._graph = True, int(state["steps"]), None
         self._clock.fill_(self._done)
         self._trouble.fill_(QUIET)
@@ -463,6 +466,43 @@ class Lattice:
             array.assign(state[name])
         self._moving, self._prepared = bool(state["bodies"][:2].any()), False
         self._prepare()
+
+    def change_step(self, factor: float) -> None:
+        """Changes the duration of a step by a factor, between two steps, with all settings and the state.
+
+        Velocity, pressure and viscous stress stay the same in SI units, up to rounding. The force and the velocity of
+        bodies are converted with the state; a caller that sets them must set converted ones from then on.
+
+        Args:
+            factor: New duration over old one; `steps` divided by it must be a whole number.
+
+        Raises:
+            ValueError: The factor is not above 0, or there is no whole number of steps.
+            WlmError: An inlet, a wall or a body becomes faster than `MAX_SPEED`.
+        """
+        done = round(self.steps / factor) if math.isfinite(factor) and factor > 0.0 else -1
+        if done < 0 or not math.isclose(done * factor, self.steps):
+            raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
+        came, tau = self.populations().reshape(self._f.shape), self._tau
+        bodies = self._boundaries.bodies.numpy()
+        bodies[:2] *= factor
+        self._boundaries.bodies.assign(bodies)
+        self._boundaries.net.zero_()
+        self._done, self._graph = done, None
+        self._clock.fill_(done)
+        self._convert_settings(factor)
+        self._prepare()
+        inputs = [self._tables, self._boundaries, came, self._far, self._clock, self._forces, tau, self._eddy, factor]
+        self._launch(self._kernels.convert, self._cells, inputs, [self._f])
+
+    def _convert_settings(self, factor: float) -> None:
+        self._tau = 0.5 + factor * (self._tau - 0.5)
+        self._boundaries.rise *= factor
+        for name, face in self._faces.items():
+            fastest = factor * float(np.linalg.norm(face.velocity, axis=-1).max())
+            _check_speed(fastest, f"face {name!r}")
+            self._faces[name] = replace(face, velocity=factor * face.velocity, excess=factor**2 * face.excess)
+        self._prepared = False
 
     def setup(self) -> Setup:
         """Returns the settings with copies of the boundaries and the force, which no later change affects."""

@@ -33,6 +33,7 @@ _SPHERE = wp.constant(SPHERE)
 _LARGEST_HALF = wp.constant(65504.0)
 _BRICK = wp.constant(BRICK)
 _BRICK_CELLS = wp.constant(BRICK**3)
+_EMPTYING = 256  # groups of threads that empty bricks: few bricks retire in a step
 
 
 @wp.func
@@ -56,7 +57,7 @@ def within(box: Box, walls: wp.array1d[wp.uint8], shape: int, centre: wp.vec3, s
 @functools.cache
 def source_kernels(stored: type) -> dict[str, wp.Kernel]:
     """Builds (once) the kernels for smoke stored as `wp.float32` or `wp.float16`, by their names: "source" has a thread
-    for each fine cell of a box, "cover" and "lift" for each coarse cell, "empty" for each cell of a brick and worker.
+    for each fine cell of a box, "cover" and "lift" for each coarse cell, "empty" for each cell of a brick and group.
     """
     fields_type = fields_struct(stored)
 
@@ -187,11 +188,12 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         # in:
         box: Box,
         bricks: Bricks,
+        groups: int,
         # out:
         fields: fields_type,
     ):
         i = wp.tid()
-        for k in range(i // _BRICK_CELLS, bricks.retired_count[0], bricks.workers):
+        for k in range(i // _BRICK_CELLS, bricks.retired_count[0], groups):
             b = cell_of(box.bricks, bricks.retired[k])
             p = _BRICK * b + cell_of(wp.vec3i(_BRICK, _BRICK, _BRICK), i % _BRICK_CELLS)
             if p[0] < box.n[0] and p[1] < box.n[1] and p[2] < box.n[2]:
@@ -283,4 +285,5 @@ def buoyancy(
 
 def empty_retired(box: Box, bricks: Bricks, fields: Fields) -> None:
     """Sets the bricks that `advection_places.relist` removed from its list to 0; must be called for every buffer."""
-    _launch("empty", bricks.workers * int(_BRICK_CELLS), [box, bricks], fields.arrays, fields)
+    groups = min(bricks.workers, _EMPTYING)
+    _launch("empty", groups * int(_BRICK_CELLS), [box, bricks, groups], fields.arrays, fields)

@@ -48,6 +48,7 @@ from wlm_kernels.fluid.lattice_sets import (
     opposite,
     wrapped,
 )
+from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
 wp.set_module_options({"enable_backward": False})
 
@@ -132,6 +133,7 @@ class FluidKernels:
         neighbours: For each cell that becomes fluid, computes the means of the fluid around it.
         uncover: Sets the equilibrium of these, and moves what lies between a cell that changes and its neighbours.
         force: Sums the force of the fluid on each body.
+        convert: Converts populations that arrive to another time step.
     """
 
     fields: wp.Kernel
@@ -142,6 +144,7 @@ class FluidKernels:
     neighbours: wp.Kernel
     uncover: wp.Kernel
     force: wp.Kernel
+    convert: wp.Kernel
 
 
 @functools.cache
@@ -154,6 +157,7 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
     memory = memory_functions(lattice_name, storage)
     load, store = memory.load, memory.store
     stored = STORAGES[storage][0]
+    flat = velocity_set(lattice_name).axes == 2
     options = {"enable_backward": False}
 
     @wp.func
@@ -432,4 +436,52 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
                     _kind, term = condition(t, b, p, q)
                     wp.atomic_add(total, body, wp.float64(term - 2.0 * came) * c)
 
-    return FluidKernels(fields, start, arrivals, settle, send_out, neighbours, uncover, force)
+    @wp.kernel(module="unique", module_options=options)
+    def convert(
+        # in:
+        t: Tables,
+        b: Boundaries,
+        came: wp.array2d[stored],
+        far: int,
+        clock: wp.array1d[int],
+        forces: wp.array1d[wp.vec3],
+        tau: float,
+        eddy: float,
+        factor: float,
+        # out:
+        f: wp.array2d[stored],
+    ):
+        i = wp.tid()
+        word = word_of(b, i)
+        if (word & SOLID) != wp.uint32(0):
+            return
+        drho = float(0.0)
+        j = wp.vec3()
+        stress = wp.mat33()
+        for q in range(t.w.shape[0]):
+            g, c = load(came, q, i), along(t, q)
+            drho += g
+            j += g * c
+            stress += g * wp.outer(c, c)
+        identity = wp.identity(n=3, dtype=float)
+        if wp.static(flat):
+            identity[2, 2] = 0.0
+        stress -= wp.outer(j, j) / (1.0 + drho) + drho / 3.0 * identity
+        tau_eddy = 0.5 * (tau + wp.sqrt(tau * tau + eddy * wp.sqrt(wp.ddot(stress, stress)) / (1.0 + drho)))
+        push = wp.vec3()
+        if forces.shape[0] > 0:
+            push = forces[i]
+        # The speed scales with the step, the pressure with its square, the stress with the strain and the viscosity.
+        after = factor * factor * drho
+        j = factor * (1.0 + after) / (1.0 + drho) * (j + 0.5 * push) - 0.5 * factor * factor * push
+        stress = factor * (0.5 + factor * (tau_eddy - 0.5)) / tau_eddy * stress + wp.outer(j, j) / (1.0 + after)
+        p = cell_of(b.n, i)
+        for q in range(t.w.shape[0]):
+            c = along(t, q)
+            value = t.w[q] * (after + 3.0 * wp.dot(c, j) + 4.5 * wp.dot(c, stress * c) - 1.5 * wp.trace(stress))
+            if is_link(word, q) and (word & TERMS) != wp.uint32(0):
+                value -= term_of(t, b, p, q, steps_done(clock), shift(b, word, steps_done(clock)))
+            k, row = element_of(t, b, word, p, i, q, far)
+            store(f, row, k, value)
+
+    return FluidKernels(fields, start, arrivals, settle, send_out, neighbours, uncover, force, convert)
