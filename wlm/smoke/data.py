@@ -265,7 +265,8 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
     with _writing(folder):
         folder.mkdir(exist_ok=True)
         if not resume:
-            for path in (*numbered(folder, "frame", ".npz").values(), folder / CHECKPOINT):
+            made = [*numbered(folder, "frame", ".npz").values(), *numbered(folder, "frame", ".vdb").values()]
+            for path in (*made, folder / CHECKPOINT):
                 path.unlink(missing_ok=True)
     content = {"format": _FORMAT, "version": _VERSION, "scene": scene.model_dump(mode="json")}
     atomic_write(folder / SCENE_FILE, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
