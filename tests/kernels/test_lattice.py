@@ -246,6 +246,15 @@ def test_sixteen_bits(lattice: str, device: str):
         pair.hold(TOLERANCE / 10)
 
 
+@pytest.mark.parametrize("faces", ["tunnel", "slip", "open tunnel"])
+def test_sixteen_bits_at_boundaries(faces: str, device: str):
+    """Bodies that move at faces, with rows of cells that are longer than a warp."""
+    solid = np.zeros((5, 4, 70), int)
+    solid[2, 1:3, 30:33], solid[3, 2, 63:] = 1, 1
+    settings = {"storage": "float16", "smagorinsky": 0.0, "shape": solid.shape, "faces": BOXES[faces]}
+    _run(Pair("D3Q19", device, solid=solid, velocity=(0.03, 0.01, -0.02), **settings), HALF_TOLERANCE)
+
+
 @pytest.mark.parametrize(("storage", "tolerance"), [("float32", TOLERANCE), _slow("float16", HALF_TOLERANCE)])
 def test_indices_of_64_bits(storage: str, tolerance: float, device: str, monkeypatch: pytest.MonkeyPatch):
     """The indices of a domain of more populations than 32 bits count, in a small one."""

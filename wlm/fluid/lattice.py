@@ -195,10 +195,10 @@ class Lattice:
         # Of size 0 while no cell has ever been solid, or freed.
         self._boundaries.solid, self._means = self._zeros(0, wp.uint8), self._zeros(0, wp.vec4)
         self._boundaries.bodies = wp.zeros((3, BODIES), dtype=wp.vec3, device=self.device)
-        self._boundaries.net, self._boundaries.fixed = self._zeros(3, wp.int64), self._zeros(3, wp.int64)
+        self._boundaries.net, self._boundaries.fixed = self._zeros(1, wp.int64), self._zeros(3, wp.int64)
         self._forces = self._zeros(0, wp.vec3)
         self._faces: dict[str, Face] = {}
-        self._prepared = False
+        self._prepared = self._moving = False
         self._graph: wp.Graph | None = None
         # Steps that this object launched itself; replays of a user's CUDA graph are counted only by the clock.
         self._done, self._unchecked, self._begun = 0, 0, False
@@ -289,6 +289,8 @@ class Lattice:
         self._launch(self._kernels.neighbours, self._cells, inputs, [self._means])
         self._launch(self._kernels.uncover, self._cells, [self._tables, edges, new, self._means, self._far], [self._f])
         edges.bodies.assign(rows)
+        if bool(rows[:2].any()) != self._moving:
+            self._moving, self._graph = not self._moving, None
         wp.copy(edges.solid, new)
         lattice_links.mark(self._tables, edges)
 
@@ -444,7 +446,7 @@ class Lattice:
             # Empty while no cell has ever been solid.
             "solid": Part(np.uint8, (0 if np.shape(state.get("solid")) == (0,) else self._cells,)),
             "bodies": Part(np.float32, (3, BODIES, 3)),
-            "net": Part(np.int64, (3,)),
+            "net": Part(np.int64, (1,)),
             "steps": Part(np.int64, (), least=0, most=_MOST_STEPS),
         }
         try:
@@ -462,7 +464,7 @@ class Lattice:
             (self._boundaries.net, "net"),
         ):
             array.assign(state[name])
-        self._prepared = False
+        self._moving, self._prepared = bool(state["bodies"][:2].any()), False
         self._prepare()
 
     def change_step(self, factor: float) -> None:
@@ -578,6 +580,11 @@ class Lattice:
         edges.excess = wp.array(excess, dtype=float, device=self.device)
         for name, dtype in (("rank", wp.uint8), ("kind", wp.uint8), ("velocity", wp.vec3)):
             setattr(edges, name, wp.array(face_column(faces, name), dtype=dtype, device=self.device))
+        # Whether links of faces add anything, and whether there are outlets.
+        kinds = face_column(faces, "kind")
+        self._outlets = bool(np.isin(kinds, (OUTLET, PRESSURE)).any())
+        moving = (kinds == BOUNCE) & face_column(faces, "velocity").any(-1)
+        self._active = self._outlets or bool((moving | (kinds == INLET)).any())
         self._make_words()
         self._prepared = True
 
@@ -594,9 +601,17 @@ class Lattice:
     def _run(self, steps: int) -> None:
         """Queues steps on the device and returns without waiting."""
         for _ in range(steps):
-            kernel = step_kernel(self._spec, bool(self._far), bool(self._far))
-            inputs = [self._tables, self._boundaries, self._f, self._tau, self._eddy, self._forces, self._done % 2]
-            self._launch(kernel, self._cells, inputs, [self._clock, self._trouble, self._f])
+            far = bool(self._far)
+            if self._moving or self._active:
+                size = self._cells if self._moving else self._boundaries.kind.shape[0]
+                inputs = [self._tables, self._boundaries, int(self._moving), self._clock]
+                self._launch(self._kernels.settle, size, inputs, [self._f])
+            inputs = [self._boundaries, self._f, self._tau, self._eddy, self._forces, self._done % 2]
+            outputs = [self._clock, self._trouble, self._f]
+            self._launch(step_kernel(self._spec, far, far), self._cells, inputs, outputs)
+            if self._outlets:
+                inputs = [self._tables, self._boundaries, int(far)]
+                self._launch(self._kernels.send_out, self._boundaries.kind.shape[0], inputs, [self._f])
             self._done += 1
 
     def _run_in_graphs(self, steps: int) -> None:

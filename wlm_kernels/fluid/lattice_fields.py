@@ -18,6 +18,7 @@ from wlm_kernels.fluid.lattice_links import (
     SOLID,
     TERMS,
     Boundaries,
+    add_up,
     along,
     body_behind,
     body_velocity,
@@ -25,12 +26,14 @@ from wlm_kernels.fluid.lattice_links import (
     condition,
     element_of,
     face_cell,
+    face_cell_at,
     fixed_point,
     is_link,
     is_outlet,
     is_solid,
     mirrored,
     outflow,
+    shift,
     term_of,
     word_of,
 )
@@ -124,7 +127,9 @@ class FluidKernels:
         fields: Computes the density minus 1 and the velocity.
         start: Sets the equilibrium of given ones.
         arrivals: Computes the populations that arrive, complete with what links add.
-        settle: Adds to populations that arrive what links add to them.
+        settle: Adds to populations that arrive what links add to them, before a step: in the cells of faces, or in
+            `every` cell.
+        send_out: Sets what outlets send back, in the cells of faces, after a step that was far or not.
         neighbours: For each cell that becomes fluid, computes the means of the fluid around it.
         uncover: Sets the equilibrium of these, and moves what lies between a cell that changes and its neighbours.
         force: Sums the force of the fluid on each body.
@@ -135,6 +140,7 @@ class FluidKernels:
     start: wp.Kernel
     arrivals: wp.Kernel
     settle: wp.Kernel
+    send_out: wp.Kernel
     neighbours: wp.Kernel
     uncover: wp.Kernel
     force: wp.Kernel
@@ -176,7 +182,7 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
         k, row = element_of(t, b, word, p, i, q, far)
         value = load(f, row, k)
         if done >= 0 and is_link(word, q) and (word & TERMS) != wp.uint32(0):
-            value += term_of(t, b, p, q, done)
+            value += term_of(t, b, p, q, done, shift(b, word, done))
         return value
 
     @wp.func
@@ -250,7 +256,7 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
             k, row = element_of(t, b, word, p, i, q, 1 - far)
             store(f, row, k, value)
         if net != 0.0:
-            wp.atomic_add(b.net, steps_done(clock) % 3, fixed_point(net))
+            wp.atomic_add(b.net, 0, fixed_point(net))
 
     @wp.kernel(module="unique", module_options=options)
     def arrivals(
@@ -277,17 +283,56 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
         # in:
         t: Tables,
         b: Boundaries,
+        every: int,
         clock: wp.array1d[int],
         # in, out:
         f: wp.array2d[stored],
     ):
-        i = wp.tid()
+        i = int(wp.tid())
+        if every == 0:
+            i = face_cell_at(b, i)
+            if i < 0:
+                return
         word = word_of(b, i)
         if (word & TERMS) != wp.uint32(0):
             p = cell_of(b.n, i)
+            shifted = shift(b, word, steps_done(clock))
             for q in range(1, t.w.shape[0]):
                 if is_link(word, q):
-                    store(f, q, i, arrival(t, b, f, word, p, i, q, 0, steps_done(clock)))
+                    store(f, q, i, load(f, q, i) + term_of(t, b, p, q, steps_done(clock), shifted))
+
+    @wp.kernel(module="unique", module_options=options)
+    def send_out(
+        # in:
+        t: Tables,
+        b: Boundaries,
+        far: int,
+        # in, out:
+        f: wp.array2d[stored],
+    ):
+        i = face_cell_at(b, wp.tid())
+        if i < 0:
+            return
+        word = word_of(b, i)
+        if (word & OUTFLOW) == wp.uint32(0):
+            return
+        p = cell_of(b.n, i)
+        drho = float(0.0)
+        j = wp.vec3()
+        for q in range(t.w.shape[0]):
+            k, row = element_of(t, b, word, p, i, q, far)
+            g = load(f, row, k)
+            drho += g
+            j -= g * along(t, q)
+        net = float(0.0)
+        for q in range(1, t.w.shape[0]):
+            if is_link(word, q):
+                kind, excess = condition(t, b, p, q)
+                if is_outlet(kind):
+                    v = outflow(t, b, p, q, kind, excess, drho, j / (1.0 + drho))
+                    net += v - load(f, q, i)
+                    store(f, q, i, v)
+        add_up(b.net, fixed_point(net))
 
     @wp.kernel(module="unique", module_options=options)
     def neighbours(
@@ -435,8 +480,8 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
             c = along(t, q)
             value = t.w[q] * (after + 3.0 * wp.dot(c, j) + 4.5 * wp.dot(c, stress * c) - 1.5 * wp.trace(stress))
             if is_link(word, q) and (word & TERMS) != wp.uint32(0):
-                value -= term_of(t, b, p, q, steps_done(clock))
+                value -= term_of(t, b, p, q, steps_done(clock), shift(b, word, steps_done(clock)))
             k, row = element_of(t, b, word, p, i, q, far)
             store(f, row, k, value)
 
-    return FluidKernels(fields, start, arrivals, settle, neighbours, uncover, force, convert)
+    return FluidKernels(fields, start, arrivals, settle, send_out, neighbours, uncover, force, convert)
