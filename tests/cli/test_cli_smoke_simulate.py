@@ -15,6 +15,7 @@ from builders.smoke_plumes import SCENE, write_frames
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.fluid.volume import load_volume, save_volume
+from wlm.formats.vdb import VdbFile
 from wlm.smoke import simulation
 from wlm.smoke.data import CHECKPOINT, load_frames, open_frames
 from wlm.smoke.scene import Scene
@@ -62,13 +63,19 @@ def test_simulate(jet, tmp_path):
 
 
 def test_simulate_as_told(jet, tmp_path):
-    call("smoke", "simulate", jet / "jet.yaml", "-o", tmp_path / "a", "--frames", 1, "--scale", 0.5, "--resume")
+    words = ("smoke", "simulate", jet / "jet.yaml", "-o", tmp_path / "a", "--frames", 1, "--scale", 0.5)
+    call(*words, "--resume", "--vdb")
     assert "there was nothing to resume" in call.stderr
     footage = load_frames(tmp_path / "a")
     assert footage.numbers == (1,) and footage.scene.grid.cells == (4, 5, 4) and footage.scene.grid.cell == 0.25
+    grid = VdbFile((tmp_path / "a" / "frame_0001.vdb").read_bytes(), "a")
+    assert [f"{head.name} {head.type}" for head in grid.heads] == ["density float", "velocity vec3s"]
+    assert grid.read("density", True).values.sum() == pytest.approx(float(footage.load(1).density.sum()))
+    call(*words)
+    assert not (tmp_path / "a" / "frame_0001.vdb").exists()
     for change, words in (
         ({"grid": {"cells": [4096, 4096, 4096], "cell": 0.1, "faces": {}}}, "4096 x 4096 x 4096 cells"),
-        ({"air": {"speed": 0.1}}, "cells per step: expected at most 0.3"),
+        ({"air": {"speed": 0.1}}, "an obstacle of 1 m/s, 0.5 cells per step: leave air.speed null or at least 1"),
         ({"inlets": [SCENE["inlets"][0] | {"radius": 0.01}]}, "inlets.0: its circle covers no cell's centre"),
         ({"smoke": {"storage": "float16", "dissipation": 1e-3}}, "with float16"),
     ):
@@ -114,6 +121,58 @@ def test_a_simulation_is_stopped_and_resumed(within, jet, tmp_path, monkeypatch)
     call("smoke", "simulate", scene, "-o", out, "--resume")
     assert "nothing to resume" not in call.stderr
     assert (out / "frame_0004.npz").stat().st_mtime_ns == before
+
+
+def test_a_simulation_goes_on_with_corrected_settings(tmp_path, monkeypatch):
+    """Finished frames stay; the state goes on in other steps, and a later source and another path from now on act."""
+    ball = {"centre": [0, 0.8, 0], "radius": 0.2}
+    body = {"radius": 0.1, "path": [[0, 0, 0.6, 0], [0.1, 0.05, 0.6, 0]]}
+    scene = JET | {"sources": [ball | {"stop": 0.05}], "obstacles": [body]}
+    first = Scene.model_validate(scene | {"frames": 2})
+    out, step = tmp_path / "out", Solver.step
+
+    def stop(self, steps=1):
+        step(self, steps)
+        if self.steps == first.steps // 2 + 3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Solver, "step", stop)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(open_frames(out, first), checkpoint_every=0.0)
+    monkeypatch.undo()
+    kept = (out / "frame_0001.npz").read_bytes()
+    later = {"sources": [ball | {"stop": 0.05}, ball | {"start": 0.25}]}
+    body = body | {"path": [*body["path"], [0.4, 0.05, 0.6, 0], [0.5, 0.05, 0.6, 0.05]]}
+    settings = {"lattice_speed": 0.08, "speed": 1.3, "smagorinsky": 0.2}
+    second = Scene.model_validate(scene | later | {"obstacles": [body], "air": settings})
+    assert second.steps % first.steps
+    for field, wrong in {
+        "smoke.buoyancy": {"smoke": {"buoyancy": 1.0}},
+        "sources": {"sources": [ball | {"stop": 0.06}]},
+        "obstacles": {"obstacles": [body | {"path": [[0, 0, 0.6, 0], [0.15, 0.05, 0.6, 0]]}]},
+    }.items():
+        with pytest.raises(WlmError, match=f"another {field} than the scene"):
+            open_frames(out, Scene.model_validate(scene | wrong), resume=True)
+    assert simulate(open_frames(out, second, resume=True), resume=True) == 2
+    assert (out / "frame_0001.npz").read_bytes() == kept and load_frames(out).numbers == (1, 2, 3, 4)
+    whole = tmp_path / "whole"
+    simulate(open_frames(whole, second))
+    for number, least in ((1, 0.0), (2, 0.0), (3, 0.1), (4, 1.0)):
+        ours, theirs = (load_frames(each).load(number).density.double() for each in (out, whole))
+        assert float(ours.sum()) == pytest.approx(float(theirs.sum()), rel=0.1)
+        assert float(ours[:, 10:].sum()) >= least
+
+
+def test_hot_smoke_shortens_the_step(tmp_path):
+    """Hot smoke faster than the scene's speed does not blow up; a step too short is refused with speed and bound."""
+    hot = {"inlets": [], "obstacles": [], "sources": [{"centre": [0, 0.4, 0], "radius": 0.25, "temperature": 1.0}]}
+    scene = Scene.model_validate(JET | hot | {"smoke": {"buoyancy": 200.0}, "frames": 2})
+    solver = simulation.make_solver(scene)
+    for frame in (1, 2):
+        simulation.advance(scene, solver, frame)
+        assert solver.fastest < 0.3 and np.isfinite(solver.density.numpy()).all()
+    assert round(scene.step / solver.duration) in (2, 4, 8)
+    assert solver.steps * scene.smoke.substeps * solver.duration == pytest.approx(scene.time(2))
 
 
 def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatch):

@@ -35,9 +35,9 @@ def _room(device: str, shape=(10, 12, 10), viscosity: float = 0.02) -> Lattice:
     return lattice
 
 
-def _jet(device: str, obstacles=(MOVING,), **settings) -> Solver:
+def _jet(device: str, obstacles=(MOVING,), ramp: int = 10, **settings) -> Solver:
     settings = {"refinement": 2, "temperature": True, "sources": [NOZZLE], "dissipation": 1e-3} | settings
-    return Solver(_tunnel(device), obstacles=obstacles, buoyancy=Buoyancy(1e-4), **settings)
+    return Solver(_tunnel(device, ramp=ramp), obstacles=obstacles, buoyancy=Buoyancy(1e-4), **settings)
 
 
 def _numbers(solver: Solver) -> np.ndarray:
@@ -131,6 +131,21 @@ def test_surfaces_are_closed(shape: str, volume: float):
     assert np.einsum("fk,fk->", a, np.cross(b, c)) / 6 == pytest.approx(volume, rel=0.01)
 
 
+def test_a_path_with_ramps():
+    """It rests at time 0, has no jump of its velocity, leaves the keys by little, and ends where it should."""
+    path = Trajectory.of([[0, 0, 0], [10, 0, 0], [10, 5, 0], [10, 5, 0]], [-1, 9, 14, 15])
+    eased, times = path.eased(2.0), np.linspace(0, 20, 2001)
+    places = np.array([eased.at(time) for time in times])
+    speed = np.diff(places, axis=0) / 0.01
+    assert np.linalg.norm(speed[0]) < 0.15 and np.linalg.norm(speed, axis=1).max() < 4 / 3 + 0.01
+    assert np.abs(np.diff(speed, axis=0)).max() < 0.3
+    assert np.linalg.norm(places - [path.at(time) for time in times], axis=1).max() < 0.36
+    np.testing.assert_allclose(eased.at(4.0), path.at(4.0))
+    np.testing.assert_allclose(eased.at(99.0), path.at(99.0))
+    rest = Trajectory.of((1, 2, 3)).eased(1.0)
+    assert not rest.moves and rest.at(5.0).tolist() == [1, 2, 3]
+
+
 def test_paths():
     path = Trajectory.of([[0, 0, 0], [2, 0, 0], [2, 4, 0]], [10, 20, 30])
     for time, at in ((0, (0, 0, 0)), (15, (1, 0, 0)), (25, (2, 2, 0)), (99, (2, 4, 0))):
@@ -179,11 +194,54 @@ def test_checkpoints_of_other_simulations(device: str, tmp_path: Path):
     solver.step(2)
     solver.save(path)
     for different, match in (
-        (_jet(device, dissipation=2e-3), "dissipation: expected 0.002, found 0.001"),
-        (_jet(device, obstacles=()), "obstacles: expected"),
+        (_jet(device, refinement=1), "refinement: expected 1, found 2"),
+        (_jet(device, duration=1e9), "duration: expected about 1e.09 for a step, found 1.0"),
     ):
         with pytest.raises(WlmError, match=match):
             different.load(path)
+
+
+def test_a_checkpoint_goes_on_with_other_settings(device: str, tmp_path: Path):
+    """An obstacle that is elsewhere moves there; the step of the file is taken over; smoke decays as it did."""
+    there = Sphere(Trajectory.of((13, 5, 5)), 2.0)
+    solver, other = _jet(device), _jet(device, [there], duration=2.0, dissipation=2e-3)
+    solver.step(6)
+    solver.save(tmp_path / "state")
+    other.load(tmp_path / "state")
+    assert (other.steps, other.duration) == (6, 1.0) and solver.solid.numpy()[13, 5, 5] == 0
+    solver.step(6)
+    other.step(6)
+    assert np.abs(_numbers(other) - _numbers(solver)).max() > 0.01 and other.solid.numpy()[13, 5, 5] == 1
+    first, second = (float(each.density.numpy()[:6].astype(float).sum()) for each in (solver, other))
+    assert second == pytest.approx(first, rel=0.02)
+
+
+@pytest.mark.parametrize("storage", ["float32", "float16"])
+def test_a_flow_in_shorter_steps(storage: str, device: str, tmp_path: Path):
+    """Halved in its course the step gives nearly the same flow, with a body, buoyancy and decay; and a checkpoint of
+    after goes on to the last bit."""
+    settings = {"storage": storage, "dissipation": 1e-3, "substeps": 1 if storage == "float16" else 2}
+    body = MOVING if storage == "float16" else Sphere(Trajectory.of((9, 5, 5)), 2.0)
+    solvers = [_jet(device, [body], ramp=180, **settings) for _ in range(3)]
+    for each in solvers:
+        each.step(100)
+    plain, halved, resumed = solvers
+    plain.step(20)
+    with pytest.raises(ValueError, match="divides 100 steps into whole ones, got 3"):
+        halved.change_step(3.0)
+    halved.change_step(0.5)
+    assert (halved.steps, halved.duration) == (200, 0.5)
+    halved.step(20)
+    halved.save(tmp_path / "state")
+    resumed.load(tmp_path / "state")
+    for each in (halved, resumed):
+        each.step(20)
+    _assert_same(halved, resumed)
+    assert halved.fastest == pytest.approx(0.5 * plain.fastest, rel=0.05)
+    assert np.abs(2.0 * halved.velocity.numpy() - plain.velocity.numpy()).mean() < 2e-3
+    assert _numbers(halved).sum() == pytest.approx(_numbers(plain).sum(), rel=0.01)
+    halved.change_step(2.0)
+    assert (halved.steps, halved.duration) == (120, 1.0)
 
 
 def test_a_blow_up_stops_with_the_last_good_state(device: str, tmp_path: Path):

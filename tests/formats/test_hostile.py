@@ -196,7 +196,7 @@ rate: RATE
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"VELOCITY": "1.0e+12"}, "expected at most 1,000,000 steps per frame, found a speed of 1e+12 m/s"),
+        ({"VELOCITY": "1.0e+12"}, "expected at most 1,000,000 steps per frame, found 5e+12, for a speed of 1e+12 m/s"),
         ({"CELL": "1.0e-300"}, "grid.cell: expected greater than or equal to 0.000000001"),
         ({"RATE": "1.0e-9"}, "rate: expected greater than or equal to 0.000001"),
         ({"SPEED": "1.0e-300"}, "expected at most 1,000,000 steps per frame"),

@@ -85,6 +85,32 @@ def collide(box: Box, f: np.ndarray, viscosity: float, smagorinsky: float, force
     return out
 
 
+def change_step(box: Box, f: np.ndarray, viscosity: float, smagorinsky: float, force, factor: float) -> np.ndarray:
+    """The populations that have arrived, for a step whose duration is changed by a factor.
+
+    Velocity and pressure are those of before; the stress is that of the same strain by the same viscosities.
+    """
+    c, w, fluid = box.c, box.w, box.solid == 0
+    came, push = f[fluid], force[fluid]
+    rho = came.sum(1, keepdims=True)
+    u = came @ c / rho
+    stress = np.einsum("nq,qa,qb->nab", came - equilibrium(c, w, rho[:, 0], u), c, c)
+    norm = np.linalg.norm(stress, axis=(1, 2))
+    # The total viscosity by the positive root of tau (tau - tau_0) = 9 C^2 |Pi| / (sqrt(2) rho).
+    tau0 = 0.5 + 3.0 * viscosity
+    tau = 0.5 * (tau0 + np.sqrt(tau0**2 + 18.0 * np.sqrt(2.0) * smagorinsky**2 * norm / rho[:, 0]))
+    strain = -3.0 * stress / (2.0 * rho * tau[:, None])[..., None]
+    new_rho = 1.0 + factor**2 * (rho - 1.0)
+    new_u = factor * (u + 0.5 * push / rho) - 0.5 * factor**2 * push / new_rho
+    new_tau = 0.5 + factor * (tau - 0.5)
+    new_stress = -2.0 * (rho * new_tau[:, None])[..., None] * factor * strain / 3.0
+    projection = np.einsum("qa,qb->qab", c, c) - CS2 * np.eye(3) * c.any(0)
+    out = np.zeros_like(f)
+    extra = w * np.einsum("qab,nab->nq", projection, new_stress) / (2 * CS2**2)
+    out[fluid] = equilibrium(c, w, new_rho[:, 0], new_u) + extra
+    return out
+
+
 def stream(box: Box, f: np.ndarray) -> np.ndarray:
     """The populations that arrive in each cell, from those that left."""
     c, w, shape = box.c, box.w, box.solid.shape

@@ -1,5 +1,6 @@
 """Scenes from YAML, cameras, moving obstacles, folders of frames, and files of lightmaps."""
 
+import copy
 import math
 from pathlib import Path
 
@@ -9,10 +10,11 @@ import pytest
 import torch
 import warp as wp
 import yaml
+from builders.random_scenes import random_scene
 from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
 from pydantic import ValidationError
 
-from wlm.config import profile_names
+from wlm.config import check_settings, profile_names
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
 from wlm.formats.exr import read_planes, write_planes
@@ -34,7 +36,12 @@ from wlm.smoke.scene import (
 from wlm.smoke.simulation import warnings_of
 
 BOX = {"shape": "box"}
+QUICK = range(8)
+"""Random scenes of every run."""
 GRID = {"cells": [4, 4, 4], "cell": 1}
+
+
+RESTING = BOX | {"radius": [0.4, 0.4, 0.4], "path": [[0, 0, 0.5, 0]]}
 
 
 def _scene(tmp_path, **changed):
@@ -50,8 +57,31 @@ def _scene(tmp_path, **changed):
         ({"inlets": []}, "sources, inlets: there are none"),
         ({"sources": [{"centre": [5, 5, 5], "radius": 0.1}]}, "sources.0: it is outside the box from"),
         ({"sources": [{"centre": [0, 0.5, 0.5], "radius": 0.1}]}, None),
-        ({"sources": [{"centre": [0, 0.5, 0], "radius": 0.1, "start": 9}]}, "sources.0: it is not active between 0"),
-        ({"sources": [{"centre": [0, 0.5, 0], "radius": 0.03}]}, "sources.0: it is smaller than a voxel of 0.05 m"),
+        ({"sources": [{"centre": [0, 0.5, 0], "radius": 0.1, "start": 9}]}, "sources.0: it is not active at a step"),
+        (
+            {"sources": [{"centre": [0, 0.5, 0], "radius": 0.1, "start": 0.011, "stop": 0.012}]},
+            "sources.0: it is not active",
+        ),
+        ({"sources": [{"centre": [0, 0.5, 0], "radius": 0.02}]}, "sources.0: it is smaller than a voxel of 0.05 m"),
+        ({"sources": [{"centre": [0.52, 0.5, 0.5], "radius": 0.05}]}, "sources.0: it reaches no voxel's centre"),
+        (
+            {"sources": [{"centre": [0, 0.5, 0], "radius": 0.1, "density": 0, "temperature": 1}]},
+            "sources.0: temperature has",
+        ),
+        (
+            {"sources": [{"centre": [0, 0.5, 0], "radius": 0.1}], "obstacles": [RESTING]},
+            "sources.0: it is inside an obstacle",
+        ),
+        ({"sources": [{"centre": [0, 0.5, 0], "radius": 0.1}], "obstacles": [SPHERE | {"radius": 0.3}]}, None),
+        ({"obstacles": [RESTING | {"path": [[0, 0, 0, 0]]}]}, "inlets.0: an obstacle covers it"),
+        (
+            {"inlets": [SCENE["inlets"][0], copy.deepcopy(SCENE["inlets"][0]) | {"radius": None}]},
+            "inlets.0: a later inlet covers it",
+        ),
+        (
+            {"obstacles": [SPHERE | {"radius": 0.18, "path": [[0, 2, 0, 0], [9, 0, 0.6, 0]]}]},
+            "obstacles.0: it is outside",
+        ),
         ({"obstacles": [SPHERE]}, "obstacles.0: it is thinner than a cell of 0.2 m"),
         ({"obstacles": [SPHERE | {"radius": 0.18}]}, None),
         ({"obstacles": [SPHERE | {"radius": 0.18, "path": [[0, 2, 0, 0]]}]}, "obstacles.0: it is outside the box"),
@@ -77,6 +107,39 @@ def test_a_thin_obstacle_covers_a_cell_wherever_it_is(tmp_path, shape):
     for height in np.linspace(1, 4, 31):
         obstacle.cover(solid, 1, np.array([2.5, height, 2.5]))
         assert solid.numpy().any(1).all()
+
+
+def test_a_source_smaller_than_a_voxel_emits_its_amount(tmp_path):
+    """Wherever it is, it reaches a voxel, with the density of the share of it that the source fills."""
+    for centre in [[0.0, 0.5, 0.0], *np.random.default_rng(1).uniform([-0.5, 0, -0.5], [0.5, 1.2, 0.5], (9, 3))]:
+        source = {"centre": list(map(float, centre)), "radius": 0.02, "density": 5.0}
+        solver = simulation.make_solver(_scene(tmp_path, inlets=[], sources=[source]))
+        solver.step()
+        density = solver.density.numpy()
+        assert 1 <= np.count_nonzero(density) <= 8
+        assert density.max() == pytest.approx(5.0 * (0.02 / (0.501 * math.sqrt(3) * 0.05)) ** 3)
+
+
+@pytest.mark.parametrize("seed", [pytest.param(n, marks=() if n in QUICK else pytest.mark.slow) for n in range(200)])
+def test_random_scenes(seed, tmp_path):
+    """Each runs to its end with finite values, or is refused in one line before its first frame."""
+    try:
+        scene = check_settings(Scene, random_scene(seed), "")
+        solver = simulation.make_solver(scene)
+    except WlmError as error:
+        assert "\n" not in str(error)
+        return
+    warnings = simulation.warnings_of(scene)
+    smoke = False
+    for frame in range(1, scene.frames + 1):
+        simulation.advance(scene, solver, frame)
+        solver.check()
+        assert np.isfinite(solver.velocity.numpy()).all()
+        density = solver.density.numpy()
+        assert np.isfinite(density).all() and density.min() >= 0.0
+        smoke = smoke or density.any()
+    emitters = sum(bool(each.density) for each in (*scene.sources, *scene.inlets))
+    assert smoke or emitters <= sum("sources" in each or "inlets" in each for each in warnings)
 
 
 def test_a_scene_from_a_file(tmp_path):
@@ -126,6 +189,11 @@ def test_scaling_keeps_one_cell(tmp_path):
         ({"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]}, "inlets.0.velocity: expected a velocity that points"),
         ({"grid": GRID | {"faces": dict.fromkeys(FACES, "wall")}}, "expected an open face"),
         ({"grid": GRID | {"faces": dict.fromkeys(("-y", "+y"), "periodic")}}, "inlets on faces that aren't periodic"),
+        ({"air": {"speed": 0.3}}, "an inlet or an obstacle of 1 m/s, 0.25 cells per step: leave air.speed null or"),
+        ({"air": {"lattice_speed": 0.21}}, "air.lattice_speed: expected less than or equal to 0.2"),
+        ({"air": {"smagorinsky": 0, "viscosity": 0}}, "expected air.viscosity of at least 0.002 m2/s at 1 m/s"),
+        ({"air": {"viscosity": 1e9}}, "expected at most 1,000,000 steps per frame, found 2.5e+09"),
+        ({"smoke": {"weight": 1e18}}, "expected at most 1,000,000 steps per frame"),
         ({"camara": {}}, "unknown key 'camara'; did you mean 'camera'?"),
     ],
 )

@@ -68,6 +68,7 @@ def simulate(
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
     frames: _SceneFrames = None,
     scale: _SceneScale = 1.0,
+    vdb: Annotated[bool, typer.Option("--vdb", help="Also write each frame as OpenVDB, with velocities.")] = False,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
     device: Device = "cpu",
@@ -99,7 +100,7 @@ def simulate(
             most = max(most, figures.get("smoke", 0.0))
             report(now)
 
-        options = {"resume": resume, "checkpoint_every": checkpoint_every}
+        options = {"resume": resume, "checkpoint_every": checkpoint_every, "vdb": vdb}
         first = simulate(folder, solver=solver, progress=progress, **options)
     if resume and first == 1:
         console.note(f"{output}: there was nothing to resume; started at frame 1")
@@ -107,7 +108,7 @@ def simulate(
         "frames": scene.frames,
         "cells of the air": " x ".join(map(str, scene.grid.cells)),
         "voxels of the smoke": " x ".join(map(str, scene.grid.shape)),
-        "steps per frame": scene.steps,
+        "steps per frame": round(1.0 / (scene.rate * solver.duration)),
     }
     if figures:
         facts |= {"smoke in the last frame": figures["smoke"], "seconds per frame": figures["frame s"]}

@@ -183,13 +183,14 @@ class DifferentiableLattice:
             lattice_adjoint.set_inlets(setup.tables, edges, setup.inlet, _flat(inlet, wp.vec3))
         left = self._populations(out)
         work.done.fill_(done)
-        edges.net.zero_()
         kernel = step_kernel(replace(setup.spec, forced=forces.shape[0] > 0), False, True)
-        inputs = [setup.tables, edges, self._populations(f), setup.tau, setup.eddy, forces, 0]
+        inputs = [edges, self._populations(f), setup.tau, setup.eddy, forces, 0]
         outputs = [work.clock, work.trouble, left]
         wp.launch(kernel, self._cells, inputs=inputs, outputs=outputs, device=left.device)
         if setup.spec.bounded:
-            inputs = [setup.tables, edges, work.clock]
+            inputs = [setup.tables, edges, 1]
+            wp.launch(setup.kernels.send_out, edges.kind.shape[0], inputs=inputs, outputs=[left], device=left.device)
+            inputs = [setup.tables, edges, 1, work.clock]
             wp.launch(setup.kernels.settle, self._cells, inputs=inputs, outputs=[left], device=left.device)
         return out
 

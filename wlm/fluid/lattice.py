@@ -123,7 +123,8 @@ def blown_up(key: int, shape: tuple[int, int, int]) -> WlmError:
     indices = tuple(int(a) for a in np.unravel_index(cell, shape))
     return WlmError(
         f"lattice: blew up in step {step} at cell {indices}: {cause}; expected speeds below {MAX_SPEED} and a"
-        f" viscosity at which the flow is stable: use a shorter step, a larger viscosity or smagorinsky=0.17"
+        f" viscosity at which the flow is stable: use a shorter step, such as by a larger air.speed, a larger"
+        " viscosity or smagorinsky=0.17"
     )
 
 
@@ -135,8 +136,8 @@ class Lattice:
 
     Args:
         shape: Cells along x, y and z.
-        viscosity: Kinematic viscosity in square cells per step; above 0.
-        smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the flow is stable at viscosity 1e-6.
+        viscosity: Kinematic viscosity in square cells per step.
+        smagorinsky: C of the eddy viscosity; 0: none. With 0.17 the flow is stable at viscosity 0.
         storage: "float32" or "float16", which halves memory and traffic. With float16 the velocities of a jet differ
             by less than 0.2% of its speed (RMS, before the chaotic flows diverge), and the total mass drifts by about
             3e-5 in 5,000 steps.
@@ -167,9 +168,9 @@ class Lattice:
         ramp: int = 0,
     ) -> None:
         self.shape = _checked_shape(shape, lattice)
-        for name, value, least in (("viscosity", viscosity, 1e-12), ("smagorinsky", smagorinsky, 0.0)):
-            if not (math.isfinite(value) and value >= least):
-                raise ValueError(f"{name}: expected a number of at least {least:g}, got {value}")
+        for name, value in (("viscosity", viscosity), ("smagorinsky", smagorinsky)):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name}: expected a number of at least 0, got {value}")
         if ramp < 0:
             raise ValueError(f"ramp: expected at least 0 steps, got {ramp}")
         self.device = wp.get_device(device)
@@ -194,10 +195,10 @@ class Lattice:
         # Of size 0 while no cell has ever been solid, or freed.
         self._boundaries.solid, self._means = self._zeros(0, wp.uint8), self._zeros(0, wp.vec4)
         self._boundaries.bodies = wp.zeros((3, BODIES), dtype=wp.vec3, device=self.device)
-        self._boundaries.net, self._boundaries.fixed = self._zeros(3, wp.int64), self._zeros(3, wp.int64)
+        self._boundaries.net, self._boundaries.fixed = self._zeros(1, wp.int64), self._zeros(3, wp.int64)
         self._forces = self._zeros(0, wp.vec3)
         self._faces: dict[str, Face] = {}
-        self._prepared = False
+        self._prepared = self._moving = False
         self._graph: wp.Graph | None = None
         # Steps that this object launched itself; replays of a user's CUDA graph are counted only by the clock.
         self._done, self._unchecked, self._begun = 0, 0, False
@@ -288,6 +289,8 @@ class Lattice:
         self._launch(self._kernels.neighbours, self._cells, inputs, [self._means])
         self._launch(self._kernels.uncover, self._cells, [self._tables, edges, new, self._means, self._far], [self._f])
         edges.bodies.assign(rows)
+        if bool(rows[:2].any()) != self._moving:
+            self._moving, self._graph = not self._moving, None
         wp.copy(edges.solid, new)
         lattice_links.mark(self._tables, edges)
 
@@ -429,8 +432,9 @@ class Lattice:
             "steps": np.array(self.steps, np.int64),
         }
 
-    def load(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continues from the state of a lattice with the same settings, faces and force.
+    def load(self, state: Mapping[str, np.ndarray], factor: float = 1.0) -> None:
+        """Continues from the state of a lattice with the same settings, faces and force, and a step that is `factor`
+        times as long, to which the settings of this lattice are converted.
 
         The following steps are the same as without the interruption, bit for bit.
 
@@ -442,13 +446,14 @@ class Lattice:
             # Empty while no cell has ever been solid.
             "solid": Part(np.uint8, (0 if np.shape(state.get("solid")) == (0,) else self._cells,)),
             "bodies": Part(np.float32, (3, BODIES, 3)),
-            "net": Part(np.int64, (3,)),
+            "net": Part(np.int64, (1,)),
             "steps": Part(np.int64, (), least=0, most=_MOST_STEPS),
         }
         try:
             state = check_parts(state, table)
         except ValueError as error:
             raise WlmError(f"lattice state: {error}") from error
+        self._convert_settings(factor)
         self._begun, self._done, self._graph = True, int(state["steps"]), None
         self._clock.fill_(self._done)
         self._trouble.fill_(QUIET)
@@ -459,8 +464,45 @@ class Lattice:
             (self._boundaries.net, "net"),
         ):
             array.assign(state[name])
-        self._prepared = False
+        self._moving, self._prepared = bool(state["bodies"][:2].any()), False
         self._prepare()
+
+    def change_step(self, factor: float) -> None:
+        """Changes the duration of a step by a factor, between two steps, with all settings and the state.
+
+        Velocity, pressure and viscous stress stay the same in SI units, up to rounding. The force and the velocity of
+        bodies are converted with the state; a caller that sets them must set converted ones from then on.
+
+        Args:
+            factor: New duration over old one; `steps` divided by it must be a whole number.
+
+        Raises:
+            ValueError: The factor is not above 0, or there is no whole number of steps.
+            WlmError: An inlet, a wall or a body becomes faster than `MAX_SPEED`.
+        """
+        done = round(self.steps / factor) if math.isfinite(factor) and factor > 0.0 else -1
+        if done < 0 or not math.isclose(done * factor, self.steps):
+            raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
+        came, tau = self.populations().reshape(self._f.shape), self._tau
+        bodies = self._boundaries.bodies.numpy()
+        bodies[:2] *= factor
+        self._boundaries.bodies.assign(bodies)
+        self._boundaries.net.zero_()
+        self._done, self._graph = done, None
+        self._clock.fill_(done)
+        self._convert_settings(factor)
+        self._prepare()
+        inputs = [self._tables, self._boundaries, came, self._far, self._clock, self._forces, tau, self._eddy, factor]
+        self._launch(self._kernels.convert, self._cells, inputs, [self._f])
+
+    def _convert_settings(self, factor: float) -> None:
+        self._tau = 0.5 + factor * (self._tau - 0.5)
+        self._boundaries.rise *= factor
+        for name, face in self._faces.items():
+            fastest = factor * float(np.linalg.norm(face.velocity, axis=-1).max())
+            _check_speed(fastest, f"face {name!r}")
+            self._faces[name] = replace(face, velocity=factor * face.velocity, excess=factor**2 * face.excess)
+        self._prepared = False
 
     def setup(self) -> Setup:
         """Returns the settings with copies of the boundaries and the force, which no later change affects."""
@@ -538,6 +580,11 @@ class Lattice:
         edges.excess = wp.array(excess, dtype=float, device=self.device)
         for name, dtype in (("rank", wp.uint8), ("kind", wp.uint8), ("velocity", wp.vec3)):
             setattr(edges, name, wp.array(face_column(faces, name), dtype=dtype, device=self.device))
+        # Whether links of faces add anything, and whether there are outlets.
+        kinds = face_column(faces, "kind")
+        self._outlets = bool(np.isin(kinds, (OUTLET, PRESSURE)).any())
+        moving = (kinds == BOUNCE) & face_column(faces, "velocity").any(-1)
+        self._active = self._outlets or bool((moving | (kinds == INLET)).any())
         self._make_words()
         self._prepared = True
 
@@ -554,9 +601,17 @@ class Lattice:
     def _run(self, steps: int) -> None:
         """Queues steps on the device and returns without waiting."""
         for _ in range(steps):
-            kernel = step_kernel(self._spec, bool(self._far), bool(self._far))
-            inputs = [self._tables, self._boundaries, self._f, self._tau, self._eddy, self._forces, self._done % 2]
-            self._launch(kernel, self._cells, inputs, [self._clock, self._trouble, self._f])
+            far = bool(self._far)
+            if self._moving or self._active:
+                size = self._cells if self._moving else self._boundaries.kind.shape[0]
+                inputs = [self._tables, self._boundaries, int(self._moving), self._clock]
+                self._launch(self._kernels.settle, size, inputs, [self._f])
+            inputs = [self._boundaries, self._f, self._tau, self._eddy, self._forces, self._done % 2]
+            outputs = [self._clock, self._trouble, self._f]
+            self._launch(step_kernel(self._spec, far, far), self._cells, inputs, outputs)
+            if self._outlets:
+                inputs = [self._tables, self._boundaries, int(far)]
+                self._launch(self._kernels.send_out, self._boundaries.kind.shape[0], inputs, [self._f])
             self._done += 1
 
     def _run_in_graphs(self, steps: int) -> None:

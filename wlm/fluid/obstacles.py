@@ -5,7 +5,6 @@ triangles, anticlockwise from outside: corners float64 [V, 3], triangles int64 [
 """
 
 import functools
-import hashlib
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from scipy.spatial import ConvexHull
 
 from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 
+_PIECES = 16  # straight pieces of a ramp of a path
 _SIDES = 24  # segments of a sphere from pole to pole; there are twice as many around it
 
 
@@ -76,9 +76,40 @@ class Trajectory:
         """Returns the position in cells, float64 (3,), at a time in steps."""
         return np.array([np.interp(time, self.times, self.positions[:, axis]) for axis in range(3)])
 
-    def describe(self) -> dict:
-        """Returns positions and times as JSON values."""
-        return {"positions": self.positions.tolist(), "times": self.times.tolist()}
+    def eased(self, reach: float) -> "Trajectory":
+        """Returns the path of a body that starts at rest at time 0, with ramps in place of jumps of its velocity.
+
+        A ramp is a cubic Hermite curve, in straight pieces. It lasts as long as the faster side of the jump takes for
+        the distance `reach`, but at most half of the time to the next position. A jump at time 0 is followed by its
+        ramp, in which the body catches up, at up to 4/3 of its speed; others are in the middle of theirs.
+        """
+        start = np.append(0.0, self.times[self.times > 0.0])
+        times = start if self.times[0] < 0.0 else self.times
+        positions = np.array([self.at(time) for time in times])
+        speeds = np.zeros((len(times) + 1, 3))
+        speeds[1:-1] = np.diff(positions, axis=0) / np.diff(times)[:, None]
+        room = np.concatenate([[2.0 * times[0]], np.diff(times), [np.inf]]) / 2.0
+        keys = [np.column_stack([times, positions])]
+        for k, (time, place) in enumerate(zip(times, positions, strict=True)):
+            change, fastest = speeds[k + 1] - speeds[k], np.linalg.norm(speeds[k : k + 2], axis=1).max()
+            if not change.any():
+                continue
+            after = min(0.5 * reach / fastest, room[k], room[k + 1])
+            before = after
+            if time == 0.0:
+                before, after = 0.0, min(reach / fastest, room[k + 1])
+            s = np.linspace(0.0, 1.0, _PIECES + 1)[:, None]
+            first, last, span = place - before * speeds[k], place + after * speeds[k + 1], before + after
+            curve = first + s**2 * (3 - 2 * s) * (last - first)
+            curve += span * (s * (1 - s) ** 2 * speeds[k] - s**2 * (1 - s) * speeds[k + 1])
+            keys[0] = keys[0][keys[0][:, 0] != time]
+            keys.append(np.column_stack([time - before + span * s, curve]))
+        table = np.concatenate(keys)
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        # Ramps that touch share a time, up to rounding.
+        gaps = np.diff(table[:, 0])
+        table = table[np.append(True, gaps > 1e-9 * gaps.max(initial=0.0))]
+        return Trajectory(table[:, 1:], table[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +137,6 @@ class Sphere:
             position: Position (3,) in cells.
         """
         voxelise_sphere(solid, body, position.tolist(), self.radius)
-
-    def describe(self) -> dict:
-        """Returns path and radius as JSON values; a checkpoint stores them to recognise its simulation."""
-        return self.path.describe() | {"radius": self.radius}
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,12 +177,6 @@ class Mesh:
             indices = wp.array(np.asarray(self.triangles, np.int32).ravel(), dtype=int, device=device)
             self._meshes[device] = wp.Mesh(points, indices, support_winding_number=True)
         voxelise_mesh(solid, body, self._meshes[device], position.tolist(), scale=self.scale)
-
-    def describe(self) -> dict:
-        """Returns path and scale as JSON values, and a hash of the mesh; see `Sphere.describe`."""
-        digest = hashlib.blake2b(np.asarray(self.vertices, np.float32).tobytes(), digest_size=16)
-        digest.update(np.asarray(self.triangles, np.int32).tobytes())
-        return self.path.describe() | {"mesh": digest.hexdigest(), "scale": self.scale}
 
 
 Obstacle = Sphere | Mesh

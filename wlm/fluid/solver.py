@@ -11,10 +11,10 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 import warp as wp
 
 from wlm.errors import WlmError
@@ -173,8 +173,10 @@ class Solver:
         substeps: Steps of the lattice per step of the solver. Above a speed of 1 / substeps smoke can jump over walls.
         bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are computed.
         threshold: With bricks, the largest value in a brick that counts as empty.
+        duration: Duration of a step of the lattice, in any unit of time.
 
     Attributes:
+        duration: Duration of a step; `change_step` and `load` change it.
         period: A CUDA graph must contain a multiple of this number of steps, see `step`.
 
     Raises:
@@ -200,6 +202,7 @@ class Solver:
         substeps: int = 2,
         bricks: bool = False,
         threshold: float = 1e-6,
+        duration: float = 1.0,
     ) -> None:
         for name, value, allowed in (("scheme", scheme, SCHEMES), ("storage", storage, tuple(advection.STORAGES))):
             if value not in allowed:
@@ -210,8 +213,9 @@ class Solver:
         for name, rate in (("dissipation", dissipation), ("cooling", cooling), ("threshold", threshold)):
             if not (math.isfinite(rate) and rate >= 0.0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {rate}")
-        self._decay = (math.exp(-dissipation * substeps), math.exp(-cooling * substeps))
-        if storage == "float16" and any(0.0 < 1.0 - factor < LEAST_HALF_LOSS for factor in self._decay):
+        # Steps after which smoke decays: only with float16 and a shortened step more than one.
+        self._rates, self._decay_every = (dissipation * substeps, cooling * substeps), 1
+        if storage == "float16" and any(0.0 < 1.0 - math.exp(-rate) < LEAST_HALF_LOSS for rate in self._rates):
             least = f"0, or a loss of at least {LEAST_HALF_LOSS:.2g} of the value per solver step"
             raise ValueError(f"dissipation, cooling: with float16 expected {least}, got less")
         if len(obstacles) > 255:
@@ -220,6 +224,8 @@ class Solver:
             raise ValueError("temperature: expected True, since a source, buoyancy or cooling uses it, got False")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
+        # The paths of obstacles are in steps of the first duration.
+        self.duration, self._first_duration = duration, duration
         self.shape = tuple(refinement * size for size in lattice.shape)
         stored, cells = advection.STORAGES[storage], math.prod(self.shape)
         require_memory(self.shape, voxel_bytes(scheme, storage, temperature), self.device)
@@ -241,23 +247,14 @@ class Solver:
         if bricks:
             rings = advection_places.rings_for(_SOUND * substeps * refinement)
             self._bricks = advection_places.make_bricks(self._box, rings, threshold, str(self.device))
-        settings = {
+        # What the arrays of a checkpoint depend on.
+        self._grids = {
             "lattice": list(lattice.shape),
             "refinement": refinement,
-            "scheme": scheme,
             "storage": storage,
             "temperature": temperature,
-            "sources": [asdict(source) for source in self.sources],
-            "obstacles": [obstacle.describe() for obstacle in self.obstacles],
-            "dissipation": dissipation,
-            "cooling": cooling,
-            "buoyancy": None if buoyancy is None else asdict(buoyancy),
             "substeps": substeps,
-            "bricks": bricks,
-            "threshold": threshold,
         }
-        # In JSON's types, which have no tuples, as they are read back.
-        self._settings: dict[str, Any] = json.loads(json.dumps(settings))
         self._done = 0
 
     # Running.
@@ -276,6 +273,7 @@ class Solver:
             raise ValueError(f"steps: expected at least 0, got {steps}")
         capturing = self.device.is_cuda and self.device.is_capturing
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
+        uneven = uneven or self._decay_every > 1
         if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
             raise ValueError(
                 f"steps: expected obstacles at rest, substeps a multiple of {self.lattice.period}, and a multiple of "
@@ -286,6 +284,59 @@ class Solver:
                 self._place_obstacles()
             self._step()
             self._done += 1
+
+    def change_step(self, factor: float) -> None:
+        """Changes the duration of a step by a factor, with all settings and the state: the flow goes on as it was.
+
+        Speeds, accelerations and rates, also those of `sources` and `buoyancy`, are per step, and change accordingly.
+
+        Args:
+            factor: New duration over old one; `steps` divided by it must be a whole number.
+
+        Raises:
+            ValueError: There is no whole number of steps.
+            WlmError: An inlet or a body becomes too fast.
+        """
+        done = round(self.steps / factor)
+        if not math.isclose(done * factor, self.steps):
+            raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
+        self.lattice.change_step(factor)
+        self._done = done
+        self._placed[:, 1] *= factor
+        wp.to_torch(self._velocity).mul_(factor)
+        self._convert_settings(factor)
+
+    def _convert_settings(self, factor: float) -> None:
+        self.duration *= factor
+        self._rates = (self._rates[0] * factor, self._rates[1] * factor)
+        self._decay_every = 1
+        if self._grids["storage"] == "float16":
+            least = min((rate for rate in self._rates if rate), default=math.inf)
+            while 1.0 - math.exp(-least * self._decay_every) < LEAST_HALF_LOSS:
+                self._decay_every *= 2
+        self.sources = tuple(
+            source
+            if source.fixed
+            else replace(source, density=factor * source.density, temperature=factor * source.temperature)
+            for source in self.sources
+        )
+        if self.buoyancy is not None:
+            square = factor * factor
+            self.buoyancy = replace(
+                self.buoyancy, lift=square * self.buoyancy.lift, weight=square * self.buoyancy.weight
+            )
+
+    @property
+    def fastest(self) -> float:
+        """Largest speed of the air that moved the smoke in the last step, cells per step; waits for the device."""
+        return float(torch.linalg.vector_norm(wp.to_torch(self._velocity), dim=-1).max())
+
+    @property
+    def _decay(self) -> tuple[float, float]:
+        """Factors of density and temperature in the next step."""
+        if (self._done + 1) % self._decay_every:
+            return 1.0, 1.0
+        return math.exp(-self._rates[0] * self._decay_every), math.exp(-self._rates[1] * self._decay_every)
 
     def check(self) -> None:
         """Checks that the air has not blown up; waits for the device.
@@ -364,7 +415,7 @@ class Solver:
             box=self._box,
             walls=wp.clone(self._walls[0]),
             scheme=self.scheme,
-            storage=self._settings["storage"],
+            storage=self._grids["storage"],
             substeps=self.substeps,
             sources=self.sources,
             buoyancy=self.buoyancy,
@@ -386,32 +437,37 @@ class Solver:
         air = self.lattice.state()
         tensors = {f"lattice.{name}": value for name, value in air.items()}
         # On a CPU .numpy() shares the array's memory; it is written before the next step changes it.
-        tensors |= {"density": self.density.numpy(), "placed": self._placed}
+        tensors |= {"density": self.density.numpy(), "placed": self._placed, "velocity": self._velocity.numpy()}
         if self.temperature is not None:
             tensors["temperature"] = self.temperature.numpy()
-        text = json.dumps(self._settings, sort_keys=True).encode()
+        settings = self._grids | {"duration": self.duration}
+        text = json.dumps(settings, sort_keys=True).encode()
         source = hashlib.blake2b(text, digest_size=16).hexdigest()
-        write_artifact(path, _SYSTEM, self._settings, tensors, source)
+        write_artifact(path, _SYSTEM, settings, tensors, source)
         self._note_checkpoint(path, air["steps"])
 
     def load(self, path: str | os.PathLike[str]) -> None:
-        """Continues from a checkpoint of a solver and a lattice with the same settings.
+        """Continues from a checkpoint of a solver with the same grids and as many obstacles, in steps of its duration.
 
-        The following steps are the same as without the interruption, bit for bit. With bricks, the threshold allows
-        small differences.
+        With the same settings the following steps are the same as without the interruption, bit for bit; with bricks
+        the threshold allows small differences. Other sources, obstacles, rates and boundaries act from now on.
 
         Raises:
-            WlmError: The file is damaged or belongs to another simulation; the message names the difference.
+            WlmError: The file is damaged or of other grids; the message names the difference.
         """
         artifact = read_artifact(path, _SYSTEM)
-        for name, value in self._settings.items():
+        for name, value in self._grids.items():
             if (stored := artifact.settings.get(name)) != value:
                 raise WlmError(f"{path}: {name}: expected {value}, found {stored}: a checkpoint of another simulation")
+        duration = artifact.settings.get("duration")
+        if not (isinstance(duration, float) and 1e-6 <= duration / self.duration <= 1e6):
+            raise WlmError(f"{path}: duration: expected about {self.duration:.3g} for a step, found {duration}")
         state, now = artifact.tensors, self._fields[0]
         field = Part(wp.dtype_to_numpy(self.density.dtype), self.density.shape, least=0)
         # NaN before the first step, when no obstacle has been placed.
         nowhere = np.isnan(state.get("placed", 0.0)).all()
         table = {"density": field, "placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
+        table["velocity"] = Part(np.float32, (*self.lattice.shape, 3))
         if self.temperature is not None:
             table["temperature"] = field
         air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
@@ -420,13 +476,15 @@ class Solver:
         except ValueError as error:
             raise WlmError(f"{path}: {error}") from error
         try:
-            self.lattice.load(air)
+            self.lattice.load(air, duration / self.duration)
         except WlmError as error:
             raise WlmError(f"{error} (in {path})") from error
+        self._convert_settings(duration / self.duration)
         for fields in self._fields[1:]:
             fields.density.zero_()
             fields.temperature.zero_()
         now.density.assign(parts["density"].ravel())
+        self._velocity.assign(parts["velocity"])
         if self.temperature is not None:
             now.temperature.assign(parts["temperature"].ravel())
         self._placed = np.array(parts["placed"])
@@ -456,10 +514,10 @@ class Solver:
 
     def _place_obstacles(self) -> None:
         """Moves obstacles to their positions in the middle of the step, unless they are there and at rest."""
-        begin = float(self._done * self.substeps)
+        span = self.substeps * self.duration / self._first_duration
         placed = np.empty_like(self._placed)
         for k, obstacle in enumerate(self.obstacles):
-            at = [obstacle.path.at(begin + t * self.substeps) for t in (0.0, 0.5, 1.0)]
+            at = [obstacle.path.at((self._done + t) * span) for t in (0.0, 0.5, 1.0)]
             placed[k] = at[1], (at[2] - at[0]) / self.substeps
         if np.array_equal(placed, self._placed):
             return

@@ -1,4 +1,5 @@
-"""Density volumes of smoke: checked input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); `.npz` output.
+"""Density volumes of smoke: checked input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); output as `.npz`
+or `.vdb`.
 
 Repairs are listed in `DensityVolume.warnings`, one line for each kind; `docs/fluid.md` lists them and the errors.
 
@@ -19,13 +20,14 @@ from torch.nn.functional import pad
 
 from wlm.errors import WlmError
 from wlm.fluid.grids import UPS, Grid, choose, is_level_set, on_one_lattice
-from wlm.formats.atomic import atomic_path
+from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.limits import RESAMPLED, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, check_growth
 from wlm.formats.nanovdb import NanoVdbFile
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import FileBytes, open_file, read_file
 from wlm.formats.vdb import LARGEST, GridHead, VdbFile
+from wlm.formats.vdb_writing import encode_vdb
 from wlm.interop import check_device, to_warp
 
 EDGE = 8
@@ -274,20 +276,40 @@ def _turned(volume: DensityVolume, up: str) -> DensityVolume:
     return replace(volume, density=smoke, temperature=heat[0] if heat else None, origin=lattice.origin)
 
 
-def save_volume(path: str | os.PathLike[str], volume: DensityVolume, *, bricks: bool = False) -> None:
-    """Writes a volume as `.npz`, whole or not at all; `load_volume` reads it back.
+def save_volume(
+    path: str | os.PathLike[str],
+    volume: DensityVolume,
+    *,
+    bricks: bool = False,
+    velocity: np.ndarray | None = None,
+) -> None:
+    """Writes a volume as `.npz` or `.vdb`, whole or not at all; `load_volume` reads it back.
 
-    With `bricks` the file is not compressed, but empty bricks of 8^3 voxels are omitted: writing is much faster, but
-    the file is larger and other programs cannot read it.
+    With `bricks` an `.npz` is not compressed, but empty bricks of 8^3 voxels are omitted: writing is much faster, but
+    the file is larger and other programs cannot read it. A `.vdb`, for Blender and Houdini, has grids named `density`,
+    `temperature` if there is one, and `velocity` if it is given, [X, Y, Z, 3] in the volume's box, also in larger
+    voxels.
 
     Raises:
         WlmError: The suffix is wrong, or the file cannot be written.
     """
-    if Path(path).suffix.lower() != ".npz":
-        raise WlmError(f"{path}: expected a name that ends in .npz, found {Path(path).suffix or 'none'}")
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".npz", ".vdb"):
+        raise WlmError(f"{path}: expected a name that ends in .npz or .vdb, found {suffix or 'none'}")
     fields = {_DENSITY: volume.density}
     if volume.temperature is not None:
         fields[_TEMPERATURE] = volume.temperature
+    if suffix == ".vdb":
+        grids = {name: values.cpu().numpy() for name, values in fields.items()}
+        grids |= {} if velocity is None else {"velocity": velocity}
+        placed = []
+        for name, values in grids.items():
+            edge = volume.size[0] / len(values)
+            matrix = np.diag([edge, edge, edge, 1.0])
+            matrix[:3, 3] = np.asarray(volume.origin) + 0.5 * edge
+            placed.append((name, values, matrix))
+        atomic_write(path, encode_vdb(placed))
+        return
     arrays = {"voxel": np.float64(volume.voxel), "origin": np.asarray(volume.origin, np.float64)}
     if bricks:
         numbers, cut = gather(list(fields.values()))

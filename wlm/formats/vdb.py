@@ -21,10 +21,10 @@ from wlm.formats.blosc import unpack as unpack_blosc
 from wlm.formats.limits import SURE_BOX, VOXELS, VOXELS_A_BYTE
 from wlm.formats.reading import damaged
 
-_MAGIC, _OLDEST, _NEWEST = 0x56444220, 222, 224
+MAGIC, _OLDEST, NEWEST = 0x56444220, 222, 224
 _HALF = "_HalfFloat"
 _NUMBERS = ("float", "double", "fp4", "fp8", "fp16", "fpn")
-_ZIP, _ACTIVE_MASK, _BLOSC = 1, 2, 4
+ZIP, ACTIVE_MASK, _BLOSC = 1, 2, 4
 # Codes of the format: one or two inactive values are stored, and a mask selects between them.
 _ONE_VALUE, _TWO_VALUES, _MASK, _ALL = (2, 4, 5), 5, (3, 4, 5), 6
 LEAF, LOWER, UPPER = 8, 16, 32
@@ -140,12 +140,10 @@ class VdbFile(GridFile):
     def _list(self) -> Iterator[_Entry]:
         cursor = Cursor(self._data)
         magic, version = cursor.unpack("<qI")
-        if magic != _MAGIC:
+        if magic != MAGIC:
             raise WlmError(f"{self._where}: expected an OpenVDB file, found other content")
-        if not _OLDEST <= version <= _NEWEST:
-            raise WlmError(
-                f"{self._where}: expected version {_OLDEST} to {_NEWEST} of OpenVDB's files, found {version}"
-            )
+        if not _OLDEST <= version <= NEWEST:
+            raise WlmError(f"{self._where}: expected version {_OLDEST} to {NEWEST} of OpenVDB's files, found {version}")
         cursor.unpack("<II")  # the version of the library
         (offsets,) = cursor.unpack("<?")
         if not offsets:
@@ -173,7 +171,7 @@ class VdbFile(GridFile):
             raise WlmError(f"{where}: expected a grid of floats, found {entry.head.type}")
         cursor = Cursor(self._data, entry.at)
         (flags,) = cursor.unpack("<I")
-        if flags & ~(_ZIP | _ACTIVE_MASK | _BLOSC):
+        if flags & ~(ZIP | ACTIVE_MASK | _BLOSC):
             raise WlmError(f"{where}: expected values compressed by zlib or Blosc, found the flags {flags}")
         cursor.metadata()
         return _matrix(cursor, where), cursor, flags
@@ -329,7 +327,7 @@ class _Tree:
             others[1] = cursor.unpack(self._one)[0]
         chosen = cursor.bits(len(active)) if kind in _MASK else None
         count = len(active)
-        if self._flags & _ACTIVE_MASK and kind != _ALL:
+        if self._flags & ACTIVE_MASK and kind != _ALL:
             count = int(np.count_nonzero(active))
         stored = self._numbers(count)
         if count == len(active):
@@ -344,7 +342,7 @@ class _Tree:
         cursor, half, size = self._cursor, self._many == "<f2", count * self._bytes
         if not count and half:
             return np.zeros(0, np.float32)
-        if self._flags & (_ZIP | _BLOSC):
+        if self._flags & (ZIP | _BLOSC):
             (packed,) = cursor.unpack("<q")
             piece = cursor.take(abs(packed))
             if packed > 0 and self._flags & _BLOSC:

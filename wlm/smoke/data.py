@@ -46,6 +46,7 @@ load = load_volume
 _FORMAT, _VERSION = "wlm-smoke-frames", 1
 # A number in a file name, with its sign: a minus that follows no word.
 _NUMBER = re.compile(r"((?<![^._ -])-(?=\d)|(?<!\d))(\d{1,9})(?!\d)")
+_PLACES = 65  # on a path, by which obstacles of two scenes are compared
 _TRANSPARENCY = "transparency"
 _DEPTH = "depth"
 
@@ -245,7 +246,8 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
     Args:
         folder: The folder; created if its parent exists.
         scene: The scene to simulate.
-        resume: Whether to continue a simulation of the same scene; otherwise frames of an earlier one are removed.
+        resume: Whether to continue a simulation of the same scene, in which only looks, accuracy, time steps and what
+            happens after the finished frames may differ; otherwise frames of an earlier one are removed.
 
     Raises:
         WlmError: The folder contains other files, has frames of another scene although `resume` is set, or cannot be
@@ -254,7 +256,8 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
     folder = Path(folder)
     claim(folder, SCENE_FILE, _FORMAT)
     if resume and (folder / SCENE_FILE).is_file():
-        earlier, later = _simulated(_read_scene(folder)), _simulated(scene)
+        until = scene.time(len(numbered(folder, "frame", ".npz")) + 1)
+        earlier, later = _simulated(_read_scene(folder), until), _simulated(scene, until)
         if (field := next((key for key in later if earlier.get(key) != later[key]), None)) is not None:
             raise WlmError(
                 f"{folder}: cannot resume: its frames have another {field} than the scene; start anew without --resume"
@@ -262,7 +265,8 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
     with _writing(folder):
         folder.mkdir(exist_ok=True)
         if not resume:
-            for path in (*numbered(folder, "frame", ".npz").values(), folder / CHECKPOINT):
+            made = [*numbered(folder, "frame", ".npz").values(), *numbered(folder, "frame", ".vdb").values()]
+            for path in (*made, folder / CHECKPOINT):
                 path.unlink(missing_ok=True)
     content = {"format": _FORMAT, "version": _VERSION, "scene": scene.model_dump(mode="json")}
     atomic_write(folder / SCENE_FILE, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
@@ -465,7 +469,21 @@ def _read_scene(folder: Path) -> Scene:
     return check_settings(Scene, content.get("scene"), f"{path}: scene.")
 
 
-def _simulated(scene: Scene) -> dict[str, Any]:
-    appearance = {"smoke": {"extinction", "glow"}, "obstacles": {"__all__": {"colour"}}}
-    others = dict.fromkeys(("name", "frames", "camera", "lights", "background"), True)
-    return json.loads(scene.model_dump_json(exclude=others | appearance))
+def _simulated(scene: Scene, until: float) -> dict[str, Any]:
+    """Returns the settings on which the smoke up to a time in seconds depends, by their names; but not those that only
+    change the accuracy of the flow or the looks."""
+    free = {
+        "smoke": {"extinction", "albedo", "glow", "scheme", "bricks"},
+        "air": {"speed", "lattice_speed", "smagorinsky"},
+    }
+    others = dict.fromkeys(("name", "frames", "camera", "lights", "background", "obstacles"), True)
+    settings = json.loads(scene.model_dump_json(exclude=others | free))
+    for source in settings["sources"]:
+        source["stop"] = None if source["stop"] is None or source["stop"] >= until else source["stop"]
+    settings["sources"] = [source for source in settings["sources"] if source["start"] < until]
+    settings["obstacles"] = []
+    for body in scene.obstacles:
+        places = [body.centre(time) / scene.grid.cell for time in np.linspace(0.0, until, _PLACES)]
+        settings["obstacles"].append([body.shape, np.asarray(body.radius).tolist(), np.round(places, 6).tolist()])
+    smoke, air = settings.pop("smoke"), settings.pop("air")
+    return settings | {f"smoke.{k}": v for k, v in smoke.items()} | {f"air.{k}": v for k, v in air.items()}

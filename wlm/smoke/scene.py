@@ -6,6 +6,7 @@ if another class has the plain name, such as `Camera`.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import os
@@ -18,12 +19,19 @@ from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings, load_settings, profile_path
 from wlm.fluid.faces import FACES
-from wlm.fluid.obstacles import surface
+from wlm.fluid.obstacles import Trajectory, surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, Ramp
 
 _SHORTEST = 1e-12
-_MOST_STEPS = 1_000_000  # largest number of steps per frame; typical scenes have hundreds
+MOST_STEPS = 1_000_000
+"""Largest number of air steps per frame; typical scenes have hundreds."""
+FASTEST = 0.2
+"""Largest speed of inlets and obstacles in cells per step; a flow with faster ones may blow up."""
+# Bounds of a stable step: acceleration in cells per step squared, viscosity in square cells per step.
+_ACCELERATION, _VISCOSITY = 0.01, 1.0
+# Without eddy viscosity, of less than this Smagorinsky constant, the largest Reynolds number of a cell.
+_LEAST_EDDIES, _CELL_REYNOLDS = 0.05, 100.0
 
 
 def _directed(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -121,9 +129,9 @@ class Air(_Settings):
         smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
     """
 
-    viscosity: _Positive = 1.5e-5
+    viscosity: _NotNegative = 1.5e-5
     speed: _Positive | None = None
-    lattice_speed: float = Field(0.1, gt=0.0, le=0.3)
+    lattice_speed: float = Field(0.1, gt=0.0, le=FASTEST)
     smagorinsky: _NotNegative = 0.17
     storage: Literal["float32", "float16"] = "float32"
 
@@ -224,7 +232,8 @@ class ObstacleSettings(_Settings):
     Attributes:
         shape: "sphere", "box" or "cylinder", whose axis is y.
         radius: Radius of a sphere in metres; for a box or cylinder half of its extents along x, y and z.
-        path: Positions (time, x, y, z) between which the centre moves linearly; before and after them it rests.
+        path: Positions (time, x, y, z) between which the centre moves linearly; before and after them it rests. It
+            starts, turns and stops while it moves by its largest diameter (`Trajectory.eased`).
         colour: Albedo R, G, B of the obstacle in pictures.
     """
 
@@ -241,8 +250,13 @@ class ObstacleSettings(_Settings):
 
     def centre(self, time: float) -> np.ndarray:
         """Returns the position of the centre at a time in seconds, float64 [3]."""
+        return self.eased.at(time)
+
+    @functools.cached_property
+    def eased(self) -> Trajectory:
+        """The path with ramps; positions in metres, times in seconds."""
         keys = np.array(self.path)
-        return np.array([np.interp(time, keys[:, 0], keys[:, axis]) for axis in (1, 2, 3)])
+        return Trajectory.of(keys[:, 1:], keys[:, 0]).eased(2.0 * float(np.max(self.radius)))
 
     @property
     def fastest(self) -> float:
@@ -354,11 +368,27 @@ class Scene(_Settings):
             raise PydanticCustomError("inlets", "expected inlets on faces that aren't periodic")
         if faces and all(face in faces or self.grid.face(face) != "open" for face in FACES):
             raise PydanticCustomError("inlets", "expected an open face without an inlet, for the air to leave")
-        if not self.fastest <= _MOST_STEPS * self._speed_of_one_step:
+        if not self._least_steps <= MOST_STEPS:
             raise PydanticCustomError(
                 "steps",
-                f"expected at most {_MOST_STEPS:,} steps per frame, found a speed of {self.fastest:g} m/s, cells of "
-                f"{self.grid.cell:g} m and {self.rate:g} frames per second",
+                f"expected at most {MOST_STEPS:,} steps per frame, found {self._least_steps:.3g}, for a speed of "
+                f"{self.fastest:g} m/s, an acceleration of {self._acceleration:g} m/s2 and a viscosity of "
+                f"{self.air.viscosity:g} m2/s in cells of {self.grid.cell:g} m at {self.rate:g} frames per second",
+            )
+        speed = max(self._speeds, default=0.0)
+        if not speed * self.step <= FASTEST * self.grid.cell * (1.0 + 1e-9):
+            raise PydanticCustomError(
+                "speed",
+                f"expected at most {FASTEST} cells per step, found an inlet or an obstacle of {speed:g} m/s, "
+                f"{speed * self.step / self.grid.cell:.3g} cells per step: leave air.speed null or at least {speed:g}",
+            )
+        speed = max(self.fastest, math.sqrt(self._acceleration * float(self.grid.size.max())))
+        least = speed * self.grid.cell / _CELL_REYNOLDS
+        if self.air.smagorinsky < _LEAST_EDDIES and self.air.viscosity < least:
+            raise PydanticCustomError(
+                "viscosity",
+                f"expected air.viscosity of at least {least:.3g} m2/s at {speed:.3g} m/s and air.smagorinsky below "
+                f"{_LEAST_EDDIES}, found {self.air.viscosity:g}: the flow would blow up",
             )
         return self
 
@@ -391,21 +421,35 @@ class Scene(_Settings):
     @property
     def fastest(self) -> float:
         """Speed in metres per second that moves air by `air.lattice_speed` cells in a step; 1 if nothing moves."""
-        if self.air.speed is not None:
-            return self.air.speed
-        speeds = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
-        return max([*speeds, *(obstacle.fastest for obstacle in self.obstacles)], default=0.0) or 1.0
+        return self.air.speed or max(self._speeds, default=0.0) or 1.0
 
     @property
-    def _speed_of_one_step(self) -> float:
-        """Speed in metres per second that would move air by `air.lattice_speed` cells if a frame had one step."""
-        return self.rate * self.air.lattice_speed * self.grid.cell
+    def _speeds(self) -> list[float]:
+        """Speeds of inlets and obstacles in metres per second."""
+        inlets = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
+        return [*inlets, *(obstacle.fastest for obstacle in self.obstacles)]
+
+    @property
+    def _acceleration(self) -> float:
+        """Largest acceleration of air by smoke, in metres per second squared."""
+        emitters = [*self.inlets, *self.sources]
+        pulls = [(self.smoke.buoyancy * each.temperature, self.smoke.weight * each.density) for each in emitters]
+        return max(itertools.chain.from_iterable(pulls), default=0.0)
+
+    @property
+    def _least_steps(self) -> float:
+        """Air steps per frame for which speed, acceleration and viscosity stay within their bounds."""
+        cell = self.grid.cell
+        by_speed = self.fastest / (self.rate * self.air.lattice_speed * cell)
+        by_acceleration = math.sqrt(self._acceleration / (_ACCELERATION * cell)) / self.rate
+        return max(by_speed, by_acceleration, self.air.viscosity / (_VISCOSITY * cell * cell * self.rate))
 
     @property
     def steps(self) -> int:
-        """Number of air steps per frame, a multiple of `smoke.substeps`: the fewest that obey `air.lattice_speed`."""
-        least = self.fastest / self._speed_of_one_step
-        return max(math.ceil(least / self.smoke.substeps - 1e-9), 1) * self.smoke.substeps
+        """Number of air steps per frame at the start, a multiple of `smoke.substeps`: the fewest that obey
+        `air.lattice_speed` and the bounds of acceleration and viscosity. A simulation doubles it while air is faster.
+        """
+        return max(math.ceil(self._least_steps / self.smoke.substeps - 1e-9), 1) * self.smoke.substeps
 
     @property
     def step(self) -> float:

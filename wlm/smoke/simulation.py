@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import warp as wp
@@ -17,7 +17,7 @@ from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked
 from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
-from wlm.smoke.scene import Inlet, ObstacleSettings, Scene, SourceSettings
+from wlm.smoke.scene import MOST_STEPS, Inlet, ObstacleSettings, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
 
 _Timed = tuple[fluid.Source, Callable[[float], bool]]
@@ -25,6 +25,10 @@ _Timed = tuple[fluid.Source, Callable[[float], bool]]
 _INLET_DEPTH = 1.0
 # Steps in which inlets open, per cell of the longest axis: a sudden start causes a sound wave.
 _RAMP = 4
+# Speed of air in cells per step above which the step is halved, and air steps between two looks at it.
+_FAST, _LOOK = 0.25, 8
+# Times at which sources and inlets inside obstacles are looked for.
+_LOOKS_AT_OBSTACLES = 17
 
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
@@ -46,6 +50,7 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
             buoyancy=_buoyancy(scene),
             substeps=smoke.substeps,
             bricks=smoke.bricks,
+            duration=scene.step,
         )
     except ValueError as error:
         # Each setting is within its range, but together they are too small or too large.
@@ -53,21 +58,43 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
 
 
 def warnings_of(scene: Scene) -> list[str]:
-    """Returns a line for each source and obstacle that has no effect or another one than its picture."""
+    """Returns a line for each inlet, source and obstacle that has no effect or another one than its picture."""
     grid, warnings, end = scene.grid, [], scene.time(scene.frames)
     low, high = np.asarray(grid.origin), grid.origin + grid.size
     corners = (", ".join(f"{number:g}" for number in corner) for corner in (low, high))
     box = f"it is outside the box from ({') to ('.join(corners)})"
+    for i, inlet in enumerate(scene.inlets):
+        points = _opening(scene, inlet)
+        later = [_opening(scene, other) for other in scene.inlets[i + 1 :] if other.face == inlet.face]
+        if not any(set(map(tuple, points)) <= set(map(tuple, other)) for other in later):
+            later = []
+        if later or _is_hidden(scene, points, 0.0, end):
+            warnings.append(
+                f"inlets.{i}: {'a later inlet' if later else 'an obstacle'} covers it, so that it is closed"
+            )
     for i, ball in enumerate(scene.sources):
+        points, (radius, share) = _voxels(scene, ball), _ball(scene, ball)
+        stop = end if ball.stop is None else min(ball.stop, end)
+        duration = scene.step * scene.smoke.substeps
         if np.linalg.norm(np.clip(ball.centre, low, high) - ball.centre) >= ball.radius:
             warnings.append(f"sources.{i}: {box}, and emits no smoke")
-        elif ball.start >= end or (ball.stop is not None and ball.stop <= 0.0):
-            warnings.append(f"sources.{i}: it is not active between 0 and {end:g} s, and emits no smoke")
-        elif ball.radius < 0.5 * math.sqrt(3.0) * grid.voxel:  # half of a voxel's diagonal
-            warnings.append(f"sources.{i}: it is smaller than a voxel of {grid.voxel:g} m, and may emit no smoke")
+        elif not math.ceil(max(ball.start, 0.0) / duration) * duration < stop:
+            warnings.append(f"sources.{i}: it is not active at a step between 0 and {end:g} s, and emits no smoke")
+        elif not len(points):
+            warnings.append(f"sources.{i}: it reaches no voxel's centre, and emits no smoke")
+        elif _is_hidden(scene, points, max(ball.start, 0.0), stop):
+            warnings.append(f"sources.{i}: it is inside an obstacle, and emits no smoke")
+        elif not (ball.density or scene.smoke.hot) and ball.temperature:
+            warnings.append(f"sources.{i}: temperature has no effect without smoke.buoyancy and smoke.emission")
+        elif share < 1.0:
+            warnings.append(
+                f"sources.{i}: it is smaller than a voxel of {grid.voxel:g} m, and is simulated with a radius of "
+                f"{radius:.3g} m at {share:.2g} of its density"
+            )
     for i, obstacle in enumerate(scene.obstacles):
-        radius, places = np.broadcast_to(obstacle.radius, 3), np.array(obstacle.path)[:, 1:]
-        if (places.max(0) + radius <= low).any() or (places.min(0) - radius >= high).any():
+        radius, times = np.broadcast_to(obstacle.radius, 3), obstacle.eased.times
+        places = [obstacle.centre(time) for time in (0.0, *times[(times > 0.0) & (times < end)], end)]
+        if (np.max(places, axis=0) + radius <= low).any() or (np.min(places, axis=0) - radius >= high).any():
             warnings.append(f"obstacles.{i}: {box}")
         elif (_radius(scene, obstacle) > radius).any():
             warnings.append(
@@ -76,6 +103,44 @@ def warnings_of(scene: Scene) -> list[str]:
     if not (scene.sources or scene.inlets):
         warnings.append("sources, inlets: there are none, and thus there is no smoke")
     return [f"{scene.name}: {warning}" for warning in warnings]
+
+
+def _opening(scene: Scene, inlet: Inlet) -> np.ndarray:
+    """Returns the centres of the faces of cells through which an inlet's air comes, [N, 3] in cells."""
+    axis, high = divmod(FACES.index(inlet.face), 2)
+    counts = [1 if a == axis else n for a, n in enumerate(scene.grid.cells)]
+    points = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in counts], indexing="ij"), -1).reshape(-1, 3)
+    points[:, axis] = scene.grid.cells[axis] - 0.5 if high else 0.5
+    if inlet.radius is not None:
+        away = points - (np.asarray(inlet.centre) - scene.grid.origin) / scene.grid.cell
+        points = points[np.linalg.norm(np.delete(away, axis, 1), axis=1) <= inlet.radius / scene.grid.cell]
+    return points
+
+
+def _voxels(scene: Scene, ball: SourceSettings) -> np.ndarray:
+    """Returns centres of voxels in a source and the box, [N, 3] in cells; of a large source some of them."""
+    refine, radius = scene.grid.refine, _ball(scene, ball)[0] / scene.grid.voxel
+    centre = (np.asarray(ball.centre) - scene.grid.origin) / scene.grid.voxel
+    begin = np.ceil(np.maximum(centre - radius, 0.0) - 0.5)
+    end = np.floor(np.minimum(centre + radius, scene.grid.shape) - 0.5)
+    axes = [np.unique(np.linspace(*ends, 16).round()) for ends in zip(begin, np.maximum(begin, end), strict=True)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) + 0.5
+    return points[(np.linalg.norm(points - centre, axis=1) <= radius) & (points < scene.grid.shape).all(1)] / refine
+
+
+def _is_hidden(scene: Scene, points: np.ndarray, start: float, stop: float) -> bool:
+    """Tests whether obstacles cover the cells of all points, [N, 3] in cells, from a time to another in seconds."""
+    places = scene.grid.origin + scene.grid.cell * (np.floor(points) + 0.5)
+    for moment in np.linspace(start, stop, _LOOKS_AT_OBSTACLES if scene.obstacles else 1):
+        covered = np.zeros(len(points), bool)
+        for obstacle in scene.obstacles:
+            away = np.abs(places - obstacle.centre(moment)) / _radius(scene, obstacle)
+            across, along = np.hypot(away[:, 0], away[:, 2]), away[:, 1]
+            reach = {"sphere": np.hypot(across, along), "cylinder": np.maximum(across, along), "box": away.max(1)}
+            covered |= reach[obstacle.shape] < 1.0
+        if not covered.all():
+            return False
+    return True
 
 
 def volume_of(scene: Scene, solver: fluid.Solver) -> DensityVolume:
@@ -91,6 +156,7 @@ def simulate(
     device: str = "cpu",
     resume: bool = False,
     checkpoint_every: float = EVERY,
+    vdb: bool = False,
     progress: OnProgress | None = None,
 ) -> int:
     """Simulates a scene and writes its frames.
@@ -105,6 +171,7 @@ def simulate(
             opening the folder, a failure leaves earlier frames in the folder.
         device: Device that `wlm.interop.check_device` returned.
         resume: Whether to continue from a saved state, if there is one. A state past the last requested frame is kept.
+        vdb: Whether to write each frame as `frame_0001.vdb`, too, with the velocity of the air in metres per second.
         checkpoint_every: Seconds between two saves of the state; 0: after every step.
         progress: Called after each frame, with the figures `smoke`, the integral of the density over the box, and
             `frame s`, the seconds of the frame; and about twice a second within a frame, without figures.
@@ -124,27 +191,26 @@ def simulate(
             return scene.frames + 1
         if solver is None:
             solver = make_solver(scene, device=device)
-        per_frame = scene.steps // scene.smoke.substeps
-        begun = 0  # steps of earlier runs
+        frame, begun = 1, 0
         if saved:
             solver.load(checkpoint)
             begun = solver.steps
-        done = begun // per_frame
-        if saved and missing and missing[0] <= done:
+            frame += begun // _steps_per_frame(scene, solver)
+        if saved and missing and missing[0] < frame:
             raise WlmError(
-                f"{frames.path}: cannot resume after frame {done}: {frames.file(missing[0]).name} is missing;"
+                f"{frames.path}: cannot resume after frame {frame - 1}: {frames.file(missing[0]).name} is missing;"
                 " start anew without --resume"
             )
-        sources, meter = _sources(scene), Meter(progress, "simulate", scene.frames)
-        pace = Pace(checkpoint_every)
-        for frame in range(done + 1, scene.frames + 1):
+        first, meter, pace = frame, Meter(progress, "simulate", scene.frames), Pace(checkpoint_every)
+        for frame in range(first, scene.frames + 1):
             begin = time.perf_counter()
-            for step in range(solver.steps % per_frame, per_frame):
-                _step(scene, solver, sources, frame - 1 + step / per_frame)
-                last = step + 1 == per_frame
+            for last in _frame_steps(scene, solver, frame):
                 if last:
                     solver.check()
                     volume = volume_of(scene, solver)
+                    if vdb:
+                        velocity = solver.velocity.numpy() * (scene.grid.cell / solver.duration)
+                        save_volume(frames.file(frame).with_suffix(".vdb"), volume, velocity=velocity)
                     # Written before the state: a state without its frame could not be resumed.
                     save_volume(frames.file(frame), volume, bricks=True)
                 if pace.due():
@@ -159,22 +225,48 @@ def simulate(
                 except KeyboardInterrupt:
                     solver.save(checkpoint)
                     raise
-        if begun <= scene.frames * per_frame:
+        if first <= scene.frames or begun == scene.frames * _steps_per_frame(scene, solver):
             checkpoint.unlink(missing_ok=True)
-        return min(done, scene.frames) + 1
+        return min(first, scene.frames + 1)
 
 
 def advance(scene: Scene, solver: fluid.Solver, frame: int) -> None:
     """Advances a solver from the previous frame to the frame with number `frame`; frames count from 1."""
-    per_frame, sources = scene.steps // scene.smoke.substeps, _sources(scene)
-    for step in range(per_frame):
-        _step(scene, solver, sources, frame - 1 + step / per_frame)
+    for _ in _frame_steps(scene, solver, frame):
+        pass
 
 
-def _step(scene: Scene, solver: fluid.Solver, sources: list[_Timed], frames: float) -> None:
-    """Does one smoke step from the time `frames`, in frame intervals, with the sources that are active at this time."""
-    solver.sources = tuple(source for source, active in sources if active(frames / scene.rate))
-    solver.step()
+def _steps_per_frame(scene: Scene, solver: fluid.Solver) -> int:
+    return round(1.0 / (scene.rate * solver.duration * solver.substeps))
+
+
+def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[bool]:
+    """Advances a solver step by step to the end of a frame; yields after each step whether it was the last.
+
+    The time step is halved while air is faster than `_FAST`.
+    """
+    sources, every = _sources(scene), max(_LOOK // solver.substeps, 1)
+    count, longest = _steps_per_frame(scene, solver), scene.steps // solver.substeps
+    step = solver.steps - (frame - 1) * count
+    if step == 0 and count % longest:
+        # The state is of a scene with other steps.
+        solver.change_step(count / longest)
+        count = longest
+    while step < count:
+        while step % every == 0 and (speed := solver.fastest) > _FAST:
+            if 2 * count * solver.substeps > MOST_STEPS:
+                metres = speed * scene.grid.cell / solver.duration
+                raise WlmError(
+                    f"{scene.name}: frame {frame}: the air moves at {metres:.3g} m/s, {speed:.3g} cells per step: "
+                    f"expected at most {_FAST} with at most {MOST_STEPS:,} steps per frame"
+                )
+            solver.change_step(0.5)
+            step, count = 2 * step, 2 * count
+        active = (frame - 1 + step / count) / scene.rate
+        solver.sources = tuple(source for source, when in sources if when(active))
+        solver.step()
+        step += 1
+        yield step == count
 
 
 def _require_memory(scene: Scene, device: str) -> None:
@@ -229,19 +321,15 @@ def _buoyancy(scene: Scene) -> fluid.Buoyancy | None:
 
 def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlets: list[tuple[int, Inlet]]) -> None:
     """Sets the inlets of a face; where two inlets overlap, the later one applies."""
-    grid = scene.grid
-    across = [axis for axis in range(3) if axis != FACES.index(name) // 2]
-    places = [grid.origin[axis] + grid.cell * (np.arange(grid.cells[axis]) + 0.5) for axis in across]
-    first, second = np.meshgrid(*places, indexing="ij")
-    velocity, opened = np.zeros((*first.shape, 3)), np.zeros(first.shape, bool)
+    axis = FACES.index(name) // 2
+    shape = tuple(np.delete(scene.grid.cells, axis).tolist())
+    velocity, opened = np.zeros((*shape, 3)), np.zeros(shape, bool)
     for number, inlet in inlets:
-        here = np.ones(first.shape, bool)
-        if inlet.radius is not None:
-            here = np.hypot(first - inlet.centre[across[0]], second - inlet.centre[across[1]]) <= inlet.radius
-        if not here.any():
+        here = tuple(np.delete(_opening(scene, inlet), axis, 1).astype(int).T)
+        if not len(here[0]):
             raise WlmError(f"{scene.name}: inlets.{number}: its circle covers no cell's centre: use a larger radius")
         velocity[here] = [domain.speed(v) for v in inlet.velocity]
-        opened |= here
+        opened[here] = True
     lattice.set_inlet(name, velocity, opened)
 
 
@@ -255,10 +343,11 @@ def _sources(scene: Scene) -> list[_Timed]:
         size: np.ndarray,
         settings: Inlet | SourceSettings,
         active: Callable[[float], bool],
+        share: float = 1.0,
     ) -> None:
         place = tuple(map(float, centre)), tuple(map(float, size))
-        temperature = settings.temperature if scene.smoke.hot else 0.0
-        sources.append((fluid.Source(shape, *place, settings.density, temperature, fixed=True), active))
+        values = share * settings.density, share * settings.temperature if scene.smoke.hot else 0.0
+        sources.append((fluid.Source(shape, *place, *values, fixed=True), active))
 
     grid = scene.grid
     half = 0.5 * np.array(grid.cells, float)
@@ -274,16 +363,24 @@ def _sources(scene: Scene) -> list[_Timed]:
         add(shape, centre, size, inlet, lambda time: True)
     for ball in scene.sources:
         centre = (np.asarray(ball.centre) - grid.origin) / grid.cell
-        add("sphere", centre, np.full(3, ball.radius / grid.cell), ball, ball.active)
+        radius, share = _ball(scene, ball)
+        add("sphere", centre, np.full(3, radius / grid.cell), ball, ball.active, share)
     return sources
+
+
+def _ball(scene: Scene, ball: SourceSettings) -> tuple[float, float]:
+    """Returns the radius with which a source is simulated, such that it covers the centre of a voxel wherever it is in
+    the box, and the share of its density for which the amount of smoke stays the same."""
+    radius = max(ball.radius, 0.501 * math.sqrt(3.0) * scene.grid.voxel)
+    return radius, (ball.radius / radius) ** 3
 
 
 def _obstacles(scene: Scene) -> list[Obstacle]:
     grid = scene.grid
     obstacles: list[Obstacle] = []
     for settings in scene.obstacles:
-        keys = np.array(settings.path)
-        path = Trajectory.of((keys[:, 1:] - grid.origin) / grid.cell, keys[:, 0] / scene.step)
+        eased = settings.eased
+        path = Trajectory.of((eased.positions - grid.origin) / grid.cell, eased.times / scene.step)
         radius = _radius(scene, settings)
         if settings.shape == "sphere":
             obstacles.append(Sphere(path, float(radius[0]) / grid.cell))

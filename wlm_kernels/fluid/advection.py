@@ -37,10 +37,8 @@ import warp as wp
 
 from wlm_kernels.fluid.advection_places import (
     BRICK,
-    BRICK_RUN,
     DENSE,
     FREE,
-    RUN,
     SOLID,
     Box,
     Bricks,
@@ -52,8 +50,11 @@ from wlm_kernels.fluid.advection_places import (
     evaluate,
     fetch,
     in_domain,
+    in_reach,
     into_domain,
     is_solid,
+    line_along_x,
+    pair,
     side_of,
     stencil,
     trace_back,
@@ -64,14 +65,28 @@ from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 # Loops over eight cells run only beside solids; unrolled they would use registers in all other cells too.
 _OPTIONS = {"enable_backward": False, "max_unroll": 4}
 
-# Threads per block, and blocks per multiprocessor: a kernel that would use 110 registers then allows more threads, and
-# spills registers in rare branches; fewer blocks are slower.
+# Threads per block, and blocks per multiprocessor: fewer blocks, with more registers, are slower.
 _BOUNDS = (256, 4)
+
+# Cells along x that one thread computes, so that cells between the same eight velocities read them once.
+_RUN, _BRICK_RUN = 16, BRICK
+
+# Threads of a block along y and z: neighbours share most of their reads.
+_TILE = 16
+
+# Cells along x by which values are fetched into the cache before they are read.
+_AHEAD = 2
 
 STORAGES = {"float32": wp.float32, "float16": wp.float16}
 
+_PREFETCH = """
+#if defined(__CUDA_ARCH__)
+asm volatile("prefetch.global.L2 [%0];" :: "l"(field.data + i));
+#endif
+"""
+
 _LARGEST_HALF = wp.constant(65504.0)
-_BRICK_RUNS = wp.constant(BRICK * BRICK * BRICK // BRICK_RUN)
+_BRICK_RUNS = wp.constant(BRICK * BRICK * BRICK // _BRICK_RUN)
 
 
 @functools.cache
@@ -104,11 +119,14 @@ class Fields:
 def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, hot: bool) -> wp.Kernel:
     """Builds (once) a kernel that advects smoke; a thread computes a run: neighbouring cells along x.
 
+    Cells whose traces are long, end at a face or may meet a solid come after the others of a run, so that they need no
+    registers while these are computed.
+
     With `correcting` the kernel does the second half of a MacCormack step, else a semi-Lagrangian step. Values are of
     the type `stored`, `wp.float32` or `wp.float16`. With `in_bricks` only listed bricks are computed. Without `solids`
     (solid cells) the code is half as long; without temperatures (`hot`) it uses fewer registers.
     """
-    run = BRICK_RUN if in_bricks else RUN
+    run = _BRICK_RUN if in_bricks else _RUN
     fields_type = fields_struct(stored)
 
     @wp.func
@@ -128,17 +146,28 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
     def value_at(field: wp.array1d[stored], i: int) -> float:
         return float(peek(field, i))
 
+    # True for 0 <= i < n.
+    @wp.func_native("return (unsigned)i < (unsigned)n;")
+    def is_below(i: int, n: int) -> bool: ...
+
+    @wp.func_native(_PREFETCH)
+    def prefetch(field: wp.array1d[stored], i: int): ...
+
+    @wp.func
+    def between(a: float, b: float, t: float) -> float:
+        return (b - a) * t + a
+
     @wp.func
     def interpolate(field: wp.array1d[stored], at: Stencil) -> float:
         i00 = at.base
         i01 = at.base + at.step[1]
         i10 = at.base + at.step[0]
         i11 = i10 + at.step[1]
-        a = wp.lerp(value_at(field, i00), value_at(field, i00 + at.step[2]), at.f[2])
-        b = wp.lerp(value_at(field, i01), value_at(field, i01 + at.step[2]), at.f[2])
-        c = wp.lerp(value_at(field, i10), value_at(field, i10 + at.step[2]), at.f[2])
-        d = wp.lerp(value_at(field, i11), value_at(field, i11 + at.step[2]), at.f[2])
-        return wp.lerp(wp.lerp(a, b, at.f[1]), wp.lerp(c, d, at.f[1]), at.f[0])
+        a = between(value_at(field, i00), value_at(field, i00 + at.step[2]), at.f[2])
+        b = between(value_at(field, i01), value_at(field, i01 + at.step[2]), at.f[2])
+        c = between(value_at(field, i10), value_at(field, i10 + at.step[2]), at.f[2])
+        d = between(value_at(field, i11), value_at(field, i11 + at.step[2]), at.f[2])
+        return between(between(a, b, at.f[1]), between(c, d, at.f[1]), at.f[0])
 
     @wp.func
     def interpolate_beside(field: wp.array1d[stored], walls: wp.array1d[wp.uint8], box: Box, p: wp.vec3) -> float:
@@ -157,8 +186,8 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return total / wp.max(weight, 1.0e-6)
 
     @wp.func
-    def limited(field: wp.array1d[stored], at: Stencil, value: float) -> float:
-        """Clamps a value to the range of the eight stored values around a point."""
+    def extremes(field: wp.array1d[stored], at: Stencil):
+        """Returns the least and the largest of the eight stored values around a point."""
         i00 = at.base
         i01 = at.base + at.step[1]
         i10 = at.base + at.step[0]
@@ -169,7 +198,30 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         i10 += at.step[2]
         i11 += at.step[2]
         b = wp.vec4(value_at(field, i00), value_at(field, i01), value_at(field, i10), value_at(field, i11))
-        return wp.clamp(value, wp.min(wp.min(a, b)), wp.max(wp.max(a, b)))
+        return wp.min(wp.min(a, b)), wp.max(wp.max(a, b))
+
+    @wp.func
+    def corrected(
+        field: wp.array1d[stored], predicted: wp.array1d[stored], i: int, to: Stencil, low: float, high: float
+    ) -> float:
+        change = 0.5 * (value_at(field, i) - interpolate(predicted, to))
+        return wp.clamp(value_at(predicted, i) + change, low, high)
+
+    @wp.func
+    def write(i: int, smoke: float, heat: float, decay: wp.vec2, out: fields_type) -> float:
+        """Writes a cell after its decay, and returns the larger of its density and temperature."""
+        most = decay[0] * smoke
+        poke(out.density, i, in_range(most))
+        if wp.static(hot):
+            warmth = decay[1] * heat
+            poke(out.temperature, i, in_range(warmth))
+            most = wp.max(most, warmth)
+        return most
+
+    @wp.func
+    def is_short(box: Box, away: wp.vec3) -> bool:
+        """Tests whether a trace ends within half a coarse cell: if no solid is beside its start, none is at its end."""
+        return wp.max(wp.abs(away)) <= 0.5 * float(box.refinement)
 
     @wp.func
     def departure_point(
@@ -193,11 +245,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             p = into_domain(box, end)
             left = beyond_open_face(box, end)
         if wp.static(solids):
-            # Within half a coarse cell of a start without a solid beside it, a read meets no solid either.
-            reach = 0.5 * float(box.refinement)
-            away = end - x
-            short = wp.abs(away[0]) <= reach and wp.abs(away[1]) <= reach and wp.abs(away[2]) <= reach
-            if wall != FREE or not short:
+            if wall != FREE or not is_short(box, end - x):
                 end_wall = wall_at(box, walls, p)
                 beside = end_wall != FREE
                 if end_wall == SOLID:
@@ -207,14 +255,82 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return p, left, beside
 
     @wp.func
+    def carry_cell(
+        box: Box,
+        cell: wp.vec3i,
+        u: wp.array1d[wp.vec3],
+        walls: wp.array1d[wp.uint8],
+        fields: fields_type,
+        predicted: fields_type,
+        dt: float,
+    ):
+        """Returns the density and the temperature of any cell after a step, before their decay."""
+        i = index_of(box.n, cell)
+        smoke = float(0.0)
+        heat = float(0.0)
+        x = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5)
+        wall = wp.uint8(0)
+        if wp.static(solids):
+            wall = wall_at(box, walls, x)
+        if wall != SOLID:
+            start = stencil(box.coarse, box.periodic, box.voxel * x)
+            around = fetch(u, start)
+            v = evaluate(around, start.f)
+            p, left, beside = departure_point(box, u, walls, around, start.f, x, v, dt, wall)
+            at = stencil(box.n, box.periodic, p)
+            if wp.static(correcting):
+                smoke = value_at(predicted.density, i)
+                if wp.static(hot):
+                    heat = value_at(predicted.temperature, i)
+                q, left_q, beside_q = departure_point(box, u, walls, around, start.f, x, v, -dt, wall)
+                if not (left or left_q or beside or beside_q):
+                    to = stencil(box.n, box.periodic, q)
+                    low, high = extremes(fields.density, at)
+                    smoke = corrected(fields.density, predicted.density, i, to, low, high)
+                    if wp.static(hot):
+                        low, high = extremes(fields.temperature, at)
+                        heat = corrected(fields.temperature, predicted.temperature, i, to, low, high)
+            elif not left:
+                if wp.static(solids):
+                    if beside:
+                        smoke = interpolate_beside(fields.density, walls, box, p)
+                        if wp.static(hot):
+                            heat = interpolate_beside(fields.temperature, walls, box, p)
+                if not beside:
+                    smoke = interpolate(fields.density, at)
+                    if wp.static(hot):
+                        heat = interpolate(fields.temperature, at)
+        return smoke, heat
+
+    @wp.func
+    def between_cells(box: Box, end: wp.vec3):
+        """Returns the eight cells around a point, relative to the centre of cell (0, 0, 0), and whether all exist."""
+        x = int(wp.floor(end[0]))
+        y = int(wp.floor(end[1]))
+        z = int(wp.floor(end[2]))
+        out = Stencil()
+        out.base = (x * box.n[1] + y) * box.n[2] + z
+        out.step = wp.vec3i(box.n[1] * box.n[2], box.n[2], 1)
+        out.f = end - wp.vec3(float(x), float(y), float(z))
+        return out, is_below(x, box.n[0] - 1) and is_below(y, box.n[1] - 1) and is_below(z, box.n[2] - 1)
+
+    @wp.func
+    def patch_of(box: Box, i: int) -> int:
+        """Returns the coarse cell, -1 or above, between whose centre and the next the centre of a fine cell is."""
+        return (2 * i + 1 + box.refinement) // (2 * box.refinement) - 1
+
+    @wp.func
     def first_of_run(box: Box, bricks: Bricks, i: int, k: int) -> wp.vec3i:
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])
-            within = cell_of(wp.vec3i(BRICK // BRICK_RUN, BRICK, BRICK), r)
-            return wp.vec3i(b[0] * BRICK + within[0] * BRICK_RUN, b[1] * BRICK + within[1], b[2] * BRICK + within[2])
-        p = cell_of(box.n, i)
-        return wp.vec3i(p[0] * RUN, p[1], p[2])
+            within = cell_of(wp.vec3i(1, BRICK, BRICK), r)
+            return wp.vec3i(b[0] * BRICK, b[1] * BRICK + within[1], b[2] * BRICK + within[2])
+        tile = cell_of(
+            wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE), i // (_TILE * _TILE)
+        )
+        thread = i % (_TILE * _TILE)
+        return wp.vec3i(tile[0] * _RUN, tile[1] * _TILE + thread // _TILE, tile[2] * _TILE + thread % _TILE)
 
     @wp.func
     def carry_run(
@@ -230,64 +346,81 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
     ) -> float:
         """Advects up to `run` cells along x and returns their largest density or temperature."""
         most = float(0.0)
-        around = TrilinearVelocity()
-        around_x = float(-2.0)
-        wall = wp.uint8(0)
-        wall_x = float(-1.0)
-        for x_cell in range(first[0], wp.min(first[0] + wp.static(run), box.n[0])):
-            cell = wp.vec3i(x_cell, first[1], first[2])
-            i = index_of(box.n, cell)
-            smoke = float(0.0)
-            heat = float(0.0)
-            if wp.static(correcting):
-                smoke = value_at(predicted.density, i)
-                if wp.static(hot):
-                    heat = value_at(predicted.temperature, i)
-            x = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5)
-            if wp.static(solids):
-                coarse_x = wp.floor(box.voxel * x[0])
-                if coarse_x != wall_x:
-                    wall = wall_at(box, walls, x)
-                    wall_x = coarse_x
-            if wall != SOLID:
-                f = box.voxel * x - wp.vec3(0.5, 0.5, 0.5)
-                least = wp.vec3(wp.floor(f[0]), wp.floor(f[1]), wp.floor(f[2]))
-                if least[0] != around_x:
-                    around = fetch(u, stencil(box.coarse, box.periodic, box.voxel * x))
-                    around_x = least[0]
-                f -= least
-                v = evaluate(around, f)
-                p, left, beside = departure_point(box, u, walls, around, f, x, v, dt, wall)
+        others = int(0)
+        fine = dt * float(box.refinement)
+        sheet = box.n[1] * box.n[2]
+        x = int(first[0])
+        end = wp.min(first[0] + wp.static(run), box.n[0])
+        i = index_of(box.n, first)
+        patch = patch_of(box, first[0])
+        patch_y = patch_of(box, first[1])
+        patch_z = patch_of(box, first[2])
+        low_y, along_y = pair(patch_y, box.coarse[1], box.periodic[1])
+        low_z, along_z = pair(patch_z, box.coarse[2], box.periodic[2])
+        fy = box.voxel * (float(first[1]) + 0.5) - 0.5 - float(patch_y)
+        fz = box.voxel * (float(first[2]) + 0.5) - 0.5 - float(patch_z)
+        corners = Stencil()
+        while x < end:
+            low_x, along_x = pair(patch, box.coarse[0], box.periodic[0])
+            corners.base = (low_x * box.coarse[1] + low_y) * box.coarse[2] + low_z
+            corners.step = wp.vec3i(along_x * box.coarse[1] * box.coarse[2], along_y * box.coarse[2], along_z)
+            around = fetch(u, corners)
+            near, slope = line_along_x(around, fy, fz)
+            centre = float(patch) + 0.5
+            stop = wp.min(end, (2 * patch + 3) * box.refinement // 2)
+            for k in range(x, stop):
+                ahead = i + wp.where(k + _AHEAD < box.n[0], _AHEAD * sheet, 0)
+                prefetch(fields.density, ahead)
                 if wp.static(correcting):
-                    q, left_q, beside_q = departure_point(box, u, walls, around, f, x, v, -dt, wall)
-                    if not (left or left_q or beside or beside_q):
-                        origin = stencil(box.n, box.periodic, p)
-                        target = stencil(box.n, box.periodic, q)
-                        back = interpolate(predicted.density, target)
-                        change = 0.5 * (value_at(fields.density, i) - back)
-                        smoke = limited(fields.density, origin, smoke + change)
+                    prefetch(predicted.density, ahead)
+                cell = wp.vec3(float(k), float(first[1]), float(first[2]))
+                f = wp.vec3(box.voxel * (cell[0] + 0.5) - centre, fy, fz)
+                half = 0.5 * dt * (slope * f[0] + near)
+                away = fine * evaluate(around, f - half)
+                at, inside = between_cells(box, cell - away)
+                simple = inside and in_reach(f - half)
+                if wp.static(solids):
+                    wall = wall_at(box, walls, cell + wp.vec3(0.5, 0.5, 0.5))
+                    simple = simple and wall == FREE and is_short(box, away)
+                smoke = float(0.0)
+                heat = float(0.0)
+                if simple:
+                    if wp.static(correcting):
+                        smoke = value_at(predicted.density, i)
+                        low, high = extremes(fields.density, at)
+                        varies = low < high
                         if wp.static(hot):
-                            back = interpolate(predicted.temperature, target)
-                            change = 0.5 * (value_at(fields.temperature, i) - back)
-                            heat = limited(fields.temperature, origin, heat + change)
-                elif not left:
-                    if wp.static(solids):
-                        if beside:
-                            smoke = interpolate_beside(fields.density, walls, box, p)
-                            if wp.static(hot):
-                                heat = interpolate_beside(fields.temperature, walls, box, p)
-                    if not beside:
-                        at = stencil(box.n, box.periodic, p)
+                            heat = value_at(predicted.temperature, i)
+                            coldest, hottest = extremes(fields.temperature, at)
+                            varies = varies or coldest < hottest
+                        # Nothing is corrected between equal values.
+                        if varies:
+                            away = -fine * evaluate(around, f + half)
+                            to, inside = between_cells(box, cell - away)
+                            simple = inside and in_reach(f + half)
+                            if wp.static(solids):
+                                simple = simple and is_short(box, away)
+                            if simple:
+                                smoke = corrected(fields.density, predicted.density, i, to, low, high)
+                                if wp.static(hot):
+                                    heat = corrected(fields.temperature, predicted.temperature, i, to, coldest, hottest)
+                    else:
                         smoke = interpolate(fields.density, at)
                         if wp.static(hot):
                             heat = interpolate(fields.temperature, at)
-            smoke *= decay[0]
-            heat *= decay[1]
-            poke(out.density, i, in_range(smoke))
-            most = wp.max(most, smoke)
-            if wp.static(hot):
-                poke(out.temperature, i, in_range(heat))
-                most = wp.max(most, heat)
+                if simple:
+                    most = wp.max(most, write(i, smoke, heat, decay, out))
+                else:
+                    others |= 1 << (k - first[0])
+                i += sheet
+            x = stop
+            patch += 1
+        if others != 0:
+            for k in range(wp.static(run)):
+                if (others >> k) & 1 != 0:
+                    any_cell = wp.vec3i(first[0] + k, first[1], first[2])
+                    any_smoke, any_heat = carry_cell(box, any_cell, u, walls, fields, predicted, dt)
+                    most = wp.max(most, write(index_of(box.n, any_cell), any_smoke, any_heat, decay, out))
         return most
 
     @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS)
@@ -313,7 +446,9 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                     if most > bricks.threshold:
                         bricks.busy[bricks.listed[k]] = 1
         else:
-            carry_run(box, first_of_run(box, bricks, i, 0), u, walls, fields, predicted, dt, decay, out)
+            first = first_of_run(box, bricks, i, 0)
+            if first[1] < box.n[1] and first[2] < box.n[2]:
+                carry_run(box, first, u, walls, fields, predicted, dt, decay, out)
 
     return carry
 
@@ -345,7 +480,8 @@ def advect(
     """
     stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0
     kernel = carry_kernel(predicted is not None, stored, bricks.workers > 0, solids, hot)
-    threads = bricks.workers * int(_BRICK_RUNS) or -(-box.n[0] // RUN) * box.n[1] * box.n[2]
+    tiles = -(-box.n[0] // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE)
+    threads = bricks.workers * int(_BRICK_RUNS) or tiles * _TILE * _TILE
     # A semi-Lagrangian step does not read the prediction.
     inputs = [box, velocity, walls, fields.arrays, (predicted or fields).arrays, float(dt), wp.vec2(*decay), bricks]
     wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=fields.density.device)

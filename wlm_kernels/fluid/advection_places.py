@@ -24,10 +24,6 @@ PERIODIC, OPEN, CLOSED = 0, 1, 2
 BRICK = 8
 """Cells along an edge of a brick."""
 
-RUN, BRICK_RUN = 16, BRICK
-"""Cells along x that one thread computes, so that cells between the same eight velocities read them once; fewer in
-bricks, which are shorter."""
-
 REACH = 0.25
 """Distance in coarse cells by which the midpoint of a trace may be outside the eight velocities around its start and
 still be extrapolated from them: reading the next eight, which are mostly the same, would double the time."""
@@ -130,7 +126,7 @@ def _neighbour(i: int, n: int, periodic: int) -> int:
 
 
 @wp.func
-def _pair(i: int, n: int, periodic: int):
+def pair(i: int, n: int, periodic: int):
     """Wraps or clamps the cells i and i + 1 of an axis; returns the first, and the second minus the first."""
     low = i
     step = int(1)
@@ -146,9 +142,9 @@ def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
     """Finds the eight cells around a point of a domain of n cells."""
     at = p - wp.vec3(0.5, 0.5, 0.5)
     least = wp.vec3(wp.floor(at[0]), wp.floor(at[1]), wp.floor(at[2]))
-    x, along_x = _pair(int(least[0]), n[0], periodic[0])
-    y, along_y = _pair(int(least[1]), n[1], periodic[1])
-    z, along_z = _pair(int(least[2]), n[2], periodic[2])
+    x, along_x = pair(int(least[0]), n[0], periodic[0])
+    y, along_y = pair(int(least[1]), n[1], periodic[1])
+    z, along_z = pair(int(least[2]), n[2], periodic[2])
     out = Stencil()
     out.base = (x * n[1] + y) * n[2] + z
     out.step = wp.vec3i(along_x * n[1] * n[2], along_y * n[2], along_z)
@@ -203,10 +199,25 @@ def fetch(u: wp.array1d[wp.vec3], at: Stencil) -> TrilinearVelocity:
 
 
 @wp.func
+def line_along_x(around: TrilinearVelocity, y: float, z: float):
+    """Returns the velocity at the fractions 0, y and z, and its slope along x."""
+    near = (around.yz * z + around.y) * y + (around.z * z + around.c)
+    slope = (around.xyz * z + around.xy) * y + (around.xz * z + around.x)
+    return near, slope
+
+
+@wp.func
 def evaluate(around: TrilinearVelocity, f: wp.vec3) -> wp.vec3:
-    near = (around.yz * f[2] + around.y) * f[1] + (around.z * f[2] + around.c)
-    slope = (around.xyz * f[2] + around.xy) * f[1] + (around.xz * f[2] + around.x)
+    near, slope = line_along_x(around, f[1], f[2])
     return slope * f[0] + near
+
+
+@wp.func
+def in_reach(half: wp.vec3) -> bool:
+    """Tests whether the eight velocities around a start also give that at its midpoint, at these fractions."""
+    least = wp.min(half[0], wp.min(half[1], half[2]))
+    most = wp.max(half[0], wp.max(half[1], half[2]))
+    return least >= -_REACH and most <= 1.0 + _REACH
 
 
 @wp.func
@@ -273,10 +284,8 @@ def trace_back(
     """
     fine = dt * float(box.refinement)
     half = f - 0.5 * dt * v
-    least = wp.min(half[0], wp.min(half[1], half[2]))
-    most = wp.max(half[0], wp.max(half[1], half[2]))
     w = wp.vec3()
-    if least >= -_REACH and most <= 1.0 + _REACH:
+    if in_reach(half):
         w = evaluate(around, half)
     else:
         at = stencil(box.coarse, box.periodic, box.voxel * into_domain(box, x - 0.5 * fine * v))

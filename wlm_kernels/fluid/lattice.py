@@ -29,21 +29,8 @@ from typing import Any
 
 import warp as wp
 
-from wlm_kernels.fluid.lattice_links import (
-    OUTFLOW,
-    SOLID,
-    TERMS,
-    Boundaries,
-    along,
-    condition,
-    fixed_point,
-    is_link,
-    is_outlet,
-    outflow,
-    term_of,
-    word_of,
-)
-from wlm_kernels.fluid.lattice_sets import PAIRS, STORAGES, Tables, cell_of, lattice, memory_functions
+from wlm_kernels.fluid.lattice_links import SOLID, Boundaries, is_link, word_of
+from wlm_kernels.fluid.lattice_sets import PAIRS, STORAGES, cell_of, lattice, memory_functions
 
 CAUSES = ("the density is not positive", "the speed exceeds that of sound", "not a number")
 """Reasons why a run stops, in the order of their codes."""
@@ -52,7 +39,7 @@ QUIET = (1 << 62) - 1
 """Key of an error while there is none."""
 
 # fast_math's approximate quotients and roots affect only the stress, by 1e-7 of it, not density and momentum.
-_OPTIONS = {"enable_backward": False, "max_unroll": 32, "fast_math": True}
+OPTIONS = {"enable_backward": False, "max_unroll": 32, "fast_math": True}
 
 # A key is (step * 2^31 + cell) * 4 + cause, so that the smallest key is that of the first cell in the first step.
 _CELLS = wp.constant(wp.int64(1 << 31))
@@ -163,28 +150,32 @@ def _relax(spec: Spec) -> Any:
 
 
 @functools.cache
+def mirror_tables(lattice_name: str) -> tuple[list[list[int]], list[list[int]]]:
+    """Returns for each velocity of a lattice the rows of its opposite with some of its components mirrored, where bit a
+    of the index is that of axis a; and the axes that it goes up along, and down along, as bits."""
+    c = lattice(lattice_name).c
+    rows = [[c.index(tuple(v if m >> a & 1 else -v for a, v in enumerate(each))) for m in range(8)] for each in c]
+    return rows, [[sum(1 << a for a in range(3) if sign * v[a] > 0) for sign in (1, -1)] for v in c]
+
+
+@functools.cache
 def _elements(spec: Spec, far: bool) -> Any:
-    """Builds (once) a function that returns the elements that a cell reads or writes, in a far step or at home; see
-    `lattice_links.element_of`, which does the same for one element of any lattice."""
+    """Builds (once) a function that returns the elements that a cell without links reads or writes, in a far step or at
+    home; see `lattice_links.element_of`, which does the same for one element of any lattice."""
     memory, c = memory_functions(spec.lattice, spec.storage, spec.wide), lattice(spec.lattice).c
     element, count = memory.element, len(c)
     stored, indices = STORAGES[spec.storage][0], wp.types.vector(count, memory.index)
-    # Rows of a velocity's opposite with some of its components mirrored: bit a of the index is that of axis a.
-    rows = [
-        [c.index(tuple(v if m >> a & 1 else -v for a, v in enumerate(velocity))) for m in range(8)] for velocity in c
-    ]
-    # The axes that a velocity goes up along, and down along, as bits.
-    signs = [[sum(1 << a for a in range(3) if sign * v[a] > 0) for sign in (1, -1)] for v in c]
+    rows, signs = mirror_tables(spec.lattice)
 
     @wp.func
-    def elements_at_home(f: wp.array2d[stored], b: Boundaries, i: int, word: wp.uint32) -> indices:
+    def elements_at_home(f: wp.array2d[stored], b: Boundaries, i: int) -> indices:
         out = indices()
         for q in range(wp.static(count)):
             out[q] = element(f, q, i)
         return out
 
     @wp.func
-    def elements_afar(f: wp.array2d[stored], b: Boundaries, i: int, word: wp.uint32) -> indices:
+    def elements_afar(f: wp.array2d[stored], b: Boundaries, i: int) -> indices:
         n = b.n
         p = cell_of(n, i)
         # The cells below and above, and whether slip walls are there.
@@ -215,13 +206,39 @@ def _elements(spec: Spec, far: bool) -> Any:
                     if wp.static(m & ~(signs[q][0] | signs[q][1]) == 0):
                         row = wp.where(crossed == wp.static(m), wp.static(rows[q][m]), row)
             line = x[wp.static(1 - c[q][0])] * n[1] + y[wp.static(1 - c[q][1])]
-            k = element(f, row, line * n[2] + z[wp.static(1 - c[q][2])])
-            if wp.static(spec.bounded):
-                k = wp.where(is_link(word, wp.static(q)), element(f, wp.static(q), i), k)
-            out[q] = k
+            out[q] = element(f, row, line * n[2] + z[wp.static(1 - c[q][2])])
         return out
 
     return elements_afar if far else elements_at_home
+
+
+@functools.cache
+def collision(spec: Spec) -> Any:
+    """Builds (once) a `wp.func` that computes from the populations that cell i reads those that leave it."""
+    memory, relax = memory_functions(spec.lattice, spec.storage, spec.wide), _relax(spec)
+    moments, vec = memory.moments, memory.vec
+
+    @wp.func
+    def collide(
+        g: vec, i: int, tau: float, eddy: float, forces: wp.array1d[wp.vec3], done: int, trouble: wp.array1d[wp.int64]
+    ) -> vec:
+        drho, j, diagonal, off = moments(g)
+        rho = 1.0 + drho
+        j2 = wp.dot(j, j)
+        if not (rho > 0.0 and j2 < _SOUND2 * rho * rho):
+            code = int(1)
+            if not (j2 >= 0.0):
+                code = 2
+            elif rho <= 0.0:
+                code = 0
+            key = wp.int64(done) * _CELLS + wp.int64(i)
+            wp.atomic_min(trouble, 0, key * _CODES + wp.int64(code))
+        push = wp.vec3()
+        if wp.static(spec.forced):
+            push = forces[i]
+        return relax(drho, j, diagonal, off, push, tau, eddy)
+
+    return collide
 
 
 @functools.cache
@@ -232,12 +249,11 @@ def step_kernel(spec: Spec, reads: bool, writes: bool) -> wp.Kernel:
         spec: The settings.
         reads: Whether populations are read far, see `lattice_links`.
         writes: Whether they are written far. In place it is the same as `reads`. If only `writes` is true, both arrays
-            have the populations that arrive, with what links add to them except for that step's: `settle` adds it.
+            have the populations that arrive.
 
     Args of the kernel, for N cells and Q velocities:
-        t: The velocity set.
-        b: The boundaries; `net` is used.
-        f: [Q, N], the populations.
+        b: The boundaries; `net` is set to 0.
+        f: [Q, N], the populations, settled, see `lattice_fields`.
         tau: Relaxation time, 1/2 + 3 nu.
         eddy: `eddy_factor`, used if `spec.eddies`.
         forces: vec3 [N], acceleration of each cell's fluid in cells per step squared, used if `spec.forced`.
@@ -246,51 +262,14 @@ def step_kernel(spec: Spec, reads: bool, writes: bool) -> wp.Kernel:
         trouble: int64 [1], lowered to the key of the first cell in which the flow blew up, see `trouble_of`.
         out: [Q, N], the populations after the step; `f` itself in place.
     """
-    memory, relax = memory_functions(spec.lattice, spec.storage, spec.wide), _relax(spec)
+    memory, collide = memory_functions(spec.lattice, spec.storage, spec.wide), collision(spec)
     elements_read, elements_written = _elements(spec, reads), _elements(spec, writes)
-    moments, peek, poke = memory.moments, memory.peek, memory.poke
-    load, store, vec = memory.load, memory.store, memory.vec
+    element, peek, poke, vec = memory.element, memory.peek, memory.poke, memory.vec
     stored, count = STORAGES[spec.storage][0], len(lattice(spec.lattice).c)
-    settled = reads != writes
 
-    @wp.func
-    def add_terms(t: Tables, b: Boundaries, i: int, word: wp.uint32, done: int):
-        """Returns the moments of what links add to the populations that arrive."""
-        drho = float(0.0)
-        j = wp.vec3()
-        diagonal = wp.vec3()
-        off = wp.vec3()
-        p = cell_of(b.n, i)
-        for q in range(1, t.w.shape[0]):
-            if is_link(word, q):
-                v = term_of(t, b, p, q, done)
-                c = along(t, q)
-                drho += v
-                j += v * c
-                diagonal += v * wp.cw_mul(c, c)
-                off += v * wp.vec3(c[0] * c[1], c[0] * c[2], c[1] * c[2])
-        return drho, j, diagonal, off
-
-    @wp.func
-    def send_out(
-        t: Tables, b: Boundaries, f: wp.array2d[stored], i: int, word: wp.uint32, drho: float, u: wp.vec3, done: int
-    ):
-        """Writes what outlets send back to a cell."""
-        p = cell_of(b.n, i)
-        net = float(0.0)
-        for q in range(1, t.w.shape[0]):
-            if is_link(word, q):
-                kind, excess = condition(t, b, p, q)
-                if is_outlet(kind):
-                    v = outflow(t, b, p, q, kind, excess, drho, u)
-                    net += v - load(f, q, i)
-                    store(f, q, i, v)
-        wp.atomic_add(b.net, (done + 1) % 3, fixed_point(net))
-
-    @wp.kernel(module="unique", module_options=_OPTIONS)
+    @wp.kernel(module="unique", module_options=OPTIONS)
     def step(
         # in:
-        t: Tables,
         b: Boundaries,
         f: wp.array2d[stored],
         tau: float,
@@ -305,44 +284,30 @@ def step_kernel(spec: Spec, reads: bool, writes: bool) -> wp.Kernel:
         i = wp.tid()
         if i == 0:
             clock[1 - parity] = clock[parity] + 1
-            b.net[(clock[parity] + 2) % 3] = wp.int64(0)
-        word = wp.uint32(0)
-        if wp.static(spec.bounded):
-            word = word_of(b, i)
-            if (word & SOLID) != wp.uint32(0):
-                return
-        elements = elements_read(f, b, i, word)
+            b.net[0] = wp.int64(0)
+        elements = elements_read(f, b, i)
         g = vec()
         for q in range(wp.static(count)):
             g[q] = float(peek(f, elements[q]))
-        drho, j, diagonal, off = moments(g)
-        if wp.static(spec.bounded and not settled):
-            if (word & TERMS) != wp.uint32(0):
-                more, more_j, more_diagonal, more_off = add_terms(t, b, i, word, clock[parity])
-                drho += more
-                j += more_j
-                diagonal += more_diagonal
-                off += more_off
-        rho = 1.0 + drho
-        j2 = wp.dot(j, j)
-        if not (rho > 0.0 and j2 < _SOUND2 * rho * rho):
-            code = int(1)
-            if not (j2 >= 0.0):
-                code = 2
-            elif rho <= 0.0:
-                code = 0
-            key = wp.int64(clock[parity]) * _CELLS + wp.int64(i)
-            wp.atomic_min(trouble, 0, key * _CODES + wp.int64(code))
-        push = wp.vec3()
-        if wp.static(spec.forced):
-            push = forces[i]
-        left = relax(drho, j, diagonal, off, push, tau, eddy)
-        if wp.static(settled):
-            elements = elements_written(f, b, i, word)
+        word = wp.uint32(0)
+        if wp.static(spec.bounded):
+            # After the populations, for which it would be one more latency.
+            word = word_of(b, i)
+            if (word & SOLID) != wp.uint32(0):
+                return
+            if wp.static(reads):
+                if word != wp.uint32(0):
+                    for q in range(1, wp.static(count)):
+                        if is_link(word, wp.static(q)):
+                            elements[q] = element(f, wp.static(q), i)
+                            g[q] = float(peek(f, elements[q]))
+        left = collide(g, i, tau, eddy, forces, clock[parity], trouble)
+        if wp.static(reads != writes):
+            elements = elements_written(f, b, i)
+            for q in range(1, wp.static(count)):
+                if is_link(word, wp.static(q)):
+                    elements[q] = element(f, wp.static(q), i)
         for q in range(wp.static(count)):
             poke(out, elements[q], out.dtype(left[wp.static(((q - 1) ^ 1) + 1 if q else 0)]))
-        if wp.static(spec.bounded):
-            if (word & OUTFLOW) != wp.uint32(0):
-                send_out(t, b, out, i, word, drho, (j + push) / rho, clock[parity])
 
     return step

@@ -18,6 +18,7 @@ from wlm_kernels.fluid.lattice_links import (
     SOLID,
     TERMS,
     Boundaries,
+    add_up,
     along,
     body_behind,
     body_velocity,
@@ -25,12 +26,14 @@ from wlm_kernels.fluid.lattice_links import (
     condition,
     element_of,
     face_cell,
+    face_cell_at,
     fixed_point,
     is_link,
     is_outlet,
     is_solid,
     mirrored,
     outflow,
+    shift,
     term_of,
     word_of,
 )
@@ -45,6 +48,7 @@ from wlm_kernels.fluid.lattice_sets import (
     opposite,
     wrapped,
 )
+from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
 wp.set_module_options({"enable_backward": False})
 
@@ -123,19 +127,24 @@ class FluidKernels:
         fields: Computes the density minus 1 and the velocity.
         start: Sets the equilibrium of given ones.
         arrivals: Computes the populations that arrive, complete with what links add.
-        settle: Adds to populations that arrive what links add to them.
+        settle: Adds to populations that arrive what links add to them, before a step: in the cells of faces, or in
+            `every` cell.
+        send_out: Sets what outlets send back, in the cells of faces, after a step that was far or not.
         neighbours: For each cell that becomes fluid, computes the means of the fluid around it.
         uncover: Sets the equilibrium of these, and moves what lies between a cell that changes and its neighbours.
         force: Sums the force of the fluid on each body.
+        convert: Converts populations that arrive to another time step.
     """
 
     fields: wp.Kernel
     start: wp.Kernel
     arrivals: wp.Kernel
     settle: wp.Kernel
+    send_out: wp.Kernel
     neighbours: wp.Kernel
     uncover: wp.Kernel
     force: wp.Kernel
+    convert: wp.Kernel
 
 
 @functools.cache
@@ -148,6 +157,7 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
     memory = memory_functions(lattice_name, storage)
     load, store = memory.load, memory.store
     stored = STORAGES[storage][0]
+    flat = velocity_set(lattice_name).axes == 2
     options = {"enable_backward": False}
 
     @wp.func
@@ -172,7 +182,7 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
         k, row = element_of(t, b, word, p, i, q, far)
         value = load(f, row, k)
         if done >= 0 and is_link(word, q) and (word & TERMS) != wp.uint32(0):
-            value += term_of(t, b, p, q, done)
+            value += term_of(t, b, p, q, done, shift(b, word, done))
         return value
 
     @wp.func
@@ -246,7 +256,7 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
             k, row = element_of(t, b, word, p, i, q, 1 - far)
             store(f, row, k, value)
         if net != 0.0:
-            wp.atomic_add(b.net, steps_done(clock) % 3, fixed_point(net))
+            wp.atomic_add(b.net, 0, fixed_point(net))
 
     @wp.kernel(module="unique", module_options=options)
     def arrivals(
@@ -273,17 +283,56 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
         # in:
         t: Tables,
         b: Boundaries,
+        every: int,
         clock: wp.array1d[int],
         # in, out:
         f: wp.array2d[stored],
     ):
-        i = wp.tid()
+        i = int(wp.tid())
+        if every == 0:
+            i = face_cell_at(b, i)
+            if i < 0:
+                return
         word = word_of(b, i)
         if (word & TERMS) != wp.uint32(0):
             p = cell_of(b.n, i)
+            shifted = shift(b, word, steps_done(clock))
             for q in range(1, t.w.shape[0]):
                 if is_link(word, q):
-                    store(f, q, i, arrival(t, b, f, word, p, i, q, 0, steps_done(clock)))
+                    store(f, q, i, load(f, q, i) + term_of(t, b, p, q, steps_done(clock), shifted))
+
+    @wp.kernel(module="unique", module_options=options)
+    def send_out(
+        # in:
+        t: Tables,
+        b: Boundaries,
+        far: int,
+        # in, out:
+        f: wp.array2d[stored],
+    ):
+        i = face_cell_at(b, wp.tid())
+        if i < 0:
+            return
+        word = word_of(b, i)
+        if (word & OUTFLOW) == wp.uint32(0):
+            return
+        p = cell_of(b.n, i)
+        drho = float(0.0)
+        j = wp.vec3()
+        for q in range(t.w.shape[0]):
+            k, row = element_of(t, b, word, p, i, q, far)
+            g = load(f, row, k)
+            drho += g
+            j -= g * along(t, q)
+        net = float(0.0)
+        for q in range(1, t.w.shape[0]):
+            if is_link(word, q):
+                kind, excess = condition(t, b, p, q)
+                if is_outlet(kind):
+                    v = outflow(t, b, p, q, kind, excess, drho, j / (1.0 + drho))
+                    net += v - load(f, q, i)
+                    store(f, q, i, v)
+        add_up(b.net, fixed_point(net))
 
     @wp.kernel(module="unique", module_options=options)
     def neighbours(
@@ -387,4 +436,52 @@ def fluid_kernels(lattice_name: str, storage: str) -> FluidKernels:
                     _kind, term = condition(t, b, p, q)
                     wp.atomic_add(total, body, wp.float64(term - 2.0 * came) * c)
 
-    return FluidKernels(fields, start, arrivals, settle, neighbours, uncover, force)
+    @wp.kernel(module="unique", module_options=options)
+    def convert(
+        # in:
+        t: Tables,
+        b: Boundaries,
+        came: wp.array2d[stored],
+        far: int,
+        clock: wp.array1d[int],
+        forces: wp.array1d[wp.vec3],
+        tau: float,
+        eddy: float,
+        factor: float,
+        # out:
+        f: wp.array2d[stored],
+    ):
+        i = wp.tid()
+        word = word_of(b, i)
+        if (word & SOLID) != wp.uint32(0):
+            return
+        drho = float(0.0)
+        j = wp.vec3()
+        stress = wp.mat33()
+        for q in range(t.w.shape[0]):
+            g, c = load(came, q, i), along(t, q)
+            drho += g
+            j += g * c
+            stress += g * wp.outer(c, c)
+        identity = wp.identity(n=3, dtype=float)
+        if wp.static(flat):
+            identity[2, 2] = 0.0
+        stress -= wp.outer(j, j) / (1.0 + drho) + drho / 3.0 * identity
+        tau_eddy = 0.5 * (tau + wp.sqrt(tau * tau + eddy * wp.sqrt(wp.ddot(stress, stress)) / (1.0 + drho)))
+        push = wp.vec3()
+        if forces.shape[0] > 0:
+            push = forces[i]
+        # The speed scales with the step, the pressure with its square, the stress with the strain and the viscosity.
+        after = factor * factor * drho
+        j = factor * (1.0 + after) / (1.0 + drho) * (j + 0.5 * push) - 0.5 * factor * factor * push
+        stress = factor * (0.5 + factor * (tau_eddy - 0.5)) / tau_eddy * stress + wp.outer(j, j) / (1.0 + after)
+        p = cell_of(b.n, i)
+        for q in range(t.w.shape[0]):
+            c = along(t, q)
+            value = t.w[q] * (after + 3.0 * wp.dot(c, j) + 4.5 * wp.dot(c, stress * c) - 1.5 * wp.trace(stress))
+            if is_link(word, q) and (word & TERMS) != wp.uint32(0):
+                value -= term_of(t, b, p, q, steps_done(clock), shift(b, word, steps_done(clock)))
+            k, row = element_of(t, b, word, p, i, q, far)
+            store(f, row, k, value)
+
+    return FluidKernels(fields, start, arrivals, settle, send_out, neighbours, uncover, force, convert)

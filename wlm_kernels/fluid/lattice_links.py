@@ -67,9 +67,9 @@ class Boundaries:
     angular velocities and centres of the bodies.
 
     `words`, uint32 [N], have bits for each cell, see the module, and `busy`, uint32 [ceil(N / 32)], has one for each
-    cell whose word is not 0; [0] where there are neither faces nor solids. `net`, int64 [3], is the mass that the
-    outlets of a step add, at the number of steps modulo 3; `fixed`, int64 [3], the mass that walls and bodies add, that
-    inlets add, and the sum of the weights of outlets.
+    cell whose word is not 0; [0] where there are neither faces nor solids. `net`, int64 [1], is the mass that the
+    outlets of the last step add; `fixed`, int64 [3], that which walls and bodies add, that which inlets add, and the
+    sum of the weights of outlets.
     """
 
     n: wp.vec3i
@@ -227,23 +227,58 @@ def risen(b: Boundaries, done: int) -> float:
     return x * x * (3.0 - 2.0 * x)
 
 
+# One atomic sum for a warp, where all of its threads add.
+@wp.func_native("""
+#ifdef __CUDA_ARCH__
+    bool whole = __activemask() == 0xffffffff;
+    if (whole) for (int lanes = 16; lanes > 0; lanes /= 2) value += __shfl_xor_sync(0xffffffff, value, lanes);
+    if (!whole || threadIdx.x % 32 == 0) atomicAdd((unsigned long long*)sum.data, (unsigned long long)value);
+#else
+    sum.data[0] += value;
+#endif
+""")
+def add_up(sum: wp.array1d[wp.int64], value: wp.int64): ...
+
+
 @wp.func
-def shift(b: Boundaries, done: int) -> float:
-    """Returns the shift, over the weight, of populations that come from outlets in the step after `done` steps."""
-    if b.fixed[2] == wp.int64(0):
+def face_cell_at(b: Boundaries, k: int) -> int:
+    """Returns the cell at cell k of the faces; -1 if the cell is also one of a face before."""
+    face = int(0)
+    for a in range(1, 6):
+        if b.bounded[a // 2] != 0 and k >= b.first[a]:
+            face = a
+    axis = face // 2
+    width = wp.where(axis == 2, b.n[1], b.n[2])
+    row = (k - b.first[face]) // width
+    column = (k - b.first[face]) % width
+    end = wp.where(face % 2 == 0, 0, b.n[axis] - 1)
+    p = wp.vec3i(wp.where(axis == 0, end, row), wp.where(axis == 1, end, wp.where(axis == 0, row, column)), column)
+    if axis == 2:
+        p[2] = end
+    for a in range(6):
+        if a < face and b.bounded[a // 2] != 0 and p[a // 2] == wp.where(a % 2 == 0, 0, b.n[a // 2] - 1):
+            return -1
+    return index_of(b.n, p)
+
+
+@wp.func
+def shift(b: Boundaries, word: wp.uint32, done: int) -> float:
+    """Returns the shift, over the weight, of what outlets send into a cell in the step after `done` steps."""
+    if (word & OUTFLOW) == wp.uint32(0) or b.fixed[2] == wp.int64(0):
         return 0.0
-    net = wp.float64(b.net[done % 3] + b.fixed[0]) + wp.float64(risen(b, done)) * wp.float64(b.fixed[1])
-    return float(net / wp.float64(b.fixed[2]))
+    net = b.net[0] + b.fixed[0]
+    inlets = wp.float64(risen(b, done)) * wp.float64(b.fixed[1])
+    return float((wp.float64(net) + inlets) / wp.float64(b.fixed[2]))
 
 
 @wp.func
-def term_of(t: Tables, b: Boundaries, p: wp.vec3i, q: int, done: int) -> float:
-    """Returns what a link adds to the population that it reads in the step after `done` steps."""
+def term_of(t: Tables, b: Boundaries, p: wp.vec3i, q: int, done: int, shifted: float) -> float:
+    """Returns what a link adds to the population that it reads in the step after `done` steps, see `shift`."""
     kind, term = condition(t, b, p, q)
     if kind == _INLET:
         return risen(b, done) * term
     if kind == _OUTLET:
-        return -t.w[q] * shift(b, done)
+        return -t.w[q] * shifted
     if kind == _BOUNCE:
         return term
     return 0.0
@@ -313,7 +348,12 @@ def _mark(
             word = SOLID
         else:
             p = cell_of(b.n, i)
+            inside = p[0] > 0 and p[1] > 0 and p[2] > 0
+            inside = inside and p[0] < b.n[0] - 1 and p[1] < b.n[1] - 1 and p[2] < b.n[2] - 1
             for q in range(1, t.w.shape[0]):
+                # Nearly all cells are of fluid between fluid.
+                if inside and not is_solid(b, index_of(b.n, p - t.c[q])):
+                    continue
                 kind, term = condition(t, b, p, q)
                 if kind >= 0 and kind != _SLIP:
                     word = word | (wp.uint32(1) << wp.uint32(q))

@@ -192,8 +192,7 @@ class _Search:
         if len(rows) <= _TOGETHER:
             weight = torch.cat(list(self._weights(moved)))
             square = weight.T @ weight
-            latent = _fitted(square, weight.T @ self._latent, self._put(latent), _OF_LATENTS)
-            feed = _feed(square, _OF_LATENTS)
+            latent, feed = _fitted(square, weight.T @ self._latent, self._put(latent), _OF_LATENTS)
         latent = _fed(latent, np.tile(step[STORED_LATENT], (len(rows), 1)), feed, CODES // 2)
         net_step = [steps.first * each for each in self._of_first]
         net_step += [steps.position] * 4 + [steps.second, steps.third]
@@ -204,8 +203,8 @@ class _Search:
         for number, layer in enumerate(self._layers):
             own = net_step[: latents + 4] if number == 0 else np.full(len(layer), net_step[latents + 3 + number])
             square = inputs.T @ inputs
-            fitted = _fitted(square, inputs.T @ wanted[number], self._put(layer), _OF_LAYERS)
-            net.append(_fed(fitted, np.repeat(own[:, None], layer.shape[1], 1), _feed(square, _OF_LAYERS), LARGEST))
+            fitted, own_feed = _fitted(square, inputs.T @ wanted[number], self._put(layer), _OF_LAYERS)
+            net.append(_fed(fitted, np.repeat(own[:, None], layer.shape[1], 1), own_feed, LARGEST))
             result = inputs @ self._put(net[-1] * own[:, None])
             inputs = _with_one(result.sigmoid())
         numbers = np.concatenate([whole, latent], 1).astype(np.int64)
@@ -251,16 +250,17 @@ def stored_step(step: float) -> float:
     return float(np.array(bits << 16, np.uint32).view(np.float32))
 
 
-def _fitted(square: torch.Tensor, right: torch.Tensor, before: torch.Tensor, share: float) -> np.ndarray:
-    """Solves normal equations with ridge regularisation towards the solution `before`."""
-    ridge = _ridge(square, share)
-    return torch.linalg.solve(square + ridge, right + ridge @ before).cpu().numpy()
-
-
-def _feed(square: torch.Tensor, share: float) -> np.ndarray:
-    """Returns the upper Cholesky factor of the inverse of a symmetric matrix plus `share` of a ridge, [I, I]."""
-    inverse = torch.linalg.inv(square + _ridge(square, share))
-    return torch.linalg.cholesky(0.5 * (inverse + inverse.T), upper=True).cpu().numpy()
+def _fitted(
+    square: torch.Tensor, right: torch.Tensor, before: torch.Tensor, share: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Solves normal equations with ridge regularisation, `share` of the mean of the diagonal, towards the solution
+    `before`. Returns the solution and the upper Cholesky factor of the inverse of the regularised matrix, [I, I]."""
+    ridge = max(share * float(square.trace()) / len(square), np.finfo(np.float32).tiny)
+    one = torch.eye(len(square), dtype=square.dtype, device=square.device)
+    # A = R R^T with upper R, so that A^-1 = U^T U with U = R^-1.
+    root = torch.linalg.cholesky((square + ridge * one).flip(0, 1)).flip(0, 1)
+    upper = torch.linalg.solve_triangular(root, one, upper=True)
+    return (upper.T @ (upper @ (right + ridge * before))).cpu().numpy(), upper.cpu().numpy()
 
 
 def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: int) -> np.ndarray:
@@ -278,12 +278,6 @@ def _fed(numbers: np.ndarray, step: np.ndarray, feed: np.ndarray | None, most: i
             own[row + 1 :] -= factor[row + 1 :, None] * over[row]
         numbers[start + _ROWS :] -= feed[part, start + _ROWS :].T @ over
     return whole
-
-
-def _ridge(square: torch.Tensor, share: float) -> torch.Tensor:
-    """Returns `share` of the mean of the diagonal, times the unit matrix."""
-    least = max(share * float(square.trace()) / len(square), np.finfo(np.float32).tiny)
-    return least * torch.eye(len(square), dtype=square.dtype, device=square.device)
 
 
 def _with_one(inputs: torch.Tensor) -> torch.Tensor:
