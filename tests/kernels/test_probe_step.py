@@ -69,7 +69,7 @@ class Step:
         self.by_group = wp.full((len(boxes), -(-count // 32)), 7, dtype=wp.uint32, device=device)
         self.by_gaussian = wp.full((count, -(-len(boxes) // 32)), 7, dtype=wp.uint32, device=device)
         self.f = nan(1 if device == "cpu" else SPLITS, latent, self.padded)
-        self.sums = nan(count, SHAPE_NUMBERS + latent)
+        self.sums = nan(count * (1 if device == "cpu" else probe_step.PARTS), SHAPE_NUMBERS + latent)
 
     def prepare(self, quantised: int = 0) -> None:
         self.launches.shapes(
@@ -88,7 +88,7 @@ class Step:
         whole[:, : grad_f.shape[1]] = grad_f
         grad = array(whole, float, self.device)
         self.launches.collect(self.groups, self.shapes, self.used, self.by_gaussian, grad, self.cut, self.sums, *lane)
-        return self.sums.numpy()
+        return self.sums.numpy().reshape(len(self.used), -1, self.sums.shape[1]).sum(1)
 
 
 def _bits(words: wp.array, count: int) -> np.ndarray:

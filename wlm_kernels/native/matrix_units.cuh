@@ -60,6 +60,13 @@ struct Units {
             : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
             : "r"(upper), "r"(lower), "r"(b));
     }
+    // c += a b of 16 x 8 and 8 x 8; of each float only the upper 19 bits count (tf32). A lane holds the columns q and q + 4 of a.
+    static __device__ void multiply_floats(float* c, const float* a, float upper, float lower) {
+        asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0,%1,%2,%3}, {%4,%5,%6,%7}, {%8,%9}, {%0,%1,%2,%3};"
+            : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
+            : "r"(__float_as_uint(a[0])), "r"(__float_as_uint(a[1])), "r"(__float_as_uint(a[2])),
+              "r"(__float_as_uint(a[3])), "r"(__float_as_uint(upper)), "r"(__float_as_uint(lower)));
+    }
     // Four 8 x 8 pieces of halves from shared memory; lane l gives the address of row l % 8 of piece l / 8.
     static __device__ void load(unsigned* r, const void* row) {
         asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0,%1,%2,%3}, [%4];"

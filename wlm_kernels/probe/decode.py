@@ -23,7 +23,6 @@ from wlm_kernels.probe.network import cpu_network
 _THREADS = 128
 _POINTS = 32  # of a block of threads on CUDA
 _BLOCKS = 1056  # most blocks of a launch, which take turns
-_NONE = wp.constant(1 << 30)
 
 
 @wp.struct
@@ -241,15 +240,13 @@ def _cuda_kernels(layout: str) -> tuple[Any, Any]:
         out: wp.array2d[float],
     ): ...
 
-    @wp.func
+    # A warp has a thread for each point of a block.
+    @wp.func_native("""
+    const int i = first + threadIdx.x % 32, r = i < region.shape[0] ? region.data[i] : -1;
+    return __reduce_min_sync(~0u, r > after ? r : 1 << 30);
+    """)
     def next_region(region: wp.array1d[int], first: int, after: int) -> int:
         """Returns the lowest region above `after` among the points of a block; a large number if there is none."""
-        found = int(_NONE)
-        for j in range(first, wp.min(first + wp.static(_POINTS), region.shape[0])):
-            r = region[j]
-            if r > after:
-                found = wp.min(found, r)
-        return found
 
     @wp.kernel(module="unique", module_options=options)
     def decode(
@@ -291,8 +288,14 @@ def _cuda_kernels(layout: str) -> tuple[Any, Any]:
     ):
         block, t = wp.tid()
         count = x.shape[0]
-        while block * wp.static(_POINTS) < count:
-            first = block * wp.static(_POINTS)
+        # A block decodes neighbouring points, most of which are in the region whose network it has.
+        pieces = (count + wp.static(_POINTS - 1)) // wp.static(_POINTS)
+        blocks = wp.min(pieces, _BLOCKS)
+        piece = block * (pieces // blocks) + wp.min(block, pieces % blocks)
+        end = (block + 1) * (pieces // blocks) + wp.min(block + 1, pieces % blocks)
+        kept = int(-1)
+        while piece < end:
+            first = piece * wp.static(_POINTS)
             i = wp.min(first + t // share, count - 1)
             r = next_region(region, first, -1)
             while r < table.shape[0]:
@@ -302,17 +305,19 @@ def _cuda_kernels(layout: str) -> tuple[Any, Any]:
                 if own.net.shape[0] > 0:
                     cube = cube_of(own.cubes, x[i])
                     begin = own.cubes.start[cube]
-                    end = own.cubes.start[cube + 1]
+                    until = own.cubes.start[cube + 1]
                     k = own.shapes.shape[0]
                     item = own.cubes.item
+                    new = wp.where(r == kept, 0, 1)
                     decode_block(
-                        own.rows, k, item, begin, end, cut, own.net, own.gain, x[i], block, 1, count, region, r, out
+                        own.rows, k, item, begin, until, cut, own.net, own.gain, x[i], piece, new, count, region, r, out
                     )
+                    kept = r
                 elif region[i] == r and t % share == 0:
                     for c in range(out.shape[1]):
                         out[i, c] = own.gain
                 r = next_region(region, first, r)
-            block += _BLOCKS
+            piece += 1
 
     return decode, regional
 

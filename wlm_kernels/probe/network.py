@@ -2,13 +2,12 @@
 and 8).
 
 The network has L + 3 inputs (the summed latent vector and the position), two hidden layers of H units and D outputs,
-the numbers of a probe. Its weights are one array: for each layer a
-row for every input, then the biases; a row of the last layer is padded to a multiple of four numbers.
+the numbers of a probe. Its weights are one array: for each layer a row for every input, then the biases; a row of the
+last layer is padded to a multiple of four numbers.
 
-On CUDA a block of threads evaluates all layers for up to 64 probes in shared memory; a thread computes 4 probes by 8
-units at a time, since one probe per thread would spill registers. This is CUDA C++, in `native/layers.cuh` and
-`native/network.cuh`. On the CPU a thread evaluates one probe. Each block writes a partial gradient of the weights; the
-partial gradients are added in a fixed order. The reference is `tests/reference/probe_network.py`.
+On CUDA a block of threads evaluates all layers for up to 64 probes in shared memory, on the matrix units, in CUDA C++
+(`native/network.cuh`). On the CPU a thread evaluates one probe. Each block writes a partial gradient of the weights;
+the partial gradients are added in a fixed order. The reference is `tests/reference/probe_network.py`.
 """
 
 import functools
@@ -19,9 +18,9 @@ import warp as wp
 
 from wlm_kernels.native import native_source
 
-THREADS = 128
-_AT_ONCE = (64, 32, 16, 8, 4)
-_SHARED = 47 * 1024  # bytes of shared memory that a block has by default, less a reserve
+THREADS = 256
+_AT_ONCE = (64, 32, 16, 8)
+_SHARED = 45 * 1024  # bytes of shared memory that a block has by default, less what Warp takes
 CPU_LANES = 2
 
 
@@ -30,24 +29,20 @@ def padded(outputs: int) -> int:
     return -(-outputs // 4) * 4
 
 
+def _eights(rows: int) -> int:
+    return -(-rows // 8) * 8
+
+
 def most_outputs(latent: int, hidden: int) -> int:
     """Returns the largest number of outputs with which the network fits in the shared memory of a CUDA block."""
-    rows = _SHARED // (4 * (_AT_ONCE[-1] + 4))
-    return (rows - (latent + 3 + 2 * hidden)) // 4 * 4
+    return _SHARED // (4 * _AT_ONCE[-1]) // 8 * 8 - _eights(latent + 4) - 2 * hidden
 
 
 def probes_at_once(latent: int, hidden: int, outputs: int) -> int:
     """Returns how many probes, at most 64, a CUDA block can evaluate within its shared memory. With more outputs than
     `most_outputs`, the kernels only run on the CPU, where the result has no effect."""
-    rows = latent + 3 + 2 * hidden + padded(outputs)
-    return next((p for p in _AT_ONCE if rows * (p + 4) * 4 <= _SHARED), _AT_ONCE[-1])
-
-
-def layer_code(latent: int, hidden: int, outputs: int, probes: int) -> str:
-    """Returns the CUDA code of the network's layers for a block of probes (`native/layers.cuh`), with sizes as
-    constants; kernels append their own code."""
-    sizes = {"L": latent, "H": hidden, "D": outputs, "DP": padded(outputs)}
-    return native_source(__package__, "layers", **sizes, P=probes, T=THREADS)
+    rows = _eights(latent + 4) + 2 * hidden + _eights(outputs)
+    return next((p for p in _AT_ONCE if 4 * rows * p <= _SHARED), _AT_ONCE[-1])
 
 
 @dataclass(frozen=True)
@@ -182,7 +177,10 @@ def network_kernels(latent: int, hidden: int, outputs: int, device_kind: str) ->
     forward, hidden_row, output_row = net_of.forward, net_of.hidden_row, net_of.output_row
     add_hidden, add_output = _add_to(vec_hidden, hidden), _add_to(vec_out, wide)
 
-    @wp.func_native(layer_code(latent, hidden, outputs, probes) + native_source(__package__, "network"))
+    sizes = {"L": latent, "H": hidden, "D": outputs, "DP": wide, "P": probes, "T": THREADS}
+    sizes |= {"XR": _eights(inputs + 1), "ER": _eights(outputs)}
+
+    @wp.func_native(native_source("wlm_kernels", "matrix_units") + native_source(__package__, "network", **sizes))
     def network(
         x: wp.array1d[wp.vec3],
         count: int,

@@ -22,7 +22,9 @@ from wlm_kernels.probe.gaussians import LATENT, SHAPE_NUMBERS, Shape, functions,
 
 GROUP = 64  # probes
 SPLITS = 4  # threads that share a probe's sum on CUDA; one thread for each of 15,000 probes leaves most of a GPU idle
-_COLLECTORS = 256  # threads that share a Gaussian's gradient on CUDA
+PARTS = 4  # blocks of threads that share a Gaussian's gradient on CUDA: some Gaussians reach all groups, most a few
+_COLLECTORS = 128  # threads of such a block
+_SMALL = 32  # threads of the blocks that make shapes, whose scattered stores would keep a few processors busy for long
 
 # Range of the logarithm of a scale, in the normalised frame.
 LOG_SCALES = wp.constant(wp.vec2(-9.21, 1.39))  # 1e-4 to 4
@@ -30,7 +32,8 @@ ADAM = wp.constant(wp.vec2(0.9, 0.999))
 ADAN = wp.constant(wp.vec3(0.98, 0.92, 0.99))  # as Xie et al. and pytorch-optimizer have them
 EPSILON = wp.constant(1.0e-8)
 
-_vec8 = wp.types.vector(8, float)
+_IN_FLIGHT = 32  # loads of partial gradients
+_vec_loads = wp.types.vector(_IN_FLIGHT, float)
 
 
 @wp.struct
@@ -111,22 +114,33 @@ def _touch(
     # in:
     groups: Groups,
     shapes: wp.array1d[Shape],
-    transposed: int,
     lanes: int,
     # out:
-    bits: wp.array2d[wp.uint32],
+    by_group: wp.array2d[wp.uint32],
+    by_gaussian: wp.array2d[wp.uint32],
 ):
-    row, word, lane = wp.tid()
-    word_bits = wp.uint32(0)
+    at, lane = wp.tid()
+    width = by_group.shape[1]
+    transposed = int(0)
+    if at >= by_group.shape[0] * width:
+        at -= by_group.shape[0] * width
+        width = by_gaussian.shape[1]
+        transposed = 1
+    row = at // width
+    word = at % width
+    bits = wp.uint32(0)
     if lanes == 32:
         # The last dimension has 32 threads, which are one warp in every launch on CUDA.
-        word_bits = _ballot(_meet(groups, shapes, transposed, row, word * 32 + lane))
+        bits = _ballot(_meet(groups, shapes, transposed, row, word * 32 + lane))
     else:
         for b in range(32):
             met = _meet(groups, shapes, transposed, row, word * 32 + b)
-            word_bits = word_bits | (wp.uint32(met) << wp.uint32(b))
+            bits = bits | (wp.uint32(met) << wp.uint32(b))
     if lane == 0:
-        bits[row, word] = word_bits
+        if transposed != 0:
+            by_gaussian[row, word] = bits
+        else:
+            by_group[row, word] = bits
 
 
 def touch(groups, shapes, by_group, by_gaussian) -> None:
@@ -141,9 +155,8 @@ def touch(groups, shapes, by_group, by_gaussian) -> None:
     """
     device = shapes.device
     lanes = 32 if device.is_cuda else 1
-    for transposed, bits in enumerate((by_group, by_gaussian)):
-        inputs = [groups, shapes, transposed, lanes]
-        wp.launch(_touch, (*bits.shape, lanes), inputs=inputs, outputs=[bits], device=device)
+    inputs, outputs = [groups, shapes, lanes], [by_group, by_gaussian]
+    wp.launch(_touch, (by_group.size + by_gaussian.size, lanes), inputs=inputs, outputs=outputs, device=device)
 
 
 @dataclass(frozen=True)
@@ -160,7 +173,7 @@ class StepKernels:
         """Compiles the kernels for a device, which would otherwise happen at their first launches."""
         # A module is compiled anew for each size of blocks that is launched.
         blocks = {
-            self._shapes: None,
+            self._shapes: _SMALL if self.device_kind == "cuda" else None,
             self._features: GROUP,
             self._collect: _COLLECTORS,
             self._update: None,
@@ -182,7 +195,8 @@ class StepKernels:
             shapes: Shape [K], written.
         """
         inputs = [rows, bounds, quantised, levels, cut, sphere]
-        wp.launch(self._shapes, rows.shape[0], inputs=inputs, outputs=[used, shapes], device=rows.device)
+        options = {"block_dim": _SMALL} if self.device_kind == "cuda" else {}
+        wp.launch(self._shapes, rows.shape[0], inputs=inputs, outputs=[used, shapes], device=rows.device, **options)
 
     def features(self, groups, shapes, used, by_group, cut, f, base=0, count=None) -> None:
         """Sums the Gaussians at each probe.
@@ -203,12 +217,13 @@ class StepKernels:
         Args:
             groups, shapes, used, by_gaussian, cut: The same as for `touch` and `shapes`.
             grad_f: float [L, N], gradient with respect to the result of `features`; 0 from index `groups.count` on.
-            sums: float [K, 9 + L], the sums of `GaussianFunctions.accumulate`, written.
+            sums: float [K P, 9 + L], the sums of `GaussianFunctions.accumulate`, written: those of each Gaussian in P
+                parts, P = `PARTS` on CUDA and 1 on the CPU.
             base, count: Index of the first Gaussian and number of Gaussians of this launch, on the CPU alone; default
                 all.
         """
         gaussians = used.shape[0]
-        dims = (gaussians, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
+        dims = (gaussians, PARTS, _COLLECTORS) if self.device_kind == "cuda" else count or gaussians
         inputs = [groups, shapes, used, by_gaussian, grad_f, cut, base]
         wp.launch(self._collect, dims, inputs=inputs, outputs=[sums], device=sums.device, block_dim=_COLLECTORS)
 
@@ -220,7 +235,7 @@ class StepKernels:
             rows: float [K, 10 + L], parameters of the Gaussians, updated.
             used: float [K, 10 + L], parameters at which the gradients were taken.
             shapes: Shape [K], made from `used`.
-            sums: float [K, 9 + L], result of `collect`.
+            sums: float [K P, 9 + L], result of `collect`.
             moments: float [4, K, 10 + L], Adan's or Adam's running means for the Gaussians, updated.
             net: float [P], weights of the network, updated.
             net_moments: float [2, P], Adam's running means for the network, updated.
@@ -245,7 +260,7 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
     channels = LATENT + latent
     options = {"enable_backward": False, "max_unroll": 32}
     cuda = device_kind == "cuda"
-    block_sum = _block_sum(vec_sums, SHAPE_NUMBERS + latent)
+    block_sum, teams = _block_sum(vec_sums, SHAPE_NUMBERS + latent), _COLLECTORS // GROUP
 
     @wp.kernel(module="unique", module_options=options)
     def shapes_kernel(
@@ -282,14 +297,13 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
         by_group: wp.array2d[wp.uint32],
         cut: float,
         i: int,
-        first: int,
-        stride: int,
+        mask: wp.uint32,
     ) -> vec_latent:
         g = i // GROUP
         x = groups.x[i]
         f = vec_latent()
-        for w in range(first, by_group.shape[1], stride):
-            bits = by_group[g, w]
+        for w in range(by_group.shape[1]):
+            bits = by_group[g, w] & mask
             while bits != wp.uint32(0):
                 k = w * 32 + next_bit(bits)
                 bits = bits & (bits - wp.uint32(1))
@@ -305,23 +319,17 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
         grad_f: wp.array2d[float],
         cut: float,
         k: int,
-        first: int,
-        stride: int,
+        mask: wp.uint32,
         lane: int,
         lanes: int,
     ) -> vec_sums:
         s = vec_sums()
         shape = shapes[k]
-        turn = int(0)
         for w in range(by_gaussian.shape[1]):
-            bits = by_gaussian[k, w]
+            bits = by_gaussian[k, w] & mask
             while bits != wp.uint32(0):
                 g = w * 32 + next_bit(bits)
                 bits = bits & (bits - wp.uint32(1))
-                # The threads that share the Gaussian take the groups in turn.
-                turn += 1
-                if turn % stride != first:
-                    continue
                 for j in range(lane, GROUP, lanes):
                     i = g * GROUP + j
                     # Most probes of a group may be out of reach: the test comes before their gradients are loaded.
@@ -348,12 +356,12 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
         if wp.static(cuda):
             g, split, lane = wp.tid()
             i = g * GROUP + lane
-            s = sum_at(groups, shapes, used, by_group, cut, i, split, SPLITS)
+            s = sum_at(groups, shapes, used, by_group, cut, i, wp.static(_mask(SPLITS)) << wp.uint32(split))
             for c in range(wp.static(latent)):
                 f[split, c, i] = s[c]
         else:
             i = base + wp.tid()
-            s = sum_at(groups, shapes, used, by_group, cut, i, 0, 1)
+            s = sum_at(groups, shapes, used, by_group, cut, i, wp.static(_mask(1)))
             for c in range(wp.static(latent)):
                 f[0, c, i] = s[c]
 
@@ -371,18 +379,23 @@ def step_kernels(latent: int, device_kind: str) -> StepKernels:
         sums: wp.array2d[float],
     ):
         if wp.static(cuda):
-            k, t = wp.tid()
-            s = sums_of(
-                groups, shapes, used, by_gaussian, grad_f, cut, k, t // GROUP, _COLLECTORS // GROUP, t % GROUP, GROUP
-            )
-            block_sum(s, k, sums)
+            k, part, t = wp.tid()
+            share = part * wp.static(teams) + t // GROUP
+            mask = wp.static(_mask(PARTS * teams)) << wp.uint32(share)
+            s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, mask, t % GROUP, GROUP)
+            block_sum(s, k * PARTS + part, sums)
         else:
             k = base + wp.tid()
-            s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, 0, 1, 0, 1)
+            s = sums_of(groups, shapes, used, by_gaussian, grad_f, cut, k, wp.static(_mask(1)), 0, 1)
             for c in range(wp.static(SHAPE_NUMBERS + latent)):
                 sums[k, c] = s[c]
 
     return StepKernels(device_kind, shapes_kernel, features, collect, update_kernel(latent))
+
+
+def _mask(share: int) -> wp.uint32:
+    """Returns a word with one of each `share` bits set, the bits of a word that are for the first of so many."""
+    return wp.uint32(sum(1 << bit for bit in range(0, 32, share)))
 
 
 def _block_sum(vec_sums, numbers: int):
@@ -419,13 +432,12 @@ def update_kernel(latent: int):
         rate = o.schedule[t - 1]
         if i < net.shape[0]:
             g = float(0.0)
-            whole = partial.shape[0] // 8 * 8
-            for b in range(0, whole, 8):
-                # Eight loads are in flight at once.
-                part = _vec8()
-                for u in range(8):
+            whole = partial.shape[0] // _IN_FLIGHT * _IN_FLIGHT
+            for b in range(0, whole, _IN_FLIGHT):
+                part = _vec_loads()
+                for u in range(_IN_FLIGHT):
                     part[u] = partial[b + u, i]
-                for u in range(8):
+                for u in range(_IN_FLIGHT):
                     g += part[u]
             for b in range(whole, partial.shape[0]):
                 g += partial[b, i]
@@ -440,15 +452,18 @@ def update_kernel(latent: int):
             k = (i - net.shape[0]) // wp.static(channels)
             c = (i - net.shape[0]) % wp.static(channels)
             g = float(0.0)
+            parts = sums.shape[0] // rows.shape[0]
             if c < LATENT:
                 # The values that the step used, since other threads are changing the rows.
                 s = vec_sums()
-                for a in range(SHAPE_NUMBERS):
-                    s[a] = sums[k, a]
+                for p in range(k * parts, (k + 1) * parts):
+                    for a in range(SHAPE_NUMBERS):
+                        s[a] += sums[p, a]
                 gradient = chain(s, shapes[k], used, k)
                 g = gradient[c]
             else:
-                g = sums[k, SHAPE_NUMBERS + c - LATENT]
+                for p in range(k * parts, (k + 1) * parts):
+                    g += sums[p, SHAPE_NUMBERS + c - LATENT]
             beta1 = wp.where(o.adan != 0, ADAN[0], ADAM[0])
             beta2 = ADAN[1]
             beta3 = wp.where(o.adan != 0, ADAN[2], ADAM[1])

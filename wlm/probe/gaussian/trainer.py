@@ -175,7 +175,7 @@ class Trainer:
             "used": zeros(count, channels),
             "f": zeros(probe_step.SPLITS if self._cuda else 1, latent, padded),
             "grad_f": zeros(latent, padded),
-            "sums": zeros(count, SHAPE_NUMBERS + latent),
+            "sums": zeros(count * (probe_step.PARTS if self._cuda else 1), SHAPE_NUMBERS + latent),
             "partial": zeros(parts, len(net)),
             "loss": zeros(parts),
         }
@@ -293,7 +293,7 @@ class Trainer:
         t["grad_f"].zero_()
         t["grad_f"][0, : self._probes] = 1.0
         self._collect()
-        influence = t["sums"][:, SHAPE_NUMBERS] * latent.norm(dim=1)
+        influence = t["sums"][:, SHAPE_NUMBERS].view(self.count, -1).sum(1) * latent.norm(dim=1)
         order = influence.argsort(stable=True)
         stored = latent.clone()
         self._features()
