@@ -375,12 +375,15 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                     prefetch(predicted.density, ahead)
                 cell = wp.vec3(float(k), float(first[1]), float(first[2]))
                 f = wp.vec3(box.voxel * (cell[0] + 0.5) - centre, fy, fz)
-                half = 0.5 * dt * (slope * f[0] + near)
-                away = fine * evaluate(around, f - half)
-                at, inside = between_cells(box, cell - away)
-                simple = inside and in_reach(f - half)
+                # The order of the tests matters: it decides whether the compiler makes branches of them.
                 if wp.static(solids):
                     wall = wall_at(box, walls, cell + wp.vec3(0.5, 0.5, 0.5))
+                half = 0.5 * dt * (slope * f[0] + near)
+                simple = in_reach(f - half)
+                away = fine * evaluate(around, f - half)
+                at, inside = between_cells(box, cell - away)
+                simple = simple and inside
+                if wp.static(solids):
                     simple = simple and wall == FREE and is_short(box, away)
                 smoke = float(0.0)
                 heat = float(0.0)
@@ -397,7 +400,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                         if varies:
                             away = -fine * evaluate(around, f + half)
                             to, inside = between_cells(box, cell - away)
-                            simple = inside and in_reach(f + half)
+                            simple = in_reach(f + half) and inside
                             if wp.static(solids):
                                 simple = simple and is_short(box, away)
                             if simple:
