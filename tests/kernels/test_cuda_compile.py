@@ -14,7 +14,7 @@ import warp as wp
 
 import wlm_kernels
 from wlm_kernels import mlp
-from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields
+from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.lightmap import matrix_decode, matrix_pages, pages
 from wlm_kernels.lightmap import step as lightmap_step
@@ -39,10 +39,10 @@ BOTH = (True, False)
 FLOATS = (wp.float16, wp.float32)
 LATENTS = (1, 9, 12, 32)
 LATTICE_STEPS = (
-    {"lattice": "D3Q19", "bounded": True, "slips": True},
-    {"lattice": "D3Q19", "bounded": True, "storage": "float16"},
+    {"lattice": "D3Q19", "solids": True, "walls": (True, True, True)},
+    {"lattice": "D3Q19", "solids": True, "storage": "float16"},
     {"lattice": "D3Q19", "forced": True},
-    {"lattice": "D3Q27", "bounded": True, "slips": True, "forced": True},
+    {"lattice": "D3Q27", "solids": True, "forced": True},
     {"lattice": "D3Q27", "storage": "float16", "eddies": False},
     {"lattice": "D2Q9"},
 )
@@ -85,10 +85,10 @@ def _smoke(dtype: type) -> list:
     return built
 
 
-def _lattice_step(settings: dict) -> list:
-    """Builds the far step, the one at home, and that of two arrays."""
-    spec = lattice.Spec(**settings)
-    return [lattice.step_kernel(spec, *far) for far in ((True, True), (False, False), (False, True))]
+def _boundaries(kind: tuple[str, str], balance: bool) -> list:
+    """Builds the links, whose sums over a block only a GPU has, and what else is of one lattice and storage."""
+    fluid = lattice_fields.fluid_kernels(*kind, (False, True, True))
+    return _members(lattice_links.link_kernels(*kind, balance), fluid)
 
 
 def _advection(bricks: bool, solids: bool, stored: type) -> list:
@@ -118,13 +118,9 @@ FACTORIES = [
     *_cases("gaussian_sum", gaussian_sum.sum_kernels, [], LATENTS),
     *_cases("probe_network", _probe_network, [((9, 64, 27),)], ((9, 64, 27), (1, 8, 3), (12, 48, 12), (12, 128, 75))),
     *_cases("smoke", _smoke, [], FLOATS),
-    *_cases("lattice_step", _lattice_step, [], LATTICE_STEPS),
+    *_cases("lattice_step", lambda settings: [lattice.step_kernel(lattice.Spec(**settings))], [], LATTICE_STEPS),
     *_cases(
-        "lattice_fields",
-        lambda name, storage: _members(lattice_fields.fluid_kernels(name, storage)),
-        [],
-        ("D2Q9", "D3Q27"),
-        ("float32", "float16"),
+        "lattice_boundaries", _boundaries, [], (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")), BOTH
     ),
     *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
     *_cases("planes", _planes, [], BOTH),

@@ -29,9 +29,23 @@ class Air:
     ramp: int
     force: np.ndarray
 
+    def __post_init__(self) -> None:
+        faces = self.box.faces
+        still = {name for name, (kind, value) in faces.items() if kind == "wall" and not np.any(value)}
+        self.closed = [{f"-{axis}", f"+{axis}"} <= still for axis in "xyz"]
+
     def arrived(self, stored: np.ndarray) -> np.ndarray:
-        """The populations [X, Y, Z, Q] that arrive, from those of the lattice, [Q, X, Y, Z], which lack the weights."""
-        return np.moveaxis(stored, 0, -1) + self.box.w
+        """The populations [X, Y, Z, Q] that arrive, from those that the lattice stores, [Q, X, Y, Z]."""
+        c, out = self.box.c, []
+        for q, velocity in enumerate(c):
+            came = np.roll(stored[q], velocity, (0, 1, 2))
+            back = stored[int(np.flatnonzero((c == -velocity).all(1))[0])]
+            for axis in range(3):
+                at = np.arange(stored.shape[1 + axis]) - velocity[axis]
+                beyond = self.closed[axis] & ((at < 0) | (at >= len(at)))
+                came = np.where(np.expand_dims(beyond, tuple(a for a in range(3) if a != axis)), back, came)
+            out.append(came)
+        return np.stack(out, -1) + self.box.w
 
     def step(self, f: np.ndarray, done: int, inlet: np.ndarray | None = None, force=None) -> np.ndarray:
         """The populations that arrive after one more step than `done`; `inlet` is the velocity at face -x."""

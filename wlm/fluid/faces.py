@@ -7,11 +7,12 @@ import numpy as np
 
 from wlm_kernels.fluid.advection_places import CLOSED, OPEN, PERIODIC
 from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
+from wlm_kernels.fluid.lattice_sets import VelocitySet
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 """The faces, by the axis that they close and the end of it."""
 
-# A population at an edge of the domain crosses two faces: the face of lower rank decides, then the order of FACES.
+# A link along an edge of the domain crosses two faces: the face of lower rank decides, then the order of FACES.
 _RANKS = {BOUNCE: 1, INLET: 2, OUTLET: 3, PRESSURE: 3, SLIP: 4}
 _STILL = 0  # a wall at rest
 
@@ -69,6 +70,12 @@ def bounded_axes(faces: Mapping[str, Face]) -> tuple[int, int, int]:
     return bounded[0], bounded[1], bounded[2]
 
 
+def walled_axes(faces: Mapping[str, Face]) -> tuple[bool, bool, bool]:
+    """Returns for each axis whether both of its ends are walls at rest, which the step's kernel handles itself."""
+    still = [name in faces and bool((faces[name].rank == _STILL).all()) for name in FACES]
+    return still[0] and still[1], still[2] and still[3], still[4] and still[5]
+
+
 def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
     """Returns what each axis's ends are for smoke: `PERIODIC`, `CLOSED` if the whole face is a wall, or `OPEN`."""
     ends = []
@@ -80,12 +87,54 @@ def axis_ends(faces: Mapping[str, Face]) -> tuple[tuple[int, int], ...]:
 
 def inlet_rows(faces: Mapping[str, Face]) -> np.ndarray:
     """Returns int32, for each cell of each face in the order of `FACES`: its number among the inlets' cells, or -1."""
-    inlet = face_column(faces, "kind") == INLET
+    opened = [(faces[name].kind == INLET).ravel() for name in FACES if name in faces]
+    inlet = np.concatenate([np.zeros(0, bool), *opened])
     return np.where(inlet, np.cumsum(inlet) - 1, -1).astype(np.int32)
 
 
-def face_column(faces: Mapping[str, Face], name: str) -> np.ndarray:
-    """Joins an array of all faces, in the order of `FACES`: [cells] or, for the velocity, [cells, 3]."""
-    tail = (3,) if name == "velocity" else ()
-    rows = [getattr(faces[face], name).reshape(-1, *tail) for face in FACES if face in faces]
-    return np.concatenate([np.zeros((0, *tail)), *rows])
+def face_links(
+    shape: tuple[int, int, int], lattice: VelocitySet, faces: Mapping[str, Face]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Lists the links of the faces: the populations that a boundary condition sends into the box.
+
+    Axes with walls at rest at both ends have none. Links are sorted by direction, then by cell. The links of solid
+    cells are included; the kernels skip them.
+
+    Returns:
+        `cell` int32 [L], `code` uint8 [L] and `term` float32 [L] of `wlm_kernels.fluid.lattice_links.Links`; and
+        int32 [L], the cell of a face that decides, numbered through all faces in the order of `FACES`.
+    """
+    bounded = bounded_axes(faces)
+    closed = np.array(walled_axes(faces))
+    beside = np.zeros(shape, bool)
+    for axis in range(3):
+        if bounded[axis] and not closed[axis]:
+            np.moveaxis(beside, axis, 0)[[0, -1]] = True
+    cells = np.flatnonzero(beside)
+    places = np.stack(np.unravel_index(cells, shape), 1)
+    links = []
+    for q in range(1, len(lattice.c)):
+        source = places - np.array(lattice.c[q])
+        walled = (((source < 0) | (source >= np.array(shape))) & closed).any(1)
+        rank = np.full(len(cells), 255)
+        kind, velocity, excess = np.zeros(len(cells), np.uint8), np.zeros((len(cells), 3)), np.zeros(len(cells))
+        decides, before = np.zeros(len(cells), np.int32), 0
+        for number, name in enumerate(FACES):
+            axis, high = divmod(number, 2)
+            if name not in faces:
+                continue
+            face = faces[name]
+            crossing = source[:, axis] >= shape[axis] if high else source[:, axis] < 0
+            first, second = (places[:, a] for a in range(3) if a != axis)
+            wins = crossing & (face.rank[first, second] < rank)
+            at = first[wins], second[wins]
+            rank[wins], kind[wins], velocity[wins] = face.rank[at], face.kind[at], face.velocity[at]
+            excess[wins] = face.excess
+            decides[wins] = before + at[0] * face.kind.shape[1] + at[1]
+            before += face.kind.size
+        linked = (rank < 255) & ~walled
+        momentum = 6.0 * lattice.w[q] * (velocity @ np.array(lattice.c[q], float))
+        term = np.where((kind == BOUNCE) | (kind == INLET), momentum, excess)
+        links.append((cells[linked], (q + 32 * kind)[linked], term[linked], decides[linked]))
+    types = np.int32, np.uint8, np.float32, np.int32
+    return tuple(np.concatenate(c).astype(t) for c, t in zip(zip(*links, strict=True), types, strict=True))

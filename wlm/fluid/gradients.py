@@ -21,13 +21,14 @@ from torch.autograd.function import once_differentiable
 
 from wlm.errors import WlmError
 from wlm.fluid import reversal
-from wlm.fluid.lattice import BODIES, MAX_SPEED, Lattice, blown_up, copy_boundaries
+from wlm.fluid.lattice import BODIES, MAX_SPEED, Lattice, blown_up
 from wlm.fluid.solver import Solver
 from wlm.interop import to_warp
 from wlm.ops.tapes import takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream
-from wlm_kernels.fluid import advection, advection_adjoint, advection_sources, lattice_adjoint
+from wlm_kernels.fluid import advection, advection_adjoint, advection_sources, lattice_adjoint, lattice_links
 from wlm_kernels.fluid.lattice import QUIET, step_kernel
+from wlm_kernels.fluid.lattice_links import OUTLET
 
 STATES = 8
 """Most states that are stored for the backward pass, by default."""
@@ -74,7 +75,12 @@ class DifferentiableLattice:
         self.device, self.inlets = torch.device(wp.device_to_torch(lattice.device)), setup.inlets
         # The step takes a force only if it has been compiled for one.
         self._unforced = wp.empty(0, dtype=wp.vec3, device=lattice.device)
-        self._complete = wp.empty(0, dtype=int, device=lattice.device)
+        code, cell = setup.links.code.numpy(), setup.links.cell.numpy()
+        balanced = code >> 5 == OUTLET
+        if setup.solid.shape[0]:
+            balanced &= setup.solid.numpy()[cell] == 0
+        weight = float(setup.tables.w.numpy()[code[balanced] & 31].sum(dtype=float))
+        self._weight = wp.array([0.0, weight], dtype=wp.float64, device=lattice.device)
 
     def populations(self) -> torch.Tensor:
         """Returns a copy of the lattice's present populations, float [Q, X, Y, Z]."""
@@ -133,7 +139,7 @@ class DifferentiableLattice:
             ValueError: As for `advance`, or the lattice has no solid, or the number is none of a body.
         """
         self._check(populations)
-        if not (0 < body < BODIES and self._setup.boundaries.solid.shape[0]):
+        if not (0 < body < BODIES and self._setup.solid.shape[0]):
             raise ValueError(f"body: expected 1 to {BODIES - 1}, in a lattice with solids, got {body}")
         return _Force.apply(self, populations, body)
 
@@ -168,30 +174,34 @@ class DifferentiableLattice:
 
     def _flow(self, forces: wp.array) -> lattice_adjoint.Flow:
         setup, flow = self._setup, lattice_adjoint.Flow()
+        flow.n, flow.bounded = wp.vec3i(*setup.shape), setup.bounded
+        flow.walled = wp.vec3i(*(int(wall) for wall in setup.spec.walls))
         flow.tau, flow.eddy, flow.axes = setup.tau, setup.eddy, 2 if setup.spec.lattice == "D2Q9" else 3
-        flow.forces = forces
+        flow.solid, flow.forces = setup.solid, forces
         return flow
+
+    def _collide(self, work: "_Work", f: wp.array, done: int, forces: wp.array, out: wp.array) -> None:
+        setup = self._setup
+        spec = replace(setup.spec, forced=forces.shape[0] > 0)
+        work.done.fill_(done)
+        inputs = [wp.vec3i(*setup.shape), f, setup.solid, setup.tau, setup.eddy, forces, 0]
+        outputs = [work.clock, work.trouble, work.sums, out]
+        wp.launch(step_kernel(spec), self._cells, inputs=inputs, outputs=outputs, device=f.device)
 
     def _advance(
         self, work: "_Work", f: torch.Tensor, done: int, inlet: torch.Tensor | None, forces: wp.array
     ) -> torch.Tensor:
         """Does a step; `inlet` is [1 or I, 3]."""
-        setup, edges = self._setup, work.boundaries
+        setup = self._setup
         # A step leaves solid cells as they are.
-        out = torch.zeros_like(f) if edges.solid.shape[0] else torch.empty_like(f)
+        out = torch.zeros_like(f) if setup.solid.shape[0] else torch.empty_like(f)
         if inlet is not None:
-            lattice_adjoint.set_inlets(setup.tables, edges, setup.inlet, _flat(inlet, wp.vec3))
+            lattice_adjoint.set_inlets(setup.tables, work.links, setup.inlet, _flat(inlet, wp.vec3))
         left = self._populations(out)
-        work.done.fill_(done)
-        kernel = step_kernel(replace(setup.spec, forced=forces.shape[0] > 0), False, True)
-        inputs = [edges, self._populations(f), setup.tau, setup.eddy, forces, 0]
-        outputs = [work.clock, work.trouble, left]
-        wp.launch(kernel, self._cells, inputs=inputs, outputs=outputs, device=left.device)
-        if setup.spec.bounded:
-            inputs = [setup.tables, edges, 1]
-            wp.launch(setup.kernels.send_out, edges.kind.shape[0], inputs=inputs, outputs=[left], device=left.device)
-            inputs = [setup.tables, edges, 1, work.clock]
-            wp.launch(setup.kernels.settle, self._cells, inputs=inputs, outputs=[left], device=left.device)
+        self._collide(work, self._populations(f), done, forces, left)
+        where = [setup.tables, wp.vec3i(*setup.shape), setup.bounded, 0, work.links, setup.solid]
+        rise = 1.0 / max(setup.ramp, 1)
+        lattice_links.apply(setup.link_kernels, *where, work.clock, rise, left, work.sums)
         return out
 
     def _reverse(
@@ -204,13 +214,20 @@ class DifferentiableLattice:
         on_inlet: torch.Tensor | None,
         on_forces: wp.array,
     ) -> torch.Tensor:
-        """Returns the gradient to the populations before a step; those to inlets and forces are added to."""
-        setup, on_f = self._setup, torch.zeros_like(f)
+        """Returns the gradient to the populations before a step; `on_out` is overwritten, the others are added to."""
+        setup, flow = self._setup, self._flow(forces)
+        before, grad, on_f = self._populations(f), self._populations(on_out), torch.zeros_like(f)
+        left = before
+        if setup.outlets:
+            # Their gradient depends on the populations that left the cells, which the links have overwritten.
+            left = self._populations(torch.zeros_like(f))
+            self._collide(work, before, done, forces, left)
+        risen = min(1.0, (done + 2) / max(setup.ramp, 1))
+        risen = risen * risen * (3.0 - 2.0 * risen)
         rows = on_out.new_zeros(0 if on_inlet is None else self.inlets, 3)
-        where = [setup.tables, work.boundaries, self._flow(forces)]
-        grads = [self._populations(on_f), on_forces, _flat(rows, wp.vec3)]
-        before, after = self._populations(f), self._populations(on_out)
-        lattice_adjoint.step_backward(*where, before, after, done, setup.inlet, *grads)
+        where = [setup.tables, flow, work.links, setup.inlet, risen, left, self._weight]
+        lattice_adjoint.links_backward(*where, grad, _flat(rows, wp.vec3))
+        lattice_adjoint.step_backward(setup.tables, flow, before, grad, self._populations(on_f), on_forces)
         if on_inlet is not None:
             on_inlet += rows if len(on_inlet) == len(rows) else rows.sum(0)
         return on_f
@@ -220,9 +237,8 @@ class DifferentiableLattice:
 
     def _read(self, f: torch.Tensor, forces: wp.array, drho: wp.array, u: wp.array) -> None:
         setup = self._setup
-        # Populations that arrive, complete.
-        inputs = [setup.tables, setup.boundaries, self._populations(f), 0, self._complete, forces]
-        wp.launch(setup.kernels.fields, self._cells, inputs=inputs, outputs=[drho, u], device=u.device)
+        inputs = [wp.vec3i(*setup.shape), self._populations(f), setup.solid, setup.bodies, forces]
+        wp.launch(setup.fluid_kernels.fields, self._cells, inputs=inputs, outputs=[drho, u], device=u.device)
 
 
 class DifferentiableSolver:
@@ -366,14 +382,23 @@ class DifferentiableSolver:
 
 
 class _Work:
-    """Arrays that the steps of a call use: `clock` and `trouble` of `wlm_kernels.fluid.lattice.step_kernel`, also as
-    tensors, and the lattice's boundaries with inlets of this call."""
+    """Small arrays that the steps of a call use, in torch's memory: `clock`, `trouble` and `sums` of
+    `wlm_kernels.fluid.lattice.step_kernel`, the first two also as tensors, and the lattice's links with terms and
+    values of this call.
+    """
 
     def __init__(self, air: DifferentiableLattice) -> None:
-        self.done = torch.zeros(2, dtype=torch.int32, device=air.device)
-        self.first_trouble = torch.full((1,), QUIET, dtype=torch.int64, device=air.device)
+        links, device = air._setup.links, air.device
+        self.done = torch.zeros(2, dtype=torch.int32, device=device)
+        self.first_trouble = torch.full((1,), QUIET, dtype=torch.int64, device=device)
         self.clock, self.trouble = to_warp(self.done), to_warp(self.first_trouble)
-        self.boundaries = copy_boundaries(air._setup.boundaries)
+        self.sums = to_warp(torch.zeros(2, dtype=torch.float64, device=device))
+        self.links = lattice_links.Links()
+        self.links.cell, self.links.code, self.links.term = links.cell, links.code, links.term
+        self.links.used, self.links.faces = links.used, links.faces
+        if links.term.shape[0]:
+            self.links.term = to_warp(wp.to_torch(links.term).clone())
+        self.links.value = _flat(torch.zeros(links.term.shape[0], device=device))
 
 
 class _Air:
@@ -445,9 +470,8 @@ class _Smoke:
         del predicted
         on_forces = air._unforced if setup.buoyancy is None else _flat(torch.zeros_like(on_u), wp.vec3)
         last, into = air._populations(before.pop()), air._populations(on_f)
-        where = [air._setup.tables, air._setup.boundaries, forces, last]
-        gradients = _flat(on_u.new_empty(0)), _flat(on_u, wp.vec3)
-        lattice_adjoint.fields_backward(*where, *gradients, into, on_forces)
+        where = [air._setup.tables, air._flow(forces), last, _flat(on_u.new_empty(0)), _flat(on_u, wp.vec3)]
+        lattice_adjoint.fields_backward(*where, into, on_forces)
         on_inlet = _at(on_controls[0], step)
         for number in reversed(range(setup.substeps)):
             done = self.begin + step * setup.substeps + number
@@ -542,7 +566,7 @@ class _Fields(torch.autograd.Function):
         on_f, on_force = torch.zeros_like(f), torch.zeros_like(force) if ctx.needs_input_grad[2] else None
         with on_stream(air.device):
             forces = air._unforced if on_force is None else _flat(on_force, wp.vec3)
-            where = [air._setup.tables, air._setup.boundaries, air._forces(force), air._populations(f)]
+            where = [air._setup.tables, air._flow(air._forces(force)), air._populations(f)]
             into = air._populations(on_f), forces
             lattice_adjoint.fields_backward(*where, _flat(dense(on_drho)), _flat(dense(on_u), wp.vec3), *into)
         return None, on_f, on_force
@@ -555,11 +579,10 @@ class _Force(torch.autograd.Function):
         ctx.air, ctx.body, ctx.like = air, body, f.new_empty(0)
         total = torch.zeros(BODIES, 3, dtype=torch.float64, device=air.device)
         with on_stream(air.device):
-            inputs, into = (
-                [setup.tables, setup.boundaries, air._populations(f), 0, air._complete],
-                to_warp(total, wp.vec3d),
-            )
-            wp.launch(setup.kernels.force, air._cells, inputs=inputs, outputs=[into], device=into.device)
+            n = wp.vec3i(*setup.shape)
+            inputs = [setup.tables, n, setup.bounded, setup.links, setup.solid, air._populations(f)]
+            size, kernel, into = setup.links.cell.shape[0], setup.link_kernels.force, to_warp(total, wp.vec3d)
+            wp.launch(kernel, size, inputs=inputs, outputs=[into], device=into.device)
         return total[body].float()
 
     @staticmethod
@@ -568,7 +591,7 @@ class _Force(torch.autograd.Function):
         air, setup = ctx.air, ctx.air._setup
         on_f = ctx.like.new_zeros(air._directions, *setup.shape)
         with on_stream(air.device):
-            where = [setup.tables, setup.boundaries, ctx.body]
+            where = [setup.tables, air._flow(setup.forces), setup.links, ctx.body]
             lattice_adjoint.force_backward(*where, to_warp(dense(on_total)[None], wp.vec3), air._populations(on_f))
         return None, on_f, None
 

@@ -13,13 +13,13 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from wlm.errors import WlmError
-from wlm.fluid.faces import FACES, Face, bounded_axes, face_column, inlet_rows, make_face
+from wlm.fluid.faces import Face, bounded_axes, face_links, inlet_rows, make_face, walled_axes
 from wlm.formats.parts import Part, check_parts
 from wlm.interop import free_memory, no_collection
 from wlm_kernels.fluid import lattice_links
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
 from wlm_kernels.fluid.lattice_fields import FluidKernels, fluid_kernels
-from wlm_kernels.fluid.lattice_links import BLOCK, BOUNCE, INLET, OUTLET, PRESSURE, SLIP, Boundaries
+from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
 from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, Tables, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
@@ -82,39 +82,41 @@ def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """The settings of a lattice of N cells, with copies of its boundaries and force, for `wlm.fluid.gradients`.
+    """The settings of a lattice of N cells, with copies of its L links, solids and force, for `wlm.fluid.gradients`.
 
     Attributes:
         shape: Cells along x, y and z.
         spec: The settings for which the kernel of a step is specialised.
         tables: The velocity set.
-        boundaries: Faces, solids and bodies.
+        bounded: 1 for each axis that is not periodic, else 0.
         tau, eddy: Relaxation time, and factor of the eddy viscosity.
-        inlet: int [F], the number of each face's cell among those of inlets, in the order of `FACES`, or -1.
+        ramp: Number of steps in which inlets rise to their velocity.
+        links: The links of faces and solids.
+        inlet: int [L], the cell of an inlet that decides a link, numbered in the order of `FACES`, or -1.
         inlets: Number of cells of inlets.
-        kernels: Kernels for the lattice's velocity set.
+        outlets: Whether there are outlets.
+        link_kernels, fluid_kernels: Kernels for the lattice's velocity set.
+        solid: uint8 [N], number of the body of each cell; [0] without solids.
+        bodies: vec3 [256], velocity of each body.
         forces: vec3 [N], the force; [0] without.
     """
 
     shape: tuple[int, int, int]
     spec: Spec
     tables: Tables
-    boundaries: Boundaries
+    bounded: wp.vec3i
     tau: float
     eddy: float
+    ramp: int
+    links: lattice_links.Links
     inlet: wp.array
     inlets: int
-    kernels: FluidKernels
+    outlets: bool
+    link_kernels: lattice_links.LinkKernels
+    fluid_kernels: FluidKernels
+    solid: wp.array
+    bodies: wp.array
     forces: wp.array
-
-
-def copy_boundaries(boundaries: Boundaries) -> Boundaries:
-    """Returns boundaries whose arrays are copies."""
-    out = Boundaries()
-    for name in Boundaries.vars:
-        value = getattr(boundaries, name)
-        setattr(out, name, wp.clone(value) if isinstance(value, wp.array) else value)
-    return out
 
 
 def blown_up(key: int, shape: tuple[int, int, int]) -> WlmError:
@@ -154,7 +156,7 @@ class Lattice:
         WlmError: There is not enough memory.
     """
 
-    period = 2  # populations are then stored as before, see `wlm_kernels.fluid.lattice_links`
+    period = 2  # the two buffers have then swapped back
 
     def __init__(
         self,
@@ -177,39 +179,32 @@ class Lattice:
         spec = Spec(lattice, storage, eddies=smagorinsky > 0.0)
         needed = self.bytes_needed(self.shape, storage, lattice)
         require_free("lattice", self.shape, needed, self.device, "fewer cells or storage='float16'")
-        self._cells = math.prod(self.shape)
+        self._n, self._cells = wp.vec3i(*self.shape), math.prod(self.shape)
         self._set, self._tables = velocity_set(lattice), tables(lattice, str(self.device))
         size = (len(self._set.c), self._cells)
         # The settings for which the kernel of a step is specialised.
         self._spec = replace(spec, wide=math.prod(size) > NARROW)
-        self._f = wp.zeros(size, dtype=STORAGES[storage][0], device=self.device)
-        self._tau, self._eddy = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky)
-        self._kernels = fluid_kernels(lattice, storage)
-        # The counter of steps and the first error, see `wlm_kernels.fluid.lattice.step_kernel`.
-        self._clock = self._zeros(2, int)
-        self._trouble = wp.full(1, QUIET, dtype=wp.int64, device=self.device)
-        self._boundaries = Boundaries()
-        self._boundaries.n = wp.vec3i(*self.shape)
+        self._f = [wp.zeros(size, dtype=STORAGES[storage][0], device=self.device) for _ in range(2)]
         # A ramp of one step is no ramp: inflow begins after it.
-        self._boundaries.rise = 1.0 / max(ramp, 1)
-        # Of size 0 while no cell has ever been solid, or freed.
-        self._boundaries.solid, self._means = self._zeros(0, wp.uint8), self._zeros(0, wp.vec4)
-        self._boundaries.bodies = wp.zeros((3, BODIES), dtype=wp.vec3, device=self.device)
-        self._boundaries.net, self._boundaries.fixed = self._zeros(1, wp.int64), self._zeros(3, wp.int64)
+        self._tau, self._eddy, self._rise = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky), 1.0 / max(ramp, 1)
+        # The counter of steps and the first error, see `wlm_kernels.fluid.lattice.step_kernel`.
+        self._clock, self._sums = self._zeros(2, int), self._zeros(2, wp.float64)
+        self._trouble = wp.full(1, QUIET, dtype=wp.int64, device=self.device)
+        # The number of the body of each cell, 0 for fluid; of size 0 while no cell has ever been solid.
+        self._solid = self._zeros(0, wp.uint8)
+        self._velocity = self._zeros(BODIES, wp.vec3)
         self._forces = self._zeros(0, wp.vec3)
         self._faces: dict[str, Face] = {}
-        self._prepared = self._moving = False
+        self._links: lattice_links.Links | None = None
         self._graph: wp.Graph | None = None
         # Steps that this object launched itself; replays of a user's CUDA graph are counted only by the clock.
-        self._done, self._unchecked, self._begun = 0, 0, False
+        self._done, self._begun = 0, False
 
     @staticmethod
     def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
-        """Returns the memory in bytes that a lattice takes with faces and bodies at rest, without small arrays; bodies
-        that move take 16 more per cell. Arguments as for `Lattice`."""
+        """Returns the memory in bytes that a lattice takes, without small arrays; arguments as for `Lattice`."""
         size = wp.types.type_size_in_bytes(STORAGES[storage][0])
-        # Populations, the word and the body of each cell, and one bit.
-        return math.prod(shape) * (8 * len(velocity_set(lattice).c) * size + 41) // 8
+        return 2 * len(velocity_set(lattice).c) * math.prod(shape) * size
 
     # Setting up.
 
@@ -244,55 +239,43 @@ class Lattice:
         """
         self._set_face(face, OUTLET if density is None else PRESSURE, density=density)
 
-    def set_solid(
-        self,
-        mask: ArrayLike | wp.array,
-        velocity: ArrayLike = (0.0, 0.0, 0.0),
-        spin: ArrayLike = (0.0, 0.0, 0.0),
-        centre: ArrayLike = (0.0, 0.0, 0.0),
-    ) -> None:
+    def set_solid(self, mask: ArrayLike | wp.array, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Sets which cells are solid and how they move; must be called again after they have moved.
 
-        Cells that become fluid get the mean density and velocity of their neighbours. With a mask on the device the
-        call does not wait for the device.
+        Cells that become fluid get the mean density and velocity of their neighbours. The call waits for the device
+        and cannot be captured in a CUDA graph.
 
         Args:
             mask: [X, Y, Z], true where a cell is solid; or the number of the body that covers each cell, 1 to 255, and
                 0 for fluid. A NumPy array, or a Warp array of uint8 on the lattice's device.
-            velocity: Velocity of the bodies, cells per step; (3,) for body 1, or [K, 3] for bodies 1 to K.
-            spin: Angular velocity of the bodies, radians per step, shaped like the velocity.
-            centre: The point of each body that has its velocity, in cells, shaped likewise.
+            velocity: Velocity of the bodies, cells per step; (3,) for body 1, or [K, 3] for bodies 1 to K. Bodies do
+                not rotate.
 
         Raises:
             WlmError: A body is faster than `MAX_SPEED`.
         """
-        new, rows = self._mask(mask), np.zeros((3, BODIES, 3), np.float32)
-        for row, (name, value) in zip(
-            rows, {"velocity": velocity, "spin": spin, "centre": centre}.items(), strict=True
-        ):
-            vectors = np.atleast_2d(np.asarray(value, np.float32))
-            if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) >= BODIES or not np.isfinite(vectors).all():
-                shapes = f"(3,) or [K, 3] for at most {BODIES - 1} bodies"
-                raise ValueError(
-                    f"{name}: expected finite numbers of shape {shapes}, got NaN or shape {np.shape(value)}"
-                )
-            row[1 : len(vectors) + 1] = vectors
-        _check_speed(float(np.linalg.norm(rows[0], axis=1).max()), "a body")
+        new, vectors = self._mask(mask), np.atleast_2d(np.asarray(velocity, np.float32))
+        if vectors.ndim != 2 or vectors.shape[1] != 3 or len(vectors) >= BODIES or not np.isfinite(vectors).all():
+            shapes = f"(3,) or [K, 3] for at most {BODIES - 1} bodies"
+            raise ValueError(
+                f"velocity: expected finite numbers of shape {shapes}, got NaN or shape {np.shape(velocity)}"
+            )
+        rows = np.zeros((BODIES, 3), np.float32)
+        rows[1 : len(vectors) + 1] = vectors
+        self._velocity.assign(rows)
         self._prepare()
-        edges = self._boundaries
-        if edges.solid.shape[0] == 0:
-            edges.solid, self._graph = self._zeros(self._cells, wp.uint8), None
-            self._make_words()
-        if self._means.shape[0] == 0:
-            self._means = self._zeros(self._cells, wp.vec4)
-        inputs = [self._tables, edges, new, self._f, self._far, self._clock]
-        self._launch(self._kernels.neighbours, self._cells, inputs, [self._means])
-        self._launch(self._kernels.uncover, self._cells, [self._tables, edges, new, self._means, self._far], [self._f])
-        edges.bodies.assign(rows)
-        if bool(rows[:2].any()) != self._moving:
-            self._moving, self._graph = not self._moving, None
-        wp.copy(edges.solid, new)
-        lattice_links.mark(self._tables, edges)
+        if self._solid.shape[0] == 0:
+            self._solid, self._graph = self._zeros(self._cells, wp.uint8), None
+        self._spec = replace(self._spec, solids=True)
+        now, spare = self._buffers
+        common = [self._tables, self._n, self._bounded]
+        inputs = [*common, now, self._solid, new]
+        self._launch(self._fluid_kernels.neighbours, self._cells, inputs, [spare])
+        inputs = [*common, self._walled, self._solid, new, spare]
+        self._launch(self._fluid_kernels.uncover, self._cells, inputs, [now])
+        wp.copy(self._solid, new)
+        self._find_links()
+        self._apply_links(self._links.faces, now)
 
     def set_force(self, force: ArrayLike | wp.array | None) -> None:
         """Sets the force on the air.
@@ -323,10 +306,12 @@ class Lattice:
         drho = (np.broadcast_to(np.asarray(density, np.float64), self.shape) - 1.0).astype(np.float32).ravel()
         if not np.isfinite(drho).all():
             raise ValueError("density: expected finite numbers, got NaN or infinity")
-        flow = [wp.array(drho, device=self.device), self._vectors("velocity", velocity)]
-        self._boundaries.net.zero_()
-        inputs = [self._tables, self._boundaries, *flow, self._far, self._clock]
-        self._launch(self._kernels.start, self._cells, inputs, [self._f])
+        inputs = [self._tables, wp.array(drho, device=self.device), self._vectors("velocity", velocity)]
+        now, spare = self._buffers
+        spare.zero_()
+        self._sums.zero_()
+        self._launch(self._fluid_kernels.start, self._cells, inputs, [now])
+        self._apply_links(0, now)
         self._begun = True
 
     @property
@@ -337,8 +322,7 @@ class Lattice:
     # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Advances the air by a number of steps, and runs `check` after every `CHECK_EVERY` of them, and on a CPU at
-        the end.
+        """Advances the air by a number of steps, and runs `check` after every `CHECK_EVERY` of them.
 
         During the capture of a CUDA graph it does not check: call `check` between replays of the graph. The number of
         steps, and the number of steps done before the capture, must then be multiples of `period`.
@@ -358,12 +342,10 @@ class Lattice:
         self._begun = True
         run = self._run_in_graphs if self.device.is_cuda and steps >= _GRAPH_FROM else self._run
         while steps > 0:
-            chunk = min(steps, CHECK_EVERY - self._unchecked)
+            chunk = min(steps, CHECK_EVERY)
             run(chunk)
             steps -= chunk
-            self._unchecked += chunk
-            if self._unchecked == CHECK_EVERY or self.device.is_cpu:
-                self.check()
+            self.check()
 
     @property
     def steps(self) -> int:
@@ -376,7 +358,7 @@ class Lattice:
         Raises:
             WlmError: The flow has blown up; the message names the first step, the cell and the cause.
         """
-        key, self._unchecked = int(self._trouble.numpy()[0]), 0
+        key = int(self._trouble.numpy()[0])
         if key == QUIET:
             return
         raise blown_up(key, self.shape)
@@ -403,7 +385,7 @@ class Lattice:
 
     def mass(self) -> float:
         """Returns the mass of all fluid cells, summed in float64."""
-        solid = int(np.count_nonzero(self._boundaries.solid.numpy()))
+        solid = int(np.count_nonzero(self._solid.numpy()))
         return self._cells - solid + float(self.excess_density().numpy().sum(dtype=np.float64))
 
     def force_on_solid(self, body: int = 1) -> np.ndarray:
@@ -415,20 +397,18 @@ class Lattice:
             raise ValueError(f"body: expected 1 to {BODIES - 1}, got {body}")
         self._prepare()
         total = self._zeros(BODIES, wp.vec3d)
-        if self._boundaries.solid.shape[0] > 0:
-            inputs = [self._tables, self._boundaries, self._f, self._far, self._clock]
-            self._launch(self._kernels.force, self._cells, inputs, [total])
+        if self._solid.shape[0] > 0:
+            inputs = [self._tables, self._n, self._bounded, self._links, self._solid, self._buffers[0]]
+            self._launch(self._link_kernels.force, self._links.cell.shape[0], inputs, [total])
         return total.numpy()[body]
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the state, for `load`: populations as stored, solid cells and their motion, the mass of outlets,
-        number of steps done."""
+        """Returns the state, for `load`: populations as stored, solid cells and their motion, number of steps done."""
         # On a CPU .numpy() shares the array's memory, which the next step modifies.
         return {
-            "populations": self._f.numpy().copy(),
-            "solid": self._boundaries.solid.numpy().copy(),
-            "bodies": self._boundaries.bodies.numpy().copy(),
-            "net": self._boundaries.net.numpy().copy(),
+            "populations": self._buffers[0].numpy().copy(),
+            "solid": self._solid.numpy().copy(),
+            "bodies": self._velocity.numpy().copy(),
             "steps": np.array(self.steps, np.int64),
         }
 
@@ -436,17 +416,18 @@ class Lattice:
         """Continues from the state of a lattice with the same settings, faces and force, and a step that is `factor`
         times as long, to which the settings of this lattice are converted.
 
-        The following steps are the same as without the interruption, bit for bit.
+        The following steps are the same as without the interruption: bit for bit on a CPU; on a GPU except for
+        rounding, since outlets sum in any order.
 
         Raises:
             WlmError: The state has another shape, lattice or storage, or contains NaN or infinity.
         """
+        now = self._buffers[0]
         table = {
-            "populations": Part(wp.dtype_to_numpy(self._f.dtype), self._f.shape),
+            "populations": Part(wp.dtype_to_numpy(now.dtype), now.shape),
             # Empty while no cell has ever been solid.
             "solid": Part(np.uint8, (0 if np.shape(state.get("solid")) == (0,) else self._cells,)),
-            "bodies": Part(np.float32, (3, BODIES, 3)),
-            "net": Part(np.int64, (1,)),
+            "bodies": Part(np.float32, (BODIES, 3)),
             "steps": Part(np.int64, (), least=0, most=_MOST_STEPS),
         }
         try:
@@ -454,18 +435,16 @@ class Lattice:
         except ValueError as error:
             raise WlmError(f"lattice state: {error}") from error
         self._convert_settings(factor)
+        self._velocity.assign(state["bodies"])
         self._begun, self._done, self._graph = True, int(state["steps"]), None
         self._clock.fill_(self._done)
         self._trouble.fill_(QUIET)
-        self._boundaries.solid = wp.array(state["solid"], dtype=wp.uint8, device=self.device)
-        for array, name in (
-            (self._f, "populations"),
-            (self._boundaries.bodies, "bodies"),
-            (self._boundaries.net, "net"),
-        ):
-            array.assign(state[name])
-        self._moving, self._prepared = bool(state["bodies"][:2].any()), False
-        self._prepare()
+        self._solid = wp.array(state["solid"], dtype=wp.uint8, device=self.device)
+        self._spec = replace(self._spec, solids=len(state["solid"]) > 0)
+        now, spare = self._buffers
+        now.assign(state["populations"])
+        spare.zero_()
+        self._find_links()
 
     def change_step(self, factor: float) -> None:
         """Changes the duration of a step by a factor, between two steps, with all settings and the state.
@@ -483,51 +462,62 @@ class Lattice:
         done = round(self.steps / factor) if math.isfinite(factor) and factor > 0.0 else -1
         if done < 0 or not math.isclose(done * factor, self.steps):
             raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
-        came, tau = self.populations().reshape(self._f.shape), self._tau
-        bodies = self._boundaries.bodies.numpy()
-        bodies[:2] *= factor
-        self._boundaries.bodies.assign(bodies)
-        self._boundaries.net.zero_()
+        self._prepare()
+        now, spare = self._buffers
+        where = [self._tables, self._n, self._bounded, self._walled]
+        inputs = [*where, now, self._solid, self._forces, self._tau, self._eddy, factor]
+        self._launch(self._fluid_kernels.convert, self._cells, inputs, [spare])
         self._done, self._graph = done, None
         self._clock.fill_(done)
+        if self._buffers[0] is now:
+            self._f.reverse()
+        self._velocity.assign(factor * self._velocity.numpy())
         self._convert_settings(factor)
-        self._prepare()
-        inputs = [self._tables, self._boundaries, came, self._far, self._clock, self._forces, tau, self._eddy, factor]
-        self._launch(self._kernels.convert, self._cells, inputs, [self._f])
 
     def _convert_settings(self, factor: float) -> None:
-        self._tau = 0.5 + factor * (self._tau - 0.5)
-        self._boundaries.rise *= factor
+        self._tau, self._rise = 0.5 + factor * (self._tau - 0.5), self._rise * factor
         for name, face in self._faces.items():
             fastest = factor * float(np.linalg.norm(face.velocity, axis=-1).max())
             _check_speed(fastest, f"face {name!r}")
             self._faces[name] = replace(face, velocity=factor * face.velocity, excess=factor**2 * face.excess)
-        self._prepared = False
+        self._links = None if factor != 1.0 else self._links
+        self._prepare()
 
     def setup(self) -> Setup:
-        """Returns the settings with copies of the boundaries and the force, which no later change affects."""
+        """Returns the settings with copies of the links, solids and force, which no later change affects."""
         self._prepare()
+        links = lattice_links.Links()
+        links.faces = self._links.faces
+        for name in ("cell", "code", "term", "value", "used"):
+            setattr(links, name, wp.clone(getattr(self._links, name)))
+        inlet = np.full(links.cell.shape[0], -1, np.int32)
         rows = inlet_rows(self._faces)
+        inlet[: links.faces] = rows[self._decides] if len(rows) else -1
+        inlet[links.code.numpy() >> 5 != INLET] = -1
+        kinds = {int(kind) for face in self._faces.values() for kind in np.unique(face.kind)}
         return Setup(
             shape=self.shape,
             spec=self._spec,
             tables=self._tables,
-            boundaries=copy_boundaries(self._boundaries),
+            bounded=self._bounded,
             tau=self._tau,
             eddy=self._eddy,
-            inlet=wp.array(rows, dtype=int, device=self.device),
+            ramp=round(1.0 / self._rise),
+            links=links,
+            inlet=wp.array(inlet, dtype=int, device=self.device),
             inlets=int(rows.max(initial=-1)) + 1,
-            kernels=self._kernels,
+            outlets=bool(kinds & {OUTLET, PRESSURE}),
+            link_kernels=self._link_kernels,
+            fluid_kernels=self._fluid_kernels,
+            solid=wp.clone(self._solid),
+            bodies=wp.clone(self._velocity),
             forces=wp.clone(self._forces),
         )
 
     def populations(self) -> wp.array:
-        """Returns the populations that arrive in each cell minus their weights, [Q, X, Y, Z]; 0 in solid cells."""
+        """Returns a copy of the populations as the lattice stores them, [Q, X, Y, Z], see `state`."""
         self._prepare()
-        out = wp.empty_like(self._f)
-        inputs = [self._tables, self._boundaries, self._f, self._far, self._clock]
-        self._launch(self._kernels.arrivals, self._cells, inputs, [out])
-        return out.reshape((len(self._set.c), *self.shape))
+        return wp.clone(self._buffers[0]).reshape((len(self._set.c), *self.shape))
 
     # Checked arguments.
 
@@ -546,7 +536,7 @@ class Lattice:
         if name not in self._faces and self._begun:
             raise ValueError(f"face {name!r}: expected this face to be set before set_flow and before the first step")
         self._faces[name] = face
-        self._prepared, self._graph = False, None
+        self._links = self._graph = None
 
     def _mask(self, mask) -> wp.array:
         if isinstance(mask, wp.array):
@@ -564,54 +554,66 @@ class Lattice:
     # On the device.
 
     @property
-    def _far(self) -> int:
-        """Whether the next step is far, see `wlm_kernels.fluid.lattice_links`."""
-        return 1 - self._done % 2
+    def _buffers(self) -> tuple[wp.array, wp.array]:
+        """The array of populations that the next step reads, and the array that it writes."""
+        return self._f[self._done % 2], self._f[1 - self._done % 2]
 
     def _prepare(self) -> None:
-        """Lists the boundaries, if faces have changed since the last call."""
-        if self._prepared:
+        """Chooses kernels and lists links for the faces, if they have changed since the last call."""
+        if self._links is not None:
             return
-        edges, faces = self._boundaries, self._faces
-        edges.bounded = wp.vec3i(*bounded_axes(faces))
-        sizes = np.array([faces[name].kind.size if name in faces else 0 for name in FACES])
-        edges.first = wp.array(np.cumsum(sizes) - sizes, dtype=int, device=self.device)
-        excess = [faces[name].excess if name in faces else 0.0 for name in FACES]
-        edges.excess = wp.array(excess, dtype=float, device=self.device)
-        for name, dtype in (("rank", wp.uint8), ("kind", wp.uint8), ("velocity", wp.vec3)):
-            setattr(edges, name, wp.array(face_column(faces, name), dtype=dtype, device=self.device))
-        # Whether links of faces add anything, and whether there are outlets.
-        kinds = face_column(faces, "kind")
-        self._outlets = bool(np.isin(kinds, (OUTLET, PRESSURE)).any())
-        moving = (kinds == BOUNCE) & face_column(faces, "velocity").any(-1)
-        self._active = self._outlets or bool((moving | (kinds == INLET)).any())
-        self._make_words()
-        self._prepared = True
+        self._bounded = wp.vec3i(*bounded_axes(self._faces))
+        walls = walled_axes(self._faces)
+        self._spec = replace(self._spec, walls=walls)
+        self._walled = wp.vec3i(*(int(wall) for wall in walls))
+        kinds = {int(kind) for face in self._faces.values() for kind in np.unique(face.kind)}
+        sets = self._spec.lattice, self._spec.storage
+        self._link_kernels = lattice_links.link_kernels(*sets, OUTLET in kinds)
+        self._fluid_kernels = fluid_kernels(*sets, walls)
+        *columns, self._decides = face_links(self.shape, self._set, self._faces)
+        self._links = self._make_links(columns, len(columns[0]))
+        self._find_links()
 
-    def _make_words(self) -> None:
-        """Makes and fills the words of cells, if there are faces or solids."""
-        edges, bounded = self._boundaries, bool(self._faces) or self._boundaries.solid.shape[0] > 0
-        blocks = -(-self._cells // BLOCK) if bounded else 0
-        edges.words = self._zeros(self._cells if bounded else 0, wp.uint32)
-        edges.busy = self._zeros(blocks * (BLOCK // 32), wp.uint32)
-        lattice_links.mark(self._tables, edges)
-        slips = any((face.kind == SLIP).any() for face in self._faces.values())
-        self._spec = replace(self._spec, bounded=bounded, slips=slips)
+    def _find_links(self) -> None:
+        """Lists the populations that solids send back (see `lattice_links`), and checks the speed of the solids."""
+        # The count is also set without solids: the state before may have had some.
+        count, fastest = 0, 0.0
+        if self._solid.shape[0] > 0:
+            count, fastest = self._search()
+            links = self._links
+            if count > links.cell.shape[0] - links.faces:
+                columns = [array.numpy()[: links.faces] for array in (links.cell, links.code, links.term)]
+                # Spare elements: the number of links of a moving body varies.
+                self._links = self._make_links(columns, links.faces + count + count // 4)
+                self._graph = None
+                self._search()
+        self._links.used.fill_(self._links.faces + count)
+        _check_speed(fastest, "a body")
+
+    def _make_links(self, columns, size: int) -> lattice_links.Links:
+        links = lattice_links.Links()
+        links.faces = len(columns[0])
+        dtypes = {"cell": np.int32, "code": np.uint8, "term": np.float32}
+        for (name, dtype), column in zip(dtypes.items(), columns, strict=True):
+            padded = np.zeros(size, dtype)
+            padded[: links.faces] = column
+            setattr(links, name, wp.array(padded, device=self.device))
+        links.value = self._zeros(size, float)
+        links.used = wp.full(1, links.faces, dtype=int, device=self.device)
+        return links
+
+    def _search(self) -> tuple[int, float]:
+        where = [self._tables, self._n, self._bounded, self._solid, self._velocity, self._links]
+        count, fastest = lattice_links.find_links(*where)
+        return int(count.numpy()[0]), float(fastest.numpy()[0])
 
     def _run(self, steps: int) -> None:
         """Queues steps on the device and returns without waiting."""
         for _ in range(steps):
-            far = bool(self._far)
-            if self._moving or self._active:
-                size = self._cells if self._moving else self._boundaries.kind.shape[0]
-                inputs = [self._tables, self._boundaries, int(self._moving), self._clock]
-                self._launch(self._kernels.settle, size, inputs, [self._f])
-            inputs = [self._boundaries, self._f, self._tau, self._eddy, self._forces, self._done % 2]
-            outputs = [self._clock, self._trouble, self._f]
-            self._launch(step_kernel(self._spec, far, far), self._cells, inputs, outputs)
-            if self._outlets:
-                inputs = [self._tables, self._boundaries, int(far)]
-                self._launch(self._kernels.send_out, self._boundaries.kind.shape[0], inputs, [self._f])
+            now, out = self._buffers
+            inputs = [self._n, now, self._solid, self._tau, self._eddy, self._forces, self._done % 2]
+            self._launch(step_kernel(self._spec), self._cells, inputs, [self._clock, self._trouble, self._sums, out])
+            self._apply_links(0, out)
             self._done += 1
 
     def _run_in_graphs(self, steps: int) -> None:
@@ -633,8 +635,12 @@ class Lattice:
 
     def _write_fields(self, drho: wp.array, u: wp.array) -> None:
         """Writes the density minus 1 of each cell to `drho` and the velocity to `u`; an array of size 0 is skipped."""
-        inputs = [self._tables, self._boundaries, self._f, self._far, self._clock, self._forces]
-        self._launch(self._kernels.fields, self._cells, inputs, [drho, u])
+        inputs = [self._n, self._buffers[0], self._solid, self._velocity, self._forces]
+        self._launch(self._fluid_kernels.fields, self._cells, inputs, [drho, u])
+
+    def _apply_links(self, first: int, f: wp.array) -> None:
+        where = [self._tables, self._n, self._bounded, first, self._links, self._solid]
+        lattice_links.apply(self._link_kernels, *where, self._clock, self._rise, f, self._sums)
 
     def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)

@@ -157,7 +157,8 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
 class Solver:
     """Simulates smoke in the air of a lattice.
 
-    Set the faces of the lattice beforehand; the solver sets the solids of the lattice and its force.
+    Set the faces of the lattice beforehand; the solver sets the solids of the lattice and its force. With a moving
+    obstacle each step waits for the device.
 
     Args:
         lattice: The air.
@@ -449,8 +450,9 @@ class Solver:
     def load(self, path: str | os.PathLike[str]) -> None:
         """Continues from a checkpoint of a solver with the same grids and as many obstacles, in steps of its duration.
 
-        With the same settings the following steps are the same as without the interruption, bit for bit; with bricks
-        the threshold allows small differences. Other sources, obstacles, rates and boundaries act from now on.
+        With the same settings the following steps are the same as without the interruption: bit for bit on a CPU; on a
+        GPU except for rounding, since outlets sum in any order. With bricks, the threshold allows small differences.
+        Other sources, obstacles, rates and boundaries act from now on.
 
         Raises:
             WlmError: The file is damaged or of other grids; the message names the difference.

@@ -125,6 +125,12 @@ def crosses(n: wp.vec3i, bounded: wp.vec3i, p: wp.vec3i) -> bool:
 
 
 @wp.func
+def owned(n: wp.vec3i, bounded: wp.vec3i, walled: wp.vec3i, p: wp.vec3i) -> bool:
+    """Tests whether a population that leaves a cell towards cell p is stored; else a face's boundary writes there."""
+    return crosses(n, walled, p) or not crosses(n, bounded, p)
+
+
+@wp.func
 def equilibrium(w: float, c: wp.vec3i, drho: float, u: wp.vec3) -> float:
     """Computes f_eq - w: the second-order equilibrium population of a velocity c, minus the velocity's weight w.
 
@@ -144,28 +150,28 @@ class MemoryFunctions:
 
     Attributes:
         vec: vec of Q floats.
-        index: The type of an element's index, int32 or int64.
-        element: (f, q, i) -> index of element i of row q.
-        peek, poke: (f, index) -> stored number; (f, index, stored number).
+        gather: (f, n, p) -> scaled vec, the populations that arrive at cell p: each is read from the cell that it left,
+            or from cell p itself at a wall at rest that closes a whole axis.
         moments: scaled vec -> rho - 1, momentum, the diagonal and the off-diagonal (xy, xz, yz) of sum_q c c (f - w).
+        put: (f, q, i, value), writes a number that is already scaled.
         load: (f, q, i) -> float, reads a number and removes the scale.
         store: (f, q, i, value), scales and writes a number.
     """
 
     vec: Any
-    index: Any
-    element: Any
-    peek: Any
-    poke: Any
+    gather: Any
     moments: Any
+    put: Any
     load: Any
     store: Any
 
 
 @functools.cache
-def memory_functions(lattice_name: str, storage: str, wide: bool = True) -> MemoryFunctions:
+def memory_functions(
+    lattice_name: str, storage: str, walls: tuple[bool, bool, bool], wide: bool = True
+) -> MemoryFunctions:
     """Builds (once) the functions for a lattice of `LATTICES` and a storage type of `STORAGES`, by whose scale numbers
-    are multiplied.
+    are multiplied, with walls at rest that close some axes.
 
     `wide` indexes populations in 64 bits, which adds a sixth to a step's instructions; otherwise there may be at most
     `NARROW` of them.
@@ -185,16 +191,50 @@ def memory_functions(lattice_name: str, storage: str, wide: bool = True) -> Memo
     def poke(f: wp.array2d[stored], k: index_type, value: stored): ...
 
     @wp.func
-    def element(f: wp.array2d[stored], q: int, i: int) -> index_type:
+    def element_of(f: wp.array2d[stored], q: int, i: int) -> index_type:
         return index_type(q) * index_type(f.shape[1]) + index_type(i)
 
     @wp.func
     def load(f: wp.array2d[stored], q: int, i: int) -> float:
-        return float(peek(f, element(f, q, i))) * wp.static(1.0 / scale)
+        return float(peek(f, element_of(f, q, i))) * wp.static(1.0 / scale)
+
+    @wp.func
+    def put(f: wp.array2d[stored], q: int, i: int, value: float):
+        poke(f, element_of(f, q, i), f.dtype(value))
 
     @wp.func
     def store(f: wp.array2d[stored], q: int, i: int, value: float):
-        poke(f, element(f, q, i), f.dtype(value * wp.static(scale)))
+        put(f, q, i, value * wp.static(scale))
+
+    @wp.func
+    def gather(f: wp.array2d[stored], n: wp.vec3i, p: wp.vec3i) -> vec:
+        x = wp.vec3i(wp.where(p[0] == 0, n[0], p[0]) - 1, p[0], wp.where(p[0] == n[0] - 1, 0, p[0] + 1))
+        y = wp.vec3i(wp.where(p[1] == 0, n[1], p[1]) - 1, p[1], wp.where(p[1] == n[1] - 1, 0, p[1] + 1))
+        z = wp.vec3i(wp.where(p[2] == 0, n[2], p[2]) - 1, p[2], wp.where(p[2] == n[2] - 1, 0, p[2] + 1))
+        i = index_of(n, p)
+        # Warp's hash of a function excludes `wp.static` expressions of loop variables: without these constants a gather
+        # with other walls would have the same hash, and would be loaded instead.
+        closed = wp.vec3i(wp.static(int(walls[0])), wp.static(int(walls[1])), wp.static(int(walls[2])))
+        low = wp.vec3i()
+        high = wp.vec3i()
+        for a in range(3):
+            low[a] = wp.where(p[a] == 0, closed[a], 0)
+            high[a] = wp.where(p[a] == n[a] - 1, closed[a], 0)
+        g = vec()
+        for q in range(wp.static(count)):
+            row = x[wp.static(1 - c[q][0])] * n[1] + y[wp.static(1 - c[q][1])]
+            k = element_of(f, q, row * n[2] + z[wp.static(1 - c[q][2])])
+            if wp.static(any(walls[a] and c[q][a] != 0 for a in range(3))):
+                # Half-way bounce-back needs no branch: it reads another element.
+                back = bool(False)
+                for a in range(3):
+                    if wp.static(walls[a] and c[q][a] > 0):
+                        back = back or low[a] != 0
+                    if wp.static(walls[a] and c[q][a] < 0):
+                        back = back or high[a] != 0
+                k = wp.where(back, element_of(f, wp.static(((q - 1) ^ 1) + 1), i), k)
+            g[q] = float(peek(f, k))
+        return g
 
     @wp.func
     def moments(g: vec):
@@ -213,4 +253,4 @@ def memory_functions(lattice_name: str, storage: str, wide: bool = True) -> Memo
         unit = wp.static(1.0 / scale)
         return unit * drho, unit * momentum, unit * diagonal, unit * off
 
-    return MemoryFunctions(vec, index_type, element, peek, poke, moments, load, store)
+    return MemoryFunctions(vec, gather, moments, put, load, store)
