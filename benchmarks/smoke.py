@@ -35,6 +35,7 @@ from torch.nn.functional import interpolate
 from benchmarks.plot import Panel
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
+from demos.plume import make_plume
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream, to_warp
@@ -45,7 +46,6 @@ from wlm.smoke.march.six_way import Guide, bake, guide
 from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera
 from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.simulation import make_solver, volume_of
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 import warp as wp
 
 from benchmarks.smoke import make_noise
+from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.atomic import atomic_path
 from wlm.interop import device_name, stream, to_warp
@@ -20,7 +21,6 @@ from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import Camera
 from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.shading import Light
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, make_inputs, orders_march
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke import orders

@@ -50,6 +50,7 @@ from benchmarks.runner import Bench, Note
 from benchmarks.smoke import make_cloud
 from benchmarks.smoke_learning import FAINT, at, draw_view, psnr
 from benchmarks.timing import Timing
+from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream
 from wlm.metrics import flip_display
@@ -60,7 +61,6 @@ from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.scene import load_scene
 from wlm.smoke.shading import Light, PointLight
 from wlm.smoke.simulation import advance, make_solver, volume_of
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import LitSmoke, light_smoke
 from wlm.smoke.transport.orders import OrdersModel, load_orders, make_inputs, orders_march, scatter
 from wlm.smoke.transport.tracing import Transport, trace

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from demo_command import run_command
+from plume import make_plume
 
 from wlm.cli.console import show_figures
 from wlm.errors import WlmError
@@ -31,7 +32,6 @@ from wlm.smoke.march.six_way import bake, guide, with_surface
 from wlm.smoke.scene import CameraSettings, Grid, Scene, load_scene
 from wlm.smoke.shading import Light
 from wlm.smoke.simulation import simulate
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport import light_smoke
 from wlm.system import Progress
 from wlm.view.pictures import contact_sheet, to_bytes

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from demo_command import run_command
+from plume import make_plume
 
 from wlm.cli.console import show_figures
 from wlm.errors import WlmError
@@ -21,7 +22,6 @@ from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import Camera
 from wlm.smoke.network.planes import to_srgb
 from wlm.smoke.shading import Light
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport import load_orders, scatter, trace
 from wlm.view.pictures import contact_sheet, to_bytes
 

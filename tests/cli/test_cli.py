@@ -61,20 +61,6 @@ def test_the_version_is_quick_to_tell():
     assert done.returncode == 0
 
 
-def test_doctor_names_the_devices_and_the_cache():
-    text = call("doctor")
-    for word in ("python", "warp", "torch", "cpu", "extra", "kernel cache"):
-        assert word in text
-    assert call.stderr == ""
-
-
-def test_doctor_reads_a_cache_that_others_change(tmp_path, monkeypatch):
-    (tmp_path / "kernel.o").write_bytes(bytes(3_000_000))
-    (tmp_path / "renamed.o").symlink_to(tmp_path / "gone.o")
-    monkeypatch.setattr("warp.config.kernel_cache_dir", str(tmp_path))
-    assert "3.0 MB" in call("doctor")
-
-
 def test_compress_prints_one_table(folder, profile, tmp_path):
     out = tmp_path / "a.wlm"
     text = call("compress", folder, "-o", out, "--profile", profile, "--steps", 10, "--seed", 4)

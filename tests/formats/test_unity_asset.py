@@ -1,4 +1,4 @@
-"""Unity's lighting data: probes and rectangles as UnityPy gives them, and what is said of others."""
+"""Unity's lighting data: probes as UnityPy gives them, and what is said of others."""
 
 import sys
 from types import ModuleType
@@ -15,7 +15,6 @@ from wlm.probe.data import load
 
 PLACES = np.array([[1.0, 2, 3], [4, 5, 6]])
 SH = np.arange(2 * 9 * 3, dtype=float).reshape(2, 9, 3) / 128 + 1.0
-RECTANGLE = (0.5, 0.25, 0.125, 0.0)
 
 
 def probes(position=PLACES, sh=SH):
@@ -23,14 +22,6 @@ def probes(position=PLACES, sh=SH):
     light = [{f"sh[{i:2d}]": value for i, value in enumerate(each.T.ravel())} for each in sh]
     places = [dict(zip("xyz", each, strict=True)) for each in position.tolist()]
     return "LightProbes", lambda: {"m_Data": {"m_Positions": places}, "m_BakedCoefficients": light}
-
-
-def lighting(*numbers):
-    """Renderers with the numbers of their lightmaps."""
-    place = dict(zip("xyzw", RECTANGLE, strict=True))
-    return "LightingDataAsset", lambda: {
-        "m_LightmappedRendererData": [{"lightmapIndex": number, "lightmapST": place} for number in numbers]
-    }
 
 
 @pytest.fixture
@@ -50,23 +41,21 @@ def unity(monkeypatch, tmp_path):
 def test_probes(unity):
     path = unity(probes(), ("LightingDataAssetParent", None))
     data = read_lighting_data(path)
-    assert (data.values == SH).all() and (data.position == PLACES).all() and not data.rectangles
+    assert (data.values == SH).all() and (data.position == PLACES).all()
     assert from_canonical(load(path).values.reshape(2, 9, 3), "unity") == pytest.approx(SH, rel=1e-6)
     both = read_lighting_data(unity(probes(), probes(PLACES + 1.0)))
     assert (both.position == np.concatenate([PLACES, PLACES + 1.0])).all() and len(both.values) == 4
 
 
-def test_rectangles_are_counted_and_probes_have_their_command(unity):
-    path = unity(probes(), lighting(0, 65535, 1, 65534, -1))
-    rectangles = read_lighting_data(path).rectangles
-    assert [(each.lightmap, each.scale_offset) for each in rectangles] == [(0, RECTANGLE), (1, RECTANGLE)]
+def test_probes_have_their_command(unity):
+    path = unity(probes(), ("LightingDataAsset", None))
     found = inspect(path)[0]
-    assert "2 light probes of 9 RGB coefficients" in found.what and "2 rectangles of renderers" in found.what
+    assert "2 light probes of 9 RGB coefficients" in found.what
     assert found.command == f"wlm compress {path} -o OUT.wlm"
 
 
 def test_what_has_no_probes_says_so(unity):
-    path = unity(lighting(0))
+    path = unity(("LightingDataAsset", None))
     assert "no light probes" in inspect(path)[0].what
     with pytest.raises(WlmError, match="LightingData.asset: expected light probes, found none"):
         load(path)

@@ -59,10 +59,20 @@ def _names(position: np.ndarray, volume: Volume) -> set[tuple[int, ...]]:
     }
 
 
+def _unscroll(volume: Volume) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The windows' blocks in spatial order, 0 where one is missing, and whether they are present, for each level."""
+    state, ends, values, valid = volume.state(), np.cumsum(volume.sides.prod(1)), [], []
+    for base, sides, page in zip(state.bases, volume.sides, np.split(state.pages, ends[:-1]), strict=True):
+        rows = np.roll(page.reshape(sides), -base, (0, 1, 2))  # a block's slot is its place modulo the sides
+        valid.append(rows >= 0)
+        values.append(state.pool[rows].view(np.float16) * state.factor[rows, None] * valid[-1][..., None])
+    return values, valid
+
+
 def _there(volume: Volume) -> dict[tuple[int, ...], np.ndarray]:
     """The blocks that can be read, by name."""
     there = {}
-    for level, (values, valid) in enumerate(zip(*volume.unscroll(), strict=True)):
+    for level, (values, valid) in enumerate(zip(*_unscroll(volume), strict=True)):
         assert not values[~valid].any()
         there |= {(level, *(i + volume.base[level]).tolist()): values[tuple(i)] for i in np.argwhere(valid)}
     return there
@@ -70,7 +80,7 @@ def _there(volume: Volume) -> dict[tuple[int, ...], np.ndarray]:
 
 def _same(volume: Volume, other: Volume) -> None:
     """Both have the same blocks with the same light."""
-    for got, want in zip(volume.unscroll(), other.unscroll(), strict=True):
+    for got, want in zip(_unscroll(volume), _unscroll(other), strict=True):
         for level, expected in zip(got, want, strict=True):
             np.testing.assert_array_equal(level, expected)
 
@@ -533,7 +543,7 @@ def test_export_of_nothing_and_over_another(volume, tmp_path):
     document, arrays = read_export(tmp_path / "out")
     pages, rows = arrays["pages"].view("<i2"), arrays["pool"].reshape(-1, 15)
     pool = rows[:, :1].view("<f4") * rows[:, 1:].copy().view("<f2")[:, :27]
-    values, valid = volume.unscroll()
+    values, valid = _unscroll(volume)
     first = 0
     for level, described in enumerate(document["levels"]):
         place, sides = np.argwhere(valid[level]), np.array(described["sides"])

@@ -10,11 +10,11 @@ from builders.smoke_plumes import facing, unit_grid
 from reference.single_light import lit
 
 from benchmarks.path_tracer import PathTracer
+from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import DIRECTIONS, RULES, VECTORS, Camera, weights
 from wlm.smoke.lightmaps import axis_faults
 from wlm.smoke.march.six_way import bake
-from wlm.smoke.synthetic import make_plume
 
 
 def _plume(device: str = "cpu", extinction: float = 7.0) -> DensityVolume:

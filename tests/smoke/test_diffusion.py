@@ -10,10 +10,10 @@ import torch
 from builders.smoke_plumes import plume
 
 from benchmarks.smoke_learning import psnr
+from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera, unit
 from wlm.smoke.shading import Light, PointLight, Ramp, half_sphere
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.diffusion import CoarseSmoke, share_of
 from wlm.smoke.transport.lighting import light_smoke, marching
 from wlm.smoke.transport.orders import orders_march, scatter

@@ -7,11 +7,11 @@ import pytest
 import torch
 from builders.smoke_plumes import facing
 
+from demos.plume import make_plume
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.six_way import bake, bake_coarse, guide
 from wlm.smoke.shading import Light, PointLight
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace

@@ -8,11 +8,11 @@ import torch
 from builders.smoke_plumes import facing
 from reference.single_light import lit
 
+from demos.plume import make_plume
 from wlm.fluid.volume import from_array
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.six_way import bake
 from wlm.smoke.shading import Light, PointLight, sky_lights
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.lighting import fine_march, light_smoke
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.settings import March

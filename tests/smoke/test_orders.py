@@ -20,11 +20,11 @@ from benchmarks.smoke_learning import (
     psnr,
     save_orders,
 )
+from demos.plume import make_plume
 from wlm.errors import WlmError
 from wlm.fluid.volume import DensityVolume
 from wlm.smoke.camera import Camera
 from wlm.smoke.shading import Light, PointLight
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.orders import ALBEDOS, Inputs, OrdersModel, load_orders, make_inputs, orders_march, scatter
 from wlm.smoke.transport.tracing import trace
 from wlm_kernels.smoke.orders import FEATURES, MIXES

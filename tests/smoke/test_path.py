@@ -11,13 +11,13 @@ from reference.single_light import lit
 from reference.transport import scattered_twice
 
 from benchmarks.path_tracer import PathTracer
+from demos.plume import make_plume
 from wlm.errors import WlmError
 from wlm.fluid.obstacles import surface
 from wlm.fluid.volume import DensityVolume, from_array
 from wlm.smoke.march.launch import medium_of
 from wlm.smoke.march.six_way import bake
 from wlm.smoke.shading import Light, PointLight
-from wlm.smoke.synthetic import make_plume
 from wlm.smoke.transport.tracing import Transport, trace
 from wlm_kernels.smoke import path
 from wlm_kernels.smoke.march import BRICK

@@ -11,6 +11,7 @@ from builders.smoke_plumes import plume
 from builders.smoke_samples import random_model, small_pool
 
 import wlm
+from demos.plume import make_plume
 from wlm.errors import WlmError
 from wlm.fluid.volume import from_array
 from wlm.metrics import psnr_from_mse
@@ -25,7 +26,6 @@ from wlm.smoke.network.prediction import SmokePredictor, predict
 from wlm.smoke.network.settings import DatasetSettings, NetworkSettings
 from wlm.smoke.network.unet import ADAPTERS, NafBlock, SixWayNetwork, support
 from wlm.smoke.scene import CameraSettings, make_camera
-from wlm.smoke.synthetic import make_plume
 
 
 def _network(**settings) -> SixWayNetwork:

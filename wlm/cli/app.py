@@ -21,7 +21,7 @@ import typer
 from typer.core import TyperGroup
 
 from wlm import __version__
-from wlm.cli import bake, doctor, inspect, smoke, verbs, view, web
+from wlm.cli import bake, inspect, smoke, verbs, view, web
 from wlm.cli import probe_volume as probe
 from wlm.cli import run as run_scene
 from wlm.cli.signals import exit_code, handled
@@ -152,7 +152,6 @@ app.command()(inspect.inspect)
 app.command()(view.view)
 app.command()(web.web)
 app.command()(run_scene.run)
-app.command()(doctor.doctor)
 app.add_typer(probe.app, name="probe")
 app.add_typer(smoke.app, name="smoke")
 app.add_typer(bake.app, name="bake")

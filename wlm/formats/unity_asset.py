@@ -1,4 +1,4 @@
-"""Reading of light probes and lightmap rectangles from Unity's `LightingData.asset` and `LightProbes.asset`.
+"""Reading of light probes from Unity's `LightingData.asset` and `LightProbes.asset`.
 
 UnityPy (extra `unity`) and all work by the layouts that a file contains run in a separate process (`unity_child`).
 Unity's editor writes lighting data in binary whatever the serialization mode of the project; text assets, a regular
@@ -18,7 +18,7 @@ from wlm.formats.child import run_child
 from wlm.formats.hdr_blocks import need
 from wlm.formats.limits import PROBES
 from wlm.formats.reading import damaged, read_file
-from wlm.formats.unity_child import KINDS, LIGHT, LIGHTING, POSITIONS, RENDERERS
+from wlm.formats.unity_child import KINDS, LIGHT, LIGHTING, POSITIONS
 
 _EXTRA = "unity"
 _BYTES = 1 << 28
@@ -40,29 +40,17 @@ def has_lightmap(number: Any) -> bool:
     return number is not None and number not in _NO_LIGHTMAP
 
 
-@dataclass(frozen=True)
-class Rectangle:
-    """The rectangle of a renderer in its lightmap: UVs are scaled by the first two numbers of `lightmapScaleOffset` and
-    offset by the last two, v up."""
-
-    lightmap: int
-    scale_offset: tuple[float, float, float, float]
-
-
 @dataclass(frozen=True, eq=False)
 class LightingData:
     """Content of an asset: the light probes' positions, float64 [N, 3], in Unity's axes, and their coefficients of
-    `SphericalHarmonicsL2`, float64 [N, 9, 3]; and a rectangle for each renderer with a lightmap, in the order of the
-    file, which does not name renderers.
-    """
+    `SphericalHarmonicsL2`, float64 [N, 9, 3]."""
 
     position: np.ndarray
     values: np.ndarray
-    rectangles: tuple[Rectangle, ...]
 
 
 def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
-    """Reads the light probes and lightmap rectangles of an asset."""
+    """Reads the light probes of an asset."""
     data = read_file(path, _BYTES, "the asset")
     if data.startswith(_TEXT):
         return _read_text(path, data)
@@ -81,9 +69,7 @@ def read_lighting_data(path: str | os.PathLike[str]) -> LightingData:
         raise WlmError(f"{path}: expected light for each of {len(position)} probes, found light for {len(light)}")
     if len(position) > PROBES:
         raise WlmError(f"{path}: expected at most {PROBES:,} light probes, found {len(position):,}")
-    rows = [(int(number), tuple(place)) for number, *place in tables[RENDERERS].tolist() if has_lightmap(number)]
-    values = light.reshape(-1, _CHANNELS, _COEFFICIENTS).transpose(0, 2, 1)
-    return LightingData(position, values, tuple(Rectangle(*row) for row in rows))
+    return LightingData(position, light.reshape(-1, _CHANNELS, _COEFFICIENTS).transpose(0, 2, 1))
 
 
 def _read_text(path: str | os.PathLike[str], data: bytes) -> LightingData:
@@ -97,7 +83,7 @@ def _read_text(path: str | os.PathLike[str], data: bytes) -> LightingData:
         )
     with damaged(f"{path}: the asset is damaged", ValueError):
         positions, values = zip(*map(_probes, texts), strict=True)
-    return LightingData(np.concatenate(positions), np.concatenate(values), ())
+    return LightingData(np.concatenate(positions), np.concatenate(values))
 
 
 def _objects(data: bytes) -> list[tuple[str, bytes]]:

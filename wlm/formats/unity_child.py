@@ -10,11 +10,11 @@ import numpy as np
 
 PACKAGE, MEMORY, SECONDS = "UnityPy", 768 << 20, 2
 
-KINDS, POSITIONS, LIGHT, RENDERERS = "kinds", "positions", "light", "renderers"
+KINDS, POSITIONS, LIGHT = "kinds", "positions", "light"
 """Names of the arrays that `encode` returns."""
 
 PROBES, LIGHTING = "LightProbes", "LightingDataAsset"
-"""Types of the objects that are read."""
+"""Types of the objects of lighting data, of which the former hold the probes."""
 
 
 def main(data: bytes) -> dict[str, np.ndarray]:
@@ -31,20 +31,17 @@ def encode(objects: Iterable[tuple[str, Callable[[], dict]]]) -> dict[str, np.nd
     """Collects the arrays of objects, each given by its type and a function that reads its members; a LookupError,
     TypeError or ValueError means other members.
 
-    Returns the types of all objects, text [K]; the positions [N, 3] and coefficients [N, 27] of light probes; and for
-    each renderer the number, scale and offset of its lightmap [R, 5]; float64.
+    Returns the types of all objects, text [K]; and the positions [N, 3] and coefficients [N, 27] of light probes,
+    float64.
     """
     kinds: set[str] = set()
-    position, light, renderer = [], [], []
+    position, light = [], []
     for kind, read in objects:
         kinds.add(kind)
         if kind == PROBES:
             tree = read()
             position += [[each[axis] for axis in "xyz"] for each in tree["m_Data"]["m_Positions"]]
             light += [[each[f"sh[{i:2d}]"] for i in range(27)] for each in tree["m_BakedCoefficients"]]
-        elif kind == LIGHTING:
-            for each in read()["m_LightmappedRendererData"]:
-                renderer.append([each["lightmapIndex"], *(each["lightmapST"][axis] for axis in "xyzw")])
-    tables = {POSITIONS: (position, 3), LIGHT: (light, 27), RENDERERS: (renderer, 5)}
+    tables = {POSITIONS: (position, 3), LIGHT: (light, 27)}
     arrays = {name: np.array(rows, np.float64).reshape(-1, width) for name, (rows, width) in tables.items()}
     return arrays | {KINDS: np.array(sorted(kinds), str)}

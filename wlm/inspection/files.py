@@ -364,12 +364,10 @@ def _checkpoint(path: Path) -> Finding:
 
 
 def _unity_asset(path: Path) -> Finding:
-    data = read_lighting_data(path)
-    rectangles = f"{len(data.rectangles)} rectangles of renderers in lightmaps, without names"
-    if not len(data.position):
-        return Finding(path, f"lighting data of Unity: no light probes, {rectangles}")
+    if not len(read_lighting_data(path).position):
+        return Finding(path, "lighting data of Unity: no light probes")
     found = _probes(path)
-    return replace(found, what=f"lighting data of Unity: {found.what}; {rectangles}")
+    return replace(found, what=f"lighting data of Unity: {found.what}")
 
 
 class _Kind(NamedTuple):

@@ -379,23 +379,6 @@ class Volume:
         with interop.stream(self.device):
             return State(*(part.numpy() for part in parts))
 
-    def unscroll(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Returns the windows' blocks in spatial order, as one texture for each level (the last step of section 3.4).
-
-        Returns:
-            The light of each level, float32 [*sides, D], by x, y and z, 0 for missing blocks; and bool [*sides], true
-            for blocks that are present. The first block of each level is that of `base`.
-        """
-        state, ends = self.state(), np.cumsum(self.sides.prod(1))
-        values, valid = [], []
-        for base, sides, page in zip(state.bases, self.sides, np.split(state.pages, ends[:-1]), strict=True):
-            # A block's slot is its coordinates modulo the sides of the window.
-            rows = np.roll(page.reshape(sides), -base, (0, 1, 2))
-            valid.append(rows >= 0)
-            light = state.pool[rows].view(np.float16) * state.factor[rows, None]
-            values.append(np.where(valid[-1][..., None], light, np.float32(0.0)))
-        return values, valid
-
 
 def _unit(normal: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     """Normalises vectors and returns them in float32; vectors of length 0 stay 0.

@@ -1,4 +1,4 @@
-"""Procedural smoke for demos and benchmarks."""
+"""Procedural smoke for demos, benchmarks and tests."""
 
 import numpy as np
 
