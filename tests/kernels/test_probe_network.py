@@ -66,7 +66,7 @@ class Pass:
         x, target = exact(self.x[: self.count]), exact(self.target[:, : self.count])
         loss = reference.loss(net, f, x, target, exact(self.weight), self.shape[1])
         loss.backward()
-        return float(loss), f.grad.numpy(), net.grad.numpy()
+        return float(loss.detach()), f.grad.numpy(), net.grad.numpy()
 
 
 def _hold(run: Pass) -> None:

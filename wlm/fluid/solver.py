@@ -248,7 +248,7 @@ class Solver:
         if bricks:
             rings = advection_places.rings_for(_SOUND * substeps * refinement)
             self._bricks = advection_places.make_bricks(self._box, rings, threshold, str(self.device))
-        # What the arrays of a checkpoint depend on.
+        # The settings on which the arrays of a checkpoint depend.
         self._grids = {
             "lattice": list(lattice.shape),
             "refinement": refinement,
