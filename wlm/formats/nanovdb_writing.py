@@ -20,7 +20,7 @@ _BOXES, _RANGES, _BREADTH_FIRST = 2, 4, 32  # flags of a grid whose nodes state 
 _FLOAT, _VECTOR, _FOG = 1, 6, 2
 _GRID, _TREE, _ALIGNED = 672, 64, 32  # bytes of `GridData` and `TreeData`, and to whose multiples tables are moved
 _HAS_BOX = 2  # flag of a leaf
-_BOX = ("box", "<i4", (2, 3))
+_BOX: tuple = ("box", "<i4", (2, 3))
 _TILE = np.dtype([("key", "<u8"), ("child", "<i8"), ("state", "<u4"), ("value", "V12")])
 
 
