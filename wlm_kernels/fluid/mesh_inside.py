@@ -1,6 +1,6 @@
 """Tests whether points are in the solid that a mesh bounds.
 
-Read `test_points_in_a_mesh` of `tests/kernels/test_lattice.py` first: it computes the same in NumPy. A point is inside
+Read `tests/kernels/test_mesh_inside.py` first: it computes the same in NumPy. A point is inside
 if the generalised winding number of the mesh is above 1/2 there (Jacobson et al., "Robust inside-outside segmentation
 using generalized winding numbers", 2013), so that small holes do not matter, or if the surface is within a distance,
 the shell, which makes surfaces solid that bound nothing.
