@@ -18,7 +18,7 @@ from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 
 _PIECES = 16  # straight pieces of a ramp of a path
 SHELL = 0.71
-"""Half of the thickness in cells of a surface that stops air: each link of D3Q19, of up to 2^(1/2), has an end in it."""
+"""Half of the thickness in cells of a surface that stops air: a link of D3Q19, of at most 2^(1/2), ends in it."""
 _SIDES = 24  # segments of a sphere from pole to pole; there are twice as many around it
 
 
