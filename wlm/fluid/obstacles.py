@@ -226,6 +226,11 @@ class Mesh:
         if not 0.0 <= self.shell < np.inf:
             raise ValueError(f"shell: expected a distance of at least 0, got {self.shell}")
 
+    @functools.cached_property
+    def extent(self) -> np.ndarray:
+        """Largest distances from the origin along the mesh's axes, in its unit, (3,)."""
+        return np.abs(np.asarray(self.vertices, np.float64)).max(0)
+
     def on(self, device: str) -> wp.Mesh:
         """Returns the mesh on a device, in its own unit, for `wlm_kernels.fluid.mesh_inside`."""
         if device not in self._meshes:
