@@ -1,4 +1,5 @@
-"""Solid obstacles in the air of a simulation, at rest or moving: spheres and closed meshes, their surfaces and paths.
+"""Solid obstacles in the air of a simulation, at rest or moving: spheres and closed meshes, their surfaces and paths,
+and the cells that they cover.
 
 Lengths are in cells of the lattice, times in its steps, as in `wlm.fluid.lattice`. Surfaces are closed and consist of
 triangles, anticlockwise from outside: corners float64 [V, 3], triangles int64 [F, 3].
@@ -14,7 +15,7 @@ import warp as wp
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
+from wlm_kernels.fluid import lattice_bodies
 
 _PIECES = 16  # straight pieces of a ramp of a path
 _SIDES = 24  # segments of a sphere from pole to pole; there are twice as many around it
@@ -177,20 +178,23 @@ class Sphere:
         if not 0.0 < self.radius < np.inf:
             raise ValueError(f"radius: expected a length above 0, got {self.radius}")
 
-    def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """Marks the cells whose centres are inside the obstacle at a position, and clears its earlier marks.
+    def speeds(self) -> np.ndarray:
+        """Returns the largest speed of the surface after each time of the path, float64 [K], cells per step."""
+        velocity, spin = self.path.rates
+        return np.linalg.norm(velocity, axis=1) + self.radius * np.linalg.norm(spin, axis=1)
 
-        Args:
-            solid: uint8 [X, Y, Z], modified.
-            body: Number of the obstacle, 1 to 255.
-            position: Position (3,) in cells.
-        """
-        voxelise_sphere(solid, body, position.tolist(), self.radius)
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the lowest and highest coordinates (3,) of the obstacle relative to its origin, at any time."""
+        return np.full(3, -self.radius), np.full(3, self.radius)
+
+    def form(self, device: wp.Device) -> tuple[float | wp.Mesh, float]:
+        """Returns shape and scale, as for `wlm_kernels.fluid.lattice_bodies.mark`."""
+        return self.radius, 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """An obstacle bounded by a closed mesh, which moves without rotation.
+    """An obstacle bounded by a closed mesh.
 
     A cell whose centre is exactly on the surface may count as inside or outside.
 
@@ -218,18 +222,93 @@ class Mesh:
         if not 0.0 < self.scale < np.inf:
             raise ValueError(f"scale: expected a number above 0, got {self.scale}")
 
-    def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """Marks the cells whose centres are inside the mesh at a position; arguments as for `Sphere.cover`."""
-        device = str(solid.device)
-        if device not in self._meshes:
+    def speeds(self) -> np.ndarray:
+        """As for `Sphere`."""
+        fastest = np.linalg.norm(self.path.rates[0], axis=1)
+        if self.path.turns:
+            corners = self.scale * np.asarray(self.vertices, np.float64)
+            for k, spin in enumerate(self.path.rates[1]):
+                # The angular velocity in the mesh's own frame; the distances from its axis do not change.
+                own = Rotation.from_quat(self.path.rotations[k]).inv().apply(spin)
+                fastest[k] += np.linalg.norm(np.cross(own, corners), axis=1).max()
+        return fastest
+
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """As for `Sphere`."""
+        corners = self.scale * np.asarray(self.vertices, np.float64)
+        if self.path.turns:
+            corners = np.linalg.norm(corners, axis=1).max() * np.array([[-1.0] * 3, [1.0] * 3])
+        else:
+            corners = corners @ self.path.turn(0.0).T
+        return corners.min(axis=0), corners.max(axis=0)
+
+    def form(self, device: wp.Device) -> tuple[float | wp.Mesh, float]:
+        """As for `Sphere`."""
+        name = str(device)
+        if name not in self._meshes:
             points = wp.array(np.asarray(self.vertices, np.float32), dtype=wp.vec3, device=device)
             indices = wp.array(np.asarray(self.triangles, np.int32).ravel(), dtype=int, device=device)
-            self._meshes[device] = wp.Mesh(points, indices, support_winding_number=True)
-        voxelise_mesh(solid, body, self._meshes[device], position.tolist(), scale=self.scale)
+            self._meshes[name] = wp.Mesh(points, indices, support_winding_number=True)
+        return self._meshes[name], self.scale
 
 
 Obstacle = Sphere | Mesh
 """An obstacle, in cells and steps of the lattice."""
+
+
+class Bodies:
+    """Obstacles on the device of a lattice, with numbers from 1 on.
+
+    Args:
+        obstacles: At most 255 obstacles.
+        shape: Cells along x, y and z.
+        device: The device.
+
+    Attributes:
+        motion: The motion of the obstacles in a step, set by `pose`.
+        moving: The windows of those that move.
+    """
+
+    def __init__(self, obstacles: Sequence[Obstacle], shape: tuple[int, int, int], device: wp.Device) -> None:
+        paths = [obstacle.path for obstacle in obstacles]
+        self.motion, self._keys = lattice_bodies.make_motion(device), lattice_bodies.Keys()
+        columns = {
+            "first": (np.cumsum([0, *(len(path.times) for path in paths)], dtype=np.int32), int),
+            "time": (np.concatenate([path.times for path in paths]), wp.float64),
+            "position": (np.concatenate([path.positions for path in paths]), wp.vec3d),
+            "turn": (np.concatenate([path.rotations for path in paths]), wp.quatd),
+            "velocity": (np.concatenate([path.rates[0] for path in paths]), wp.vec3d),
+            "spin": (np.concatenate([path.rates[1] for path in paths]), wp.vec3d),
+        }
+        for name, (values, dtype) in columns.items():
+            setattr(self._keys, name, wp.array(values, dtype=dtype, device=device))
+        flags = np.zeros(256, np.uint8)
+        flags[1 : len(paths) + 1] = [path.moves for path in paths]
+        self.motion.moving.assign(flags)
+        windows = [lattice_bodies.make_window(shape, k + 1, *each.box()) for k, each in enumerate(obstacles)]
+        self._forms = [each.form(device) for each in obstacles]
+        self._windows, self.moving = windows, [window for window in windows if flags[window.body]]
+        # Begin and end of each piece of a moving path, and the largest speed in it.
+        moves = [each for each in obstacles if each.path.moves]
+        self._ends = np.concatenate(
+            [np.zeros((2, 0)), *([each.path.times[:-1], each.path.times[1:]] for each in moves)], axis=1
+        )
+        self._speeds = np.concatenate([np.zeros(0), *(each.speeds()[:-1] for each in moves)])
+
+    def pose(self, clock: wp.array, pace: float) -> None:
+        """Sets `motion` to that in the middle of the next step; arguments as for `lattice_bodies.set_poses`."""
+        lattice_bodies.set_poses(self._keys, clock, pace, self.motion)
+
+    def mark(self, solid: wp.array, fresh: wp.array, stamp: int, windows: Sequence | None = None) -> None:
+        """Marks the cells of the obstacles of some windows, or of all; arguments as for `lattice_bodies.mark`."""
+        for window in self._windows if windows is None else windows:
+            form = self._forms[window.body - 1]
+            lattice_bodies.mark(window, self.motion, *form, stamp, solid, fresh)
+
+    def fastest(self, begin: float, end: float) -> float:
+        """Returns the largest speed between two times of the paths, in their unit."""
+        within = (self._ends[0] < end) & (self._ends[1] > begin)
+        return float(self._speeds[within].max(initial=0.0))
 
 
 def box_mesh(path: Trajectory, size: Sequence[float]) -> Mesh:
