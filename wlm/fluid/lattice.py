@@ -302,8 +302,7 @@ class Lattice:
         """Places the bodies for the next step, whichever cells were solid before."""
         solid = self._zeros(self._cells, wp.uint8)
         if self._bodies is not None:
-            self._bodies.pose(self._clock, self._pace)
-            self._bodies.mark(solid, self._zeros(0, wp.uint8), _STALE)
+            solid = self._bodies.cover(self._clock, self._pace)
         self._fresh.zero_()
         self._graph = None
         self._cover(solid)
@@ -661,7 +660,7 @@ class Lattice:
         self._graph = self._graph if self._links is before else None
 
     def _with_solids(self, links: lattice_links.Links, every: bool) -> lattice_links.Links:
-        """Lists the links of solids after those of faces, in larger arrays if necessary; `every`: also of moving ones."""
+        """Lists the links of solids (`every`: of moving ones too) after those of faces; in larger arrays if needed."""
         # The count is also set without solids: the state before may have had some.
         count = 0
         if self._solid.shape[0] > 0:
@@ -695,8 +694,7 @@ class Lattice:
             self._launch(step_kernel(self._spec), self._cells, inputs, [self._clock, self._trouble, self._sums, out])
             stamp = 1 + self._done % 2
             if self.moving:
-                self._bodies.pose(self._clock, self._pace)
-                self._bodies.mark(self._solid, self._fresh, stamp, self._bodies.moving)
+                self._bodies.move(self._clock, self._pace, self._solid, self._fresh, stamp)
             self._apply_links(0, out, stamp)
             self._done += 1
 

@@ -7,6 +7,7 @@ triangles, anticlockwise from outside: corners float64 [V, 3], triangles int64 [
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -265,12 +266,12 @@ class Bodies:
         device: The device.
 
     Attributes:
-        motion: The motion of the obstacles in a step, set by `pose`.
+        motion: The motion of the obstacles in a step, set by `cover` and `move`.
         moving: The windows of those that move.
     """
 
     def __init__(self, obstacles: Sequence[Obstacle], shape: tuple[int, int, int], device: wp.Device) -> None:
-        paths = [obstacle.path for obstacle in obstacles]
+        paths, self._shape = [obstacle.path for obstacle in obstacles], shape
         self.motion, self._keys = lattice_bodies.make_motion(device), lattice_bodies.Keys()
         columns = {
             "first": (np.cumsum([0, *(len(path.times) for path in paths)], dtype=np.int32), int),
@@ -295,20 +296,35 @@ class Bodies:
         )
         self._speeds = np.concatenate([np.zeros(0), *(each.speeds()[:-1] for each in moves)])
 
-    def pose(self, clock: wp.array, pace: float) -> None:
-        """Sets `motion` to that in the middle of the next step; arguments as for `lattice_bodies.set_poses`."""
+    def cover(self, clock: wp.array, pace: float) -> wp.array:
+        """Sets `motion` as `move`, and returns the marks of all cells, uint8 [X Y Z]."""
         lattice_bodies.set_poses(self._keys, clock, pace, self.motion)
+        solid = wp.zeros(math.prod(self._shape), dtype=wp.uint8, device=clock.device)
+        self._mark(self._windows, solid, wp.empty(0, dtype=wp.uint8, device=clock.device), 1)
+        return solid
 
-    def mark(self, solid: wp.array, fresh: wp.array, stamp: int, windows: Sequence | None = None) -> None:
-        """Marks the cells of the obstacles of some windows, or of all; arguments as for `lattice_bodies.mark`."""
-        for window in self._windows if windows is None else windows:
-            form = self._forms[window.body - 1]
-            lattice_bodies.mark(window, self.motion, *form, stamp, solid, fresh)
+    def move(self, clock: wp.array, pace: float, solid: wp.array, fresh: wp.array, stamp: int) -> None:
+        """Sets `motion` to that in the middle of the next step, and the marks of the obstacles that move accordingly.
+
+        Arguments: see `lattice_bodies.set_poses` and `lattice_bodies.mark`.
+        """
+        lattice_bodies.set_poses(self._keys, clock, pace, self.motion)
+        self._mark(self.moving, solid, fresh, stamp)
+
+    def _mark(self, windows: Sequence, solid: wp.array, fresh: wp.array, stamp: int) -> None:
+        for window in windows:
+            lattice_bodies.mark(window, self.motion, *self._forms[window.body - 1], stamp, solid, fresh)
 
     def fastest(self, begin: float, end: float) -> float:
         """Returns the largest speed between two times of the paths, in their unit."""
         within = (self._ends[0] < end) & (self._ends[1] > begin)
         return float(self._speeds[within].max(initial=0.0))
+
+
+def cells_of(obstacles: Sequence[Obstacle], shape: tuple[int, int, int], device: str = "cpu") -> wp.array:
+    """Returns the number of the obstacle that covers the centre of each cell at time 0, uint8 [X, Y, Z], 0 for none."""
+    clock = wp.zeros(2, dtype=int, device=device)
+    return Bodies(obstacles, shape, clock.device).cover(clock, 0.0).reshape(shape)
 
 
 def box_mesh(path: Trajectory, size: Sequence[float]) -> Mesh:

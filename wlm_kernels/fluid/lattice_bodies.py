@@ -27,9 +27,9 @@ _MARGIN = wp.constant(2)
 
 @wp.struct
 class Motion:
-    """Motion of bodies, by their numbers up to 255: `centre`, vec3 [256], a body's origin in cells; `turn`, quat [256],
-    its rotation about it; `velocity`, vec3 [256], in cells per step; `spin`, vec3 [256], its angular velocity in radians
-    per step; `moving`, uint8 [256], whether it ever moves."""
+    """Motion of bodies, in arrays [256] by their numbers: `centre`, a body's origin in cells; `turn`, its rotation;
+    `velocity`, in cells per step; `spin`, its angular velocity in radians per step; `moving`, whether its path moves.
+    """
 
     centre: wp.array1d[wp.vec3]
     turn: wp.array1d[wp.quat]
@@ -40,9 +40,9 @@ class Motion:
 
 @wp.struct
 class Keys:
-    """Paths of B bodies, one after the other: body b has the poses `first[b]` to `first[b + 1]`, int [B + 1], at `time`,
-    float64 [K], increasing: `position`, vec3d [K], in cells, and `turn`, quatd [K]; `velocity` and `spin`, vec3d [K],
-    are the rates of change until the next pose."""
+    """Paths of B bodies, one after the other: the poses of body b are `first[b]` to `first[b + 1]`, int [B + 1], of K.
+    Each is at a `time`, increasing, and has a `position` in cells and a `turn`; `velocity` and `spin` are the rates of
+    change until the next pose, per unit of time."""
 
     first: wp.array1d[int]
     time: wp.array1d[wp.float64]
@@ -54,8 +54,8 @@ class Keys:
 
 @wp.struct
 class Window:
-    """The box of cells around body `body`: `low`, the body's lowest coordinates relative to its origin, and `cells`, the
-    size of the box, at most that of the domain of `n` cells."""
+    """The box of cells around body `body`: `low`, the body's lowest coordinates relative to its origin, and `cells`,
+    the size of the box, at most that of the domain of `n` cells."""
 
     n: wp.vec3i
     body: int
@@ -122,7 +122,7 @@ def _pose(
 
 @functools.cache
 def _mark_kernel(is_mesh: bool) -> wp.Kernel:
-    """Builds (once) the kernel that marks the cells of a sphere or of a mesh, with a thread for each cell of a window."""
+    """Builds (once) the kernel that marks the cells of a sphere or mesh, with a thread for each cell of a window."""
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def mark(

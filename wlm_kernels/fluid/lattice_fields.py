@@ -1,7 +1,7 @@
 """Velocity and density of the air on a lattice, its initial state, and cells that become fluid.
 
-Read `fields` and `equilibrium` of `tests/reference/lattice.py` first: they compute the same in NumPy. The marks of solid
-cells are those of `lattice_bodies`.
+Read `fields` and `equilibrium` of `tests/reference/lattice.py` first: they compute the same in NumPy. The marks of
+solid cells are those of `lattice_bodies`.
 """
 
 import functools
@@ -23,6 +23,7 @@ from wlm_kernels.fluid.lattice_sets import (
     wrapped,
 )
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
+
 
 @dataclass(frozen=True)
 class FluidKernels:

@@ -135,10 +135,10 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         return equilibrium(t.w[q], t.c[q], drho, u)
 
     @wp.func
-    def summed(sums: wp.array1d[wp.float64], at: int, value: wp.float64):
+    def summed(thread: int, sums: wp.array1d[wp.float64], at: int, value: wp.float64):
         # All threads of a block take part in its sums; most terms are 0.
         total = wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
-        if wp.tid() % wp.block_dim() == 0 and total != wp.float64(0.0):
+        if thread % wp.block_dim() == 0 and total != wp.float64(0.0):
             wp.atomic_add(sums, at, total)
 
     @wp.kernel(module="unique", module_options=options)
@@ -190,8 +190,8 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                 if kind == _OUTLET:
                     weight = wp.float64(t.w[q])
         if wp.static(balance):
-            summed(sums, 0, net)
-            summed(sums, 1, weight)
+            summed(wp.tid(), sums, 0, net)
+            summed(wp.tid(), sums, 1, weight)
 
     @wp.kernel(module="unique", module_options=options)
     def write(
@@ -318,7 +318,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                             store(f, q, k, load(f, opposite(q), i) + term)
                             net += wp.float64(term)
         if wp.static(balance):
-            summed(sums, 0, net)
+            summed(wp.tid(), sums, 0, net)
 
     return LinkKernels(values, write, force, bounce)
 
@@ -355,7 +355,9 @@ def _find(
                     links.term[at] = 6.0 * t.w[q] * wp.dot(c, u)
 
 
-def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, motion: Motion, every: bool, links: Links):
+def find_links(
+    tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, motion: Motion, every: bool, links: Links
+) -> wp.array:
     """Lists the links of solid cells, in any order, after the links of faces; `links.used` is not changed.
 
     Bodies that move are left out, as if they were fluid, unless `every` is true. `n` are the cells along x, y and z, N
