@@ -19,6 +19,8 @@ from scipy.spatial.transform import Rotation
 from wlm_kernels.fluid import lattice_bodies
 
 _PIECES = 16  # straight pieces of a ramp of a path
+SHELL = 0.71
+"""Half of the thickness in cells of a surface that stops air: a link of D3Q19, of at most 2^(1/2), ends in it."""
 _SIDES = 24  # segments of a sphere from pole to pole; there are twice as many around it
 
 
@@ -188,28 +190,32 @@ class Sphere:
         """Returns the lowest and highest coordinates (3,) of the obstacle relative to its origin, at any time."""
         return np.full(3, -self.radius), np.full(3, self.radius)
 
-    def form(self, device: wp.Device) -> tuple[float | wp.Mesh, float]:
-        """Returns shape and scale, as for `wlm_kernels.fluid.lattice_bodies.mark`."""
-        return self.radius, 1.0
+    def form(self, device: str) -> tuple[float | wp.Mesh, float, float]:
+        """Returns shape, scale and shell, as for `wlm_kernels.fluid.lattice_bodies.mark`."""
+        return self.radius, 1.0, 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """An obstacle bounded by a closed mesh.
+    """An obstacle bounded by a mesh.
 
-    A cell whose centre is exactly on the surface may count as inside or outside.
+    It is solid by its winding number, so that small holes do not matter, and within the shell of its surface, so that
+    a surface that is open or thin stops the air. A cell whose centre is exactly on the surface may count as inside or
+    outside.
 
     Attributes:
         path: Path of the mesh's origin.
         vertices: float32 [V, 3], corners relative to the mesh's origin, in the mesh's own unit.
         triangles: int32 [T, 3], indices of each triangle's corners, anticlockwise seen from outside.
         scale: Cells per unit of the mesh.
+        shell: Distance from the surface in cells within which a cell is solid, too; of at least `SHELL` no air passes.
     """
 
     path: Trajectory
     vertices: np.ndarray
     triangles: np.ndarray
     scale: float = 1.0
+    shell: float = 0.0
     _meshes: dict[str, wp.Mesh] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -222,6 +228,8 @@ class Mesh:
             raise ValueError(f"triangles: expected vertex indices of 0 to {len(v) - 1}, got {t.min()} to {t.max()}")
         if not 0.0 < self.scale < np.inf:
             raise ValueError(f"scale: expected a number above 0, got {self.scale}")
+        if not 0.0 <= self.shell < np.inf:
+            raise ValueError(f"shell: expected a distance of at least 0, got {self.shell}")
 
     def speeds(self) -> np.ndarray:
         """As for `Sphere`."""
@@ -241,16 +249,19 @@ class Mesh:
             corners = np.linalg.norm(corners, axis=1).max() * np.array([[-1.0] * 3, [1.0] * 3])
         else:
             corners = corners @ self.path.turn(0.0).T
-        return corners.min(axis=0), corners.max(axis=0)
+        return corners.min(axis=0) - self.shell, corners.max(axis=0) + self.shell
 
-    def form(self, device: wp.Device) -> tuple[float | wp.Mesh, float]:
-        """As for `Sphere`."""
-        name = str(device)
-        if name not in self._meshes:
+    def on(self, device: str) -> wp.Mesh:
+        """Returns the mesh on a device, in its own unit, for `wlm_kernels.fluid.mesh_inside`."""
+        if device not in self._meshes:
             points = wp.array(np.asarray(self.vertices, np.float32), dtype=wp.vec3, device=device)
             indices = wp.array(np.asarray(self.triangles, np.int32).ravel(), dtype=int, device=device)
-            self._meshes[name] = wp.Mesh(points, indices, support_winding_number=True)
-        return self._meshes[name], self.scale
+            self._meshes[device] = wp.Mesh(points, indices, support_winding_number=True)
+        return self._meshes[device]
+
+    def form(self, device: str) -> tuple[float | wp.Mesh, float, float]:
+        """As for `Sphere`."""
+        return self.on(device), self.scale, self.shell
 
 
 Obstacle = Sphere | Mesh
@@ -287,7 +298,7 @@ class Bodies:
         flags[1 : len(paths) + 1] = [path.moves for path in paths]
         self.motion.moving.assign(flags)
         windows = [lattice_bodies.make_window(shape, k + 1, *each.box()) for k, each in enumerate(obstacles)]
-        self._forms = [each.form(device) for each in obstacles]
+        self._forms = [each.form(str(device)) for each in obstacles]
         self._windows, self.moving = windows, [window for window in windows if flags[window.body]]
         # Begin and end of each piece of a moving path, and the largest speed in it.
         moves = [each for each in obstacles if each.path.moves]

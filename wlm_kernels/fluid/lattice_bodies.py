@@ -17,11 +17,10 @@ import numpy as np
 import warp as wp
 
 from wlm_kernels.fluid.lattice_sets import cell_of, crosses, index_of
+from wlm_kernels.fluid.mesh_inside import in_mesh
 
 wp.set_module_options({"enable_backward": False})
 
-# The winding number is correct even where a sign from rays would fail because a ray grazes a triangle.
-_INSIDE = wp.constant(0.5)
 _MARGIN = wp.constant(2)
 
 
@@ -132,6 +131,7 @@ def _mark_kernel(is_mesh: bool) -> wp.Kernel:
         mesh: wp.uint64,
         size: float,
         reach: float,
+        shell: float,
         stamp: wp.uint8,
         # out:
         solid: wp.array1d[wp.uint8],
@@ -144,8 +144,7 @@ def _mark_kernel(is_mesh: bool) -> wp.Kernel:
         x = wp.quat_rotate_inv(motion.turn[body], centre_of(p) - motion.centre[body])
         inside = bool(False)
         if wp.static(is_mesh):
-            query = wp.mesh_query_point_sign_winding_number(mesh, x / size, reach, 2.0, _INSIDE)
-            inside = query.result and query.sign < 0.0
+            inside = in_mesh(mesh, x / size, reach, shell / size)
         else:
             inside = wp.length(x) < size
         i = index_of(window.n, p)
@@ -197,14 +196,16 @@ def set_poses(keys: Keys, clock: wp.array, pace: float, motion: Motion) -> None:
     wp.launch(_pose, bodies, inputs=[keys, clock, wp.float64(pace)], outputs=[motion], device=clock.device)
 
 
-def mark(window: Window, motion: Motion, shape: float | wp.Mesh, scale: float, stamp: int, solid, fresh) -> None:
+def mark(
+    window: Window, motion: Motion, shape: float | wp.Mesh, scale: float, shell: float, stamp: int, solid, fresh
+) -> None:
     """Marks the cells whose centres are in a body, and clears its other cells in its window.
 
     Args:
         window: The body's window.
         motion: The pose of the body.
-        shape: Radius of a sphere in cells, or a closed mesh, made with `support_winding_number=True`.
-        scale: Cells per unit of the mesh.
+        shape: Radius of a sphere in cells, or a mesh, made with `support_winding_number=True`.
+        scale, shell: Cells per unit of the mesh, and its shell in cells (`mesh_inside`).
         stamp: A number that differs from that of the step before.
         solid: uint8 [N], the bodies' marks.
         fresh: uint8 [N], set to `stamp` in the cells that the body leaves, and to 0 in the window's others without this
@@ -215,6 +216,6 @@ def mark(window: Window, motion: Motion, shape: float | wp.Mesh, scale: float, s
         inputs = [shape.id, scale, 4.0 * float(sum(window.n)) / scale]
     else:
         inputs = [wp.uint64(0), shape, 0.0]
-    inputs = [window, motion, *inputs, wp.uint8(stamp)]
+    inputs = [window, motion, *inputs, shell, wp.uint8(stamp)]
     kernel = _mark_kernel(isinstance(shape, wp.Mesh))
     wp.launch(kernel, size_of(window), inputs=inputs, outputs=[solid, fresh], device=solid.device)
