@@ -2,7 +2,8 @@
 (neural-six-way-lightmaps, section 5: 100^3 velocities, 400^3 densities).
 
 Lengths are in cells of the lattice, times in its steps. A step of the solver is `substeps` of the lattice, in this
-order: obstacles move, smoke accelerates the air (buoyancy), the air moves, it carries the smoke, sources add smoke.
+order: smoke accelerates the air (buoyancy), the air and the obstacles move, the air carries the smoke, sources add
+smoke.
 """
 
 import hashlib
@@ -162,7 +163,6 @@ class SmokeSetup:
         temperature: Whether the smoke has a temperature.
         decay: Factors of density and temperature per step.
         bricks: Whether only bricks with smoke are computed.
-        moves: Whether an obstacle moves.
     """
 
     shape: tuple[int, int, int]
@@ -176,7 +176,6 @@ class SmokeSetup:
     temperature: bool
     decay: tuple[float, float]
     bricks: bool
-    moves: bool
 
 
 def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
@@ -197,8 +196,7 @@ def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Devi
 class Solver:
     """Simulates smoke in the air of a lattice.
 
-    Set the faces of the lattice beforehand; the solver sets the solids of the lattice and its force. With a moving
-    obstacle each step waits for the device.
+    Set the faces of the lattice beforehand; the solver sets the bodies of the lattice and its force.
 
     Args:
         lattice: The air.
@@ -265,8 +263,7 @@ class Solver:
             raise ValueError("temperature: expected True, since a source, buoyancy or cooling uses it, got False")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
-        # The paths of obstacles are in steps of the first duration.
-        self.duration, self._first_duration = duration, duration
+        self.duration = duration
         self.shape = tuple(refinement * size for size in lattice.shape)
         stored, cells = advection.STORAGES[storage], math.prod(self.shape)
         require_memory(self.shape, voxel_bytes(scheme, storage, temperature), self.device)
@@ -281,9 +278,11 @@ class Solver:
         if buoyancy is not None:
             self._force = self._zeros(lattice.shape, wp.vec3)
             lattice.set_force(self._force)
-        self._solid = self._zeros(lattice.shape if obstacles else (0,), wp.uint8)
-        self._walls = [self._zeros((self._solid.size,), wp.uint8) for _ in range(2)]
-        self._placed = np.full((len(obstacles), 2, 3), np.nan)
+        if obstacles:
+            lattice.set_bodies(self.obstacles)
+        self._walls = [self._zeros((math.prod(lattice.shape) if obstacles else 0,), wp.uint8) for _ in range(2)]
+        if obstacles:
+            advection_places.mark_walls(self._box, lattice.solid.flatten(), self._walls[0])
         self._bricks = DENSE
         if bricks:
             rings = advection_places.rings_for(_SOUND * substeps * refinement)
@@ -295,6 +294,7 @@ class Solver:
             "storage": storage,
             "temperature": temperature,
             "substeps": substeps,
+            "obstacles": len(obstacles),
         }
         self._done = 0
 
@@ -305,7 +305,7 @@ class Solver:
 
         During the capture of a CUDA graph it does not check the air: call `check` between replays of the graph. The
         number of steps, and the number of steps done before the capture, must then be multiples of `period`, `substeps`
-        must be a multiple of the lattice's `period`, and obstacles must be at rest.
+        must be a multiple of the lattice's `period`.
 
         Raises:
             WlmError: The air blew up, or an obstacle is too fast.
@@ -315,14 +315,12 @@ class Solver:
         capturing = self.device.is_cuda and self.device.is_capturing
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         uneven = uneven or self._decay_every > 1
-        if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
+        if capturing and (uneven or not self._done):
             raise ValueError(
-                f"steps: expected obstacles at rest, substeps a multiple of {self.lattice.period}, and a multiple of "
+                f"steps: expected substeps a multiple of {self.lattice.period}, and a multiple of "
                 f"{self.period} steps in the captured CUDA graph and before it; got {steps} after {self._done}"
             )
         for _ in range(steps):
-            if not capturing:
-                self._place_obstacles()
             self._step()
             self._done += 1
 
@@ -343,7 +341,6 @@ class Solver:
             raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
         self.lattice.change_step(factor)
         self._done = done
-        self._placed[:, 1] *= factor
         wp.to_torch(self._velocity).mul_(factor)
         self._convert_settings(factor)
 
@@ -409,7 +406,7 @@ class Solver:
     @property
     def solid(self) -> wp.array:
         """Numbers of the obstacles, uint8 [cells of the lattice]; [0] without obstacles."""
-        return self._solid
+        return self.lattice.solid
 
     @property
     def velocity(self) -> wp.array:
@@ -449,8 +446,7 @@ class Solver:
         )
 
     def setup(self) -> SmokeSetup:
-        """Places the obstacles as the next step would, and returns the settings with a copy of their cells."""
-        self._place_obstacles()
+        """Returns the settings, with a copy of the obstacles' cells."""
         return SmokeSetup(
             shape=self.shape,
             box=self._box,
@@ -463,7 +459,6 @@ class Solver:
             temperature=self.temperature is not None,
             decay=self._decay,
             bricks=self._bricks is not DENSE,
-            moves=any(obstacle.path.moves for obstacle in self.obstacles),
         )
 
     # Checkpoints.
@@ -478,7 +473,7 @@ class Solver:
         air = self.lattice.state()
         tensors = {f"lattice.{name}": value for name, value in air.items()}
         # On a CPU .numpy() shares the array's memory; it is written before the next step changes it.
-        tensors |= {"density": self.density.numpy(), "placed": self._placed, "velocity": self._velocity.numpy()}
+        tensors |= {"density": self.density.numpy(), "velocity": self._velocity.numpy()}
         if self.temperature is not None:
             tensors["temperature"] = self.temperature.numpy()
         settings = self._grids | {"duration": self.duration}
@@ -506,10 +501,7 @@ class Solver:
             raise WlmError(f"{path}: duration: expected about {self.duration:.3g} for a step, found {duration}")
         state, now = artifact.tensors, self._fields[0]
         field = Part(wp.dtype_to_numpy(self.density.dtype), self.density.shape, least=0)
-        # NaN before the first step, when no obstacle has been placed.
-        nowhere = np.isnan(state.get("placed", 0.0)).all()
-        table = {"density": field, "placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
-        table["velocity"] = Part(np.float32, (*self.lattice.shape, 3))
+        table = {"density": field, "velocity": Part(np.float32, (*self.lattice.shape, 3))}
         if self.temperature is not None:
             table["temperature"] = field
         air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
@@ -529,15 +521,12 @@ class Solver:
         self._velocity.assign(parts["velocity"])
         if self.temperature is not None:
             now.temperature.assign(parts["temperature"].ravel())
-        self._placed = np.array(parts["placed"])
         self._done = self.steps
         if self.obstacles:
-            # Before the first step the lattice has no solid.
-            if air["solid"].size:
-                self._solid.assign(np.array(air["solid"]).reshape(self._solid.shape))
-            else:
-                self._solid.zero_()
-            advection_places.mark_walls(self._box, self._solid.flatten(), self._walls[0])
+            # Smoke that an obstacle covers which was elsewhere is lost.
+            before = wp.array(air["solid"], dtype=wp.uint8, device=self.device)
+            advection_places.mark_walls(self._box, before, self._walls[0])
+            self._change_walls()
         if self._bricks is not DENSE:
             self._bricks.busy.fill_(1)
         self._note_checkpoint(path, air["steps"])
@@ -554,43 +543,33 @@ class Solver:
 
     # Within a step.
 
-    def _place_obstacles(self) -> None:
-        """Moves obstacles to their positions in the middle of the step, unless they are there and at rest."""
-        span = self.substeps * self.duration / self._first_duration
-        placed = np.empty_like(self._placed)
-        for k, obstacle in enumerate(self.obstacles):
-            at = [obstacle.path.at((self._done + t) * span) for t in (0.0, 0.5, 1.0)]
-            placed[k] = at[1], (at[2] - at[0]) / self.substeps
-        if np.array_equal(placed, self._placed):
-            return
-        for k, obstacle in enumerate(self.obstacles):
-            obstacle.cover(self._solid, k + 1, placed[k, 0])
-        with self._naming_checkpoint():
-            self.lattice.set_solid(self._solid, placed[:, 1])
+    def _change_walls(self) -> None:
+        """Follows the obstacles: cells that they cover lose their smoke, cells that they leave get some from beside."""
         old, new = self._walls
-        advection_places.mark_walls(self._box, self._solid.flatten(), new)
+        advection_places.mark_walls(self._box, self.lattice.solid.flatten(), new)
         advection_sources.change_solids(self._box, old, new, self._fields[0], self._bricks)
         self._walls = [new, old]
-        self._placed = placed
 
     def _step(self) -> None:
-        box, walls, bricks = self._box, self._walls[0], self._bricks
+        box, bricks = self._box, self._bricks
         if bricks is not DENSE:
             advection_places.relist(box, bricks)
             for fields in self._fields:
                 advection_sources.empty_retired(box, bricks, fields)
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
-            advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
+            advection_sources.buoyancy(box, self._walls[0], self._fields[0], *by, self._force.flatten(), bricks)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
+        if self.lattice.moving:
+            self._change_walls()
         self.lattice.velocity(out=self._velocity)
         self._carry()
         for source in self.sources:
             steps = source.steps(self.substeps)
             value = (steps * source.density, steps * source.temperature)
-            region = source.region(box.refinement, str(self.device))
-            advection_sources.add_source(box, walls, region, value, self._fields[0], fixed=source.fixed, bricks=bricks)
+            where = [box, self._walls[0], source.region(box.refinement, str(self.device)), value]
+            advection_sources.add_source(*where, self._fields[0], fixed=source.fixed, bricks=bricks)
 
     def _carry(self) -> None:
         now, *spare = self._fields
