@@ -2,8 +2,9 @@
 
 Two patches are alike if their distance is below a threshold, lambda. For most pairs, lower and upper bounds of the
 distance (`Bounds`) decide, so that all samples are compared for few pairs only. The bounds are float32 with a margin
-above their rounding errors, and so never change a result. Patches are sorted by mean colour: if two means differ by
-lambda or more, the patches can't be alike and are not compared.
+above their rounding errors, and so never change a result. Lattices of more than 65 samples along a side have no bounds,
+since computing them would take longer than the few comparisons of such patches. Patches are sorted by mean colour: if
+two means differ by lambda or more, the patches can't be alike and are not compared.
 
 Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`), which does the same with the distances of
 all pairs.
@@ -29,6 +30,8 @@ from wlm_kernels.atlas.patches import (
 
 # The margin exceeds the rounding of a bound in float32: 6e-8 of up to 765 levels, a few dozen times.
 _MARGIN = wp.constant(4.0e-3)
+
+_BOUNDED = 7  # sizes with `Bounds`: up to 65
 
 
 @wp.struct
@@ -68,8 +71,8 @@ class Rule:
     colour: int
     level: float
     whole: int
-    same: wp.array1d[int]
-    mixed: wp.array1d[int]
+    same: wp.array1d[wp.int64]
+    mixed: wp.array1d[wp.int64]
 
 
 @wp.kernel(enable_backward=False)
@@ -168,24 +171,26 @@ def _alike(
         large = y
         small = x
     level = wp.max(a.level, b.level)
-    f = bounds[large, level]
-    g = bounds[small, level]
-    below = _row_differences(f.moment, g.moment)
-    above = _row_differences(f.corner, g.corner)
-    undecided = int(0)
+    undecided = int(63)
     first = int(0)
-    closest = float(wp.inf)
-    for order in range(6):
-        bound = _along(above, order) / 3.0 + f.residual + g.residual
-        if bound < rule.level - _MARGIN:
-            return True
-        if bound < closest:
-            closest = bound
-            first = order
-        if _along(below, order) < rule.level + _MARGIN:
-            undecided += 1 << order
-    if undecided == 0:
-        return False
+    if level < bounds.shape[1]:
+        f = bounds[large, level]
+        g = bounds[small, level]
+        below = _row_differences(f.moment, g.moment)
+        above = _row_differences(f.corner, g.corner)
+        undecided = 0
+        closest = float(wp.inf)
+        for order in range(6):
+            bound = _along(above, order) / 3.0 + f.residual + g.residual
+            if bound < rule.level - _MARGIN:
+                return True
+            if bound < closest:
+                closest = bound
+                first = order
+            if _along(below, order) < rule.level + _MARGIN:
+                undecided += 1 << order
+        if undecided == 0:
+            return False
     limit = rule.mixed[level]
     if a.level == b.level:
         limit = rule.same[level]
@@ -201,24 +206,44 @@ def _alike(
 @wp.kernel(enable_backward=False)
 def _spans(
     # in:
+    samples: wp.array1d[int],
     patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
+    levels: int,
     # out:
     low: wp.array1d[float],
     high: wp.array1d[float],
 ):
-    """Writes a patch's least and greatest mean colour (sum of the channels) on its own lattice and all larger ones."""
-    i = wp.tid()
-    least = float(wp.inf)
-    most = float(-wp.inf)
-    for level in range(patches[i].level, bounds.shape[1]):
-        moment = bounds[i, level].moment
-        sum = moment[0] + moment[1] + moment[2]
-        mean = sum[0] + sum[1] + sum[2]
+    """Writes a patch's least and greatest mean colour (sum of the channels) on its own lattice and all larger ones.
+
+    A larger lattice has s steps in each step of the patch's own. In the sum of the interpolated colours a sample within
+    the patch then has the weight s^2, one on an edge s (s + 1) / 2 and one at a corner (s + 1) (s + 2) / 6.
+    """
+    t = wp.tid()
+    p = patches[t]
+    steps = 1 << p.level
+    sums = wp.vec3d()  # within, on edges, at corners
+    at = p.start
+    for j in range(steps + 1):
+        for i in range(steps + 1 - j):
+            k = steps - i - j
+            zeros = wp.where(i == 0, 1, 0) + wp.where(j == 0, 1, 0) + wp.where(k == 0, 1, 0)
+            a = samples[at]
+            sums[zeros] += wp.float64(channel(a, 0) + channel(a, 1) + channel(a, 2))
+            at += 1
+    least = wp.float64(wp.inf)
+    most = wp.float64(-wp.inf)
+    for level in range(p.level, levels):
+        s = wp.float64(1 << (level - p.level))
+        n = wp.float64((1 << level) + 1)
+        one = wp.float64(1.0)
+        two = wp.float64(2.0)
+        six = wp.float64(6.0)
+        sum = s * s * sums[0] + s * (s + one) / two * sums[1] + (s + one) * (s + two) / six * sums[2]
+        mean = sum / (n * (n + one) / two)
         least = wp.min(least, mean)
         most = wp.max(most, mean)
-    low[i] = least
-    high[i] = most
+    low[t] = float(least)
+    high[t] = float(most)
 
 
 @wp.kernel(enable_backward=False)
@@ -288,14 +313,14 @@ def rule(threshold: float, colour_threshold: float, device) -> Rule:
     out.whole = math.ceil(total)
     same = [math.ceil(total * samples_of(size)) for size in SIZES]
     mixed = [math.ceil(total * samples_of(size) * (size - 1)) for size in SIZES]
-    out.same = wp.array(same, dtype=int, device=device)
-    out.mixed = wp.array(mixed, dtype=int, device=device)
+    out.same = wp.array(same, dtype=wp.int64, device=device)
+    out.mixed = wp.array(mixed, dtype=wp.int64, device=device)
     return out
 
 
 def bounds(samples, patches, levels: int):
-    """Returns the `Bounds` [F, levels] of F patches on the lattices of the sizes `SIZES[:levels]`."""
-    out = wp.empty((patches.shape[0], levels), dtype=Bounds, device=samples.device)
+    """Returns the `Bounds` [F, L] of F patches on the lattices of the sizes `SIZES[:L]`, L = `levels`, at most 7."""
+    out = wp.empty((patches.shape[0], min(levels, _BOUNDED)), dtype=Bounds, device=samples.device)
     wp.launch(_bounds, out.shape, inputs=[samples, patches], outputs=[out], device=samples.device)
     return out
 
@@ -327,11 +352,12 @@ class Graph:
         return [self.samples, self.patches, self.bounds, self.rule]
 
 
-def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
-    """Makes the graph of M patches. Also returns the index in `patches` of each of its nodes, int64 [M]."""
+def graph(samples, patches, bounds, levels: int, rule: Rule) -> tuple[Graph, np.ndarray]:
+    """Makes the graph of M patches of the sizes `SIZES[:levels]`. Also returns the index in `patches` of each of its
+    nodes, int64 [M]."""
     count, device = patches.shape[0], samples.device
     low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
-    wp.launch(_spans, count, inputs=[patches, bounds], outputs=[low, high], device=device)
+    wp.launch(_spans, count, inputs=[samples, patches, levels], outputs=[low, high], device=device)
     least, most = low.numpy(), high.numpy()
     order = np.argsort(least, kind="stable")
     spans = [wp.array(values[order], dtype=float, device=device) for values in (least, most)]
