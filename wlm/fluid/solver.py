@@ -24,7 +24,7 @@ from wlm.fluid.lattice import Lattice, require_free
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume, gather, scatter
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.formats.parts import Part, check_parts
+from wlm.formats.parts import Part, check_part, check_parts
 from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.advection_places import DENSE
 
@@ -499,18 +499,17 @@ class Solver:
         duration = artifact.settings.get("duration")
         if not (isinstance(duration, float) and 1e-6 <= duration / self.duration <= 1e6):
             raise WlmError(f"{path}: duration: expected about {self.duration:.3g} for a step, found {duration}")
-        state = artifact.tensors
-        count, edge = np.size(state.get("bricks", ())), advection_places.BRICK
-        field = Part(wp.dtype_to_numpy(self._stored), (count, edge, edge, edge), least=0)
+        state, edge = artifact.tensors, advection_places.BRICK
         # NaN before the first step, when no obstacle has been placed.
         nowhere = np.isnan(state.get("placed", 0.0)).all()
-        table = {"density": field, "placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
+        table = {"placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
         table["velocity"] = Part(np.float32, (*self.lattice.shape, 3))
-        table["bricks"] = Part(np.int32, (count,), least=0, most=math.prod(self._box.bricks) - 1)
-        if self._grids["temperature"]:
-            table["temperature"] = field
+        table["bricks"] = Part(np.int32, (None,), least=0, most=math.prod(self._box.bricks) - 1)
         air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
         try:
+            count = len(check_part(state, "bricks", table["bricks"]))
+            for name in ("density", "temperature")[: 1 + self._grids["temperature"]]:
+                table[name] = Part(wp.dtype_to_numpy(self._stored), (count, edge, edge, edge), least=0)
             parts = check_parts({name: v for name, v in state.items() if not name.startswith("lattice.")}, table)
         except ValueError as error:
             raise WlmError(f"{path}: {error}") from error
