@@ -265,7 +265,7 @@ def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
         for name, timing in times.items():
             figures = {"voxels": edge}
             if name != "dense":
-                worked = lists[name].count * advection_places.CELLS / edge**3
+                worked = int(lists[name].bricks.counts.numpy()[0]) * advection_places.CELLS / edge**3
                 figures["worked_on"] = min(worked, 1.0)
                 figures["speedup"] = times["dense"].median_ms / timing.median_ms
             rows.append(bench.row("advection bricks", f"{scheme}, {name}", scene="cube", timing=timing, **figures))

@@ -10,10 +10,11 @@ import warp as wp
 
 from wlm import fluid
 from wlm.errors import WlmError
+from wlm.fluid.bricks import require_memory
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
 from wlm.fluid.obstacles import Sphere, Trajectory, box_mesh, surface
-from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source, require_memory
+from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
 
 SHAPE = (20, 10, 10)
 NOZZLE = Source("box", (2, 5, 5), (1.5, 2.5, 2.5), 1.0, 0.5, fixed=True)
@@ -113,9 +114,10 @@ def test_bricks_take_memory_where_smoke_is(device: str, monkeypatch: pytest.Monk
     small.sources = [Source("box", (4, 4, 4), (9, 9, 9), 1.0, fixed=True)]
     small.step()
     assert small.active_cells == 16**3 and (_numbers(small) == 1.0).all() and small.stored_bytes > empty
-    monkeypatch.setattr("wlm.fluid.bricks.free_memory", lambda device: 1000)
-    with pytest.raises(WlmError, match="bricks of 8.3 cells need 0.0 GiB on .*: expected at most"):
-        Solver(_room(device, (8, 8, 8)), sources=small.sources, bricks=True).step()
+    scarce = Solver(_room(device, (8, 8, 8)), sources=small.sources, bricks=True)
+    monkeypatch.setattr("wlm.fluid.lattice.free_memory", lambda device: 1000)
+    with pytest.raises(WlmError, match="bricks of smoke: 65 x 512 x 1 cells need 0.0 GiB on .*: expected at most"):
+        scarce.step()
 
 
 def test_smoke_decays(device: str):
@@ -363,7 +365,7 @@ def test_too_large(device: str):
     with pytest.raises(WlmError, match="1600 x 1600 x 1600 cells: expected fewer than 2\\^31"):
         Solver(Lattice((8, 8, 8), viscosity=0.1, device=device), refinement=200)
     with pytest.raises(WlmError, match=r"100 x 100 x 100 cells need .* GiB on .*: expected at most"):
-        require_memory((100, 100, 100), 10**15, wp.get_device(device))
+        require_memory("smoke", (100, 100, 100), 10**15, wp.get_device(device))
 
 
 def test_a_frame_is_the_smoke_as_it_is(device: str):

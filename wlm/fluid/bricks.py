@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.interop import free_memory
+from wlm.fluid.lattice import require_free
 from wlm_kernels.fluid import advection_places, advection_sources
 from wlm_kernels.fluid.advection import Fields
 from wlm_kernels.fluid.advection_places import CELLS, Box
@@ -20,6 +20,15 @@ INDEX_BYTES = 16
 """Memory of a brick that is not stored."""
 
 _MARGIN = 64  # bricks by which the pool grows at least
+
+
+def require_memory(name: str, shape: tuple[int, int, int], needed: int, device: wp.Device) -> None:
+    """Checks that cells of smoke can be indexed, and `needed` bytes for them allocated; `name` is for the message."""
+    x, y, z = shape
+    if x * y * z >= 2**31:
+        raise WlmError(f"{name}: {x} x {y} x {z} cells: expected fewer than 2^31 cells in all: use a lower refinement")
+    remedy = "a lower refinement, bricks, storage='float16' or the scheme 'semi-lagrangian'"
+    require_free(name, shape, needed, device, remedy)
 
 
 class BrickPool:
@@ -48,17 +57,6 @@ class BrickPool:
     def is_full(self) -> bool:
         """Whether the pool has room for all bricks of the domain, so that it never grows."""
         return self._size > self.most
-
-    @property
-    def count(self) -> int:
-        """Number of listed bricks; waits for the device."""
-        return int(self.bricks.counts.numpy()[0])
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the pool and of the lists on the device."""
-        pool = sum(part.capacity for each in self.fields for part in (each.density, each.temperature))
-        return pool + INDEX_BYTES * self.most + self.bricks.free.capacity
 
     def relist(self) -> None:
         """Lists the bricks of the next step; `store` must follow."""
@@ -90,16 +88,12 @@ class BrickPool:
             return
         size = min(count + max(count // 4, _MARGIN), self.most) + 1
         now, old = self.fields[0], self._size
-        brick = sum(
-            wp.types.type_size_in_bytes(part.dtype) * CELLS for part in (now.density, now.temperature) if part.size
-        )
+        parts = [part for part in (now.density, now.temperature) if part.size]
+        brick = sum(CELLS * wp.types.type_size_in_bytes(part.dtype) for part in parts)
         # The other buffers are empty between two steps, and the kept one is copied.
-        buffers, free = len(self.fields), free_memory(self._device) + old * brick * (len(self.fields) - 1)
-        if (need := size * brick * buffers) > free or size * CELLS >= 2**31:
-            raise WlmError(
-                f"smoke: {count} bricks of 8^3 cells need {need / 2**30:.1f} GiB on {self._device}: expected at most "
-                f"2^31 cells, and the {free / 2**30:.1f} GiB that are free: use a lower refinement or storage='float16'"
-            )
+        buffers = len(self.fields)
+        more = (size * buffers - old * (buffers - 1)) * brick
+        require_memory("bricks of smoke", (size, CELLS, 1), more, self._device)
         self.fields[1:] = []
         grown = self._make(size * CELLS)
         for name in ("density", "temperature"):
@@ -124,12 +118,8 @@ class BrickPool:
         return _cubes(field)[wp.to_torch(self.bricks.places)[numbers.long()].long()]
 
     def put(self, numbers: torch.Tensor, values: Sequence[torch.Tensor]) -> None:
-        """Stores bricks in the first buffer, and marks them as busy; the pool must be new.
-
-        Args:
-            numbers: Indices of bricks, int32 [N] on the device.
-            values: The density and, of smoke that has one, the temperature, each [N, 8, 8, 8].
-        """
+        """Stores the density and perhaps the temperature, [N, 8, 8, 8], in the bricks with the indices `numbers`, int32
+        [N], and marks these as busy; the pool must be new."""
         wp.to_torch(self.bricks.busy)[numbers.long()] = 1
         self.relist()
         self.store(clear=False)

@@ -18,9 +18,9 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.fluid.bricks import INDEX_BYTES, BrickPool
+from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
 from wlm.fluid.faces import axis_ends
-from wlm.fluid.lattice import Lattice, require_free
+from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume, gather, scatter
 from wlm.formats.artifact import read_artifact, write_artifact
@@ -148,15 +148,6 @@ def bytes_needed(shape: tuple[int, int, int], scheme: str, storage: str, tempera
     return math.prod(shape) * fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
 
 
-def require_memory(shape: tuple[int, int, int], needed: int, device: wp.Device) -> None:
-    """Checks that a grid of smoke of `needed` bytes can be indexed and allocated."""
-    x, y, z = shape
-    if x * y * z >= 2**31:
-        raise WlmError(f"smoke: {x} x {y} x {z} cells: expected fewer than 2^31 cells in all: use a lower refinement")
-    remedy = "a lower refinement, bricks, storage='float16' or the scheme 'semi-lagrangian'"
-    require_free("smoke", shape, needed, device, remedy)
-
-
 class Solver:
     """Simulates smoke in the air of a lattice.
 
@@ -232,7 +223,8 @@ class Solver:
         self.duration, self._first_duration = duration, duration
         self.shape = tuple(refinement * size for size in lattice.shape)
         self._stored = advection.STORAGES[storage]
-        require_memory(self.shape, bytes_needed(self.shape, scheme, storage, temperature, bricks), self.device)
+        needed = bytes_needed(self.shape, scheme, storage, temperature, bricks)
+        require_memory("smoke", self.shape, needed, self.device)
         self._box = advection_places.make_box(lattice.shape, refinement, axis_ends(lattice.faces))
         self._kept = ""
         # The settings on which the arrays of a checkpoint depend.
@@ -407,13 +399,15 @@ class Solver:
     @property
     def active_cells(self) -> int:
         """Number of cells of smoke that the last step computed; without bricks all. Waits for the device."""
-        return math.prod(self.shape) if self._pool is None else self._pool.count * advection_places.CELLS
+        return (
+            math.prod(self.shape)
+            if self._pool is None
+            else int(self._bricks.counts.numpy()[0]) * advection_places.CELLS
+        )
 
     @property
     def stored_bytes(self) -> int:
-        """Memory that the smoke takes on the device, without the air."""
-        if self._pool is not None:
-            return self._pool.nbytes
+        """Memory of density and temperature with all buffers of a step, in bytes."""
         return sum(part.capacity for each in self._fields for part in (each.density, each.temperature))
 
     def frame(
@@ -582,7 +576,10 @@ class Solver:
     def _step(self) -> None:
         box, walls, bricks = self._box, self._walls[0], self._bricks
         if self._pool is not None:
-            self._touch_sources()
+            # A source keeps its bricks, but new ones are not stored yet.
+            if self.sources != self._touched:
+                self._emit(only_mark=True)
+            self._touched = self.sources
             self._pool.relist()
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
@@ -593,20 +590,14 @@ class Solver:
         if self._pool is not None:
             self._pool.store()
         self._carry()
+        self._emit()
+
+    def _emit(self, only_mark: bool = False) -> None:
         for source in self.sources:
             steps = source.steps(self.substeps)
             value = (steps * source.density, steps * source.temperature)
-            where = [box, walls, *source.region(box.refinement), value]
-            advection_sources.add_source(*where, self._fields[0], fixed=source.fixed, bricks=bricks)
-
-    def _touch_sources(self) -> None:
-        """Has the bricks of new sources stored; a source keeps its own."""
-        for source in self.sources if self.sources != self._touched else ():
-            _, centre, size = source.region(self._box.refinement)
-            low, cells, total = advection_sources.region_of(self._box, centre, size)
-            if total > 0:
-                advection_places.touch(self._box, self._bricks, low, cells)
-        self._touched = self.sources
+            where = [self._box, self._walls[0], *source.region(self._box.refinement), value, self._fields[0]]
+            advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
 
     def _carry(self) -> None:
         now, *spare = self._fields

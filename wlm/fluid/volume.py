@@ -335,14 +335,8 @@ def save_bricks(
 ) -> None:
     """Writes smoke in bricks as the `.npz` file of `save_volume` with `bricks`, whole or not at all.
 
-    Args:
-        path: The file.
-        numbers, values: Indices of the bricks, and the density and perhaps the temperature in them, as of `gather`.
-        shape: Voxels along x, y and z.
-        voxel, origin: Attributes of the volume.
-
-    Raises:
-        WlmError: The file cannot be written.
+    `numbers` and `values` are the indices of the bricks, and the density and perhaps the temperature in them, as of
+    `gather`; `shape` has the voxels along x, y and z. Raises a WlmError if the file cannot be written.
     """
     parts = zip((_DENSITY, _TEMPERATURE), values, strict=False)
     arrays = {f"{name}_bricks": part.cpu().numpy() for name, part in parts} | {_BRICKS: numbers.cpu().numpy()}

@@ -11,6 +11,7 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid import solver as fluid
+from wlm.fluid.bricks import require_memory
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Domain, Lattice
 from wlm.fluid.obstacles import SHELL, Mesh, Obstacle, Sphere, Trajectory
@@ -298,7 +299,7 @@ def _require_memory(scene: Scene, device: str) -> None:
             f" but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, bricks, or storage: float16"
         )
     # A grid may also have more voxels than can be indexed.
-    fluid.require_memory(grid.shape, smoke_bytes, warp_device)
+    require_memory("smoke", grid.shape, smoke_bytes, warp_device)
 
 
 def _make_lattice(scene: Scene, device: str) -> Lattice:

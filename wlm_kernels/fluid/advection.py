@@ -347,10 +347,9 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         z = int(wp.floor(end[2]))
         f = end - wp.vec3(float(x), float(y), float(z))
         inside = is_below(x, box.n[0] - 1) and is_below(y, box.n[1] - 1) and is_below(z, box.n[2] - 1)
-        if wp.static(in_bricks):
+        if wp.static(in_bricks) and not inside:
             # Cells that do not exist have no brick.
-            if not inside:
-                return Corners(), False
+            return Corners(), False
         return corners_of(box, bricks, x, y, z, wp.vec3i(1, 1, 1), f), inside
 
     @wp.func

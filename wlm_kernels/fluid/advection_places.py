@@ -468,23 +468,3 @@ def _settle(
 def settle(bricks: Bricks, clear: bool) -> None:
     """Ends the storing of fresh bricks; with `clear` no brick is busy any longer."""
     wp.launch(_settle, bricks.busy.shape, inputs=[clear, bricks], device=bricks.busy.device)
-
-
-@wp.kernel
-def _touch(
-    # in:
-    box: Box,
-    low: wp.vec3i,
-    size: wp.vec3i,
-    # out:
-    busy: wp.array1d[int],
-):
-    busy[index_of(box.bricks, low + cell_of(size, wp.tid()))] = 1
-
-
-def touch(box: Box, bricks: Bricks, low: Sequence[int], cells: Sequence[int]) -> None:
-    """Marks the bricks of a region as busy: of `cells` fine cells along each axis, at least 1, from the cell `low`."""
-    first = [a // BRICK for a in low]
-    size = [(a + n - 1) // BRICK - b + 1 for a, n, b in zip(low, cells, first, strict=True)]
-    inputs = [box, wp.vec3i(*first), wp.vec3i(*size)]
-    wp.launch(_touch, size[0] * size[1] * size[2], inputs=inputs, outputs=[bricks.busy], device=bricks.busy.device)

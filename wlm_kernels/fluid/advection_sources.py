@@ -77,6 +77,7 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         size: wp.vec3,
         value: wp.vec2,
         kept: float,
+        only_mark: bool,
         low: wp.vec3i,
         cells: wp.vec3i,
         bricks: Bricks,
@@ -86,7 +87,7 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         p = low + cell_of(cells, wp.tid())
         # The bricks stay stored, however little smoke the source adds.
         _mark_busy(box, p, wp.inf, bricks)
-        if not within(box, walls, shape, centre, size, p):
+        if only_mark or not within(box, walls, shape, centre, size, p):
             return
         i = address_of(box, bricks, p)
         smoke = in_range(wp.max(kept * float(fields.density[i]) + value[0], 0.0))
@@ -232,6 +233,7 @@ def add_source(
     *,
     fixed: bool,
     bricks: Bricks = DENSE,
+    only_mark: bool = False,
 ) -> None:
     """Adds or sets smoke in the cells whose centres are in a box or an ellipsoid; density and temperature stay at
     least 0.
@@ -246,10 +248,11 @@ def add_source(
         fields: The smoke, modified.
         fixed: Whether the values are set instead of added.
         bricks: Those of the source's box, all of which must be stored, are marked as busy.
+        only_mark: Whether bricks are marked and nothing else is done.
     """
     low, cells, total = region_of(box, centre, size)
     if total > 0:
-        region = [wp.vec3(*centre), wp.vec3(*size), wp.vec2(*value), 0.0 if fixed else 1.0]
+        region = [wp.vec3(*centre), wp.vec3(*size), wp.vec2(*value), 0.0 if fixed else 1.0, only_mark]
         inputs = [box, walls, shape, *region, low, cells, bricks]
         _launch("source", total, inputs, fields.arrays, fields)
 
