@@ -152,9 +152,9 @@ def _training() -> Kept:
         for other in (path, Path(f"{path}.csv")):
             other.unlink(missing_ok=True)
 
-    def read(path: Path) -> None:
+    def read(path: Path) -> Any:
         with mock.patch("wlm.smoke.fit._CHUNK", 2):
-            train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0, **pools)
+            return train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0, **pools)
 
     free = {"clock": "nan", "curve": "nan size"}
     ranges = {"step": ((), -1), "skipped": ((), 99.0), "counts": (0, -1), "adam.step.heads.0.bias": ((), -1.0)}
@@ -171,12 +171,13 @@ def _simulation() -> Kept:
     source = Source("box", (1, 1, 1), (1, 1, 1), 1.0)
     solver = Solver(Lattice((8, 8, 8), viscosity=0.1), refinement=2, obstacles=[ball], sources=[source])
     solver.step(2)
-    return Kept(
-        _written(solver.save),
-        solver.load,
-        {},
-        {"lattice.steps": ((), -1), "density": ((0, 0, 0, 0), -1.0), "bricks": (0, 8)},
-    )
+
+    def read(path: Path) -> Solver:
+        solver.load(path)
+        return solver
+
+    ranges = {"lattice.steps": ((), -1), "density": ((0, 0, 0, 0), -1.0), "bricks": (0, 8)}
+    return Kept(_written(solver.save), read, {}, ranges)
 
 
 KEPT: dict[str, Callable[[], Kept]] = {
