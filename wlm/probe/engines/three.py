@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from wlm.bundle import filled
 from wlm.errors import WlmError
 from wlm.formats.ktx2 import write_ktx2
-from wlm.probe.engines import asset
 from wlm.probe.engines.lattice import NUMBERS, Lattice, lattice_kit
 
 _TEXTURE_FILE, _LOADER_FILE = "grid.ktx2", "grid.js"
@@ -42,7 +42,7 @@ def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]
     parts = np.moveaxis(padded.reshape(nz, ny, nx, _PARTS, 4), 3, 0)
     texels = np.concatenate([parts[:, :1], parts, parts[:, -1:]], 1)
     write_ktx2(folder / _TEXTURE_FILE, texels.tobytes(), nx, ny, "R16G16B16A16_SFLOAT", _PARTS * (nz + 2))
-    (folder / _LOADER_FILE).write_text(asset("three_probes.js"), encoding="utf-8")
+    (folder / _LOADER_FILE).write_text(filled(__package__, "three_probes.js"), encoding="utf-8")
     corners = [(box[0] + size / 2).tolist(), (box[1] - size / 2).tolist()]
     return {"texture": _TEXTURE_FILE, "box": box.tolist(), "corners": corners}
 

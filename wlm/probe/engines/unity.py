@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from wlm.bundle import Bundle
+from wlm.bundle import Bundle, filled
 from wlm.errors import WlmError
 from wlm.formats.folder import compact_json, rounded
 from wlm.probe.axes import read_axes, turned
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines import asset
 from wlm.probe.places import positions_of
 from wlm.probe.sphere import sh_count
 
@@ -75,6 +74,6 @@ def write_kit(
         # [N, C, 3] to channel after channel.
         "sh": rounded(light.astype(np.float32).swapaxes(1, 2).reshape(-1)),
     }
-    (folder / SCRIPT_FILE).write_text(asset("unity_probes.cs"), encoding="utf-8")
+    (folder / SCRIPT_FILE).write_text(filled(__package__, "unity_probes.cs"), encoding="utf-8")
     (folder / INFO_FILE).write_text(compact_json(document), encoding="utf-8")
     return {"about": _ABOUT}

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from wlm.bundle import filled
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
 from wlm.probe.conventions import from_canonical
-from wlm.probe.engines import asset
 from wlm.probe.engines.lattice import Lattice, lattice_kit
 
 AMBIENT_FILE = "ambient.dds"
@@ -59,9 +59,10 @@ def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]
     textures |= {name: (np.ascontiguousarray(ratios[:, i]), _RATIOS) for i, name in enumerate(SH_FILES)}
     for name, (texels, form) in textures.items():
         write_dds(folder / name, texels.tobytes(), width, height, form, depth)
-    text = asset("unreal_probes.usf")
-    for mark, numbers in (("@CORNER@", corner), ("@SIZE@", size)):
-        text = text.replace(mark, ", ".join(f"{number:.9e}" for number in numbers))
+    marks = {
+        mark: ", ".join(f"{number:.9e}" for number in numbers) for mark, numbers in (("CORNER", corner), ("SIZE", size))
+    }
+    text = filled(__package__, "unreal_probes.usf", **marks)
     (folder / "WlmProbes.usf").write_text(text, encoding="utf-8")
     return {"box": [corner.tolist(), (corner + size).tolist()]}
 
