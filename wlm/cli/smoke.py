@@ -188,7 +188,7 @@ def predict(
     output: _Lightmaps,
     options: SmokeOptions,
     network: Annotated[
-        Path | None, typer.Option(metavar="FILE", help='Network of wlm smoke train; default "fast", which ships with wlm.')
+        Path | None, typer.Option(metavar="FILE", help='File of wlm smoke train; default "fast", which ships with wlm.')
     ] = None,
     coarse: Annotated[bool, typer.Option("--coarse", help="Only use a coarse ray march, without a network.")] = False,
     seed: Seed = 0,
