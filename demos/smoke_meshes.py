@@ -1,6 +1,6 @@
 """Makes the meshes of the scenes of smoke that are shipped, `configs/meshes`: a rabbit and the wheel of a fan.
 
-    python -m demos.smoke_meshes FOLDER
+The command is `python -m demos.smoke_meshes configs/meshes`.
 """
 
 import sys

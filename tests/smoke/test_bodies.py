@@ -200,7 +200,7 @@ def test_a_source_that_moves_and_turns(tmp_path, shape):
     if shape in ("box", "cylinder"):
         body["radius"] = [0.1, 0.2, 0.1]
     source = body | {"start": [0, 0.3], "stop": [0.2, None], "density": 0.75}
-    scene = _scene(tmp_path, [], sources=[source], inlets=[])
+    scene = _scene(tmp_path, [], sources=[source], inlets=[], smoke={"bricks": shape == "mesh"})
     assert warnings_of(scene) == []
     assert [len(sources_at(scene, time)) for time in (0.1, 0.2, 0.25, 0.3, 9.0)] == [1, 0, 0, 1, 1]
     surface = scene.sources[0]
