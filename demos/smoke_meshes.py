@@ -64,7 +64,7 @@ def fan() -> trimesh.Trimesh:
     for r in stations:
         pitch, chord = np.radians(50 - 25 * r), 0.24 + 0.2 * r
         along = np.array([np.sin(pitch), 0.0, -np.cos(pitch)])
-        thick = 0.025 * np.array([np.cos(pitch), 0.0, np.sin(pitch)])
+        thick = 0.045 * np.array([np.cos(pitch), 0.0, np.sin(pitch)])
         rows.append([s * chord * along + t * thick + (0, r, 0) for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
     points = np.array(rows).reshape(-1, 3)
     k = np.arange(len(stations) - 1)[:, None, None] * 4

@@ -280,7 +280,7 @@ class Body(_Settings):
     def fastest(self) -> float:
         """Largest speed along the path, of a body that turns on its surface, in metres per second."""
         speeds, spins = (np.linalg.norm(rates, axis=1) for rates in self._keyed.rates)
-        reach = float(np.linalg.norm(np.abs(self.bounds).max(0))) if spins.any() else 0.0
+        reach = float(np.linalg.norm(self.mesh()[0], axis=1).max()) if spins.any() else 0.0
         return float((speeds + reach * spins).max())
 
     @property
