@@ -19,7 +19,7 @@ from wlm.interop import free_memory, no_collection
 from wlm_kernels.fluid import lattice_links
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
 from wlm_kernels.fluid.lattice_fields import FluidKernels, fluid_kernels
-from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
+from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP, WIND
 from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, Tables, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
@@ -193,7 +193,7 @@ class Lattice:
         # The number of the body of each cell, 0 for fluid; of size 0 while no cell has ever been solid.
         self._solid = self._zeros(0, wp.uint8)
         self._velocity = self._zeros(BODIES, wp.vec3)
-        self._forces = self._zeros(0, wp.vec3)
+        self._forces, self._wind = self._zeros(0, wp.vec3), self._zeros(1, wp.vec3)
         self._faces: dict[str, Face] = {}
         self._links: lattice_links.Links | None = None
         self._graph: wp.Graph | None = None
@@ -227,6 +227,25 @@ class Lattice:
             where: bool [A, B], true in the open part of the face; elsewhere it is a wall. None: the whole face is open.
         """
         self._set_face(face, INLET, velocity, where=where)
+
+    def set_wind(self, face: str) -> None:
+        """Makes a face (see `set_wall`) one through which the wind of `blow` comes, or leaves; at first there is none.
+
+        Its velocity is that of the wind everywhere on the face. Wind needs an outlet, too, or air cannot pass.
+        """
+        self._set_face(face, WIND)
+
+    def blow(self, velocity: ArrayLike) -> None:
+        """Sets the velocity of the wind from now on, (3,) in cells per step, without waiting for the device.
+
+        Raises:
+            WlmError: It is faster than `MAX_SPEED`.
+        """
+        wind = np.asarray(velocity, np.float32)
+        if wind.shape != (3,) or not np.isfinite(wind).all():
+            raise ValueError(f"velocity: expected three finite numbers, got {velocity!r}")
+        _check_speed(float(np.linalg.norm(wind)), "the wind")
+        self._wind.assign(wind[None])
 
     def set_outlet(self, face: str, density: float | None = None) -> None:
         """Makes a face an outlet.
@@ -318,6 +337,11 @@ class Lattice:
     def faces(self) -> dict[str, Face]:
         """The faces that have been set, by name; an axis without faces is periodic."""
         return dict(self._faces)
+
+    @property
+    def clock(self) -> wp.array:
+        """Counters, int [2] on the device, of which the larger is the number of steps done."""
+        return self._clock
 
     # Running.
 
@@ -598,7 +622,7 @@ class Lattice:
             padded = np.zeros(size, dtype)
             padded[: links.faces] = column
             setattr(links, name, wp.array(padded, device=self.device))
-        links.value = self._zeros(size, float)
+        links.value, links.wind = self._zeros(size, float), self._wind
         links.used = wp.full(1, links.faces, dtype=int, device=self.device)
         return links
 

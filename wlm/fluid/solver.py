@@ -19,13 +19,15 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid.faces import axis_ends
+from wlm.fluid.forcing import CALM, Turbulence, Wind
 from wlm.fluid.lattice import Lattice, require_free
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.parts import Part, check_parts
-from wlm_kernels.fluid import advection, advection_places, advection_sources
+from wlm_kernels.fluid import advection, advection_places, advection_sources, forcing
 from wlm_kernels.fluid.advection_places import DENSE
+from wlm_kernels.fluid.lattice_links import WIND
 
 SCHEMES = ("maccormack", "semi-lagrangian")
 
@@ -123,6 +125,7 @@ class SmokeSetup:
         decay: Factors of density and temperature per step.
         bricks: Whether only bricks with smoke are computed.
         moves: Whether an obstacle moves.
+        stirred: Whether confinement or turbulence acts.
     """
 
     shape: tuple[int, int, int]
@@ -137,6 +140,7 @@ class SmokeSetup:
     decay: tuple[float, float]
     bricks: bool
     moves: bool
+    stirred: bool
 
 
 def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
@@ -171,6 +175,9 @@ class Solver:
         dissipation: Decay rate of the density: exp(-dissipation t) of it remains after t steps of the lattice.
         cooling: Decay rate of the temperature, in the same unit.
         buoyancy: Acceleration of the air by smoke; None: smoke does not move the air.
+        confinement: Strength of the vorticity confinement per step of the lattice (Fedkiw, Stam and Jensen 2001: eps).
+        turbulence: Random acceleration of all air.
+        wind: Velocity of the wind at the lattice's faces for it, in cells per step at times in steps.
         substeps: Steps of the lattice per step of the solver. Above a speed of 1 / substeps smoke can jump over walls.
         bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are computed.
         threshold: With bricks, the largest value in a brick that counts as empty.
@@ -200,6 +207,9 @@ class Solver:
         dissipation: float = 0.0,
         cooling: float = 0.0,
         buoyancy: Buoyancy | None = None,
+        confinement: float = 0.0,
+        turbulence: Turbulence | None = None,
+        wind: Wind | None = None,
         substeps: int = 2,
         bricks: bool = False,
         threshold: float = 1e-6,
@@ -211,7 +221,8 @@ class Solver:
         for name, count in (("refinement", refinement), ("substeps", substeps)):
             if count < 1:
                 raise ValueError(f"{name}: expected at least 1, got {count}")
-        for name, rate in (("dissipation", dissipation), ("cooling", cooling), ("threshold", threshold)):
+        rates = {"dissipation": dissipation, "cooling": cooling, "threshold": threshold, "confinement": confinement}
+        for name, rate in rates.items():
             if not (math.isfinite(rate) and rate >= 0.0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {rate}")
         # Steps after which smoke decays: only with float16 and a shortened step more than one.
@@ -237,8 +248,13 @@ class Solver:
             for _ in range(_buffers(scheme))
         ]
         self._velocity = self._zeros(lattice.shape, wp.vec3)
+        if wind is not None and not any((face.kind == WIND).any() for face in lattice.faces.values()):
+            raise ValueError("wind: expected a lattice with a face for it (set_wind), got none")
+        self._confinement, self._turbulence, self._wind = confinement, turbulence, wind
+        self._modes = CALM if turbulence is None else turbulence.modes(str(self.device))
+        self._stirred = confinement > 0.0 or turbulence is not None
         self._force = None
-        if buoyancy is not None:
+        if buoyancy is not None or self._stirred:
             self._force = self._zeros(lattice.shape, wp.vec3)
             lattice.set_force(self._force)
         self._solid = self._zeros(lattice.shape if obstacles else (0,), wp.uint8)
@@ -275,14 +291,18 @@ class Solver:
         capturing = self.device.is_cuda and self.device.is_capturing
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         uneven = uneven or self._decay_every > 1
-        if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
+        moves = self._wind is not None or any(obstacle.path.moves for obstacle in self.obstacles)
+        if capturing and (uneven or not self._done or moves):
             raise ValueError(
-                f"steps: expected obstacles at rest, substeps a multiple of {self.lattice.period}, and a multiple of "
-                f"{self.period} steps in the captured CUDA graph and before it; got {steps} after {self._done}"
+                f"steps: expected obstacles at rest, no wind, substeps a multiple of {self.lattice.period}, and a "
+                f"multiple of {self.period} steps in a CUDA graph and before it; got {steps} after {self._done}"
             )
         for _ in range(steps):
             if not capturing:
                 self._place_obstacles()
+                if self._wind is not None:
+                    ratio = self.duration / self._first_duration
+                    self.lattice.blow(ratio * self._wind.at((self._done + 0.5) * self.substeps * ratio))
             self._step()
             self._done += 1
 
@@ -326,6 +346,10 @@ class Solver:
             self.buoyancy = replace(
                 self.buoyancy, lift=square * self.buoyancy.lift, weight=square * self.buoyancy.weight
             )
+        self._confinement *= factor
+        if self._turbulence is not None:
+            self._turbulence = self._turbulence.in_steps(factor)
+            self._modes = self._turbulence.modes(str(self.device))
 
     @property
     def fastest(self) -> float:
@@ -424,6 +448,7 @@ class Solver:
             decay=self._decay,
             bricks=self._bricks is not DENSE,
             moves=any(obstacle.path.moves for obstacle in self.obstacles),
+            stirred=self._stirred,
         )
 
     # Checkpoints.
@@ -542,6 +567,10 @@ class Solver:
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
             advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
+        if self._stirred:
+            air = [box.coarse, box.periodic, self._velocity.flatten(), self._solid.flatten(), self._confinement]
+            where = [*air, self._modes, self.lattice.clock, self._force.flatten()]
+            forcing.stir(*where, added=self.buoyancy is not None)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)

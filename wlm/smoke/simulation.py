@@ -10,6 +10,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid import solver as fluid
 from wlm.fluid.faces import FACES
+from wlm.fluid.forcing import Turbulence
 from wlm.fluid.lattice import Domain, Lattice
 from wlm.fluid.obstacles import Mesh, Obstacle, Sphere, Trajectory
 from wlm.fluid.volume import DensityVolume, save_volume
@@ -27,6 +28,7 @@ _INLET_DEPTH = 1.0
 _RAMP = 4
 # Speed of air in cells per step above which the step is halved, and air steps between two looks at it.
 _FAST, _LOOK = 0.25, 8
+_EDDY = 4.0  # cells along the smallest wavelength of turbulence
 # Times at which sources and inlets inside obstacles are looked for.
 _LOOKS_AT_OBSTACLES = 17
 
@@ -48,6 +50,9 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
             dissipation=smoke.dissipation * scene.step,
             cooling=smoke.cooling * scene.step if smoke.hot else 0.0,
             buoyancy=_buoyancy(scene),
+            confinement=scene.air.confinement * scene.step,
+            turbulence=_turbulence(scene),
+            wind=scene.air.blowing(scene.step, scene.grid.cell),
             substeps=smoke.substeps,
             bricks=smoke.bricks,
             duration=scene.step,
@@ -100,6 +105,10 @@ def warnings_of(scene: Scene) -> list[str]:
             warnings.append(
                 f"obstacles.{i}: it is thinner than a cell of {grid.cell:g} m, and is simulated as a cell thick"
             )
+    if (stirring := scene.air.turbulence) is not None and stirring.size < _EDDY * grid.cell:
+        warnings.append(f"air.turbulence: its size is below {_EDDY} cells, and is simulated as {_EDDY * grid.cell:g} m")
+    if scene.air.gusts is not None and not scene.air.wind:
+        warnings.append("air.gusts: there is no wind, and thus they have no effect")
     if not (scene.sources or scene.inlets):
         warnings.append("sources, inlets: there are none, and thus there is no smoke")
     return [f"{scene.name}: {warning}" for warning in warnings]
@@ -300,13 +309,15 @@ def _make_lattice(scene: Scene, device: str) -> Lattice:
     for name in FACES:
         inlets = [(i, inlet) for i, inlet in enumerate(scene.inlets) if inlet.face == name]
         kind = grid.face(name)
-        if inlets:
+        if name in scene.windy:
+            lattice.set_wind(name)
+        elif inlets:
             _set_inlets(lattice, scene, domain, name, inlets)
         elif kind in ("wall", "slip"):
             lattice.set_wall(name, slip=kind == "slip")
         elif kind == "open":
             # With inlets, the outflow equals the inflow; without, the outside is at rest.
-            lattice.set_outlet(name, density=None if scene.inlets else 1.0)
+            lattice.set_outlet(name, density=None if scene.inlets or scene.windy else 1.0)
     return lattice
 
 
@@ -317,6 +328,15 @@ def _buoyancy(scene: Scene) -> fluid.Buoyancy | None:
     up = np.array(smoke.up) / np.linalg.norm(smoke.up)
     lift, weight = (domain.acceleration(value) for value in (smoke.buoyancy, smoke.weight))
     return fluid.Buoyancy(lift, weight, tuple(map(float, up)))
+
+
+def _turbulence(scene: Scene) -> Turbulence | None:
+    stirring, cell = scene.air.turbulence, scene.grid.cell
+    if stirring is None or not stirring.strength:
+        return None
+    strength = Domain(cell, scene.step).acceleration(stirring.strength)
+    size = max(stirring.size / cell, _EDDY)
+    return Turbulence(strength, size, stirring.period / scene.step, stirring.seed)
 
 
 def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlets: list[tuple[int, Inlet]]) -> None:

@@ -1,0 +1,101 @@
+"""What moves the air of a `Solver` besides smoke: turbulence, and wind with gusts."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+
+from wlm_kernels.fluid.forcing import Modes
+
+_MODES = 16
+
+
+@dataclass(frozen=True)
+class Turbulence:
+    """A random acceleration of all air, free of divergence, in cells and steps of the lattice; the same for a seed.
+
+    Attributes:
+        strength: Root mean square of the acceleration in cells per step squared.
+        size: Wavelength of its largest eddies in cells, at least 4; the smallest are half as large.
+        period: Mean duration in steps in which an eddy comes and goes.
+        seed: Seed of the random modes.
+    """
+
+    strength: float
+    size: float
+    period: float
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.strength) and self.strength >= 0.0):
+            raise ValueError(f"strength: expected a finite number of at least 0, got {self.strength}")
+        if not (math.isfinite(self.size) and self.size >= 4.0):
+            raise ValueError(f"size: expected at least 4 cells, got {self.size}")
+        if not (math.isfinite(self.period) and self.period > 0.0):
+            raise ValueError(f"period: expected a finite number of steps above 0, got {self.period}")
+
+    def in_steps(self, factor: float) -> "Turbulence":
+        """Returns the same turbulence in steps that are `factor` times as long."""
+        return replace(self, strength=factor * factor * self.strength, period=self.period / factor)
+
+    def modes(self, device: str) -> Modes:
+        """Makes the random Fourier modes on a device, see `wlm_kernels.fluid.forcing`."""
+        random = np.random.default_rng(self.seed)
+        way, other = random.normal(size=(2, _MODES, 3))
+        length = 2.0 * np.pi / self.size * random.uniform(1.0, 2.0, (_MODES, 1))
+        k = length * way / np.linalg.norm(way, axis=1, keepdims=True)
+        push = np.cross(np.sin(k), other)
+        push *= self.strength * math.sqrt(2.0 / _MODES) / np.linalg.norm(push, axis=1, keepdims=True)
+        turn = random.normal(size=_MODES) * 2.0 * np.pi / self.period, random.uniform(0.0, 2.0 * np.pi, _MODES)
+        out = Modes()
+        for name, values in (("k", k), ("push", push), ("turn", np.stack(turn, 1))):
+            kind = wp.vec2 if name == "turn" else wp.vec3
+            setattr(out, name, wp.array(values.astype(np.float32), dtype=kind, device=device))
+        return out
+
+
+@dataclass(frozen=True)
+class Wind:
+    """The velocity of the wind at the faces of the box that `Lattice.set_wind` opens to it.
+
+    Attributes:
+        keys: Rows (time, x, y, z) of velocities, linear between them and constant beyond, times increasing.
+        gusts: Largest change of the speed in gusts, as a share of it, at most 1.
+        period: Mean time from gust to gust.
+        seed: Seed of the gusts.
+    """
+
+    keys: tuple[tuple[float, float, float, float], ...]
+    gusts: float = 0.0
+    period: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        keys = np.asarray(self.keys, np.float64)
+        if keys.ndim != 2 or keys.shape[1] != 4 or not (np.isfinite(keys).all() and (np.diff(keys[:, 0]) > 0).all()):
+            raise ValueError(f"keys: expected rows of an increasing time and a velocity, got {self.keys}")
+        if not 0.0 <= self.gusts <= 1.0 or not (math.isfinite(self.period) and self.period > 0.0):
+            raise ValueError(f"gusts, period: expected 0 to 1, and above 0, got {self.gusts} and {self.period}")
+
+    def at(self, time: float) -> np.ndarray:
+        """Returns the velocity at a time, float64 [3]."""
+        keys = np.asarray(self.keys, np.float64)
+        mean = np.array([np.interp(time, keys[:, 0], column) for column in keys.T[1:]])
+        random = np.random.default_rng(self.seed)
+        waves = np.sin(2.0 * np.pi * (random.uniform(0.5, 2.0, 4) * time / self.period + random.random(4)))
+        return mean * (1.0 + self.gusts * float(waves.mean()))
+
+    @property
+    def fastest(self) -> float:
+        """An upper bound of the speed."""
+        return float(np.linalg.norm(np.asarray(self.keys)[:, 1:], axis=1).max()) * (1.0 + self.gusts)
+
+    def enters(self, inward: Sequence[float]) -> bool:
+        """Tests whether the wind ever blows along a direction, such as that from a face into the box."""
+        return bool((np.asarray(self.keys)[:, 1:] @ np.asarray(inward) > 0.0).any())
+
+
+CALM = Modes()
+"""No turbulence."""
