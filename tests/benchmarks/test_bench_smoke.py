@@ -75,16 +75,6 @@ def test_shares_of_the_copy(rows):
         assert row["of_copy"] == pytest.approx(24**3 * moved / (1e-3 * row["time_ms"]) / bandwidth)
 
 
-def test_schemes_and_a_solution(rows):
-    """The ball comes round; the scheme of second order is the better one, and 16 bits change little."""
-    advection = by_option(rows, "advection")
-    error = {option: row["rms"] for option, row in advection.items() if "rms" in row.figures}
-    assert len(error) == 4 and error["maccormack, float32"] < 0.8 * error["semi-lagrangian, float32"] < 0.8
-    bricks = by_option(rows, "advection bricks")
-    assert bricks["maccormack, smoke in 0%"]["worked_on"] == 0.0
-    assert bricks["maccormack, smoke in 100%"]["worked_on"] == 1.0
-
-
 def test_a_frame_is_the_sum_of_its_stages(rows):
     frame = by_option(rows, "frame")
     parts = ("simulation", "guide", "obstacles' shadows", "weights and background")

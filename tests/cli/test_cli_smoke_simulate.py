@@ -64,15 +64,21 @@ def test_simulate(jet, tmp_path):
 
 def test_simulate_as_told(jet, tmp_path):
     words = ("smoke", "simulate", jet / "jet.yaml", "-o", tmp_path / "a", "--frames", 1, "--scale", 0.5)
-    call(*words, "--resume", "--vdb")
+    call(*words, "--resume", "--volumes", "vdb")
     assert "there was nothing to resume" in call.stderr
     footage = load_frames(tmp_path / "a")
     assert footage.numbers == (1,) and footage.scene.grid.cells == (4, 5, 4) and footage.scene.grid.cell == 0.25
     grid = VdbFile((tmp_path / "a" / "frame_0001.vdb").read_bytes(), "a")
     assert [f"{head.name} {head.type}" for head in grid.heads] == ["density float", "velocity vec3s"]
     assert grid.read("density", True).values.sum() == pytest.approx(float(footage.load(1).density.sum()))
-    call(*words)
-    assert not (tmp_path / "a" / "frame_0001.vdb").exists()
+    sizes = []
+    for form in ("nvdb", "nvdb-raw"):
+        call(*words, "--volumes", form)
+        assert not (tmp_path / "a" / "frame_0001.vdb").exists()
+        path = tmp_path / "a" / "frame_0001.nvdb"
+        assert float(load_volume(path).density.sum()) == pytest.approx(float(footage.load(1).density.sum()))
+        sizes.append(path.stat().st_size)
+    assert sizes[0] < 0.1 * sizes[1]
     for change, words in (
         ({"grid": {"cells": [4096, 4096, 4096], "cell": 0.1, "faces": {}}}, "4096 x 4096 x 4096 cells"),
         ({"air": {"speed": 0.1}}, "an obstacle of 1 m/s, 0.5 cells per step: leave air.speed null or at least 1"),

@@ -150,6 +150,25 @@ def test_paths():
     path = Trajectory.of([[0, 0, 0], [2, 0, 0], [2, 4, 0]], [10, 20, 30])
     for time, at in ((0, (0, 0, 0)), (15, (1, 0, 0)), (25, (2, 2, 0)), (99, (2, 4, 0))):
         np.testing.assert_allclose(path.at(time), at)
+    assert path.moves and not path.turns
+    with pytest.raises(ValueError, match="quaternions of length 1"):
+        Trajectory.of((0, 0, 0), rotations=(0, 0, 0, 0))
+
+
+def test_a_path_that_turns():
+    """The shorter way between two keys, whatever their signs; eased, it starts and stops gently and ends there."""
+    angles, times = np.array([0.0, 2.0, 2.0 + np.pi - 0.1, 5.0]), [0, 10, 20, 30]
+    quaternions = np.column_stack([0 * angles, np.sin(angles / 2), 0 * angles, np.cos(angles / 2)])
+    quaternions[2] *= -1
+    path = Trajectory.of([(1, 2, 3)] * 4, times, quaternions)
+    moments = np.linspace(-5, 40, 901)
+    for given, most in ((path, 0.31), (path.eased(2.0), 0.06)):
+        turns = np.array([given.turn(time) for time in moments])
+        np.testing.assert_allclose(turns[:, :, 1], np.broadcast_to((0, 1, 0), (901, 3)), atol=1e-12)
+        angle = np.unwrap(np.arctan2(turns[:, 0, 2], turns[:, 0, 0]))
+        assert np.abs(angle - np.interp(moments, times, angles)).max() < (1e-9 if given is path else 0.4)
+        assert angle[-1] == pytest.approx(5.0) and np.abs(np.diff(angle, 2)).max() < most * 0.05
+        assert given.moves and given.turns and given.at(7.0).tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize(

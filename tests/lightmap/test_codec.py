@@ -111,15 +111,6 @@ def test_tiles_with_wrong_content_are_one_line(tmp_path):
         assert f"a.wlm: sheet random: tile 0: {words}" in line
 
 
-def test_each_tile_is_read_alone(tmp_path):
-    """A tile is a piece of the part, a zstd frame of its own."""
-    model = random_model((3, 2, 4, 0))
-    model.save(tmp_path / "a.wlm")
-    pieces, (sheet,) = read_artifact(tmp_path / "a.wlm").pieces["0.tiles"], model.sheets.values()
-    data = zstd.decompress(pieces[2], encoding_of(4).packed_size(sheet, 2), "tile 2")
-    assert data == encoding_of(4).pack(sheet, 2)
-
-
 def _on_levels(model):
     """The model with networks on 8-bit levels."""
     profile, nets = model.profile, {}

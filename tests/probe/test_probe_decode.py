@@ -185,16 +185,3 @@ def test_every_number_by_the_equations(monkeypatch, support, pairs):
     model.content.code[:2, 6:10] = 0  # no rotation at all
     points = model.origin + model.extent * np.random.default_rng(1).uniform(-0.2, 1.2, (30, 3)) * model.size
     np.testing.assert_allclose(decode64(model, points), [slow(model, point) for point in points], rtol=1e-11)
-
-
-def test_a_gaussian_ends_at_the_cut():
-    model = random_model(count=1, latent=1)
-    model.content.bounds[:, 3:10] = [np.log(0.1)] * 3 + [1.0, 0.0, 0.0, 0.0]
-    model.content.code[:, :3] = 2**15
-    middle = model.origin + model.extent * model.content.rows()[0, :3].astype(np.float64)
-    way = model.extent * 0.1 * 3.0 * np.array([[0.999, 0, 0], [1.001, 0, 0], [2.0, 0, 0]])
-    inside, outside, far = decode64(model, middle + way)
-    model.content.bounds[:, 10:] = 0.0
-    nothing = decode64(model, middle + way)
-    assert (inside != nothing[0]).any()
-    np.testing.assert_allclose([outside, far], nothing[1:], rtol=1e-12)

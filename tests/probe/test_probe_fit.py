@@ -15,9 +15,8 @@ from wlm.probe.data import from_arrays
 from wlm.probe.evaluation import evaluate
 from wlm.probe.fit import compress, open_checkpoint
 from wlm.probe.gaussian import trainer as training
-from wlm.probe.gaussian.trainer import Trainer, first_gaussians, local_spread
+from wlm.probe.gaussian.trainer import Trainer
 from wlm.probe.model import Profile, box_of
-from wlm.probe.morton import morton_order
 from wlm.probe.pca.fit import ENOUGH, fit_components
 from wlm.probe.pca.model import Components, unit_of
 from wlm.probe.selection import least_count
@@ -127,21 +126,6 @@ def test_a_fit_that_diverges_is_an_error(monkeypatch):
     monkeypatch.setattr(Trainer, "mse", lambda self: float("nan"))
     with pytest.raises(WlmError, match="room: the fit diverged; use smaller learning rates"):
         compress(synthetic(60), SMALL)
-
-
-def test_first_places():
-    x = RANDOM.random((500, 3)).astype(np.float32)
-    values = np.where(x[:, :1] > 0.8, RANDOM.normal(size=(500, 3)), 0.5)
-    order = morton_order(x)
-    assert sorted(order) == list(range(500))
-    steps = np.linalg.norm(np.diff(x[order], axis=0), axis=1).mean()
-    assert steps < 0.5 * np.linalg.norm(np.diff(x, axis=0), axis=1).mean()
-    spread = local_spread(x, values)
-    assert spread[x[:, 0] > 0.9].mean() > 5 * spread[x[:, 0] < 0.5].mean()
-    plain, scale = first_gaussians(x, values, 50, 0.0, 1.0, np.random.default_rng(0))
-    keen, _ = first_gaussians(x, values, 50, 1.0, 1.0, np.random.default_rng(0))
-    assert plain.shape == keen.shape == (50, 3) and (scale > 0).all()
-    assert (keen[:, 0] > 0.75).sum() > 1.5 * (plain[:, 0] > 0.75).sum()
 
 
 def brighter(factor, chosen):
@@ -281,21 +265,6 @@ def test_more_bytes_have_less_error(live, clustered):
     values = clustered[:live]
     errors = [fit_components(values, share * values.nbytes // 8, enough=0.0)[1] for share in (2, 4, 8)]
     assert errors[0] > errors[1] >= errors[2] and errors[2] < 1e-4
-
-
-def test_packed_codes_are_bits(clustered):
-    components = fit_components(clustered, 14 * len(clustered))[0]
-    assert np.ptp(components.bits) > 0, "clusters differ in their bits"
-    group, index, codes = ("".join(format(int(word), "032b")[::-1] for word in part) for part in components.packed())
-    length, bits = components.bits[components.cluster], (components.clusters - 1).bit_length()
-    for probe in (0, 1, 777, 1999):
-        own, first = components.cluster[probe], int(length[:probe].sum())
-        assert int(index[probe * bits : (probe + 1) * bits][::-1], 2) == own
-        begin = int(group[probe // 64 * 32 : probe // 64 * 32 + 32][::-1], 2)
-        assert begin == length[: probe // 64 * 64].sum()
-        for code, width in zip(components.code[probe].tolist(), components.width[own].tolist(), strict=True):
-            assert int(codes[first : first + width][::-1] or "0", 2) == code
-            first += width
 
 
 NINE = PLACES[:9]

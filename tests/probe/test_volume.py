@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 from builders.checks import error_of
 from builders.exported import read_export
-from builders.probe_models import random_model
 from reference import volume as reference
 from reference import volume_blocks
 
 from wlm.errors import WlmError
 from wlm.export import export
 from wlm.probe.data import from_arrays
-from wlm.probe.gaussian.decode import GaussianLight
 from wlm.probe.volume.bundle import volume_bundle
 from wlm.probe.volume.cascade import FrameStats, Volume
 from wlm.probe.volume.index import BlockIndex, finest_side
-from wlm.probe.volume.light import StoredLight, at_probes
+from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.walk import camera_path, loop_frames, score_volume, settle, walk
 
 # A multiple of every block's side, so that all of a scene can move by it.
@@ -185,23 +183,6 @@ def test_blocks_of_another_hour_are_decoded_again(device: str, rows: int):
     frame(away, 23.9)
     light.set(0.1)  # near midnight 0.2 h lie between
     assert volume.update(away).left < len(_there(volume)) - 20
-
-
-def test_a_full_pool_is_decoded_again(device: str):
-    """Blocks that find no row do not keep the others from it."""
-    position = _surface(60)
-    light = _Day(position, device)
-    volume = Volume(position, light, block=2.0, side=SIDE, budget=20, rows=80)
-    for _ in range(8):
-        assert volume.update([3.0, 1.0, -5.0]).left > 0
-    before = _there(volume)
-    light.set(6.0)
-    for _ in range(4 * 4):
-        volume.update([3.0, 1.0, -5.0])
-    after = _there(volume)
-    assert set(after) == set(before) and len(before) == 80
-    for name, light_of in after.items():
-        np.testing.assert_allclose(light_of, 6.0 * before[name], rtol=2e-3)
 
 
 def test_blocks_have_the_stated_light(device: str):
@@ -448,25 +429,6 @@ def test_dead_probes_are_left_out(device: str):
     for volume in volumes:
         settle(volume, np.zeros(3))
     _same(*volumes)
-
-
-def test_a_model_is_decoded_where_it_is_asked(device: str):
-    """Blocks from a model are those from what it decodes to."""
-    model = random_model(outputs=12)
-    random = np.random.default_rng(4)
-    position = model.origin + model.extent * model.size * random.random((90, 3))
-    decoder = model.decoder(device)
-    light, stored = decoder.light(position), StoredLight(decoder.decode(position), device)
-    assert isinstance(light, GaussianLight)
-    numbers = np.array([3, 80, 3, 0])
-    np.testing.assert_allclose(at_probes(light, numbers), at_probes(stored, numbers), atol=1e-6)
-    volumes = [Volume(position, source, side=16) for source in (light, stored)]
-    for volume in volumes:
-        settle(volume, position.mean(0))
-    got, want = (_there(volume) for volume in volumes)
-    assert got.keys() == want.keys() and got
-    for name, values in want.items():
-        np.testing.assert_allclose(got[name], values, atol=1e-3 * np.abs(values).max())
 
 
 @pytest.mark.parametrize(

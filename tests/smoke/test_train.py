@@ -10,7 +10,6 @@ from builders.checks import error_of
 from builders.smoke_samples import file_content, small_pool
 
 import wlm
-from wlm.config import profile_names
 from wlm.errors import WlmError
 from wlm.smoke.evaluation import of_network, score
 from wlm.smoke.fit import train
@@ -337,16 +336,6 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_smoke(kind):
     assert torch.equal(motion[0, 0], -pool.motion[1, 0].float().flip(-1))
     assert torch.equal(motion[0, 1], pool.motion[1, 1].float().flip(-1))
     assert torch.equal(guides[1], pool.guides[0].float()) and torch.equal(targets[1], pool.targets[0].float())
-
-
-def test_profiles_load():
-    names = profile_names(Profile.FILES)
-    assert names == ["fast", "paper"]
-    for name in names:
-        profile = Profile.load(name)
-        assert profile.name == f"network-{name}"
-        assert profile.network.guide == profile.dataset.guide == ("paper" if name == "paper" else "six")
-        assert profile.network.width == {"paper": 16, "fast": 24}[name]
 
 
 def test_a_profile_is_overridden_part_by_part():

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import warp as wp
 from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 
@@ -41,22 +42,31 @@ def surface(shape: str) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Positions at K times, linear between them, constant before the first time and after the last.
+    """The path of a body through K poses: position and turn change at constant rates between two of them, and are
+    constant before the first time and after the last.
 
     Attributes:
-        positions: float64 [K, 3], in cells.
+        positions: float64 [K, 3], of the body's origin in cells.
         times: float64 [K], in steps of the lattice, increasing.
+        rotations: float64 [K, 4], unit quaternions (x, y, z, w) that turn the body about its origin.
     """
 
     positions: np.ndarray
     times: np.ndarray
+    rotations: np.ndarray
 
     @classmethod
-    def of(cls, positions: Sequence, times: Sequence[float] = (0.0,)) -> "Trajectory":
+    def of(
+        cls, positions: Sequence, times: Sequence[float] = (0.0,), rotations: Sequence | None = None
+    ) -> "Trajectory":
         """Makes a trajectory through positions [K, 3] in cells at times [K] in steps, or one constant position (3,).
 
+        `rotations` are unit quaternions (x, y, z, w), [K, 4] or (4,); None: the body does not turn. Between two times
+        it turns the shorter way (spherical linear interpolation), by less than half a turn.
+
         Raises:
-            ValueError: A shape is wrong, a number is not finite, or the times do not increase.
+            ValueError: A shape is wrong, a number is not finite, the times do not increase, or a quaternion's length is
+                not 1.
         """
         p, t = np.atleast_2d(np.asarray(positions, np.float64)), np.asarray(times, np.float64)
         if t.ndim != 1 or len(t) == 0 or p.shape != (len(t), 3):
@@ -65,51 +75,90 @@ class Trajectory:
             raise ValueError("path: expected finite positions and times, got NaN or infinity")
         if (np.diff(t) <= 0).any():
             raise ValueError(f"path: expected increasing times, got {t.tolist()}")
-        return cls(p, t)
+        still = np.broadcast_to((0.0, 0.0, 0.0, 1.0), (len(t), 4))
+        r = still if rotations is None else np.atleast_2d(np.asarray(rotations, np.float64))
+        lengths = np.linalg.norm(r, axis=-1, keepdims=True)
+        if r.shape != (len(t), 4) or not (np.abs(lengths - 1.0) < 1e-3).all():
+            raise ValueError(f"path: expected rotations [{len(t)}, 4], quaternions of length 1, got {r.tolist()}")
+        return cls(p, t, r / lengths)
 
     @property
     def moves(self) -> bool:
-        """Whether an obstacle on this path moves, that is whether the positions differ."""
-        return bool((self.positions != self.positions[0]).any())
+        """Whether a body on this path moves, that is whether the positions or the rotations differ."""
+        return bool((self.positions != self.positions[0]).any() or self.turns)
+
+    @property
+    def turns(self) -> bool:
+        """Whether a body on this path turns."""
+        return bool(self.rates[1].any())
+
+    @functools.cached_property
+    def rates(self) -> tuple[np.ndarray, np.ndarray]:
+        """Velocity in cells per step and angular velocity in radians per step after each time, float64 [K, 3]; 0 after
+        the last."""
+        spans, turns = np.diff(self.times)[:, None], Rotation.from_quat(self.rotations)
+        rates = np.diff(self.positions, axis=0) / spans, (turns[1:] * turns[:-1].inv()).as_rotvec() / spans
+        return tuple(np.concatenate([rate, np.zeros((1, 3))]) for rate in rates)
 
     def at(self, time: float) -> np.ndarray:
         """Returns the position in cells, float64 (3,), at a time in steps."""
         return np.array([np.interp(time, self.times, self.positions[:, axis]) for axis in range(3)])
 
+    def turn(self, time: float) -> np.ndarray:
+        """Returns the matrix, float64 (3, 3), that turns the body from its own frame at a time in steps."""
+        return self._turned(time).as_matrix()
+
+    def _turned(self, time: float) -> Rotation:
+        k = max(int(np.searchsorted(self.times, time, side="right")) - 1, 0)
+        angle = max(time - self.times[k], 0.0) * self.rates[1][k]
+        return Rotation.from_rotvec(angle) * Rotation.from_quat(self.rotations[k])
+
     def eased(self, reach: float) -> "Trajectory":
-        """Returns the path of a body that starts at rest at time 0, with ramps in place of jumps of its velocity.
+        """Returns the path of a body that starts at rest at time 0, with ramps in place of jumps of its velocity and
+        angular velocity.
 
         A ramp is a cubic Hermite curve, in straight pieces. It lasts as long as the faster side of the jump takes for
-        the distance `reach`, but at most half of the time to the next position. A jump at time 0 is followed by its
-        ramp, in which the body catches up, at up to 4/3 of its speed; others are in the middle of theirs.
+        the distance `reach`, the body's diameter, also on its surface, but at most half of the time to the next pose. A
+        jump at time 0 is followed by its ramp, in which the body catches up, at up to 4/3 of its speed; others are in
+        the middle of theirs.
         """
         start = np.append(0.0, self.times[self.times > 0.0])
         times = start if self.times[0] < 0.0 else self.times
         positions = np.array([self.at(time) for time in times])
-        speeds = np.zeros((len(times) + 1, 3))
-        speeds[1:-1] = np.diff(positions, axis=0) / np.diff(times)[:, None]
+        turns = [self._turned(time) for time in times]
+        path = Trajectory(positions, times, np.array([turn.as_quat() for turn in turns]))
+        speeds, spins = (np.concatenate([np.zeros((1, 3)), rates]) for rates in path.rates)
+        fast = np.linalg.norm(speeds, axis=1) + 0.5 * reach * np.linalg.norm(spins, axis=1)
         room = np.concatenate([[2.0 * times[0]], np.diff(times), [np.inf]]) / 2.0
-        keys = [np.column_stack([times, positions])]
-        for k, (time, place) in enumerate(zip(times, positions, strict=True)):
-            change, fastest = speeds[k + 1] - speeds[k], np.linalg.norm(speeds[k : k + 2], axis=1).max()
-            if not change.any():
+        keys = [np.column_stack([times, positions, path.rotations])]
+        for k, (time, place, turn) in enumerate(zip(times, positions, turns, strict=True)):
+            if (speeds[k] == speeds[k + 1]).all() and np.allclose(spins[k], spins[k + 1], 1e-9, 1e-9 * fast[k] / reach):
                 continue
+            fastest = fast[k : k + 2].max()
             after = min(0.5 * reach / fastest, room[k], room[k + 1])
             before = after
             if time == 0.0:
                 before, after = 0.0, min(reach / fastest, room[k + 1])
             s = np.linspace(0.0, 1.0, _PIECES + 1)[:, None]
-            first, last, span = place - before * speeds[k], place + after * speeds[k + 1], before + after
-            curve = first + s**2 * (3 - 2 * s) * (last - first)
-            curve += span * (s * (1 - s) ** 2 * speeds[k] - s**2 * (1 - s) * speeds[k + 1])
+            span = before + after
+            first, last = place - before * speeds[k], place + after * speeds[k + 1]
+            begin, end = (Rotation.from_rotvec(angle) * turn for angle in (-before * spins[k], after * spins[k + 1]))
+            whole = (end * begin.inv()).as_rotvec()
+            curve = first + _ramp(s, last - first, span * speeds[k], span * speeds[k + 1])
+            turned = Rotation.from_rotvec(_ramp(s, whole, span * spins[k], span * spins[k + 1])) * begin
             keys[0] = keys[0][keys[0][:, 0] != time]
-            keys.append(np.column_stack([time - before + span * s, curve]))
+            keys.append(np.column_stack([time - before + span * s, curve, turned.as_quat()]))
         table = np.concatenate(keys)
         table = table[np.argsort(table[:, 0], kind="stable")]
         # Ramps that touch share a time, up to rounding.
         gaps = np.diff(table[:, 0])
         table = table[np.append(True, gaps > 1e-9 * gaps.max(initial=0.0))]
-        return Trajectory(table[:, 1:], table[:, 0])
+        return Trajectory(table[:, 1:4], table[:, 0], table[:, 4:])
+
+
+def _ramp(s: np.ndarray, whole: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Returns the cubic from 0 to `whole`, with the derivatives `before` and `after` at its ends, at s in 0 to 1."""
+    return s**2 * (3 - 2 * s) * whole + s * (1 - s) ** 2 * before - s**2 * (1 - s) * after
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,5 @@
-"""Density volumes of smoke: checked input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); output as `.npz`
-or `.vdb`.
+"""Density volumes of smoke: checked input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); output as the
+same.
 
 Repairs are listed in `DensityVolume.warnings`, one line for each kind; `docs/fluid.md` lists them and the errors.
 
@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.limits import RESAMPLED, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, check_growth
 from wlm.formats.nanovdb import NanoVdbFile
+from wlm.formats.nanovdb_writing import encode_nvdb
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import FileBytes, open_file, read_file
 from wlm.formats.vdb import LARGEST, GridHead, VdbFile
@@ -66,7 +67,7 @@ _THIN, _THICK = 0.1, 1000.0  # optical thickness of smoke that hides 10% of the 
 _KELVIN = 250.0  # temperatures above it are probably kelvins; those of smoke simulations are about 1
 
 SUFFIXES = (".npz", ".nvdb", ".vdb")
-"""Suffixes of the files that `load_volume` reads."""
+"""Suffixes of the files that `load_volume` reads and `save_volume` writes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,15 +212,13 @@ def load_volume(
     Raises:
         WlmError: The input has one of the errors that `docs/fluid.md` lists; the message names the file and the field.
     """
-    path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise WlmError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, found {path.suffix or 'none'}")
+    path, suffix = Path(path), _suffix(path)
     told, up = up is not None, up or "y"
     if up not in UPS:
         raise ValueError(f"up: expected one of {', '.join(UPS)}, got {up!r}")
     names, device = (density, temperature), check_device(device)
     factors = {"extinction": extinction, "emission": emission, "name": str(path)}
-    if path.suffix.lower() == ".npz":
+    if suffix == ".npz":
         volume = from_array(**_read_npz(path, names, device, trust), **factors, device=device)
         volume = _turned(volume, up) if up != "y" else volume
     else:
@@ -243,6 +242,13 @@ def load_volume(
     if not _TINY <= voxel <= _HUGE:
         raise WlmError(f"{path}: voxel: expected a length above 0 that float32 holds, found {voxel}")
     return replace(volume, voxel=voxel, origin=tuple(voxel / volume.voxel * o for o in volume.origin))
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    """Returns the suffix of a volume's file in lower case, which must be one of `SUFFIXES`."""
+    if (suffix := Path(path).suffix.lower()) not in SUFFIXES:
+        raise WlmError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, found {suffix or 'none'}")
+    return suffix
 
 
 def thickness_hint(thickness: float, extinction: float) -> str | None:
@@ -282,24 +288,23 @@ def save_volume(
     *,
     bricks: bool = False,
     velocity: np.ndarray | None = None,
+    codec: Literal["zip", "none"] = "zip",
 ) -> None:
-    """Writes a volume as `.npz` or `.vdb`, whole or not at all; `load_volume` reads it back.
+    """Writes a volume as `.npz`, `.vdb` or `.nvdb`, whole or not at all; `load_volume` reads it back.
 
     With `bricks` an `.npz` is not compressed, but empty bricks of 8^3 voxels are omitted: writing is much faster, but
-    the file is larger and other programs cannot read it. A `.vdb`, for Blender and Houdini, has grids named `density`,
-    `temperature` if there is one, and `velocity` if it is given, [X, Y, Z, 3] in the volume's box, also in larger
-    voxels.
+    the file is larger and other programs cannot read it. A `.vdb`, for Blender and Houdini, and a `.nvdb`, for
+    renderers on GPUs, have grids named `density`, `temperature` if there is one, and `velocity` if it is given, [X, Y,
+    Z, 3] in the volume's box, also in larger voxels. A `.nvdb` is compressed by zlib unless `codec` is "none".
 
     Raises:
         WlmError: The suffix is wrong, or the file cannot be written.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in (".npz", ".vdb"):
-        raise WlmError(f"{path}: expected a name that ends in .npz or .vdb, found {suffix or 'none'}")
+    suffix = _suffix(path)
     fields = {_DENSITY: volume.density}
     if volume.temperature is not None:
         fields[_TEMPERATURE] = volume.temperature
-    if suffix == ".vdb":
+    if suffix != ".npz":
         grids = {name: values.cpu().numpy() for name, values in fields.items()}
         grids |= {} if velocity is None else {"velocity": velocity}
         placed = []
@@ -308,7 +313,7 @@ def save_volume(
             matrix = np.diag([edge, edge, edge, 1.0])
             matrix[:3, 3] = np.asarray(volume.origin) + 0.5 * edge
             placed.append((name, values, matrix))
-        atomic_write(path, encode_vdb(placed))
+        atomic_write(path, encode_vdb(placed) if suffix == ".vdb" else encode_nvdb(placed, codec))
         return
     arrays = {"voxel": np.float64(volume.voxel), "origin": np.asarray(volume.origin, np.float64)}
     if bricks:

@@ -265,7 +265,7 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
     with _writing(folder):
         folder.mkdir(exist_ok=True)
         if not resume:
-            made = [*numbered(folder, "frame", ".npz").values(), *numbered(folder, "frame", ".vdb").values()]
+            made = (path for suffix in SUFFIXES for path in numbered(folder, "frame", suffix).values())
             for path in (*made, folder / CHECKPOINT):
                 path.unlink(missing_ok=True)
     content = {"format": _FORMAT, "version": _VERSION, "scene": scene.model_dump(mode="json")}

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator
+from typing import Literal
 
 import numpy as np
 import warp as wp
@@ -165,7 +166,7 @@ def simulate(
     device: str = "cpu",
     resume: bool = False,
     checkpoint_every: float = EVERY,
-    vdb: bool = False,
+    volumes: Literal["vdb", "nvdb", "nvdb-raw"] | None = None,
     progress: OnProgress | None = None,
 ) -> int:
     """Simulates a scene and writes its frames.
@@ -180,7 +181,8 @@ def simulate(
             opening the folder, a failure leaves earlier frames in the folder.
         device: Device that `wlm.interop.check_device` returned.
         resume: Whether to continue from a saved state, if there is one. A state past the last requested frame is kept.
-        vdb: Whether to write each frame as `frame_0001.vdb`, too, with the velocity of the air in metres per second.
+        volumes: Format in which each frame is written, too, with the velocity of the air in metres per second:
+            `frame_0001.vdb`, or `frame_0001.nvdb`, compressed or as a GPU holds it (nvdb-raw). None: no second file.
         checkpoint_every: Seconds between two saves of the state; 0: after every step.
         progress: Called after each frame, with the figures `smoke`, the integral of the density over the box, and
             `frame s`, the seconds of the frame; and about twice a second within a frame, without figures.
@@ -217,9 +219,11 @@ def simulate(
                 if last:
                     solver.check()
                     volume = volume_of(scene, solver)
-                    if vdb:
+                    if volumes is not None:
                         velocity = solver.velocity.numpy() * (scene.grid.cell / solver.duration)
-                        save_volume(frames.file(frame).with_suffix(".vdb"), volume, velocity=velocity)
+                        suffix, _, raw = volumes.partition("-")
+                        copy = frames.file(frame).with_suffix(f".{suffix}")
+                        save_volume(copy, volume, velocity=velocity, codec="none" if raw else "zip")
                     # Written before the state: a state without its frame could not be resumed.
                     save_volume(frames.file(frame), volume, bricks=True)
                 if pace.due():

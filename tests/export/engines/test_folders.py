@@ -49,23 +49,6 @@ def test_a_large_lightmap_has_few_files(engine, tmp_path):
 TEXTS = {".md", ".js", ".glsl", ".gd", ".gdshader", ".hlsl", ".shader", ".cs", ".py"}
 
 
-def test_one_engines_files_take_the_place_of_anothers(tmp_path):
-    folder = tmp_path / "out"
-    (folder).mkdir()
-    export(random_lightmap(ALL), folder, "three")
-    (folder / "mine.txt").write_text("x")
-    for engine in (*ENGINES[1:], ENGINES[0]):
-        paths = export(random_lightmap((2, 1, 2, 0)), folder, engine)
-        assert set(os.listdir(folder)) == {path.name for path in paths} | {"mine.txt"}
-    model = atlas_model("tiles")
-    for engine in (*ENGINES, None):
-        paths = export(model, tmp_path / "atlas", engine)
-        assert set(os.listdir(tmp_path / "atlas")) == {path.name for path in paths}
-        info = json.loads(paths[-1].read_text())
-        assert {each["file"] for each in info["textures"].values()} < set(os.listdir(tmp_path / "atlas"))
-        assert info["uv_set"] == 0
-
-
 def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
     model = random_atlas(sheet(), MIXED)
     for engine in (*ENGINES, None):
