@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 
 _PIECES = 16  # straight pieces of a ramp of a path
+SHELL = 0.71
+"""Half of the thickness in cells of a surface that stops air: a link of D3Q19, of at most 2^(1/2), ends in it."""
 _SIDES = 24  # segments of a sphere from pole to pole; there are twice as many around it
 
 
@@ -190,21 +192,25 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """An obstacle bounded by a closed mesh, which moves without rotation.
+    """An obstacle bounded by a mesh, which moves without rotation.
 
-    A cell whose centre is exactly on the surface may count as inside or outside.
+    It is solid by its winding number, so that small holes do not matter, and within the shell of its surface, so that
+    a surface that is open or thin stops the air. A cell whose centre is exactly on the surface may count as inside or
+    outside.
 
     Attributes:
         path: Path of the mesh's origin.
         vertices: float32 [V, 3], corners relative to the mesh's origin, in the mesh's own unit.
         triangles: int32 [T, 3], indices of each triangle's corners, anticlockwise seen from outside.
         scale: Cells per unit of the mesh.
+        shell: Distance from the surface in cells within which a cell is solid, too; of at least `SHELL` no air passes.
     """
 
     path: Trajectory
     vertices: np.ndarray
     triangles: np.ndarray
     scale: float = 1.0
+    shell: float = 0.0
     _meshes: dict[str, wp.Mesh] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -217,15 +223,21 @@ class Mesh:
             raise ValueError(f"triangles: expected vertex indices of 0 to {len(v) - 1}, got {t.min()} to {t.max()}")
         if not 0.0 < self.scale < np.inf:
             raise ValueError(f"scale: expected a number above 0, got {self.scale}")
+        if not 0.0 <= self.shell < np.inf:
+            raise ValueError(f"shell: expected a distance of at least 0, got {self.shell}")
 
-    def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """Marks the cells whose centres are inside the mesh at a position; arguments as for `Sphere.cover`."""
-        device = str(solid.device)
+    def on(self, device: str) -> wp.Mesh:
+        """Returns the mesh on a device, in its own unit, for `wlm_kernels.fluid.mesh_inside`."""
         if device not in self._meshes:
             points = wp.array(np.asarray(self.vertices, np.float32), dtype=wp.vec3, device=device)
             indices = wp.array(np.asarray(self.triangles, np.int32).ravel(), dtype=int, device=device)
             self._meshes[device] = wp.Mesh(points, indices, support_winding_number=True)
-        voxelise_mesh(solid, body, self._meshes[device], position.tolist(), scale=self.scale)
+        return self._meshes[device]
+
+    def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
+        """Marks the cells whose centres are inside the mesh at a position; arguments as for `Sphere.cover`."""
+        mesh = self.on(str(solid.device))
+        voxelise_mesh(solid, body, mesh, position.tolist(), scale=self.scale, shell=self.shell)
 
 
 Obstacle = Sphere | Mesh

@@ -25,6 +25,7 @@ from wlm.errors import WlmError
 from wlm.fluid.grids import choose
 from wlm.fluid.volume import SUFFIXES, DensityVolume, from_array, grid_heads, load_volume
 from wlm.formats.atomic import atomic_write
+from wlm.formats.compact import digest
 from wlm.formats.exr import read_header, read_planes, write_planes
 from wlm.formats.exr_header import check_header
 from wlm.formats.folder import claim, read_index, write_index
@@ -484,6 +485,8 @@ def _simulated(scene: Scene, until: float) -> dict[str, Any]:
     settings["obstacles"] = []
     for body in scene.obstacles:
         places = [body.centre(time) / scene.grid.cell for time in np.linspace(0.0, until, _PLACES)]
-        settings["obstacles"].append([body.shape, np.asarray(body.radius).tolist(), np.round(places, 6).tolist()])
+        # The content of a mesh counts, not its place.
+        corners = digest(*body.mesh())
+        settings["obstacles"].append([corners, body.shell, np.round(places, 6).tolist()])
     smoke, air = settings.pop("smoke"), settings.pop("air")
     return settings | {f"smoke.{k}": v for k, v in smoke.items()} | {f"air.{k}": v for k, v in air.items()}

@@ -13,7 +13,7 @@ from wlm.fluid import solver as fluid
 from wlm.fluid.faces import FACES
 from wlm.fluid.forcing import Turbulence
 from wlm.fluid.lattice import Domain, Lattice
-from wlm.fluid.obstacles import Mesh, Obstacle, Sphere, Trajectory
+from wlm.fluid.obstacles import SHELL, Mesh, Obstacle, Sphere, Trajectory
 from wlm.fluid.volume import DensityVolume, save_volume
 from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked
@@ -21,6 +21,7 @@ from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
 from wlm.smoke.scene import MOST_STEPS, Inlet, ObstacleSettings, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
+from wlm_kernels.fluid.mesh_inside import contains
 
 _Timed = tuple[fluid.Source, Callable[[float], bool]]
 # Depth in cells of the smoke at an inlet, so that the air carries smoke of full density into the box.
@@ -98,11 +99,11 @@ def warnings_of(scene: Scene) -> list[str]:
                 f"{radius:.3g} m at {share:.2g} of its density"
             )
     for i, obstacle in enumerate(scene.obstacles):
-        radius, times = np.broadcast_to(obstacle.radius, 3), obstacle.eased.times
+        bounds, times = obstacle.bounds, obstacle.eased.times
         places = [obstacle.centre(time) for time in (0.0, *times[(times > 0.0) & (times < end)], end)]
-        if (np.max(places, axis=0) + radius <= low).any() or (np.min(places, axis=0) - radius >= high).any():
+        if (np.max(places, 0) + bounds[1] <= low).any() or (np.min(places, 0) + bounds[0] >= high).any():
             warnings.append(f"obstacles.{i}: {box}")
-        elif (_radius(scene, obstacle) > radius).any():
+        elif _is_thin(scene, obstacle):
             warnings.append(
                 f"obstacles.{i}: it is thinner than a cell of {grid.cell:g} m, and is simulated as a cell thick"
             )
@@ -144,13 +145,21 @@ def _is_hidden(scene: Scene, points: np.ndarray, start: float, stop: float) -> b
     for moment in np.linspace(start, stop, _LOOKS_AT_OBSTACLES if scene.obstacles else 1):
         covered = np.zeros(len(points), bool)
         for obstacle in scene.obstacles:
-            away = np.abs(places - obstacle.centre(moment)) / _radius(scene, obstacle)
-            across, along = np.hypot(away[:, 0], away[:, 2]), away[:, 1]
-            reach = {"sphere": np.hypot(across, along), "cylinder": np.maximum(across, along), "box": away.max(1)}
-            covered |= reach[obstacle.shape] < 1.0
+            covered |= _covers(scene, obstacle, places - obstacle.centre(moment))
         if not covered.all():
             return False
     return True
+
+
+def _covers(scene: Scene, obstacle: ObstacleSettings, away: np.ndarray) -> np.ndarray:
+    """Tests which places, [N, 3] in metres relative to an obstacle's origin, are in the obstacle: bool [N]."""
+    if obstacle.surface is not None:
+        mesh = _mesh(scene, obstacle)
+        return contains(mesh.on("cpu"), away, mesh.shell * scene.grid.cell)
+    away = np.abs(away - obstacle.offset) / _radius(scene, obstacle)
+    across, along = np.hypot(away[:, 0], away[:, 2]), away[:, 1]
+    reach = {"sphere": np.hypot(across, along), "cylinder": np.maximum(across, along), "box": away.max(1)}
+    return reach[obstacle.shape] < 1.0
 
 
 def volume_of(scene: Scene, solver: fluid.Solver) -> DensityVolume:
@@ -400,18 +409,36 @@ def _ball(scene: Scene, ball: SourceSettings) -> tuple[float, float]:
 
 
 def _obstacles(scene: Scene) -> list[Obstacle]:
-    grid = scene.grid
     obstacles: list[Obstacle] = []
     for settings in scene.obstacles:
-        eased = settings.eased
-        path = Trajectory.of((eased.positions - grid.origin) / grid.cell, eased.times / scene.step)
-        radius = _radius(scene, settings)
-        if settings.shape == "sphere":
-            obstacles.append(Sphere(path, float(radius[0]) / grid.cell))
+        if settings.shape == "sphere" and not any(settings.offset):
+            obstacles.append(Sphere(_path(scene, settings), float(_radius(scene, settings)[0]) / scene.grid.cell))
         else:
-            points, triangles = settings.model_copy(update={"radius": tuple(radius)}).mesh()
-            obstacles.append(Mesh(path, points.astype(np.float32), triangles.astype(np.int32), scale=1.0 / grid.cell))
+            obstacles.append(_mesh(scene, settings))
     return obstacles
+
+
+def _path(scene: Scene, obstacle: ObstacleSettings) -> Trajectory:
+    eased, grid = obstacle.eased, scene.grid
+    return Trajectory.of((eased.positions - grid.origin) / grid.cell, eased.times / scene.step)
+
+
+def _mesh(scene: Scene, obstacle: ObstacleSettings) -> Mesh:
+    if (surface := obstacle.surface) is None:
+        thick, shell = obstacle.model_copy(update={"radius": tuple(_radius(scene, obstacle))}), 0.0
+    else:
+        surface_only = surface.is_open if obstacle.shell is None else obstacle.shell
+        thick, shell = obstacle, SHELL if surface_only or _is_thin(scene, obstacle) else 0.0
+    points, triangles = thick.mesh()
+    places = points.astype(np.float32), triangles.astype(np.int32)
+    return Mesh(_path(scene, obstacle), *places, scale=1.0 / scene.grid.cell, shell=shell)
+
+
+def _is_thin(scene: Scene, obstacle: ObstacleSettings) -> bool:
+    """Tests whether an obstacle is simulated thicker than it is."""
+    if (surface := obstacle.surface) is None:
+        return bool((_radius(scene, obstacle) > obstacle.radius).any())
+    return surface.thickness * obstacle.scale < scene.grid.cell
 
 
 def _radius(scene: Scene, obstacle: ObstacleSettings) -> np.ndarray:

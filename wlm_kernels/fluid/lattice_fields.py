@@ -26,11 +26,9 @@ from wlm_kernels.fluid.lattice_sets import (
     wrapped,
 )
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
+from wlm_kernels.fluid.mesh_inside import in_mesh
 
 wp.set_module_options({"enable_backward": False})
-
-# The winding number is correct even where a sign from rays would fail because a ray grazes a triangle.
-_INSIDE = wp.constant(0.5)
 
 
 @wp.func
@@ -70,13 +68,13 @@ def _mesh(
     position: wp.vec3,
     scale: float,
     reach: float,
+    shell: float,
     # out:
     solid: wp.array1d[wp.uint8],
 ):
     i = wp.tid()
     x = (_centre(n, i) - position) / scale
-    query = wp.mesh_query_point_sign_winding_number(mesh, x, reach, 2.0, _INSIDE)
-    _put(solid, i, body, query.result and query.sign < 0.0)
+    _put(solid, i, body, in_mesh(mesh, x, reach, shell / scale))
 
 
 def voxelise_sphere(solid, body: int, centre, radius: float) -> None:
@@ -87,9 +85,9 @@ def voxelise_sphere(solid, body: int, centre, radius: float) -> None:
     wp.launch(_sphere, solid.size, inputs=inputs, outputs=[solid.flatten()], device=solid.device)
 
 
-def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position, scale: float) -> None:
-    """Marks the cells of `solid`, uint8 [X, Y, Z], whose centres are in a closed mesh with a body's number, 1 to 255,
-    and clears the body's other cells.
+def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position, scale: float, shell: float = 0.0) -> None:
+    """Marks the cells of `solid`, uint8 [X, Y, Z], whose centres are in a mesh or within `shell` cells of its surface
+    (`mesh_inside`), with a body's number, 1 to 255, and clears the body's other cells.
 
     The mesh, on the same device, was made with `support_winding_number=True`. `position` is that of its origin in
     cells, and `scale` the cells per unit of the mesh.
@@ -97,7 +95,7 @@ def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position, scale: float) -> No
     n = wp.vec3i(*solid.shape)
     # No cell is farther away than the domain's diagonal.
     reach = 4.0 * float(sum(solid.shape)) / scale
-    inputs = [n, wp.uint8(body), mesh.id, wp.vec3(*position), float(scale), reach]
+    inputs = [n, wp.uint8(body), mesh.id, wp.vec3(*position), float(scale), reach, float(shell)]
     wp.launch(_mesh, solid.size, inputs=inputs, outputs=[solid.flatten()], device=solid.device)
 
 
