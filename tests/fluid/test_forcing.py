@@ -12,6 +12,7 @@ from wlm.fluid.forcing import CALM, Turbulence, Wind
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.solver import Solver
 from wlm_kernels.fluid import forcing
+from wlm_kernels.fluid.advection_places import Box
 
 ENDS = [(0, 0, 0), (1, 0, 1), (1, 1, 1)]
 
@@ -47,7 +48,9 @@ def _stir(u, periodic, solid, confinement, modes, step, force, device, *, added=
     out = wp.array(force.reshape(-1, 3).astype(np.float32), dtype=wp.vec3, device=device)
     clock = wp.array([step, step - 1], dtype=int, device=device)
     marks = wp.array(solid.ravel().astype(np.uint8), device=device)
-    forcing.stir(wp.vec3i(*shape), wp.vec3i(*periodic), air, marks, confinement, modes, clock, out, added=added)
+    box = Box()
+    box.coarse, box.periodic = wp.vec3i(*shape), wp.vec3i(*periodic)
+    forcing.stir(box, air, marks, confinement, modes, clock, out, added=added)
     return out.numpy().reshape(u.shape)
 
 
@@ -120,8 +123,8 @@ def test_a_halved_step_is_the_same_flow(device: str):
 
 @pytest.mark.parametrize(("settings", "message"), [
     ({"strength": -1.0, "size": 8.0, "period": 5.0}, "strength: expected a finite number of at least 0"),
-    ({"strength": 1.0, "size": 3.0, "period": 5.0}, "size: expected at least 4 cells"),
-    ({"strength": 1.0, "size": 8.0, "period": 0.0}, "period: expected a finite number of steps above 0"),
+    ({"strength": 1.0, "size": 3.0, "period": 5.0}, "size: expected a finite number of at least 4"),
+    ({"strength": 1.0, "size": 8.0, "period": 0.0}, "period: expected a finite number of at least 1e-12"),
     ({"keys": [[0, 1, 0, 0], [0, 1, 0, 0]]}, "keys: expected rows of an increasing time"),
     ({"keys": [[0, 1, 0, 0]], "gusts": 1.5}, "gusts, period: expected 0 to 1"),
 ])  # fmt: skip

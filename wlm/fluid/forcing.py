@@ -29,12 +29,9 @@ class Turbulence:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.strength) and self.strength >= 0.0):
-            raise ValueError(f"strength: expected a finite number of at least 0, got {self.strength}")
-        if not (math.isfinite(self.size) and self.size >= 4.0):
-            raise ValueError(f"size: expected at least 4 cells, got {self.size}")
-        if not (math.isfinite(self.period) and self.period > 0.0):
-            raise ValueError(f"period: expected a finite number of steps above 0, got {self.period}")
+        for name, least in (("strength", 0.0), ("size", 4.0), ("period", 1e-12)):
+            if not least <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite number of at least {least:g}, got {getattr(self, name)}")
 
     def in_steps(self, factor: float) -> "Turbulence":
         """Returns the same turbulence in steps that are `factor` times as long."""
@@ -50,9 +47,8 @@ class Turbulence:
         push *= self.strength * math.sqrt(2.0 / _MODES) / np.linalg.norm(push, axis=1, keepdims=True)
         turn = random.normal(size=_MODES) * 2.0 * np.pi / self.period, random.uniform(0.0, 2.0 * np.pi, _MODES)
         out = Modes()
-        for name, values in (("k", k), ("push", push), ("turn", np.stack(turn, 1))):
-            kind = wp.vec2 if name == "turn" else wp.vec3
-            setattr(out, name, wp.array(values.astype(np.float32), dtype=kind, device=device))
+        out.k, out.push = (wp.array(each.astype(np.float32), dtype=wp.vec3, device=device) for each in (k, push))
+        out.turn = wp.array(np.stack(turn, 1).astype(np.float32), dtype=wp.vec2, device=device)
         return out
 
 

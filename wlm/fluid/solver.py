@@ -568,9 +568,8 @@ class Solver:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
             advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
         if self._stirred:
-            air = [box.coarse, box.periodic, self._velocity.flatten(), self._solid.flatten(), self._confinement]
-            where = [*air, self._modes, self.lattice.clock, self._force.flatten()]
-            forcing.stir(*where, added=self.buoyancy is not None)
+            air = [box, self._velocity.flatten(), self._solid.flatten(), self._confinement, self._modes]
+            forcing.stir(*air, self.lattice.clock, self._force.flatten(), added=self.buoyancy is not None)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)

@@ -137,13 +137,7 @@ class Grid(_Settings):
 
 
 class GustSettings(_Settings):
-    """Gusts of the wind.
-
-    Attributes:
-        strength: Largest change of its speed, as a share of it.
-        period: Mean time between two gusts in seconds.
-        seed: Seed of the gusts.
-    """
+    """Gusts: the largest change of the wind's speed, as a share of it, and their mean period in seconds."""
 
     strength: _Share = 0.3
     period: _Positive = 1.0
@@ -151,14 +145,7 @@ class GustSettings(_Settings):
 
 
 class TurbulenceSettings(_Settings):
-    """A random acceleration of all air, free of divergence.
-
-    Attributes:
-        strength: Root mean square of the acceleration in metres per second squared.
-        size: Wavelength of the largest eddies in metres; the smallest are half as large.
-        period: Mean duration in seconds in which an eddy comes and goes.
-        seed: Seed of the eddies.
-    """
+    """`wlm.fluid.forcing.Turbulence` in metres and seconds."""
 
     strength: _NotNegative
     size: _Positive

@@ -13,6 +13,7 @@ Nothing acts in solid cells. Gradients do not exist: `wlm.fluid.gradients` refus
 
 import warp as wp
 
+from wlm_kernels.fluid.advection_places import Box
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 
 wp.set_module_options({"enable_backward": False})
@@ -49,13 +50,11 @@ def _slope(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3i, a: int):
 
 @wp.func
 def _curl(n: wp.vec3i, periodic: wp.vec3i, u: wp.array1d[wp.vec3], p: wp.vec3i) -> wp.vec3:
-    low, high, share = _slope(n, periodic, p, 0)
-    x = share * (u[index_of(n, high)] - u[index_of(n, low)])
-    low, high, share = _slope(n, periodic, p, 1)
-    y = share * (u[index_of(n, high)] - u[index_of(n, low)])
-    low, high, share = _slope(n, periodic, p, 2)
-    z = share * (u[index_of(n, high)] - u[index_of(n, low)])
-    return wp.vec3(y[2] - z[1], z[0] - x[2], x[1] - y[0])
+    d = wp.mat33()
+    for a in range(3):
+        low, high, share = _slope(n, periodic, p, a)
+        d[a] = share * (u[index_of(n, high)] - u[index_of(n, low)])
+    return wp.vec3(d[1][2] - d[2][1], d[2][0] - d[0][2], d[0][1] - d[1][0])
 
 
 @wp.kernel
@@ -92,30 +91,11 @@ def _stir(
     force[i] = push
 
 
-def stir(
-    n: wp.vec3i,
-    periodic: wp.vec3i,
-    u: wp.array,
-    solid: wp.array,
-    confinement: float,
-    modes: Modes,
-    clock: wp.array,
-    force: wp.array,
-    *,
-    added: bool,
-) -> None:
-    """Computes the acceleration of the air by confinement and stirring.
+def stir(box: Box, u: wp.array, solid: wp.array, confinement: float, modes: Modes, clock: wp.array, force, *, added):
+    """Writes the acceleration of the N cells of the air to `force`, vec3 [N], in cells per step squared, or adds it.
 
-    Args:
-        n: Cells of the air along x, y and z; N in all.
-        periodic: 1 for each periodic axis, else 0.
-        u: vec3 [N], the velocity in cells per step.
-        solid: uint8 [N], above 0 where a cell is solid; [0] without solids.
-        confinement: eps in 1 / step; 0: none.
-        modes: The stirring; of no modes: none.
-        clock: int [2] of the lattice, the larger of which is the number of steps done.
-        force: vec3 [N], the acceleration in cells per step squared, written.
-        added: Whether it is added to what the array holds.
+    `u`, vec3 [N], is the velocity, `solid`, uint8 [N] or [0], above 0 where a cell is solid, `confinement` eps per step,
+    and `clock`, int [2], that of `lattice.step_kernel`.
     """
-    inputs = [n, periodic, u, solid, confinement, modes, clock, float(added)]
+    inputs = [box.coarse, box.periodic, u, solid, confinement, modes, clock, float(added)]
     wp.launch(_stir, force.shape[0], inputs=inputs, outputs=[force], device=force.device)
