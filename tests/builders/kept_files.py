@@ -152,9 +152,9 @@ def _training() -> Kept:
         for other in (path, Path(f"{path}.csv")):
             other.unlink(missing_ok=True)
 
-    def read(path: Path) -> None:
+    def read(path: Path) -> Any:
         with mock.patch("wlm.smoke.fit._CHUNK", 2):
-            train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0, **pools)
+            return train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0, **pools)
 
     free = {"clock": "nan", "curve": "nan size"}
     ranges = {"step": ((), -1), "skipped": ((), 99.0), "counts": (0, -1), "adam.step.heads.0.bias": ((), -1.0)}
@@ -170,7 +170,12 @@ def _simulation() -> Kept:
     ball = Sphere(Trajectory.of(np.array([[4.0, 4.0, 4.0]]), np.array([0.0])), 1.5)
     solver = Solver(Lattice((8, 8, 8), viscosity=0.1), refinement=1, obstacles=[ball])
     solver.step(2)
-    return Kept(_written(solver.save), solver.load, {}, {"lattice.steps": ((), -1), "density": ((0, 0, 0), -1.0)})
+
+    def read(path: Path) -> Solver:
+        solver.load(path)
+        return solver
+
+    return Kept(_written(solver.save), read, {}, {"lattice.steps": ((), -1), "density": ((0, 0, 0), -1.0)})
 
 
 KEPT: dict[str, Callable[[], Kept]] = {

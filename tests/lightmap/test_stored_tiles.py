@@ -1,6 +1,5 @@
 """Tiles that are read from a file when they are needed: alone, together, by threads, and from files that change."""
 
-import hashlib
 import json
 import os
 import threading
@@ -10,8 +9,8 @@ import numpy as np
 import pytest
 from builders.checks import assert_same, error_of
 from builders.layered_sets import random_layers
-from builders.resigned import index_bytes
 from builders.synthetic import random_model
+from fuzz.containers import open_artifact, sign
 
 import wlm
 from wlm.errors import WlmError
@@ -124,19 +123,10 @@ def test_a_flipped_byte_is_an_error_of_its_tile(path, tmp_path, piece):
 
 def signed(path: Path, change) -> None:
     """Changes header and body of a file and gives it a right digest."""
-    content = path.read_bytes()
-    start = 8 + int.from_bytes(content[:8], "little")
-    header, body = json.loads(content[8:start]), bytearray(content[start:])
+    header, content = open_artifact(path.read_bytes())
+    body = bytearray(content)
     change(header, body)
-    words = header["__metadata__"]["wlm"].split(" ")
-
-    def joined(digest):
-        header["__metadata__"]["wlm"] = " ".join([*words[:3], digest])
-        text = json.dumps(header, separators=(",", ":")).encode()
-        return len(text).to_bytes(8, "little") + text + body
-
-    whole = joined("0" * 32)
-    path.write_bytes(joined(hashlib.blake2b(whole[: index_bytes(whole)], digest_size=16).hexdigest()))
+    path.write_bytes(sign(header, bytes(body)))
 
 
 def resized(*sizes: int):

@@ -16,7 +16,7 @@ from builders.checks import error_of
 from builders.engine_scripts import Script, assert_csharp_parses, assert_gdscript_parses, node_gives, pixels_of
 from builders.layered_sets import random_layers
 from builders.light_groups import random_groups
-from builders.shader_runs import run_glsl, run_hlsl
+from builders.shader_runs import compiled, run_glsl, run_hlsl
 from builders.synthetic import random_model as random_lightmap
 
 from benchmarks.atlas_exact import decode64
@@ -147,15 +147,6 @@ def test_blocks_that_do_not_fill_their_texture_become_half_floats(tmp_path):
     np.testing.assert_array_equal(read_light(tmp_path / "out" / "colour.dds")[0][..., :3], model.texels[0])
     export(model, tmp_path / "out")
     assert (tmp_path / "out" / "colour.dds").read_bytes().endswith(model.blocks.tobytes())
-
-
-def compiled(text, folder, *words):
-    if shutil.which("glslangValidator") is None:
-        pytest.skip("no glslangValidator: install glslang-tools")
-    (folder / "shader.comp").write_text(text)
-    words = ["glslangValidator", "-V", *words, "-o", "shader.spv", "shader.comp"]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)
