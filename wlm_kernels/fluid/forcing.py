@@ -94,7 +94,7 @@ def _stir(
 def stir(box: Box, u: wp.array, solid: wp.array, confinement: float, modes: Modes, clock: wp.array, force, *, added):
     """Writes the acceleration of the N cells of the air to `force`, vec3 [N], in cells per step squared, or adds it.
 
-    `u`, vec3 [N], is the velocity; `solid`, uint8 [N] or [0], above 0 where a cell is solid; `confinement` eps per step;
+    `u`, vec3 [N], is the air's velocity; `solid`, uint8 [N] or [0], above 0 in solids; `confinement` eps per step;
     and `clock`, int [2], that of `lattice.step_kernel`.
     """
     inputs = [box.coarse, box.periodic, u, solid, confinement, modes, clock, float(added)]
