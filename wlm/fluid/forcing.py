@@ -1,7 +1,6 @@
 """What moves the air of a `Solver` besides smoke: turbulence, and wind with gusts."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -87,10 +86,6 @@ class Wind:
     def fastest(self) -> float:
         """An upper bound of the speed."""
         return float(np.linalg.norm(np.asarray(self.keys)[:, 1:], axis=1).max()) * (1.0 + self.gusts)
-
-    def enters(self, inward: Sequence[float]) -> bool:
-        """Tests whether the wind ever blows along a direction, such as that from a face into the box."""
-        return bool((np.asarray(self.keys)[:, 1:] @ np.asarray(inward) > 0.0).any())
 
 
 CALM = Modes()

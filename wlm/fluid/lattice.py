@@ -229,23 +229,14 @@ class Lattice:
         self._set_face(face, INLET, velocity, where=where)
 
     def set_wind(self, face: str) -> None:
-        """Makes a face (see `set_wall`) one through which the wind of `blow` comes, or leaves; at first there is none.
-
-        Its velocity is that of the wind everywhere on the face. Wind needs an outlet, too, or air cannot pass.
-        """
+        """Makes a face (see `set_wall`) one through which the wind of `blow` comes or leaves; at first there is none."""
         self._set_face(face, WIND)
 
     def blow(self, velocity: ArrayLike) -> None:
-        """Sets the velocity of the wind from now on, (3,) in cells per step, without waiting for the device.
-
-        Raises:
-            WlmError: It is faster than `MAX_SPEED`.
-        """
-        wind = np.asarray(velocity, np.float32)
-        if wind.shape != (3,) or not np.isfinite(wind).all():
-            raise ValueError(f"velocity: expected three finite numbers, got {velocity!r}")
+        """Sets the velocity of the wind from now on, (3,) in cells per step; raises a WlmError above `MAX_SPEED`."""
+        wind = np.asarray(velocity, np.float32).reshape(1, 3)
         _check_speed(float(np.linalg.norm(wind)), "the wind")
-        self._wind.assign(wind[None])
+        self._wind.assign(wind)
 
     def set_outlet(self, face: str, density: float | None = None) -> None:
         """Makes a face an outlet.

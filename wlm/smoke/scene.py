@@ -161,8 +161,7 @@ class Air(_Settings):
         speed: Speed in metres per second that equals `lattice_speed`; null: that of the fastest inlet or obstacle.
         lattice_speed: Speed in cells per step. Errors grow with its square, the number of steps with its inverse.
         smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
-        wind: Velocities of the wind in metres per second at times in seconds: rows (time, x, y, z), linear between
-            them. It comes through the open faces without an inlet through which it ever enters the box.
+        wind: Velocities of the wind: rows (time, x, y, z), linear between them; see `Scene.windy`.
         gusts: Gusts of the wind; null: none.
         confinement: Strength per second of the vorticity confinement (Fedkiw et al. 2001: eps), which keeps small
             eddies; 0: none.
@@ -503,10 +502,15 @@ class Scene(_Settings):
     @property
     def windy(self) -> list[str]:
         """The faces through which the wind comes: open ones without an inlet through which it ever enters the box."""
-        wind, taken = self.air.blowing(), {inlet.face for inlet in self.inlets}
-        free = [face for face in FACES if self.grid.face(face) == "open" and face not in taken]
-        inward = {face: (1.0 if face[0] == "-" else -1.0) * np.eye(3)["xyz".index(face[1])] for face in free}
-        return [] if wind is None else [face for face in free if wind.enters(inward[face])]
+        keys = np.array(self.air.wind).reshape(-1, 4)
+        entering = {face: (keys[:, 1 + k // 2] * (1 - 2 * (k % 2)) > 0.0).any() for k, face in enumerate(FACES)}
+        return [face for face in self._free if entering[face]]
+
+    @property
+    def _free(self) -> list[str]:
+        """The open faces without an inlet."""
+        taken = {inlet.face for inlet in self.inlets}
+        return [face for face in FACES if self.grid.face(face) == "open" and face not in taken]
 
     @property
     def fastest(self) -> float:
@@ -524,11 +528,9 @@ class Scene(_Settings):
     @property
     def _outflow(self) -> float:
         """An upper bound of the speed in metres per second at which what comes in leaves through the open faces."""
-        area = {face: float(np.prod(np.delete(self.grid.size, FACES.index(face) // 2))) for face in FACES}
-        closed = {*(inlet.face for inlet in self.inlets), *self.windy}
-        out = sum(area[face] for face in FACES if self.grid.face(face) == "open" and face not in closed)
-        wind = self.air.blowing()
-        flux = 0.0 if wind is None else wind.fastest * sum(area[face] for face in self.windy)
+        area = {face: float(np.prod(np.delete(self.grid.size, k // 2))) for k, face in enumerate(FACES)}
+        out = sum(area[face] for face in self._free if face not in self.windy)
+        flux = sum(self.air.blowing().fastest * area[face] for face in self.windy)
         for inlet in self.inlets:
             opening = area[inlet.face] if inlet.radius is None else math.pi * inlet.radius**2
             flux += abs(inlet.velocity[FACES.index(inlet.face) // 2]) * min(opening, area[inlet.face])

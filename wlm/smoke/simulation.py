@@ -345,11 +345,10 @@ def _buoyancy(scene: Scene) -> fluid.Buoyancy | None:
 
 def _turbulence(scene: Scene) -> Turbulence | None:
     stirring, cell = scene.air.turbulence, scene.grid.cell
-    if stirring is None or not stirring.strength:
+    if stirring is None:
         return None
     strength = Domain(cell, scene.step).acceleration(stirring.strength)
-    size = max(stirring.size / cell, _EDDY)
-    return Turbulence(strength, size, stirring.period / scene.step, stirring.seed)
+    return Turbulence(strength, max(stirring.size / cell, _EDDY), stirring.period / scene.step, stirring.seed)
 
 
 def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlets: list[tuple[int, Inlet]]) -> None:
