@@ -9,6 +9,8 @@ Each method has a table of its own:
   the relative drift of the mass.
 - "advection": a step that moves random smoke in eddies, with and without a solid sphere; and the error of a smooth ball
   after a full rotation: RMS error over the RMS of the ball, largest error (the ball's peak is 1), and smoke gained.
+- "advection mass": smoke gained in a closed box in two seconds after its source of hot smoke stopped, with and
+  without a sphere that crosses it.
 - "advection bricks": the same step with sparse storage, where only a cube in a corner contains smoke.
 - "guide": guiding maps (coarse lightmaps for the network) against a march in steps of half a voxel with no jitter and
   no cutoff. PSNR is of the light; its peak is the largest value.
@@ -22,6 +24,7 @@ user makes. On CUDA the lattice itself replays graphs where it does many steps, 
 graphs, so that gaps between launches do not count.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -36,6 +39,7 @@ from benchmarks.plot import Panel
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from demos.plume import make_plume
+from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.volume import DensityVolume
 from wlm.interop import stream, to_warp
@@ -45,7 +49,7 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.six_way import Guide, bake, guide
 from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera
 from wlm.smoke.shading import Light, PointLight
-from wlm.smoke.simulation import make_solver, volume_of
+from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
@@ -71,6 +75,8 @@ _BALL = (0.68, 0.2)  # its centre along x and its radius, of the box's edge
 _SCHEMES = ("semi-lagrangian", "maccormack")
 # Floats that a cell has to be read and written at the least: each pass takes its fields once, and leaves one.
 _PASSES = {"semi-lagrangian": 2, "maccormack": 2 + 3}
+_FILLED = 5  # frames in which smoke enters the closed box
+_CROSSING = {"radius": 0.12, "path": [[0.6, 0.15, 0.5, 0.5], [2.5, 0.85, 0.5, 0.5]]}
 _CLOUD = "cloud"
 _DEPTH = 8.0  # optical, through the cloud's box at density 1
 _OCTAVES = range(2, 7)
@@ -243,6 +249,33 @@ def advection_rows(bench: SmokeBench) -> list[Row]:
             if not option.endswith("sphere"):
                 figures |= _turn(bench, scheme, storage)
             rows.append(bench.row("advection", option, scene="ball", timing=timing, **figures))
+    return rows
+
+
+def mass_rows(bench: SmokeBench) -> list[Row]:
+    """Measures the smoke that a closed box of 1 m gains while hot smoke rises in it, without sources or outlets."""
+    bench.note("measuring the mass of smoke in a closed box")
+    rows, n = [], bench.sizes.small
+    for solid, obstacles in (("", []), (", a sphere crosses", [_CROSSING])):
+        for scheme, storage in itertools.product(_SCHEMES, advection.STORAGES):
+            if solid and storage == "float16" and not bench.sizes.every:
+                continue
+            settings = {
+                "name": "closed box",
+                "grid": {"cells": [n] * 3, "cell": 1.0 / n, "refine": 2, "faces": dict.fromkeys(FACES, "wall")},
+                "smoke": {"buoyancy": 5.0, "scheme": scheme, "storage": storage},
+                "sources": [{"centre": [0.5, 0.2, 0.5], "radius": 0.1, "temperature": 1, "stop": 0.1 * _FILLED}],
+                "obstacles": obstacles,
+                "frames": 5 * _FILLED,
+                "rate": 10.0,
+            }
+            scene = Scene.model_validate(settings)
+            solver, mass = make_solver(scene, device=bench.device), {}
+            for frame in range(1, scene.frames + 1):
+                advance(scene, solver, frame)
+                mass[frame] = float(volume_of(scene, solver).density.double().sum())
+            figures = {"smoke_gained": mass[scene.frames] / mass[_FILLED] - 1.0, "voxels": 2 * n}
+            rows.append(bench.row("advection mass", f"{scheme}, {storage}{solid}", scene="closed box", **figures))
     return rows
 
 
@@ -695,6 +728,7 @@ _PARTS: tuple[Callable[[SmokeBench], Iterable[Row]], ...] = (
     lattice_rows,
     storage_rows,
     advection_rows,
+    mass_rows,
     smoke_brick_rows,
     guide_rows,
     six_rows,
