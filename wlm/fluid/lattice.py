@@ -229,7 +229,7 @@ class Lattice:
         self._set_face(face, INLET, velocity, where=where)
 
     def set_wind(self, face: str) -> None:
-        """Makes a face (see `set_wall`) one through which the wind of `blow` comes or leaves; at first there is none."""
+        """Makes a face (see `set_wall`) one through which the wind of `blow` comes or leaves; first there is none."""
         self._set_face(face, WIND)
 
     def blow(self, velocity: ArrayLike) -> None:
