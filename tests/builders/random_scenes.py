@@ -70,9 +70,9 @@ def random_scene(seed: int) -> dict:
     if chance(0.2):
         air["speed"] = speed * 10 ** random.uniform(-0.5, 2)
     if chance(0.3):
-        air["wind"] = [[0.0, *(speed * random.normal(size=3))], [frames / rate, *(speed * random.normal(size=3))]]
-        air["wind"] = [[float(number) for number in key] for key in air["wind"]]
-        air["gusts"] = {"strength": float(random.uniform()), "period": frames / rate}
+        keys = [[0.0, *(speed * random.normal(size=3))], [frames / rate, *(speed * random.normal(size=3))]]
+        keys = [[float(number) for number in key] for key in keys]
+        air["wind"] = {"keys": keys, "gusts": float(random.uniform()), "period": frames / rate}
     if chance(0.3):
         air["confinement"] = rate * 10 ** random.uniform(-1, 2)
     if chance(0.3):

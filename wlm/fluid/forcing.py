@@ -1,46 +1,51 @@
-"""What moves the air of a `Solver` besides smoke: turbulence, and wind with gusts."""
+"""What moves the air of a `Solver` besides smoke: turbulence, and wind with gusts.
+
+Lengths and times are in any units; `scaled` converts them to those of cells and steps.
+"""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import warp as wp
 
 from wlm_kernels.fluid.forcing import Modes
 
+EDDY = 4.0
+"""Cells along the smallest wavelength of turbulence."""
 _MODES = 16
 
 
 @dataclass(frozen=True)
 class Turbulence:
-    """A random acceleration of all air, free of divergence, in cells and steps of the lattice; the same for a seed.
+    """A random acceleration of all air, free of divergence; the same for a seed.
 
     Attributes:
-        strength: Root mean square of the acceleration in cells per step squared.
-        size: Wavelength of its largest eddies in cells, at least 4; the smallest are half as large.
-        period: Mean duration in steps in which an eddy comes and goes.
-        seed: Seed of the random modes.
+        strength: Root mean square of the acceleration.
+        size: Wavelength of its largest eddies, simulated as at least `EDDY` cells; the smallest are half as large.
+        period: Mean duration in which an eddy comes and goes.
+        seed: Seed of the random modes, at least 0.
     """
 
     strength: float
     size: float
-    period: float
+    period: float = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("strength", 0.0), ("size", 4.0), ("period", 1e-12)):
+        for name, least in (("strength", 0.0), ("size", 1e-12), ("period", 1e-12), ("seed", 0)):
             if not least <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a finite number of at least {least:g}, got {getattr(self, name)}")
 
-    def in_steps(self, factor: float) -> "Turbulence":
-        """Returns the same turbulence in steps that are `factor` times as long."""
-        return replace(self, strength=factor * factor * self.strength, period=self.period / factor)
+    def scaled(self, step: float, cell: float = 1.0) -> "Turbulence":
+        """Returns the same in units of `cell` and `step`."""
+        return Turbulence(self.strength * step * step / cell, self.size / cell, self.period / step, self.seed)
 
     def modes(self, device: str) -> Modes:
         """Makes the random Fourier modes on a device, see `wlm_kernels.fluid.forcing`."""
         random = np.random.default_rng(self.seed)
         way, other = random.normal(size=(2, _MODES, 3))
-        length = 2.0 * np.pi / self.size * random.uniform(1.0, 2.0, (_MODES, 1))
+        length = 2.0 * np.pi / max(self.size, EDDY) * random.uniform(1.0, 2.0, (_MODES, 1))
         k = length * way / np.linalg.norm(way, axis=1, keepdims=True)
         push = np.cross(np.sin(k), other)
         push *= self.strength * math.sqrt(2.0 / _MODES) / np.linalg.norm(push, axis=1, keepdims=True)
@@ -69,10 +74,20 @@ class Wind:
 
     def __post_init__(self) -> None:
         keys = np.asarray(self.keys, np.float64)
-        if keys.ndim != 2 or keys.shape[1] != 4 or not (np.isfinite(keys).all() and (np.diff(keys[:, 0]) > 0).all()):
-            raise ValueError(f"keys: expected rows of an increasing time and a velocity, got {self.keys}")
+        if (
+            not self.seed >= 0
+            or keys.ndim != 2
+            or keys.shape[1] != 4
+            or not (np.isfinite(keys).all() and (np.diff(keys[:, 0]) > 0).all())
+        ):
+            raise ValueError(f"keys: expected rows of an increasing time and a velocity, and a seed of at least 0")
         if not 0.0 <= self.gusts <= 1.0 or not (math.isfinite(self.period) and self.period > 0.0):
             raise ValueError(f"gusts, period: expected 0 to 1, and above 0, got {self.gusts} and {self.period}")
+
+    def scaled(self, step: float, cell: float) -> "Wind":
+        """Returns the same in units of `cell` and `step`."""
+        keys = np.asarray(self.keys) * (1.0 / step, *[step / cell] * 3)
+        return Wind(keys.tolist(), self.gusts, self.period / step, self.seed)
 
     def at(self, time: float) -> np.ndarray:
         """Returns the velocity at a time, float64 [3]."""

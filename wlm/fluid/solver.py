@@ -348,7 +348,7 @@ class Solver:
             )
         self._confinement *= factor
         if self._turbulence is not None:
-            self._turbulence = self._turbulence.in_steps(factor)
+            self._turbulence = self._turbulence.scaled(factor)
             self._modes = self._turbulence.modes(str(self.device))
 
     @property

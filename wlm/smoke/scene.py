@@ -21,7 +21,7 @@ from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings, load_settings, profile_path
 from wlm.fluid.faces import FACES
-from wlm.fluid.forcing import Wind
+from wlm.fluid.forcing import Turbulence, Wind
 from wlm.fluid.obstacles import Trajectory, surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.meshes import SUFFIXES, Surface, read_surface
@@ -136,23 +136,6 @@ class Grid(_Settings):
         return self.cell * np.asarray(self.cells, np.float64)
 
 
-class GustSettings(_Settings):
-    """Gusts: the largest change of the wind's speed, as a share of it, and their mean period in seconds."""
-
-    strength: _Share = 0.3
-    period: _Positive = 1.0
-    seed: int = Field(0, ge=0, lt=2**32)
-
-
-class TurbulenceSettings(_Settings):
-    """`wlm.fluid.forcing.Turbulence` in metres and seconds."""
-
-    strength: _NotNegative
-    size: _Positive
-    period: _Positive = 1.0
-    seed: int = Field(0, ge=0, lt=2**32)
-
-
 class Air(_Settings):
     """Settings of the flow of the air.
 
@@ -161,11 +144,10 @@ class Air(_Settings):
         speed: Speed in metres per second that equals `lattice_speed`; null: that of the fastest inlet or obstacle.
         lattice_speed: Speed in cells per step. Errors grow with its square, the number of steps with its inverse.
         smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
-        wind: Velocities of the wind: rows (time, x, y, z), linear between them; see `Scene.windy`.
-        gusts: Gusts of the wind; null: none.
+        wind: Wind, in metres and seconds, through the faces `Scene.windy`; null: none.
         confinement: Strength per second of the vorticity confinement (Fedkiw et al. 2001: eps), which keeps small
             eddies; 0: none.
-        turbulence: A stirring of all air; null: none.
+        turbulence: A stirring of all air, in metres and seconds; null: none.
     """
 
     viscosity: _NotNegative = 1.5e-5
@@ -173,18 +155,9 @@ class Air(_Settings):
     lattice_speed: float = Field(0.1, gt=0.0, le=FASTEST)
     smagorinsky: _NotNegative = 0.17
     storage: Literal["float32", "float16"] = "float32"
-    wind: Annotated[tuple[tuple[_Number, _Number, _Number, _Number], ...], AfterValidator(_rising)] = ()
-    gusts: GustSettings | None = None
+    wind: Wind | None = None
     confinement: _NotNegative = 0.0
-    turbulence: TurbulenceSettings | None = None
-
-    def blowing(self, step: float = 1.0, cell: float = 1.0) -> Wind | None:
-        """Returns the wind in cells of `cell` metres and steps of `step` seconds; None: there is none."""
-        if not self.wind:
-            return None
-        keys = tuple((t / step, *(v * step / cell for v in velocity)) for t, *velocity in self.wind)
-        gusts = self.gusts or GustSettings(strength=0.0)
-        return Wind(keys, gusts.strength, gusts.period / step, gusts.seed)
+    turbulence: Turbulence | None = None
 
 
 class Smoke(_Settings):
@@ -502,7 +475,7 @@ class Scene(_Settings):
     @property
     def windy(self) -> list[str]:
         """The faces through which the wind comes: open ones without an inlet through which it ever enters the box."""
-        keys = np.array(self.air.wind).reshape(-1, 4)
+        keys = np.zeros((0, 4)) if self.air.wind is None else np.array(self.air.wind.keys)
         entering = {face: (keys[:, 1 + k // 2] * (1 - 2 * (k % 2)) > 0.0).any() for k, face in enumerate(FACES)}
         return [face for face in self._free if entering[face]]
 
@@ -521,8 +494,8 @@ class Scene(_Settings):
     def _speeds(self) -> list[float]:
         """Speeds of inlets, wind and obstacles in metres per second."""
         inlets = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
-        if (wind := self.air.blowing()) is not None:
-            inlets.append(wind.fastest)
+        if self.air.wind is not None:
+            inlets.append(self.air.wind.fastest)
         return [*inlets, *(obstacle.fastest for obstacle in self.obstacles)]
 
     @property
@@ -530,7 +503,7 @@ class Scene(_Settings):
         """An upper bound of the speed in metres per second at which what comes in leaves through the open faces."""
         area = {face: float(np.prod(np.delete(self.grid.size, k // 2))) for k, face in enumerate(FACES)}
         out = sum(area[face] for face in self._free if face not in self.windy)
-        flux = sum(self.air.blowing().fastest * area[face] for face in self.windy)
+        flux = 0.0 if self.air.wind is None else sum(self.air.wind.fastest * area[face] for face in self.windy)
         for inlet in self.inlets:
             opening = area[inlet.face] if inlet.radius is None else math.pi * inlet.radius**2
             flux += abs(inlet.velocity[FACES.index(inlet.face) // 2]) * min(opening, area[inlet.face])

@@ -11,7 +11,7 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid import solver as fluid
 from wlm.fluid.faces import FACES
-from wlm.fluid.forcing import Turbulence
+from wlm.fluid.forcing import EDDY
 from wlm.fluid.lattice import Domain, Lattice
 from wlm.fluid.obstacles import SHELL, Mesh, Obstacle, Sphere, Trajectory
 from wlm.fluid.volume import DensityVolume, save_volume
@@ -30,14 +30,13 @@ _INLET_DEPTH = 1.0
 _RAMP = 4
 # Speed of air in cells per step above which the step is halved, and air steps between two looks at it.
 _FAST, _LOOK = 0.25, 8
-_EDDY = 4.0  # cells along the smallest wavelength of turbulence
 # Times at which sources and inlets inside obstacles are looked for.
 _LOOKS_AT_OBSTACLES = 17
 
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
     """Builds the solver of a scene on a device, which `wlm.interop.check_device` must have returned."""
-    smoke = scene.smoke
+    smoke, air = scene.smoke, scene.air
     _require_memory(scene, device)
     try:
         lattice = _make_lattice(scene, device)
@@ -52,9 +51,9 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
             dissipation=smoke.dissipation * scene.step,
             cooling=smoke.cooling * scene.step if smoke.hot else 0.0,
             buoyancy=_buoyancy(scene),
-            confinement=scene.air.confinement * scene.step,
-            turbulence=_turbulence(scene),
-            wind=scene.air.blowing(scene.step, scene.grid.cell),
+            confinement=air.confinement * scene.step,
+            turbulence=air.turbulence and air.turbulence.scaled(scene.step, scene.grid.cell),
+            wind=air.wind and air.wind.scaled(scene.step, scene.grid.cell),
             substeps=smoke.substeps,
             bricks=smoke.bricks,
             duration=scene.step,
@@ -107,10 +106,8 @@ def warnings_of(scene: Scene) -> list[str]:
             warnings.append(
                 f"obstacles.{i}: it is thinner than a cell of {grid.cell:g} m, and is simulated as a cell thick"
             )
-    if (stirring := scene.air.turbulence) is not None and stirring.size < _EDDY * grid.cell:
-        warnings.append(f"air.turbulence: its size is below {_EDDY} cells, and is simulated as {_EDDY * grid.cell:g} m")
-    if scene.air.gusts is not None and not scene.air.wind:
-        warnings.append("air.gusts: there is no wind, and thus they have no effect")
+    if (stirring := scene.air.turbulence) is not None and stirring.size < EDDY * grid.cell:
+        warnings.append(f"air.turbulence: its size is below {EDDY} cells, and is simulated as {EDDY * grid.cell:g} m")
     if not (scene.sources or scene.inlets):
         warnings.append("sources, inlets: there are none, and thus there is no smoke")
     return [f"{scene.name}: {warning}" for warning in warnings]
@@ -341,14 +338,6 @@ def _buoyancy(scene: Scene) -> fluid.Buoyancy | None:
     up = np.array(smoke.up) / np.linalg.norm(smoke.up)
     lift, weight = (domain.acceleration(value) for value in (smoke.buoyancy, smoke.weight))
     return fluid.Buoyancy(lift, weight, tuple(map(float, up)))
-
-
-def _turbulence(scene: Scene) -> Turbulence | None:
-    stirring, cell = scene.air.turbulence, scene.grid.cell
-    if stirring is None:
-        return None
-    strength = Domain(cell, scene.step).acceleration(stirring.strength)
-    return Turbulence(strength, max(stirring.size / cell, _EDDY), stirring.period / scene.step, stirring.seed)
 
 
 def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlets: list[tuple[int, Inlet]]) -> None:
