@@ -126,7 +126,7 @@ def test_a_halved_step_is_the_same_flow(device: str):
     ({"strength": 1.0, "size": float("nan"), "period": 5.0}, "size: expected a finite number"),
     ({"strength": 1.0, "size": 8.0, "period": 0.0}, "period: expected a finite number of at least 1e-12"),
     ({"keys": [[0, 1, 0, 0], [0, 1, 0, 0]]}, "keys: expected rows of an increasing time"),
-    ({"keys": [[0, 1, 0, 0]], "gusts": 1.5}, "gusts, period: expected 0 to 1"),
+    ({"keys": [[0, 1, 0, 0]], "gusts": 1.5}, "gusts, period, seed: expected 0 to 1"),
 ])  # fmt: skip
 def test_wrong_settings(settings, message: str):
     with pytest.raises(ValueError, match=message):

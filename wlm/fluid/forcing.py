@@ -74,15 +74,10 @@ class Wind:
 
     def __post_init__(self) -> None:
         keys = np.asarray(self.keys, np.float64)
-        if (
-            not self.seed >= 0
-            or keys.ndim != 2
-            or keys.shape[1] != 4
-            or not (np.isfinite(keys).all() and (np.diff(keys[:, 0]) > 0).all())
-        ):
-            raise ValueError(f"keys: expected rows of an increasing time and a velocity, and a seed of at least 0")
-        if not 0.0 <= self.gusts <= 1.0 or not (math.isfinite(self.period) and self.period > 0.0):
-            raise ValueError(f"gusts, period: expected 0 to 1, and above 0, got {self.gusts} and {self.period}")
+        if keys.ndim != 2 or keys.shape[1] != 4 or not (np.isfinite(keys).all() and (np.diff(keys[:, 0]) > 0).all()):
+            raise ValueError(f"keys: expected rows of an increasing time and a velocity, got {self.keys}")
+        if not (0.0 <= self.gusts <= 1.0 and 0.0 < self.period < math.inf and self.seed >= 0):
+            raise ValueError("gusts, period, seed: expected 0 to 1, above 0, at least 0")
 
     def scaled(self, step: float, cell: float) -> "Wind":
         """Returns the same in units of `cell` and `step`."""
