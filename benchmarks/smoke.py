@@ -39,9 +39,10 @@ from benchmarks.plot import Panel
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from demos.plume import make_plume
+from wlm.fluid.bricks import BrickPool
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Lattice
-from wlm.fluid.volume import DensityVolume
+from wlm.fluid.volume import DensityVolume, gather
 from wlm.interop import stream, to_warp
 from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import RULES, Camera
@@ -55,7 +56,7 @@ from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
 from wlm.view.smoke import Drawing
 from wlm.view.smoke_run import Lighting
-from wlm_kernels.fluid import advection, advection_places, advection_sources
+from wlm_kernels.fluid import advection, advection_places
 from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.smoke.settings import March
@@ -287,7 +288,8 @@ def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
     box, velocity = _box(n), _swirl(n, bench.device)
     walls = _walls(box, bench.device, 0.0)
     for scheme in _SCHEMES:
-        dense = _carry(bench, scheme, box, velocity, walls, _cubes(bench, 1.0, scheme))
+        fields = [_fields(_cube(bench, 1.0), "float32", bench.device) for _ in range(3)]
+        dense = _carry(bench, scheme, box, velocity, walls, fields)
         calls, lists = {"dense": dense}, {}
         for fill in bench.sizes.fills:
             name = f"smoke in {100 * fill:g}%"
@@ -296,7 +298,7 @@ def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
         for name, timing in times.items():
             figures = {"voxels": edge}
             if name != "dense":
-                worked = int(lists[name].count.numpy()[0]) * advection_places.BRICK**3 / edge**3
+                worked = int(lists[name].bricks.counts.numpy()[0]) * advection_places.CELLS / edge**3
                 figures["worked_on"] = min(worked, 1.0)
                 figures["speedup"] = times["dense"].median_ms / timing.median_ms
             rows.append(bench.row("advection bricks", f"{scheme}, {name}", scene="cube", timing=timing, **figures))
@@ -391,39 +393,38 @@ def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Call
     return bench.replay(step)
 
 
-def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields]:
-    """Makes smoke fields with a cube of smoke in a corner; `fill` is the cube's volume as a share of the box."""
+def _cube(bench: SmokeBench, fill: float) -> torch.Tensor:
+    """Makes a density with a cube of smoke in a corner; `fill` is the cube's volume as a share of the box."""
     edge = _RATIO * bench.sizes.coarse
     density = torch.zeros((edge,) * 3, device=bench.device)
     full = round(fill ** (1 / 3) * edge)
     density[:full, :full, :full] = 0.5
-    return [_fields(density, "float32", bench.device) for _ in range(3 if scheme == "maccormack" else 2)]
+    return density
 
 
 def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
     """Returns a call that does one advection step in sparse bricks, including their lists, and returns the bricks."""
-    fields = _cubes(bench, fill, scheme)
     rings = advection_places.rings_for(math.sqrt(1.0 / 3.0) * _SUBSTEPS * _RATIO)
-    bricks = advection_places.make_bricks(box, rings, _THRESHOLD, bench.device)
-    edge = box.n[0]
-    at = torch.arange(edge**3, device=bench.device)
-    brick = torch.zeros(bricks.busy.shape[0], dtype=torch.int32, device=bench.device)
-    x, y, z = at // edge**2, at // edge % edge, at % edge
-    size = advection_places.BRICK
-    index = (x // size * box.bricks[1] + y // size) * box.bricks[2] + z // size
-    brick[index[wp.to_torch(fields[0].density) > 0]] = 1
-    busy = to_warp(brick)
+
+    def make(cells: int) -> advection.Fields:
+        return _fields(torch.zeros(cells), "float32", bench.device)
+
+    buffers = 3 if scheme == "maccormack" else 2
+    pool = BrickPool(box, rings, _THRESHOLD, make, buffers, wp.get_device(bench.device))
+    # A graph has no pool that grows.
+    pool.reserve(pool.most)
+    pool.put(*gather([_cube(bench, fill)]))
+    busy, bricks, fields = wp.clone(pool.bricks.busy), pool.bricks, pool.fields
 
     def step() -> None:
         wp.copy(bricks.busy, busy)
-        advection_places.relist(box, bricks)
-        for field in fields:
-            advection_sources.empty_retired(box, bricks, field)
+        pool.relist()
+        pool.store()
         advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, bricks=bricks)
         if scheme == "maccormack":
             advection.advect(box, velocity, walls, fields[0], fields[2], _SUBSTEPS, bricks=bricks, predicted=fields[1])
 
-    return bench.replay(step), bricks
+    return bench.replay(step), pool
 
 
 def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
