@@ -79,7 +79,7 @@ class Wind:
         if not (0.0 <= self.gusts <= 1.0 and 0.0 < self.period < math.inf and self.seed >= 0):
             raise ValueError("gusts, period, seed: expected 0 to 1, above 0, at least 0")
 
-    def scaled(self, step: float, cell: float) -> "Wind":
+    def scaled(self, step: float, cell: float = 1.0) -> "Wind":
         """Returns the same in units of `cell` and `step`."""
         keys = np.asarray(self.keys) * (1.0 / step, *[step / cell] * 3)
         return Wind(keys.tolist(), self.gusts, self.period / step, self.seed)

@@ -2,7 +2,8 @@
 (neural-six-way-lightmaps, section 5: 100^3 velocities, 400^3 densities).
 
 Lengths are in cells of the lattice, times in its steps. A step of the solver is `substeps` of the lattice, in this
-order: obstacles move, smoke accelerates the air (buoyancy), the air moves, it carries the smoke, sources add smoke.
+order: smoke accelerates the air (buoyancy), the air and the obstacles move, the air carries the smoke, sources add
+smoke, and cells that obstacles cover lose theirs.
 """
 
 import hashlib
@@ -125,7 +126,6 @@ class SmokeSetup:
         temperature: Whether the smoke has a temperature.
         decay: Factors of density and temperature per step.
         bricks: Whether only bricks with smoke are computed.
-        moves: Whether an obstacle moves.
         stirred: Whether confinement or turbulence acts.
     """
 
@@ -140,7 +140,6 @@ class SmokeSetup:
     temperature: bool
     decay: tuple[float, float]
     bricks: bool
-    moves: bool
     stirred: bool
 
 
@@ -155,8 +154,7 @@ def bytes_needed(shape: tuple[int, int, int], scheme: str, storage: str, tempera
 class Solver:
     """Simulates smoke in the air of a lattice.
 
-    Set the faces of the lattice beforehand; the solver sets the solids of the lattice and its force. With a moving
-    obstacle each step waits for the device.
+    Set the faces of the lattice beforehand; the solver sets the bodies of the lattice and its force.
 
     Args:
         lattice: The air.
@@ -230,8 +228,7 @@ class Solver:
             raise ValueError("temperature: expected True, since a source, buoyancy or cooling uses it, got False")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
-        # The paths of obstacles are in steps of the first duration.
-        self.duration, self._first_duration = duration, duration
+        self.duration = duration
         self.shape = tuple(refinement * size for size in lattice.shape)
         self._stored = advection.STORAGES[storage]
         needed = bytes_needed(self.shape, scheme, storage, temperature, bricks)
@@ -245,6 +242,7 @@ class Solver:
             "storage": storage,
             "temperature": temperature,
             "substeps": substeps,
+            "obstacles": len(obstacles),
         }
         self._threshold = threshold
         self._pool = self._make_pool() if bricks else None
@@ -261,9 +259,10 @@ class Solver:
         if buoyancy is not None or self._stirred:
             self._force = self._zeros(lattice.shape, wp.vec3)
             lattice.set_force(self._force)
-        self._solid = self._zeros(lattice.shape if obstacles else (0,), wp.uint8)
-        self._walls = [self._zeros((self._solid.size,), wp.uint8) for _ in range(2)]
-        self._placed = np.full((len(obstacles), 2, 3), np.nan)
+        self._walls = [self._zeros((math.prod(lattice.shape) if obstacles else 0,), wp.uint8) for _ in range(2)]
+        if obstacles:
+            lattice.set_bodies(self.obstacles)
+            advection_places.mark_walls(self._box, self.solid.flatten(), self._walls[0])
         self._done = 0
 
     # Running.
@@ -273,7 +272,7 @@ class Solver:
 
         During the capture of a CUDA graph it does not check the air: call `check` between replays of the graph. The
         number of steps, and the number of steps done before the capture, must then be multiples of `period`, `substeps`
-        must be a multiple of the lattice's `period`, and obstacles must be at rest. With bricks call `reserve` before.
+        must be a multiple of the lattice's `period`. With bricks call `reserve` before.
 
         Raises:
             WlmError: The air blew up, an obstacle is too fast, or bricks do not fit into the memory.
@@ -283,19 +282,15 @@ class Solver:
         capturing = self.device.is_cuda and self.device.is_capturing
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         uneven = uneven or self._decay_every > 1 or not (self._pool is None or self._pool.is_full)
-        moves = self._wind is not None or any(obstacle.path.moves for obstacle in self.obstacles)
-        if capturing and (uneven or not self._done or moves):
+        if capturing and (uneven or not self._done or self._wind is not None):
             raise ValueError(
-                f"steps: expected obstacles at rest, no wind, room for all bricks (`reserve`), substeps a multiple of "
+                f"steps: expected no wind, room for all bricks (`reserve`), substeps a multiple of "
                 f"{self.lattice.period}, and a multiple of "
                 f"{self.period} steps in the captured CUDA graph and before it; got {steps} after {self._done}"
             )
         for _ in range(steps):
-            if not capturing:
-                self._place_obstacles()
-                if self._wind is not None:
-                    ratio = self.duration / self._first_duration
-                    self.lattice.blow(ratio * self._wind.at((self._done + 0.5) * self.substeps * ratio))
+            if self._wind is not None:
+                self.lattice.blow(self._wind.at((self._done + 0.5) * self.substeps))
             self._step()
             self._done += 1
 
@@ -325,7 +320,6 @@ class Solver:
             raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
         self.lattice.change_step(factor)
         self._done = done
-        self._placed[:, 1] *= factor
         wp.to_torch(self._velocity).mul_(factor)
         self._convert_settings(factor)
 
@@ -349,6 +343,8 @@ class Solver:
                 self.buoyancy, lift=square * self.buoyancy.lift, weight=square * self.buoyancy.weight
             )
         self._confinement *= factor
+        if self._wind is not None:
+            self._wind = self._wind.scaled(factor)
         if self._turbulence is not None:
             self._turbulence = self._turbulence.scaled(factor)
             self._modes = self._turbulence.modes(str(self.device))
@@ -413,7 +409,7 @@ class Solver:
     @property
     def solid(self) -> wp.array:
         """Numbers of the obstacles, uint8 [cells of the lattice]; [0] without obstacles."""
-        return self._solid
+        return self.lattice.solid
 
     @property
     def velocity(self) -> wp.array:
@@ -462,8 +458,7 @@ class Solver:
         )
 
     def setup(self) -> SmokeSetup:
-        """Places the obstacles as the next step would, and returns the settings with a copy of their cells."""
-        self._place_obstacles()
+        """Returns the settings, with a copy of the obstacles' cells."""
         return SmokeSetup(
             shape=self.shape,
             box=self._box,
@@ -476,7 +471,6 @@ class Solver:
             temperature=self._grids["temperature"],
             decay=self._decay,
             bricks=self._pool is not None,
-            moves=any(obstacle.path.moves for obstacle in self.obstacles),
             stirred=self._stirred,
         )
 
@@ -493,7 +487,7 @@ class Solver:
         tensors = {f"lattice.{name}": value for name, value in air.items()}
         # On a CPU .numpy() shares the array's memory; it is written before the next step changes it.
         numbers, values = self.bricks()
-        tensors |= {"placed": self._placed, "velocity": self._velocity.numpy(), "bricks": numbers.cpu().numpy()}
+        tensors |= {"velocity": self._velocity.numpy(), "bricks": numbers.cpu().numpy()}
         tensors |= {name: part.cpu().numpy() for name, part in zip(("density", "temperature"), values, strict=False)}
         settings = self._grids | {"duration": self.duration}
         text = json.dumps(settings, sort_keys=True).encode()
@@ -519,10 +513,7 @@ class Solver:
         if not (isinstance(duration, float) and 1e-6 <= duration / self.duration <= 1e6):
             raise WlmError(f"{path}: duration: expected about {self.duration:.3g} for a step, found {duration}")
         state, edge = artifact.tensors, advection_places.BRICK
-        # NaN before the first step, when no obstacle has been placed.
-        nowhere = np.isnan(state.get("placed", 0.0)).all()
-        table = {"placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
-        table["velocity"] = Part(np.float32, (*self.lattice.shape, 3))
+        table = {"velocity": Part(np.float32, (*self.lattice.shape, 3))}
         table["bricks"] = Part(np.int32, (None,), least=0, most=math.prod(self._box.bricks) - 1)
         air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
         try:
@@ -552,15 +543,12 @@ class Solver:
             self._pool.put(numbers, values)
             self._fields = self._pool.fields
         self._velocity.assign(parts["velocity"])
-        self._placed = np.array(parts["placed"])
         self._done = self.steps
         if self.obstacles:
-            # Before the first step the lattice has no solid.
-            if air["solid"].size:
-                self._solid.assign(np.array(air["solid"]).reshape(self._solid.shape))
-            else:
-                self._solid.zero_()
-            advection_places.mark_walls(self._box, self._solid.flatten(), self._walls[0])
+            before = wp.array(air["solid"], dtype=wp.uint8, device=self.device)
+            advection_places.mark_walls(self._box, before, self._walls[0])
+            # Obstacles of the file may have been elsewhere.
+            self._change_walls()
         self._note_checkpoint(path, air["steps"])
 
     def _note_checkpoint(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
@@ -575,28 +563,16 @@ class Solver:
 
     # Within a step.
 
-    def _place_obstacles(self) -> None:
-        """Moves obstacles to their positions in the middle of the step, unless they are there and at rest."""
-        span = self.substeps * self.duration / self._first_duration
-        placed = np.empty_like(self._placed)
-        for k, obstacle in enumerate(self.obstacles):
-            at = [obstacle.path.at((self._done + t) * span) for t in (0.0, 0.5, 1.0)]
-            placed[k] = at[1], (at[2] - at[0]) / self.substeps
-        if np.array_equal(placed, self._placed):
-            return
-        for k, obstacle in enumerate(self.obstacles):
-            obstacle.cover(self._solid, k + 1, placed[k, 0])
-        with self._naming_checkpoint():
-            self.lattice.set_solid(self._solid, placed[:, 1])
+    def _change_walls(self) -> None:
+        """Follows the obstacles: cells that they cover lose their smoke, cells that they leave get some from beside."""
         old, new = self._walls
-        advection_places.mark_walls(self._box, self._solid.flatten(), new)
+        advection_places.mark_walls(self._box, self.solid.flatten(), new)
         if self._pool is not None:
             # A cell that an obstacle leaves gets smoke of its neighbours.
             self._pool.relist()
             self._pool.store(clear=False)
         advection_sources.change_solids(self._box, old, new, self._fields[0], self._bricks)
         self._walls = [new, old]
-        self._placed = placed
 
     def _step(self) -> None:
         box, walls, bricks = self._box, self._walls[0], self._bricks
@@ -610,7 +586,7 @@ class Solver:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
             advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
         if self._stirred:
-            air = [box, self._velocity.flatten(), self._solid.flatten(), self._confinement, self._modes]
+            air = [box, self._velocity.flatten(), self.solid.flatten(), self._confinement, self._modes]
             forcing.stir(*air, self.lattice.clock, self._force.flatten(), added=self.buoyancy is not None)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
@@ -619,6 +595,8 @@ class Solver:
             self._pool.store()
         self._carry()
         self._emit()
+        if self.lattice.moving:
+            self._change_walls()
 
     def _emit(self, only_mark: bool = False) -> None:
         for source in self.sources:
