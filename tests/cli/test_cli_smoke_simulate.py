@@ -14,7 +14,7 @@ from builders.smoke_plumes import SCENE, write_frames
 
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
-from wlm.fluid.volume import load_volume, save_volume
+from wlm.fluid.volume import load_volume, save_bricks
 from wlm.formats.vdb import VdbFile
 from wlm.smoke import simulation
 from wlm.smoke.data import CHECKPOINT, load_frames, open_frames
@@ -183,17 +183,17 @@ def test_hot_smoke_shortens_the_step(tmp_path):
 
 def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatch):
     """A state is saved after its frame: a missing frame is simulated again."""
-    scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_volume
+    scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_bricks
 
-    def full(path, volume, **options):
+    def full(path, *content):
         if path.name == "frame_0003.npz":
             raise WlmError(f"{path}: cannot write: no space left")
-        save(path, volume, **options)
+        save(path, *content)
 
-    monkeypatch.setattr(simulation, "save_volume", full)
+    monkeypatch.setattr(simulation, "save_bricks", full)
     with pytest.raises(WlmError, match="no space left"):
         simulate(open_frames(out, scene), checkpoint_every=0.0)
-    monkeypatch.setattr(simulation, "save_volume", save)
+    monkeypatch.setattr(simulation, "save_bricks", save)
     kept = (out / CHECKPOINT).read_bytes()
     # A frame that was lost otherwise can't be made of the state that is kept.
     (out / "frame_0001.npz").rename(tmp_path / "one.npz")

@@ -148,8 +148,15 @@ def test_neighbours_without_bounds(device: str, threshold: float):
     want = reference.adjacency([split[t] for t in number], threshold, 2.0)
     assert 0 < want.sum() < want.size - len(level)
     edge = wp.zeros(want.shape, dtype=wp.uint8, device=device)
-    graphs.find_edges(graph, 0, len(level), edge)
+    for begin in range(0, len(level), 4):
+        graphs.find_edges(graph, begin, min(begin + 4, len(level)), edge)
     np.testing.assert_array_equal(edge.numpy() != 0, want)
+    heads, joined = np.arange(len(level)), wp.empty(len(level), dtype=int, device=device)
+    low = wp.array(graph.means, dtype=float, device=device)
+    rank = np.array([3, 1, 0, 5, 4, 2])
+    graphs.join(graph, _ints(heads, device), 0, 6, _ints(heads, device), low, _ints(rank, device), joined)
+    like = want | np.eye(len(level), dtype=bool)
+    np.testing.assert_array_equal(joined.numpy(), np.where(like, rank, len(level)).min(1))
     means = [reference.upsampled(split[t], SIZES[level[t]] if len(split[t]) > 3 else 2, 129) for t in number]
     means = [np.mean(list(colours.values()), 0).sum() for colours in means]
     assert (graph.low.numpy() <= np.array(means) + 1e-3).all() and (graph.high.numpy() >= np.array(means) - 1e-3).all()

@@ -317,7 +317,7 @@ class Held:
         monkeypatch.setattr(type(model.light), "only", waiting)
 
 
-def test_requests_are_bounded_ordered_and_can_be_cancelled(path, monkeypatch):
+def test_requests_are_bounded_ordered_and_can_be_replaced(path, monkeypatch):
     model = wlm.load(path)
     held = Held(monkeypatch, model)
     with TileLoader(model, most=3) as loader:
@@ -328,7 +328,7 @@ def test_requests_are_bounded_ordered_and_can_be_cancelled(path, monkeypatch):
         assert not loader.request(LIGHT, 4, 1.0), "three wait that are as important"
         assert loader.request(LIGHT, 4, 1.5), "which takes the place of tile 1"
         assert loader.request(LIGHT, 3, 9.0), "a new priority"
-        assert loader.cancel(LIGHT, 2) == 1 and loader.cancel(LIGHT, 2) == 0
+        loader.replace([(LIGHT, 3, 9.0), (LIGHT, 4, 1.5)])
         assert loader.request(LIGHT, 5, 0.5)
         held.go.set()
         got = []
@@ -336,14 +336,6 @@ def test_requests_are_bounded_ordered_and_can_be_cancelled(path, monkeypatch):
             got += loader.take()
         assert [each.number for each in got] == held.order == [0, 3, 4, 5]
         assert not loader.wait(0.0) and loader.take() == []
-        while held.begun.acquire(blocking=False):
-            continue
-        held.go.clear()
-        loader.request(LIGHT, 0)
-        assert held.begun.acquire(timeout=30.0)
-        loader.request(LIGHT, 1)
-        assert loader.cancel() == 1
-        held.go.set()
 
 
 def test_results_that_nobody_takes_pause_the_loader(path):

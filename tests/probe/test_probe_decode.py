@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
+from builders.checks import error_of
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from benchmarks import probe_exact as exact
@@ -112,18 +113,15 @@ def test_the_models_own_probes(device):
 
 def test_wrong_positions():
     decoder = GaussianDecoder(random_model())
-    with pytest.raises(WlmError, match="random: the file stores no positions"):
-        decoder.decode_probes()
+    assert "random: the file stores no positions" in error_of(decoder.decode_probes)
     with pytest.raises(WlmError, match="expected the positions of its own 200 probes"):
         GaussianDecoder(random_model(), position=np.zeros((7, 3)))
     bad = np.zeros((4, 3))
     bad[2, 1] = np.nan
-    with pytest.raises(WlmError, match="position 2: expected finite"):
-        decoder.decode(bad)
+    assert "position 2: expected finite" in error_of(decoder.decode, bad)
     with pytest.raises(ValueError, match=r"expected \[M, 3\]"):
         decoder.decode(np.zeros(3))
-    with pytest.raises(WlmError, match="device 'cuda:9'"):
-        GaussianDecoder(random_model(), "cuda:9")
+    assert "device 'cuda:9'" in error_of(GaussianDecoder, random_model(), "cuda:9")
     assert decoder.decode(np.zeros((0, 3))).shape == (0, 27)
 
 

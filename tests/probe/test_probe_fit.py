@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from builders.checks import error_of
 from builders.probe_sets import synthetic
 from reference.components import decode as reference_decode
 
@@ -124,8 +125,7 @@ def test_useless_gaussians_are_dropped_within_the_bound(monkeypatch):
 
 def test_a_fit_that_diverges_is_an_error(monkeypatch):
     monkeypatch.setattr(Trainer, "mse", lambda self: float("nan"))
-    with pytest.raises(WlmError, match="room: the fit diverged; use smaller learning rates"):
-        compress(synthetic(60), SMALL)
+    assert "room: the fit diverged; use smaller learning rates" in error_of(compress, synthetic(60), SMALL)
 
 
 def brighter(factor, chosen):
@@ -158,8 +158,7 @@ def test_dark_probes_keep_their_light_beside_bright_ones(probes):
 def test_a_fit_that_diverged_keeps_no_state():
     trainer = Trainer(*_input(synthetic(60)), SMALL, 0, "cpu")
     trainer._tensors["net"][5] = np.nan
-    with pytest.raises(WlmError, match="the fit diverged; use smaller learning rates than profile small"):
-        trainer.state()
+    assert "the fit diverged; use smaller learning rates than profile small" in error_of(trainer.state)
 
 
 NORMAL = np.random.default_rng(3)
@@ -294,8 +293,7 @@ def test_light_between_probes_is_read_from_a_volume(tmp_path):
     probes = synthetic(300)
     model = wlm.probe.compress(probes)
     assert model.method == "pca"
-    with pytest.raises(WlmError, match="stores no positions"):
-        model.decoder().decode(probes.position)
+    assert "stores no positions" in error_of(model.decoder().decode, probes.position)
     decoder = model.decoder(position=probes.position)
     report = wlm.probe.evaluate(model, probes)
     at = wlm.probe.score(decoder.decode(probes.position), probes, 1).psnr
@@ -303,10 +301,8 @@ def test_light_between_probes_is_read_from_a_volume(tmp_path):
     # Points outside of the box are moved to it, and no point is black.
     far = decoder.decode(np.array([[1e6, 0.0, 0.0], [4.0, 1.5, 3.0]]))
     assert np.isfinite(far).all() and (np.abs(far) > 0).any(1).all()
-    with pytest.raises(WlmError, match="expected the positions of its own 300 probes"):
-        model.decoder(position=probes.position[:7])
-    with pytest.raises(WlmError, match="expected the positions of its own 300 probes"):
-        decoder.light(probes.position + 1.0)
+    assert "expected the positions of its own 300 probes" in error_of(model.decoder, position=probes.position[:7])
+    assert "expected the positions of its own 300 probes" in error_of(decoder.light, probes.position + 1.0)
 
 
 def test_the_choice_is_by_error_at_equal_gpu_bytes():
@@ -327,8 +323,7 @@ def test_components_that_overflow_are_not_exported():
     bounds[0, 0] = 1000.0
     broken = dataclasses.replace(model, content=dataclasses.replace(content, bounds=bounds))
     assert isinstance(content, Components)
-    with pytest.raises(WlmError, match="cannot export: the model decodes to NaN or infinity"):
-        broken.bundle()
+    assert "cannot export: the model decodes to NaN or infinity" in error_of(broken.bundle)
 
 
 @pytest.mark.parametrize("power", [0.2, 1.3])

@@ -497,9 +497,7 @@ def test_export_of_nothing_and_over_another(volume, tmp_path):
     nothing = Volume(volume.position, volume.light, side=8)
     with pytest.raises(ValueError, match="viewpoint"):
         _ = nothing.viewpoint
-    with pytest.raises(WlmError, match="no block"):
-        export(volume_bundle(nothing), tmp_path / "none")
-    assert not (tmp_path / "none").exists()
+    assert "no block" in error_of(volume_bundle, nothing)
     paths = export(volume_bundle(volume), tmp_path / "out")
     assert [path.exists() for path in paths] == [True] * 8 and export(volume_bundle(volume), tmp_path / "out") == paths
     document, arrays = read_export(tmp_path / "out")
@@ -560,8 +558,7 @@ def test_camera_path_of_little():
     tower = np.stack([np.zeros(5), np.arange(5.0), np.zeros(5)], 1)
     np.testing.assert_allclose(camera_path(tower, 2), [[0.0, 2.05, 0.0]] * 2)
     for position, frames in [(np.zeros((0, 3)), 5), (place, 0)]:
-        with pytest.raises(WlmError, match="camera path: expected at least"):
-            camera_path(position, frames)
+        assert "camera path: expected at least" in error_of(camera_path, position, frames)
     for position, up in [(place[0], 1), (place, 3)]:
         with pytest.raises(ValueError, match="camera path"):
             camera_path(position, 5, up=up)
@@ -636,8 +633,7 @@ def test_walk_refuses():
             walk(volume, path, light, **options)
     with pytest.raises(ValueError, match="original"):
         walk(volume, _line(1, 0.0), light[1:])
-    with pytest.raises(WlmError, match="viewpoint"):
-        walk(volume, np.array([[0.0, np.nan, 0.0]]), light)
+    assert "viewpoint" in error_of(walk, volume, np.array([[0.0, np.nan, 0.0]]), light)
 
 
 def _cells(key: np.ndarray) -> np.ndarray:
@@ -696,5 +692,4 @@ def test_side_follows_the_spacing():
     for position in (np.array([[0, np.nan, 0]]), np.full((1, 3), 1e101)):
         with pytest.raises(ValueError, match="position: expected probes"):
             BlockIndex(position, 1.0, (1,))
-    with pytest.raises(WlmError, match="positions: expected distances"):
-        finest_side(np.array([[0.0, 0.0, 0.0], [1e300, 1e300, 1e300]]))
+    assert "positions: expected distances" in error_of(finest_side, np.array([[0.0, 0.0, 0.0], [1e300, 1e300, 1e300]]))

@@ -345,14 +345,34 @@ def save_volume(
             placed.append((name, values, matrix))
         atomic_write(path, encode_vdb(placed) if suffix == ".vdb" else encode_nvdb(placed, codec))
         return
-    arrays = {"voxel": np.float64(volume.voxel), "origin": np.asarray(volume.origin, np.float64)}
     if bricks:
-        numbers, cut = gather(list(fields.values()))
-        fields = {f"{name}_bricks": part for name, part in zip(fields, cut, strict=True)}
-        arrays |= {_BRICKS: numbers.cpu().numpy(), "shape": np.asarray(volume.shape, np.int64)}
-    arrays |= {name: values.cpu().numpy() for name, values in fields.items()}
+        save_bricks(path, *gather(list(fields.values())), volume.shape, volume.voxel, volume.origin)
+        return
+    arrays = {name: values.cpu().numpy() for name, values in fields.items()}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        (np.savez if bricks else np.savez_compressed)(file, **arrays)
+        np.savez_compressed(
+            file, voxel=np.float64(volume.voxel), origin=np.asarray(volume.origin, np.float64), **arrays
+        )
+
+
+def save_bricks(
+    path: str | os.PathLike[str],
+    numbers: torch.Tensor,
+    values: Sequence[torch.Tensor],
+    shape: Sequence[int],
+    voxel: float,
+    origin: Sequence[float],
+) -> None:
+    """Writes smoke in bricks as the `.npz` file of `save_volume` with `bricks`, whole or not at all.
+
+    `numbers` and `values` are the indices of the bricks, and the density and perhaps the temperature in them, as of
+    `gather`; `shape` has the voxels along x, y and z. Raises a WlmError if the file cannot be written.
+    """
+    parts = zip((_DENSITY, _TEMPERATURE), values, strict=False)
+    arrays = {f"{name}_bricks": part.cpu().numpy() for name, part in parts} | {_BRICKS: numbers.cpu().numpy()}
+    place = {"shape": np.asarray(shape, np.int64), "voxel": np.float64(voxel), "origin": np.asarray(origin, np.float64)}
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **place, **arrays)
 
 
 def _check(

@@ -6,14 +6,17 @@ from collections.abc import Callable, Iterator
 from typing import Literal
 
 import numpy as np
+import torch
 import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid import solver as fluid
+from wlm.fluid.bricks import require_memory
 from wlm.fluid.faces import FACES
+from wlm.fluid.forcing import EDDY
 from wlm.fluid.lattice import Domain, Lattice
 from wlm.fluid.obstacles import SHELL, Mesh, Obstacle, Sphere, Trajectory
-from wlm.fluid.volume import DensityVolume, save_volume
+from wlm.fluid.volume import DensityVolume, save_bricks, save_volume
 from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked
 from wlm.interop import free_memory
@@ -35,7 +38,7 @@ _LOOKS_AT_OBSTACLES = 17
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
     """Builds the solver of a scene on a device, which `wlm.interop.check_device` must have returned."""
-    smoke = scene.smoke
+    smoke, air = scene.smoke, scene.air
     _require_memory(scene, device)
     try:
         lattice = _make_lattice(scene, device)
@@ -50,6 +53,9 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
             dissipation=smoke.dissipation * scene.step,
             cooling=smoke.cooling * scene.step if smoke.hot else 0.0,
             buoyancy=_buoyancy(scene),
+            confinement=air.confinement * scene.step,
+            turbulence=air.turbulence and air.turbulence.scaled(scene.step, scene.grid.cell),
+            wind=air.wind and air.wind.scaled(scene.step, scene.grid.cell),
             substeps=smoke.substeps,
             bricks=smoke.bricks,
             duration=scene.step,
@@ -102,6 +108,8 @@ def warnings_of(scene: Scene) -> list[str]:
             warnings.append(
                 f"obstacles.{i}: it is thinner than a cell of {grid.cell:g} m, and is simulated as a cell thick"
             )
+    if (stirring := scene.air.turbulence) is not None and stirring.size < EDDY * grid.cell:
+        warnings.append(f"air.turbulence: its size is below {EDDY} cells, and is simulated as {EDDY * grid.cell:g} m")
     if not (scene.sources or scene.inlets):
         warnings.append("sources, inlets: there are none, and thus there is no smoke")
     return [f"{scene.name}: {warning}" for warning in warnings]
@@ -154,7 +162,7 @@ def _covers(scene: Scene, obstacle: ObstacleSettings, away: np.ndarray) -> np.nd
 
 
 def volume_of(scene: Scene, solver: fluid.Solver) -> DensityVolume:
-    """Returns the solver's smoke; the volume shares the solver's memory and is valid until the next step."""
+    """Returns the solver's smoke, as `wlm.fluid.solver.Solver.frame`."""
     smoke, grid = scene.smoke, scene.grid
     return solver.frame(extinction=smoke.extinction, emission=smoke.emission, cell=grid.cell, origin=grid.origin)
 
@@ -218,20 +226,21 @@ def simulate(
             for last in _frame_steps(scene, solver, frame):
                 if last:
                     solver.check()
-                    volume = volume_of(scene, solver)
                     if volumes is not None:
                         velocity = solver.velocity.numpy() * (scene.grid.cell / solver.duration)
                         suffix, _, raw = volumes.partition("-")
                         copy = frames.file(frame).with_suffix(f".{suffix}")
-                        save_volume(copy, volume, velocity=velocity, codec="none" if raw else "zip")
+                        save_volume(copy, volume_of(scene, solver), velocity=velocity, codec="none" if raw else "zip")
                     # Written before the state: a state without its frame could not be resumed.
-                    save_volume(frames.file(frame), volume, bricks=True)
+                    numbers, values = solver.bricks()
+                    place = (solver.shape, scene.grid.voxel, scene.grid.origin)
+                    save_bricks(frames.file(frame), numbers, values, *place)
                 if pace.due():
                     with pace.saving():
                         solver.save(checkpoint)
                 try:
                     if last and progress is not None:
-                        mass = float(volume.density.double().sum()) * volume.voxel**3
+                        mass = float(values[0].sum(dtype=torch.float64)) * scene.grid.voxel**3
                         meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
                     elif meter.due(frame - 1):
                         meter.report(frame - 1)
@@ -285,18 +294,18 @@ def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[boo
 def _require_memory(scene: Scene, device: str) -> None:
     """Checks before the allocation that air and smoke fit into the free memory; raises a WlmError if not."""
     grid, smoke = scene.grid, scene.smoke
-    voxel = fluid.voxel_bytes(smoke.scheme, smoke.storage, smoke.hot)
-    needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + voxel * math.prod(grid.shape)
+    smoke_bytes = fluid.bytes_needed(grid.shape, smoke.scheme, smoke.storage, smoke.hot, smoke.bricks)
+    needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + smoke_bytes
     warp_device = wp.get_device(device)
     free = free_memory(warp_device)
     if needed > free:
         air, dense = (" x ".join(map(str, shape)) for shape in (grid.cells, grid.shape))
         raise WlmError(
             f"{scene.name}: {air} cells of air and {dense} voxels of smoke need {needed / 2**30:.1f} GiB on {device},"
-            f" but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, or storage: float16"
+            f" but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, bricks, or storage: float16"
         )
     # A grid may also have more voxels than can be indexed.
-    fluid.require_memory(grid.shape, voxel, warp_device)
+    require_memory("smoke", grid.shape, smoke_bytes, warp_device)
 
 
 def _make_lattice(scene: Scene, device: str) -> Lattice:
@@ -313,13 +322,15 @@ def _make_lattice(scene: Scene, device: str) -> Lattice:
     for name in FACES:
         inlets = [(i, inlet) for i, inlet in enumerate(scene.inlets) if inlet.face == name]
         kind = grid.face(name)
-        if inlets:
+        if name in scene.windy:
+            lattice.set_wind(name)
+        elif inlets:
             _set_inlets(lattice, scene, domain, name, inlets)
         elif kind in ("wall", "slip"):
             lattice.set_wall(name, slip=kind == "slip")
         elif kind == "open":
             # With inlets, the outflow equals the inflow; without, the outside is at rest.
-            lattice.set_outlet(name, density=None if scene.inlets else 1.0)
+            lattice.set_outlet(name, density=None if scene.inlets or scene.windy else 1.0)
     return lattice
 
 

@@ -261,13 +261,42 @@ def _edges(
 ):
     """Finds the edges between one patch per thread and all later patches, so that each pair is tested once."""
     a = offset + wp.tid()
+    if patches[a].level >= bounds.shape[1]:
+        return
     last = high[a] + rule.level + _MARGIN
     for b in range(a + 1, low.shape[0]):
         if low[b] > last:
             break
-        if _alike(samples, patches, bounds, rule, a, b):
-            edge[a, b] = wp.uint8(1)
-            edge[b, a] = wp.uint8(1)
+        if patches[b].level < bounds.shape[1]:
+            if _alike(samples, patches, bounds, rule, a, b):
+                edge[a, b] = wp.uint8(1)
+                edge[b, a] = wp.uint8(1)
+
+
+@wp.kernel(enable_backward=False)
+def _large_edges(
+    # in:
+    samples: wp.array1d[int],
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    rule: Rule,
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+    large: wp.array1d[int],
+    # out:
+    edge: wp.array2d[wp.uint8],
+):
+    """Finds the edges of patches that have no bounds, with a thread for each pair, since a comparison takes long."""
+    k, b = wp.tid()
+    a = large[k]
+    if b == a or (b < a and patches[b].level >= bounds.shape[1]):
+        return
+    margin = rule.level + _MARGIN
+    if low[b] > high[a] + margin or low[a] > high[b] + margin:
+        return
+    if _alike(samples, patches, bounds, rule, a, b):
+        edge[a, b] = wp.uint8(1)
+        edge[b, a] = wp.uint8(1)
 
 
 @wp.kernel(enable_backward=False)
@@ -293,6 +322,9 @@ def _join(
     a = nodes[i]
     margin = rule.level + _MARGIN
     best = int(rank.shape[0])
+    if patches[a].level >= bounds.shape[1]:
+        joined[i] = best
+        return
     for k in range(wp.lower_bound(head_low, low[a] - margin - reach), heads.shape[0]):
         if head_low[k] > high[a] + margin:
             break
@@ -300,6 +332,34 @@ def _join(
             if _alike(samples, patches, bounds, rule, heads[k], a):
                 best = rank[k]
     joined[i] = best
+
+
+@wp.kernel(enable_backward=False)
+def _join_large(
+    # in:
+    samples: wp.array1d[int],
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    rule: Rule,
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+    nodes: wp.array1d[int],
+    large: wp.array1d[int],
+    heads: wp.array1d[int],
+    rank: wp.array1d[int],
+    # out:
+    joined: wp.array1d[int],
+):
+    """Does the same for nodes whose patches have no bounds, with a thread for each pair of a node and a group."""
+    j, k = wp.tid()
+    i = large[j]
+    a = nodes[i]
+    margin = rule.level + _MARGIN
+    head = heads[k]
+    if low[head] > high[a] + margin or low[a] > high[head] + margin or rank[k] >= joined[i]:
+        return
+    if _alike(samples, patches, bounds, rule, head, a):
+        wp.atomic_min(joined, i, rank[k])
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
@@ -336,6 +396,7 @@ class Graph:
         low, high: float [M], a patch's least and greatest mean colour on any lattice, in levels. If two patches are
             alike, their means on the larger one's lattice differ by less than `rule.level`.
         means: float32 [M], copy of `low` in the CPU's memory.
+        large: bool [M], on the CPU: whether a patch has no bounds.
         reach: The largest difference of `high` and `low` in any patch.
     """
 
@@ -346,6 +407,7 @@ class Graph:
     low: wp.array
     high: wp.array
     means: np.ndarray
+    large: np.ndarray
     reach: float
 
     def _inputs(self) -> list:
@@ -362,14 +424,15 @@ def graph(samples, patches, bounds, levels: int, rule: Rule) -> tuple[Graph, np.
     order = np.argsort(least, kind="stable")
     spans = [wp.array(values[order], dtype=float, device=device) for values in (least, most)]
     reach = float((most - least).max(initial=0.0))
-    return Graph(samples, *_taken(patches, bounds, order), rule, *spans, least[order], reach), order
+    large = patches.numpy()["level"][order] >= bounds.shape[1]
+    return Graph(samples, *_taken(patches, bounds, order), rule, *spans, least[order], large, reach), order
 
 
 def part(whole: Graph, nodes: np.ndarray) -> Graph:
     """Makes the subgraph of N nodes, whose numbers `nodes`, int [N], must ascend."""
     spans = [wp.array(values.numpy()[nodes], dtype=float, device=values.device) for values in (whole.low, whole.high)]
     taken = _taken(whole.patches, whole.bounds, nodes)
-    return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.reach)
+    return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.large[nodes], whole.reach)
 
 
 def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
@@ -380,13 +443,22 @@ def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
 def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
     """Finds the edges between the nodes `begin` to `end` - 1 and all later ones. For an edge between a and b it writes
     1 to `edge`, uint8 [M, M], at (a, b) and at (b, a); all of `edge` must be 0 before."""
-    inputs = [*graph._inputs(), graph.low, graph.high, begin]
-    wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge], device=edge.device)
+    inputs = [*graph._inputs(), graph.low, graph.high]
+    wp.launch(_edges, end - begin, inputs=[*inputs, begin], outputs=[edge], device=edge.device)
+    large = begin + np.flatnonzero(graph.large[begin:end])
+    if len(large):
+        inputs.append(wp.array(large, dtype=int, device=edge.device))
+        wp.launch(_large_edges, (len(large), graph.low.shape[0]), inputs=inputs, outputs=[edge], device=edge.device)
 
 
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
     """Finds for each of the nodes `nodes[begin:end]` the first of H groups whose representative it is like, and writes
     the group's rank to `joined`, int [N], or H if there is none. `heads`, int [H], are the representatives in ascending
     order; `head_low` is the `low` of each, and `rank` its place in the order in which groups are tried."""
-    inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
-    wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)
+    device, means = joined.device, [graph.low, graph.high]
+    inputs = [*graph._inputs(), *means, graph.reach, nodes, begin, heads, head_low, rank]
+    wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=device)
+    large = begin + np.flatnonzero(graph.large[nodes.numpy()[begin:end]])
+    if len(large):
+        inputs = [*graph._inputs(), *means, nodes, wp.array(large, dtype=int, device=device), heads, rank]
+        wp.launch(_join_large, (len(large), heads.shape[0]), inputs=inputs, outputs=[joined], device=device)
