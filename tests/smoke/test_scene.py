@@ -143,6 +143,24 @@ def test_random_scenes(seed, tmp_path):
     assert smoke or emitters <= sum("sources" in each or "inlets" in each for each in warnings)
 
 
+def test_wind_of_a_scene(tmp_path):
+    """It takes the open faces through which it ever enters, bounds the step, and needs a way out."""
+    air = {"wind": {"keys": [[0, 1, 0, 0.5], [1, 4, 0, -0.5]], "gusts": 0.5}}
+    scene = _scene(tmp_path, inlets=[], air=air)
+    assert scene.windy == ["-x", "-z", "+z"] and scene.fastest == pytest.approx(1.5 * math.hypot(4, 0.5))
+    assert _scene(tmp_path, inlets=[], air={"confinement": 50.0}).steps >= 50 / 0.02 / scene.rate
+    stirred = _scene(tmp_path, air={"turbulence": {"strength": 1.0, "size": 0.1}})
+    assert [each.split(": ")[1] for each in simulation.warnings_of(stirred)] == ["air.turbulence"]
+    for wind, words in (([[0, 0, -1, 0]], "through which the wind enters"), ([[0, 1, 0, 0]], "for the air to leave")):
+        with pytest.raises(WlmError, match=words):
+            _scene(
+                tmp_path,
+                inlets=[],
+                air={"wind": {"keys": wind}},
+                grid=GRID | {"faces": dict.fromkeys(FACES[1:], "wall")},
+            )
+
+
 def test_a_scene_from_a_file(tmp_path):
     scene = _scene(tmp_path, obstacles=[SPHERE])
     assert (scene.grid.shape, scene.grid.voxel) == ((20, 24, 20), 0.05)
@@ -190,7 +208,11 @@ def test_scaling_keeps_one_cell(tmp_path):
         ({"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]}, "inlets.0.velocity: expected a velocity that points"),
         ({"grid": GRID | {"faces": dict.fromkeys(FACES, "wall")}}, "expected an open face"),
         ({"grid": GRID | {"faces": dict.fromkeys(("-y", "+y"), "periodic")}}, "inlets on faces that aren't periodic"),
-        ({"air": {"speed": 0.3}}, "an inlet or an obstacle of 1 m/s, 0.25 cells per step: leave air.speed null or"),
+        ({"air": {"wind": {"keys": [[0, 1, 0]]}}}, "air.wind.keys"),
+        ({"air": {"wind": {"keys": [[0, 1, 0, 0]], "gust": 1}}}, "air.wind.gust"),
+        ({"air": {"wind": {"keys": [[0, 1, 0, 0]], "gusts": 2}}}, "expected 0 to 1"),
+        ({"air": {"turbulence": {"strength": ".nan", "size": 1}}}, "air.turbulence.strength"),
+        ({"air": {"speed": 0.3}}, "a wind or an obstacle of 1 m/s, 0.25 cells per step: leave air.speed null or"),
         ({"air": {"lattice_speed": 0.21}}, "air.lattice_speed: expected less than or equal to 0.2"),
         ({"air": {"smagorinsky": 0, "viscosity": 0}}, "expected air.viscosity of at least 0.002 m2/s at 1 m/s"),
         ({"air": {"viscosity": 1e9}}, "expected at most 1,000,000 steps per frame, found 2.5e+09"),

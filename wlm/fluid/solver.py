@@ -21,13 +21,15 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
 from wlm.fluid.faces import axis_ends
+from wlm.fluid.forcing import CALM, Turbulence, Wind
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume, gather, scatter
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.parts import Part, check_part, check_parts
-from wlm_kernels.fluid import advection, advection_places, advection_sources
+from wlm_kernels.fluid import advection, advection_places, advection_sources, forcing
 from wlm_kernels.fluid.advection_places import DENSE
+from wlm_kernels.fluid.lattice_links import WIND
 
 SCHEMES = ("maccormack", "semi-lagrangian")
 
@@ -124,6 +126,7 @@ class SmokeSetup:
         temperature: Whether the smoke has a temperature.
         decay: Factors of density and temperature per step.
         bricks: Whether only bricks with smoke are computed.
+        stirred: Whether confinement or turbulence acts.
     """
 
     shape: tuple[int, int, int]
@@ -137,6 +140,7 @@ class SmokeSetup:
     temperature: bool
     decay: tuple[float, float]
     bricks: bool
+    stirred: bool
 
 
 def bytes_needed(shape: tuple[int, int, int], scheme: str, storage: str, temperature: bool, bricks: bool) -> int:
@@ -163,6 +167,9 @@ class Solver:
         dissipation: Decay rate of the density: exp(-dissipation t) of it remains after t steps of the lattice.
         cooling: Decay rate of the temperature, in the same unit.
         buoyancy: Acceleration of the air by smoke; None: smoke does not move the air.
+        confinement: Strength of the vorticity confinement per step of the lattice (Fedkiw, Stam and Jensen 2001: eps).
+        turbulence: Random acceleration of all air.
+        wind: Velocity of the wind at the lattice's faces for it, in cells per step at times in steps.
         substeps: Steps of the lattice per step of the solver. Above a speed of 1 / substeps smoke can jump over walls.
         bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are stored and computed.
         threshold: With bricks, the largest value in a brick that counts as empty.
@@ -192,6 +199,9 @@ class Solver:
         dissipation: float = 0.0,
         cooling: float = 0.0,
         buoyancy: Buoyancy | None = None,
+        confinement: float = 0.0,
+        turbulence: Turbulence | None = None,
+        wind: Wind | None = None,
         substeps: int = 2,
         bricks: bool = False,
         threshold: float = 1e-6,
@@ -203,7 +213,8 @@ class Solver:
         for name, count in (("refinement", refinement), ("substeps", substeps)):
             if count < 1:
                 raise ValueError(f"{name}: expected at least 1, got {count}")
-        for name, rate in (("dissipation", dissipation), ("cooling", cooling), ("threshold", threshold)):
+        rates = {"dissipation": dissipation, "cooling": cooling, "threshold": threshold, "confinement": confinement}
+        for name, rate in rates.items():
             if not (math.isfinite(rate) and rate >= 0.0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {rate}")
         # Steps after which smoke decays: only with float16 and a shortened step more than one.
@@ -239,8 +250,13 @@ class Solver:
         self._fields = self._pool.fields if self._pool else [self._make_fields(cells) for _ in range(_buffers(scheme))]
         self._touched: tuple[Source, ...] = ()
         self._velocity = self._zeros(lattice.shape, wp.vec3)
+        if wind is not None and not any((face.kind == WIND).any() for face in lattice.faces.values()):
+            raise ValueError("wind: expected a lattice with a face for it (set_wind), got none")
+        self._confinement, self._turbulence, self._wind = confinement, turbulence, wind
+        self._modes = CALM if turbulence is None else turbulence.modes(str(self.device))
+        self._stirred = confinement > 0.0 or turbulence is not None
         self._force = None
-        if buoyancy is not None:
+        if buoyancy is not None or self._stirred:
             self._force = self._zeros(lattice.shape, wp.vec3)
             lattice.set_force(self._force)
         self._walls = [self._zeros((math.prod(lattice.shape) if obstacles else 0,), wp.uint8) for _ in range(2)]
@@ -266,13 +282,15 @@ class Solver:
         capturing = self.device.is_cuda and self.device.is_capturing
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         uneven = uneven or self._decay_every > 1 or not (self._pool is None or self._pool.is_full)
-        if capturing and (uneven or not self._done):
+        if capturing and (uneven or not self._done or self._wind is not None):
             raise ValueError(
-                f"steps: expected room for all bricks (`reserve`), substeps a multiple of "
+                f"steps: expected no wind, room for all bricks (`reserve`), substeps a multiple of "
                 f"{self.lattice.period}, and a multiple of "
                 f"{self.period} steps in the captured CUDA graph and before it; got {steps} after {self._done}"
             )
         for _ in range(steps):
+            if self._wind is not None:
+                self.lattice.blow(self._wind.at((self._done + 0.5) * self.substeps))
             self._step()
             self._done += 1
 
@@ -324,6 +342,12 @@ class Solver:
             self.buoyancy = replace(
                 self.buoyancy, lift=square * self.buoyancy.lift, weight=square * self.buoyancy.weight
             )
+        self._confinement *= factor
+        if self._wind is not None:
+            self._wind = self._wind.scaled(factor)
+        if self._turbulence is not None:
+            self._turbulence = self._turbulence.scaled(factor)
+            self._modes = self._turbulence.modes(str(self.device))
 
     @property
     def fastest(self) -> float:
@@ -447,6 +471,7 @@ class Solver:
             temperature=self._grids["temperature"],
             decay=self._decay,
             bricks=self._pool is not None,
+            stirred=self._stirred,
         )
 
     # Checkpoints.
@@ -560,6 +585,9 @@ class Solver:
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
             advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
+        if self._stirred:
+            air = [box, self._velocity.flatten(), self.solid.flatten(), self._confinement, self._modes]
+            forcing.stir(*air, self.lattice.clock, self._force.flatten(), added=self.buoyancy is not None)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)

@@ -10,6 +10,7 @@ into these elements. This takes two passes, since the element of one link may be
 
 - bounce: f_q = f*_opposite + term, half-way bounce-back; the term is 6 w_q c_q . u at a wall of velocity u.
 - inlet: the same formula; it adds a mass of u per cell of the face. The term may rise from 0 in the first steps.
+- wind: an inlet whose velocity is the same at all of its cells and may change at every step.
 - slip: a wall without friction: the mirror image of the population that leaves the neighbouring cell.
 - outlet: the equilibrium at the cell's own density and velocity (zero gradient). It is then shifted, by w_q times the
   same factor at all outlets, so that outflow equals inflow: mass is conserved to rounding.
@@ -43,8 +44,8 @@ from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
 wp.set_module_options({"enable_backward": False})
 
-BOUNCE, SLIP, OUTLET, PRESSURE, INLET = range(5)
-_BOUNCE, _SLIP, _OUTLET, _INLET = (wp.constant(kind) for kind in (BOUNCE, SLIP, OUTLET, INLET))
+BOUNCE, SLIP, OUTLET, PRESSURE, INLET, WIND = range(6)
+_BOUNCE, _SLIP, _OUTLET, _INLET, _WIND = (wp.constant(kind) for kind in (BOUNCE, SLIP, OUTLET, INLET, WIND))
 
 BLOCK = 256
 
@@ -60,7 +61,7 @@ class Links:
 
     `cell`, int [L], is the fluid cell a; `code`, uint8 [L], the direction q + 32 times the kind of boundary; `term`,
     float [L], the term of the boundary condition, see the module; `value`, float [L], the population that the boundary
-    returns, result of the first pass.
+    returns, result of the first pass; `wind`, vec3 [1], the velocity of the wind in cells per step.
     """
 
     cell: wp.array1d[int]
@@ -68,6 +69,7 @@ class Links:
     term: wp.array1d[float]
     value: wp.array1d[float]
     used: wp.array1d[int]
+    wind: wp.array1d[wp.vec3]
     faces: int
 
 
@@ -174,10 +176,14 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                 v = float(0.0)
                 if kind == _BOUNCE:
                     v = out + links.term[at]
-                elif kind == _INLET:
+                elif kind == _INLET or kind == _WIND:
                     # The larger of the two is the number of steps done; this value is for the next step.
                     risen = wp.min(1.0, float(wp.max(clock[0], clock[1]) + 1) * rise)
-                    v = out + risen * risen * (3.0 - 2.0 * risen) * links.term[at]
+                    term = links.term[at]
+                    if kind == _WIND:
+                        along = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
+                        term = 6.0 * t.w[q] * wp.dot(along, links.wind[0])
+                    v = out + risen * risen * (3.0 - 2.0 * risen) * term
                 elif kind == _SLIP:
                     k, c = mirrored(t, n, bounded, i, q)
                     # A solid at the mirrored cell bounces the population back.
