@@ -43,6 +43,7 @@ class Domain:
     """Converts SI units to units of a lattice.
 
     Attributes:
+        changes: Number of times that a captured CUDA graph of steps has become invalid.
         cell: Edge of a cell in metres.
         step: Duration of a step in seconds.
     """
@@ -196,7 +197,8 @@ class Lattice:
         self._forces = self._zeros(0, wp.vec3)
         self._faces: dict[str, Face] = {}
         self._links: lattice_links.Links | None = None
-        self._graph: wp.Graph | None = None
+        self.changes = 0
+        self._graph = None
         # Steps that this object launched itself; replays of a user's CUDA graph are counted only by the clock.
         self._done, self._begun = 0, False
 
@@ -362,6 +364,15 @@ class Lattice:
         if key == QUIET:
             return
         raise blown_up(key, self.shape)
+
+    @property
+    def _graph(self) -> wp.Graph | None:
+        return self._captured
+
+    @_graph.setter
+    def _graph(self, graph: wp.Graph | None) -> None:
+        self._captured = graph
+        self.changes += graph is None
 
     # Results.
 

@@ -72,7 +72,7 @@ _OPTIONS = {"enable_backward": False, "max_unroll": 4}
 _BOUNDS = (256, 4)
 
 # Cells along x that one thread computes, so that cells between the same eight velocities read them once.
-_RUN, _BRICK_RUN = 16, 2
+_RUN, _BRICK_RUN = 16, BRICK
 
 # Threads of a block along y and z: neighbours share most of their reads.
 _TILE = 16
@@ -319,8 +319,11 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 smoke = value_at(predicted.density, i)
                 if wp.static(hot):
                     heat = value_at(predicted.temperature, i)
-                q, left_q, beside_q = departure_point(box, u, walls, around, start.f, x, v, -dt, wall)
-                if not (left or left_q or beside or beside_q):
+                uncorrected = left or beside
+                if not uncorrected:
+                    q, left_q, beside_q = departure_point(box, u, walls, around, start.f, x, v, -dt, wall)
+                    uncorrected = left_q or beside_q
+                if not uncorrected:
                     to = corners_around(box, bricks, q)
                     low, high = extremes(fields.density, at)
                     smoke = corrected(fields.density, predicted.density, i, to, low, high)
@@ -362,8 +365,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])
-            within = cell_of(wp.vec3i(wp.static(BRICK // run), BRICK, BRICK), r)
-            return BRICK * b + wp.vec3i(wp.static(run) * within[0], within[1], within[2])
+            return BRICK * b + wp.vec3i(0, r // BRICK, r % BRICK)
         tile = cell_of(
             wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE), i // (_TILE * _TILE)
         )

@@ -303,9 +303,10 @@ def is_solid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
     """Tests whether a fine cell is solid; false if `walls` is empty."""
     if walls.shape[0] == 0:
         return False
-    x = cell[0] // box.refinement
-    y = cell[1] // box.refinement
-    z = cell[2] // box.refinement
+    # Divisions of integers would take several times as long.
+    x = int((float(cell[0]) + 0.5) * box.voxel)
+    y = int((float(cell[1]) + 0.5) * box.voxel)
+    z = int((float(cell[2]) + 0.5) * box.voxel)
     return walls[(x * box.coarse[1] + y) * box.coarse[2] + z] == SOLID
 
 
