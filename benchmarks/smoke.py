@@ -4,7 +4,7 @@ Each method has a table of its own:
 
 - "lattice": a copy of an array, and steps of the lattice Boltzmann solver with each storage and
   kind of boundary. The bytes that a step must move, over its time, are stated as a share of the copy's bandwidth.
-  "moving sphere" also marks the sphere's cells and finds its boundary links again at each step.
+  "moving sphere" also moves the sphere, which crosses 5 cells in 100 steps and returns.
 - "lattice storage": difference of velocities stored in 16 and in 32 bits, relative to the speed of a jet's inlet, and
   the relative drift of the mass.
 - "advection": a step that moves random smoke in eddies, with and without a solid sphere; and the error of a smooth ball
@@ -42,6 +42,7 @@ from demos.plume import make_plume
 from wlm.fluid.bricks import BrickPool
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Lattice
+from wlm.fluid.obstacles import Sphere, Trajectory, cells_of
 from wlm.fluid.volume import DensityVolume, gather
 from wlm.interop import stream, to_warp
 from wlm.metrics import psnr_from_mse
@@ -57,7 +58,6 @@ from wlm.smoke.transport.tracing import trace
 from wlm.view.smoke import Drawing
 from wlm.view.smoke_run import Lighting
 from wlm_kernels.fluid import advection, advection_places
-from wlm_kernels.fluid.lattice_fields import voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.smoke.settings import March
 
@@ -65,6 +65,7 @@ PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("
 """The panels of a plot: PSNR and error of guiding maps and of the fine march against their time."""
 
 _SPEED = 0.1  # speed of the inlet in cells per step
+_PLACES = 2000  # positions of a sphere that moves to and fro, 100 steps apart
 _VISCOSITY = 1e-6
 _COPIED = {"cpu": 1 << 24, "cuda": 1 << 28}  # floats: far more than caches hold
 _RATIO = 4
@@ -180,8 +181,12 @@ def lattice_rows(bench: SmokeBench) -> list[Row]:
     calls["kernel"] = lambda: torch.neg(source, out=target)
     for name, (size, settings) in cases.items():
         calls[name] = partial(_jet(bench, size, **settings).step, chunk)
-    sphere = f"float32, moving sphere, {small}³"
-    calls[sphere], moved = _moving(bench, small)
+    moving = {f"{storage}, moving sphere, {small}³": storage for storage in ("float32", "float16")}
+    for name, storage in moving.items():
+        lattice = _jet(bench, small, storage=storage)
+        lattice.set_bodies([_sphere(small, moves=True)])
+        cases[name] = (small, {"storage": storage})
+        calls[name] = partial(lattice.step, chunk)
     times = bench.time(calls)
     # The faster of a memcpy and a kernel: devices differ.
     copy = min((times.pop("copy"), times.pop("kernel")), key=lambda timing: timing.median_ms)
@@ -192,9 +197,7 @@ def lattice_rows(bench: SmokeBench) -> list[Row]:
         ms = timing.median_ms / chunk
         figures = {"mlups": 1e-3 * size**3 / ms, "of_copy": bench.of_copy(_bytes(**settings) * size**3, ms)}
         rows.append(bench.row("lattice", name, scene="jet", timing=timing, calls=chunk, cells=size, **figures))
-    figures = {"cells": small, "mlups": 1e-3 * small**3 * moved / times[sphere].median_ms}
-    note = "marked anew each step"
-    return [*rows, bench.row("lattice", sphere, note, scene="jet", timing=times[sphere], calls=moved, **figures)]
+    return rows
 
 
 def storage_rows(bench: SmokeBench) -> list[Row]:
@@ -318,30 +321,15 @@ def _jet(bench: SmokeBench, size: int, faces: str = "all", **settings) -> Lattic
         across = (np.indices((size, size)) + 0.5) / size - 0.5
         lattice.set_inlet("-x", (_SPEED, 0.0, 0.0), where=np.hypot(*across) < 0.15)
         lattice.set_outlet("+x")
-        lattice.set_solid(_sphere(wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device), 0.0))
+        lattice.set_bodies([_sphere(size)])
     return lattice
 
 
-def _sphere(mask: wp.array, moved: float) -> wp.array:
-    size = mask.shape[0]
-    voxelise_sphere(mask, 1, (0.4 * size + moved, 0.5 * size, 0.5 * size), 0.12 * size)
-    return mask
-
-
-def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
-    """Returns a call that does some solver steps while a sphere moves to and fro, and the number of these steps."""
-    lattice, speed, steps = _jet(bench, size), 0.05, 10
-    mask = wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device)
-    lattice.step(1)
-
-    def go() -> None:
-        for k in range(steps):
-            there = k < steps // 2
-            _sphere(mask, speed * (k if there else steps - k))
-            lattice.set_solid(mask, (speed if there else -speed, 0.0, 0.0))
-            lattice.step(1)
-
-    return go, steps
+def _sphere(size: int, moves: bool = False) -> Sphere:
+    """Makes a sphere in a box of `size` cells; it may move to and fro, at 0.05 cells per step."""
+    places = np.full((_PLACES if moves else 1, 3), 0.5 * size)
+    places[:, 0] = 0.4 * size + 5.0 * (np.arange(len(places)) % 2)
+    return Sphere(Trajectory.of(places, 100.0 * np.arange(len(places))), 0.12 * size)
 
 
 def _bytes(lattice: str = "D3Q19", storage: str = "float32", faces: str = "all", **_) -> int:
@@ -368,8 +356,7 @@ def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
     n = box.coarse[0]
     walls = wp.zeros(n**3 if radius else 0, dtype=wp.uint8, device=device)
     if radius:
-        solid = wp.zeros((n,) * 3, dtype=wp.uint8, device=device)
-        voxelise_sphere(solid, 1, (0.5 * n,) * 3, radius * n)
+        solid = cells_of([Sphere(Trajectory.of((0.5 * n,) * 3), radius * n)], (n,) * 3, device)
         advection_places.mark_walls(box, solid.flatten(), walls)
     return walls
 

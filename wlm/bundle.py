@@ -148,7 +148,7 @@ class Bundle:
         return own + sum(part.nbytes for part in self.parts.values())
 
 
-def filled(package: str, name: str, **parts: object) -> str:
+def filled(package: str, name: str, /, **parts: object) -> str:
     """Reads a text from the folder `assets` of a package and replaces its marks `@NAME@` by `parts`.
 
     Raises:

@@ -162,8 +162,8 @@ def test_obstacles_cover_what_they_should(device: str):
     solid = solver.solid.numpy()
     x = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in SHAPE], indexing="ij"), -1)
     np.testing.assert_array_equal(solid == 2, (np.abs(x - (14, 5, 5)) < (2, 3, 1)).all(-1))
-    # The sphere moves 3 cells in 60 steps, and is placed where it is in the middle of the first two.
-    np.testing.assert_array_equal(solid == 1, np.linalg.norm(x - (9.05, 5, 5), axis=-1) < 2)
+    # The sphere moves 3 cells in 60 steps, and is placed where it is in the middle of the third.
+    np.testing.assert_array_equal(solid == 1, np.linalg.norm(x - (9.125, 5, 5), axis=-1) < 2)
 
 
 @pytest.mark.parametrize(("shape", "volume"), [("sphere", 4 / 3 * np.pi), ("box", 8.0), ("cylinder", 2 * np.pi)])
@@ -254,15 +254,14 @@ def test_a_checkpoint_of_all_cells_goes_on_in_bricks_and_back(device: str, tmp_p
 
 @pytest.mark.parametrize("before", [0, 5])
 def test_a_checkpoint_of_before_the_first_step(before: int, device: str, tmp_path: Path):
-    """Its obstacles aren't placed yet; those of the solver that loads it are, or have moved."""
+    """The obstacles of the solver that loads it may have moved."""
     first, second = _jet(device), _jet(device)
     first.save(tmp_path / "state")
     second.step(before)
     second.load(tmp_path / "state")
-    assert second.steps == 0 and not second.solid.numpy().any()
+    assert second.steps == 0
     for solver in (first, second):
         solver.step(6)
-    assert first.solid.numpy().any()
     _assert_same(first, second)
 
 

@@ -2,13 +2,13 @@
 
 import copy
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
 import torch
-import warp as wp
 import yaml
 from builders.random_scenes import random_scene
 from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from wlm.config import check_settings, profile_names
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
+from wlm.fluid.obstacles import Trajectory, cells_of
 from wlm.formats.exr import read_planes, write_planes
 from wlm.smoke import simulation
 from wlm.smoke.data import CHECKPOINT, NumberedFiles, load_frames, open_frames, read_six_way, spread, write_six_way
@@ -97,16 +98,16 @@ def test_what_has_no_effect_is_said(tmp_path, changed, words):
 def test_a_thin_obstacle_covers_a_cell_wherever_it_is(tmp_path, shape):
     radius = 0.01 if shape == "sphere" else [0.01, 0.01, 0.01]
     scene = _scene(tmp_path, obstacles=[{"shape": shape, "radius": radius, "path": [[0, 0, 0.6, 0]]}])
-    (obstacle,), solid = simulation._obstacles(scene), wp.zeros(scene.grid.cells, wp.uint8, "cpu")
+    (obstacle,) = simulation._obstacles(scene)
     for position in [[2.0, 3.0, 2.0], *np.random.default_rng(2).uniform(1, 4, (40, 3))]:
-        obstacle.cover(solid, 1, np.asarray(position))
+        solid = cells_of([replace(obstacle, path=Trajectory.of(position))], scene.grid.cells)
         assert 1 <= solid.numpy().sum() <= 8
     # A wall through the box has no hole.
     wall = {"shape": "box", "radius": [1, 0.004, 1], "path": [[0, 0, 0.6, 0]]}
     (obstacle,) = simulation._obstacles(_scene(tmp_path, obstacles=[wall]))
     for height in np.linspace(1, 4, 31):
-        obstacle.cover(solid, 1, np.array([2.5, height, 2.5]))
-        assert solid.numpy().any(1).all()
+        moved = replace(obstacle, path=Trajectory.of((2.5, height, 2.5)))
+        assert cells_of([moved], scene.grid.cells).numpy().any(1).all()
 
 
 def test_a_source_smaller_than_a_voxel_emits_its_amount(tmp_path):
@@ -140,6 +141,24 @@ def test_random_scenes(seed, tmp_path):
         smoke = smoke or density.any()
     emitters = sum(bool(each.density) for each in (*scene.sources, *scene.inlets))
     assert smoke or emitters <= sum("sources" in each or "inlets" in each for each in warnings)
+
+
+def test_wind_of_a_scene(tmp_path):
+    """It takes the open faces through which it ever enters, bounds the step, and needs a way out."""
+    air = {"wind": {"keys": [[0, 1, 0, 0.5], [1, 4, 0, -0.5]], "gusts": 0.5}}
+    scene = _scene(tmp_path, inlets=[], air=air)
+    assert scene.windy == ["-x", "-z", "+z"] and scene.fastest == pytest.approx(1.5 * math.hypot(4, 0.5))
+    assert _scene(tmp_path, inlets=[], air={"confinement": 50.0}).steps >= 50 / 0.02 / scene.rate
+    stirred = _scene(tmp_path, air={"turbulence": {"strength": 1.0, "size": 0.1}})
+    assert [each.split(": ")[1] for each in simulation.warnings_of(stirred)] == ["air.turbulence"]
+    for wind, words in (([[0, 0, -1, 0]], "through which the wind enters"), ([[0, 1, 0, 0]], "for the air to leave")):
+        with pytest.raises(WlmError, match=words):
+            _scene(
+                tmp_path,
+                inlets=[],
+                air={"wind": {"keys": wind}},
+                grid=GRID | {"faces": dict.fromkeys(FACES[1:], "wall")},
+            )
 
 
 def test_a_scene_from_a_file(tmp_path):
@@ -189,7 +208,11 @@ def test_scaling_keeps_one_cell(tmp_path):
         ({"inlets": [{"face": "+y", "velocity": [0, 1, 0]}]}, "inlets.0.velocity: expected a velocity that points"),
         ({"grid": GRID | {"faces": dict.fromkeys(FACES, "wall")}}, "expected an open face"),
         ({"grid": GRID | {"faces": dict.fromkeys(("-y", "+y"), "periodic")}}, "inlets on faces that aren't periodic"),
-        ({"air": {"speed": 0.3}}, "an inlet or an obstacle of 1 m/s, 0.25 cells per step: leave air.speed null or"),
+        ({"air": {"wind": {"keys": [[0, 1, 0]]}}}, "air.wind.keys"),
+        ({"air": {"wind": {"keys": [[0, 1, 0, 0]], "gust": 1}}}, "air.wind.gust"),
+        ({"air": {"wind": {"keys": [[0, 1, 0, 0]], "gusts": 2}}}, "expected 0 to 1"),
+        ({"air": {"turbulence": {"strength": ".nan", "size": 1}}}, "air.turbulence.strength"),
+        ({"air": {"speed": 0.3}}, "a wind or an obstacle of 1 m/s, 0.25 cells per step: leave air.speed null or"),
         ({"air": {"lattice_speed": 0.21}}, "air.lattice_speed: expected less than or equal to 0.2"),
         ({"air": {"smagorinsky": 0, "viscosity": 0}}, "expected air.viscosity of at least 0.002 m2/s at 1 m/s"),
         ({"air": {"viscosity": 1e9}}, "expected at most 1,000,000 steps per frame, found 2.5e+09"),

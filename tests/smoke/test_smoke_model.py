@@ -180,7 +180,7 @@ def test_weights_beyond_half_floats_are_refused(tmp_path):
 def test_a_network_comes_with_the_package(monkeypatch, tmp_path):
     path = shipped()
     assert path.stat().st_size <= 10_000_000
-    model = open_network()
+    model = open_network("fast")
     assert model.settings.width <= 24 and model.settings.guide == model.dataset.guide == "six"
     assert {"profile", "seed", "steps", "seconds", "device"} <= model.summary.keys()
     model.save(tmp_path / "again")

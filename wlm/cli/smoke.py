@@ -188,7 +188,7 @@ def predict(
     output: _Lightmaps,
     options: SmokeOptions,
     network: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Network that wlm smoke train wrote; default the shipped one.")
+        Path | None, typer.Option(metavar="FILE", help='File of wlm smoke train; default "fast", which ships with wlm.')
     ] = None,
     coarse: Annotated[bool, typer.Option("--coarse", help="Only use a coarse ray march, without a network.")] = False,
     seed: Seed = 0,
@@ -345,7 +345,7 @@ def run(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Network that wlm smoke train wrote, to make the six-way lightmaps; default a coarse march.",
+            help='Network for six-way lightmaps, "fast" or a file of wlm smoke train; default a coarse march.',
         ),
     ] = None,
     white: White = 1.0,

@@ -21,6 +21,8 @@ _PLACES = {
     "Source": "wlm.fluid.solver",
     "Sphere": "wlm.fluid.obstacles",
     "Trajectory": "wlm.fluid.obstacles",
+    "Turbulence": "wlm.fluid.forcing",
+    "Wind": "wlm.fluid.forcing",
     "box_mesh": "wlm.fluid.obstacles",
     "from_array": "wlm.fluid.volume",
     "load_volume": "wlm.fluid.volume",

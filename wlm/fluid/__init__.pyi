@@ -1,5 +1,7 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
 from wlm.fluid.faces import FACES as FACES
+from wlm.fluid.forcing import Turbulence as Turbulence
+from wlm.fluid.forcing import Wind as Wind
 from wlm.fluid.gradients import DifferentiableLattice as DifferentiableLattice
 from wlm.fluid.gradients import DifferentiableSolver as DifferentiableSolver
 from wlm.fluid.gradients import SmokeState as SmokeState

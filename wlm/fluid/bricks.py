@@ -112,10 +112,8 @@ class BrickPool:
 
     @property
     def _brick_bytes(self) -> int:
-        now = self.fields[0]
-        return sum(
-            CELLS * wp.types.type_size_in_bytes(part.dtype) for part in (now.density, now.temperature) if part.size
-        )
+        parts = [part for part in (self.fields[0].density, self.fields[0].temperature) if part.size]
+        return CELLS * len(parts) * wp.types.type_size_in_bytes(parts[0].dtype)
 
     def numbers(self) -> torch.Tensor:
         """Returns the indices of the stored bricks, int32 [N], increasing; waits for the device."""

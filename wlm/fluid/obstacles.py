@@ -1,4 +1,5 @@
-"""Solid obstacles in the air of a simulation, at rest or moving: spheres and closed meshes, their surfaces and paths.
+"""Solid obstacles in the air of a simulation, at rest or moving: spheres and closed meshes, their surfaces and paths,
+and the cells that they cover.
 
 Lengths are in cells of the lattice, times in its steps, as in `wlm.fluid.lattice`. Surfaces are closed and consist of
 triangles, anticlockwise from outside: corners float64 [V, 3], triangles int64 [F, 3].
@@ -6,6 +7,7 @@ triangles, anticlockwise from outside: corners float64 [V, 3], triangles int64 [
 
 import functools
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -14,7 +16,7 @@ import warp as wp
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
+from wlm_kernels.fluid import lattice_bodies
 
 _PIECES = 16  # straight pieces of a ramp of a path
 SHELL = 0.71
@@ -179,20 +181,23 @@ class Sphere:
         if not 0.0 < self.radius < np.inf:
             raise ValueError(f"radius: expected a length above 0, got {self.radius}")
 
-    def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """Marks the cells whose centres are inside the obstacle at a position, and clears its earlier marks.
+    def speeds(self) -> np.ndarray:
+        """Returns the largest speed of the surface after each time of the path, float64 [K], cells per step."""
+        velocity, spin = self.path.rates
+        return np.linalg.norm(velocity, axis=1) + self.radius * np.linalg.norm(spin, axis=1)
 
-        Args:
-            solid: uint8 [X, Y, Z], modified.
-            body: Number of the obstacle, 1 to 255.
-            position: Position (3,) in cells.
-        """
-        voxelise_sphere(solid, body, position.tolist(), self.radius)
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the lowest and highest coordinates (3,) of the obstacle relative to its origin, at any time."""
+        return np.full(3, -self.radius), np.full(3, self.radius)
+
+    def form(self, device: str) -> tuple[float | wp.Mesh, float, float]:
+        """Returns shape, scale and shell, as for `wlm_kernels.fluid.lattice_bodies.mark`."""
+        return self.radius, 1.0, 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """An obstacle bounded by a mesh, which moves without rotation.
+    """An obstacle bounded by a mesh.
 
     It is solid by its winding number, so that small holes do not matter, and within the shell of its surface, so that
     a surface that is open or thin stops the air. A cell whose centre is exactly on the surface may count as inside or
@@ -226,6 +231,26 @@ class Mesh:
         if not 0.0 <= self.shell < np.inf:
             raise ValueError(f"shell: expected a distance of at least 0, got {self.shell}")
 
+    def speeds(self) -> np.ndarray:
+        """As for `Sphere`."""
+        fastest = np.linalg.norm(self.path.rates[0], axis=1)
+        if self.path.turns:
+            corners = self.scale * np.asarray(self.vertices, np.float64)
+            for k, spin in enumerate(self.path.rates[1]):
+                # The angular velocity in the mesh's own frame; the distances from its axis do not change.
+                own = Rotation.from_quat(self.path.rotations[k]).inv().apply(spin)
+                fastest[k] += np.linalg.norm(np.cross(own, corners), axis=1).max()
+        return fastest
+
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """As for `Sphere`."""
+        corners = self.scale * np.asarray(self.vertices, np.float64)
+        if self.path.turns:
+            corners = np.linalg.norm(corners, axis=1).max() * np.array([[-1.0] * 3, [1.0] * 3])
+        else:
+            corners = corners @ self.path.turn(0.0).T
+        return corners.min(axis=0) - self.shell, corners.max(axis=0) + self.shell
+
     def on(self, device: str) -> wp.Mesh:
         """Returns the mesh on a device, in its own unit, for `wlm_kernels.fluid.mesh_inside`."""
         if device not in self._meshes:
@@ -234,14 +259,83 @@ class Mesh:
             self._meshes[device] = wp.Mesh(points, indices, support_winding_number=True)
         return self._meshes[device]
 
-    def cover(self, solid: wp.array, body: int, position: np.ndarray) -> None:
-        """Marks the cells whose centres are inside the mesh at a position; arguments as for `Sphere.cover`."""
-        mesh = self.on(str(solid.device))
-        voxelise_mesh(solid, body, mesh, position.tolist(), scale=self.scale, shell=self.shell)
+    def form(self, device: str) -> tuple[float | wp.Mesh, float, float]:
+        """As for `Sphere`."""
+        return self.on(device), self.scale, self.shell
 
 
 Obstacle = Sphere | Mesh
 """An obstacle, in cells and steps of the lattice."""
+
+
+class Bodies:
+    """Obstacles on the device of a lattice, with numbers from 1 on.
+
+    Args:
+        obstacles: At most 255 obstacles.
+        shape: Cells along x, y and z.
+        device: The device.
+
+    Attributes:
+        motion: The motion of the obstacles in a step, set by `cover` and `move`.
+        moving: The windows of those that move.
+    """
+
+    def __init__(self, obstacles: Sequence[Obstacle], shape: tuple[int, int, int], device: wp.Device) -> None:
+        paths, self._shape = [obstacle.path for obstacle in obstacles], shape
+        self.motion, self._keys = lattice_bodies.make_motion(device), lattice_bodies.Keys()
+        columns = {
+            "first": (np.cumsum([0, *(len(path.times) for path in paths)], dtype=np.int32), int),
+            "time": (np.concatenate([path.times for path in paths]), wp.float64),
+            "position": (np.concatenate([path.positions for path in paths]), wp.vec3d),
+            "turn": (np.concatenate([path.rotations for path in paths]), wp.quatd),
+            "velocity": (np.concatenate([path.rates[0] for path in paths]), wp.vec3d),
+            "spin": (np.concatenate([path.rates[1] for path in paths]), wp.vec3d),
+        }
+        for name, (values, dtype) in columns.items():
+            setattr(self._keys, name, wp.array(values, dtype=dtype, device=device))
+        flags = np.zeros(256, np.uint8)
+        flags[1 : len(paths) + 1] = [path.moves for path in paths]
+        self.motion.moving.assign(flags)
+        windows = [lattice_bodies.make_window(shape, k + 1, *each.box()) for k, each in enumerate(obstacles)]
+        self._forms = [each.form(str(device)) for each in obstacles]
+        self._windows, self.moving = windows, [window for window in windows if flags[window.body]]
+        # Begin and end of each piece of a moving path, and the largest speed in it.
+        moves = [each for each in obstacles if each.path.moves]
+        self._ends = np.concatenate(
+            [np.zeros((2, 0)), *([each.path.times[:-1], each.path.times[1:]] for each in moves)], axis=1
+        )
+        self._speeds = np.concatenate([np.zeros(0), *(each.speeds()[:-1] for each in moves)])
+
+    def cover(self, clock: wp.array, pace: float) -> wp.array:
+        """Sets `motion` as `move`, and returns the marks of all cells, uint8 [X Y Z]."""
+        lattice_bodies.set_poses(self._keys, clock, pace, self.motion)
+        solid = wp.zeros(math.prod(self._shape), dtype=wp.uint8, device=clock.device)
+        self._mark(self._windows, solid, wp.empty(0, dtype=wp.uint8, device=clock.device), 1)
+        return solid
+
+    def move(self, clock: wp.array, pace: float, solid: wp.array, fresh: wp.array, stamp: int) -> None:
+        """Sets `motion` to that in the middle of the next step, and the marks of the obstacles that move accordingly.
+
+        Arguments: see `lattice_bodies.set_poses` and `lattice_bodies.mark`.
+        """
+        lattice_bodies.set_poses(self._keys, clock, pace, self.motion)
+        self._mark(self.moving, solid, fresh, stamp)
+
+    def _mark(self, windows: Sequence, solid: wp.array, fresh: wp.array, stamp: int) -> None:
+        for window in windows:
+            lattice_bodies.mark(window, self.motion, *self._forms[window.body - 1], stamp, solid, fresh)
+
+    def fastest(self, begin: float, end: float) -> float:
+        """Returns the largest speed between two times of the paths, in their unit."""
+        within = (self._ends[0] < end) & (self._ends[1] > begin)
+        return float(self._speeds[within].max(initial=0.0))
+
+
+def cells_of(obstacles: Sequence[Obstacle], shape: tuple[int, int, int], device: str = "cpu") -> wp.array:
+    """Returns the number of the obstacle that covers the centre of each cell at time 0, uint8 [X, Y, Z], 0 for none."""
+    clock = wp.zeros(2, dtype=int, device=device)
+    return Bodies(obstacles, shape, clock.device).cover(clock, 0.0).reshape(shape)
 
 
 def box_mesh(path: Trajectory, size: Sequence[float]) -> Mesh:

@@ -2,7 +2,8 @@
 (neural-six-way-lightmaps, section 5: 100^3 velocities, 400^3 densities).
 
 Lengths are in cells of the lattice, times in its steps. A step of the solver is `substeps` of the lattice, in this
-order: obstacles move, smoke accelerates the air (buoyancy), the air moves, it carries the smoke, sources add smoke.
+order: smoke accelerates the air (buoyancy), the air and the obstacles move, the air carries the smoke, sources add
+smoke, and cells that obstacles cover lose theirs.
 """
 
 import hashlib
@@ -20,14 +21,16 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
 from wlm.fluid.faces import axis_ends
+from wlm.fluid.forcing import CALM, Turbulence, Wind
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
 from wlm.fluid.obstacles import Obstacle
 from wlm.fluid.volume import DensityVolume, gather, scatter
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.interop import no_collection
-from wlm_kernels.fluid import advection, advection_places, advection_sources
+from wlm_kernels.fluid import advection, advection_places, advection_sources, forcing
 from wlm_kernels.fluid.advection_places import DENSE
+from wlm_kernels.fluid.lattice_links import WIND
 
 SCHEMES = ("maccormack", "semi-lagrangian")
 
@@ -124,7 +127,7 @@ class SmokeSetup:
         temperature: Whether the smoke has a temperature.
         decay: Factors of density and temperature per step.
         bricks: Whether only bricks with smoke are computed.
-        moves: Whether an obstacle moves.
+        stirred: Whether confinement or turbulence acts.
     """
 
     shape: tuple[int, int, int]
@@ -138,7 +141,7 @@ class SmokeSetup:
     temperature: bool
     decay: tuple[float, float]
     bricks: bool
-    moves: bool
+    stirred: bool
 
 
 def bytes_needed(shape: tuple[int, int, int], scheme: str, storage: str, temperature: bool, bricks: bool) -> int:
@@ -152,8 +155,7 @@ def bytes_needed(shape: tuple[int, int, int], scheme: str, storage: str, tempera
 class Solver:
     """Simulates smoke in the air of a lattice.
 
-    Set the faces of the lattice beforehand; the solver sets the solids of the lattice and its force. With a moving
-    obstacle each step waits for the device.
+    Set the faces of the lattice beforehand; the solver sets the bodies of the lattice and its force.
 
     Args:
         lattice: The air.
@@ -166,6 +168,9 @@ class Solver:
         dissipation: Decay rate of the density: exp(-dissipation t) of it remains after t steps of the lattice.
         cooling: Decay rate of the temperature, in the same unit.
         buoyancy: Acceleration of the air by smoke; None: smoke does not move the air.
+        confinement: Strength of the vorticity confinement per step of the lattice (Fedkiw, Stam and Jensen 2001: eps).
+        turbulence: Random acceleration of all air.
+        wind: Velocity of the wind at the lattice's faces for it, in cells per step at times in steps.
         substeps: Steps of the lattice per step of the solver. Above a speed of 1 / substeps smoke can jump over walls.
         bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are stored and computed.
         threshold: With bricks, the largest value in a brick that counts as empty.
@@ -195,6 +200,9 @@ class Solver:
         dissipation: float = 0.0,
         cooling: float = 0.0,
         buoyancy: Buoyancy | None = None,
+        confinement: float = 0.0,
+        turbulence: Turbulence | None = None,
+        wind: Wind | None = None,
         substeps: int = 2,
         bricks: bool = False,
         threshold: float = 1e-6,
@@ -206,7 +214,8 @@ class Solver:
         for name, count in (("refinement", refinement), ("substeps", substeps)):
             if count < 1:
                 raise ValueError(f"{name}: expected at least 1, got {count}")
-        for name, rate in (("dissipation", dissipation), ("cooling", cooling), ("threshold", threshold)):
+        rates = {"dissipation": dissipation, "cooling": cooling, "threshold": threshold, "confinement": confinement}
+        for name, rate in rates.items():
             if not (math.isfinite(rate) and rate >= 0.0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {rate}")
         # Steps after which smoke decays: only with float16 and a shortened step more than one.
@@ -220,8 +229,7 @@ class Solver:
             raise ValueError("temperature: expected True, since a source, buoyancy or cooling uses it, got False")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
-        # The paths of obstacles are in steps of the first duration.
-        self.duration, self._first_duration = duration, duration
+        self.duration = duration
         self.shape = tuple(refinement * size for size in lattice.shape)
         self._stored = advection.STORAGES[storage]
         needed = bytes_needed(self.shape, scheme, storage, temperature, bricks)
@@ -235,6 +243,7 @@ class Solver:
             "storage": storage,
             "temperature": temperature,
             "substeps": substeps,
+            "obstacles": len(obstacles),
         }
         self._threshold = threshold
         self._pool = self._make_pool() if bricks else None
@@ -242,17 +251,22 @@ class Solver:
         self._fields = self._pool.fields if self._pool else [self._make_fields(cells) for _ in range(_buffers(scheme))]
         self._touched: tuple[Source, ...] = ()
         self._velocity = self._zeros(lattice.shape, wp.vec3)
+        if wind is not None and not any((face.kind == WIND).any() for face in lattice.faces.values()):
+            raise ValueError("wind: expected a lattice with a face for it (set_wind), got none")
+        self._confinement, self._turbulence, self._wind = confinement, turbulence, wind
+        self._modes = CALM if turbulence is None else turbulence.modes(str(self.device))
+        self._stirred = confinement > 0.0 or turbulence is not None
         self._force = None
-        if buoyancy is not None:
+        if buoyancy is not None or self._stirred:
             self._force = self._zeros(lattice.shape, wp.vec3)
             lattice.set_force(self._force)
-        self._solid = self._zeros(lattice.shape if obstacles else (0,), wp.uint8)
-        self._walls = [self._zeros((self._solid.size,), wp.uint8) for _ in range(2)]
-        self._placed = np.full((len(obstacles), 2, 3), np.nan)
+        self._walls = [self._zeros((math.prod(lattice.shape) if obstacles else 0,), wp.uint8) for _ in range(2)]
+        if obstacles:
+            lattice.set_bodies(self.obstacles)
+            advection_places.mark_walls(self._box, self.solid.flatten(), self._walls[0])
         self._done = 0
         # The settings of the last steps, and a graph of steps with them; None: these steps cannot be captured.
-        graphs = self.device.is_cuda and substeps % lattice.period == 0
-        graphs = graphs and not any(obstacle.path.moves for obstacle in obstacles)
+        graphs = self.device.is_cuda and substeps % lattice.period == 0 and wind is None
         graphs = graphs and (self._pool is None or self._pool.is_full)
         self._captures: tuple[tuple, wp.Graph | None] | None = ((), None) if graphs else None
 
@@ -263,7 +277,7 @@ class Solver:
 
         During the capture of a CUDA graph it does not check the air: call `check` between replays of the graph. The
         number of steps, and the number of steps done before the capture, must then be multiples of `period`, `substeps`
-        must be a multiple of the lattice's `period`, and obstacles must be at rest. With bricks call `reserve` before.
+        must be a multiple of the lattice's `period`. With bricks call `reserve` before.
 
         Raises:
             WlmError: The air blew up, an obstacle is too fast, or bricks do not fit into the memory.
@@ -273,9 +287,9 @@ class Solver:
         capturing = self.device.is_cuda and self.device.is_capturing
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         uneven = uneven or self._decay_every > 1 or not (self._pool is None or self._pool.is_full)
-        if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
+        if capturing and (uneven or not self._done or self._wind is not None):
             raise ValueError(
-                f"steps: expected obstacles at rest, room for all bricks (`reserve`), substeps a multiple of "
+                f"steps: expected no wind, room for all bricks (`reserve`), substeps a multiple of "
                 f"{self.lattice.period}, and a multiple of "
                 f"{self.period} steps in the captured CUDA graph and before it; got {steps} after {self._done}"
             )
@@ -283,8 +297,8 @@ class Solver:
             if not capturing and steps >= self.period and self._replay():
                 steps -= self.period
                 continue
-            if not capturing:
-                self._place_obstacles()
+            if self._wind is not None:
+                self.lattice.blow(self._wind.at((self._done + 0.5) * self.substeps))
             self._step()
             self._done += 1
             steps -= 1
@@ -315,7 +329,6 @@ class Solver:
             raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
         self.lattice.change_step(factor)
         self._done = done
-        self._placed[:, 1] *= factor
         wp.to_torch(self._velocity).mul_(factor)
         self._convert_settings(factor)
 
@@ -338,6 +351,12 @@ class Solver:
             self.buoyancy = replace(
                 self.buoyancy, lift=square * self.buoyancy.lift, weight=square * self.buoyancy.weight
             )
+        self._confinement *= factor
+        if self._wind is not None:
+            self._wind = self._wind.scaled(factor)
+        if self._turbulence is not None:
+            self._turbulence = self._turbulence.scaled(factor)
+            self._modes = self._turbulence.modes(str(self.device))
 
     @property
     def fastest(self) -> float:
@@ -399,7 +418,7 @@ class Solver:
     @property
     def solid(self) -> wp.array:
         """Numbers of the obstacles, uint8 [cells of the lattice]; [0] without obstacles."""
-        return self._solid
+        return self.lattice.solid
 
     @property
     def velocity(self) -> wp.array:
@@ -448,8 +467,7 @@ class Solver:
         )
 
     def setup(self) -> SmokeSetup:
-        """Places the obstacles as the next step would, and returns the settings with a copy of their cells."""
-        self._place_obstacles()
+        """Returns the settings, with a copy of the obstacles' cells."""
         return SmokeSetup(
             shape=self.shape,
             box=self._box,
@@ -462,7 +480,7 @@ class Solver:
             temperature=self._grids["temperature"],
             decay=self._decay,
             bricks=self._pool is not None,
-            moves=any(obstacle.path.moves for obstacle in self.obstacles),
+            stirred=self._stirred,
         )
 
     # Checkpoints.
@@ -478,7 +496,7 @@ class Solver:
         tensors = {f"lattice.{name}": value for name, value in air.items()}
         # On a CPU .numpy() shares the array's memory; it is written before the next step changes it.
         numbers, values = self.bricks()
-        tensors |= {"placed": self._placed, "velocity": self._velocity.numpy(), "bricks": numbers.cpu().numpy()}
+        tensors |= {"velocity": self._velocity.numpy(), "bricks": numbers.cpu().numpy()}
         tensors |= {name: part.cpu().numpy() for name, part in zip(("density", "temperature"), values, strict=False)}
         settings = self._grids | {"duration": self.duration}
         text = json.dumps(settings, sort_keys=True).encode()
@@ -504,10 +522,7 @@ class Solver:
         if not (isinstance(duration, float) and 1e-6 <= duration / self.duration <= 1e6):
             raise WlmError(f"{path}: duration: expected about {self.duration:.3g} for a step, found {duration}")
         state, edge = artifact.tensors, advection_places.BRICK
-        # NaN before the first step, when no obstacle has been placed.
-        nowhere = np.isnan(state.get("placed", 0.0)).all()
-        table = {"placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
-        table["velocity"] = Part(np.float32, (*self.lattice.shape, 3))
+        table = {"velocity": Part(np.float32, (*self.lattice.shape, 3))}
         table["bricks"] = Part(np.int32, (None,), least=0, most=math.prod(self._box.bricks) - 1)
         air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
         try:
@@ -537,15 +552,12 @@ class Solver:
             self._pool.put(numbers, values)
             self._fields = self._pool.fields
         self._velocity.assign(parts["velocity"])
-        self._placed = np.array(parts["placed"])
         self._done = self.steps
         if self.obstacles:
-            # Before the first step the lattice has no solid.
-            if air["solid"].size:
-                self._solid.assign(np.array(air["solid"]).reshape(self._solid.shape))
-            else:
-                self._solid.zero_()
-            advection_places.mark_walls(self._box, self._solid.flatten(), self._walls[0])
+            before = wp.array(air["solid"], dtype=wp.uint8, device=self.device)
+            advection_places.mark_walls(self._box, before, self._walls[0])
+            # Obstacles of the file may have been elsewhere.
+            self._change_walls()
         self._captures = self._captures and ((), None)
         self._note_checkpoint(path, air["steps"])
 
@@ -566,7 +578,7 @@ class Solver:
         whether it did."""
         if self._captures is None:
             return False
-        settings = (self.sources, self.buoyancy, self._rates, self.lattice.changes)
+        settings = (self.sources, self.buoyancy, self._rates, self._confinement, self._turbulence, self.lattice.changes)
         if self._done % self.period or self._decay_every > 1 or settings != self._captures[0]:
             if self._done % self.period == 0:
                 self._captures = (settings, None)
@@ -584,28 +596,16 @@ class Solver:
             self.check()
         return True
 
-    def _place_obstacles(self) -> None:
-        """Moves obstacles to their positions in the middle of the step, unless they are there and at rest."""
-        span = self.substeps * self.duration / self._first_duration
-        placed = np.empty_like(self._placed)
-        for k, obstacle in enumerate(self.obstacles):
-            at = [obstacle.path.at((self._done + t) * span) for t in (0.0, 0.5, 1.0)]
-            placed[k] = at[1], (at[2] - at[0]) / self.substeps
-        if np.array_equal(placed, self._placed):
-            return
-        for k, obstacle in enumerate(self.obstacles):
-            obstacle.cover(self._solid, k + 1, placed[k, 0])
-        with self._naming_checkpoint():
-            self.lattice.set_solid(self._solid, placed[:, 1])
+    def _change_walls(self) -> None:
+        """Follows the obstacles: cells that they cover lose their smoke, cells that they leave get some from beside."""
         old, new = self._walls
-        advection_places.mark_walls(self._box, self._solid.flatten(), new)
+        advection_places.mark_walls(self._box, self.solid.flatten(), new)
         if self._pool is not None:
             # A cell that an obstacle leaves gets smoke of its neighbours.
             self._pool.relist()
             self._pool.store(clear=False)
         advection_sources.change_solids(self._box, old, new, self._fields[0], self._bricks)
         self._walls = [new, old]
-        self._placed = placed
 
     def _step(self) -> None:
         box, walls, bricks = self._box, self._walls[0], self._bricks
@@ -618,6 +618,9 @@ class Solver:
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
             advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
+        if self._stirred:
+            air = [box, self._velocity.flatten(), self.solid.flatten(), self._confinement, self._modes]
+            forcing.stir(*air, self.lattice.clock, self._force.flatten(), added=self.buoyancy is not None)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)
@@ -625,6 +628,8 @@ class Solver:
             self._pool.store()
         self._carry()
         self._emit()
+        if self.lattice.moving:
+            self._change_walls()
 
     def _emit(self, only_mark: bool = False) -> None:
         for source in self.sources:

@@ -21,6 +21,7 @@ from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings, load_settings, profile_path
 from wlm.fluid.faces import FACES
+from wlm.fluid.forcing import Turbulence, Wind
 from wlm.fluid.obstacles import Trajectory, surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.meshes import SUFFIXES, Surface, read_surface
@@ -33,6 +34,8 @@ FASTEST = 0.2
 """Largest speed of inlets and obstacles in cells per step; a flow with faster ones may blow up."""
 # Bounds of a stable step: acceleration in cells per step squared, viscosity in square cells per step.
 _ACCELERATION, _VISCOSITY = 0.01, 1.0
+# Confinement per step, and the largest acceleration of turbulence over its root mean square.
+_CONFINEMENT, _PEAK = 0.02, 3.0
 # Without eddy viscosity, of less than this Smagorinsky constant, the largest Reynolds number of a cell.
 _LEAST_EDDIES, _CELL_REYNOLDS = 0.05, 100.0
 
@@ -141,6 +144,10 @@ class Air(_Settings):
         speed: Speed in metres per second that equals `lattice_speed`; null: that of the fastest inlet or obstacle.
         lattice_speed: Speed in cells per step. Errors grow with its square, the number of steps with its inverse.
         smagorinsky, storage: As for `wlm.fluid.lattice.Lattice`.
+        wind: Wind, in metres and seconds, through the faces `Scene.windy`; null: none.
+        confinement: Strength per second of the vorticity confinement (Fedkiw et al. 2001: eps), which keeps small
+            eddies; 0: none.
+        turbulence: A stirring of all air, in metres and seconds; null: none.
     """
 
     viscosity: _NotNegative = 1.5e-5
@@ -148,6 +155,9 @@ class Air(_Settings):
     lattice_speed: float = Field(0.1, gt=0.0, le=FASTEST)
     smagorinsky: _NotNegative = 0.17
     storage: Literal["float32", "float16"] = "float32"
+    wind: Wind | None = None
+    confinement: _NotNegative = 0.0
+    turbulence: Turbulence | None = None
 
 
 class Smoke(_Settings):
@@ -406,20 +416,24 @@ class Scene(_Settings):
         faces = {inlet.face for inlet in self.inlets}
         if any(self.grid.face(face) == "periodic" for face in faces):
             raise PydanticCustomError("inlets", "expected inlets on faces that aren't periodic")
+        if self.air.wind and not self.windy:
+            raise PydanticCustomError("wind", "expected an open face without an inlet, through which the wind enters")
+        faces |= set(self.windy)
         if faces and all(face in faces or self.grid.face(face) != "open" for face in FACES):
-            raise PydanticCustomError("inlets", "expected an open face without an inlet, for the air to leave")
+            raise PydanticCustomError("inlets", "expected an open face without inlet or wind, for the air to leave")
         if not self._least_steps <= MOST_STEPS:
             raise PydanticCustomError(
                 "steps",
                 f"expected at most {MOST_STEPS:,} steps per frame, found {self._least_steps:.3g}, for a speed of "
-                f"{self.fastest:g} m/s, an acceleration of {self._acceleration:g} m/s2 and a viscosity of "
-                f"{self.air.viscosity:g} m2/s in cells of {self.grid.cell:g} m at {self.rate:g} frames per second",
+                f"{self.fastest:g} m/s, an acceleration of {self._acceleration:g} m/s2, a confinement of "
+                f"{self.air.confinement:g} per second and a viscosity of {self.air.viscosity:g} m2/s in cells of "
+                f"{self.grid.cell:g} m at {self.rate:g} frames per second",
             )
         speed = max(self._speeds, default=0.0)
         if not speed * self.step <= FASTEST * self.grid.cell * (1.0 + 1e-9):
             raise PydanticCustomError(
                 "speed",
-                f"expected at most {FASTEST} cells per step, found an inlet or an obstacle of {speed:g} m/s, "
+                f"expected at most {FASTEST} cells per step, found an inlet, a wind or an obstacle of {speed:g} m/s, "
                 f"{speed * self.step / self.grid.cell:.3g} cells per step: leave air.speed null or at least {speed:g}",
             )
         speed = max(self.fastest, math.sqrt(self._acceleration * float(self.grid.size.max())))
@@ -459,30 +473,59 @@ class Scene(_Settings):
         return self.model_copy(update={"grid": grid})
 
     @property
+    def windy(self) -> list[str]:
+        """The faces through which the wind comes: open ones without an inlet through which it ever enters the box."""
+        keys = np.zeros((0, 4)) if self.air.wind is None else np.array(self.air.wind.keys)
+        entering = {face: (keys[:, 1 + k // 2] * (1 - 2 * (k % 2)) > 0.0).any() for k, face in enumerate(FACES)}
+        return [face for face in self._free if entering[face]]
+
+    @property
+    def _free(self) -> list[str]:
+        """The open faces without an inlet."""
+        taken = {inlet.face for inlet in self.inlets}
+        return [face for face in FACES if self.grid.face(face) == "open" and face not in taken]
+
+    @property
     def fastest(self) -> float:
         """Speed in metres per second that moves air by `air.lattice_speed` cells in a step; 1 if nothing moves."""
         return self.air.speed or max(self._speeds, default=0.0) or 1.0
 
     @property
     def _speeds(self) -> list[float]:
-        """Speeds of inlets and obstacles in metres per second."""
+        """Speeds of inlets, wind and obstacles in metres per second."""
         inlets = [float(np.linalg.norm(inlet.velocity)) for inlet in self.inlets]
+        if self.air.wind is not None:
+            inlets.append(self.air.wind.fastest)
         return [*inlets, *(obstacle.fastest for obstacle in self.obstacles)]
 
     @property
+    def _outflow(self) -> float:
+        """An upper bound of the speed in metres per second at which what comes in leaves through the open faces."""
+        area = {face: float(np.prod(np.delete(self.grid.size, k // 2))) for k, face in enumerate(FACES)}
+        out = sum(area[face] for face in self._free if face not in self.windy)
+        flux = 0.0 if self.air.wind is None else sum(self.air.wind.fastest * area[face] for face in self.windy)
+        for inlet in self.inlets:
+            opening = area[inlet.face] if inlet.radius is None else math.pi * inlet.radius**2
+            flux += abs(inlet.velocity[FACES.index(inlet.face) // 2]) * min(opening, area[inlet.face])
+        return flux / out if out else 0.0
+
+    @property
     def _acceleration(self) -> float:
-        """Largest acceleration of air by smoke, in metres per second squared."""
+        """Largest acceleration of air by smoke or turbulence, in metres per second squared."""
         emitters = [*self.inlets, *self.sources]
         pulls = [(self.smoke.buoyancy * each.temperature, self.smoke.weight * each.density) for each in emitters]
-        return max(itertools.chain.from_iterable(pulls), default=0.0)
+        stirring = 0.0 if self.air.turbulence is None else _PEAK * self.air.turbulence.strength
+        return max(itertools.chain.from_iterable(pulls), default=0.0) + stirring
 
     @property
     def _least_steps(self) -> float:
-        """Air steps per frame for which speed, acceleration and viscosity stay within their bounds."""
+        """Air steps per frame for which speed, acceleration, confinement and viscosity stay within their bounds."""
         cell = self.grid.cell
-        by_speed = self.fastest / (self.rate * self.air.lattice_speed * cell)
+        by_speed = max(self.fastest / self.air.lattice_speed, self._outflow / FASTEST) / (self.rate * cell)
         by_acceleration = math.sqrt(self._acceleration / (_ACCELERATION * cell)) / self.rate
-        return max(by_speed, by_acceleration, self.air.viscosity / (_VISCOSITY * cell * cell * self.rate))
+        by_confinement = self.air.confinement / (_CONFINEMENT * self.rate)
+        by_viscosity = self.air.viscosity / (_VISCOSITY * cell * cell * self.rate)
+        return max(by_speed, by_acceleration, by_confinement, by_viscosity)
 
     @property
     def steps(self) -> int:

@@ -13,6 +13,7 @@ from wlm.errors import WlmError
 from wlm.fluid import solver as fluid
 from wlm.fluid.bricks import require_memory
 from wlm.fluid.faces import FACES
+from wlm.fluid.forcing import EDDY
 from wlm.fluid.lattice import Domain, Lattice
 from wlm.fluid.obstacles import SHELL, Mesh, Obstacle, Sphere, Trajectory
 from wlm.fluid.volume import DensityVolume, save_bricks, save_volume
@@ -37,7 +38,7 @@ _LOOKS_AT_OBSTACLES = 17
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
     """Builds the solver of a scene on a device, which `wlm.interop.check_device` must have returned."""
-    smoke = scene.smoke
+    smoke, air = scene.smoke, scene.air
     _require_memory(scene, device)
     try:
         lattice = _make_lattice(scene, device)
@@ -52,6 +53,9 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
             dissipation=smoke.dissipation * scene.step,
             cooling=smoke.cooling * scene.step if smoke.hot else 0.0,
             buoyancy=_buoyancy(scene),
+            confinement=air.confinement * scene.step,
+            turbulence=air.turbulence and air.turbulence.scaled(scene.step, scene.grid.cell),
+            wind=air.wind and air.wind.scaled(scene.step, scene.grid.cell),
             substeps=smoke.substeps,
             bricks=smoke.bricks,
             duration=scene.step,
@@ -104,6 +108,8 @@ def warnings_of(scene: Scene) -> list[str]:
             warnings.append(
                 f"obstacles.{i}: it is thinner than a cell of {grid.cell:g} m, and is simulated as a cell thick"
             )
+    if (stirring := scene.air.turbulence) is not None and stirring.size < EDDY * grid.cell:
+        warnings.append(f"air.turbulence: its size is below {EDDY} cells, and is simulated as {EDDY * grid.cell:g} m")
     if not (scene.sources or scene.inlets):
         warnings.append("sources, inlets: there are none, and thus there is no smoke")
     return [f"{scene.name}: {warning}" for warning in warnings]
@@ -319,13 +325,15 @@ def _make_lattice(scene: Scene, device: str) -> Lattice:
     for name in FACES:
         inlets = [(i, inlet) for i, inlet in enumerate(scene.inlets) if inlet.face == name]
         kind = grid.face(name)
-        if inlets:
+        if name in scene.windy:
+            lattice.set_wind(name)
+        elif inlets:
             _set_inlets(lattice, scene, domain, name, inlets)
         elif kind in ("wall", "slip"):
             lattice.set_wall(name, slip=kind == "slip")
         elif kind == "open":
             # With inlets, the outflow equals the inflow; without, the outside is at rest.
-            lattice.set_outlet(name, density=None if scene.inlets else 1.0)
+            lattice.set_outlet(name, density=None if scene.inlets or scene.windy else 1.0)
     return lattice
 
 
