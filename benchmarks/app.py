@@ -91,6 +91,10 @@ _OPTIONS: dict[str, tuple[Any, Any]] = {
     "steps": _option(int | None, "--steps", help="Optimisation steps of each fit. Default: the profile's.", min=1),
     "only": _option(_Names, "--only", help="Name of a variant to measure. Repeatable; default: all.", metavar="ROW"),
     "networks": _option(_Paths, "--network", help="File of a trained network to measure. Repeatable.", metavar="FILE"),
+    "baseline_path": _option(
+        _Path, "--baseline", help="Older result file; a kernel slower than there is an error.", metavar="OLD.json"
+    ),
+    "plot_path": _option(_Path, "--plot", help="Picture to write: time over size.", metavar="FILE.png"),
     "json_path": _option(_Path, "--json", help="Result file to write, with the machine.", metavar="FILE.json"),
 }
 _MESHES = ("meshes_path", "mesh_path", "lightmap_paths", "mask_path")
@@ -140,6 +144,10 @@ _COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "smoke": (
         "Measure smoke: speed of the solver against a memory copy, advection, six-way lightmaps and whole frames.",
         ("quick", "device"),
+    ),
+    "kernels": (
+        "Measure kernels of frames and fits against what the device can do, at several sizes.",
+        ("quick", "device", "only", "baseline_path", "plot_path"),
     ),
     "fluid-gradients": (
         "Measure gradients through air and smoke: the time of a step both ways, and memory.",

@@ -121,6 +121,13 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "bandwidth": Figure("bandwidth", "GB/s", ".4g"),
         "mlups": Figure("MLUPS"),  # million lattice cells a second
         "voxel_rate": Figure("voxels", "M/s"),
+        "rate": Figure("rate", "G/s", ".4g"),  # of one kind of work, `benchmarks.ceilings`
+        "floor_ms": Figure("floor", "ms", ".3g"),  # the next ones as in `benchmarks.kernels`
+        "of_floor": Figure("of the floor", "%", ".3g"),
+        "slope": Figure("slope", form=".2f"),
+        "launches": Figure("launches", form=".3g"),
+        "moved_bytes": Figure("bytes", "bytes", _WHOLE),
+        "operations": Figure("operations", form=".3g"),
         "of_copy": Figure("of the copy", "%", ".3g"),  # the copy's bandwidth, at the bytes that must be moved
         "worked_on": Figure("worked on", "%", ".3g"),
         "speedup": Figure("speedup", form=".2f"),
@@ -204,6 +211,7 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "dropped": Figure("dropped", form=_WHOLE),
         "list_entries": Figure("list entries", form=_WHOLE),
         "frames": Figure("frames", form=_WHOLE),
+        "size": Figure("size", form=_WHOLE),
         "cells": Figure("edge", "cells", _WHOLE),
         "voxels": Figure("edge", "voxels", _WHOLE),
         "pixels": Figure("edge", "pixels", _WHOLE),

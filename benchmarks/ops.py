@@ -62,7 +62,7 @@ def _uniform(*shape: int, seed: int = 2) -> np.ndarray:
     return np.random.default_rng(seed).random(shape).astype(np.float32)
 
 
-def _sphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
+def make_sphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns a closed, bumpy sphere of 4 rings^2 triangles before a camera: clip [V, 4], triangles [F, 3]."""
     sectors = 2 * rings
     height, turn = np.meshgrid(np.linspace(0.0, np.pi, rings + 2)[1:-1], np.arange(sectors) / sectors * 2.0 * np.pi)
@@ -78,7 +78,7 @@ def _sphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _drawn(rings: int, size: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    clip, triangle = _sphere(rings)
+    clip, triangle = make_sphere(rings)
     raster = ops.rasterize(torch.tensor(clip), torch.tensor(triangle), size, size)
     fields = {"visible": raster.triangle, "barycentric": raster.barycentric, "depth": raster.depth}
     return clip, triangle, {name: tensor.numpy() for name, tensor in fields.items()}
@@ -113,7 +113,7 @@ def works() -> dict[str, Work]:
     rays = {"origin": np.float32([12.0, 12.0, 12.0]) + 4.0 * _normal(1024, 3, seed=3) - 30.0 * direction}
     rays["direction"] = direction
     toward = {"toward": np.float32([[0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])}
-    clip, triangle = _sphere(8)
+    clip, triangle = make_sphere(8)
     fine, faces, pixels = _drawn(8, 256)
     image, uv = _normal(512, 512, 4), _uniform(65536, 2)
     made = [

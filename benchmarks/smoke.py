@@ -4,11 +4,13 @@ Each method has a table of its own:
 
 - "lattice": a copy of an array, and steps of the lattice Boltzmann solver with each storage and
   kind of boundary. The bytes that a step must move, over its time, are stated as a share of the copy's bandwidth.
-  "moving sphere" also marks the sphere's cells and finds its boundary links again at each step.
+  "moving sphere" also moves the sphere, which crosses 5 cells in 100 steps and returns.
 - "lattice storage": difference of velocities stored in 16 and in 32 bits, relative to the speed of a jet's inlet, and
   the relative drift of the mass.
 - "advection": a step that moves random smoke in eddies, with and without a solid sphere; and the error of a smooth ball
   after a full rotation: RMS error over the RMS of the ball, largest error (the ball's peak is 1), and smoke gained.
+- "advection mass": smoke gained in a closed box in two seconds after its source of hot smoke stopped, with and
+  without a sphere that crosses it.
 - "advection bricks": the same step with sparse storage, where only a cube in a corner contains smoke.
 - "guide": guiding maps (coarse lightmaps for the network) against a march in steps of half a voxel with no jitter and
   no cutoff. PSNR is of the light; its peak is the largest value.
@@ -22,6 +24,7 @@ user makes. On CUDA the lattice itself replays graphs where it does many steps, 
 graphs, so that gaps between launches do not count.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -36,8 +39,11 @@ from benchmarks.plot import Panel
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note
 from demos.plume import make_plume
+from wlm.fluid.bricks import BrickPool
+from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Lattice
-from wlm.fluid.volume import DensityVolume
+from wlm.fluid.obstacles import Sphere, Trajectory, cells_of
+from wlm.fluid.volume import DensityVolume, gather
 from wlm.interop import stream, to_warp
 from wlm.metrics import psnr_from_mse
 from wlm.smoke.camera import RULES, Camera
@@ -45,14 +51,13 @@ from wlm.smoke.lightmaps import SixWay
 from wlm.smoke.march.six_way import Guide, bake, guide
 from wlm.smoke.scene import CameraSettings, Scene, load_scene, make_camera
 from wlm.smoke.shading import Light, PointLight
-from wlm.smoke.simulation import make_solver, volume_of
+from wlm.smoke.simulation import advance, make_solver, volume_of
 from wlm.smoke.transport.lighting import light_smoke
 from wlm.smoke.transport.orders import scatter
 from wlm.smoke.transport.tracing import trace
 from wlm.view.smoke import Drawing
 from wlm.view.smoke_run import Lighting
-from wlm_kernels.fluid import advection, advection_places, advection_sources
-from wlm_kernels.fluid.lattice_fields import voxelise_sphere
+from wlm_kernels.fluid import advection, advection_places
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 from wlm_kernels.smoke.settings import March
 
@@ -60,6 +65,7 @@ PANELS = (Panel("time_ms", "psnr", ("guide",)), Panel("time_ms", "max_error", ("
 """The panels of a plot: PSNR and error of guiding maps and of the fine march against their time."""
 
 _SPEED = 0.1  # speed of the inlet in cells per step
+_PLACES = 2000  # positions of a sphere that moves to and fro, 100 steps apart
 _VISCOSITY = 1e-6
 _COPIED = {"cpu": 1 << 24, "cuda": 1 << 28}  # floats: far more than caches hold
 _RATIO = 4
@@ -71,6 +77,8 @@ _BALL = (0.68, 0.2)  # its centre along x and its radius, of the box's edge
 _SCHEMES = ("semi-lagrangian", "maccormack")
 # Floats that a cell has to be read and written at the least: each pass takes its fields once, and leaves one.
 _PASSES = {"semi-lagrangian": 2, "maccormack": 2 + 3}
+_FILLED = 5  # frames in which smoke enters the closed box
+_CROSSING = {"radius": 0.12, "path": [[0.6, 0.15, 0.5, 0.5], [2.5, 0.85, 0.5, 0.5]]}
 _CLOUD = "cloud"
 _DEPTH = 8.0  # optical, through the cloud's box at density 1
 _OCTAVES = range(2, 7)
@@ -173,8 +181,12 @@ def lattice_rows(bench: SmokeBench) -> list[Row]:
     calls["kernel"] = lambda: torch.neg(source, out=target)
     for name, (size, settings) in cases.items():
         calls[name] = partial(_jet(bench, size, **settings).step, chunk)
-    sphere = f"float32, moving sphere, {small}³"
-    calls[sphere], moved = _moving(bench, small)
+    moving = {f"{storage}, moving sphere, {small}³": storage for storage in ("float32", "float16")}
+    for name, storage in moving.items():
+        lattice = _jet(bench, small, storage=storage)
+        lattice.set_bodies([_sphere(small, moves=True)])
+        cases[name] = (small, {"storage": storage})
+        calls[name] = partial(lattice.step, chunk)
     times = bench.time(calls)
     # The faster of a memcpy and a kernel: devices differ.
     copy = min((times.pop("copy"), times.pop("kernel")), key=lambda timing: timing.median_ms)
@@ -185,9 +197,7 @@ def lattice_rows(bench: SmokeBench) -> list[Row]:
         ms = timing.median_ms / chunk
         figures = {"mlups": 1e-3 * size**3 / ms, "of_copy": bench.of_copy(_bytes(**settings) * size**3, ms)}
         rows.append(bench.row("lattice", name, scene="jet", timing=timing, calls=chunk, cells=size, **figures))
-    figures = {"cells": small, "mlups": 1e-3 * small**3 * moved / times[sphere].median_ms}
-    note = "marked anew each step"
-    return [*rows, bench.row("lattice", sphere, note, scene="jet", timing=times[sphere], calls=moved, **figures)]
+    return rows
 
 
 def storage_rows(bench: SmokeBench) -> list[Row]:
@@ -246,6 +256,33 @@ def advection_rows(bench: SmokeBench) -> list[Row]:
     return rows
 
 
+def mass_rows(bench: SmokeBench) -> list[Row]:
+    """Measures the smoke that a closed box of 1 m gains while hot smoke rises in it, without sources or outlets."""
+    bench.note("measuring the mass of smoke in a closed box")
+    rows, n = [], bench.sizes.small
+    for solid, obstacles in (("", []), (", a sphere crosses", [_CROSSING])):
+        for scheme, storage in itertools.product(_SCHEMES, advection.STORAGES):
+            if solid and storage == "float16" and not bench.sizes.every:
+                continue
+            settings = {
+                "name": "closed box",
+                "grid": {"cells": [n] * 3, "cell": 1.0 / n, "refine": 2, "faces": dict.fromkeys(FACES, "wall")},
+                "smoke": {"buoyancy": 5.0, "scheme": scheme, "storage": storage},
+                "sources": [{"centre": [0.5, 0.2, 0.5], "radius": 0.1, "temperature": 1, "stop": 0.1 * _FILLED}],
+                "obstacles": obstacles,
+                "frames": 5 * _FILLED,
+                "rate": 10.0,
+            }
+            scene = Scene.model_validate(settings)
+            solver, mass = make_solver(scene, device=bench.device), {}
+            for frame in range(1, scene.frames + 1):
+                advance(scene, solver, frame)
+                mass[frame] = float(volume_of(scene, solver).density.double().sum())
+            figures = {"smoke_gained": mass[scene.frames] / mass[_FILLED] - 1.0, "voxels": 2 * n}
+            rows.append(bench.row("advection mass", f"{scheme}, {storage}{solid}", scene="closed box", **figures))
+    return rows
+
+
 def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
     """Times an advection step in sparse bricks, with smoke in several shares of the box."""
     bench.note("timing advection in sparse bricks")
@@ -254,7 +291,8 @@ def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
     box, velocity = _box(n), _swirl(n, bench.device)
     walls = _walls(box, bench.device, 0.0)
     for scheme in _SCHEMES:
-        dense = _carry(bench, scheme, box, velocity, walls, _cubes(bench, 1.0, scheme))
+        fields = [_fields(_cube(bench, 1.0), "float32", bench.device) for _ in range(3)]
+        dense = _carry(bench, scheme, box, velocity, walls, fields)
         calls, lists = {"dense": dense}, {}
         for fill in bench.sizes.fills:
             name = f"smoke in {100 * fill:g}%"
@@ -263,7 +301,7 @@ def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
         for name, timing in times.items():
             figures = {"voxels": edge}
             if name != "dense":
-                worked = int(lists[name].count.numpy()[0]) * advection_places.BRICK**3 / edge**3
+                worked = int(lists[name].bricks.counts.numpy()[0]) * advection_places.CELLS / edge**3
                 figures["worked_on"] = min(worked, 1.0)
                 figures["speedup"] = times["dense"].median_ms / timing.median_ms
             rows.append(bench.row("advection bricks", f"{scheme}, {name}", scene="cube", timing=timing, **figures))
@@ -283,30 +321,15 @@ def _jet(bench: SmokeBench, size: int, faces: str = "all", **settings) -> Lattic
         across = (np.indices((size, size)) + 0.5) / size - 0.5
         lattice.set_inlet("-x", (_SPEED, 0.0, 0.0), where=np.hypot(*across) < 0.15)
         lattice.set_outlet("+x")
-        lattice.set_solid(_sphere(wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device), 0.0))
+        lattice.set_bodies([_sphere(size)])
     return lattice
 
 
-def _sphere(mask: wp.array, moved: float) -> wp.array:
-    size = mask.shape[0]
-    voxelise_sphere(mask, 1, (0.4 * size + moved, 0.5 * size, 0.5 * size), 0.12 * size)
-    return mask
-
-
-def _moving(bench: SmokeBench, size: int) -> tuple[Callable[[], None], int]:
-    """Returns a call that does some solver steps while a sphere moves to and fro, and the number of these steps."""
-    lattice, speed, steps = _jet(bench, size), 0.05, 10
-    mask = wp.zeros((size,) * 3, dtype=wp.uint8, device=bench.device)
-    lattice.step(1)
-
-    def go() -> None:
-        for k in range(steps):
-            there = k < steps // 2
-            _sphere(mask, speed * (k if there else steps - k))
-            lattice.set_solid(mask, (speed if there else -speed, 0.0, 0.0))
-            lattice.step(1)
-
-    return go, steps
+def _sphere(size: int, moves: bool = False) -> Sphere:
+    """Makes a sphere in a box of `size` cells; it may move to and fro, at 0.05 cells per step."""
+    places = np.full((_PLACES if moves else 1, 3), 0.5 * size)
+    places[:, 0] = 0.4 * size + 5.0 * (np.arange(len(places)) % 2)
+    return Sphere(Trajectory.of(places, 100.0 * np.arange(len(places))), 0.12 * size)
 
 
 def _bytes(lattice: str = "D3Q19", storage: str = "float32", faces: str = "all", **_) -> int:
@@ -333,8 +356,7 @@ def _walls(box: advection_places.Box, device: str, radius: float) -> wp.array:
     n = box.coarse[0]
     walls = wp.zeros(n**3 if radius else 0, dtype=wp.uint8, device=device)
     if radius:
-        solid = wp.zeros((n,) * 3, dtype=wp.uint8, device=device)
-        voxelise_sphere(solid, 1, (0.5 * n,) * 3, radius * n)
+        solid = cells_of([Sphere(Trajectory.of((0.5 * n,) * 3), radius * n)], (n,) * 3, device)
         advection_places.mark_walls(box, solid.flatten(), walls)
     return walls
 
@@ -358,39 +380,38 @@ def _carry(bench: SmokeBench, scheme: str, box, velocity, walls, fields) -> Call
     return bench.replay(step)
 
 
-def _cubes(bench: SmokeBench, fill: float, scheme: str) -> list[advection.Fields]:
-    """Makes smoke fields with a cube of smoke in a corner; `fill` is the cube's volume as a share of the box."""
+def _cube(bench: SmokeBench, fill: float) -> torch.Tensor:
+    """Makes a density with a cube of smoke in a corner; `fill` is the cube's volume as a share of the box."""
     edge = _RATIO * bench.sizes.coarse
     density = torch.zeros((edge,) * 3, device=bench.device)
     full = round(fill ** (1 / 3) * edge)
     density[:full, :full, :full] = 0.5
-    return [_fields(density, "float32", bench.device) for _ in range(3 if scheme == "maccormack" else 2)]
+    return density
 
 
 def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
     """Returns a call that does one advection step in sparse bricks, including their lists, and returns the bricks."""
-    fields = _cubes(bench, fill, scheme)
     rings = advection_places.rings_for(math.sqrt(1.0 / 3.0) * _SUBSTEPS * _RATIO)
-    bricks = advection_places.make_bricks(box, rings, _THRESHOLD, bench.device)
-    edge = box.n[0]
-    at = torch.arange(edge**3, device=bench.device)
-    brick = torch.zeros(bricks.busy.shape[0], dtype=torch.int32, device=bench.device)
-    x, y, z = at // edge**2, at // edge % edge, at % edge
-    size = advection_places.BRICK
-    index = (x // size * box.bricks[1] + y // size) * box.bricks[2] + z // size
-    brick[index[wp.to_torch(fields[0].density) > 0]] = 1
-    busy = to_warp(brick)
+
+    def make(cells: int) -> advection.Fields:
+        return _fields(torch.zeros(cells), "float32", bench.device)
+
+    buffers = 3 if scheme == "maccormack" else 2
+    pool = BrickPool(box, rings, _THRESHOLD, make, buffers, wp.get_device(bench.device))
+    # A graph has no pool that grows.
+    pool.reserve(pool.most)
+    pool.put(*gather([_cube(bench, fill)]))
+    busy, bricks, fields = wp.clone(pool.bricks.busy), pool.bricks, pool.fields
 
     def step() -> None:
         wp.copy(bricks.busy, busy)
-        advection_places.relist(box, bricks)
-        for field in fields:
-            advection_sources.empty_retired(box, bricks, field)
+        pool.relist()
+        pool.store()
         advection.advect(box, velocity, walls, fields[0], fields[1], _SUBSTEPS, bricks=bricks)
         if scheme == "maccormack":
             advection.advect(box, velocity, walls, fields[0], fields[2], _SUBSTEPS, bricks=bricks, predicted=fields[1])
 
-    return bench.replay(step), bricks
+    return bench.replay(step), pool
 
 
 def _turn(bench: SmokeBench, scheme: str, storage: str) -> dict[str, float]:
@@ -695,6 +716,7 @@ _PARTS: tuple[Callable[[SmokeBench], Iterable[Row]], ...] = (
     lattice_rows,
     storage_rows,
     advection_rows,
+    mass_rows,
     smoke_brick_rows,
     guide_rows,
     six_rows,

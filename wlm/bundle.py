@@ -23,8 +23,10 @@ has no use for is left out. From a bundle's `document` they read these keys, amo
               (numbers above the range of 8 bits)
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import resources
 from typing import Any, Self
 
 import numpy as np
@@ -53,6 +55,7 @@ RESERVED = frozenset(
 )
 """Keys of an exported index that `wlm.export` fills in; a document must not have them."""
 
+_MARK = re.compile(r"@(\w+)@")
 _SAMPLER = """\
 #ifndef {macro}
 #ifndef {macro}_BINDING
@@ -143,6 +146,16 @@ class Bundle:
         """Bytes that the textures and buffers take in GPU memory, including the ones in `parts`."""
         own = sum(item.nbytes for item in (*self.textures.values(), *self.buffers.values()))
         return own + sum(part.nbytes for part in self.parts.values())
+
+
+def filled(package: str, name: str, /, **parts: object) -> str:
+    """Reads a text from the folder `assets` of a package and replaces its marks `@NAME@` by `parts`.
+
+    Raises:
+        KeyError: A mark is not among `parts`.
+    """
+    text = (resources.files(package) / "assets" / name).read_text(encoding="utf-8")
+    return _MARK.sub(lambda match: str(parts[match[1]]), text)
 
 
 def sampler(name: str, kind: str) -> str:

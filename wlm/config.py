@@ -26,7 +26,7 @@ _INTEGER_LENGTH = 80  # characters: 64 binary digits with signs between them
 
 def load_settings(cls: type[_Settings], path: str | os.PathLike[str]) -> _Settings:
     """Reads a YAML file, one mapping, into a settings model and checks it, see `check_settings`."""
-    return check_settings(cls, read_yaml(path), f"{path}: ")
+    return check_settings(cls, read_yaml(path), f"{path}: ", folder=Path(path).parent)
 
 
 def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
@@ -55,16 +55,21 @@ def read_yaml(path: str | os.PathLike[str]) -> dict[Any, Any]:
 
 
 def check_settings(
-    cls: type[_Settings], values: Any, prefix: str = "", extra: Literal["forbid", "ignore"] = "forbid"
+    cls: type[_Settings],
+    values: Any,
+    prefix: str = "",
+    extra: Literal["forbid", "ignore"] = "forbid",
+    folder: str | os.PathLike[str] = "",
 ) -> _Settings:
     """Checks a mapping of plain values as a settings model, whatever its own configuration says about unknown keys:
     errors, or ignored with `extra`.
 
     `prefix` is the text before the field's name in an error, such as `"scene.yaml: "` or `"file: profile."`; `"--"`
-    writes the field as a command line option, with dashes.
+    writes the field as a command line option, with dashes. Validators find `folder`, to which paths of files are
+    relative, in their context.
     """
     try:
-        return cls.model_validate(values, extra=extra)
+        return cls.model_validate(values, extra=extra, context={"folder": folder})
     except ValidationError as error:
         raise WlmError(f"{prefix}{_first_problem(cls, error, as_option=prefix == '--')}") from error
 

@@ -4,14 +4,11 @@ import json
 import math
 from pathlib import Path
 
-import imagecodecs
 import numpy as np
 import pytest
-import trimesh
 from builders.checks import error_of
 from builders.gltf_scene import Thing, box, write_scene
 from builders.rooms import write_room
-from builders.textures import make_dds, make_ktx2
 from PIL import Image
 
 from wlm.atlas.coverage import covered_texels, touched_texels
@@ -86,22 +83,6 @@ def test_a_mesh_from_files_and_arrays(tmp_path, kind):
     assert sheet.active.all() and [sheet.position.dtype, sheet.uv.dtype] == [np.float64] * 2
     assert [sheet.triangle.dtype, sheet.lightmap.dtype, sheet.mask.dtype] == [np.int32, np.float32, bool]
     assert mesh.source == from_arrays(POSITION, TRIANGLE, UV, _lightmap()).source
-
-
-def test_a_lightmap_of_any_format(tmp_path):
-    glb, light = _files(tmp_path)
-    texels = _lightmap()
-    texels[5] = np.inf  # outside the chart
-    (tmp_path / "a.ktx2").write_bytes(make_ktx2(106, WIDTH, HEIGHT, [texels.tobytes()], scheme=3))
-    (tmp_path / "a.dds").write_bytes(make_dds(6, WIDTH, HEIGHT, texels.tobytes()))
-    (tmp_path / "a.hdr").write_bytes(imagecodecs.rgbe_encode(_lightmap(), header=True))
-    expected = load(glb, light)
-    for name in ("a.ktx2", "a.dds"):
-        mesh = load(glb, tmp_path / name)
-        assert mesh.warnings == ()
-        np.testing.assert_array_equal(mesh.sheets[0].lightmap, expected.sheets[0].lightmap)
-    mesh = load(glb, tmp_path / "a.hdr")
-    np.testing.assert_allclose(mesh.sheets[0].lightmap, expected.sheets[0].lightmap, rtol=2**-7)
 
 
 def test_source_names_all_that_counts():
@@ -278,35 +259,6 @@ def test_a_mask_that_is_derived_leaves_out_what_was_never_baked():
     tiny = np.array([[0.51, 0.52], [0.52, 0.52], [0.51, 0.53]])
     dark = from_arrays(POSITION[:3], TRIANGLE[:1], tiny, lightmap * 0)
     assert np.argwhere(dark.sheets[0].mask).tolist() == [[3, 4]]
-
-
-def test_a_mesh_is_written_with_new_uvs(tmp_path):
-    files = _files(tmp_path)
-    mesh = load(*files)
-    corner_uv = np.zeros((2, 3, 2))
-    corner_uv[0] = [[0, 0], [1, 0], [0, 1]]
-    corner_uv[1] = [[-0.0, 1], [1, 0], [0.5, 0.5]]  # shares both of its old vertices with the first
-    assert _write_mesh(tmp_path / "out.glb", mesh, corner_uv) == 1
-    again = load(tmp_path / "out.glb", files[1])
-    assert again.uv_set == 1 and len(again.sheets[0].position) == 4
-    np.testing.assert_array_equal(again.sheets[0].uv[again.sheets[0].triangle], corner_uv + 0.0)
-    np.testing.assert_array_equal(again.sheets[0].position[again.sheets[0].triangle], POSITION[TRIANGLE])
-    original = load(tmp_path / "out.glb", files[1], uv_set=0)
-    np.testing.assert_array_equal(original.sheets[0].uv[original.sheets[0].triangle], UV[TRIANGLE])
-    corner_uv[1, 0] = 0.25
-    assert _write_mesh(tmp_path / "out.glb", again, corner_uv) == 2
-    assert len(load(tmp_path / "out.glb", files[1], uv_set=2).sheets[0].position) == 5
-
-
-def test_what_came_from_an_obj_is_written_as_glb(tmp_path):
-    (tmp_path / "a.obj").write_text(OBJ)
-    write_exr(tmp_path / "light.exr", _lightmap())
-    mesh = load(tmp_path / "a.obj", tmp_path / "light.exr")
-    _write_mesh(tmp_path / "out.glb", mesh, mesh.sheets[0].uv[mesh.sheets[0].triangle] * 0.5)
-    again = load(tmp_path / "out.glb", tmp_path / "light.exr")
-    np.testing.assert_array_equal(again.sheets[0].uv, UV * 0.5)
-    (loaded,) = trimesh.load(tmp_path / "out.glb").geometry.values()
-    np.testing.assert_array_equal(loaded.vertices[loaded.faces], POSITION[TRIANGLE])
 
 
 def test_texels_touched_and_covered_as_by_cutting_polygons():

@@ -7,6 +7,7 @@ from reference import patches as reference
 from wlm.atlas.cascade import cluster as clustering
 from wlm.atlas.cascade.cluster import Clusters, cluster
 from wlm.atlas.charts import charts, welded
+from wlm.errors import WlmError
 from wlm_kernels.atlas import patches as kernels
 from wlm_kernels.atlas.patches import ORDERS, SIZES
 
@@ -83,7 +84,7 @@ def test_against_naive(device: str, threshold: float, colour_threshold: float):
         threshold=threshold,
         colour_threshold=colour_threshold,
         active=active,
-        largest=65,
+        patch_size=65,
         device=device,
         progress=reports.append,
     )
@@ -105,10 +106,10 @@ def test_many_triangles_are_grouped_by_samples(device: str, monkeypatch: pytest.
     """Each is like its representative, no two representatives are alike, and there are few more of them."""
     count = 100
     (uv, triangle), lightmap = _mesh(count), _lightmap()
-    exact = cluster(uv, triangle, lightmap, largest=65, device=device)
+    exact = cluster(uv, triangle, lightmap, patch_size=65, device=device)
     monkeypatch.setattr(clustering, "SAMPLE", 20)
     reports = []
-    clusters = cluster(uv, triangle, lightmap, largest=65, device=device, progress=reports.append)
+    clusters = cluster(uv, triangle, lightmap, patch_size=65, device=device, progress=reports.append)
     _sound(clusters, count)
     assert clusters.distance.max() < 0.03
     patches, edges, _ = _naive(uv, triangle, lightmap, 0.03, 0.09, 2.0, np.ones(count, bool))
@@ -188,6 +189,42 @@ def test_bright_triangles(device: str):
     assert not clusters.excluded.any()
 
 
+@pytest.mark.parametrize("patch_size", [17, None])
+def test_stripes_in_a_large_triangle(device: str, patch_size: int | None):
+    """Stripes of 15 texels in a triangle of 480 are 1/4 away from one of their colours; 17 samples miss one."""
+    lightmap = np.full((512, 1024, 3), 1.5, np.float32)
+    lightmap[:, :512] = np.where(np.arange(512) // 15 % 2, 0.5, 1.5)[None, :, None]
+    corners = np.array([[8.0, 8], [488, 8], [8, 488]])
+    uv = (np.concatenate([corners, corners + [512, 0]]) + 0.5) / [1024, 512]
+    arguments = uv, np.arange(6).reshape(2, 3), lightmap
+    clusters = cluster(*arguments, threshold=0.5, colour_threshold=2.0, patch_size=patch_size, device=device)
+    y, x = np.mgrid[8:489, 8:489]
+    inside = (x + y <= 496)[..., None]
+    true = (np.abs(lightmap[8:489, 8:489] - 1.5) / 2.0).mean(where=inside, dtype=np.float64)
+    assert true == pytest.approx(0.25, abs=1e-3)
+    assert (abs(clusters.distance.max() - true) < 0.1 * true) == (patch_size is None)
+    alone = cluster(*arguments, colour_threshold=2.0, device=device)
+    assert alone.representative.tolist() == [0, 1]
+
+
+def test_a_few_bright_texels_of_a_large_triangle(device: str):
+    """Four texels in a row that no sample reads exclude the triangle that contains them, and no other."""
+    lightmap = np.zeros((512, 512, 3), np.float32)
+    lightmap[103, 210:214] = 5.0
+    inside, outside = ([[8, 8], [488, 8], [8, 488]], [[488, 488], [488, 15], [15, 488]])
+    uv = (np.array([inside, outside], float).reshape(-1, 2) + 0.5) / 512
+    for turned in ([0, 1, 2], [2, 1, 0]):
+        clusters = cluster(uv, np.array([turned, [3, 4, 5]]), lightmap, patch_size=17, device=device)
+        assert clusters.excluded.tolist() == [True, False]
+
+
+def test_too_many_samples():
+    """Slivers as long as a lightmap have R_s^2 / 2 samples each: refused in one line beyond 2^31."""
+    uv = np.tile([[0.0, 0.0], [1.0, 1.0], [1.0, 0.999]], (300, 1))
+    with pytest.raises(WlmError, match="patch_size: expected fewer than 2"):
+        cluster(uv, np.arange(900).reshape(-1, 3), np.zeros((4096, 4096, 3), np.float32))
+
+
 def test_ties_go_to_the_lowest_number(device: str):
     """Two pairs, each of one colour: the pair with the lower triangle is taken first, by its lower triangle."""
     lightmap = np.zeros((*SIDE, 3), np.float32)
@@ -203,7 +240,7 @@ def test_many_triangles_of_one_colour():
     import resource
 
     count = 132_000
-    clusters = cluster(*_mesh(count, longest=64), np.full((*SIDE, 3), 0.25, np.float32), largest=65)
+    clusters = cluster(*_mesh(count, longest=64), np.full((*SIDE, 3), 0.25, np.float32), patch_size=65)
     assert len(clusters.representative) == 1
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 8e6  # KiB
 

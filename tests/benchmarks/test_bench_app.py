@@ -66,6 +66,11 @@ COMMANDS = [
         {"profile": "cascade", "only": ["ASTC"], "steps": 9},
     ),
     (["smoke", "--quick"], "smoke --quick --device cpu", {"quick": True}),
+    (
+        ["kernels", "--quick", "--only", "atlas, read"],
+        "kernels --quick --device cpu --only 'atlas, read'",
+        {"quick": True},
+    ),
     (["fluid-gradients", "--quick"], "fluid-gradients --quick --device cpu", {"quick": True}),
     (["smoke-orders"], "smoke-orders --device cpu", {"quick": False}),
     (

@@ -70,13 +70,6 @@ def test_every_row_has_its_figures(rows, tmp_path):
     assert "; LDR" in next(row.notes for row in rows if row.method == "ASTC")
 
 
-def test_the_texture_is_as_good_as_the_decode(rows):
-    ours, texture = (next(row for row in rows if row.method == method) for method in ("ours", "texture"))
-    assert "one RGB9E5 texture with 8 mips" in texture.notes
-    # 8 bits lose little at such errors. The PSNR is the mean with that of the constant tile, 120 dB before rounding.
-    assert abs(texture["seen"] - ours["seen"]) < 0.1 and abs(texture["worst_seen"] - ours["worst_seen"]) < 0.1
-
-
 def test_errors_against_the_float64_path(rows):
     by_name = {(row.method, row.option): row.get("max_error") for row in rows}
     # Radiance up to 2.6 in float32: 1e-6 measured.
@@ -87,11 +80,6 @@ def test_errors_against_the_float64_path(rows):
     assert 0.95 * half < by_name["exact", "erf"] < half + 5e-3
     # A channel of RGB9E5 errs by up to a 1024th of the brightest one, which is 2.6 times the darkest.
     assert 1e-4 < by_name["pages", "M"] < 2e-3
-
-
-def test_all_pages_are_decoded_and_timed(rows):
-    texture, pages = (next(row for row in rows if row.method == method) for method in ("texture", "pages"))
-    assert pages["pages_decoded"] == 3 + 2 + 1 and abs(pages["psnr"] - texture["psnr"]) < 0.1
 
 
 @pytest.mark.slow

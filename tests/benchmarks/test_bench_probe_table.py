@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from builders.bench_rows import keys
 
-from benchmarks.probe_table import RIVALS, Errors, nearest_probes, table_rows
+from benchmarks.probe_table import RIVALS, nearest_probes, table_rows
 from wlm.errors import WlmError
 from wlm.probe.data import from_arrays
 from wlm.probe.evaluation import by_distance, score
@@ -74,17 +74,6 @@ def test_errors_of_the_originals_are_those_of_reading(made, probes):
     assert 25.0 < row["volume_psnr"] < 120.0 and row["volume_relative_db"] > 15.0
 
 
-def test_less_light_is_seen_everywhere(probes):
-    values = probes.values[probes.live]
-    exact, dim, black = Errors(probes, "cpu", 2).of([values, values * np.float32(0.8), values * np.float32(0.0)])
-    assert dim["relative_error"] == pytest.approx(0.2, rel=1e-5) and black["relative_db"] == pytest.approx(
-        0.0, abs=1e-5
-    )
-    for name in ("psnr", "held_out_psnr", "volume_psnr", "volume_relative_db", "view_psnr"):
-        assert exact[name] > dim[name] > black[name], name
-    assert exact["view_flip"] < dim["view_flip"] < black["view_flip"]
-
-
 def test_a_single_probe_has_no_held_out_light(probes):
     one = nearest_probes(probes, 1)
     (row,) = (
@@ -100,8 +89,3 @@ def test_the_nearest_probes_are_around_the_middle(probes):
     for count in (0, 271):
         with pytest.raises(WlmError, match="expected 1 to 270 live probes"):
             nearest_probes(probes, count)
-
-
-def test_an_unknown_method_is_one_line(probes):
-    with pytest.raises(WlmError, match="--only: expected one of ours, PCA, rivals; found 'JPEG'"):
-        table_rows([probes], PROFILE, device="cpu", only=["JPEG"])

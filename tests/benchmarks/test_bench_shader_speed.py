@@ -55,11 +55,6 @@ def test_a_texture_holds_its_texels(screen, fmt, layers):
     np.testing.assert_allclose(picture.read()[..., : expected.shape[2]], expected, rtol=1e-3, atol=1e-3)
 
 
-def test_a_picture_is_timed(screen):
-    picture = screen.picture("vec4 shown(ivec2 pixel) { return vec4(pixel, 0.0, 1.0); }\n", (2, 3), {})
-    assert picture.read()[1, 2].tolist() == [2.0, 1.0, 0.0, 1.0] and picture.time(2) > 0.0
-
-
 def test_software_is_no_gpu(screen):
     if not screen.name.startswith("llvmpipe"):
         pytest.skip(f"OpenGL has a GPU here: {screen.name}")

@@ -29,6 +29,7 @@ METHODS = [
     ("jet", "lattice"),
     ("jet", "lattice storage"),
     ("ball", "advection"),
+    ("closed box", "advection mass"),
     ("cube", "advection bricks"),
     ("cloud", "guide"),
     ("cloud", "six ways"),
@@ -50,7 +51,7 @@ def test_every_row_has_its_figures(rows, tmp_path):
     assert len(set(labels)) == len(labels)
     for row in rows:
         assert row.system == "smoke" and row.figures
-        assert ("time_ms" in row.figures) == (row.method not in ("lattice storage", "weights"))
+        assert ("time_ms" in row.figures) == (row.method not in ("lattice storage", "advection mass", "weights"))
         assert row.get("time_ms") is None or row["time_ms"] > 0.0
 
 
@@ -73,16 +74,6 @@ def test_shares_of_the_copy(rows):
     for option, moved in (("semi-lagrangian, float32", 8), ("maccormack, float32", 20), ("maccormack, float16", 10)):
         row = by_option(rows, "advection")[option]
         assert row["of_copy"] == pytest.approx(24**3 * moved / (1e-3 * row["time_ms"]) / bandwidth)
-
-
-def test_schemes_and_a_solution(rows):
-    """The ball comes round; the scheme of second order is the better one, and 16 bits change little."""
-    advection = by_option(rows, "advection")
-    error = {option: row["rms"] for option, row in advection.items() if "rms" in row.figures}
-    assert len(error) == 4 and error["maccormack, float32"] < 0.8 * error["semi-lagrangian, float32"] < 0.8
-    bricks = by_option(rows, "advection bricks")
-    assert bricks["maccormack, smoke in 0%"]["worked_on"] == 0.0
-    assert bricks["maccormack, smoke in 100%"]["worked_on"] == 1.0
 
 
 def test_a_frame_is_the_sum_of_its_stages(rows):

@@ -81,26 +81,6 @@ def test_parts_of_a_frame(rows):
     assert "32x32x32" in frame["simulation"].notes
 
 
-def test_flip_book(rows):
-    """Right from where it was baked, and wrong from elsewhere, where march and network are as good as ever."""
-    turned = by_option(rows, "flip book")
-    assert turned["turned 0°"]["psnr"] > 60.0 > 35.0 > turned["turned 60°"]["psnr"]
-    for row in turned.values():
-        assert row.notes == "coarse march of h 0.8, network young"
-        assert row["coarse_psnr"] > 40.0 and row["network_psnr"] == pytest.approx(row["coarse_psnr"], abs=0.01)
-
-
-def test_density_and_flicker(rows):
-    density = by_option(rows, "density")
-    marches = [f"coarse, h {h}" for h in ("0.8", "0.4", "0.24")]
-    assert list(density) == [f"{name}, x{scale}" for scale in (1, 2) for name in ("young", *marches)]
-    for scale in (1, 2):
-        network, march = density[f"young, x{scale}"], density[f"coarse, h 0.8, x{scale}"]
-        assert network["psnr"] == pytest.approx(march["psnr"], abs=0.05)
-        assert 0.9 < march["flicker_ratio"] < 1.5 and march["flicker"] > 0.0
-    assert density["coarse, h 0.8, x2"]["psnr"] < density["coarse, h 0.8, x1"]["psnr"]
-
-
 def test_a_score():
     references = [torch.zeros(8, 4, 4), torch.ones(8, 4, 4)]
     predicted = [torch.full((8, 4, 4), 0.1), torch.ones(8, 4, 4) - 0.01]

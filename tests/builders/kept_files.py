@@ -22,7 +22,7 @@ from builders.small_sets import moving_light, tiny_profile
 import wlm
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import Sphere, Trajectory
-from wlm.fluid.solver import Solver
+from wlm.fluid.solver import Solver, Source
 from wlm.formats.checkpoint import Checkpoint
 from wlm.lightmap import trainer as lightmap_trainer
 from wlm.lightmap.fit import SheetFit
@@ -152,9 +152,9 @@ def _training() -> Kept:
         for other in (path, Path(f"{path}.csv")):
             other.unlink(missing_ok=True)
 
-    def read(path: Path) -> None:
+    def read(path: Path) -> Any:
         with mock.patch("wlm.smoke.fit._CHUNK", 2):
-            train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0, **pools)
+            return train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0, **pools)
 
     free = {"clock": "nan", "curve": "nan size"}
     ranges = {"step": ((), -1), "skipped": ((), 99.0), "counts": (0, -1), "adam.step.heads.0.bias": ((), -1.0)}
@@ -168,9 +168,16 @@ def _training() -> Kept:
 
 def _simulation() -> Kept:
     ball = Sphere(Trajectory.of(np.array([[4.0, 4.0, 4.0]]), np.array([0.0])), 1.5)
-    solver = Solver(Lattice((8, 8, 8), viscosity=0.1), refinement=1, obstacles=[ball])
+    source = Source("box", (1, 1, 1), (1, 1, 1), 1.0)
+    solver = Solver(Lattice((8, 8, 8), viscosity=0.1), refinement=2, obstacles=[ball], sources=[source])
     solver.step(2)
-    return Kept(_written(solver.save), solver.load, {}, {"lattice.steps": ((), -1), "density": ((0, 0, 0), -1.0)})
+
+    def read(path: Path) -> Solver:
+        solver.load(path)
+        return solver
+
+    ranges = {"lattice.steps": ((), -1), "density": ((0, 0, 0, 0), -1.0), "bricks": (0, 8)}
+    return Kept(_written(solver.save), read, {}, ranges)
 
 
 KEPT: dict[str, Callable[[], Kept]] = {

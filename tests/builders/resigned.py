@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from builders.checks import error_of
 
+import wlm
 from wlm.formats.artifact import read_artifact, write_artifact
 
 GONE = object()
@@ -43,6 +45,17 @@ def rewrite(
         changed = {name: change(values[name]) if callable(change) else change for name, change in changes.items()}
         contents.append({name: value for name, value in {**values, **changed}.items() if value is not GONE})
     write_artifact(path, artifact.system, *contents, artifact.source)
+
+
+def error_of_changed(
+    model: Any, path: Path, settings: Mapping[str, Any] | None = None, tensors: Mapping[str, Any] | None = None
+) -> str:
+    """The error of the file of a model with other settings or parts, which names the file, when all of it is read."""
+    model.save(path)
+    rewrite(path, settings, tensors)
+    text = error_of(lambda: wlm.load(path).check())
+    assert text.startswith(str(path)), text
+    return text
 
 
 def rewrite_number(path: Path, key: str, text: str) -> None:

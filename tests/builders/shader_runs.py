@@ -167,14 +167,14 @@ def run_wgsl_compute(text, size, bound, group):
     return _run(text, size, {name: bound[name] for name in used}, used, group)
 
 
-def compile_hlsl(source, folder):
-    """Compiles HLSL to shader.spv; skips the test, with what to install, where glslang is missing."""
+def compiled(text, folder, *words, name="shader.comp", spirv=True):
+    """Compiles a shader, to shader.spv if asked to; skips the test, with what to install, where glslang is missing."""
     if shutil.which("glslangValidator") is None:
         pytest.skip("no glslangValidator: install glslang-tools")
-    (folder / "shader.comp").write_text(source)
-    words = ["glslangValidator", "-D", "-V", "-e", "main", "-o", "shader.spv", "shader.comp"]
+    (folder / name).write_text(text)
+    words = ["glslangValidator", *["-V", "-o", "shader.spv"] * spirv, *words, name]
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
+    assert done.returncode == 0 and "WARNING" not in done.stdout, done.stdout
 
 
 def run_hlsl(text, expression, size, bound, tmp_path):
@@ -190,7 +190,7 @@ def run_hlsl(text, expression, size, bound, tmp_path):
     int2 pixel = int2(id.xy);
     if (pixel.x < {size[1]} && pixel.y < {size[0]}) {{ wlm_out[pixel.y * {size[1]} + pixel.x] = {expression}; }}
 }}"""
-    compile_hlsl(source, tmp_path)
+    compiled(source, tmp_path, "-D", "-e", "main")
     used = {name: place for place, name in enumerate(names) if len(re.findall(rf"\b{name}\b", source)) > 1}
     code = (tmp_path / "shader.spv").read_bytes()
     return _run(code, size, {name: bound.get(name) for name in used}, used)

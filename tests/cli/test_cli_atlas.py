@@ -44,13 +44,6 @@ def cascade(inputs, tmp_path_factory):
     return folder / "a.wlm"
 
 
-def test_compress_writes_one_file_and_prints_one_table(inputs, tmp_path):
-    text = call("compress", *inputs, "-o", tmp_path / "a.wlm", *QUICK)
-    model, size = wlm.load(tmp_path / "a.wlm"), (tmp_path / "a.wlm").stat().st_size
-    assert f"{model.compression_ratio:.2%}" in text and f"{-(-model.bits // 8):,}" in text and f"{size:,}" in text
-    assert "fit: weights" in call.stderr and os.listdir(tmp_path) == ["a.wlm"]
-
-
 def test_the_options_of_compress_reach_the_fit(inputs, tmp_path):
     mask = np.zeros((40, 48), np.uint8)
     mask[:30] = 255
@@ -134,16 +127,6 @@ def test_evaluate_refuses_other_inputs(inputs, tiles, tmp_path):
     write_exr(tmp_path / "light.exr", changed)
     assert re.search("expected the mesh and lightmaps .*[0-9a-f]{16}", fails(*words, tmp_path / "light.exr"))
     assert "expected a name that ends in .json" in fails(*words, inputs[1], "--json", tmp_path / "a.txt")
-
-
-@pytest.mark.parametrize("kind", ["tiles", "cascade"])
-def test_decode_the_lightmap(kind, inputs, request, tmp_path):
-    path, mesh = request.getfixturevalue(kind), load(*inputs).sheets[0]
-    text = call("decode", path, "-o", tmp_path / "a.exr")
-    expected = wlm.load(path).decoder().lightmap()
-    decoded, _ = read_exr(tmp_path / "a.exr")
-    np.testing.assert_array_equal(decoded, expected.astype(np.float16))
-    assert "48x40" in text and np.abs(decoded - mesh.lightmap)[mesh.mask].mean() < 0.1
 
 
 def test_wrong_words_of_decode(tiles, tmp_path):

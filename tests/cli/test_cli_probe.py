@@ -47,20 +47,6 @@ def carrying(room, profile, tmp_path_factory):
     return path
 
 
-def test_compress_prints_one_table(room, profile, tmp_path):
-    out = tmp_path / "a.wlm"
-    text = call("compress", room, "-o", out, "--profile", profile)
-    size, model = out.stat().st_size, wlm.load(out)
-    for word in (f"{size:,}", f"{size * 8 / PROBES:.2f}", f"{size / (PROBES * 27 * 4):.2%}"):
-        assert word in text
-    assert re.search(rf"gaussians +│ +{model.content.count} │", text)
-    assert model.content.count + model.content.dropped == round(0.1 * (PROBES - DEAD))
-    assert re.search(r"fit: 30 of 30, error \d+\.\d+", call.stderr)
-    assert f"{room}: {data.load(room).reading}" in call.stderr
-    assert (model.profile.name, model.profile.steps, len(model.positions)) == ("tiny", 30, 0)
-    assert [path.name for path in tmp_path.iterdir()] == ["a.wlm"], "no checkpoint is left"
-
-
 def test_the_options_of_compress_reach_the_fit(room, profile, tmp_path):
     out, other, wider = tmp_path / "a.wlm", tmp_path / "b.wlm", tmp_path / "wider.yaml"
     wider.write_text(profile.read_text().replace("latent: 3", "latent: 4"))
@@ -89,17 +75,6 @@ def test_a_fit_to_pictures_takes_a_mesh(room, profile, tmp_path):
         call("compress", room, "-o", out, "--profile", profile, "--method", "gaussians", *words)
         files.append(out.read_bytes())
     assert files[0] != files[1]
-
-
-def test_warnings_of_the_set_are_shown(profile, tmp_path):
-    probes = synthetic(20)
-    values = probes.values.reshape(-1, 9, 3).copy()
-    values[3, 2, 1] = np.nan
-    np.savez(tmp_path / "a.npz", position=probes.position, sh_noon=values, sh_night=values)
-    words = ["compress", tmp_path / "a.npz", "-o", tmp_path / "a.wlm", "--profile", profile]
-    call(*words, "--key", "noon")
-    assert re.search(r"^warning: .*1 probe", call.stderr, re.MULTILINE)
-    assert "found several arrays of values" in fails(*words)
 
 
 def decoded(path, *words):
@@ -137,15 +112,6 @@ def write_json(path, content):
     return path
 
 
-def test_decode_in_an_engines_convention(fitted, room, tmp_path):
-    text = call("decode", fitted, "--positions", room, "-o", tmp_path / "a.npz", "--convention", "unity")
-    assert "the probes" in text and f"{PROBES}" in text
-    with np.load(tmp_path / "a.npz") as arrays:
-        assert arrays["convention"] == "unity"
-    expected = wlm.load(fitted).decoder(position=data.load(room).position).decode_probes()
-    np.testing.assert_allclose(data.load(tmp_path / "a.npz").values, expected, rtol=1e-5, atol=1e-6)
-
-
 def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path):
     words = ["evaluate", fitted, room, "--json", tmp_path / "r.json"]
     text = call(*words)
@@ -157,18 +123,6 @@ def test_evaluate_prints_and_writes_the_report(fitted, room, tmp_path):
         assert word in text
     said = [line.removeprefix("warning: ") for line in call.stderr.splitlines() if line.startswith("warning: ")]
     assert f"at the worst, probe {report.worst_probe['probe']} at (" in call.stderr and said == report.warnings
-
-
-def test_evaluate_reads_numbers_channel_by_channel(fitted, room, tmp_path):
-    probes = data.load(room)
-    by_channel = probes.values.reshape(-1, 9, 3).transpose(0, 2, 1).reshape(-1, 27)
-    np.savez(tmp_path / "a.npz", position=probes.position, sh=by_channel)
-    for words, kind in (((), "assumed: --order"), (("--order", "channel"), "channel by channel (r0 r1 ... g0 ...);")):
-        call("evaluate", fitted, tmp_path / "a.npz", *words)
-        assert "not the input" not in call.stderr and kind in call.stderr
-        assert ("fits light better" in call.stderr) == (not words)
-    call("evaluate", fitted, tmp_path / "a.npz", "--order", "coefficient")
-    assert "not the input" in call.stderr and "Then add --order channel" in call.stderr
 
 
 def test_evaluate_against_another_set(fitted, tmp_path):

@@ -1,7 +1,6 @@
 """Volumes and frames from the command line: baked, predicted, shaded."""
 
 import json
-import math
 import os
 import re
 from importlib import import_module
@@ -113,34 +112,6 @@ def test_bake_of_frames(frames, baked, tmp_path):
     (tmp_path / "other.txt").write_text("x")
     assert "found other.txt" in fails("smoke", "bake", frames, "-o", tmp_path)
     assert "another folder than that of the frames" in fails("smoke", "bake", frames, "-o", frames)
-
-
-def test_shade(baked, tmp_path):
-    out = tmp_path / "s.png"
-    lights = ["--light", "1,0,0", "--light", "0,2,0:6,3,0", "--light", "0,0,1:1"]
-    one = baked / "six_0001.exr"
-    call("smoke", "shade", one, "-o", out, *lights, "--background", "0.1,0.2,0.3", "--white", 2)
-    given = [((1, 0, 0), (4 * math.pi,) * 3), ((0, 2, 0), (6, 3, 0)), ((0, 0, 1), (1, 1, 1))]
-    made = [LightSettings(toward=toward, irradiance=irradiance).light() for toward, irradiance in given]
-    six, looks = read_shaded(one)
-    scene = {"obstacles": looks.obstacles, "time": looks.time}
-    expected = to_bytes(picture(six, made, background=(0.1, 0.2, 0.3), **scene), 2.0)
-    np.testing.assert_array_equal(png(out), expected)
-    # Baked lightmaps know their camera.
-    call("smoke", "shade", baked / "six_0002.exr", "-o", out, "--light", "1,1,0", "--rule", "absolute")
-    light = LightSettings(toward=(1, 1, 0)).light()
-    six, looks = read_shaded(baked / "six_0002.exr")
-    expected = picture(six, [light], rule="absolute", obstacles=looks.obstacles, time=looks.time)
-    np.testing.assert_array_equal(png(out), to_bytes(expected))
-    # Frames have a scene: its obstacle is in the picture, and moves.
-    text = call("smoke", "shade", baked, "-o", tmp_path / "s")
-    names = [f"shade_{i:04d}.png" for i in (1, 2, 3)]
-    assert sorted(os.listdir(tmp_path / "s")) == [*names, "sheet.png"] and all(name in text for name in names)
-    without = [to_bytes(read_six_way(baked / f"six_{i:04d}.exr").shade([LIGHT])) for i in (1, 2, 3)]
-    differ = [np.abs(png(tmp_path / "s" / names[i]) - np.int32(plain)) > 2 for i, plain in enumerate(without)]
-    columns = [np.flatnonzero(each.any((0, 2))).mean() for each in differ]
-    assert columns[0] < columns[1] < columns[2]
-    assert png(tmp_path / "s" / "sheet.png").shape[1] > 3 * 20
 
 
 def test_every_route_keeps_the_scene(tmp_path):

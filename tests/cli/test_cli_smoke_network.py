@@ -10,7 +10,6 @@ import pytest
 import torch
 import yaml
 from builders.running import call, fails
-from builders.smoke_plumes import write_frames
 from builders.smoke_samples import file_content
 
 import wlm
@@ -135,16 +134,6 @@ def test_without_a_network_the_one_that_ships_is_used(network, volume, tmp_path,
     monkeypatch.setattr(codec, "shipped", lambda: network)
     monkeypatch.setattr(onnx_file, "export_onnx", lambda model, path, **size: model.settings.width)
     assert "512 x 512 pixels" in call("smoke", "export-onnx", "-o", tmp_path / "a.onnx")
-
-
-def test_predict_frames(network, tmp_path):
-    folder = write_frames(tmp_path / "frames").path
-    call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 170)
-    # One that has learned next to nothing is left out, and one line says so.
-    assert " ".join(call.stderr.split()).count("the network has a weight of") == 1
-    call("smoke", "predict", folder, "-o", tmp_path / "six", "--network", network, "--resolution", 17)
-    assert sorted(os.listdir(tmp_path / "six")) == [f"six_{i:04d}.exr" for i in (1, 2, 3)]
-    assert read_six_way(tmp_path / "six" / "six_0002.exr").lightmaps.shape == (6, 17, 17)
 
 
 def test_evaluate(network, tmp_path):

@@ -14,7 +14,7 @@ from builders.smoke_plumes import SCENE, write_frames
 
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
-from wlm.fluid.volume import load_volume, save_volume
+from wlm.fluid.volume import load_volume, save_bricks
 from wlm.formats.vdb import VdbFile
 from wlm.smoke import simulation
 from wlm.smoke.data import CHECKPOINT, load_frames, open_frames
@@ -64,15 +64,21 @@ def test_simulate(jet, tmp_path):
 
 def test_simulate_as_told(jet, tmp_path):
     words = ("smoke", "simulate", jet / "jet.yaml", "-o", tmp_path / "a", "--frames", 1, "--scale", 0.5)
-    call(*words, "--resume", "--vdb")
+    call(*words, "--resume", "--volumes", "vdb")
     assert "there was nothing to resume" in call.stderr
     footage = load_frames(tmp_path / "a")
     assert footage.numbers == (1,) and footage.scene.grid.cells == (4, 5, 4) and footage.scene.grid.cell == 0.25
     grid = VdbFile((tmp_path / "a" / "frame_0001.vdb").read_bytes(), "a")
     assert [f"{head.name} {head.type}" for head in grid.heads] == ["density float", "velocity vec3s"]
     assert grid.read("density", True).values.sum() == pytest.approx(float(footage.load(1).density.sum()))
-    call(*words)
-    assert not (tmp_path / "a" / "frame_0001.vdb").exists()
+    sizes = []
+    for form in ("nvdb", "nvdb-raw"):
+        call(*words, "--volumes", form)
+        assert not (tmp_path / "a" / "frame_0001.vdb").exists()
+        path = tmp_path / "a" / "frame_0001.nvdb"
+        assert float(load_volume(path).density.sum()) == pytest.approx(float(footage.load(1).density.sum()))
+        sizes.append(path.stat().st_size)
+    assert sizes[0] < 0.1 * sizes[1]
     for change, words in (
         ({"grid": {"cells": [4096, 4096, 4096], "cell": 0.1, "faces": {}}}, "4096 x 4096 x 4096 cells"),
         ({"air": {"speed": 0.1}}, "an obstacle of 1 m/s, 0.5 cells per step: leave air.speed null or at least 1"),
@@ -177,17 +183,17 @@ def test_hot_smoke_shortens_the_step(tmp_path):
 
 def test_a_frame_that_cannot_be_written_is_not_resumed_past(tmp_path, monkeypatch):
     """A state is saved after its frame: a missing frame is simulated again."""
-    scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_volume
+    scene, out, save = Scene.model_validate(JET), tmp_path / "out", save_bricks
 
-    def full(path, volume, **options):
+    def full(path, *content):
         if path.name == "frame_0003.npz":
             raise WlmError(f"{path}: cannot write: no space left")
-        save(path, volume, **options)
+        save(path, *content)
 
-    monkeypatch.setattr(simulation, "save_volume", full)
+    monkeypatch.setattr(simulation, "save_bricks", full)
     with pytest.raises(WlmError, match="no space left"):
         simulate(open_frames(out, scene), checkpoint_every=0.0)
-    monkeypatch.setattr(simulation, "save_volume", save)
+    monkeypatch.setattr(simulation, "save_bricks", save)
     kept = (out / CHECKPOINT).read_bytes()
     # A frame that was lost otherwise can't be made of the state that is kept.
     (out / "frame_0001.npz").rename(tmp_path / "one.npz")

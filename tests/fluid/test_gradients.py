@@ -351,6 +351,10 @@ def test_refusals():
     with pytest.raises(WlmError, match=r"^lattice: expected storage='float32'.*$"):
         fluid.DifferentiableLattice(half)
     moving = fluid.Sphere(fluid.Trajectory.of([[2, 2, 0.5], [3, 2, 0.5]], [0, 50]), 1.0)
+    lattice = Lattice((6, 4, 1), lattice="D2Q9", viscosity=VISCOSITY)
+    lattice.set_bodies([moving])
+    with pytest.raises(WlmError, match=r"^lattice: expected bodies at rest.*$"):
+        fluid.DifferentiableLattice(lattice)
     for settings, words in (
         ({"storage": "float16"}, "float16"),
         ({"bricks": True}, "bricks"),

@@ -11,6 +11,7 @@ from builders.nvdb_files import LEVEL_SET, nvdb_file, raw_grid
 from builders.vdb_files import ACTIVE_MASK, scaled, tree, vdb_file
 
 from wlm.errors import WlmError
+from wlm.fluid.black_body import black_body_luminance
 from wlm.fluid.grids import choose
 from wlm.fluid.volume import load_volume, thickness_hint
 from wlm.formats.vdb import GridHead
@@ -107,7 +108,10 @@ def test_nanovdb_that_claims_too_much(tmp_path: Path):
         (old, "expected version 32 of NanoVDB's grids, found 28"),
         (nvdb_file(bomb * 50, codec=1, size=len(whole)), "after decompression, found "),
         (nvdb_file(whole, codec=9), "expected a codec from 0 to 2, found 9"),
-        (raw_grid(smoke(), "float")[:632] + struct.pack("<2I", 2, 6) + whole[640:], r"found density \(vec3f\): export"),
+        (
+            raw_grid(smoke(), "float")[:632] + struct.pack("<2I", 2, 6) + whole[640:],
+            r"found density \(vec3f\): coloured smoke",
+        ),
     ):
         path.write_bytes(bytes(data))
         with pytest.raises(WlmError, match=rf"a\.nvdb: .*{message}"):
@@ -141,6 +145,8 @@ def test_tiles_that_overlap(tmp_path: Path):
         ("surface|level_set", None),
         ("density|vec3s", None),
         ("density|vec3s heat", None),
+        ("density color|vec3s", "density"),
+        ("scatter soot", "soot"),
         ("smoke fog", None),
         ("a b", None),
         ("points|ptdataidx32", None),
@@ -154,12 +160,19 @@ def test_the_grid_of_the_smoke(heads: str, chosen: str | None):
         group = kind.replace("_", " ") if kind == "level_set" else ""
         found.append(GridHead(name, "float" if group or not kind else kind, group))
     if chosen is None:
-        with pytest.raises(WlmError, match=f"a: expected a grid of floats named density, found {found[0].name}"):
+        reason = ".*coloured smoke is not read" if "vec3s" in heads else ""
+        with pytest.raises(
+            WlmError, match=f"a: expected a grid of floats named density, found {found[0].name}{reason}"
+        ):
             choose("a", found)
         return
     density, _, warnings = choose("a", found)
-    assert density == chosen and len(warnings) == (chosen.lower() != "density")
-    assert all(f"the grid {chosen} is read as the density" in each for each in warnings)
+    coloured = [
+        f"a: colours ({name}) are not read: smoke has one albedo" for name in ("color", "scatter") if name in heads
+    ]
+    named = [f"a: the grid {chosen} is read as the density"] * (chosen.lower() != "density")
+    assert density == chosen and len(warnings) == len(named + coloured)
+    assert all(each.startswith(text) for each, text in zip(warnings, named + coloured, strict=True))
 
 
 def test_level_sets(tmp_path: Path):
@@ -190,11 +203,52 @@ def test_two_grids_of_one_name(tmp_path: Path):
 
 
 def test_temperatures_in_kelvin(tmp_path: Path):
-    data = {"density": grid(smoke()), "temperature": grid(1500 * smoke())}
-    (tmp_path / "a.vdb").write_bytes(vdb_file(data))
-    (warning,) = load_volume(tmp_path / "a.vdb", up="y").warnings
-    assert "if they are kelvins, --volume emission=0.0005" in warning
-    assert load_volume(tmp_path / "a.vdb", up="y", emission=5e-4).warnings == ()
+    """Above 250 they are kelvins, whose light is that of black bodies, or what the user says."""
+    path, heat = tmp_path / "a.vdb", 1500 * smoke()
+    path.write_bytes(vdb_file({"density": grid(smoke()), "temperature": grid(heat)}))
+    volume = load_volume(path, up="y", emission=2.0)
+    light = black_body_luminance(heat) / black_body_luminance(1500.0)
+    np.testing.assert_allclose(volume.temperature, light, rtol=1e-5)
+    emitted = 2 * light.max()
+    assert (
+        volume.kelvin and f"are read as kelvins: the hottest voxel emits {emitted:.2g} per length" in volume.warnings[0]
+    )
+    np.testing.assert_array_equal(load_volume(path, up="y", kelvin=True).temperature, volume.temperature)
+    raw = load_volume(path, up="y", kelvin=False)
+    np.testing.assert_array_equal(raw.temperature, heat)
+    assert raw.warnings == () and not raw.kelvin
+    np.savez(tmp_path / "a.npz", density=np.ones((1, 1, 3)), temperature=np.array([[[np.nan, -5.0, 1500.0]]]))
+    mended = load_volume(tmp_path / "a.npz")
+    assert mended.temperature.tolist() == [[[0.0, 0.0, pytest.approx(1.0)]]] and len(mended.warnings) == 2
+
+
+def test_black_bodies():
+    """The candela was defined by platinum that freezes, 2,042 kelvins: 60 per square centimetre; and Wien's law."""
+    assert black_body_luminance(2042.0) == pytest.approx(60e4, rel=0.01)
+    wavelengths = np.linspace(380e-9, 780e-9, 2001)
+    # The efficiency as Wyman, Sloan and Shirley (2013) fit it, to 2%.
+    lobes = ((0.821, 568.8, 0.0213, 0.0247), (0.286, 530.9, 0.0613, 0.0322))
+    away = [(share, 1e9 * wavelengths - centre, left, right) for share, centre, left, right in lobes]
+    seen = sum(share * np.exp(-0.5 * (d * np.where(d < 0, left, right)) ** 2) for share, d, left, right in away)
+    for kelvin in (300.0, 900.0, 3000.0, 20000.0):
+        radiance = 2 * 5.9552149e-17 / wavelengths**5 / np.expm1(0.014387769 / (wavelengths * kelvin))
+        expected = 683 * np.trapezoid(radiance * seen, wavelengths)
+        assert black_body_luminance(np.array([[kelvin]]))[0, 0] == pytest.approx(
+            expected, rel=0.05 if kelvin > 500 else 0.5
+        )
+    assert black_body_luminance(np.array([-1.0, 0.0, 100.0])).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_sequence_in_kelvin(tmp_path: Path):
+    """One frame tells the unit of all, so that a cold one does not flash."""
+    for number, hottest in ((1, 200.0), (2, 1800.0)):
+        data = {"density": grid(smoke()), "temperature": grid(hottest * smoke() / smoke().max())}
+        (tmp_path / f"s_{number}.vdb").write_bytes(vdb_file(data))
+    frames = load_frames(tmp_path, up="y")
+    cold = frames.load(1)
+    assert float(cold.temperature.max()) < 1e-20 and frames.load(2).temperature.max() > 1
+    assert len(cold.warnings) == 1 and "temperatures are read as kelvins" in cold.warnings[0]
+    assert float(load_frames(tmp_path, up="y", kelvin=False).load(1).temperature.max()) == 200
 
 
 def test_one_grid_for_a_sequence(tmp_path: Path):

@@ -354,14 +354,14 @@ def test_damage(tmp_path: Path):
         load_volume(path)
     path.write_bytes(whole.replace(b"Tree_float_5_4_3", b"Tree_vec3s_5_4_3"))
     with pytest.raises(
-        WlmError, match=r"a.vdb: expected a grid of floats named density, found density \(vec3s\): export it"
+        WlmError, match=r"a.vdb: expected a grid of floats named density, found density \(vec3s\): coloured smoke"
     ):
         load_volume(path)
     nodes = tree(*smoke(), 0)
     both = vdb_file({name: (scaled(1, 1, 1), nodes, 0, False) for name in ("density", "heat")})
     path.write_bytes(both.replace(b"Tree_float_5_4_3", b"Tree_vec3s_5_4_3", 1))
     with pytest.raises(
-        WlmError, match=r"a.vdb: expected a grid of floats named density, found density \(vec3s\), heat: choose"
+        WlmError, match=r"a.vdb: expected a grid of floats named density, found density \(vec3s\), heat: coloured"
     ):
         load_volume(path)
     assert load_volume(path, density="heat").shape == (24, 16, 32)

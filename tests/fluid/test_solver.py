@@ -1,5 +1,6 @@
 """A whole simulation: smoke in moving air, obstacles, checkpoints, hard cases, and the documented examples."""
 
+import itertools
 import re
 from pathlib import Path
 
@@ -9,10 +10,11 @@ import warp as wp
 
 from wlm import fluid
 from wlm.errors import WlmError
+from wlm.fluid.bricks import require_memory
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
 from wlm.fluid.obstacles import Sphere, Trajectory, box_mesh, surface
-from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source, require_memory
+from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
 
 SHAPE = (20, 10, 10)
 NOZZLE = Source("box", (2, 5, 5), (1.5, 2.5, 2.5), 1.0, 0.5, fixed=True)
@@ -75,6 +77,49 @@ def test_still_smoke_costs_its_bricks(device: str):
     assert solver.active_cells == 3 * 2 * 2 * 512
 
 
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_bricks_are_the_smoke_of_all_cells(scheme: str, device: str):
+    """To the last bit at a threshold of 0: with a moving obstacle, buoyancy, decay, a source that moves and one that an
+    obstacle covers; the pool grows."""
+    leaving = Source("sphere", (9, 5, 5), (0.5, 0.5, 0.5), 0.3, fixed=True)
+    dense, sparse = (
+        _jet(device, refinement=3, scheme=scheme, bricks=bricks, threshold=0.0, sources=[leaving])
+        for bricks in (False, True)
+    )
+    sizes = []
+    for step in range(24):
+        for each in (dense, sparse):
+            each.sources = (leaving, Source("box", (4 + 0.5 * step, 3, 5), (0.7, 0.7, 0.7), 0.1, 1.0))
+            each.step()
+        sizes.append(sparse.active_cells)
+        _assert_same(dense, sparse)
+    assert 0 < sizes[0] < 0.8 * dense.active_cells < sizes[-1]
+    for numbers, values in (dense.bricks(), sparse.bricks()):
+        assert len(numbers) * 512 <= sizes[-1] and len(values) == 2 and values[0].shape == (len(numbers), 8, 8, 8)
+    assert all((a == b).all() for a, b in zip(dense.bricks()[1], sparse.bricks()[1], strict=True))
+
+
+def test_bricks_take_memory_where_smoke_is(device: str, monkeypatch: pytest.MonkeyPatch):
+    """A box of 512^3 voxels holds a puff in 60 MB; a full pool has room for a whole box, and one that does not fit
+    ends with an error."""
+    source = Source("sphere", (4, 4, 4), (1, 1, 1), 1.0, fixed=True)
+    large = Solver(Lattice((16, 16, 16), viscosity=0.1, device=device), refinement=32, sources=[source], bricks=True)
+    large.step()
+    assert 512 < large.active_cells < 4e6 and large.stored_bytes < 12 * 2**20 + 3 * 5 * large.active_cells
+    small = Solver(_room(device, (8, 8, 8)), refinement=2, bricks=True)
+    small.step()
+    empty = small.stored_bytes
+    assert small.active_cells == 0 and not small.bricks()[0].numel() and not _numbers(small).any()
+    small.reserve()
+    small.sources = [Source("box", (4, 4, 4), (9, 9, 9), 1.0, fixed=True)]
+    small.step()
+    assert small.active_cells == 16**3 and (_numbers(small) == 1.0).all() and small.stored_bytes > empty
+    scarce = Solver(_room(device, (8, 8, 8)), sources=small.sources, bricks=True)
+    monkeypatch.setattr("wlm.fluid.lattice.free_memory", lambda device: 1000)
+    with pytest.raises(WlmError, match="bricks of smoke: 65 x 512 x 1 cells need 0.0 GiB on .*: expected at most"):
+        scarce.step()
+
+
 def test_smoke_decays(device: str):
     """Still smoke decays by exp(-rate t), its temperature by its own rate."""
     source = Source("box", (4, 4, 4), (9, 9, 9), 1.0, 2.0)
@@ -117,8 +162,8 @@ def test_obstacles_cover_what_they_should(device: str):
     solid = solver.solid.numpy()
     x = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in SHAPE], indexing="ij"), -1)
     np.testing.assert_array_equal(solid == 2, (np.abs(x - (14, 5, 5)) < (2, 3, 1)).all(-1))
-    # The sphere moves 3 cells in 60 steps, and is placed where it is in the middle of the first two.
-    np.testing.assert_array_equal(solid == 1, np.linalg.norm(x - (9.05, 5, 5), axis=-1) < 2)
+    # The sphere moves 3 cells in 60 steps, and is placed where it is in the middle of the third.
+    np.testing.assert_array_equal(solid == 1, np.linalg.norm(x - (9.125, 5, 5), axis=-1) < 2)
 
 
 @pytest.mark.parametrize(("shape", "volume"), [("sphere", 4 / 3 * np.pi), ("box", 8.0), ("cylinder", 2 * np.pi)])
@@ -150,6 +195,25 @@ def test_paths():
     path = Trajectory.of([[0, 0, 0], [2, 0, 0], [2, 4, 0]], [10, 20, 30])
     for time, at in ((0, (0, 0, 0)), (15, (1, 0, 0)), (25, (2, 2, 0)), (99, (2, 4, 0))):
         np.testing.assert_allclose(path.at(time), at)
+    assert path.moves and not path.turns
+    with pytest.raises(ValueError, match="quaternions of length 1"):
+        Trajectory.of((0, 0, 0), rotations=(0, 0, 0, 0))
+
+
+def test_a_path_that_turns():
+    """The shorter way between two keys, whatever their signs; eased, it starts and stops gently and ends there."""
+    angles, times = np.array([0.0, 2.0, 2.0 + np.pi - 0.1, 5.0]), [0, 10, 20, 30]
+    quaternions = np.column_stack([0 * angles, np.sin(angles / 2), 0 * angles, np.cos(angles / 2)])
+    quaternions[2] *= -1
+    path = Trajectory.of([(1, 2, 3)] * 4, times, quaternions)
+    moments = np.linspace(-5, 40, 901)
+    for given, most in ((path, 0.31), (path.eased(2.0), 0.06)):
+        turns = np.array([given.turn(time) for time in moments])
+        np.testing.assert_allclose(turns[:, :, 1], np.broadcast_to((0, 1, 0), (901, 3)), atol=1e-12)
+        angle = np.unwrap(np.arctan2(turns[:, 0, 2], turns[:, 0, 0]))
+        assert np.abs(angle - np.interp(moments, times, angles)).max() < (1e-9 if given is path else 0.4)
+        assert angle[-1] == pytest.approx(5.0) and np.abs(np.diff(angle, 2)).max() < most * 0.05
+        assert given.moves and given.turns and given.at(7.0).tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize(
@@ -175,17 +239,29 @@ def test_a_checkpoint_goes_on_to_the_last_bit(settings: dict, device: str, tmp_p
     _assert_same(first, second)
 
 
+def test_a_checkpoint_of_all_cells_goes_on_in_bricks_and_back(device: str, tmp_path: Path):
+    solvers = [_jet(device, bricks=bricks, threshold=0.0) for bricks in (False, True, False)]
+    solvers[0].step(5)
+    for earlier, later in itertools.pairwise(solvers):
+        earlier.save(tmp_path / "state")
+        later.step(3)
+        later.load(tmp_path / "state")
+        for each in solvers[: solvers.index(later) + 1]:
+            each.step(3)
+    for other in solvers[1:]:
+        _assert_same(solvers[0], other)
+
+
 @pytest.mark.parametrize("before", [0, 5])
 def test_a_checkpoint_of_before_the_first_step(before: int, device: str, tmp_path: Path):
-    """Its obstacles aren't placed yet; those of the solver that loads it are, or have moved."""
+    """The obstacles of the solver that loads it may have moved."""
     first, second = _jet(device), _jet(device)
     first.save(tmp_path / "state")
     second.step(before)
     second.load(tmp_path / "state")
-    assert second.steps == 0 and not second.solid.numpy().any()
+    assert second.steps == 0
     for solver in (first, second):
         solver.step(6)
-    assert first.solid.numpy().any()
     _assert_same(first, second)
 
 
@@ -288,7 +364,7 @@ def test_too_large(device: str):
     with pytest.raises(WlmError, match="1600 x 1600 x 1600 cells: expected fewer than 2\\^31"):
         Solver(Lattice((8, 8, 8), viscosity=0.1, device=device), refinement=200)
     with pytest.raises(WlmError, match=r"100 x 100 x 100 cells need .* GiB on .*: expected at most"):
-        require_memory((100, 100, 100), 10**9, wp.get_device(device))
+        require_memory("smoke", (100, 100, 100), 10**15, wp.get_device(device))
 
 
 def test_a_frame_is_the_smoke_as_it_is(device: str):
@@ -312,6 +388,7 @@ def test_steps_can_be_captured(device: str):
     for bricks in (False, True):
         eager, graphed = (_jet(device, obstacles=at_rest, bricks=bricks) for _ in range(2))
         graphed.step(2)
+        graphed.reserve()
         with wp.ScopedCapture(device) as capture:
             graphed.step(2)
         for _ in range(5):

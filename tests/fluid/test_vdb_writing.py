@@ -102,5 +102,5 @@ def test_vdb_of_nothing(tmp_path: Path):
     save_volume(tmp_path / "a.vdb", from_array(np.zeros((9, 2, 3), np.float32)))
     assert Bytes((tmp_path / "a.vdb").read_bytes()).grids["density"][2] == {}
     assert not load_volume(tmp_path / "a.vdb").density.any()
-    with pytest.raises(WlmError, match=r"ends in .npz or .vdb, found .nvdb"):
-        save_volume(tmp_path / "a.nvdb", from_array(np.zeros((1, 1, 1), np.float32)))
+    with pytest.raises(WlmError, match=r"ends in .npz, .nvdb, .vdb, found .vdbx"):
+        save_volume(tmp_path / "a.vdbx", from_array(np.zeros((1, 1, 1), np.float32)))

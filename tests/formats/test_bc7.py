@@ -31,18 +31,6 @@ def test_two_other_decoders_agree_bit_for_bit(blocks):
     assert np.array_equal(ours, np.frombuffer(bgra, np.uint8).reshape(shape)[..., [2, 1, 0, 3]])
 
 
-@pytest.mark.parametrize("mode", [0, 1, 2, 3, 7])
-def test_every_partition_is_read(mode):
-    """The number of a partition is in the bits above those of the mode."""
-    rng, count = np.random.default_rng(mode), 16 if mode == 0 else 64
-    blocks = rng.integers(0, 256, (count, 64, 16), np.uint8)
-    number = np.arange(count, dtype=np.uint16)[:, None] << mode + 1
-    low = blocks[..., 0].astype(np.uint16) | blocks[..., 1].astype(np.uint16) << 8
-    low = low & ~np.uint16((2 * count << mode) - 1) | number | np.uint16(1 << mode)
-    blocks[..., 0], blocks[..., 1] = low & 255, low >> 8
-    assert np.array_equal(decode_image(blocks), imagecodecs.bcn_decode(blocks.tobytes(), 7, shape=(4 * count, 256, 4)))
-
-
 def test_packing_keeps_the_texels():
     endpoints, indices = _parameters(4, 5)
     assert np.any(indices[..., 0] >= 8) and np.any(indices[..., 0] < 8)

@@ -4,7 +4,7 @@
     containers.py  the same inside a container, which is closed again: digests, CRCs, lengths
     readers.py     the table of readers: what a case is made of, how it is read, what an accepted one must be
     models.py      those of artifacts and checkpoints
-    corpus.py      the small good files in `corpus/`, and how they are made
+    corpus/        the small good files
     worker.py      reads cases within limits of time and memory
     campaign.py    processes for many cases, and the table of counts
     __main__.py    `python -m tests.fuzz`

@@ -2,7 +2,6 @@
 
 python -m tests.fuzz READER INDEX [--write FILE]    makes a case again, and reads it
 python -m tests.fuzz --cases 20000 --json FILE      many cases of all readers, with a table of counts
-python -m tests.fuzz --corpus                       makes the files of `corpus/` again
 """
 
 import argparse
@@ -32,12 +31,8 @@ def main() -> int:
     parser.add_argument("--cases", type=int, metavar="N", help="cases a reader")
     parser.add_argument("--workers", type=int, default=os.cpu_count(), metavar="N", help="processes")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the counts there")
-    parser.add_argument("--corpus", action="store_true", help="make the corpus again")
     words = parser.parse_args()
     os.environ.setdefault("WARP_CACHE_PATH", str(ROOT / ".cache" / "warp"))
-    if words.corpus:
-        import_module("tests.fuzz.corpus").write_corpus(Path(__file__).parent / "corpus")
-        return 0
     readers = import_module("tests.fuzz.readers").READERS
     if words.cases is None and (words.index is None or words.reader not in readers):
         parser.error(f"expected a reader and an index, or --cases; readers are {', '.join(readers)}")

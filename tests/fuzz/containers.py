@@ -45,19 +45,19 @@ _NAMES = (
 )
 
 
-def _open_artifact(data: bytes) -> tuple[dict[str, Any], bytes]:
+def open_artifact(data: bytes) -> tuple[dict[str, Any], bytes]:
     """The header's JSON and the bytes of all parts."""
     length = struct.unpack_from("<Q", data)[0]
     return json.loads(data[8 : 8 + length]), data[8 + length :]
 
 
-def _sign(header: Any, body: bytes) -> bytes:
+def sign(header: Any, body: bytes) -> bytes:
     """An artifact of a header, whatever it says, with the digest that fits it."""
     metadata = header.get("__metadata__") if isinstance(header, dict) else None
     digest, end = "0" * 32, len(body)
     with suppress(AttributeError, KeyError, TypeError, IndexError, ValueError, OverflowError):
-        split = [name for name in header if f"{name}.pieces" in header]
-        end = min([end, *(int(header[name]["data_offsets"][0]) for name in split)])
+        whole = [name for name in header if name != "__metadata__" and f"{name}.pieces" not in header]
+        end = max(int(header[name]["data_offsets"][1]) for name in whole)
     if isinstance(metadata, dict) and isinstance(metadata.get("wlm"), str) and metadata["wlm"].count(" ") == 3:
         metadata["wlm"] = f"{metadata['wlm'].rpartition(' ')[0]} {digest}"
     text = json.dumps(header, separators=(",", ":")).encode()
@@ -69,15 +69,15 @@ def _sign(header: Any, body: bytes) -> bytes:
 
 def signed(head: bytes, body: bytes) -> bytes:
     """An artifact of a header with its length, and of other bytes of its parts."""
-    return _sign(json.loads(head[8:]), body)
+    return sign(json.loads(head[8:]), body)
 
 
 def vary_artifact(draw: Random, data: bytes) -> bytes:
     """Changes settings, parts, the header or the parts' bytes, and signs the whole again."""
     kind = draw.randrange(8)
     if kind <= 1:
-        header, body = _open_artifact(data)
-        return _sign(vary_json(draw, header), body) if kind else _sign(header, corrupt(draw, body))
+        header, body = open_artifact(data)
+        return sign(vary_json(draw, header), body) if kind else sign(header, corrupt(draw, body))
 
     def change(settings: Any, parts: dict[str, np.ndarray]) -> Any:
         if kind >= 4:
@@ -91,7 +91,7 @@ def vary_artifact(draw: Random, data: bytes) -> bytes:
                     parts[name] = vary_array(draw, parts[name])
         return vary_json(draw, settings) if kind <= 4 else settings
 
-    header, body = _open_artifact(data)
+    header, body = open_artifact(data)
     metadata = header.pop("__metadata__")
     parts = {}
     for name, entry in header.items():
@@ -147,7 +147,7 @@ def _pack_artifact(words: str, settings: Any, parts: dict[str, np.ndarray]) -> b
         offsets = [len(body), len(body) + len(raw)]
         header[name] = {"dtype": _TYPE_NAMES[array.dtype], "shape": list(array.shape), "data_offsets": offsets}
         body += raw
-    return _sign(header, body)
+    return sign(header, body)
 
 
 def vary_compact(draw: Random, data: bytes) -> bytes:

@@ -3,7 +3,7 @@
 import functools
 import re
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
+from builders.kept_files import KEPT
 from builders.probe_sets import synthetic
 from builders.small_sets import moving_light, tiny_profile
 from typer.testing import CliRunner
@@ -23,11 +24,6 @@ from wlm.errors import WlmError
 from wlm.formats.exr import read_every_channel
 from wlm.lightmap import fit as lightmap_fit
 from wlm.probe import fit as probe_fit
-from wlm.smoke.fit import train
-from wlm.smoke.network.planes import Pool
-from wlm.smoke.network.settings import NetworkSettings, Profile, TrainSettings
-from wlm.smoke.scene import Scene
-from wlm.smoke.simulation import make_solver
 from wlm.smoke.transport.orders import load_orders
 from wlm.system import Meter
 
@@ -186,29 +182,8 @@ def _checkpoints(module: Any, system: str, cost: int) -> Reader:
     return Reader(f"{system}-checkpoint", "a.partial", seeds, vary_artifact, read, cost=cost)
 
 
-@functools.cache
-def _solver() -> Any:
-    scene = {"name": "small", "grid": {"cells": [4, 6, 4], "cell": 0.25}, "frames": 1, "rate": 10.0}
-    inlet = {"face": "-y", "velocity": [0, 1, 0], "radius": 0.3}
-    return make_solver(Scene.model_validate(scene | {"inlets": [inlet]}))
-
-
-@functools.cache
-def _solver_states() -> Sequence[bytes]:
-    def first(output: Path) -> None:
-        _solver().save(f"{output}.partial")
-
-    def later(output: Path) -> None:
-        for _ in range(4):
-            _solver().step()
-        _solver().save(f"{output}.partial")
-
-    return _bytes_of(first), _bytes_of(later)
-
-
 def _smoke_checkpoint(path: Path) -> None:
-    solver = _solver()
-    solver.load(path)
+    solver = KEPT["simulation"]().read(path)
     check_digest(path)
     check_finite(density=solver.density.numpy())
     assert (solver.density.numpy() >= 0).all(), "accepted a negative density"
@@ -218,32 +193,15 @@ def _smoke_checkpoint(path: Path) -> None:
         solver.check()
 
 
-@functools.cache
-def _training() -> tuple[Any, Any]:
-    settings = TrainSettings(rounds=2, steps=1, batch=2, warmup=1)
-    profile = Profile(name="tiny", network=NetworkSettings(width=8, levels=2), training=settings)
-    guides, targets = torch.linspace(0, 1, 2 * 3 * 256), torch.linspace(1, 0, 2 * 8 * 256)
-    motion = torch.zeros(1, 2, 16, 16)
-    shapes = guides.reshape(1, 2, 3, 16, 16), targets.reshape(1, 2, 8, 16, 16)
-    return profile, Pool(*(part.half() for part in (*shapes, motion)), torch.zeros(1, dtype=torch.int64))
-
-
-def _train(output: Path, **options: Any) -> Any:
-    profile, pool = _training()
-    pools = {"make_pool": lambda *a, **k: pool, "make_validation": lambda *a, **k: pool}
-    return train(profile, output, **pools, **options)
-
-
-@functools.cache
-def _training_states() -> Sequence[bytes]:
-    return (_bytes_of(lambda output: _train(output, minutes=0.0)),)
+def _kept(name: str) -> Callable[[], Sequence[bytes]]:
+    return lambda: (KEPT[name]().content,)
 
 
 def _network_checkpoint(path: Path) -> None:
     output = path.with_suffix("")
     try:
         with _diverging():
-            training = _train(output, resume=True)
+            training = KEPT["training"]().read(path)
             # A training whose time was up before its first validation has no network yet.
             if training.model is not None:
                 _again(training.model, path)
@@ -272,6 +230,6 @@ READERS = (
     Reader("smoke-orders", "a.npz", _shipped_orders, vary_npz, _orders),
     _checkpoints(lightmap_fit, "lightmap", cost=8),
     _checkpoints(probe_fit, "probe", cost=4),
-    Reader("smoke-checkpoint", "a.partial", _solver_states, vary_artifact, _smoke_checkpoint, cost=2),
-    Reader("smoke-network-checkpoint", "a.partial", _training_states, vary_artifact, _network_checkpoint, cost=8),
+    Reader("smoke-checkpoint", "a.partial", _kept("simulation"), vary_artifact, _smoke_checkpoint, cost=2),
+    Reader("smoke-network-checkpoint", "a.partial", _kept("training"), vary_artifact, _network_checkpoint, cost=8),
 )

@@ -1,6 +1,6 @@
 """The table of readers: of what each case is made, how it is read, and what an accepted file must be.
 
-A new reader is a row: its good files (in `corpus.py`, or made here), how to change one with some knowledge of the
+A new reader is a row: its good files (in `corpus/`, or made here), how to change one with some knowledge of the
 format, and a function that reads it as users do and asserts what the format's page forbids.
 """
 

@@ -61,12 +61,34 @@ class Grid:
         self.walls = wp.zeros(0 if solid is None else solid.size, dtype=wp.uint8, device=device)
         if solid is not None:
             mark_walls(self.box, _flat(solid, wp.uint8, device), self.walls)
-        self.bricks = DENSE if reach is None else make_bricks(self.box, rings_for(reach), threshold, device)
-        self.computed = 0
+        self.bricks, self.computed = DENSE, 0
+        if reach is not None:
+            self.bricks = make_bricks(self.box, rings_for(reach), threshold, device)
+            total = self.bricks.busy.size
+            self.bricks.free = wp.array(np.arange(1, total + 1), dtype=int, device=device)
+            self.bricks.depth.fill_(total)
 
     def fields(self, density: np.ndarray, temperature: np.ndarray | None = None) -> Fields:
         values = np.zeros(0) if temperature is None else temperature
         return Fields(_flat(density, self.dtype, self.device), _flat(values, self.dtype, self.device))
+
+    def pooled(self, density: np.ndarray) -> Fields:
+        """A density in bricks, all of which are busy."""
+        self.bricks.busy.fill_(1)
+        relist(self.box, self.bricks)
+        fields = self.fields(np.zeros((self.bricks.free.size + 1) * BRICK**3))
+        advection_sources.store(self.bricks, fields, clear=False)
+        pool = fields.density.numpy()
+        pool[self.indices] = density.ravel()
+        fields.density.assign(pool)
+        return fields
+
+    @property
+    def indices(self) -> np.ndarray:
+        """The index of each cell in the pool."""
+        x = np.indices(self.shape).reshape(3, -1)
+        places = self.bricks.places.numpy()[np.ravel_multi_index(x // BRICK, self.box.bricks)]
+        return places * BRICK**3 + np.ravel_multi_index(x % BRICK, (BRICK,) * 3)
 
     def run(self, fields: Fields, dt: float, steps: int = 1, decay=(1.0, 1.0)) -> Fields:
         spare = [Fields(wp.zeros_like(fields.density), wp.zeros_like(fields.temperature)) for _ in range(2)]
@@ -74,9 +96,8 @@ class Grid:
         for _ in range(steps):
             if self.bricks is not DENSE:
                 relist(self.box, self.bricks)
-                self.computed += int(self.bricks.count.numpy()[0]) * BRICK**3
-                for buffer in (fields, *spare):
-                    advection_sources.empty_retired(self.box, self.bricks, buffer)
+                self.computed += int(self.bricks.counts.numpy()[0]) * BRICK**3
+                advection_sources.store(self.bricks, fields)
             if self.scheme == "maccormack":
                 advect(*at, fields, spare[0], dt, bricks=self.bricks)
                 advect(*at, fields, spare[1], dt, decay, self.bricks, spare[0])
@@ -87,11 +108,13 @@ class Grid:
         return fields
 
     def array(self, flat: wp.array) -> np.ndarray:
-        return flat.numpy().reshape(self.shape).astype(np.float64)
+        values = flat.numpy() if self.bricks is DENSE else flat.numpy()[self.indices]
+        return values.reshape(self.shape).astype(np.float64)
 
     def carried(self, density: np.ndarray, dt: float, steps: int = 1) -> np.ndarray:
         """A density after some steps."""
-        return self.array(self.run(self.fields(density), dt, steps).density)
+        fields = self.fields(density) if self.bricks is DENSE else self.pooled(density)
+        return self.array(self.run(fields, dt, steps).density)
 
 
 def _centres(shape, refinement=1) -> np.ndarray:
@@ -188,14 +211,21 @@ def test_solids_that_come_and_go(device: str):
     start = np.full(grid.shape, 0.5)
     start[2:4, 2:4, 2:4] = 0.0
     fields = grid.fields(start, start)
-    bricks = make_bricks(grid.box, 1, 0.0, device)
-    bricks.busy.zero_()
-    advection_sources.change_solids(grid.box, *walls, fields, bricks)
+    advection_sources.change_solids(grid.box, *walls, fields)
     expected = np.full(grid.shape, 0.5)
     expected[4:6, 2:4, 2:4] = 0.0
     for field in (fields.density, fields.temperature):
         np.testing.assert_allclose(grid.array(field), expected, atol=1e-6)
-    assert bricks.busy.numpy().tolist() == [1]
+    # In a brick, which then is busy; without one nothing is written.
+    sparse = Grid(np.zeros((*coarse, 3)), 2, SHUT, device, reach=1.0)
+    for stored in (True, False):
+        fields = sparse.pooled(start)
+        sparse.bricks.busy.zero_()
+        if not stored:
+            sparse.bricks.places.zero_()
+        advection_sources.change_solids(grid.box, *walls, fields, sparse.bricks)
+        assert sparse.bricks.busy.numpy().tolist() == [stored]
+        np.testing.assert_allclose(sparse.array(fields.density), expected if stored else 0.0, atol=1e-6)
     # With nothing but solids around there is nothing to take.
     full = wp.full(36, wp.uint8(2), dtype=wp.uint8, device=device)
     fields = grid.fields(np.zeros(grid.shape))
@@ -254,12 +284,14 @@ def test_buoyancy_is_of_means(refinement: int, device: str):
     expected = (d * (0, -0.5, 0) + t * (0.1, 2.0, 0)) * ~solid[..., None]
     np.testing.assert_allclose(force.numpy().reshape(*coarse, 3), expected, atol=1e-5)
     # Where no brick is listed there is nothing to lift.
-    bricks = make_bricks(grid.box, 1, 0.0, device)
-    advection_sources.buoyancy(grid.box, grid.walls, fields, (0, -0.5, 0), (0.1, 2.0, 0), force, bricks)
-    np.testing.assert_array_equal(force.numpy(), 0.0)
-    relist(grid.box, bricks)
-    advection_sources.buoyancy(grid.box, grid.walls, fields, (0, -0.5, 0), (0.1, 2.0, 0), force, bricks)
+    sparse = Grid(np.zeros((*coarse, 3)), refinement, SHUT, device, reach=1.0)
+    fields = sparse.pooled(density)
+    advection_sources.buoyancy(grid.box, grid.walls, fields, (0, -0.5, 0), (0.1, 2.0, 0), force, sparse.bricks)
+    expected = d * (0, -0.5, 0) * ~solid[..., None]
     np.testing.assert_allclose(force.numpy().reshape(*coarse, 3), expected, atol=1e-5)
+    sparse.bricks.places.zero_()
+    advection_sources.buoyancy(grid.box, grid.walls, fields, (0, -0.5, 0), (0.1, 2.0, 0), force, sparse.bricks)
+    np.testing.assert_array_equal(force.numpy(), 0.0)
 
 
 @pytest.mark.parametrize("ends", [WRAPPED, SHUT])
@@ -290,22 +322,22 @@ def test_smoke_jumps_over_a_brick_that_is_cut_short(device: str):
 
 
 def test_bricks_follow_the_smoke(device: str):
-    """Only bricks near smoke are computed, and those that it has left are empty in every buffer."""
+    """Only bricks near smoke are stored and computed, and those that it has left are free again."""
     u = np.broadcast_to((0.9, 0.0, 0.0), (48, 8, 8, 3))
     grid = Grid(u, 1, ((OPEN, OPEN), *SHUT[:2]), device, scheme="semi-lagrangian", reach=1.0, threshold=1e-4)
     start = np.zeros(grid.shape)
     start[2:6, 2:6, 2:6] = 1.0
-    fields = grid.fields(start)
+    fields = grid.pooled(start)
     counts = []
     for _ in range(14):
         fields = grid.run(fields, 1.0, 5)
-        counts.append(int(grid.bricks.count.numpy()[0]))
+        counts.append(int(grid.bricks.counts.numpy()[0]))
+        places = grid.bricks.places.numpy()
+        free = grid.bricks.free.numpy()[: grid.bricks.depth.numpy()[0]]
+        assert np.count_nonzero(places) == counts[-1]
+        assert sorted([*free, *places[places > 0]]) == list(range(1, 7))
     assert 2 <= max(counts[1:8]) <= 5
     assert counts[-1] == 0
-    np.testing.assert_array_equal(grid.array(fields.density), 0.0)
-    still = Grid(u, 1, SHUT, device, reach=1.0)
-    still.run(still.fields(np.zeros(grid.shape)), 1.0, 3)
-    assert still.computed == np.prod(grid.shape)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30, -1e30])

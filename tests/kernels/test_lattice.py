@@ -4,13 +4,13 @@ import itertools
 
 import numpy as np
 import pytest
-import warp as wp
 from reference import lattice as reference
+from scipy.spatial.transform import Rotation
 
 from wlm.fluid import lattice as lattice_module
 from wlm.fluid.lattice import Lattice
+from wlm.fluid.obstacles import Mesh, Sphere, Trajectory, box_mesh, cells_of
 from wlm_kernels.fluid.lattice import CAUSES, trouble_of
-from wlm_kernels.fluid.lattice_fields import voxelise_mesh, voxelise_sphere
 from wlm_kernels.fluid.lattice_sets import LATTICES
 
 STEPS = 2  # one from each of the two buffers
@@ -237,31 +237,67 @@ def test_trouble_of_decodes_a_key():
         assert trouble_of((step * 2**31 + cell) * 4 + code) == (step, cell, CAUSES[code])
 
 
-def test_sphere_voxels(device: str):
-    """Its volume; cells that it leaves are free again, and those of another body stay."""
-    solid = wp.zeros((24, 20, 22), dtype=wp.uint8, device=device)
-    voxelise_sphere(solid, 2, (18.0, 10.0, 11.0), 3.0)
-    cells = (solid.numpy() == 2).sum()
-    voxelise_sphere(solid, 1, (8.0, 10.0, 11.0), 6.0)
-    assert (solid.numpy() == 1).sum() == pytest.approx(4 / 3 * np.pi * 6**3, rel=0.03)
-    voxelise_sphere(solid, 1, (9.5, 10.0, 11.0), 2.0)
-    places = np.argwhere(solid.numpy() == 1) + 0.5
-    np.testing.assert_allclose(places.mean(0), (9.5, 10.0, 11.0), atol=0.1)
-    assert (solid.numpy() == 2).sum() == cells
+EXTENTS = np.array([3.3, 1.3, 1.7])
 
 
-def test_mesh_voxels(device: str):
-    """A box as a mesh, scaled and moved."""
-    corners = np.array(list(itertools.product((-0.5, 0.5), (-1.0, 1.0), (-0.25, 0.25))), np.float32)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = np.array([(a, b, c) + (a, c, d) for a, b, c, d in quads], np.int32).ravel()
-    mesh = wp.Mesh(
-        points=wp.array(corners, dtype=wp.vec3, device=device),
-        indices=wp.array(faces, dtype=int, device=device),
-        support_winding_number=True,
-    )
-    solid = wp.zeros((16, 16, 16), dtype=wp.uint8, device=device)
-    voxelise_mesh(solid, 3, mesh, (8.0, 8.0, 8.0), 4.0)
-    expected = np.zeros((16, 16, 16), np.uint8)
-    expected[6:10, 4:12, 7:9] = 3
-    np.testing.assert_array_equal(solid.numpy(), expected)
+def _bodies(time: float = 0.0, at_rest: bool = False) -> list[Sphere | Mesh]:
+    """A sphere and a box that move and turn, in each other's way; or at rest where they are at a time."""
+    times, angles = np.array([-1.0, 4.0, 9.0]), np.array([[0.0, 0.3, 0.1], [0.3, 0.0, 0.4]])
+    out = []
+    for k, (first, way) in enumerate((((2.4, 3.1, 3.0), (0.9, 0.5, 0.1)), ((5.4, 4.2, 3.4), (-0.7, 0.2, 0.4)))):
+        turns = Rotation.from_rotvec(np.outer(angles[k], [0.48, -0.6, 0.64])).as_quat()
+        path = Trajectory.of(np.array(first) + np.outer([0, 1, 1.5], way), times, turns)
+        if at_rest:
+            turn = Rotation.from_matrix(path.turn(time)).as_quat()
+            path = Trajectory.of(path.at(time), rotations=turn)
+        out.append(box_mesh(path, EXTENTS) if k else Sphere(path, 1.45))
+    return out
+
+
+def _covered(bodies, time: float, shape) -> np.ndarray:
+    x, out = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in shape], indexing="ij"), -1), np.zeros(shape, int)
+    for k, body in enumerate(bodies):
+        own = (x - body.path.at(time)) @ body.path.turn(time)
+        inside = (np.abs(own) < EXTENTS / 2).all(-1) if k else np.linalg.norm(own, axis=-1) < body.radius
+        out[inside] = k + 1
+    return out
+
+
+@pytest.mark.parametrize("faces", ["tunnel", ""])
+def test_bodies_that_move(faces: str, device: str):
+    """A step with bodies that cover and leave cells, also the other's, at a face and across a periodic one."""
+    shape, bodies = (7, 6, 5), _bodies()
+    pair = Pair("D3Q19", device, faces=BOXES.get(faces, ()), shape=shape)
+    box, left_cells = pair.box, 0
+
+    def motion(body: int, x: np.ndarray) -> np.ndarray:
+        path, time = bodies[body - 1].path, pair.done + 0.5
+        k = int(np.searchsorted(path.times, time)) - 1
+        return path.rates[0][k] + np.cross(path.rates[1][k], x - path.at(time))
+
+    box.velocity = motion
+    pair.device.set_bodies(bodies)
+    pair.device.set_flow(pair.u, pair.rho)
+    start = reference.equilibrium(box.c, box.w, pair.rho, pair.u)
+    box.solid = _covered(bodies, 0.5, shape)
+    pair.f = reference.stream(box, start)
+    pair.hold(TOLERANCE)
+    for _ in range(7):
+        left = reference.collide(box, pair.f, force=pair.force, **pair.how)
+        pair.done += 1
+        before, box.solid = box.solid, _covered(bodies, pair.done + 0.5, shape)
+        left_cells += np.count_nonzero((before > 0) & (box.solid == 0))
+        pair.f = reference.stream(box, reference.uncover(box, left, before))
+        pair.device.step()
+        np.testing.assert_array_equal(pair.device.solid.numpy(), box.solid)
+        pair.hold(2 * TOLERANCE)
+    assert left_cells > 5
+
+
+@pytest.mark.parametrize("time", [-3.0, 0.0, 3.7, 20.0])
+def test_marks_of_bodies_at_rest(time: float, device: str):
+    """Turned, at once; the first of two bodies at rest has a cell."""
+    expected = _covered(_bodies(), time, (7, 6, 5))
+    got = cells_of(_bodies(time, at_rest=True), (7, 6, 5), device).numpy()
+    np.testing.assert_array_equal(got > 0, expected > 0)
+    assert (got[expected == 1] == 1).all()

@@ -103,8 +103,9 @@ def _ints(values: np.ndarray, device: str) -> wp.array:
 
 def _graph(samples, patches, threshold: float, colour_threshold: float, device: str):
     """The graph, and the number that each of its nodes had."""
-    bounds = graphs.bounds(samples, patches, int(patches.numpy()["level"].max()) + 1)
-    return graphs.graph(samples, patches, bounds, graphs.rule(threshold, colour_threshold, device))
+    levels = int(patches.numpy()["level"].max()) + 1
+    bounds = graphs.bounds(samples, patches, levels)
+    return graphs.graph(samples, patches, bounds, levels, graphs.rule(threshold, colour_threshold, device))
 
 
 @pytest.mark.parametrize(("threshold", "contrast"), [(0.003, 0.02), (0.003, 0.2), (0.03, 0.2), (0.03, 1.0), (0.1, 1.0)])
@@ -133,6 +134,32 @@ def test_neighbours(device: str, threshold: float, contrast: float):
     graphs.join(graph, nodes, 0, count, _ints(heads, device), low, _ints(np.array([1, 0]), device), joined)
     like = want[heads] | (heads[:, None] == np.arange(count))
     np.testing.assert_array_equal(joined.numpy(), np.where(like[1], 0, np.where(like[0], 1, 2)))
+
+
+@pytest.mark.parametrize("threshold", [0.02, 0.1])
+def test_neighbours_without_bounds(device: str, threshold: float):
+    """Patches of up to 129 samples, larger than those with bounds, beside small ones: the edges of the naive matrix."""
+    image, level = _image(contrast=0.3), np.array([7, 0, 7, 2, 5, 7], np.int32)
+    corners = _triangles(len(level), seed=5)[0]
+    corners[:3] = [[4, 4], [20, 4], [4, 20]] + np.array([0.0, 0.5, 0.1])[:, None, None]
+    samples, patches, _ = _sampled(image, corners, level, device)
+    graph, number = _graph(samples, patches, threshold, 2.0, device)
+    split = [_smallest(patch) for patch in _unpacked(samples, level)]
+    want = reference.adjacency([split[t] for t in number], threshold, 2.0)
+    assert 0 < want.sum() < want.size - len(level)
+    edge = wp.zeros(want.shape, dtype=wp.uint8, device=device)
+    for begin in range(0, len(level), 4):
+        graphs.find_edges(graph, begin, min(begin + 4, len(level)), edge)
+    np.testing.assert_array_equal(edge.numpy() != 0, want)
+    heads, joined = np.arange(len(level)), wp.empty(len(level), dtype=int, device=device)
+    low = wp.array(graph.means, dtype=float, device=device)
+    rank = np.array([3, 1, 0, 5, 4, 2])
+    graphs.join(graph, _ints(heads, device), 0, 6, _ints(heads, device), low, _ints(rank, device), joined)
+    like = want | np.eye(len(level), dtype=bool)
+    np.testing.assert_array_equal(joined.numpy(), np.where(like, rank, len(level)).min(1))
+    means = [reference.upsampled(split[t], SIZES[level[t]] if len(split[t]) > 3 else 2, 129) for t in number]
+    means = [np.mean(list(colours.values()), 0).sum() for colours in means]
+    assert (graph.low.numpy() <= np.array(means) + 1e-3).all() and (graph.high.numpy() >= np.array(means) - 1e-3).all()
 
 
 @pytest.mark.parametrize(("step", "alike"), [(50, True), (51, False)])

@@ -7,7 +7,7 @@ import pytest
 import torch
 from builders import small_sets
 from builders.checks import assert_same, error_of
-from builders.resigned import GONE, rewrite
+from builders.resigned import GONE, error_of_changed
 from builders.synthetic import random_model, random_sheet
 from reference.levels import put_on_levels
 
@@ -79,9 +79,8 @@ def test_any_block_of_mode_6_comes_back(tmp_path, part):
 
 def _changed(tmp_path, **parts) -> str:
     """Returns the error of a file whose parts were replaced, when it is opened or when all its tiles are read."""
-    random_model((3, 2, 1, 0)).save(tmp_path / "a.wlm")
-    rewrite(tmp_path / "a.wlm", tensors={f"0.{name}": change for name, change in parts.items()})
-    return error_of(lambda: wlm.load(tmp_path / "a.wlm").check())
+    changed = {f"0.{name}": change for name, change in parts.items()}
+    return error_of_changed(random_model((3, 2, 1, 0)), tmp_path / "a.wlm", tensors=changed)
 
 
 def test_damage_is_one_line(tmp_path):
@@ -109,15 +108,6 @@ def test_tiles_with_wrong_content_are_one_line(tmp_path):
         content[-2] = 0xFF  # with the high byte a NaN
         line = _changed(tmp_path, tiles=lambda tiles, content=content: [zstd.compress(bytes(content)), tiles[1]])
         assert f"a.wlm: sheet random: tile 0: {words}" in line
-
-
-def test_each_tile_is_read_alone(tmp_path):
-    """A tile is a piece of the part, a zstd frame of its own."""
-    model = random_model((3, 2, 4, 0))
-    model.save(tmp_path / "a.wlm")
-    pieces, (sheet,) = read_artifact(tmp_path / "a.wlm").pieces["0.tiles"], model.sheets.values()
-    data = zstd.decompress(pieces[2], encoding_of(4).packed_size(sheet, 2), "tile 2")
-    assert data == encoding_of(4).pack(sheet, 2)
 
 
 def _on_levels(model):

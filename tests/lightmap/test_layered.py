@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from builders.checks import assert_same, error_of
 from builders.layered_sets import SHEETS, random_layers, small_layers, turning_directions
-from builders.resigned import GONE, rewrite
+from builders.resigned import GONE, error_of_changed
 from builders.running import report_always
 from builders.small_sets import HOURS, moving_light, tiny_profile
 
@@ -48,13 +48,6 @@ def test_what_is_written_comes_back(tmp_path):
 
 def test_files_that_claim_too_much_are_one_line(tmp_path):
     path = tmp_path / "a.wlm"
-
-    def refused(settings, tensors, words):
-        random_layers().save(path)
-        rewrite(path, settings, tensors)
-        text = error_of(wlm.load, path)
-        assert text.startswith(str(path)) and words in text, text
-
     random_layers().save(path)
     stored = read_artifact(path)
     sheets = stored.settings["sheets"]
@@ -62,12 +55,14 @@ def test_files_that_claim_too_much_are_one_line(tmp_path):
     def changed(number, **values):
         return {"sheets": [item | values if i == number else item for i, item in enumerate(sheets)]}
 
-    refused({"sheets": [*sheets, sheets[0]]}, {}, "found one twice")
-    refused(changed(2, channels=["G"]), {}, "every channel once")
-    refused(changed(1, size=[119, 107]), {}, "texels, but others of its layer")
-    refused({}, {"1.mask": stored.tensors["0.mask"]}, "part 1.mask: expected a mask only with the first sheet")
-
-    refused({}, {"0.times": stored.tensors["times"], "times": GONE}, "times")
+    for settings, tensors, words in (
+        ({"sheets": [*sheets, sheets[0]]}, {}, "found one twice"),
+        (changed(2, channels=["G"]), {}, "every channel once"),
+        (changed(1, size=[119, 107]), {}, "texels, but others of its layer"),
+        ({}, {"1.mask": stored.tensors["0.mask"]}, "part 1.mask: expected a mask only with the first sheet"),
+        ({}, {"0.times": stored.tensors["times"], "times": GONE}, "times"),
+    ):
+        assert words in error_of_changed(random_layers(), path, settings, tensors)
 
 
 def test_signed_values_keep_their_sign(fitted):

@@ -23,7 +23,7 @@ from wlm.formats.checkpoint import Checkpoint, Pace
 from wlm.formats.parts import Part
 from wlm.lightmap import dispatch, fit
 from wlm.lightmap.data import from_arrays, load
-from wlm.lightmap.fit import compress, open_checkpoint
+from wlm.lightmap.fit import open_checkpoint
 from wlm.lightmap.trainer import Fitter
 from wlm.workers import Here, Lost, Processes, Workers
 
@@ -267,27 +267,6 @@ def test_a_fit_never_holds_all_tiles():
     finally:
         tracemalloc.stop()
     assert peak < 0.6 * lightmaps.light.frames.nbytes  # two threads have a few tiles each
-
-
-def both_kinds():
-    """A dynamic tile beside a static one: two batches."""
-    static, moving = static_light().light, moving_light().light
-    return from_arrays(np.concatenate([static.frames, moving.frames], axis=2), moving.times, period=24.0)
-
-
-def interrupted(path, lightmaps, step, profile=PROFILE, **options):
-    checkpoint = open_checkpoint(path, lightmaps, profile, **options)
-    with pytest.raises(KeyboardInterrupt):
-        compress(lightmaps, profile, progress=stop_after(step), checkpoint=checkpoint, **options)
-    return checkpoint
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """The file of a fit that was not interrupted."""
-    path = tmp_path_factory.mktemp("whole") / "whole.wlm"
-    compress(both_kinds(), PROFILE, seed=3).save(path)
-    return path.read_bytes()
 
 
 @pytest.mark.parametrize(("every", "waits"), [(10.0, [10.0, 10.0, 57.0]), (0.0, [0.0, 0.0, 0.0])])

@@ -51,12 +51,11 @@ def test_only_quantised_gaussians_are_stored(tmp_path):
 
 @pytest.mark.parametrize("profile", ["standard", "compact", "paper", "small", "pca"])
 def test_no_file_is_larger_than_half_floats_and_a_little(profile, tmp_path):
-    for count in (1, 2, 3, 4, 5, 9, 33, 200):
-        for coefficients in (1, 4, 9):
-            probes = synthetic(count, coefficients=coefficients, dead=2 if count > 4 else 0)
-            model = wlm.probe.compress(probes, profile, steps=10)
-            assert model.file_bytes() <= 2 * probes.outputs * probes.probes + 200, (count, coefficients)
-            assert model.content.nbytes == model.bundle().nbytes
+    for count, coefficients in ((1, 1), (1, 9), (2, 4), (3, 9), (5, 1), (9, 9), (33, 4), (200, 9)):
+        probes = synthetic(count, coefficients=coefficients, dead=2 if count > 4 else 0)
+        model = wlm.probe.compress(probes, profile, steps=10)
+        assert model.file_bytes() <= 2 * probes.outputs * probes.probes + 200, (count, coefficients)
+        assert model.content.nbytes == model.bundle().nbytes
 
 
 def test_dead_probes_cost_a_bit_each_at_most(tmp_path):

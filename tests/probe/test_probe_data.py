@@ -45,18 +45,6 @@ def _same(a: ProbeSet, b: ProbeSet) -> None:
     assert a.source == b.source
 
 
-def test_npz(tmp_path):
-    path = _write(tmp_path / "Room.NPZ.npz")
-    for argument in (path, str(path)):
-        loaded = load(argument)
-        assert (loaded.name, loaded.key, loaded.warnings) == ("Room.NPZ", "sh", ())
-        assert (loaded.probes, loaded.outputs, loaded.float_bytes) == (N, 27, N * 27 * 4)
-        np.testing.assert_array_equal(loaded.position, _position())
-        np.testing.assert_array_equal(loaded.values.reshape(N, 9, 3), _values(N, 9, 3))
-        assert loaded.live.all()
-        assert [a.dtype for a in (loaded.position, loaded.values, loaded.live)] == [np.float64, np.float32, bool]
-
-
 @pytest.mark.parametrize("shape", [(N, 1), (N, 5), (N, 7, 3), (N, 1, 3), (N, 4, 3), (N, 16, 3), (1, 27), (1, 1)])
 def test_any_count_of_probes_and_numbers(shape):
     probes = from_arrays(_position(shape[0]), _values(*shape))

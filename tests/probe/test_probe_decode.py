@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import warp as wp
+from builders.checks import error_of
 from builders.probe_models import EXTENT, ORIGIN, SIZE, random_model
 
 from benchmarks import probe_exact as exact
@@ -112,18 +113,15 @@ def test_the_models_own_probes(device):
 
 def test_wrong_positions():
     decoder = GaussianDecoder(random_model())
-    with pytest.raises(WlmError, match="random: the file stores no positions"):
-        decoder.decode_probes()
+    assert "random: the file stores no positions" in error_of(decoder.decode_probes)
     with pytest.raises(WlmError, match="expected the positions of its own 200 probes"):
         GaussianDecoder(random_model(), position=np.zeros((7, 3)))
     bad = np.zeros((4, 3))
     bad[2, 1] = np.nan
-    with pytest.raises(WlmError, match="position 2: expected finite"):
-        decoder.decode(bad)
+    assert "position 2: expected finite" in error_of(decoder.decode, bad)
     with pytest.raises(ValueError, match=r"expected \[M, 3\]"):
         decoder.decode(np.zeros(3))
-    with pytest.raises(WlmError, match="device 'cuda:9'"):
-        GaussianDecoder(random_model(), "cuda:9")
+    assert "device 'cuda:9'" in error_of(GaussianDecoder, random_model(), "cuda:9")
     assert decoder.decode(np.zeros((0, 3))).shape == (0, 27)
 
 
@@ -185,16 +183,3 @@ def test_every_number_by_the_equations(monkeypatch, support, pairs):
     model.content.code[:2, 6:10] = 0  # no rotation at all
     points = model.origin + model.extent * np.random.default_rng(1).uniform(-0.2, 1.2, (30, 3)) * model.size
     np.testing.assert_allclose(decode64(model, points), [slow(model, point) for point in points], rtol=1e-11)
-
-
-def test_a_gaussian_ends_at_the_cut():
-    model = random_model(count=1, latent=1)
-    model.content.bounds[:, 3:10] = [np.log(0.1)] * 3 + [1.0, 0.0, 0.0, 0.0]
-    model.content.code[:, :3] = 2**15
-    middle = model.origin + model.extent * model.content.rows()[0, :3].astype(np.float64)
-    way = model.extent * 0.1 * 3.0 * np.array([[0.999, 0, 0], [1.001, 0, 0], [2.0, 0, 0]])
-    inside, outside, far = decode64(model, middle + way)
-    model.content.bounds[:, 10:] = 0.0
-    nothing = decode64(model, middle + way)
-    assert (inside != nothing[0]).any()
-    np.testing.assert_allclose([outside, far], nothing[1:], rtol=1e-12)

@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 from builders.checks import error_of
 from builders.exported import read_export
-from builders.probe_models import random_model
 from reference import volume as reference
 from reference import volume_blocks
 
 from wlm.errors import WlmError
 from wlm.export import export
 from wlm.probe.data import from_arrays
-from wlm.probe.gaussian.decode import GaussianLight
 from wlm.probe.volume.bundle import volume_bundle
 from wlm.probe.volume.cascade import FrameStats, Volume
 from wlm.probe.volume.index import BlockIndex, finest_side
-from wlm.probe.volume.light import StoredLight, at_probes
+from wlm.probe.volume.light import StoredLight
 from wlm.probe.volume.walk import camera_path, loop_frames, score_volume, settle, walk
 
 # A multiple of every block's side, so that all of a scene can move by it.
@@ -185,23 +183,6 @@ def test_blocks_of_another_hour_are_decoded_again(device: str, rows: int):
     frame(away, 23.9)
     light.set(0.1)  # near midnight 0.2 h lie between
     assert volume.update(away).left < len(_there(volume)) - 20
-
-
-def test_a_full_pool_is_decoded_again(device: str):
-    """Blocks that find no row do not keep the others from it."""
-    position = _surface(60)
-    light = _Day(position, device)
-    volume = Volume(position, light, block=2.0, side=SIDE, budget=20, rows=80)
-    for _ in range(8):
-        assert volume.update([3.0, 1.0, -5.0]).left > 0
-    before = _there(volume)
-    light.set(6.0)
-    for _ in range(4 * 4):
-        volume.update([3.0, 1.0, -5.0])
-    after = _there(volume)
-    assert set(after) == set(before) and len(before) == 80
-    for name, light_of in after.items():
-        np.testing.assert_allclose(light_of, 6.0 * before[name], rtol=2e-3)
 
 
 def test_blocks_have_the_stated_light(device: str):
@@ -450,25 +431,6 @@ def test_dead_probes_are_left_out(device: str):
     _same(*volumes)
 
 
-def test_a_model_is_decoded_where_it_is_asked(device: str):
-    """Blocks from a model are those from what it decodes to."""
-    model = random_model(outputs=12)
-    random = np.random.default_rng(4)
-    position = model.origin + model.extent * model.size * random.random((90, 3))
-    decoder = model.decoder(device)
-    light, stored = decoder.light(position), StoredLight(decoder.decode(position), device)
-    assert isinstance(light, GaussianLight)
-    numbers = np.array([3, 80, 3, 0])
-    np.testing.assert_allclose(at_probes(light, numbers), at_probes(stored, numbers), atol=1e-6)
-    volumes = [Volume(position, source, side=16) for source in (light, stored)]
-    for volume in volumes:
-        settle(volume, position.mean(0))
-    got, want = (_there(volume) for volume in volumes)
-    assert got.keys() == want.keys() and got
-    for name, values in want.items():
-        np.testing.assert_allclose(got[name], values, atol=1e-3 * np.abs(values).max())
-
-
 @pytest.mark.parametrize(
     "viewpoint",
     [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0], 3.0, [3e9, 0.0, 0.0]],
@@ -535,9 +497,7 @@ def test_export_of_nothing_and_over_another(volume, tmp_path):
     nothing = Volume(volume.position, volume.light, side=8)
     with pytest.raises(ValueError, match="viewpoint"):
         _ = nothing.viewpoint
-    with pytest.raises(WlmError, match="no block"):
-        export(volume_bundle(nothing), tmp_path / "none")
-    assert not (tmp_path / "none").exists()
+    assert "no block" in error_of(volume_bundle, nothing)
     paths = export(volume_bundle(volume), tmp_path / "out")
     assert [path.exists() for path in paths] == [True] * 8 and export(volume_bundle(volume), tmp_path / "out") == paths
     document, arrays = read_export(tmp_path / "out")
@@ -598,8 +558,7 @@ def test_camera_path_of_little():
     tower = np.stack([np.zeros(5), np.arange(5.0), np.zeros(5)], 1)
     np.testing.assert_allclose(camera_path(tower, 2), [[0.0, 2.05, 0.0]] * 2)
     for position, frames in [(np.zeros((0, 3)), 5), (place, 0)]:
-        with pytest.raises(WlmError, match="camera path: expected at least"):
-            camera_path(position, frames)
+        assert "camera path: expected at least" in error_of(camera_path, position, frames)
     for position, up in [(place[0], 1), (place, 3)]:
         with pytest.raises(ValueError, match="camera path"):
             camera_path(position, 5, up=up)
@@ -674,8 +633,7 @@ def test_walk_refuses():
             walk(volume, path, light, **options)
     with pytest.raises(ValueError, match="original"):
         walk(volume, _line(1, 0.0), light[1:])
-    with pytest.raises(WlmError, match="viewpoint"):
-        walk(volume, np.array([[0.0, np.nan, 0.0]]), light)
+    assert "viewpoint" in error_of(walk, volume, np.array([[0.0, np.nan, 0.0]]), light)
 
 
 def _cells(key: np.ndarray) -> np.ndarray:
@@ -734,5 +692,4 @@ def test_side_follows_the_spacing():
     for position in (np.array([[0, np.nan, 0]]), np.full((1, 3), 1e101)):
         with pytest.raises(ValueError, match="position: expected probes"):
             BlockIndex(position, 1.0, (1,))
-    with pytest.raises(WlmError, match="positions: expected distances"):
-        finest_side(np.array([[0.0, 0.0, 0.0], [1e300, 1e300, 1e300]]))
+    assert "positions: expected distances" in error_of(finest_side, np.array([[0.0, 0.0, 0.0], [1e300, 1e300, 1e300]]))

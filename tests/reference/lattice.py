@@ -8,7 +8,7 @@ It shares no code with the kernels: streaming finds for each cell and direction 
 collision uses Hermite polynomials.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,14 +26,14 @@ class Box:
         c, w: Velocities [Q, 3] and weights [Q].
         solid: int [X, Y, Z], 0 is fluid.
         faces: For some of `FACES`: one of `RANKS`, and the velocity or the density (None: mass is conserved).
-        velocity: Velocity of the solids.
+        velocity: Velocity of the solids; or a function that returns that of a body at a point.
     """
 
     c: np.ndarray
     w: np.ndarray
     solid: np.ndarray
     faces: dict[str, tuple[str, object]] = field(default_factory=dict)
-    velocity: Sequence[float] = (0.0, 0.0, 0.0)
+    velocity: Sequence[float] | Callable[[int, np.ndarray], np.ndarray] = (0.0, 0.0, 0.0)
 
     def crossed(self, source: Sequence[int]) -> list[int]:
         """The faces, by their numbers in `FACES`, beyond which a cell lies; periodic ones don't count."""
@@ -111,6 +111,23 @@ def change_step(box: Box, f: np.ndarray, viscosity: float, smagorinsky: float, f
     return out
 
 
+def uncover(box: Box, f: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """The populations that leave each cell, also those that were solid before: at the mean of the fluid beside them."""
+    out = f.copy()
+    for cell in np.argwhere((before > 0) & (box.solid == 0)):
+        means, weights = [], []
+        for q in range(1, len(box.c)):
+            beside = cell + box.c[q]
+            k = tuple(beside % np.array(box.solid.shape))
+            if not box.crossed(beside) and before[k] == 0 and box.solid[k] == 0:
+                rho = f[k].sum()
+                means.append([rho, *(f[k] @ box.c / rho)])
+                weights.append(box.w[q])
+        rho, *u = np.average(means, axis=0, weights=weights)
+        out[tuple(cell)] = equilibrium(box.c, box.w, np.array(rho), np.array(u))
+    return out
+
+
 def stream(box: Box, f: np.ndarray) -> np.ndarray:
     """The populations that arrive in each cell, from those that left."""
     c, w, shape = box.c, box.w, box.solid.shape
@@ -128,7 +145,10 @@ def stream(box: Box, f: np.ndarray) -> np.ndarray:
             if face is None:
                 inside = tuple(at % n for at, n in zip(source, shape, strict=True))
                 if box.solid[inside]:
-                    out[cell][q] = leaves + 2 * w[q] * (c[q] @ np.asarray(box.velocity)) / CS2
+                    u = box.velocity
+                    if callable(u):
+                        u = u(box.solid[inside], np.array(cell) + 0.5 - 0.5 * c[q])
+                    out[cell][q] = leaves + 2 * w[q] * (c[q] @ np.asarray(u)) / CS2
                     balance += out[cell][q] - leaves
                 else:
                     out[cell][q] = f[inside][q]

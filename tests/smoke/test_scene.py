@@ -2,13 +2,13 @@
 
 import copy
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
 import torch
-import warp as wp
 import yaml
 from builders.random_scenes import random_scene
 from builders.smoke_plumes import SCENE, SPHERE, plume, write_frames
@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from wlm.config import check_settings, profile_names
 from wlm.errors import WlmError
 from wlm.fluid.faces import FACES
+from wlm.fluid.obstacles import Trajectory, cells_of
 from wlm.formats.exr import read_planes, write_planes
 from wlm.smoke import simulation
 from wlm.smoke.data import CHECKPOINT, NumberedFiles, load_frames, open_frames, read_six_way, spread, write_six_way
@@ -97,16 +98,16 @@ def test_what_has_no_effect_is_said(tmp_path, changed, words):
 def test_a_thin_obstacle_covers_a_cell_wherever_it_is(tmp_path, shape):
     radius = 0.01 if shape == "sphere" else [0.01, 0.01, 0.01]
     scene = _scene(tmp_path, obstacles=[{"shape": shape, "radius": radius, "path": [[0, 0, 0.6, 0]]}])
-    (obstacle,), solid = simulation._obstacles(scene), wp.zeros(scene.grid.cells, wp.uint8, "cpu")
+    (obstacle,) = simulation._obstacles(scene)
     for position in [[2.0, 3.0, 2.0], *np.random.default_rng(2).uniform(1, 4, (40, 3))]:
-        obstacle.cover(solid, 1, np.asarray(position))
+        solid = cells_of([replace(obstacle, path=Trajectory.of(position))], scene.grid.cells)
         assert 1 <= solid.numpy().sum() <= 8
     # A wall through the box has no hole.
     wall = {"shape": "box", "radius": [1, 0.004, 1], "path": [[0, 0, 0.6, 0]]}
     (obstacle,) = simulation._obstacles(_scene(tmp_path, obstacles=[wall]))
     for height in np.linspace(1, 4, 31):
-        obstacle.cover(solid, 1, np.array([2.5, height, 2.5]))
-        assert solid.numpy().any(1).all()
+        moved = replace(obstacle, path=Trajectory.of((2.5, height, 2.5)))
+        assert cells_of([moved], scene.grid.cells).numpy().any(1).all()
 
 
 def test_a_source_smaller_than_a_voxel_emits_its_amount(tmp_path):

@@ -123,6 +123,9 @@ class Profile(Settings):
     max_radiance: float | None = Field(2.0, gt=0.0)
     """For the cascade: triangles with brighter texels share none, and both thresholds are fractions of this radiance
     (section 4.1.1); None: the brightest texel of the charts, which treats dark and bright lightmaps alike."""
+    patch_size: Literal[2, 3, 5, 9, 17, 33, 65, 129, 257, 513, 1025, 2049, 4097] | None = None
+    """For the cascade: largest number of samples along an edge of a triangle when its light is compared; None: R_s, one
+    per texel of its longest edge (eq. 1)."""
     scale: float = Field(0.5, gt=0.0, le=1.0)
     """For the cascade: epsilon, texels of the repacked lightmap per original texel along a side (section 3.3.1)."""
     colour_scale: float = Field(0.4, gt=0.0, le=1.0)

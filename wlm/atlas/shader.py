@@ -11,23 +11,10 @@ from wlm.atlas.model import (
     SIDE_BITS,
     AtlasModel,
 )
-from wlm.bundle import sampler
+from wlm.bundle import filled, sampler
 
 EXACT = "WLM_ATLAS_EXACT"
 """Macro that makes the shader fetch texels and interpolate them in floating point."""
-
-_HEAD = """\
-// Light from a compressed lightmap: {what}
-// (Lightmap Compression with Color-Coherent UV Clustering and Cascade Texture Optimization, eq. 7).
-// For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below #version, in ES below the
-// precision statements of the types that it declares. Call wlm_atlas with {coordinate}: u to the right, v down, (0, 0)
-// at the first texel of the first row.
-//
-{textures}
-// They have one mip level. Where WLM_ATLAS_EXACT is defined four texels are fetched and mixed in floats; else the
-// sampler mixes four texels, in one fetch, with the 8 or so bits that a GPU gives to a place between two of them.
-
-"""
 
 _TEXTURES = {
     "plain": "// colour: the small texture, sampler2D, filter linear, clamped to its edge.",
@@ -37,44 +24,7 @@ _TEXTURES = {
 }
 """Texture declarations of each method and of colour "mixed"; every model has those of "plain"."""
 
-# Coordinates are in texels, so that arithmetic within a tile stays exact.
-_READ = """
-// The texture at a place in texels; texel i has its centre at i + 1/2.
-{type} wlm_atlas_{name}_at(vec2 place)
-{{
-    ivec2 last = textureSize({image}, 0) - ivec2(1, 1);
-#ifdef WLM_ATLAS_EXACT
-    vec2 inside = clamp(place - vec2(0.5, 0.5), vec2(0.0, 0.0), vec2(last));
-    ivec2 low = ivec2(floor(inside));
-    ivec2 high = min(low + ivec2(1, 1), last);
-    vec2 share = inside - vec2(low);
-    vec4 top = mix(texelFetch({image}, low, 0), texelFetch({image}, ivec2(high.x, low.y), 0), share.x);
-    vec4 bottom = mix(texelFetch({image}, ivec2(low.x, high.y), 0), texelFetch({image}, high, 0), share.x);
-    return mix(top, bottom, share.y).{channels};
-#else
-    return textureLod({image}, place / vec2(last + ivec2(1, 1)), 0.0).{channels};
-#endif
-}}
-"""
-
-_TILES = """
-const vec2 WLM_ATLAS_SIZE = vec2({width}.0, {height}.0); // of the lightmap, in texels
-const float WLM_ATLAS_TILE = {tile}.0; // texels of the lightmap along a tile
-
-vec3 wlm_atlas(vec2 uv)
-{{
-    // Tiles begin and end on centres of the lightmap's texels.
-    vec2 x = clamp(uv * WLM_ATLAS_SIZE - vec2(0.5, 0.5), vec2(0.0, 0.0), WLM_ATLAS_SIZE - vec2(1.0, 1.0));
-    x = x / WLM_ATLAS_TILE;
-    ivec2 tile = min(ivec2(floor(x)), textureSize(WLM_ATLAS_LUT, 0) - ivec2(1, 1));
-    uvec2 entry = texelFetch(WLM_ATLAS_LUT, tile, 0).xy;
-    // An entry is the first texel of the tile's rectangle, and in the low bits its texels less one.
-    uvec2 first = entry >> uvec2({bits}u, {bits}u);
-    uvec2 steps = entry & uvec2({mask}u, {mask}u);
-{blocks}    return wlm_atlas_colour_at(vec2(first) + (x - vec2(tile)) * vec2(steps) + vec2(0.5, 0.5));
-}}
-"""
-
+# In assets/tiles.glsl coordinates are in texels, so that arithmetic within a tile stays exact.
 _BLOCKS = """\
     if (steps.x >= {code}u) {{
         // Its first block, and from {code} on its blocks less one, of {side} texels a side.
@@ -119,7 +69,9 @@ def _one_lightmap(model: AtlasModel) -> str:
     samplers = {"colour": "sampler2D"} | ({"blocks": "sampler2D"} if mixed else {})
     if method != "plain":
         samplers["lut"] = "usampler2D" if method == "tiles" else "sampler2D"
-    text = _HEAD.format(
+    text = filled(
+        __package__,
+        "head.glsl",
         what=_WHAT[method],
         coordinate="the new UVs of mesh.glb" if len(model.uv) else "the mesh's own lightmap UVs",
         textures="\n".join(_TEXTURES[kind] for kind in kinds),
@@ -128,11 +80,15 @@ def _one_lightmap(model: AtlasModel) -> str:
     for name, kind in samplers.items():
         if kind == "sampler2D":
             type, channels = ("vec2", "xy") if name == "lut" else ("vec3", "rgb")
-            text += _READ.format(type=type, name=name, image=f"WLM_ATLAS_{name.upper()}", channels=channels)
+            text += filled(
+                __package__, "read.glsl", type=type, name=name, image=f"WLM_ATLAS_{name.upper()}", channels=channels
+            )
     if method != "tiles":
         return text + (_CASCADE if method == "cascade" else _PLAIN)
     lines = _BLOCKS if mixed else "" if model.first_block_code else _WHOLE_BLOCKS
-    return text + _TILES.format(
+    return text + filled(
+        __package__,
+        "tiles.glsl",
         width=width,
         height=height,
         tile=model.profile.tile,
@@ -148,58 +104,6 @@ vec3 wlm_object(vec2 uv, vec4 place, int sheet, float state)
 {
     return wlm_scene(uv * place.xy + place.zw, sheet, max(state, 0.0));
 }
-"""
-
-_SHARED_TEXT = """\
-// Light from the compressed lightmaps of a scene: each tile of each lightmap is a few rectangles of a texture array,
-// found by one lookup texture. For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below
-// #version, in ES below the precision statements of the types that it declares.
-//
-// wlm_scene_sheets: the texture sheets, usampler2D, filter nearest.
-// wlm_scene_lut: the texture lut, usampler2D, filter nearest.
-// wlm_scene_factors: the texture factors, sampler2D of 32-bit floats, filter nearest.
-// wlm_scene_colour: the texture colour, sampler2DArray, filter linear, clamped to its edge.
-{second}//
-// Call wlm_scene with the lightmap's UVs, u to the right, v down, after the object's scale and offset; the number of
-// the sheet that the object reads; and the number of the state, 1.5 for example half-way from the second to the third.
-
-{samplers}
-const float WLM_SCENE_TILE = {tile}.0; // texels of a lightmap along a tile
-
-vec3 {name}(vec2 uv, int sheet, float state)
-{{
-    uvec4 place = texelFetch(WLM_SCENE_SHEETS, ivec2(0, sheet), 0); // texels of its lightmap, first entry
-    uvec4 tiles = texelFetch(WLM_SCENE_SHEETS, ivec2(1, sheet), 0);
-    vec2 size = vec2(place.xy);
-    // Tiles begin and end on centres of the lightmap's texels.
-    vec2 x = clamp(uv * size - vec2(0.5, 0.5), vec2(0.0, 0.0), size - vec2(1.0, 1.0)) / WLM_SCENE_TILE;
-    ivec2 tile = min(ivec2(floor(x)), ivec2(tiles.xy) - ivec2(1, 1));
-    uvec4 entry = texelFetch(WLM_SCENE_LUT, ivec2(place.zw) + tile, 0);
-    // {entry}
-    vec2 first = vec2(entry.xy >> uvec2({bits}u, {bits}u));
-    vec2 steps = vec2(entry.xy & uvec2({mask}u, {mask}u));
-    vec2 extent = vec2({width}.0, {height}.0); // of a page
-{blocks}    vec2 at = first + (x - vec2(tile)) * steps + vec2(0.5, 0.5);
-    int components = {components};
-    int component = {component};
-    float page = {page};
-    int before = min(int(state), {last});
-    int after = min(before + 1, {last});
-    float share = state - float(before);
-    // A constant, and then a factor for each component.
-    vec3 light = vec3(0.0, 0.0, 0.0);
-    for (int k = 0; k <= components; k++) {{
-        vec3 factor = texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, before), 0).rgb;
-        factor = mix(factor, texelFetch(WLM_SCENE_FACTORS, ivec2(component + k, after), 0).rgb, share);
-        vec2 spot = at + vec2(float(k - 1) * (steps.x + 1.0), 0.0);
-{coarse}        spot = spot / extent;
-        if (k > 0)
-            {read}
-        if (components > 0)
-            light += factor;
-    }}
-    return max(light, vec3(0.0, 0.0, 0.0));
-}}
 """
 
 _SHARED_BLOCKS = """\
@@ -240,44 +144,6 @@ _SHORT = {
     "page": "0.0",
 }
 
-_SHARED_GRAD = """
-// Light where a pixel is large: dx and dy are dFdx(uv) and dFdy(uv). Up close it is wlm_scene(uv, sheet, state).
-vec3 {name}(vec2 uv, vec2 dx, vec2 dy, int sheet, float state)
-{{
-    vec2 size = vec2(texelFetch(WLM_SCENE_SHEETS, ivec2(0, sheet), 0).xy); // of the lightmap, in texels
-    float texels = max(length(dx * size), length(dy * size)); // along the pixel
-    // A bilinear read still meets all texels where a pixel is two of them. The first smaller level is a quarter.
-    float level = clamp(log2(max(texels, 1.0)) - {octaves}.0, 0.0, 32.0);
-    int near = sheet;
-    int far = int(texelFetch(WLM_SCENE_SHEETS, ivec2(1, sheet), 0).z); // 0: there is none
-    int steps = int(level);
-    for (int i = 0; i < steps; i++) {{
-        if (far > 0) {{
-            near = far;
-            far = int(texelFetch(WLM_SCENE_SHEETS, ivec2(1, near), 0).z);
-        }}
-    }}
-    float share = level - float(steps);
-    vec3 light = {read}(uv, near, state);
-    if (share <= 0.0 || far == 0)
-        return light;
-    return mix(light, {read}(uv, far, state), share);
-}}
-"""
-
-_SEPARATE = """
-// Each state has its own rows of sheets.
-vec3 {name}({declared}, int sheet, float state)
-{{
-    int before = min(int(state), {last});
-    int after = min(before + 1, {last});
-    float share = state - float(before);
-    vec3 light = {row}({given}, sheet + {stride} * before, float(before));
-    if (share <= 0.0)
-        return light;
-    return mix(light, {row}({given}, sheet + {stride} * after, float(after)), share);
-}}
-"""
 _FUNCTIONS = {"wlm_scene": ("vec2 uv", "uv"), "wlm_scene_grad": ("vec2 uv, vec2 dx, vec2 dy", "uv, dx, dy")}
 """Functions, with the arguments before the sheet as they are declared and passed on."""
 
@@ -293,7 +159,9 @@ def _shared(model: AtlasModel) -> str:
     short = model.lut.shape[2] == SHORT_ENTRY
     numbers = _SHORT if short else _LONG
     names = {name: f"{name}_row" if model.later else name for name in _FUNCTIONS}
-    text = _SHARED_TEXT.format(
+    text = filled(
+        __package__,
+        "shared.glsl",
         name=names["wlm_scene"],
         blocks=_SHARED_BLOCKS.format(**sizes) if mixed else "",
         coarse=_COARSE.format(**sizes, **numbers) if mixed and not short else "",
@@ -309,13 +177,21 @@ def _shared(model: AtlasModel) -> str:
         **numbers,
     )
     if model.levels:
-        text += _SHARED_GRAD.format(octaves=MIP_OCTAVES - 1, name=names["wlm_scene_grad"], read=names["wlm_scene"])
+        text += filled(
+            __package__,
+            "shared_grad.glsl",
+            octaves=MIP_OCTAVES - 1,
+            name=names["wlm_scene_grad"],
+            read=names["wlm_scene"],
+        )
     if not model.later:
         return text
     states = {"last": len(model.states) - 1, "stride": model.stride}
     for name, (declared, given) in _FUNCTIONS.items():
         if name == "wlm_scene" or model.levels:
-            text += _SEPARATE.format(name=name, row=names[name], declared=declared, given=given, **states)
+            text += filled(
+                __package__, "separate.glsl", name=name, row=names[name], declared=declared, given=given, **states
+            )
     return text
 
 

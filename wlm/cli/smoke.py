@@ -68,7 +68,12 @@ def simulate(
     output: Annotated[Path, output_option("DIR", "The folder of frames to write.")],
     frames: _SceneFrames = None,
     scale: _SceneScale = 1.0,
-    vdb: Annotated[bool, typer.Option("--vdb", help="Also write each frame as OpenVDB, with velocities.")] = False,
+    volumes: Annotated[
+        Literal["vdb", "nvdb", "nvdb-raw"] | None,
+        typer.Option(
+            help="Also write each frame, with velocities, as OpenVDB (vdb) or NanoVDB (nvdb; nvdb-raw: not compressed)."
+        ),
+    ] = None,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
     device: Device = "cpu",
@@ -100,7 +105,7 @@ def simulate(
             most = max(most, figures.get("smoke", 0.0))
             report(now)
 
-        options = {"resume": resume, "checkpoint_every": checkpoint_every, "vdb": vdb}
+        options = {"resume": resume, "checkpoint_every": checkpoint_every, "volumes": volumes}
         first = simulate(folder, solver=solver, progress=progress, **options)
     if resume and first == 1:
         console.note(f"{output}: there was nothing to resume; started at frame 1")
@@ -183,7 +188,7 @@ def predict(
     output: _Lightmaps,
     options: SmokeOptions,
     network: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Network that wlm smoke train wrote; default the shipped one.")
+        Path | None, typer.Option(metavar="FILE", help='File of wlm smoke train; default "fast", which ships with wlm.')
     ] = None,
     coarse: Annotated[bool, typer.Option("--coarse", help="Only use a coarse ray march, without a network.")] = False,
     seed: Seed = 0,
@@ -340,7 +345,7 @@ def run(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Network that wlm smoke train wrote, to make the six-way lightmaps; default a coarse march.",
+            help='Network for six-way lightmaps, "fast" or a file of wlm smoke train; default a coarse march.',
         ),
     ] = None,
     white: White = 1.0,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 SHEET = "sheet.png"
 _CAMERA = ("toward", "turn", "extent", "distance", "perspective")
-_VOLUME = ("up", "extinction", "emission", "density", "temperature")
+_VOLUME = ("up", "extinction", "emission", "density", "temperature", "kelvin")
 
 White = Annotated[float, typer.Option(help="Radiance that becomes white in a PNG.")]
 Background = Annotated[
@@ -63,7 +63,8 @@ class SmokeOptions:
         typer.Option(
             metavar="NAME=VALUE",
             help="Volume setting, repeatable: up=x|y|z, the upward axis of the file; extinction=PER_LENGTH at density "
-            "1; emission=PER_LENGTH at temperature 1; density=GRID and temperature=GRID, names of the grids.",
+            "1; emission=PER_LENGTH at temperature 1, or 1,500 kelvins; kelvin=yes|no, the unit of temperatures; "
+            "density=GRID and temperature=GRID, names of the grids.",
         ),
     ] = None
     trust: Trust = False
@@ -81,6 +82,10 @@ class SmokeOptions:
         for name in ("extinction", "emission"):
             if name in settings:
                 settings[name] = _float(f"--volume {name}", settings[name])
+        if settings.get("kelvin", "yes") not in ("yes", "no"):
+            raise WlmError(f"--volume kelvin: expected yes or no, got {settings['kelvin']!r}")
+        if "kelvin" in settings:
+            settings["kelvin"] = settings["kelvin"] == "yes"
         frames = load_frames(smoke, **settings, trust=self.trust or None, device=check_device(self.device))
         note_warnings(frames.warnings)
         return frames

@@ -63,7 +63,7 @@ class DifferentiableLattice:
             its two axes in the order x, y, z.
 
     Raises:
-        WlmError: The lattice stores 16-bit floats.
+        WlmError: The lattice stores 16-bit floats, or a body of it moves.
     """
 
     def __init__(self, lattice: Lattice) -> None:
@@ -71,6 +71,8 @@ class DifferentiableLattice:
         setup = self._setup
         if setup.spec.storage != "float32":
             raise WlmError("lattice: expected storage='float32', since float16 has no gradients, got 'float16'")
+        if lattice.moving:
+            raise WlmError("lattice: expected bodies at rest, since others have no gradients, got one that moves")
         self._cells, self._directions = math.prod(setup.shape), setup.tables.w.shape[0]
         self.device, self.inlets = torch.device(wp.device_to_torch(lattice.device)), setup.inlets
         # The step takes a force only if it has been compiled for one.
@@ -259,7 +261,7 @@ class DifferentiableSolver:
         for wrong, expected, found in (
             (self._setup.storage != "float32", "storage='float32'", "'float16'"),
             (self._setup.bricks, "bricks=False", "bricks"),
-            (self._setup.moves, "obstacles at rest", "one that moves"),
+            (solver.lattice.moving, "obstacles at rest", "one that moves"),
         ):
             if wrong:
                 raise WlmError(f"smoke: expected {expected}, since other smoke has no gradients, got {found}")

@@ -63,8 +63,9 @@ _SMOKE = ("dens", "smoke", "soot", "fog", "cloud", "steam", "mist", "vapor", "va
 _OTHERS = (
     *("temp", "heat", "flame", "fire", "burn", "fuel", "react", "emission", "emissive", "incandescence", "kelvin"),
     *("vel", "speed", "press", "diverg", "vort", "curl", "force", "collision", "obstacle", "mask", "distance"),
-    *("sdf", "surface", "levelset", "phi", "shadow", "color", "colour", "albedo", "grad"),
+    *("sdf", "surface", "levelset", "phi", "shadow", "grad"),
 )
+_COLOURS = ("color", "colour", "albedo", "scatter")
 
 
 def choose(
@@ -86,7 +87,7 @@ def choose(
     warnings = []
     if density is None:
         exact = [name for name in names if name == _DENSITY] or [name for name in names if name.lower() == _DENSITY]
-        other = [name for name in names if any(part in name.lower() for part in _OTHERS)]
+        other = [name for name in names if any(part in name.lower() for part in (*_OTHERS, *_COLOURS))]
         left = [name for name in names if name not in other]
         chosen = exact or [name for name in left if any(part in name.lower() for part in _SMOKE)] or left
         vectors = not exact and any(head.name.lower() == _DENSITY and not head.is_number for head in heads)
@@ -94,12 +95,19 @@ def choose(
             usable = next((head.name for head in heads if head.is_number), None)
             name = next(iter(chosen or names), usable)
             advice = "export it as floats" if name is None else f"choose one, such as --volume density={name}"
+            if vectors:
+                advice = "coloured smoke is not read, since lightmaps have one albedo: export the density as floats"
             level = "; a level set is filled with smoke if it is chosen" if name not in names and name else ""
             raise WlmError(f"{where}: expected a grid of floats named density, found {found}: {advice}{level}")
         density = chosen[0]
         if not exact and density:
             more = f" (found {found}; --volume density=NAME chooses)" if len(heads) > 1 else ""
             warnings.append(f"{where}: the grid {density} is read as the density{more}")
+        if coloured := [head.name for head in heads if any(part in head.name.lower() for part in _COLOURS)]:
+            names_of = ", ".join(dict.fromkeys(coloured))
+            warnings.append(
+                f"{where}: colours ({names_of}) are not read: smoke has one albedo, such as --albedo of light"
+            )
     if temperature is None and density.lower() != _TEMPERATURE:
         temperature = next((name for name in names if name.lower() == _TEMPERATURE), None)
     return density, temperature, warnings

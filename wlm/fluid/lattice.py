@@ -5,7 +5,7 @@ Lengths are in cells, times in steps, and the density of air at rest is 1; `Doma
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike
 
 from wlm.errors import WlmError
 from wlm.fluid.faces import Face, bounded_axes, face_links, inlet_rows, make_face, walled_axes
+from wlm.fluid.obstacles import Bodies, Obstacle
 from wlm.formats.parts import Part, check_parts
 from wlm.interop import free_memory, no_collection
-from wlm_kernels.fluid import lattice_links
+from wlm_kernels.fluid import lattice_bodies, lattice_links
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
 from wlm_kernels.fluid.lattice_fields import FluidKernels, fluid_kernels
 from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
@@ -36,6 +37,8 @@ is a quarter."""
 _MOST_STEPS = 2**31 - 1  # limit of the device's counter
 # Least number of steps for which capturing a graph saves time.
 _GRAPH_FROM = 16
+# A mark of no cell in `Lattice._fresh`.
+_STALE = 3
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ class Setup:
         outlets: Whether there are outlets.
         link_kernels, fluid_kernels: Kernels for the lattice's velocity set.
         solid: uint8 [N], number of the body of each cell; [0] without solids.
-        bodies: vec3 [256], velocity of each body.
+        bodies: The motion of the bodies.
         forces: vec3 [N], the force; [0] without.
     """
 
@@ -115,7 +118,7 @@ class Setup:
     link_kernels: lattice_links.LinkKernels
     fluid_kernels: FluidKernels
     solid: wp.array
-    bodies: wp.array
+    bodies: lattice_bodies.Motion
     forces: wp.array
 
 
@@ -192,13 +195,15 @@ class Lattice:
         self._trouble = wp.full(1, QUIET, dtype=wp.int64, device=self.device)
         # The number of the body of each cell, 0 for fluid; of size 0 while no cell has ever been solid.
         self._solid = self._zeros(0, wp.uint8)
-        self._velocity = self._zeros(BODIES, wp.vec3)
+        self._motion, self._bodies = lattice_bodies.make_motion(self.device), None
+        # The cells that bodies have just left, and the duration of a step in the unit of the bodies' paths.
+        self._fresh, self._pace = self._zeros(0, wp.uint8), 1.0
         self._forces = self._zeros(0, wp.vec3)
         self._faces: dict[str, Face] = {}
         self._links: lattice_links.Links | None = None
         self._graph: wp.Graph | None = None
         # Steps that this object launched itself; replays of a user's CUDA graph are counted only by the clock.
-        self._done, self._begun = 0, False
+        self._done, self._unchecked, self._begun = 0, 0, False
 
     @staticmethod
     def bytes_needed(shape: tuple[int, int, int], storage: str = "float32", lattice: str = "D3Q19") -> int:
@@ -239,8 +244,32 @@ class Lattice:
         """
         self._set_face(face, OUTLET if density is None else PRESSURE, density=density)
 
+    def set_bodies(self, obstacles: Sequence[Obstacle]) -> None:
+        """Sets the solid bodies, in place of earlier ones; each step moves and turns those whose paths do.
+
+        A step is done with the bodies where they are in its middle, and places them for the next. Cells that they leave
+        get the mean density and velocity of the fluid beside them. A body at rest keeps its cells where a moving one
+        reaches it; parts outside the box are without effect. `change_step` changes the pace, not the paths.
+
+        Args:
+            obstacles: At most 255 obstacles, bodies 1, 2 and so on; lengths and times of their paths are in cells and
+                steps.
+
+        Raises:
+            ValueError: There are more obstacles.
+            WlmError: In `step`, before a body's surface is faster than `MAX_SPEED`.
+        """
+        if len(obstacles) >= BODIES:
+            raise ValueError(f"obstacles: expected at most {BODIES - 1}, got {len(obstacles)}")
+        self._prepare()
+        self._bodies = Bodies(obstacles, self.shape, self.device) if obstacles else None
+        self._motion = self._bodies.motion if obstacles else lattice_bodies.make_motion(self.device)
+        self._fresh = self._zeros(self._cells if self.moving else 0, wp.uint8)
+        self._place()
+
     def set_solid(self, mask: ArrayLike | wp.array, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> None:
-        """Sets which cells are solid and how they move; must be called again after they have moved.
+        """Sets which cells are solid and how they move, in place of earlier bodies; must be called again after they
+        have moved.
 
         Cells that become fluid get the mean density and velocity of their neighbours. The call waits for the device
         and cannot be captured in a CUDA graph.
@@ -248,8 +277,8 @@ class Lattice:
         Args:
             mask: [X, Y, Z], true where a cell is solid; or the number of the body that covers each cell, 1 to 255, and
                 0 for fluid. A NumPy array, or a Warp array of uint8 on the lattice's device.
-            velocity: Velocity of the bodies, cells per step; (3,) for body 1, or [K, 3] for bodies 1 to K. Bodies do
-                not rotate.
+            velocity: Velocity of the bodies, cells per step; (3,) for body 1, or [K, 3] for bodies 1 to K. For bodies
+                that turn see `set_bodies`.
 
         Raises:
             WlmError: A body is faster than `MAX_SPEED`.
@@ -260,10 +289,26 @@ class Lattice:
             raise ValueError(
                 f"velocity: expected finite numbers of shape {shapes}, got NaN or shape {np.shape(velocity)}"
             )
+        _check_speed(float(np.linalg.norm(vectors, axis=1).max(initial=0.0)), "a body")
         rows = np.zeros((BODIES, 3), np.float32)
         rows[1 : len(vectors) + 1] = vectors
-        self._velocity.assign(rows)
+        if self._bodies is not None:
+            self.set_bodies(())
+        self._motion.velocity.assign(rows)
         self._prepare()
+        self._cover(new)
+
+    def _place(self) -> None:
+        """Places the bodies for the next step, whichever cells were solid before."""
+        solid = self._zeros(self._cells, wp.uint8)
+        if self._bodies is not None:
+            solid = self._bodies.cover(self._clock, self._pace)
+        self._fresh.zero_()
+        self._graph = None
+        self._cover(solid)
+
+    def _cover(self, new: wp.array) -> None:
+        """Makes the cells of a mask, uint8 [N], solid, and the others fluid."""
         if self._solid.shape[0] == 0:
             self._solid, self._graph = self._zeros(self._cells, wp.uint8), None
         self._spec = replace(self._spec, solids=True)
@@ -322,7 +367,8 @@ class Lattice:
     # Running.
 
     def step(self, steps: int = 1) -> None:
-        """Advances the air by a number of steps, and runs `check` after every `CHECK_EVERY` of them.
+        """Advances the air by a number of steps, and runs `check` after every `CHECK_EVERY` of them, also of several
+        calls.
 
         During the capture of a CUDA graph it does not check: call `check` between replays of the graph. The number of
         steps, and the number of steps done before the capture, must then be multiples of `period`.
@@ -336,16 +382,25 @@ class Lattice:
             if not self._begun or steps % self.period or self._done % self.period:
                 found = f"got {steps} in the graph and {self._done} before it"
                 raise ValueError(f"steps: expected a multiple of {self.period} in a CUDA graph and before it, {found}")
+            self._require_slow(math.inf)
             self._run(steps)
             return
         self._prepare()
         self._begun = True
         run = self._run_in_graphs if self.device.is_cuda and steps >= _GRAPH_FROM else self._run
         while steps > 0:
-            chunk = min(steps, CHECK_EVERY)
+            chunk = min(steps, CHECK_EVERY - self._unchecked)
+            self._require_slow(chunk)
             run(chunk)
-            steps -= chunk
-            self.check()
+            steps, self._unchecked = steps - chunk, self._unchecked + chunk
+            if self._unchecked == CHECK_EVERY:
+                self.check()
+
+    def _require_slow(self, steps: float) -> None:
+        """Checks the speed of the bodies in the next steps."""
+        if self.moving:
+            begin = self._done * self._pace
+            _check_speed(self._pace * self._bodies.fastest(begin, begin + steps * self._pace), "a body")
 
     @property
     def steps(self) -> int:
@@ -358,12 +413,22 @@ class Lattice:
         Raises:
             WlmError: The flow has blown up; the message names the first step, the cell and the cause.
         """
-        key = int(self._trouble.numpy()[0])
+        key, self._unchecked = int(self._trouble.numpy()[0]), 0
         if key == QUIET:
             return
         raise blown_up(key, self.shape)
 
     # Results.
+
+    @property
+    def moving(self) -> bool:
+        """Whether one of the bodies of `set_bodies` moves or turns."""
+        return self._bodies is not None and bool(self._bodies.moving)
+
+    @property
+    def solid(self) -> wp.array:
+        """The number of the body in each cell, uint8 [X, Y, Z], 0 for fluid; [0] while no cell has ever been solid."""
+        return self._solid.reshape(self.shape) if self._solid.size else self._solid
 
     def velocity(self, out: wp.array | None = None) -> wp.array:
         """Returns the velocity, vec3 [X, Y, Z], in cells per step; in a solid cell it is the velocity of the body."""
@@ -398,8 +463,11 @@ class Lattice:
         self._prepare()
         total = self._zeros(BODIES, wp.vec3d)
         if self._solid.shape[0] > 0:
-            inputs = [self._tables, self._n, self._bounded, self._links, self._solid, self._buffers[0]]
-            self._launch(self._link_kernels.force, self._links.cell.shape[0], inputs, [total])
+            links = self._links
+            if self.moving:
+                links = self._with_solids(self._make_links(0), every=True)
+            inputs = [self._tables, self._n, self._bounded, links, self._solid, self._buffers[0]]
+            self._launch(self._link_kernels.force, links.cell.shape[0], inputs, [total])
         return total.numpy()[body]
 
     def state(self) -> dict[str, np.ndarray]:
@@ -408,7 +476,7 @@ class Lattice:
         return {
             "populations": self._buffers[0].numpy().copy(),
             "solid": self._solid.numpy().copy(),
-            "bodies": self._velocity.numpy().copy(),
+            "bodies": self._motion.velocity.numpy().copy(),
             "steps": np.array(self.steps, np.int64),
         }
 
@@ -417,7 +485,7 @@ class Lattice:
         times as long, to which the settings of this lattice are converted.
 
         The following steps are the same as without the interruption: bit for bit on a CPU; on a GPU except for
-        rounding, since outlets sum in any order.
+        rounding, since outlets sum in any order. The bodies of `set_bodies` are then placed where they should be.
 
         Raises:
             WlmError: The state has another shape, lattice or storage, or contains NaN or infinity.
@@ -435,7 +503,7 @@ class Lattice:
         except ValueError as error:
             raise WlmError(f"lattice state: {error}") from error
         self._convert_settings(factor)
-        self._velocity.assign(state["bodies"])
+        self._motion.velocity.assign(state["bodies"])
         self._begun, self._done, self._graph = True, int(state["steps"]), None
         self._clock.fill_(self._done)
         self._trouble.fill_(QUIET)
@@ -445,12 +513,15 @@ class Lattice:
         now.assign(state["populations"])
         spare.zero_()
         self._find_links()
+        if self._bodies is not None:
+            self._place()
 
     def change_step(self, factor: float) -> None:
         """Changes the duration of a step by a factor, between two steps, with all settings and the state.
 
-        Velocity, pressure and viscous stress stay the same in SI units, up to rounding. The force and the velocity of
-        bodies are converted with the state; a caller that sets them must set converted ones from then on.
+        Velocity, pressure and viscous stress stay the same in SI units, up to rounding. The force and the motion of
+        bodies are converted with the state; a caller of `set_force` and `set_solid` must set converted ones from then
+        on.
 
         Args:
             factor: New duration over old one; `steps` divided by it must be a whole number.
@@ -471,10 +542,15 @@ class Lattice:
         self._clock.fill_(done)
         if self._buffers[0] is now:
             self._f.reverse()
-        self._velocity.assign(factor * self._velocity.numpy())
+        velocity = factor * self._motion.velocity.numpy()
+        _check_speed(float(np.linalg.norm(velocity, axis=1).max()), "a body")
+        self._motion.velocity.assign(velocity)
         self._convert_settings(factor)
+        if self._bodies is not None:
+            self._place()
 
     def _convert_settings(self, factor: float) -> None:
+        self._pace *= factor
         self._tau, self._rise = 0.5 + factor * (self._tau - 0.5), self._rise * factor
         for name, face in self._faces.items():
             fastest = factor * float(np.linalg.norm(face.velocity, axis=-1).max())
@@ -490,6 +566,9 @@ class Lattice:
         links.faces = self._links.faces
         for name in ("cell", "code", "term", "value", "used"):
             setattr(links, name, wp.clone(getattr(self._links, name)))
+        bodies = lattice_bodies.Motion()
+        for name in ("centre", "turn", "velocity", "spin", "moving"):
+            setattr(bodies, name, wp.clone(getattr(self._motion, name)))
         inlet = np.full(links.cell.shape[0], -1, np.int32)
         rows = inlet_rows(self._faces)
         inlet[: links.faces] = rows[self._decides] if len(rows) else -1
@@ -510,7 +589,7 @@ class Lattice:
             link_kernels=self._link_kernels,
             fluid_kernels=self._fluid_kernels,
             solid=wp.clone(self._solid),
-            bodies=wp.clone(self._velocity),
+            bodies=bodies,
             forces=wp.clone(self._forces),
         )
 
@@ -570,42 +649,42 @@ class Lattice:
         sets = self._spec.lattice, self._spec.storage
         self._link_kernels = lattice_links.link_kernels(*sets, OUTLET in kinds)
         self._fluid_kernels = fluid_kernels(*sets, walls)
-        *columns, self._decides = face_links(self.shape, self._set, self._faces)
-        self._links = self._make_links(columns, len(columns[0]))
+        *self._face_columns, self._decides = face_links(self.shape, self._set, self._faces)
+        self._links = self._make_links(0)
         self._find_links()
 
     def _find_links(self) -> None:
-        """Lists the populations that solids send back (see `lattice_links`), and checks the speed of the solids."""
-        # The count is also set without solids: the state before may have had some.
-        count, fastest = 0, 0.0
-        if self._solid.shape[0] > 0:
-            count, fastest = self._search()
-            links = self._links
-            if count > links.cell.shape[0] - links.faces:
-                columns = [array.numpy()[: links.faces] for array in (links.cell, links.code, links.term)]
-                # Spare elements: the number of links of a moving body varies.
-                self._links = self._make_links(columns, links.faces + count + count // 4)
-                self._graph = None
-                self._search()
-        self._links.used.fill_(self._links.faces + count)
-        _check_speed(fastest, "a body")
+        """Lists the populations that solids at rest and those of `set_solid` send back (see `lattice_links`)."""
+        before = self._links
+        self._links = self._with_solids(before, every=False)
+        self._graph = self._graph if self._links is before else None
 
-    def _make_links(self, columns, size: int) -> lattice_links.Links:
-        links = lattice_links.Links()
-        links.faces = len(columns[0])
-        dtypes = {"cell": np.int32, "code": np.uint8, "term": np.float32}
-        for (name, dtype), column in zip(dtypes.items(), columns, strict=True):
-            padded = np.zeros(size, dtype)
-            padded[: links.faces] = column
-            setattr(links, name, wp.array(padded, device=self.device))
-        links.value = self._zeros(size, float)
-        links.used = wp.full(1, links.faces, dtype=int, device=self.device)
+    def _with_solids(self, links: lattice_links.Links, every: bool) -> lattice_links.Links:
+        """Lists the links of solids (`every`: of moving ones too) after those of faces; in larger arrays if needed."""
+        # The count is also set without solids: the state before may have had some.
+        count = 0
+        if self._solid.shape[0] > 0:
+            where = [self._tables, self._n, self._bounded, self._solid, self._motion, every]
+            count = int(lattice_links.find_links(*where, links).numpy()[0])
+            if count > links.cell.shape[0] - links.faces:
+                # Spare elements: the number of links of a moving body varies.
+                links = self._make_links(count + count // 4)
+                lattice_links.find_links(*where, links)
+        links.used.fill_(links.faces + count)
         return links
 
-    def _search(self) -> tuple[int, float]:
-        where = [self._tables, self._n, self._bounded, self._solid, self._velocity, self._links]
-        count, fastest = lattice_links.find_links(*where)
-        return int(count.numpy()[0]), float(fastest.numpy()[0])
+    def _make_links(self, room: int) -> lattice_links.Links:
+        """Makes the links of the faces, with room for those of solids."""
+        links = lattice_links.Links()
+        links.faces = len(self._face_columns[0])
+        dtypes = {"cell": np.int32, "code": np.uint8, "term": np.float32}
+        for (name, dtype), column in zip(dtypes.items(), self._face_columns, strict=True):
+            padded = np.zeros(links.faces + room, dtype)
+            padded[: links.faces] = column
+            setattr(links, name, wp.array(padded, device=self.device))
+        links.value = self._zeros(links.faces + room, float)
+        links.used = wp.full(1, links.faces, dtype=int, device=self.device)
+        return links
 
     def _run(self, steps: int) -> None:
         """Queues steps on the device and returns without waiting."""
@@ -613,7 +692,10 @@ class Lattice:
             now, out = self._buffers
             inputs = [self._n, now, self._solid, self._tau, self._eddy, self._forces, self._done % 2]
             self._launch(step_kernel(self._spec), self._cells, inputs, [self._clock, self._trouble, self._sums, out])
-            self._apply_links(0, out)
+            stamp = 1 + self._done % 2
+            if self.moving:
+                self._bodies.move(self._clock, self._pace, self._solid, self._fresh, stamp)
+            self._apply_links(0, out, stamp)
             self._done += 1
 
     def _run_in_graphs(self, steps: int) -> None:
@@ -635,10 +717,14 @@ class Lattice:
 
     def _write_fields(self, drho: wp.array, u: wp.array) -> None:
         """Writes the density minus 1 of each cell to `drho` and the velocity to `u`; an array of size 0 is skipped."""
-        inputs = [self._n, self._buffers[0], self._solid, self._velocity, self._forces]
+        inputs = [self._n, self._buffers[0], self._solid, self._motion, self._forces]
         self._launch(self._fluid_kernels.fields, self._cells, inputs, [drho, u])
 
-    def _apply_links(self, first: int, f: wp.array) -> None:
+    def _apply_links(self, first: int, f: wp.array, stamp: int = _STALE) -> None:
+        """Applies the boundary conditions from link `first` on; cells that bodies have left have the mark `stamp`."""
+        for window in self._bodies.moving if self.moving else ():
+            where = [self._tables, self._bounded, window, self._motion, stamp, self._solid, self._fresh]
+            lattice_links.bounce(self._link_kernels, *where, f, self._sums)
         where = [self._tables, self._n, self._bounded, first, self._links, self._solid]
         lattice_links.apply(self._link_kernels, *where, self._clock, self._rise, f, self._sums)
 

@@ -2,7 +2,8 @@
 (neural-six-way-lightmaps, section 5: 100^3 velocities, 400^3 densities).
 
 Lengths are in cells of the lattice, times in its steps. A step of the solver is `substeps` of the lattice, in this
-order: obstacles move, smoke accelerates the air (buoyancy), the air moves, it carries the smoke, sources add smoke.
+order: smoke accelerates the air (buoyancy), the air and the obstacles move, the air carries the smoke, sources add
+smoke, and cells that obstacles cover lose theirs.
 """
 
 import hashlib
@@ -18,12 +19,13 @@ import torch
 import warp as wp
 
 from wlm.errors import WlmError
+from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
 from wlm.fluid.faces import axis_ends
-from wlm.fluid.lattice import Lattice, require_free
+from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import Obstacle
-from wlm.fluid.volume import DensityVolume
+from wlm.fluid.volume import DensityVolume, gather, scatter
 from wlm.formats.artifact import read_artifact, write_artifact
-from wlm.formats.parts import Part, check_parts
+from wlm.formats.parts import Part, check_part, check_parts
 from wlm_kernels.fluid import advection, advection_places, advection_sources
 from wlm_kernels.fluid.advection_places import DENSE
 
@@ -122,7 +124,6 @@ class SmokeSetup:
         temperature: Whether the smoke has a temperature.
         decay: Factors of density and temperature per step.
         bricks: Whether only bricks with smoke are computed.
-        moves: Whether an obstacle moves.
     """
 
     shape: tuple[int, int, int]
@@ -136,29 +137,20 @@ class SmokeSetup:
     temperature: bool
     decay: tuple[float, float]
     bricks: bool
-    moves: bool
 
 
-def voxel_bytes(scheme: str, storage: str, temperature: bool) -> int:
-    """Returns the memory that one cell of smoke takes, in bytes; arguments as for `Solver`."""
+def bytes_needed(shape: tuple[int, int, int], scheme: str, storage: str, temperature: bool, bricks: bool) -> int:
+    """Returns the memory that smoke takes at the start, in bytes; arguments as for `Solver`, and its cells."""
+    if bricks:
+        return INDEX_BYTES * math.prod(-(-n // advection_places.BRICK) for n in shape)
     fields = _buffers(scheme) * (2 if temperature else 1)
-    return fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
-
-
-def require_memory(shape: tuple[int, int, int], cell_bytes: int, device: wp.Device) -> None:
-    """Checks that a grid of smoke with `cell_bytes` bytes per cell can be indexed and allocated."""
-    x, y, z = shape
-    if x * y * z >= 2**31:
-        raise WlmError(f"smoke: {x} x {y} x {z} cells: expected fewer than 2^31 cells in all: use a lower refinement")
-    remedy = "a lower refinement, storage='float16' or the scheme 'semi-lagrangian'"
-    require_free("smoke", shape, cell_bytes * x * y * z, device, remedy)
+    return math.prod(shape) * fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
 
 
 class Solver:
     """Simulates smoke in the air of a lattice.
 
-    Set the faces of the lattice beforehand; the solver sets the solids of the lattice and its force. With a moving
-    obstacle each step waits for the device.
+    Set the faces of the lattice beforehand; the solver sets the bodies of the lattice and its force.
 
     Args:
         lattice: The air.
@@ -172,7 +164,7 @@ class Solver:
         cooling: Decay rate of the temperature, in the same unit.
         buoyancy: Acceleration of the air by smoke; None: smoke does not move the air.
         substeps: Steps of the lattice per step of the solver. Above a speed of 1 / substeps smoke can jump over walls.
-        bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are computed.
+        bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are stored and computed.
         threshold: With bricks, the largest value in a brick that counts as empty.
         duration: Duration of a step of the lattice, in any unit of time.
 
@@ -225,29 +217,13 @@ class Solver:
             raise ValueError("temperature: expected True, since a source, buoyancy or cooling uses it, got False")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
-        # The paths of obstacles are in steps of the first duration.
-        self.duration, self._first_duration = duration, duration
+        self.duration = duration
         self.shape = tuple(refinement * size for size in lattice.shape)
-        stored, cells = advection.STORAGES[storage], math.prod(self.shape)
-        require_memory(self.shape, voxel_bytes(scheme, storage, temperature), self.device)
+        self._stored = advection.STORAGES[storage]
+        needed = bytes_needed(self.shape, scheme, storage, temperature, bricks)
+        require_memory("smoke", self.shape, needed, self.device)
         self._box = advection_places.make_box(lattice.shape, refinement, axis_ends(lattice.faces))
         self._kept = ""
-        self._fields = [
-            advection.Fields(self._zeros((cells,), stored), self._zeros((cells if temperature else 0,), stored))
-            for _ in range(_buffers(scheme))
-        ]
-        self._velocity = self._zeros(lattice.shape, wp.vec3)
-        self._force = None
-        if buoyancy is not None:
-            self._force = self._zeros(lattice.shape, wp.vec3)
-            lattice.set_force(self._force)
-        self._solid = self._zeros(lattice.shape if obstacles else (0,), wp.uint8)
-        self._walls = [self._zeros((self._solid.size,), wp.uint8) for _ in range(2)]
-        self._placed = np.full((len(obstacles), 2, 3), np.nan)
-        self._bricks = DENSE
-        if bricks:
-            rings = advection_places.rings_for(_SOUND * substeps * refinement)
-            self._bricks = advection_places.make_bricks(self._box, rings, threshold, str(self.device))
         # The settings on which the arrays of a checkpoint depend.
         self._grids = {
             "lattice": list(lattice.shape),
@@ -255,7 +231,22 @@ class Solver:
             "storage": storage,
             "temperature": temperature,
             "substeps": substeps,
+            "obstacles": len(obstacles),
         }
+        self._threshold = threshold
+        self._pool = self._make_pool() if bricks else None
+        cells = math.prod(self.shape)
+        self._fields = self._pool.fields if self._pool else [self._make_fields(cells) for _ in range(_buffers(scheme))]
+        self._touched: tuple[Source, ...] = ()
+        self._velocity = self._zeros(lattice.shape, wp.vec3)
+        self._force = None
+        if buoyancy is not None:
+            self._force = self._zeros(lattice.shape, wp.vec3)
+            lattice.set_force(self._force)
+        self._walls = [self._zeros((math.prod(lattice.shape) if obstacles else 0,), wp.uint8) for _ in range(2)]
+        if obstacles:
+            lattice.set_bodies(self.obstacles)
+            advection_places.mark_walls(self._box, self.solid.flatten(), self._walls[0])
         self._done = 0
 
     # Running.
@@ -265,26 +256,34 @@ class Solver:
 
         During the capture of a CUDA graph it does not check the air: call `check` between replays of the graph. The
         number of steps, and the number of steps done before the capture, must then be multiples of `period`, `substeps`
-        must be a multiple of the lattice's `period`, and obstacles must be at rest.
+        must be a multiple of the lattice's `period`. With bricks call `reserve` before.
 
         Raises:
-            WlmError: The air blew up, or an obstacle is too fast.
+            WlmError: The air blew up, an obstacle is too fast, or bricks do not fit into the memory.
         """
         if steps < 0:
             raise ValueError(f"steps: expected at least 0, got {steps}")
         capturing = self.device.is_cuda and self.device.is_capturing
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
-        uneven = uneven or self._decay_every > 1
-        if capturing and (uneven or not self._done or any(obstacle.path.moves for obstacle in self.obstacles)):
+        uneven = uneven or self._decay_every > 1 or not (self._pool is None or self._pool.is_full)
+        if capturing and (uneven or not self._done):
             raise ValueError(
-                f"steps: expected obstacles at rest, substeps a multiple of {self.lattice.period}, and a multiple of "
+                f"steps: expected room for all bricks (`reserve`), substeps a multiple of "
+                f"{self.lattice.period}, and a multiple of "
                 f"{self.period} steps in the captured CUDA graph and before it; got {steps} after {self._done}"
             )
         for _ in range(steps):
-            if not capturing:
-                self._place_obstacles()
             self._step()
             self._done += 1
+
+    def reserve(self) -> None:
+        """Makes room for all bricks of the box, which is not needed without bricks.
+
+        Raises:
+            WlmError: There is not enough memory.
+        """
+        if self._pool is not None:
+            self._pool.reserve(self._pool.most)
 
     def change_step(self, factor: float) -> None:
         """Changes the duration of a step by a factor, with all settings and the state: the flow goes on as it was.
@@ -303,7 +302,6 @@ class Solver:
             raise ValueError(f"factor: expected one that divides {self.steps} steps into whole ones, got {factor}")
         self.lattice.change_step(factor)
         self._done = done
-        self._placed[:, 1] *= factor
         wp.to_torch(self._velocity).mul_(factor)
         self._convert_settings(factor)
 
@@ -357,19 +355,37 @@ class Solver:
 
     @property
     def density(self) -> wp.array:
-        """The density, float or half [X, Y, Z] on the device; valid until the next step."""
-        return self._fields[0].density.reshape(self.shape)
+        """The density, float or half [X, Y, Z] on the device; valid until the next step. With bricks it is a copy, made
+        at each call."""
+        return self._whole(self._fields[0].density)
 
     @property
     def temperature(self) -> wp.array | None:
         """The temperature, an array like the density; None if the smoke has none."""
-        values = self._fields[0].temperature
-        return values.reshape(self.shape) if values.size else None
+        return self._whole(self._fields[0].temperature) if self._grids["temperature"] else None
+
+    def bricks(self) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Returns the bricks that have smoke or heat, as `wlm.fluid.volume.gather` does; a solver with bricks makes no
+        array of all cells for it."""
+        now = self._fields[0]
+        parts = [now.density, now.temperature] if self._grids["temperature"] else [now.density]
+        if self._pool is None:
+            return gather([wp.to_torch(part.reshape(self.shape)) for part in parts])
+        numbers = self._pool.numbers()
+        values = [self._pool.values(part, numbers) for part in parts]
+        some = torch.stack([(part != 0).flatten(1).any(1) for part in values]).any(0)
+        return numbers[some], [part[some] for part in values]
+
+    def _whole(self, field: wp.array) -> wp.array:
+        if self._pool is None:
+            return field.reshape(self.shape)
+        numbers = self._pool.numbers()
+        return wp.from_torch(scatter(numbers, self._pool.values(field, numbers), self.shape))
 
     @property
     def solid(self) -> wp.array:
         """Numbers of the obstacles, uint8 [cells of the lattice]; [0] without obstacles."""
-        return self._solid
+        return self.lattice.solid
 
     @property
     def velocity(self) -> wp.array:
@@ -379,9 +395,16 @@ class Solver:
     @property
     def active_cells(self) -> int:
         """Number of cells of smoke that the last step computed; without bricks all. Waits for the device."""
-        if self._bricks is DENSE:
-            return math.prod(self.shape)
-        return int(self._bricks.count.numpy()[0]) * advection_places.BRICK**3
+        return (
+            math.prod(self.shape)
+            if self._pool is None
+            else int(self._bricks.counts.numpy()[0]) * advection_places.CELLS
+        )
+
+    @property
+    def stored_bytes(self) -> int:
+        """Memory of density and temperature with all buffers of a step, in bytes."""
+        return sum(part.capacity for each in self._fields for part in (each.density, each.temperature))
 
     def frame(
         self,
@@ -391,7 +414,8 @@ class Solver:
         cell: float = 1.0,
         origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> DensityVolume:
-        """Returns the smoke as a volume, which shares the solver's memory and is valid until the next step.
+        """Returns the smoke as a volume of all cells. Without bricks it shares the solver's memory and is valid until
+        the next step; with bricks it is a copy.
 
         Args:
             extinction: Extinction per length of the world at density 1.
@@ -399,18 +423,18 @@ class Solver:
             cell: Edge of a cell of the lattice in the world's unit.
             origin: Corner of the domain in the world.
         """
+        heat = self.temperature
         return DensityVolume(
             density=wp.to_torch(self.density),
             extinction=extinction,
             voxel=cell * self._box.voxel,
             origin=origin,
-            temperature=None if self.temperature is None else wp.to_torch(self.temperature),
+            temperature=None if heat is None else wp.to_torch(heat),
             emission=emission,
         )
 
     def setup(self) -> SmokeSetup:
-        """Places the obstacles as the next step would, and returns the settings with a copy of their cells."""
-        self._place_obstacles()
+        """Returns the settings, with a copy of the obstacles' cells."""
         return SmokeSetup(
             shape=self.shape,
             box=self._box,
@@ -420,10 +444,9 @@ class Solver:
             substeps=self.substeps,
             sources=self.sources,
             buoyancy=self.buoyancy,
-            temperature=self.temperature is not None,
+            temperature=self._grids["temperature"],
             decay=self._decay,
-            bricks=self._bricks is not DENSE,
-            moves=any(obstacle.path.moves for obstacle in self.obstacles),
+            bricks=self._pool is not None,
         )
 
     # Checkpoints.
@@ -438,9 +461,9 @@ class Solver:
         air = self.lattice.state()
         tensors = {f"lattice.{name}": value for name, value in air.items()}
         # On a CPU .numpy() shares the array's memory; it is written before the next step changes it.
-        tensors |= {"density": self.density.numpy(), "placed": self._placed, "velocity": self._velocity.numpy()}
-        if self.temperature is not None:
-            tensors["temperature"] = self.temperature.numpy()
+        numbers, values = self.bricks()
+        tensors |= {"velocity": self._velocity.numpy(), "bricks": numbers.cpu().numpy()}
+        tensors |= {name: part.cpu().numpy() for name, part in zip(("density", "temperature"), values, strict=False)}
         settings = self._grids | {"duration": self.duration}
         text = json.dumps(settings, sort_keys=True).encode()
         source = hashlib.blake2b(text, digest_size=16).hexdigest()
@@ -464,16 +487,14 @@ class Solver:
         duration = artifact.settings.get("duration")
         if not (isinstance(duration, float) and 1e-6 <= duration / self.duration <= 1e6):
             raise WlmError(f"{path}: duration: expected about {self.duration:.3g} for a step, found {duration}")
-        state, now = artifact.tensors, self._fields[0]
-        field = Part(wp.dtype_to_numpy(self.density.dtype), self.density.shape, least=0)
-        # NaN before the first step, when no obstacle has been placed.
-        nowhere = np.isnan(state.get("placed", 0.0)).all()
-        table = {"density": field, "placed": Part(np.float64, self._placed.shape, finite=not nowhere)}
-        table["velocity"] = Part(np.float32, (*self.lattice.shape, 3))
-        if self.temperature is not None:
-            table["temperature"] = field
+        state, edge = artifact.tensors, advection_places.BRICK
+        table = {"velocity": Part(np.float32, (*self.lattice.shape, 3))}
+        table["bricks"] = Part(np.int32, (None,), least=0, most=math.prod(self._box.bricks) - 1)
         air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
         try:
+            count = len(check_part(state, "bricks", table["bricks"]))
+            for name in ("density", "temperature")[: 1 + self._grids["temperature"]]:
+                table[name] = Part(wp.dtype_to_numpy(self._stored), (count, edge, edge, edge), least=0)
             parts = check_parts({name: v for name, v in state.items() if not name.startswith("lattice.")}, table)
         except ValueError as error:
             raise WlmError(f"{path}: {error}") from error
@@ -482,24 +503,27 @@ class Solver:
         except WlmError as error:
             raise WlmError(f"{error} (in {path})") from error
         self._convert_settings(duration / self.duration)
-        for fields in self._fields[1:]:
-            fields.density.zero_()
-            fields.temperature.zero_()
-        now.density.assign(parts["density"].ravel())
+        device = wp.device_to_torch(self.device)
+        numbers, *values = (
+            torch.from_numpy(np.array(parts[name])).to(device)
+            for name in ("bricks", "density", "temperature")
+            if name in parts
+        )
+        if self._pool is None:
+            now = self._fields[0]
+            for array, part in zip((now.density, now.temperature), values, strict=False):
+                wp.to_torch(array).copy_(scatter(numbers, part, self.shape).flatten())
+        else:
+            self._pool, self._touched = self._make_pool(), ()
+            self._pool.put(numbers, values)
+            self._fields = self._pool.fields
         self._velocity.assign(parts["velocity"])
-        if self.temperature is not None:
-            now.temperature.assign(parts["temperature"].ravel())
-        self._placed = np.array(parts["placed"])
         self._done = self.steps
         if self.obstacles:
-            # Before the first step the lattice has no solid.
-            if air["solid"].size:
-                self._solid.assign(np.array(air["solid"]).reshape(self._solid.shape))
-            else:
-                self._solid.zero_()
-            advection_places.mark_walls(self._box, self._solid.flatten(), self._walls[0])
-        if self._bricks is not DENSE:
-            self._bricks.busy.fill_(1)
+            before = wp.array(air["solid"], dtype=wp.uint8, device=self.device)
+            advection_places.mark_walls(self._box, before, self._walls[0])
+            # Obstacles of the file may have been elsewhere.
+            self._change_walls()
         self._note_checkpoint(path, air["steps"])
 
     def _note_checkpoint(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
@@ -514,43 +538,44 @@ class Solver:
 
     # Within a step.
 
-    def _place_obstacles(self) -> None:
-        """Moves obstacles to their positions in the middle of the step, unless they are there and at rest."""
-        span = self.substeps * self.duration / self._first_duration
-        placed = np.empty_like(self._placed)
-        for k, obstacle in enumerate(self.obstacles):
-            at = [obstacle.path.at((self._done + t) * span) for t in (0.0, 0.5, 1.0)]
-            placed[k] = at[1], (at[2] - at[0]) / self.substeps
-        if np.array_equal(placed, self._placed):
-            return
-        for k, obstacle in enumerate(self.obstacles):
-            obstacle.cover(self._solid, k + 1, placed[k, 0])
-        with self._naming_checkpoint():
-            self.lattice.set_solid(self._solid, placed[:, 1])
+    def _change_walls(self) -> None:
+        """Follows the obstacles: cells that they cover lose their smoke, cells that they leave get some from beside."""
         old, new = self._walls
-        advection_places.mark_walls(self._box, self._solid.flatten(), new)
+        advection_places.mark_walls(self._box, self.solid.flatten(), new)
+        if self._pool is not None:
+            # A cell that an obstacle leaves gets smoke of its neighbours.
+            self._pool.relist()
+            self._pool.store(clear=False)
         advection_sources.change_solids(self._box, old, new, self._fields[0], self._bricks)
         self._walls = [new, old]
-        self._placed = placed
 
     def _step(self) -> None:
         box, walls, bricks = self._box, self._walls[0], self._bricks
-        if bricks is not DENSE:
-            advection_places.relist(box, bricks)
-            for fields in self._fields:
-                advection_sources.empty_retired(box, bricks, fields)
+        if self._pool is not None:
+            # A source keeps its bricks, but new ones are not stored yet.
+            if self.sources != self._touched:
+                self._emit(only_mark=True)
+            self._touched = self.sources
+            self._pool.relist()
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
             advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)
+        if self._pool is not None:
+            self._pool.store()
         self._carry()
+        self._emit()
+        if self.lattice.moving:
+            self._change_walls()
+
+    def _emit(self, only_mark: bool = False) -> None:
         for source in self.sources:
             steps = source.steps(self.substeps)
             value = (steps * source.density, steps * source.temperature)
-            where = [box, walls, *source.region(box.refinement), value]
-            advection_sources.add_source(*where, self._fields[0], fixed=source.fixed, bricks=bricks)
+            where = [self._box, self._walls[0], *source.region(self._box.refinement), value, self._fields[0]]
+            advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
 
     def _carry(self) -> None:
         now, *spare = self._fields
@@ -559,10 +584,24 @@ class Solver:
             predicted, out = spare
             advection.advect(*where, predicted, self.substeps, bricks=self._bricks)
             advection.advect(*where, out, self.substeps, self._decay, self._bricks, predicted)
-            self._fields = [out, predicted, now]
+            self._fields[:] = [out, predicted, now]
         else:
             advection.advect(*where, spare[0], self.substeps, self._decay, self._bricks)
-            self._fields = [spare[0], now]
+            self._fields[:] = [spare[0], now]
+
+    @property
+    def _bricks(self) -> advection_places.Bricks:
+        return DENSE if self._pool is None else self._pool.bricks
+
+    def _make_pool(self) -> BrickPool:
+        # Smoke also moves by a cell of the lattice when an obstacle leaves it.
+        reach = max(_SOUND * self.substeps, float(bool(self.obstacles))) * self._box.refinement
+        rings = advection_places.rings_for(reach)
+        return BrickPool(self._box, rings, self._threshold, self._make_fields, _buffers(self.scheme), self.device)
+
+    def _make_fields(self, cells: int) -> advection.Fields:
+        heat = cells if self._grids["temperature"] else 0
+        return advection.Fields(self._zeros((cells,), self._stored), self._zeros((heat,), self._stored))
 
     def _zeros(self, shape: tuple[int, ...], dtype) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)

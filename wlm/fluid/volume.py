@@ -1,5 +1,5 @@
-"""Density volumes of smoke: checked input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); output as `.npz`
-or `.vdb`.
+"""Density volumes of smoke: checked input from arrays, `.npz`, NanoVDB (`.nvdb`) or OpenVDB (`.vdb`); output as the
+same.
 
 Repairs are listed in `DensityVolume.warnings`, one line for each kind; `docs/fluid.md` lists them and the errors.
 
@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -19,11 +19,13 @@ import warp as wp
 from torch.nn.functional import pad
 
 from wlm.errors import WlmError
+from wlm.fluid.black_body import black_body_luminance
 from wlm.fluid.grids import UPS, Grid, choose, is_level_set, on_one_lattice
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.exr import HALF_MAX
 from wlm.formats.limits import RESAMPLED, SURE_BOX, SURE_VOXELS, VOLUME_BYTES, VOXELS, check_growth
 from wlm.formats.nanovdb import NanoVdbFile
+from wlm.formats.nanovdb_writing import encode_nvdb
 from wlm.formats.npz import read_npz
 from wlm.formats.reading import FileBytes, open_file, read_file
 from wlm.formats.vdb import LARGEST, GridHead, VdbFile
@@ -63,10 +65,11 @@ _DENSITY, _TEMPERATURE, _BRICKS = "density", "temperature", "bricks"
 _TINY, _HUGE = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 _THIN, _THICK = 0.1, 1000.0  # optical thickness of smoke that hides 10% of the light, and that looks solid
-_KELVIN = 250.0  # temperatures above it are probably kelvins; those of smoke simulations are about 1
+_KELVIN = 250.0  # temperatures above it are kelvins; those of smoke simulations are about 1
+_GLOWING = 1500.0  # kelvins at which a black body emits `emission` per length
 
 SUFFIXES = (".npz", ".nvdb", ".vdb")
-"""Suffixes of the files that `load_volume` reads."""
+"""Suffixes of the files that `load_volume` reads and `save_volume` writes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +85,7 @@ class DensityVolume:
         origin: float64 [3], corner of voxel (0, 0, 0) in the world; its centre is half a voxel further.
         temperature: Tensor like the density; None: no emission.
         emission: Light emitted per unit of length at temperature 1.
+        kelvin: Whether the file has kelvins; the temperature is then the light of black bodies, 1 at 1,500 kelvin.
         warnings: The values that were repaired, one line for each kind.
     """
 
@@ -91,6 +95,7 @@ class DensityVolume:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     temperature: torch.Tensor | None = None
     emission: float = 1.0
+    kelvin: bool = False
     warnings: tuple[str, ...] = ()
 
     @property
@@ -171,7 +176,8 @@ def from_array(
             raise WlmError(f"{name}: {_TEMPERATURE}: expected shape {tuple(smoke.shape)}, found {tuple(heat.shape)}")
         heat = _dimmed(name, heat, emission, voxel, warnings)
     corner = tuple(float(o) for o in origin)
-    return DensityVolume(smoke, float(extinction), float(voxel), corner, heat, float(emission), tuple(warnings))
+    factors = {"extinction": float(extinction), "voxel": float(voxel), "emission": float(emission)}
+    return DensityVolume(smoke, **factors, origin=corner, temperature=heat, warnings=tuple(warnings))
 
 
 def load_volume(
@@ -185,6 +191,7 @@ def load_volume(
     up: str | None = None,
     density: str | None = None,
     temperature: str | None = None,
+    kelvin: bool | None = None,
 ) -> DensityVolume:
     """Reads a volume from a file.
 
@@ -204,6 +211,8 @@ def load_volume(
             `.vdb` is longest along z, which is up in Blender and Unreal.
         density: Name of the array or grid; None: `density`, or in a VDB file as `wlm.fluid.grids.choose` does.
         temperature: Name of the array or grid of temperatures; None: `temperature`, if it exists.
+        kelvin: Whether temperatures are kelvins, whose light is that of black bodies: `emission` per length at 1,500
+            kelvin. None: yes, with a warning, if one is above 250.
 
     Returns:
         The volume; NaN, infinite and negative values are replaced by 0, see `docs/fluid.md`.
@@ -211,38 +220,65 @@ def load_volume(
     Raises:
         WlmError: The input has one of the errors that `docs/fluid.md` lists; the message names the file and the field.
     """
-    path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise WlmError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, found {path.suffix or 'none'}")
+    path, suffix = Path(path), _suffix(path)
     told, up = up is not None, up or "y"
     if up not in UPS:
         raise ValueError(f"up: expected one of {', '.join(UPS)}, got {up!r}")
     names, device = (density, temperature), check_device(device)
     factors = {"extinction": extinction, "emission": emission, "name": str(path)}
-    if path.suffix.lower() == ".npz":
-        volume = from_array(**_read_npz(path, names, device, trust), **factors, device=device)
+    if suffix == ".npz":
+        arrays, hot, hints = _in_kelvin(path, _read_npz(path, names, device, trust), emission, kelvin)
+        volume = from_array(**arrays, **factors, device=device)
         volume = _turned(volume, up) if up != "y" else volume
     else:
         grids, warnings = _read_grids(path, names, trust)
         most = LARGEST if trust else min(VOXELS, max(SURE_BOX, RESAMPLED * sum(g.values.numel() for g in grids)))
         lattice, (smoke, *heat) = on_one_lattice(grids, most, up)
-        place = {"voxel": lattice.voxel, "origin": lattice.origin, "device": device}
-        volume = from_array(smoke, temperature=heat[0] if heat else None, **place, **factors)
+        arrays = {"density": smoke, "temperature": heat[0] if heat else None}
+        arrays, hot, hints = _in_kelvin(path, arrays, emission, kelvin)
+        volume = from_array(**arrays, voxel=lattice.voxel, origin=lattice.origin, device=device, **factors)
         volume = replace(volume, warnings=(*warnings, *volume.warnings))
         if not told and is_long_along_z(volume):
             warning = f"{path}: longest along z: if that is up, as in Blender and Unreal, say so (--volume up=z)"
             volume = replace(volume, warnings=(*volume.warnings, warning))
-    if volume.temperature is not None and emission == 1.0 and (hottest := float(volume.temperature.max())) > _KELVIN:
-        warning = (
-            f"{path}: temperatures up to {hottest:,.0f}: if they are kelvins, --volume emission={1 / hottest:.2g} lets "
-            "the hottest voxel emit 1 per length"
-        )
-        volume = replace(volume, warnings=(*volume.warnings, warning))
+    volume = replace(volume, kelvin=hot, warnings=(*volume.warnings, *hints))
     if voxel is None:
         return volume
     if not _TINY <= voxel <= _HUGE:
         raise WlmError(f"{path}: voxel: expected a length above 0 that float32 holds, found {voxel}")
     return replace(volume, voxel=voxel, origin=tuple(voxel / volume.voxel * o for o in volume.origin))
+
+
+def _in_kelvin(
+    path: Path, arrays: dict[str, Any], emission: float, kelvin: bool | None
+) -> tuple[dict[str, Any], bool, list[str]]:
+    """Replaces the temperature of a file by the light of black bodies if it is in kelvin; returns whether it is, and a
+    warning if this is an assumption."""
+    heat = arrays.get(_TEMPERATURE)
+    values = np.asarray(heat.cpu() if isinstance(heat, torch.Tensor) else heat)
+    if kelvin is False or values.dtype.kind not in "iuf" or values.ndim != 3:
+        return arrays, False, []
+    hottest = float(np.max(values, where=np.isfinite(values), initial=0.0))
+    if not (kelvin or hottest > _KELVIN):
+        return arrays, False, []
+    light, unit = np.empty(values.shape, np.float32), black_body_luminance(_GLOWING)
+    for out, plane in zip(light, values, strict=True):
+        out[...] = np.where(np.isfinite(plane), black_body_luminance(plane) / unit, plane)
+    if kelvin:
+        return arrays | {_TEMPERATURE: light}, True, []
+    most = float(black_body_luminance(hottest) / unit)
+    warning = (
+        f"{path}: temperatures up to {hottest:,.0f} are read as kelvins: the hottest voxel emits {emission * most:.2g} "
+        f"per length; --volume emission={1 / most:.2g} makes it 1, kelvin=no takes temperatures for light"
+    )
+    return arrays | {_TEMPERATURE: light}, True, [warning]
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    """Returns the suffix of a volume's file in lower case, which must be one of `SUFFIXES`."""
+    if (suffix := Path(path).suffix.lower()) not in SUFFIXES:
+        raise WlmError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, found {suffix or 'none'}")
+    return suffix
 
 
 def thickness_hint(thickness: float, extinction: float) -> str | None:
@@ -282,24 +318,23 @@ def save_volume(
     *,
     bricks: bool = False,
     velocity: np.ndarray | None = None,
+    codec: Literal["zip", "none"] = "zip",
 ) -> None:
-    """Writes a volume as `.npz` or `.vdb`, whole or not at all; `load_volume` reads it back.
+    """Writes a volume as `.npz`, `.vdb` or `.nvdb`, whole or not at all; `load_volume` reads it back.
 
     With `bricks` an `.npz` is not compressed, but empty bricks of 8^3 voxels are omitted: writing is much faster, but
-    the file is larger and other programs cannot read it. A `.vdb`, for Blender and Houdini, has grids named `density`,
-    `temperature` if there is one, and `velocity` if it is given, [X, Y, Z, 3] in the volume's box, also in larger
-    voxels.
+    the file is larger and other programs cannot read it. A `.vdb`, for Blender and Houdini, and a `.nvdb`, for
+    renderers on GPUs, have grids named `density`, `temperature` if there is one, and `velocity` if it is given, [X, Y,
+    Z, 3] in the volume's box, also in larger voxels. A `.nvdb` is compressed by zlib unless `codec` is "none".
 
     Raises:
         WlmError: The suffix is wrong, or the file cannot be written.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix not in (".npz", ".vdb"):
-        raise WlmError(f"{path}: expected a name that ends in .npz or .vdb, found {suffix or 'none'}")
+    suffix = _suffix(path)
     fields = {_DENSITY: volume.density}
     if volume.temperature is not None:
         fields[_TEMPERATURE] = volume.temperature
-    if suffix == ".vdb":
+    if suffix != ".npz":
         grids = {name: values.cpu().numpy() for name, values in fields.items()}
         grids |= {} if velocity is None else {"velocity": velocity}
         placed = []
@@ -308,16 +343,36 @@ def save_volume(
             matrix = np.diag([edge, edge, edge, 1.0])
             matrix[:3, 3] = np.asarray(volume.origin) + 0.5 * edge
             placed.append((name, values, matrix))
-        atomic_write(path, encode_vdb(placed))
+        atomic_write(path, encode_vdb(placed) if suffix == ".vdb" else encode_nvdb(placed, codec))
         return
-    arrays = {"voxel": np.float64(volume.voxel), "origin": np.asarray(volume.origin, np.float64)}
     if bricks:
-        numbers, cut = gather(list(fields.values()))
-        fields = {f"{name}_bricks": part for name, part in zip(fields, cut, strict=True)}
-        arrays |= {_BRICKS: numbers.cpu().numpy(), "shape": np.asarray(volume.shape, np.int64)}
-    arrays |= {name: values.cpu().numpy() for name, values in fields.items()}
+        save_bricks(path, *gather(list(fields.values())), volume.shape, volume.voxel, volume.origin)
+        return
+    arrays = {name: values.cpu().numpy() for name, values in fields.items()}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        (np.savez if bricks else np.savez_compressed)(file, **arrays)
+        np.savez_compressed(
+            file, voxel=np.float64(volume.voxel), origin=np.asarray(volume.origin, np.float64), **arrays
+        )
+
+
+def save_bricks(
+    path: str | os.PathLike[str],
+    numbers: torch.Tensor,
+    values: Sequence[torch.Tensor],
+    shape: Sequence[int],
+    voxel: float,
+    origin: Sequence[float],
+) -> None:
+    """Writes smoke in bricks as the `.npz` file of `save_volume` with `bricks`, whole or not at all.
+
+    `numbers` and `values` are the indices of the bricks, and the density and perhaps the temperature in them, as of
+    `gather`; `shape` has the voxels along x, y and z. Raises a WlmError if the file cannot be written.
+    """
+    parts = zip((_DENSITY, _TEMPERATURE), values, strict=False)
+    arrays = {f"{name}_bricks": part.cpu().numpy() for name, part in parts} | {_BRICKS: numbers.cpu().numpy()}
+    place = {"shape": np.asarray(shape, np.int64), "voxel": np.float64(voxel), "origin": np.asarray(origin, np.float64)}
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **place, **arrays)
 
 
 def _check(

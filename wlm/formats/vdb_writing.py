@@ -52,14 +52,24 @@ def _bits(mask: np.ndarray) -> bytes:
     return np.packbits(mask.ravel(), bitorder="little").tobytes()
 
 
-def _tree(values: np.ndarray) -> tuple[bytes, bytes]:
-    """Returns the topology of a tree, and the values of its leaves."""
-    channels, half = values.shape[3:], values.dtype == np.float16
+def occupied_leaves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cuts values [X, Y, Z] or [X, Y, Z, C] into leaves of 8^3 voxels.
+
+    Returns, for each leaf with a voxel other than 0, in the order of x, y, z: its place, int64 [N, 3] in leaves; its
+    values, [N, 8, 8, 8] or [N, 8, 8, 8, C]; and which of its voxels are not 0, bool [N, 8, 8, 8].
+    """
+    channels = values.shape[3:]
     padded = np.pad(values, [(0, -n % LEAF) for n in values.shape[:3]] + [(0, 0)] * len(channels))
     x, y, z = (n // LEAF for n in padded.shape[:3])
     cut = np.moveaxis(padded.reshape(x, LEAF, y, LEAF, z, LEAF, *channels), (2, 4), (1, 2))
     active = (cut.reshape(x, y, z, LEAF, LEAF, LEAF, -1) != 0).any(-1)
-    places, leaves = np.argwhere(active.any((3, 4, 5))), []
+    some = active.any((3, 4, 5))
+    return np.argwhere(some), cut[some], active[some]
+
+
+def _tree(values: np.ndarray) -> tuple[bytes, bytes]:
+    """Returns the topology of a tree, and the values of its leaves."""
+    half, (places, cubes, active), leaves = values.dtype == np.float16, occupied_leaves(values), []
     uppers = np.unique(places // (LOWER * UPPER), axis=0)
     # The number of buffers of a leaf, the background, and the number of tiles of the root.
     topology = [struct.pack("<I", 1), bytes(values[0, 0, 0].size * 4), struct.pack("<2I", 0, len(uppers))]
@@ -67,10 +77,10 @@ def _tree(values: np.ndarray) -> tuple[bytes, bytes]:
         within = places[(places // (LOWER * UPPER) == upper).all(1)]
         topology += [struct.pack("<3i", *(upper * LOWER * UPPER * LEAF)), _node(within // LOWER % UPPER, UPPER, half)]
         for lower in np.unique(within // LOWER, axis=0):
-            inside = within[(within // LOWER == lower).all(1)]
-            topology.append(_node(inside % LOWER, LOWER, half))
-            for place in map(tuple, inside):
-                mask, data = _bits(active[place]), cut[place][active[place]].tobytes()
+            inside = np.flatnonzero((places // LOWER == lower).all(1))
+            topology.append(_node(places[inside] % LOWER, LOWER, half))
+            for i in inside:
+                mask, data = _bits(active[i]), cubes[i][active[i]].tobytes()
                 packed = zlib.compress(data, 1)
                 size = len(packed) if len(packed) < len(data) else -len(data)
                 topology.append(mask)

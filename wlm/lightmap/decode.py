@@ -55,15 +55,10 @@ class SheetDecoder:
         self,
         model: SheetModel,
         device: str = "cpu",
-        gelu: str | None = None,
         tiles: Sequence[int] | np.ndarray | None = None,
     ) -> None:
-        """Uploads a sheet, or only the tiles of some numbers, which alone are read of a sheet of a file.
-
-        `gelu` is a GELU variant to use instead of the one that the model was trained with, for speed; None: the
-        model's.
-        """
-        self.device, gelu = device_of(device), gelu_of(model, gelu)
+        """Uploads a sheet, or only the tiles of some numbers, which alone are read of a sheet of a file."""
+        self.device, gelu = device_of(device), model.profile.gelu
         self.model = model if tiles is None else model.only(tiles)
         self._grid, self._left_out = model.grid, np.flatnonzero(model.kind != self.model.kind)
         self._tiles: list[DeviceTiles] = [
@@ -122,14 +117,13 @@ class Decoder:
         self,
         model: LightmapModel,
         device: str = "cpu",
-        gelu: str | None = None,
         tiles: Mapping[Sheet, Sequence[int]] | Sequence[int] | None = None,
     ) -> None:
         """Uploads a model.
 
         Args:
             model: The model.
-            device, gelu: As for `SheetDecoder`.
+            device: As for `SheetDecoder`.
             tiles: Numbers of the tiles to upload, by sheet, or of a model with one sheet the numbers alone. Of a file
                 only these are read, and sheets that are not named have no decoder. None: all.
 
@@ -146,7 +140,7 @@ class Decoder:
                 raise WlmError(f"{model.name}: tiles: expected a sheet of the model, got {sheet}")
             chosen = {sheet: named[sheet] for sheet in model.sheets if sheet in named}
         self.sheets: dict[Sheet, SheetDecoder] = {
-            sheet: SheetDecoder(model.sheets[sheet], device, gelu, own) for sheet, own in chosen.items()
+            sheet: SheetDecoder(model.sheets[sheet], device, own) for sheet, own in chosen.items()
         }
 
     @property

@@ -1,6 +1,6 @@
 """Generates the GLSL that decodes a lightmap from the textures and buffers of its bundle (`wlm.lightmap.bundle`)."""
 
-from wlm.bundle import sampler
+from wlm.bundle import filled, sampler
 from wlm.lightmap.encodings.base import columns
 from wlm.lightmap.encodings.maps import fours
 from wlm.lightmap.model import SheetModel
@@ -40,25 +40,6 @@ vec4 wlm_gelu(vec4 x)
 """,
 }
 
-_HEAD = """\
-// Decodes a temporal lightmap: feature maps and a small network for each tile of 128 x 128 texels (Neural Dynamic GI,
-// sections 3.2 to 3.4). For GLSL 3.30, GLSL ES 3.00 and later, with or without Vulkan; include it below #version, in ES
-// below `precision highp` of float, int, sampler2D and sampler2DArray.
-//
-{use}//
-// Textures; row 0 is v = 0. Filters are linear, without mip levels.
-{textures}//
-// If WLM_LIGHTMAP_EXACT is defined, four texels are fetched and mixed in floats; otherwise the filter unit mixes four
-// texels, with about 8 bits for a position between two of them.
-//
-// wlm_lightmap_four(i) and wlm_lightmap_entry(i) read four floats of networks and of the table: if these are in
-// buffers change them, or define WLM_LIGHTMAP_NET(i) and WLM_LIGHTMAP_HOUR_AT(i) before this file.
-
-{samplers}{reads}
-const int WLM_LIGHTMAP_COLUMNS = {columns}; // tiles in a row of the map
-const int WLM_LIGHTMAP_RECORD = {record}; // fours of a tile in the table, after {head} of all
-"""
-
 _DRAWN = """\
 // For each stored hour that is needed: bind the table of the hour, draw the map into a texture of linear light with
 // {last}(texel), and draw that one into another, each texel from wlm_source(texel), which fills the gaps between
@@ -91,39 +72,6 @@ vec4 {function}(int i)
 }}
 """
 
-_NETWORK = """
-const int WLM_LIGHTMAP_FOURS = {fours}; // of {hidden} units
-
-{gelu}
-// b + x W, where the rows of W are `apart` groups of four apart.
-vec4 wlm_lightmap_add(vec4 b, vec4 x, int at, int apart)
-{{
-    vec4 sum = b + x.x * wlm_lightmap_four(at) + x.y * wlm_lightmap_four(at + apart);
-    return sum + x.z * wlm_lightmap_four(at + 2 * apart) + x.w * wlm_lightmap_four(at + 3 * apart);
-}}
-
-// Colour of a tile of maps: `record` is the position of its record, `inner` the texel in the tile. G of eq. 4 has two
-// hidden layers. Four units of the first at a time are added to the second, whose array has constant indices, so that
-// it is in registers.
-vec3 wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner)
-{{
-    int row = int(tile.y);
-    int start = int(tile.z);
-    int second = start + 5 * WLM_LIGHTMAP_FOURS;
-    ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
-    vec4 uv = texelFetch(WLM_LIGHTMAP_UV, at, 0);
-{inputs}    int third = second + (4 * WLM_LIGHTMAP_FOURS + 1) * WLM_LIGHTMAP_FOURS;
-    vec4 b[WLM_LIGHTMAP_FOURS];
-{biases}    for (int i = 0; i < WLM_LIGHTMAP_FOURS; i++) {{
-        vec4 a = wlm_lightmap_add(wlm_lightmap_entry(record + 3 + i), uv, start + i, WLM_LIGHTMAP_FOURS);
-{sums}        a = wlm_gelu(a);
-        int w = second + 4 * WLM_LIGHTMAP_FOURS * i;
-{products}    }}
-    vec4 y = wlm_lightmap_four(third + 4 * WLM_LIGHTMAP_FOURS);
-{outputs}    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
-    return max(gain + wlm_lightmap_entry(record + 2).xyz * y.xyz, vec3(0.0, 0.0, 0.0));
-}}
-"""
 _UNITS = {
     "biases": "    b[{j}] = wlm_lightmap_four(third - WLM_LIGHTMAP_FOURS + {j});\n",
     "products": "        b[{j}] = wlm_lightmap_add(b[{j}], a, w + {j}, WLM_LIGHTMAP_FOURS);\n",
@@ -149,63 +97,6 @@ _SUMS = """\
             a = wlm_lightmap_add(a, uvt, start + 4 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
             a = wlm_lightmap_add(a, planes, start + 8 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
         }
-"""
-
-_MAPS = """
-const int WLM_LIGHTMAP_SIDE = {side}; // texels of a slice of F_uvt along a side
-
-// A slice of F_uvt at a place in its texels; texel i has its centre at i + 1/2.
-vec4 wlm_lightmap_slice(int image, vec2 place)
-{{
-    ivec2 first = ivec2(image % {uvt_columns}, image / {uvt_columns}) * WLM_LIGHTMAP_SIDE;
-    vec2 inside = clamp(place, vec2(0.5, 0.5), vec2({side}.0, {side}.0) - vec2(0.5, 0.5));
-#ifdef WLM_LIGHTMAP_EXACT
-    inside = inside - vec2(0.5, 0.5);
-    ivec2 low = ivec2(floor(inside));
-    ivec2 high = min(low + ivec2(1, 1), ivec2(WLM_LIGHTMAP_SIDE - 1, WLM_LIGHTMAP_SIDE - 1));
-    vec2 share = inside - vec2(low);
-    vec4 a = texelFetch(WLM_LIGHTMAP_UVT, first + low, 0);
-    vec4 b = texelFetch(WLM_LIGHTMAP_UVT, first + ivec2(high.x, low.y), 0);
-    vec4 c = texelFetch(WLM_LIGHTMAP_UVT, first + ivec2(low.x, high.y), 0);
-    vec4 d = texelFetch(WLM_LIGHTMAP_UVT, first + high, 0);
-    return mix(mix(a, b, share.x), mix(c, d, share.x), share.y);
-#else
-    return textureLod(WLM_LIGHTMAP_UVT, (vec2(first) + inside) / vec2({uvt_width}.0, {uvt_height}.0), 0.0);
-#endif
-}}
-
-// F_uvt at the table's hour, at a place from 0 to 1.
-vec4 wlm_lightmap_volume(int row, vec2 place)
-{{
-    vec4 time = wlm_lightmap_entry(0);
-    vec2 texel = place * {side}.0;
-    vec4 early = wlm_lightmap_slice(row * {slices} + int(time.x), texel);
-    return mix(early, wlm_lightmap_slice(row * {slices} + int(time.y), texel), time.z);
-}}
-
-// F_ut (an even image) or F_vt (an odd one) at a row of time.
-vec2 wlm_lightmap_line(int image, float place, int time)
-{{
-    ivec2 first = ivec2(image % {plane_across} * {plane_columns}, image / {plane_across} * {plane_rows} + time);
-    float inside = clamp(place * {plane_columns}.0, 0.5, {plane_columns}.0 - 0.5);
-#ifdef WLM_LIGHTMAP_EXACT
-    inside = inside - 0.5;
-    int low = int(floor(inside));
-    vec4 a = texelFetch(WLM_LIGHTMAP_PLANES, first + ivec2(low, 0), 0);
-    vec4 b = texelFetch(WLM_LIGHTMAP_PLANES, first + ivec2(min(low + 1, {plane_columns} - 1), 0), 0);
-    return mix(a.xy, b.xy, inside - float(low));
-#else
-    vec2 at = vec2(first) + vec2(inside, 0.5);
-    return textureLod(WLM_LIGHTMAP_PLANES, at / vec2({planes_width}.0, {planes_height}.0), 0.0).xy;
-#endif
-}}
-
-vec2 wlm_lightmap_plane(int image, float place)
-{{
-    vec4 time = wlm_lightmap_entry(1);
-    vec2 early = wlm_lightmap_line(image, place, int(time.x));
-    return mix(early, wlm_lightmap_line(image, place, int(time.y)), time.z);
-}}
 """
 
 _FRAMES = """
@@ -237,54 +128,6 @@ vec3 wlm_colour(ivec2 texel)
     int record = {head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD;
     vec4 tile = wlm_lightmap_entry(record);
 {kinds}    return wlm_lightmap_unmapped(tile, record, inner);
-}}
-"""
-
-_PAIR = """
-{gelu}
-shared vec4 wlm_lightmap_weights[{weights}];
-
-// Copies the network of a tile to the memory that a group of {invocations} invocations shares. Each calls it once, with
-// a texel of the tile, the same for all, and its own index.
-void wlm_lightmap_begin(ivec2 texel, int index)
-{{
-    ivec2 place = texel / {TILE};
-    vec4 tile = wlm_lightmap_entry({head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD);
-    int kind = int(tile.x);
-    int count = kind == 1 || kind == 2 ? {weights} : 0;
-{copies}    barrier();
-}}
-
-// Colours of two texels of a tile of maps, {below} rows apart: `record` is the position of its record, `inner` the
-// upper texel in the tile. G of eq. 4 has two hidden layers of {hidden} units. Each weight that is read serves both
-// texels. Four units of the first layer at a time are added to the second, whose array has constant indices, so that it
-// is in registers.
-void wlm_lightmap_mapped(vec4 tile, int record, ivec2 inner, out vec3 colour[2])
-{{
-    int row = int(tile.y);
-    ivec2 at = ivec2(row % {uv_columns}, row / {uv_columns}) * {TILE} + inner;
-    vec4 uv0 = texelFetch(WLM_LIGHTMAP_UV, at, 0);
-    vec4 uv1 = texelFetch(WLM_LIGHTMAP_UV, at + ivec2(0, {below}), 0);
-{inputs}    vec4 w0;
-    vec4 w1;
-    vec4 w2;
-    vec4 w3;
-    vec4 b[2 * {fours}];
-{biases}    for (int i = 0; i < {fours}; i++) {{
-        vec4 a0 = wlm_lightmap_entry(record + 3 + i);
-        vec4 a1 = a0;
-{sums}        a0 = wlm_gelu(a0);
-        a1 = wlm_gelu(a1);
-        int w = {second} + 4 * {fours} * i;
-{products}    }}
-    vec4 y0 = wlm_lightmap_weights[{last}];
-    vec4 y1 = y0;
-    vec4 a0;
-    vec4 a1;
-{outputs}    vec3 gain = wlm_lightmap_entry(record + 1).xyz;
-    vec3 spread = wlm_lightmap_entry(record + 2).xyz;
-    colour[0] = max(gain + spread * y0.xyz, vec3(0.0, 0.0, 0.0));
-    colour[1] = max(gain + spread * y1.xyz, vec3(0.0, 0.0, 0.0));
 }}
 """
 
@@ -337,29 +180,6 @@ _FRAMES_KIND = """\
     }}
 """
 
-_SOURCE = """
-// The texel whose light a texel of the map shows: itself inside a chart; in a gap the nearest inside within {reach}
-// texels, in reading order of several as near; beyond that itself.
-ivec2 wlm_source(ivec2 texel)
-{{
-    if (texelFetch(WLM_LIGHTMAP_VALID, texel, 0).x > 0.5)
-        return texel;
-    ivec2 found = texel;
-    int least = {beyond};
-    for (int y = -{reach}; y <= {reach}; y++)
-        for (int x = -{reach}; x <= {reach}; x++) {{
-            ivec2 at = texel + ivec2(x, y);
-            if (x * x + y * y < least && at.x >= 0 && at.y >= 0 && at.x < {width} && at.y < {height}) {{
-                if (texelFetch(WLM_LIGHTMAP_VALID, at, 0).x > 0.5) {{
-                    least = x * x + y * y;
-                    found = at;
-                }}
-            }}
-        }}
-    return found;
-}}
-"""
-
 _LINEAR = {
     "radiance": """
 // Linear radiance of a colour, at most 65504: a target of half floats would make more infinite.
@@ -381,25 +201,6 @@ vec3 wlm_{kind}(ivec2 texel)
 {{
     vec3 colour = wlm_colour(texel);  // glslang's HLSL takes no call with textures as an argument here
     return wlm_lightmap_linear(colour);
-}}
-"""
-
-_PAIR_COLOURS = """
-// Linear light of a texel of the group's tile and of the one {below} rows below.
-void wlm_lightmap_pair(ivec2 texel, out vec3 light[2])
-{{
-    ivec2 place = texel / {TILE};
-    ivec2 inner = texel - place * {TILE};
-    int record = {head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD;
-    vec4 tile = wlm_lightmap_entry(record);
-    if (int(tile.x) == 1 || int(tile.x) == 2) {{
-        wlm_lightmap_mapped(tile, record, inner, light);
-    }} else {{
-        light[0] = wlm_lightmap_unmapped(tile, record, inner);
-        light[1] = wlm_lightmap_unmapped(tile, record, inner + ivec2(0, {below}));
-    }}
-    light[0] = wlm_lightmap_linear(light[0]);
-    light[1] = wlm_lightmap_linear(light[1]);
 }}
 """
 
@@ -481,7 +282,7 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
     has_frames = "frames" in names
     unmapped = _UNMAPPED.format(frames=_FRAMES_KIND.format(**words) if has_frames else "")
     unmapped = (_FRAMES.format(**words) if has_frames else "") + unmapped
-    maps = _MAPS.format(**words) if "uvt" in names else ""
+    maps = filled(__package__, "maps.glsl", **words) if "uvt" in names else ""
     if pairs:
         names.remove("valid")
         group, rows = GROUP_SIZE
@@ -490,15 +291,17 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
         inputs = ["uv", "uvt", "planes"] if maps else ["uv"]
         lines = _pair_lines(wide, inputs, third)
         lines |= {"copies": _COPIES[bool(maps)].format(**words), "inputs": _PAIR_INPUTS.format(**words) if maps else ""}
-        text += _PAIR.format(gelu=_GELU[profile.gelu], **lines, **words)
-        return text + _PAIR_COLOURS.format(**words)
+        text += filled(__package__, "pair.glsl", gelu=_GELU[profile.gelu], **lines, **words)
+        return text + filled(__package__, "pair_colours.glsl", **words)
     text, kinds = _head(names, words | {"use": _DRAWN.format(last=f"wlm_{kind}")}) + maps, ""
     if "networks" in names:
         units = {name: "".join(line.format(j=j, at=4 * j) for j in range(wide)) for name, line in _UNITS.items()}
         inputs, sums = (_INPUTS.format(**words), _SUMS) if maps else ("", "")
-        text += _NETWORK.format(gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words)
+        text += filled(
+            __package__, "network.glsl", gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words
+        )
         kinds = _MAPPED_KIND
-    text += unmapped + _COLOUR.format(kinds=kinds, **words) + _SOURCE.format(**words)
+    text += unmapped + _COLOUR.format(kinds=kinds, **words) + filled(__package__, "source.glsl", **words)
     return text + linear + _LAST.format(kind=kind)
 
 
@@ -536,7 +339,9 @@ def _head(names: list[str], words: dict[str, object]) -> str:
         )
         if name in names
     )
-    return _HEAD.format(
+    return filled(
+        __package__,
+        "head.glsl",
         textures="".join(lines),
         samplers="".join(sampler(f"wlm_lightmap_{name}", _TEXTURES[name][0]) for name in names),
         reads=reads,

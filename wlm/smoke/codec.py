@@ -78,9 +78,9 @@ def open_network(path: str | os.PathLike[str] | None = None) -> SmokeModel:
     """Loads a trained network, and checks that its file has the settings that its guiding maps must be rendered with.
 
     Args:
-        path: The file; None: the network that ships with wlm.
+        path: The file; None or "fast": the network of the profile `fast`, which ships with wlm.
     """
-    path = shipped() if path is None else path
+    path = shipped() if path is None or os.fspath(path) == "fast" else path
     model = load(path, SmokeModel.SYSTEM)
     try:
         _ = model.dataset

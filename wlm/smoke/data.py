@@ -25,6 +25,7 @@ from wlm.errors import WlmError
 from wlm.fluid.grids import choose
 from wlm.fluid.volume import SUFFIXES, DensityVolume, from_array, grid_heads, load_volume
 from wlm.formats.atomic import atomic_write
+from wlm.formats.compact import digest
 from wlm.formats.exr import read_header, read_planes, write_planes
 from wlm.formats.exr_header import check_header
 from wlm.formats.folder import claim, read_index, write_index
@@ -87,21 +88,23 @@ class Frames:
 
     def view(self, settings: CameraSettings, volume: DensityVolume) -> Camera:
         """Places a camera in front of a frame; in a sequence it rests, and looks at the box around all frames."""
-        box = (volume.origin, volume.size) if self.scene is not None or self.single else self._box
+        box = (volume.origin, volume.size) if self.scene is not None or self.single else self._survey[:2]
         return make_camera(settings, *box)
 
     @functools.cached_property
-    def _box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest corner [3] and edges [3] of the bounding box of all frames with smoke; every file is read for it."""
-        boxes = []
+    def _survey(self) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Lowest corner [3] and edges [3] of the bounding box of all frames with smoke, and whether a frame is in
+        kelvin, so that all are; every file is read for it."""
+        boxes, kelvin = [], False
         for number in self.files:
-            volume = replace(self, device="cpu").load(number)
+            volume = replace(self, device="cpu", options={"kelvin": None, **self.options}).load(number)
+            kelvin |= volume.kelvin
             begin = np.asarray(volume.origin)
             boxes.append((bool(volume.density.any()), begin, begin + volume.size))
         # The box of a frame without smoke may be anywhere.
         smoky = [box for box in boxes if box[0]] or boxes
         low = np.min([box[1] for box in smoky], axis=0)
-        return low, np.max([box[2] for box in smoky], axis=0) - low
+        return low, np.max([box[2] for box in smoky], axis=0) - low, kelvin
 
     @property
     def extinction_used(self) -> float:
@@ -131,14 +134,24 @@ class Frames:
         """Reads the volume of a frame."""
         factors = self._factors
         options = dict(self.options)
-        if self.scene is None and not self.single and (heads := grid_heads(self.file(number))):
+        if self.scene is not None or self.single:
+            return load_volume(self.file(number), **factors, device=self.device, **options)
+        if heads := grid_heads(self.file(number)):
             # All frames have the same grids; files from before the smoke or the fire may lack them.
             names = {head.name for head in heads}
             if options["density"] not in names:
                 return from_array(np.zeros((1, 1, 1), np.float32), **factors, device=self.device)
             if options.get("temperature") not in names:
                 options.pop("temperature", None)
-        return load_volume(self.file(number), **factors, device=self.device, **options)
+        assumed = "kelvin" not in options and (not heads or "temperature" in options) and self._survey[2]
+        if assumed:
+            # A frame before the fire may have no temperature that tells the unit.
+            options["kelvin"] = True
+        volume = load_volume(self.file(number), **factors, device=self.device, **options)
+        if assumed and number == self.numbers[0]:
+            warning = f"{self.path}: temperatures are read as kelvins; --volume kelvin=no takes them for light"
+            volume = replace(volume, warnings=(*volume.warnings, warning))
+        return volume
 
     def volumes(
         self, numbers: Sequence[int] | None = None, progress: OnProgress | None = None
@@ -265,7 +278,7 @@ def open_frames(folder: str | os.PathLike[str], scene: Scene, *, resume: bool = 
     with _writing(folder):
         folder.mkdir(exist_ok=True)
         if not resume:
-            made = [*numbered(folder, "frame", ".npz").values(), *numbered(folder, "frame", ".vdb").values()]
+            made = (path for suffix in SUFFIXES for path in numbered(folder, "frame", suffix).values())
             for path in (*made, folder / CHECKPOINT):
                 path.unlink(missing_ok=True)
     content = {"format": _FORMAT, "version": _VERSION, "scene": scene.model_dump(mode="json")}
@@ -484,6 +497,8 @@ def _simulated(scene: Scene, until: float) -> dict[str, Any]:
     settings["obstacles"] = []
     for body in scene.obstacles:
         places = [body.centre(time) / scene.grid.cell for time in np.linspace(0.0, until, _PLACES)]
-        settings["obstacles"].append([body.shape, np.asarray(body.radius).tolist(), np.round(places, 6).tolist()])
+        # The content of a mesh counts, not its place.
+        corners = digest(*body.mesh())
+        settings["obstacles"].append([corners, body.shell, np.round(places, 6).tolist()])
     smoke, air = settings.pop("smoke"), settings.pop("air")
     return settings | {f"smoke.{k}": v for k, v in smoke.items()} | {f"air.{k}": v for k, v in air.items()}

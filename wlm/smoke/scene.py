@@ -11,16 +11,19 @@ import itertools
 import math
 import os
 from collections.abc import Sequence
+from pathlib import Path
+from types import NoneType
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
 
 from wlm.config import check_settings, load_settings, profile_path
 from wlm.fluid.faces import FACES
 from wlm.fluid.obstacles import Trajectory, surface
 from wlm.smoke.camera import Camera
+from wlm.smoke.meshes import SUFFIXES, Surface, read_surface
 from wlm.smoke.shading import Light, Ramp
 
 _SHORTEST = 1e-12
@@ -46,6 +49,17 @@ def _rising(path: tuple[tuple[float, float, float, float], ...]) -> tuple[tuple[
     return path
 
 
+def _shape(shape: str, info: ValidationInfo) -> str:
+    """Returns the name of a shape, or the absolute path of a mesh."""
+    if shape in _SIZES:
+        return shape
+    if Path(shape).suffix.lower() not in SUFFIXES:
+        names = ", ".join(_SIZES)
+        raise PydanticCustomError("shape", f"expected {names}, or a mesh file ({', '.join(SUFFIXES)})")
+    return os.path.abspath(os.path.join((info.context or {}).get("folder", ""), shape))
+
+
+_SIZES = {"sphere": float, "box": tuple, "cylinder": tuple}
 _LARGEST = 1e18  # its square is within float32
 _Number = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
 _Vector = tuple[_Number, _Number, _Number]
@@ -230,33 +244,42 @@ class ObstacleSettings(_Settings):
     """A solid obstacle.
 
     Attributes:
-        shape: "sphere", "box" or "cylinder", whose axis is y.
-        radius: Radius of a sphere in metres; for a box or cylinder half of its extents along x, y and z.
-        path: Positions (time, x, y, z) between which the centre moves linearly; before and after them it rests. It
+        shape: "sphere", "box", "cylinder", whose axis is y, or the path of a mesh, relative to the scene's file.
+        radius: Radius of a sphere in metres; for a box or cylinder half of its extents along x, y and z; null for a
+            mesh.
+        scale: Metres per unit of the mesh.
+        offset: Place of the shape's centre, or of the mesh's origin, relative to the obstacle's own, in metres.
+        path: Positions (time, x, y, z) between which the origin moves linearly; before and after them it rests. It
             starts, turns and stops while it moves by its largest diameter (`Trajectory.eased`).
+        shell: Whether only the surface of a mesh is solid; null: if its holes are more than 5% of it, or if it is
+            thinner than a cell.
         colour: Albedo R, G, B of the obstacle in pictures.
     """
 
-    shape: Literal["sphere", "box", "cylinder"] = "sphere"
-    radius: _Positive | tuple[_Positive, _Positive, _Positive]
+    shape: Annotated[str, AfterValidator(_shape)] = "sphere"
+    radius: _Positive | tuple[_Positive, _Positive, _Positive] | None = None
+    scale: _Positive = 1.0
+    offset: _Vector = (0.0, 0.0, 0.0)
     path: Annotated[tuple[tuple[_Number, _Number, _Number, _Number], ...], Field(min_length=1), AfterValidator(_rising)]
+    shell: bool | None = None
     colour: _Colour = (0.12, 0.12, 0.13)
 
     @model_validator(mode="after")
     def _sizes(self) -> ObstacleSettings:
-        if (self.shape == "sphere") == isinstance(self.radius, tuple):
-            raise PydanticCustomError("radius", "expected one number for a sphere, three for a box or cylinder")
+        if not isinstance(self.radius, _SIZES.get(self.shape, NoneType)):
+            text = "expected one number for a sphere, three for a box or cylinder, none for a mesh"
+            raise PydanticCustomError("radius", text)
         return self
 
     def centre(self, time: float) -> np.ndarray:
-        """Returns the position of the centre at a time in seconds, float64 [3]."""
+        """Returns the position of the origin at a time in seconds, float64 [3]."""
         return self.eased.at(time)
 
     @functools.cached_property
     def eased(self) -> Trajectory:
         """The path with ramps; positions in metres, times in seconds."""
         keys = np.array(self.path)
-        return Trajectory.of(keys[:, 1:], keys[:, 0]).eased(2.0 * float(np.max(self.radius)))
+        return Trajectory.of(keys[:, 1:], keys[:, 0]).eased(2.0 * float(np.abs(self.bounds).max()))
 
     @property
     def fastest(self) -> float:
@@ -265,10 +288,27 @@ class ObstacleSettings(_Settings):
         distance = np.linalg.norm(np.diff(keys[:, 1:], axis=0), axis=1)
         return float((distance / np.diff(keys[:, 0])).max(initial=0.0))
 
+    @property
+    def surface(self) -> Surface | None:
+        """What the mesh file contains; None for other shapes.
+
+        Raises:
+            WlmError: The file cannot be read.
+        """
+        return None if self.shape in _SIZES else read_surface(self.shape)
+
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the surface relative to the centre: corners, float64 [V, 3], and triangles, int64 [F, 3]."""
+        """Returns the surface relative to the origin: corners, float64 [V, 3], and triangles, int64 [F, 3]."""
+        if (read := self.surface) is not None:
+            return read.points * self.scale + self.offset, read.triangles
         points, triangles = surface(self.shape)
-        return points * np.asarray(self.radius), triangles
+        return points * np.asarray(self.radius) + self.offset, triangles
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """Lowest and highest corner of the box around the surface, relative to the origin, float64 [2, 3]."""
+        points = self.mesh()[0]
+        return np.stack([points.min(0), points.max(0)])
 
 
 class CameraSettings(_Settings):

@@ -3,22 +3,26 @@
 import math
 import time
 from collections.abc import Callable, Iterator
+from typing import Literal
 
 import numpy as np
+import torch
 import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid import solver as fluid
+from wlm.fluid.bricks import require_memory
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Domain, Lattice
-from wlm.fluid.obstacles import Mesh, Obstacle, Sphere, Trajectory
-from wlm.fluid.volume import DensityVolume, save_volume
+from wlm.fluid.obstacles import SHELL, Mesh, Obstacle, Sphere, Trajectory
+from wlm.fluid.volume import DensityVolume, save_bricks, save_volume
 from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked
 from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
 from wlm.smoke.scene import MOST_STEPS, Inlet, ObstacleSettings, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
+from wlm_kernels.fluid.mesh_inside import contains
 
 _Timed = tuple[fluid.Source, Callable[[float], bool]]
 # Depth in cells of the smoke at an inlet, so that the air carries smoke of full density into the box.
@@ -92,11 +96,11 @@ def warnings_of(scene: Scene) -> list[str]:
                 f"{radius:.3g} m at {share:.2g} of its density"
             )
     for i, obstacle in enumerate(scene.obstacles):
-        radius, times = np.broadcast_to(obstacle.radius, 3), obstacle.eased.times
+        bounds, times = obstacle.bounds, obstacle.eased.times
         places = [obstacle.centre(time) for time in (0.0, *times[(times > 0.0) & (times < end)], end)]
-        if (np.max(places, axis=0) + radius <= low).any() or (np.min(places, axis=0) - radius >= high).any():
+        if (np.max(places, 0) + bounds[1] <= low).any() or (np.min(places, 0) + bounds[0] >= high).any():
             warnings.append(f"obstacles.{i}: {box}")
-        elif (_radius(scene, obstacle) > radius).any():
+        elif _is_thin(scene, obstacle):
             warnings.append(
                 f"obstacles.{i}: it is thinner than a cell of {grid.cell:g} m, and is simulated as a cell thick"
             )
@@ -134,17 +138,25 @@ def _is_hidden(scene: Scene, points: np.ndarray, start: float, stop: float) -> b
     for moment in np.linspace(start, stop, _LOOKS_AT_OBSTACLES if scene.obstacles else 1):
         covered = np.zeros(len(points), bool)
         for obstacle in scene.obstacles:
-            away = np.abs(places - obstacle.centre(moment)) / _radius(scene, obstacle)
-            across, along = np.hypot(away[:, 0], away[:, 2]), away[:, 1]
-            reach = {"sphere": np.hypot(across, along), "cylinder": np.maximum(across, along), "box": away.max(1)}
-            covered |= reach[obstacle.shape] < 1.0
+            covered |= _covers(scene, obstacle, places - obstacle.centre(moment))
         if not covered.all():
             return False
     return True
 
 
+def _covers(scene: Scene, obstacle: ObstacleSettings, away: np.ndarray) -> np.ndarray:
+    """Tests which places, [N, 3] in metres relative to an obstacle's origin, are in the obstacle: bool [N]."""
+    if obstacle.surface is not None:
+        mesh = _mesh(scene, obstacle)
+        return contains(mesh.on("cpu"), away, mesh.shell * scene.grid.cell)
+    away = np.abs(away - obstacle.offset) / _radius(scene, obstacle)
+    across, along = np.hypot(away[:, 0], away[:, 2]), away[:, 1]
+    reach = {"sphere": np.hypot(across, along), "cylinder": np.maximum(across, along), "box": away.max(1)}
+    return reach[obstacle.shape] < 1.0
+
+
 def volume_of(scene: Scene, solver: fluid.Solver) -> DensityVolume:
-    """Returns the solver's smoke; the volume shares the solver's memory and is valid until the next step."""
+    """Returns the solver's smoke, as `wlm.fluid.solver.Solver.frame`."""
     smoke, grid = scene.smoke, scene.grid
     return solver.frame(extinction=smoke.extinction, emission=smoke.emission, cell=grid.cell, origin=grid.origin)
 
@@ -156,7 +168,7 @@ def simulate(
     device: str = "cpu",
     resume: bool = False,
     checkpoint_every: float = EVERY,
-    vdb: bool = False,
+    volumes: Literal["vdb", "nvdb", "nvdb-raw"] | None = None,
     progress: OnProgress | None = None,
 ) -> int:
     """Simulates a scene and writes its frames.
@@ -171,7 +183,8 @@ def simulate(
             opening the folder, a failure leaves earlier frames in the folder.
         device: Device that `wlm.interop.check_device` returned.
         resume: Whether to continue from a saved state, if there is one. A state past the last requested frame is kept.
-        vdb: Whether to write each frame as `frame_0001.vdb`, too, with the velocity of the air in metres per second.
+        volumes: Format in which each frame is written, too, with the velocity of the air in metres per second:
+            `frame_0001.vdb`, or `frame_0001.nvdb`, compressed or as a GPU holds it (nvdb-raw). None: no second file.
         checkpoint_every: Seconds between two saves of the state; 0: after every step.
         progress: Called after each frame, with the figures `smoke`, the integral of the density over the box, and
             `frame s`, the seconds of the frame; and about twice a second within a frame, without figures.
@@ -207,18 +220,21 @@ def simulate(
             for last in _frame_steps(scene, solver, frame):
                 if last:
                     solver.check()
-                    volume = volume_of(scene, solver)
-                    if vdb:
+                    if volumes is not None:
                         velocity = solver.velocity.numpy() * (scene.grid.cell / solver.duration)
-                        save_volume(frames.file(frame).with_suffix(".vdb"), volume, velocity=velocity)
+                        suffix, _, raw = volumes.partition("-")
+                        copy = frames.file(frame).with_suffix(f".{suffix}")
+                        save_volume(copy, volume_of(scene, solver), velocity=velocity, codec="none" if raw else "zip")
                     # Written before the state: a state without its frame could not be resumed.
-                    save_volume(frames.file(frame), volume, bricks=True)
+                    numbers, values = solver.bricks()
+                    place = (solver.shape, scene.grid.voxel, scene.grid.origin)
+                    save_bricks(frames.file(frame), numbers, values, *place)
                 if pace.due():
                     with pace.saving():
                         solver.save(checkpoint)
                 try:
                     if last and progress is not None:
-                        mass = float(volume.density.double().sum()) * volume.voxel**3
+                        mass = float(values[0].sum(dtype=torch.float64)) * scene.grid.voxel**3
                         meter.report(frame, smoke=mass, frame_s=time.perf_counter() - begin)
                     elif meter.due(frame - 1):
                         meter.report(frame - 1)
@@ -272,18 +288,18 @@ def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[boo
 def _require_memory(scene: Scene, device: str) -> None:
     """Checks before the allocation that air and smoke fit into the free memory; raises a WlmError if not."""
     grid, smoke = scene.grid, scene.smoke
-    voxel = fluid.voxel_bytes(smoke.scheme, smoke.storage, smoke.hot)
-    needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + voxel * math.prod(grid.shape)
+    smoke_bytes = fluid.bytes_needed(grid.shape, smoke.scheme, smoke.storage, smoke.hot, smoke.bricks)
+    needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + smoke_bytes
     warp_device = wp.get_device(device)
     free = free_memory(warp_device)
     if needed > free:
         air, dense = (" x ".join(map(str, shape)) for shape in (grid.cells, grid.shape))
         raise WlmError(
             f"{scene.name}: {air} cells of air and {dense} voxels of smoke need {needed / 2**30:.1f} GiB on {device},"
-            f" but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, or storage: float16"
+            f" but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, bricks, or storage: float16"
         )
     # A grid may also have more voxels than can be indexed.
-    fluid.require_memory(grid.shape, voxel, warp_device)
+    require_memory("smoke", grid.shape, smoke_bytes, warp_device)
 
 
 def _make_lattice(scene: Scene, device: str) -> Lattice:
@@ -376,18 +392,36 @@ def _ball(scene: Scene, ball: SourceSettings) -> tuple[float, float]:
 
 
 def _obstacles(scene: Scene) -> list[Obstacle]:
-    grid = scene.grid
     obstacles: list[Obstacle] = []
     for settings in scene.obstacles:
-        eased = settings.eased
-        path = Trajectory.of((eased.positions - grid.origin) / grid.cell, eased.times / scene.step)
-        radius = _radius(scene, settings)
-        if settings.shape == "sphere":
-            obstacles.append(Sphere(path, float(radius[0]) / grid.cell))
+        if settings.shape == "sphere" and not any(settings.offset):
+            obstacles.append(Sphere(_path(scene, settings), float(_radius(scene, settings)[0]) / scene.grid.cell))
         else:
-            points, triangles = settings.model_copy(update={"radius": tuple(radius)}).mesh()
-            obstacles.append(Mesh(path, points.astype(np.float32), triangles.astype(np.int32), scale=1.0 / grid.cell))
+            obstacles.append(_mesh(scene, settings))
     return obstacles
+
+
+def _path(scene: Scene, obstacle: ObstacleSettings) -> Trajectory:
+    eased, grid = obstacle.eased, scene.grid
+    return Trajectory.of((eased.positions - grid.origin) / grid.cell, eased.times / scene.step)
+
+
+def _mesh(scene: Scene, obstacle: ObstacleSettings) -> Mesh:
+    if (surface := obstacle.surface) is None:
+        thick, shell = obstacle.model_copy(update={"radius": tuple(_radius(scene, obstacle))}), 0.0
+    else:
+        surface_only = surface.is_open if obstacle.shell is None else obstacle.shell
+        thick, shell = obstacle, SHELL if surface_only or _is_thin(scene, obstacle) else 0.0
+    points, triangles = thick.mesh()
+    places = points.astype(np.float32), triangles.astype(np.int32)
+    return Mesh(_path(scene, obstacle), *places, scale=1.0 / scene.grid.cell, shell=shell)
+
+
+def _is_thin(scene: Scene, obstacle: ObstacleSettings) -> bool:
+    """Tests whether an obstacle is simulated thicker than it is."""
+    if (surface := obstacle.surface) is None:
+        return bool((_radius(scene, obstacle) > obstacle.radius).any())
+    return surface.thickness * obstacle.scale < scene.grid.cell
 
 
 def _radius(scene: Scene, obstacle: ObstacleSettings) -> np.ndarray:

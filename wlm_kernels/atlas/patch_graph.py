@@ -2,8 +2,9 @@
 
 Two patches are alike if their distance is below a threshold, lambda. For most pairs, lower and upper bounds of the
 distance (`Bounds`) decide, so that all samples are compared for few pairs only. The bounds are float32 with a margin
-above their rounding errors, and so never change a result. Patches are sorted by mean colour: if two means differ by
-lambda or more, the patches can't be alike and are not compared.
+above their rounding errors, and so never change a result. Lattices of more than 65 samples along a side have no bounds,
+since computing them would take longer than the few comparisons of such patches. Patches are sorted by mean colour: if
+two means differ by lambda or more, the patches can't be alike and are not compared.
 
 Read `tests/reference/patches.py` first (`distances`, `adjacency`, `greedy`), which does the same with the distances of
 all pairs.
@@ -29,6 +30,8 @@ from wlm_kernels.atlas.patches import (
 
 # The margin exceeds the rounding of a bound in float32: 6e-8 of up to 765 levels, a few dozen times.
 _MARGIN = wp.constant(4.0e-3)
+
+_BOUNDED = 7  # sizes with `Bounds`: up to 65
 
 
 @wp.struct
@@ -68,8 +71,8 @@ class Rule:
     colour: int
     level: float
     whole: int
-    same: wp.array1d[int]
-    mixed: wp.array1d[int]
+    same: wp.array1d[wp.int64]
+    mixed: wp.array1d[wp.int64]
 
 
 @wp.kernel(enable_backward=False)
@@ -168,24 +171,26 @@ def _alike(
         large = y
         small = x
     level = wp.max(a.level, b.level)
-    f = bounds[large, level]
-    g = bounds[small, level]
-    below = _row_differences(f.moment, g.moment)
-    above = _row_differences(f.corner, g.corner)
-    undecided = int(0)
+    undecided = int(63)
     first = int(0)
-    closest = float(wp.inf)
-    for order in range(6):
-        bound = _along(above, order) / 3.0 + f.residual + g.residual
-        if bound < rule.level - _MARGIN:
-            return True
-        if bound < closest:
-            closest = bound
-            first = order
-        if _along(below, order) < rule.level + _MARGIN:
-            undecided += 1 << order
-    if undecided == 0:
-        return False
+    if level < bounds.shape[1]:
+        f = bounds[large, level]
+        g = bounds[small, level]
+        below = _row_differences(f.moment, g.moment)
+        above = _row_differences(f.corner, g.corner)
+        undecided = 0
+        closest = float(wp.inf)
+        for order in range(6):
+            bound = _along(above, order) / 3.0 + f.residual + g.residual
+            if bound < rule.level - _MARGIN:
+                return True
+            if bound < closest:
+                closest = bound
+                first = order
+            if _along(below, order) < rule.level + _MARGIN:
+                undecided += 1 << order
+        if undecided == 0:
+            return False
     limit = rule.mixed[level]
     if a.level == b.level:
         limit = rule.same[level]
@@ -201,24 +206,44 @@ def _alike(
 @wp.kernel(enable_backward=False)
 def _spans(
     # in:
+    samples: wp.array1d[int],
     patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
+    levels: int,
     # out:
     low: wp.array1d[float],
     high: wp.array1d[float],
 ):
-    """Writes a patch's least and greatest mean colour (sum of the channels) on its own lattice and all larger ones."""
-    i = wp.tid()
-    least = float(wp.inf)
-    most = float(-wp.inf)
-    for level in range(patches[i].level, bounds.shape[1]):
-        moment = bounds[i, level].moment
-        sum = moment[0] + moment[1] + moment[2]
-        mean = sum[0] + sum[1] + sum[2]
+    """Writes a patch's least and greatest mean colour (sum of the channels) on its own lattice and all larger ones.
+
+    A larger lattice has s steps in each step of the patch's own. In the sum of the interpolated colours a sample within
+    the patch then has the weight s^2, one on an edge s (s + 1) / 2 and one at a corner (s + 1) (s + 2) / 6.
+    """
+    t = wp.tid()
+    p = patches[t]
+    steps = 1 << p.level
+    sums = wp.vec3d()  # within, on edges, at corners
+    at = p.start
+    for j in range(steps + 1):
+        for i in range(steps + 1 - j):
+            k = steps - i - j
+            zeros = wp.where(i == 0, 1, 0) + wp.where(j == 0, 1, 0) + wp.where(k == 0, 1, 0)
+            a = samples[at]
+            sums[zeros] += wp.float64(channel(a, 0) + channel(a, 1) + channel(a, 2))
+            at += 1
+    least = wp.float64(wp.inf)
+    most = wp.float64(-wp.inf)
+    for level in range(p.level, levels):
+        s = wp.float64(1 << (level - p.level))
+        n = wp.float64((1 << level) + 1)
+        one = wp.float64(1.0)
+        two = wp.float64(2.0)
+        six = wp.float64(6.0)
+        sum = s * s * sums[0] + s * (s + one) / two * sums[1] + (s + one) * (s + two) / six * sums[2]
+        mean = sum / (n * (n + one) / two)
         least = wp.min(least, mean)
         most = wp.max(most, mean)
-    low[i] = least
-    high[i] = most
+    low[t] = float(least)
+    high[t] = float(most)
 
 
 @wp.kernel(enable_backward=False)
@@ -236,13 +261,42 @@ def _edges(
 ):
     """Finds the edges between one patch per thread and all later patches, so that each pair is tested once."""
     a = offset + wp.tid()
+    if patches[a].level >= bounds.shape[1]:
+        return
     last = high[a] + rule.level + _MARGIN
     for b in range(a + 1, low.shape[0]):
         if low[b] > last:
             break
-        if _alike(samples, patches, bounds, rule, a, b):
-            edge[a, b] = wp.uint8(1)
-            edge[b, a] = wp.uint8(1)
+        if patches[b].level < bounds.shape[1]:
+            if _alike(samples, patches, bounds, rule, a, b):
+                edge[a, b] = wp.uint8(1)
+                edge[b, a] = wp.uint8(1)
+
+
+@wp.kernel(enable_backward=False)
+def _large_edges(
+    # in:
+    samples: wp.array1d[int],
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    rule: Rule,
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+    large: wp.array1d[int],
+    # out:
+    edge: wp.array2d[wp.uint8],
+):
+    """Finds the edges of patches that have no bounds, with a thread for each pair, since a comparison takes long."""
+    k, b = wp.tid()
+    a = large[k]
+    if b == a or (b < a and patches[b].level >= bounds.shape[1]):
+        return
+    margin = rule.level + _MARGIN
+    if low[b] > high[a] + margin or low[a] > high[b] + margin:
+        return
+    if _alike(samples, patches, bounds, rule, a, b):
+        edge[a, b] = wp.uint8(1)
+        edge[b, a] = wp.uint8(1)
 
 
 @wp.kernel(enable_backward=False)
@@ -268,6 +322,9 @@ def _join(
     a = nodes[i]
     margin = rule.level + _MARGIN
     best = int(rank.shape[0])
+    if patches[a].level >= bounds.shape[1]:
+        joined[i] = best
+        return
     for k in range(wp.lower_bound(head_low, low[a] - margin - reach), heads.shape[0]):
         if head_low[k] > high[a] + margin:
             break
@@ -275,6 +332,34 @@ def _join(
             if _alike(samples, patches, bounds, rule, heads[k], a):
                 best = rank[k]
     joined[i] = best
+
+
+@wp.kernel(enable_backward=False)
+def _join_large(
+    # in:
+    samples: wp.array1d[int],
+    patches: wp.array1d[Patch],
+    bounds: wp.array2d[Bounds],
+    rule: Rule,
+    low: wp.array1d[float],
+    high: wp.array1d[float],
+    nodes: wp.array1d[int],
+    large: wp.array1d[int],
+    heads: wp.array1d[int],
+    rank: wp.array1d[int],
+    # out:
+    joined: wp.array1d[int],
+):
+    """Does the same for nodes whose patches have no bounds, with a thread for each pair of a node and a group."""
+    j, k = wp.tid()
+    i = large[j]
+    a = nodes[i]
+    margin = rule.level + _MARGIN
+    head = heads[k]
+    if low[head] > high[a] + margin or low[a] > high[head] + margin or rank[k] >= joined[i]:
+        return
+    if _alike(samples, patches, bounds, rule, head, a):
+        wp.atomic_min(joined, i, rank[k])
 
 
 def rule(threshold: float, colour_threshold: float, device) -> Rule:
@@ -288,14 +373,14 @@ def rule(threshold: float, colour_threshold: float, device) -> Rule:
     out.whole = math.ceil(total)
     same = [math.ceil(total * samples_of(size)) for size in SIZES]
     mixed = [math.ceil(total * samples_of(size) * (size - 1)) for size in SIZES]
-    out.same = wp.array(same, dtype=int, device=device)
-    out.mixed = wp.array(mixed, dtype=int, device=device)
+    out.same = wp.array(same, dtype=wp.int64, device=device)
+    out.mixed = wp.array(mixed, dtype=wp.int64, device=device)
     return out
 
 
 def bounds(samples, patches, levels: int):
-    """Returns the `Bounds` [F, levels] of F patches on the lattices of the sizes `SIZES[:levels]`."""
-    out = wp.empty((patches.shape[0], levels), dtype=Bounds, device=samples.device)
+    """Returns the `Bounds` [F, L] of F patches on the lattices of the sizes `SIZES[:L]`, L = `levels`, at most 7."""
+    out = wp.empty((patches.shape[0], min(levels, _BOUNDED)), dtype=Bounds, device=samples.device)
     wp.launch(_bounds, out.shape, inputs=[samples, patches], outputs=[out], device=samples.device)
     return out
 
@@ -311,6 +396,7 @@ class Graph:
         low, high: float [M], a patch's least and greatest mean colour on any lattice, in levels. If two patches are
             alike, their means on the larger one's lattice differ by less than `rule.level`.
         means: float32 [M], copy of `low` in the CPU's memory.
+        large: bool [M], on the CPU: whether a patch has no bounds.
         reach: The largest difference of `high` and `low` in any patch.
     """
 
@@ -321,29 +407,32 @@ class Graph:
     low: wp.array
     high: wp.array
     means: np.ndarray
+    large: np.ndarray
     reach: float
 
     def _inputs(self) -> list:
         return [self.samples, self.patches, self.bounds, self.rule]
 
 
-def graph(samples, patches, bounds, rule: Rule) -> tuple[Graph, np.ndarray]:
-    """Makes the graph of M patches. Also returns the index in `patches` of each of its nodes, int64 [M]."""
+def graph(samples, patches, bounds, levels: int, rule: Rule) -> tuple[Graph, np.ndarray]:
+    """Makes the graph of M patches of the sizes `SIZES[:levels]`. Also returns the index in `patches` of each of its
+    nodes, int64 [M]."""
     count, device = patches.shape[0], samples.device
     low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
-    wp.launch(_spans, count, inputs=[patches, bounds], outputs=[low, high], device=device)
+    wp.launch(_spans, count, inputs=[samples, patches, levels], outputs=[low, high], device=device)
     least, most = low.numpy(), high.numpy()
     order = np.argsort(least, kind="stable")
     spans = [wp.array(values[order], dtype=float, device=device) for values in (least, most)]
     reach = float((most - least).max(initial=0.0))
-    return Graph(samples, *_taken(patches, bounds, order), rule, *spans, least[order], reach), order
+    large = patches.numpy()["level"][order] >= bounds.shape[1]
+    return Graph(samples, *_taken(patches, bounds, order), rule, *spans, least[order], large, reach), order
 
 
 def part(whole: Graph, nodes: np.ndarray) -> Graph:
     """Makes the subgraph of N nodes, whose numbers `nodes`, int [N], must ascend."""
     spans = [wp.array(values.numpy()[nodes], dtype=float, device=values.device) for values in (whole.low, whole.high)]
     taken = _taken(whole.patches, whole.bounds, nodes)
-    return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.reach)
+    return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.large[nodes], whole.reach)
 
 
 def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
@@ -354,13 +443,22 @@ def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
 def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
     """Finds the edges between the nodes `begin` to `end` - 1 and all later ones. For an edge between a and b it writes
     1 to `edge`, uint8 [M, M], at (a, b) and at (b, a); all of `edge` must be 0 before."""
-    inputs = [*graph._inputs(), graph.low, graph.high, begin]
-    wp.launch(_edges, end - begin, inputs=inputs, outputs=[edge], device=edge.device)
+    inputs = [*graph._inputs(), graph.low, graph.high]
+    wp.launch(_edges, end - begin, inputs=[*inputs, begin], outputs=[edge], device=edge.device)
+    large = begin + np.flatnonzero(graph.large[begin:end])
+    if len(large):
+        inputs.append(wp.array(large, dtype=int, device=edge.device))
+        wp.launch(_large_edges, (len(large), graph.low.shape[0]), inputs=inputs, outputs=[edge], device=edge.device)
 
 
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
     """Finds for each of the nodes `nodes[begin:end]` the first of H groups whose representative it is like, and writes
     the group's rank to `joined`, int [N], or H if there is none. `heads`, int [H], are the representatives in ascending
     order; `head_low` is the `low` of each, and `rank` its place in the order in which groups are tried."""
-    inputs = [*graph._inputs(), graph.low, graph.high, graph.reach, nodes, begin, heads, head_low, rank]
-    wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=joined.device)
+    device, means = joined.device, [graph.low, graph.high]
+    inputs = [*graph._inputs(), *means, graph.reach, nodes, begin, heads, head_low, rank]
+    wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=device)
+    large = begin + np.flatnonzero(graph.large[nodes.numpy()[begin:end]])
+    if len(large):
+        inputs = [*graph._inputs(), *means, nodes, wp.array(large, dtype=int, device=device), heads, rank]
+        wp.launch(_join_large, (len(large), heads.shape[0]), inputs=inputs, outputs=[joined], device=device)

@@ -13,9 +13,9 @@ depends on the device:
 
 - The lightmap has 16 bits per channel, vertices are in 1/65536 of a texel, and a sample's place is rounded to 1/256 of
   a texel, as texture filters of GPUs do.
-- Dist (eq. 2) is summed exactly. If two patches differ in size, the smaller one is interpolated linearly in the
-  triangles of its lattice, in multiples of 1 / (n - 1) of an 8-bit level. Triangles favour no vertex; in square cells
-  the result would depend on the order of the vertices.
+- Dist (eq. 2) is summed exactly, in 64 bits. If two patches differ in size, the smaller one is interpolated linearly
+  in the triangles of its lattice, in multiples of 1 / (n - 1) of an 8-bit level. Triangles favour no vertex; in square
+  cells the result would depend on the order of the vertices.
 
 The paper does not define |.| of a colour. Here it is the mean of |.| over the three channels, as fractions of 255, so
 that Dist is in [0, 1].
@@ -31,8 +31,8 @@ import warp as wp
 ORDERS = tuple(itertools.permutations(range(3)))
 """The six orders of a triangle's vertices, as permutations p; order 0 is the identity."""
 
-SIZES = (2, 3, 5, 9, 17, 33, 65, 129)
-"""Sizes of patches in samples along a side; sums over a larger patch would need more than 32 bits."""
+SIZES = tuple(2**level + 1 for level in range(13))
+"""Sizes of patches in samples along a side, up to 4097."""
 
 BINS = 32
 """Number of bins of the colour histogram per channel (section 3.2.1)."""
@@ -89,6 +89,35 @@ def _place(i: int, j: int, k: int, a: wp.int64, b: wp.int64, c: wp.int64, side: 
     return int((at + wp.int64(128) * steps) // (wp.int64(256) * steps))
 
 
+@wp.func
+def _bright_inside(lightmap: wp.array3d[wp.uint16], corner: wp.array3d[wp.int64], t: int) -> int:
+    """Returns 1 if the centre of a texel that is too bright lies inside triangle t or on its border, else 0."""
+    low = wp.vec2i()
+    high = wp.vec2i()
+    for a in range(2):
+        least = wp.min(corner[t, 0, a], wp.min(corner[t, 1, a], corner[t, 2, a]))
+        most = wp.max(corner[t, 0, a], wp.max(corner[t, 1, a], corner[t, 2, a]))
+        last = wp.int64(lightmap.shape[1 - a] - 1)
+        low[a] = int(wp.clamp((least + wp.int64(65535)) >> wp.int64(16), wp.int64(0), last))
+        high[a] = int(wp.clamp(most >> wp.int64(16), wp.int64(0), last))
+    for y in range(low[1], high[1] + 1):
+        for x in range(low[0], high[0] + 1):
+            if lightmap[y, x, 3] != wp.uint16(0):
+                px = wp.int64(x) << wp.int64(16)
+                py = wp.int64(y) << wp.int64(16)
+                left = int(0)
+                right = int(0)
+                for v in range(3):
+                    w = (v + 1) % 3
+                    across = (corner[t, w, 0] - corner[t, v, 0]) * (py - corner[t, v, 1])
+                    across -= (corner[t, w, 1] - corner[t, v, 1]) * (px - corner[t, v, 0])
+                    left += wp.where(across > wp.int64(0), 1, 0)
+                    right += wp.where(across < wp.int64(0), 1, 0)
+                if left == 0 or right == 0:
+                    return 1
+    return 0
+
+
 @wp.kernel(enable_backward=False)
 def _sample(
     # in:
@@ -133,6 +162,8 @@ def _sample(
                 colour += value << (8 * c)
             samples[at] = colour
             at += 1
+    if over == 0:
+        over = _bright_inside(lightmap, corner, t)
     p = Patch()
     p.start = start[t]
     p.level = level[t]
@@ -259,26 +290,28 @@ def spread(samples: wp.array1d[int], small: Patch, i: int, j: int, level: int) -
 
 
 @wp.func
-def distance_sum(samples: wp.array1d[int], large: Patch, small: Patch, order: int, limit: int) -> int:
+def distance_sum(samples: wp.array1d[int], large: Patch, small: Patch, order: int, limit: wp.int64) -> wp.int64:
     """Sums the absolute colour differences of two patches over the samples of the large one, with vertex k of the small
     patch on vertex p[k] of the large one, p = `ORDERS[order]`; in levels, or for two sizes in 1 / (n - 1) of a level,
     where n is the larger size. Stops early once the sum reaches `limit`."""
     steps = 1 << large.level
     size = steps + 1
     at = large.start
-    total = int(0)
+    total = wp.int64(0)
     for j in range(size):
         for i in range(size - j):
             w = turned(wp.vec3i(i, j, steps - i - j), order)
             a = samples[at]
             at += 1
             if small.level == large.level:
-                total += _difference(a, samples[small.start + _index(size, w[0], w[1])])
+                total += wp.int64(_difference(a, samples[small.start + _index(size, w[0], w[1])]))
             else:
                 b = spread(samples, small, w[0], w[1], large.level)
-                total += wp.abs(steps * channel(a, 0) - b[0])
-                total += wp.abs(steps * channel(a, 1) - b[1])
-                total += wp.abs(steps * channel(a, 2) - b[2])
+                total += wp.int64(
+                    wp.abs(steps * channel(a, 0) - b[0])
+                    + wp.abs(steps * channel(a, 1) - b[1])
+                    + wp.abs(steps * channel(a, 2) - b[2])
+                )
         if total >= limit:
             return total
     return total
@@ -303,7 +336,7 @@ def _compare(
     if a.level < b.level:
         large = b
         small = a
-    limit = int(0x7FFFFFFF)
+    limit = wp.int64(0x7FFFFFFFFFFFFFFF)
     best = int(0)
     for o in range(6):
         permutation = o
@@ -314,10 +347,10 @@ def _compare(
             limit = total
             best = o
     order[t] = wp.int8(best)
-    size = size_of(large.level)
-    levels = 765 * (size * (size + 1) // 2)
+    size = wp.int64(size_of(large.level))
+    levels = wp.int64(765) * (size * (size + wp.int64(1)) // wp.int64(2))
     if large.level != small.level:
-        levels *= size - 1
+        levels *= size - wp.int64(1)
     distance[t] = wp.float64(limit) / wp.float64(levels)
 
 
@@ -332,7 +365,7 @@ def sample(lightmap: np.ndarray, corner: np.ndarray, level: np.ndarray, device) 
 
     Returns:
         The samples of all patches, int; the patches, Patch [F], still without dominant colours; and uint8 [F], 1 for
-        patches that read a texel that is too bright.
+        triangles that contain the centre of a texel that is too bright, or whose patch reads one.
     """
     start = np.concatenate([[0], np.cumsum(samples_of(np.array(SIZES, np.int64))[level])])
     if start[-1] > np.iinfo(np.int32).max:

@@ -11,9 +11,9 @@ Read `tests/reference/advection.py` first: it is the same step in float64 NumPy,
 
 Neither scheme conserves mass.
 
-Positions are in fine cells, centres at half integers; fields are flat, [X, Y, Z] with z fastest. Velocities are in
-coarse cells per step at the centres of coarse cells, trilinear between them and constant beyond the outermost centres.
-Special cases:
+Positions are in fine cells, centres at half integers; fields are flat, [X, Y, Z] with z fastest, or pools of bricks.
+Velocities are in coarse cells per step at the centres of coarse cells, trilinear between them and constant beyond the
+outermost centres. Special cases:
 
 ===============================  =====================================================================
 a trace that leaves the domain   through an open face: 0, clean air; at a closed face: clamped to it
@@ -37,6 +37,7 @@ import warp as wp
 
 from wlm_kernels.fluid.advection_places import (
     BRICK,
+    CELLS,
     DENSE,
     FREE,
     SOLID,
@@ -46,7 +47,6 @@ from wlm_kernels.fluid.advection_places import (
     TrilinearVelocity,
     beyond_open_face,
     clip_at_solid,
-    corner,
     evaluate,
     fetch,
     in_domain,
@@ -54,9 +54,12 @@ from wlm_kernels.fluid.advection_places import (
     into_domain,
     is_solid,
     line_along_x,
+    lowest_cell,
     pair,
+    share_of,
     side_of,
     stencil,
+    stored_index,
     trace_back,
     wall_at,
 )
@@ -69,7 +72,7 @@ _OPTIONS = {"enable_backward": False, "max_unroll": 4}
 _BOUNDS = (256, 4)
 
 # Cells along x that one thread computes, so that cells between the same eight velocities read them once.
-_RUN, _BRICK_RUN = 16, BRICK
+_RUN, _BRICK_RUN = 16, 2
 
 # Threads of a block along y and z: neighbours share most of their reads.
 _TILE = 16
@@ -86,7 +89,17 @@ asm volatile("prefetch.global.L2 [%0];" :: "l"(field.data + i));
 """
 
 _LARGEST_HALF = wp.constant(65504.0)
-_BRICK_RUNS = wp.constant(BRICK * BRICK * BRICK // _BRICK_RUN)
+_BRICK_RUNS = wp.constant(CELLS // _BRICK_RUN)
+
+
+@wp.struct
+class Corners:
+    """Indices of the eight cells around a point in a field, the lower and the upper of each pair along z, and the
+    fractions between them; the pairs are those of (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1)."""
+
+    low: wp.vec4i
+    high: wp.vec4i
+    f: wp.vec3
 
 
 @functools.cache
@@ -103,7 +116,8 @@ def fields_struct(stored: type) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """The smoke: flat arrays [cells] of one type, float or half; [0] for the temperature of smoke that has none."""
+    """The smoke: flat arrays [cells], or [512 P] of a pool of P bricks, of one type, float or half; [0] for the
+    temperature of smoke that has none."""
 
     density: wp.array
     temperature: wp.array
@@ -158,51 +172,73 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return (b - a) * t + a
 
     @wp.func
-    def interpolate(field: wp.array1d[stored], at: Stencil) -> float:
-        i00 = at.base
-        i01 = at.base + at.step[1]
-        i10 = at.base + at.step[0]
-        i11 = i10 + at.step[1]
-        a = between(value_at(field, i00), value_at(field, i00 + at.step[2]), at.f[2])
-        b = between(value_at(field, i01), value_at(field, i01 + at.step[2]), at.f[2])
-        c = between(value_at(field, i10), value_at(field, i10 + at.step[2]), at.f[2])
-        d = between(value_at(field, i11), value_at(field, i11 + at.step[2]), at.f[2])
+    def address(box: Box, bricks: Bricks, cell: wp.vec3i) -> int:
+        if wp.static(in_bricks):
+            return stored_index(box, bricks, cell)
+        return index_of(box.n, cell)
+
+    @wp.func
+    def corners_of(box: Box, bricks: Bricks, x: int, y: int, z: int, along: wp.vec3i, f: wp.vec3) -> Corners:
+        """Returns the eight cells from (x, y, z) to (x, y, z) + along, with the fractions f between them."""
+        out = Corners()
+        out.f = f
+        if wp.static(in_bricks):
+            for k in range(4):
+                row = wp.vec3i(x + (k // 2) * along[0], y + (k % 2) * along[1], z)
+                out.low[k] = stored_index(box, bricks, row)
+                row[2] += along[2]
+                out.high[k] = stored_index(box, bricks, row)
+        else:
+            i = (x * box.n[1] + y) * box.n[2] + z
+            j = i + along[0] * box.n[1] * box.n[2]
+            row_step = along[1] * box.n[2]
+            out.low = wp.vec4i(i, i + row_step, j, j + row_step)
+            out.high = out.low + wp.vec4i(along[2], along[2], along[2], along[2])
+        return out
+
+    @wp.func
+    def corners_around(box: Box, bricks: Bricks, p: wp.vec3) -> Corners:
+        cell, along, f = lowest_cell(box.n, box.periodic, p)
+        return corners_of(box, bricks, cell[0], cell[1], cell[2], along, f)
+
+    @wp.func
+    def interpolate(field: wp.array1d[stored], at: Corners) -> float:
+        a = between(value_at(field, at.low[0]), value_at(field, at.high[0]), at.f[2])
+        b = between(value_at(field, at.low[1]), value_at(field, at.high[1]), at.f[2])
+        c = between(value_at(field, at.low[2]), value_at(field, at.high[2]), at.f[2])
+        d = between(value_at(field, at.low[3]), value_at(field, at.high[3]), at.f[2])
         return between(between(a, b, at.f[1]), between(c, d, at.f[1]), at.f[0])
 
     @wp.func
-    def interpolate_beside(field: wp.array1d[stored], walls: wp.array1d[wp.uint8], box: Box, p: wp.vec3) -> float:
-        at = stencil(box.n, box.periodic, p)
+    def interpolate_beside(
+        field: wp.array1d[stored], walls: wp.array1d[wp.uint8], box: Box, bricks: Bricks, p: wp.vec3
+    ) -> float:
+        first, along, f = lowest_cell(box.n, box.periodic, p)
         total = float(0.0)
         weight = float(0.0)
-        # Integer divisions are slow: one cell is found by them, the others by its neighbours along each axis.
-        first = cell_of(box.n, at.base)
-        along = wp.vec3i(at.step[0] // (box.n[1] * box.n[2]), at.step[1] // box.n[2], at.step[2])
         for k in range(8):
-            i, w = corner(at, k)
-            if not is_solid(box, walls, first + wp.cw_mul(side_of(k), along)):
-                total += w * value_at(field, i)
+            side = side_of(k)
+            cell = first + wp.cw_mul(side, along)
+            if not is_solid(box, walls, cell):
+                w = share_of(side, f)
+                total += w * value_at(field, address(box, bricks, cell))
                 weight += w
         # The result is 0 if all eight cells are solid.
         return total / wp.max(weight, 1.0e-6)
 
     @wp.func
-    def extremes(field: wp.array1d[stored], at: Stencil):
+    def extremes(field: wp.array1d[stored], at: Corners):
         """Returns the least and the largest of the eight stored values around a point."""
-        i00 = at.base
-        i01 = at.base + at.step[1]
-        i10 = at.base + at.step[0]
-        i11 = i10 + at.step[1]
-        a = wp.vec4(value_at(field, i00), value_at(field, i01), value_at(field, i10), value_at(field, i11))
-        i00 += at.step[2]
-        i01 += at.step[2]
-        i10 += at.step[2]
-        i11 += at.step[2]
-        b = wp.vec4(value_at(field, i00), value_at(field, i01), value_at(field, i10), value_at(field, i11))
+        a = wp.vec4()
+        b = wp.vec4()
+        for k in range(4):
+            a[k] = value_at(field, at.low[k])
+            b[k] = value_at(field, at.high[k])
         return wp.min(wp.min(a, b)), wp.max(wp.max(a, b))
 
     @wp.func
     def corrected(
-        field: wp.array1d[stored], predicted: wp.array1d[stored], i: int, to: Stencil, low: float, high: float
+        field: wp.array1d[stored], predicted: wp.array1d[stored], i: int, to: Corners, low: float, high: float
     ) -> float:
         change = 0.5 * (value_at(field, i) - interpolate(predicted, to))
         return wp.clamp(value_at(predicted, i) + change, low, high)
@@ -257,15 +293,16 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
     @wp.func
     def carry_cell(
         box: Box,
+        bricks: Bricks,
         cell: wp.vec3i,
+        i: int,
         u: wp.array1d[wp.vec3],
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
         predicted: fields_type,
         dt: float,
     ):
-        """Returns the density and the temperature of any cell after a step, before their decay."""
-        i = index_of(box.n, cell)
+        """Returns the density and the temperature of any cell, of index i, after a step, before their decay."""
         smoke = float(0.0)
         heat = float(0.0)
         x = wp.vec3(float(cell[0]) + 0.5, float(cell[1]) + 0.5, float(cell[2]) + 0.5)
@@ -277,14 +314,14 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             around = fetch(u, start)
             v = evaluate(around, start.f)
             p, left, beside = departure_point(box, u, walls, around, start.f, x, v, dt, wall)
-            at = stencil(box.n, box.periodic, p)
+            at = corners_around(box, bricks, p)
             if wp.static(correcting):
                 smoke = value_at(predicted.density, i)
                 if wp.static(hot):
                     heat = value_at(predicted.temperature, i)
                 q, left_q, beside_q = departure_point(box, u, walls, around, start.f, x, v, -dt, wall)
                 if not (left or left_q or beside or beside_q):
-                    to = stencil(box.n, box.periodic, q)
+                    to = corners_around(box, bricks, q)
                     low, high = extremes(fields.density, at)
                     smoke = corrected(fields.density, predicted.density, i, to, low, high)
                     if wp.static(hot):
@@ -293,9 +330,9 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             elif not left:
                 if wp.static(solids):
                     if beside:
-                        smoke = interpolate_beside(fields.density, walls, box, p)
+                        smoke = interpolate_beside(fields.density, walls, box, bricks, p)
                         if wp.static(hot):
-                            heat = interpolate_beside(fields.temperature, walls, box, p)
+                            heat = interpolate_beside(fields.temperature, walls, box, bricks, p)
                 if not beside:
                     smoke = interpolate(fields.density, at)
                     if wp.static(hot):
@@ -303,16 +340,17 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return smoke, heat
 
     @wp.func
-    def between_cells(box: Box, end: wp.vec3):
+    def between_cells(box: Box, bricks: Bricks, end: wp.vec3):
         """Returns the eight cells around a point, relative to the centre of cell (0, 0, 0), and whether all exist."""
         x = int(wp.floor(end[0]))
         y = int(wp.floor(end[1]))
         z = int(wp.floor(end[2]))
-        out = Stencil()
-        out.base = (x * box.n[1] + y) * box.n[2] + z
-        out.step = wp.vec3i(box.n[1] * box.n[2], box.n[2], 1)
-        out.f = end - wp.vec3(float(x), float(y), float(z))
-        return out, is_below(x, box.n[0] - 1) and is_below(y, box.n[1] - 1) and is_below(z, box.n[2] - 1)
+        f = end - wp.vec3(float(x), float(y), float(z))
+        inside = is_below(x, box.n[0] - 1) and is_below(y, box.n[1] - 1) and is_below(z, box.n[2] - 1)
+        if wp.static(in_bricks) and not inside:
+            # Cells that do not exist have no brick.
+            return Corners(), False
+        return corners_of(box, bricks, x, y, z, wp.vec3i(1, 1, 1), f), inside
 
     @wp.func
     def patch_of(box: Box, i: int) -> int:
@@ -324,8 +362,8 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])
-            within = cell_of(wp.vec3i(1, BRICK, BRICK), r)
-            return wp.vec3i(b[0] * BRICK, b[1] * BRICK + within[1], b[2] * BRICK + within[2])
+            within = cell_of(wp.vec3i(wp.static(BRICK // run), BRICK, BRICK), r)
+            return BRICK * b + wp.vec3i(wp.static(run) * within[0], within[1], within[2])
         tile = cell_of(
             wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE), i // (_TILE * _TILE)
         )
@@ -342,16 +380,18 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         predicted: fields_type,
         dt: float,
         decay: wp.vec2,
+        bricks: Bricks,
         out: fields_type,
     ) -> float:
         """Advects up to `run` cells along x and returns their largest density or temperature."""
         most = float(0.0)
         others = int(0)
         fine = dt * float(box.refinement)
-        sheet = box.n[1] * box.n[2]
+        sheet = wp.where(wp.static(in_bricks), BRICK * BRICK, box.n[1] * box.n[2])
         x = int(first[0])
         end = wp.min(first[0] + wp.static(run), box.n[0])
-        i = index_of(box.n, first)
+        begin = address(box, bricks, first)
+        i = int(begin)
         patch = patch_of(box, first[0])
         patch_y = patch_of(box, first[1])
         patch_z = patch_of(box, first[2])
@@ -369,10 +409,11 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             centre = float(patch) + 0.5
             stop = wp.min(end, (2 * patch + 3) * box.refinement // 2)
             for k in range(x, stop):
-                ahead = i + wp.where(k + _AHEAD < box.n[0], _AHEAD * sheet, 0)
-                prefetch(fields.density, ahead)
-                if wp.static(correcting):
-                    prefetch(predicted.density, ahead)
+                if wp.static(not in_bricks):
+                    ahead = i + wp.where(k + _AHEAD < box.n[0], _AHEAD * sheet, 0)
+                    prefetch(fields.density, ahead)
+                    if wp.static(correcting):
+                        prefetch(predicted.density, ahead)
                 cell = wp.vec3(float(k), float(first[1]), float(first[2]))
                 f = wp.vec3(box.voxel * (cell[0] + 0.5) - centre, fy, fz)
                 # The order of the tests matters: it decides whether the compiler makes branches of them.
@@ -381,7 +422,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 half = 0.5 * dt * (slope * f[0] + near)
                 simple = in_reach(f - half)
                 away = fine * evaluate(around, f - half)
-                at, inside = between_cells(box, cell - away)
+                at, inside = between_cells(box, bricks, cell - away)
                 simple = simple and inside
                 if wp.static(solids):
                     simple = simple and wall == FREE and is_short(box, away)
@@ -399,7 +440,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                         # Nothing is corrected between equal values.
                         if varies:
                             away = -fine * evaluate(around, f + half)
-                            to, inside = between_cells(box, cell - away)
+                            to, inside = between_cells(box, bricks, cell - away)
                             simple = in_reach(f + half) and inside
                             if wp.static(solids):
                                 simple = simple and is_short(box, away)
@@ -422,8 +463,9 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             for k in range(wp.static(run)):
                 if (others >> k) & 1 != 0:
                     any_cell = wp.vec3i(first[0] + k, first[1], first[2])
-                    any_smoke, any_heat = carry_cell(box, any_cell, u, walls, fields, predicted, dt)
-                    most = wp.max(most, write(index_of(box.n, any_cell), any_smoke, any_heat, decay, out))
+                    at_cell = begin + k * sheet
+                    any_smoke, any_heat = carry_cell(box, bricks, any_cell, at_cell, u, walls, fields, predicted, dt)
+                    most = wp.max(most, write(at_cell, any_smoke, any_heat, decay, out))
         return most
 
     @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS)
@@ -442,16 +484,16 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
     ):
         i = wp.tid()
         if wp.static(in_bricks):
-            for k in range(i // _BRICK_RUNS, bricks.count[0], bricks.workers):
+            for k in range(i // _BRICK_RUNS, bricks.counts[0], bricks.workers):
                 first = first_of_run(box, bricks, i, k)
                 if first[0] < box.n[0] and first[1] < box.n[1] and first[2] < box.n[2]:
-                    most = carry_run(box, first, u, walls, fields, predicted, dt, decay, out)
+                    most = carry_run(box, first, u, walls, fields, predicted, dt, decay, bricks, out)
                     if most > bricks.threshold:
                         bricks.busy[bricks.listed[k]] = 1
         else:
             first = first_of_run(box, bricks, i, 0)
             if first[1] < box.n[1] and first[2] < box.n[2]:
-                carry_run(box, first, u, walls, fields, predicted, dt, decay, out)
+                carry_run(box, first, u, walls, fields, predicted, dt, decay, bricks, out)
 
     return carry
 
@@ -478,7 +520,7 @@ def advect(
         dt: Duration in lattice steps.
         decay: Factors by which density and temperature are multiplied, at most 1; (1, 1) in the first half of a
             MacCormack step.
-        bricks: The bricks to compute, listed by `advection_places.relist`; default all cells.
+        bricks: The bricks to compute, stored by `advection_sources.store`; default all cells.
         predicted: The result of the first half, in a third set of arrays.
     """
     stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0

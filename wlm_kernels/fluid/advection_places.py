@@ -5,9 +5,11 @@ Read `tests/reference/advection.py` first: `Domain` there has the same grids, fa
 The fine grid (smoke) has `refinement` cells along each edge of a cell of the coarse grid (air). Solids are whole
 coarse cells. Each axis is periodic, or each of its two ends is open (clean air comes in) or closed.
 
-A brick is busy if a value in it exceeds the threshold, and is listed, that is computed in the next step, if it or a
-brick at most `rings` bricks away is busy. All other bricks are 0 in every buffer. Relative to a step that computes all
-cells, the error per cell and step is at most the threshold, outside the listed bricks; at a threshold of 0 it is 0.
+A brick is busy if a value in it exceeds the threshold, and is listed, that is stored and computed in the next step, if
+it or a brick at most `rings` bricks away is busy. All other bricks are 0 and take no memory: the arrays of smoke are a
+pool of bricks of 8^3 cells, in which the first brick is always empty and stands for those that are not stored. Relative
+to a step that computes all cells, the error per cell and step is at most the threshold, outside the listed bricks; at a
+threshold of 0 it is 0.
 """
 
 from collections.abc import Sequence
@@ -21,15 +23,15 @@ wp.set_module_options({"enable_backward": False})
 PERIODIC, OPEN, CLOSED = 0, 1, 2
 """Kinds of the ends of an axis; either both ends are periodic or neither."""
 
-BRICK = 8
-"""Cells along an edge of a brick."""
+BRICK, CELLS = 8, 512
+"""Cells along an edge of a brick, and in a brick."""
 
 REACH = 0.25
 """Distance in coarse cells by which the midpoint of a trace may be outside the eight velocities around its start and
 still be extrapolated from them: reading the next eight, which are mostly the same, would double the time."""
 
 FREE, _BESIDE, SOLID = wp.constant(wp.uint8(0)), wp.constant(wp.uint8(1)), wp.constant(wp.uint8(2))
-_OPEN = wp.constant(OPEN)
+_OPEN, _CELLS = wp.constant(OPEN), wp.constant(CELLS)
 _HALVINGS = wp.constant(6)
 _REACH = wp.constant(REACH)
 # Groups of threads that share the list of bricks; enough to fill any GPU.
@@ -62,32 +64,36 @@ class Box:
 
 @wp.struct
 class Bricks:
-    """Lists of the B bricks of a domain, on a device.
+    """The B bricks of a domain, and their places in a pool of P bricks, on a device.
+
+    The brick at place s of the pool has the elements 512 s to 512 s + 511 of a field, [x, y, z] with z fastest.
 
     Attributes:
         rings: Distance in bricks by which smoke may move beyond a busy brick in a step.
-        workers: Groups of threads that share the listed bricks; 0: there are no bricks, all cells are computed.
+        workers: Groups of threads that share the listed bricks; 0: there are no bricks, all cells are stored.
         threshold: Largest value of a brick that counts as empty.
-        busy: int [B], 1 where a value above the threshold has been written since the last `relist`.
-        active: int [B], 1 for each listed brick, else 0.
-        listed: int [B], its first `count` (int [1]) elements are the indices of the listed bricks, in any order.
-        retired: int [B], its first `retired_count` (int [1]) elements are the bricks that the last `relist` removed
-            from the list.
+        busy: int [B], 1 where a value above the threshold has been written since the last `store`.
+        places: int [B], the place of each listed brick in the pool; 0 for all others.
+        listed: int [B], its first `counts[0]` elements are the indices of the listed bricks, in any order.
+        fresh: int [B], its first `counts[1]` elements are the listed bricks that have no place yet.
+        counts: int [2].
+        free: int [P], a stack; its first `depth` (int [1]) elements are the places of the pool that are not in use.
     """
 
     rings: int
     workers: int
     threshold: float
     busy: wp.array1d[int]
-    active: wp.array1d[int]
+    places: wp.array1d[int]
     listed: wp.array1d[int]
-    count: wp.array1d[int]
-    retired: wp.array1d[int]
-    retired_count: wp.array1d[int]
+    fresh: wp.array1d[int]
+    counts: wp.array1d[int]
+    free: wp.array1d[int]
+    depth: wp.array1d[int]
 
 
 DENSE = Bricks()
-"""No bricks: every cell is computed."""
+"""No bricks: every cell is stored and computed."""
 
 
 @wp.struct
@@ -138,18 +144,41 @@ def pair(i: int, n: int, periodic: int):
 
 
 @wp.func
-def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
-    """Finds the eight cells around a point of a domain of n cells."""
+def lowest_cell(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3):
+    """Finds the eight cells around a point of a domain of n cells: returns the lowest, the steps to the next along each
+    axis, and the fractions between them."""
     at = p - wp.vec3(0.5, 0.5, 0.5)
     least = wp.vec3(wp.floor(at[0]), wp.floor(at[1]), wp.floor(at[2]))
     x, along_x = pair(int(least[0]), n[0], periodic[0])
     y, along_y = pair(int(least[1]), n[1], periodic[1])
     z, along_z = pair(int(least[2]), n[2], periodic[2])
+    return wp.vec3i(x, y, z), wp.vec3i(along_x, along_y, along_z), at - least
+
+
+@wp.func
+def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
+    """Finds the eight cells around a point of a domain of n cells."""
+    cell, along, f = lowest_cell(n, periodic, p)
     out = Stencil()
-    out.base = (x * n[1] + y) * n[2] + z
-    out.step = wp.vec3i(along_x * n[1] * n[2], along_y * n[2], along_z)
-    out.f = at - least
+    out.base = index_of(n, cell)
+    out.step = wp.vec3i(along[0] * n[1] * n[2], along[1] * n[2], along[2])
+    out.f = f
     return out
+
+
+@wp.func
+def stored_index(box: Box, bricks: Bricks, cell: wp.vec3i) -> int:
+    """Returns the index of a cell in a pool, or of one of the empty brick if the cell is not stored."""
+    b = index_of(box.bricks, wp.vec3i(cell[0] >> 3, cell[1] >> 3, cell[2] >> 3))
+    return bricks.places[b] * _CELLS + ((cell[0] & 7) << 6) + ((cell[1] & 7) << 3) + (cell[2] & 7)
+
+
+@wp.func
+def address_of(box: Box, bricks: Bricks, cell: wp.vec3i) -> int:
+    """Returns the index of a cell in the arrays of the smoke, with bricks or without."""
+    if bricks.workers == 0:
+        return index_of(box.n, cell)
+    return stored_index(box, bricks, cell)
 
 
 @wp.func
@@ -159,13 +188,19 @@ def side_of(k: int) -> wp.vec3i:
 
 
 @wp.func
+def share_of(side: wp.vec3i, f: wp.vec3) -> float:
+    """Returns the trilinear weight of one of eight cells around a point."""
+    weight = float(1.0)
+    for a in range(3):
+        weight *= wp.where(side[a] == 0, 1.0 - f[a], f[a])
+    return weight
+
+
+@wp.func
 def corner(at: Stencil, k: int):
     """Returns the index of the cell k of eight around a point, and its trilinear weight."""
     side = side_of(k)
-    weight = float(1.0)
-    for a in range(3):
-        weight *= wp.where(side[a] == 0, 1.0 - at.f[a], at.f[a])
-    return at.base + wp.dot(side, at.step), weight
+    return at.base + wp.dot(side, at.step), share_of(side, at.f)
 
 
 @wp.func_native("return u.data[i];")
@@ -361,7 +396,8 @@ def rings_for(cells: float) -> int:
 
 
 def make_bricks(box: Box, rings: int, threshold: float, device: str) -> Bricks:
-    """Makes the bricks of a domain, all busy and none listed; for `rings` and `threshold` see `Bricks`."""
+    """Makes the bricks of a domain, none of them busy or listed, and a pool of the empty brick alone; for `rings` and
+    `threshold` see `Bricks`."""
     total = box.bricks[0] * box.bricks[1] * box.bricks[2]
     bricks = Bricks()
     # The brick across a periodic face may be cut short, so that smoke reaches the one behind it.
@@ -369,9 +405,8 @@ def make_bricks(box: Box, rings: int, threshold: float, device: str) -> Bricks:
     # A CPU runs workers sequentially.
     bricks.workers = min(total, _WORKERS) if wp.get_device(device).is_cuda else 1
     bricks.threshold = threshold
-    bricks.busy = wp.ones(total, dtype=int, device=device)
-    bricks.active, bricks.listed, bricks.retired = (wp.zeros(total, dtype=int, device=device) for _ in range(3))
-    bricks.count, bricks.retired_count = (wp.zeros(1, dtype=int, device=device) for _ in range(2))
+    bricks.busy, bricks.places, bricks.listed, bricks.fresh = (wp.zeros(total, int, device) for _ in range(4))
+    bricks.counts, bricks.free, bricks.depth = (wp.zeros(size, int, device) for size in (2, 1, 1))
     return bricks
 
 
@@ -397,16 +432,39 @@ def _list(
                     exists = exists and near[a] >= 0 and near[a] < box.bricks[a]
                 if exists:
                     needed = wp.max(needed, bricks.busy[index_of(box.bricks, near)])
+    place = bricks.places[b]
     if needed != 0:
-        bricks.listed[wp.atomic_add(bricks.count, 0, 1)] = b
-    elif bricks.active[b] != 0:
-        bricks.retired[wp.atomic_add(bricks.retired_count, 0, 1)] = b
-    bricks.active[b] = needed
+        bricks.listed[wp.atomic_add(bricks.counts, 0, 1)] = b
+        if place == 0:
+            bricks.fresh[wp.atomic_add(bricks.counts, 1, 1)] = b
+    elif place != 0:
+        bricks.free[wp.atomic_add(bricks.depth, 0, 1)] = place
+        bricks.places[b] = 0
 
 
 def relist(box: Box, bricks: Bricks) -> None:
-    """Lists the bricks to compute in the next step, and the bricks that this removes from the list; clears `busy`."""
-    bricks.count.zero_()
-    bricks.retired_count.zero_()
+    """Lists the bricks to compute in the next step, and frees the places of the others. `store` must follow, with at
+    least `counts[0]` places beside the empty brick in the pool."""
+    bricks.counts.zero_()
     wp.launch(_list, bricks.busy.shape, inputs=[box, bricks], device=bricks.busy.device)
-    bricks.busy.zero_()
+
+
+@wp.kernel
+def _settle(
+    # in:
+    clear: bool,
+    # in, out:
+    bricks: Bricks,
+):
+    b = wp.tid()
+    if clear:
+        bricks.busy[b] = 0
+    if b == 0:
+        # The places of fresh bricks were at the top of the stack.
+        bricks.depth[0] -= bricks.counts[1]
+        bricks.counts[1] = 0
+
+
+def settle(bricks: Bricks, clear: bool) -> None:
+    """Ends the storing of fresh bricks; with `clear` no brick is busy any longer."""
+    wp.launch(_settle, bricks.busy.shape, inputs=[clear, bricks], device=bricks.busy.device)

@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import warp as wp
 
 from wlm_kernels.fluid.advection import Fields, fields_struct
-from wlm_kernels.fluid.advection_places import BRICK, DENSE, SOLID, Box, Bricks, is_solid
+from wlm_kernels.fluid.advection_places import BRICK, CELLS, DENSE, SOLID, Box, Bricks, address_of, is_solid, settle
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 
 _OPTIONS = {"enable_backward": False}
@@ -32,8 +32,8 @@ SPHERE, BOX = 0, 1
 _SPHERE = wp.constant(SPHERE)
 _LARGEST_HALF = wp.constant(65504.0)
 _BRICK = wp.constant(BRICK)
-_BRICK_CELLS = wp.constant(BRICK**3)
-_EMPTYING = 256  # groups of threads that empty bricks: few bricks retire in a step
+_CELLS = wp.constant(CELLS)
+_STORING = 256  # groups of threads that store bricks: a step adds few
 
 
 @wp.func
@@ -57,7 +57,7 @@ def within(box: Box, walls: wp.array1d[wp.uint8], shape: int, centre: wp.vec3, s
 @functools.cache
 def source_kernels(stored: type) -> dict[str, wp.Kernel]:
     """Builds (once) the kernels for smoke stored as `wp.float32` or `wp.float16`, by their names: "source" has a thread
-    for each fine cell of a box, "cover" and "lift" for each coarse cell, "empty" for each cell of a brick and group.
+    for each fine cell of a box, "cover" and "lift" for each coarse cell, "store" for each cell of a brick and group.
     """
     fields_type = fields_struct(stored)
 
@@ -77,6 +77,7 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         size: wp.vec3,
         value: wp.vec2,
         kept: float,
+        only_mark: bool,
         low: wp.vec3i,
         cells: wp.vec3i,
         bricks: Bricks,
@@ -84,16 +85,16 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         fields: fields_type,
     ):
         p = low + cell_of(cells, wp.tid())
-        if not within(box, walls, shape, centre, size, p):
+        # The bricks stay stored, however little smoke the source adds.
+        _mark_busy(box, p, wp.inf, bricks)
+        if only_mark or not within(box, walls, shape, centre, size, p):
             return
-        i = index_of(box.n, p)
+        i = address_of(box, bricks, p)
         smoke = in_range(wp.max(kept * float(fields.density[i]) + value[0], 0.0))
         fields.density[i] = stored(smoke)
-        _mark_busy(box, p, smoke, bricks)
         if fields.temperature.shape[0] > 0:
             heat = in_range(wp.max(kept * float(fields.temperature[i]) + value[1], 0.0))
             fields.temperature[i] = stored(heat)
-            _mark_busy(box, p, heat, bricks)
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def cover(
@@ -133,13 +134,16 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
                     if valid:
                         c = index_of(box.coarse, beside)
                         if before[c] != SOLID and after[c] != SOLID:
-                            at = index_of(box.n, q)
+                            at = address_of(box, bricks, q)
                             smoke += float(fields.density[at])
                             if fields.temperature.shape[0] > 0:
                                 heat += float(fields.temperature[at])
                             count += 1.0
             weight = 1.0 / wp.max(count, 1.0)
-            at = index_of(box.n, p)
+            at = address_of(box, bricks, p)
+            if bricks.workers > 0 and at < _CELLS:
+                # Its brick is not stored: what is around is below the threshold.
+                continue
             fields.density[at] = stored(weight * smoke)
             _mark_busy(box, p, weight * smoke, bricks)
             if fields.temperature.shape[0] > 0:
@@ -169,40 +173,40 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
             for x in range(first[0] // _BRICK, last[0] // _BRICK + 1):
                 for y in range(first[1] // _BRICK, last[1] // _BRICK + 1):
                     for z in range(first[2] // _BRICK, last[2] // _BRICK + 1):
-                        needed = wp.max(needed, bricks.active[index_of(box.bricks, wp.vec3i(x, y, z))])
+                        needed = wp.max(needed, bricks.places[index_of(box.bricks, wp.vec3i(x, y, z))])
         smoke = float(0.0)
         heat = float(0.0)
         if needed != 0 and not is_solid(box, walls, first):
             for x in range(r):
                 for y in range(r):
-                    row = ((first[0] + x) * box.n[1] + first[1] + y) * box.n[2] + first[2]
                     for z in range(r):
-                        smoke += float(fields.density[row + z])
+                        at = address_of(box, bricks, first + wp.vec3i(x, y, z))
+                        smoke += float(fields.density[at])
                         if fields.temperature.shape[0] > 0:
-                            heat += float(fields.temperature[row + z])
+                            heat += float(fields.temperature[at])
         volume = box.voxel * box.voxel * box.voxel
         force[i] = (volume * smoke) * by_density + (volume * heat) * by_temperature
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
-    def empty(
+    def store(
         # in:
-        box: Box,
-        bricks: Bricks,
         groups: int,
+        # in, out:
+        bricks: Bricks,
         # out:
         fields: fields_type,
     ):
         i = wp.tid()
-        for k in range(i // _BRICK_CELLS, bricks.retired_count[0], groups):
-            b = cell_of(box.bricks, bricks.retired[k])
-            p = _BRICK * b + cell_of(wp.vec3i(_BRICK, _BRICK, _BRICK), i % _BRICK_CELLS)
-            if p[0] < box.n[0] and p[1] < box.n[1] and p[2] < box.n[2]:
-                at = index_of(box.n, p)
-                fields.density[at] = stored(0.0)
-                if fields.temperature.shape[0] > 0:
-                    fields.temperature[at] = stored(0.0)
+        cell = i % _CELLS
+        for k in range(i // _CELLS, bricks.counts[1], groups):
+            place = bricks.free[bricks.depth[0] - 1 - k]
+            if cell == 0:
+                bricks.places[bricks.fresh[k]] = place
+            fields.density[place * _CELLS + cell] = stored(0.0)
+            if fields.temperature.shape[0] > 0:
+                fields.temperature[place * _CELLS + cell] = stored(0.0)
 
-    return {"source": source, "cover": cover, "lift": lift, "empty": empty}
+    return {"source": source, "cover": cover, "lift": lift, "store": store}
 
 
 def _launch(name: str, size: int, inputs: list, output, fields: Fields) -> None:
@@ -229,6 +233,7 @@ def add_source(
     *,
     fixed: bool,
     bricks: Bricks = DENSE,
+    only_mark: bool = False,
 ) -> None:
     """Adds or sets smoke in the cells whose centres are in a box or an ellipsoid; density and temperature stay at
     least 0.
@@ -242,11 +247,12 @@ def add_source(
         value: Density and temperature to add or to set.
         fields: The smoke, modified.
         fixed: Whether the values are set instead of added.
-        bricks: Bricks that receive smoke are marked as busy.
+        bricks: Those of the source's box, all of which must be stored, are marked as busy.
+        only_mark: Whether bricks are marked and nothing else is done.
     """
     low, cells, total = region_of(box, centre, size)
     if total > 0:
-        region = [wp.vec3(*centre), wp.vec3(*size), wp.vec2(*value), 0.0 if fixed else 1.0]
+        region = [wp.vec3(*centre), wp.vec3(*size), wp.vec2(*value), 0.0 if fixed else 1.0, only_mark]
         inputs = [box, walls, shape, *region, low, cells, bricks]
         _launch("source", total, inputs, fields.arrays, fields)
 
@@ -255,7 +261,7 @@ def change_solids(box: Box, before: wp.array, after: wp.array, fields: Fields, b
     """Empties the cells that become solid, and fills the cells that become fluid from their neighbours.
 
     `before` and `after` are marks of solid cells, uint8 [coarse cells], from `advection_places.mark_walls`. Bricks that
-    receive smoke are marked as busy.
+    receive smoke, which must be stored, are marked as busy.
     """
     _launch("cover", before.shape[0], [box, before, after, bricks], fields.arrays, fields)
 
@@ -277,13 +283,15 @@ def buoyancy(
         fields: The smoke.
         by_density, by_temperature: (3,), acceleration at density 1 and at temperature 1, coarse cells per step squared.
         force: vec3 [coarse cells], the acceleration, written; 0 in solids.
-        bricks: Cells outside the active bricks count as empty.
+        bricks: Cells outside the listed bricks count as empty.
     """
     inputs = [box, walls, fields.arrays, wp.vec3(*by_density), wp.vec3(*by_temperature), bricks]
     _launch("lift", force.shape[0], inputs, force, fields)
 
 
-def empty_retired(box: Box, bricks: Bricks, fields: Fields) -> None:
-    """Sets the bricks that `advection_places.relist` removed from its list to 0; must be called for every buffer."""
-    groups = min(bricks.workers, _EMPTYING)
-    _launch("empty", groups * int(_BRICK_CELLS), [box, bricks, groups], fields.arrays, fields)
+def store(bricks: Bricks, fields: Fields, clear: bool = True) -> None:
+    """Gives the bricks that `advection_places.relist` added to its list their places in the pool, and empties them in
+    the smoke before the step; other buffers of the step may hold anything there. With `clear` no brick is busy then."""
+    groups = min(bricks.workers, _STORING)
+    _launch("store", groups * CELLS, [groups, bricks], fields.arrays, fields)
+    settle(bricks, clear)

@@ -1,11 +1,7 @@
-"""Velocity and density of the air on a lattice, its initial state, and solid bodies: their cells and motion.
+"""Velocity and density of the air on a lattice, its initial state, and cells that become fluid.
 
-Read `fields` and `equilibrium` of `tests/reference/lattice.py`, and `test_sphere_voxels` and `test_mesh_voxels` of
-`tests/kernels/test_lattice.py` first: they compute the same in NumPy.
-
-An array of uint8 stores for each cell the number of its body, 1 to 255, or 0 for fluid. Cell centres are at half
-integers, in units of a cell. Bodies do not rotate; an array of velocities, vec3, has that of body k at index k, in
-cells per step.
+Read `fields` and `equilibrium` of `tests/reference/lattice.py` first: they compute the same in NumPy. The marks of
+solid cells are those of `lattice_bodies`.
 """
 
 import functools
@@ -13,6 +9,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from wlm_kernels.fluid.lattice_bodies import Motion, centre_of, wall_velocity
 from wlm_kernels.fluid.lattice_sets import (
     STORAGES,
     Tables,
@@ -26,79 +23,6 @@ from wlm_kernels.fluid.lattice_sets import (
     wrapped,
 )
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
-
-wp.set_module_options({"enable_backward": False})
-
-# The winding number is correct even where a sign from rays would fail because a ray grazes a triangle.
-_INSIDE = wp.constant(0.5)
-
-
-@wp.func
-def _centre(n: wp.vec3i, i: int) -> wp.vec3:
-    p = cell_of(n, i)
-    return wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
-
-
-@wp.func
-def _put(solid: wp.array1d[wp.uint8], i: int, body: wp.uint8, inside: bool):
-    if inside:
-        solid[i] = body
-    elif solid[i] == body:
-        solid[i] = wp.uint8(0)
-
-
-@wp.kernel
-def _sphere(
-    # in:
-    n: wp.vec3i,
-    body: wp.uint8,
-    centre: wp.vec3,
-    radius: float,
-    # out:
-    solid: wp.array1d[wp.uint8],
-):
-    i = wp.tid()
-    _put(solid, i, body, wp.length(_centre(n, i) - centre) < radius)
-
-
-@wp.kernel
-def _mesh(
-    # in:
-    n: wp.vec3i,
-    body: wp.uint8,
-    mesh: wp.uint64,
-    position: wp.vec3,
-    scale: float,
-    reach: float,
-    # out:
-    solid: wp.array1d[wp.uint8],
-):
-    i = wp.tid()
-    x = (_centre(n, i) - position) / scale
-    query = wp.mesh_query_point_sign_winding_number(mesh, x, reach, 2.0, _INSIDE)
-    _put(solid, i, body, query.result and query.sign < 0.0)
-
-
-def voxelise_sphere(solid, body: int, centre, radius: float) -> None:
-    """Marks the cells of `solid`, uint8 [X, Y, Z], whose centres are in a sphere, in cells, with a body's number, 1 to
-    255, and clears the body's other cells."""
-    n = wp.vec3i(*solid.shape)
-    inputs = [n, wp.uint8(body), wp.vec3(*centre), float(radius)]
-    wp.launch(_sphere, solid.size, inputs=inputs, outputs=[solid.flatten()], device=solid.device)
-
-
-def voxelise_mesh(solid, body: int, mesh: wp.Mesh, position, scale: float) -> None:
-    """Marks the cells of `solid`, uint8 [X, Y, Z], whose centres are in a closed mesh with a body's number, 1 to 255,
-    and clears the body's other cells.
-
-    The mesh, on the same device, was made with `support_winding_number=True`. `position` is that of its origin in
-    cells, and `scale` the cells per unit of the mesh.
-    """
-    n = wp.vec3i(*solid.shape)
-    # No cell is farther away than the domain's diagonal.
-    reach = 4.0 * float(sum(solid.shape)) / scale
-    inputs = [n, wp.uint8(body), mesh.id, wp.vec3(*position), float(scale), reach]
-    wp.launch(_mesh, solid.size, inputs=inputs, outputs=[solid.flatten()], device=solid.device)
 
 
 @dataclass(frozen=True)
@@ -131,7 +55,7 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         n: wp.vec3i,
         f: wp.array2d[stored],
         solid: wp.array1d[wp.uint8],
-        velocity: wp.array1d[wp.vec3],
+        motion: Motion,
         forces: wp.array1d[wp.vec3],
         # out:
         drho: wp.array1d[float],
@@ -144,7 +68,7 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         if solid.shape[0] > 0:
             body = int(solid[i])
         if body > 0:
-            v = velocity[body]
+            v = wall_velocity(motion, body, centre_of(cell_of(n, i)))
         else:
             excess, j, _diagonal, _off = moments(gather(f, n, cell_of(n, i)))
             if forces.shape[0] > 0:

@@ -16,6 +16,10 @@ into these elements. This takes two passes, since the element of one link may be
 - pressure: the outlet without the shift; its density relaxes towards a given density: the term, plus 1.
 
 Velocities into the domain are set to 0 at an outlet: backflow would feed on itself.
+
+Bodies that move have no links: after a step, with the bodies at their next places, `bounce` finds the populations that
+they send back in the cells around them. No link's cell reads these elements, so that it needs one pass. Before, it
+fills the cells that a body has just left with the equilibrium at the mean density and velocity of the fluid beside.
 """
 
 import functools
@@ -23,6 +27,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
+from wlm_kernels.fluid.lattice_bodies import Motion, Window, centre_of, size_of, wall_velocity, window_cell
 from wlm_kernels.fluid.lattice_sets import (
     STORAGES,
     Tables,
@@ -68,13 +73,14 @@ class Links:
 @dataclass(frozen=True)
 class LinkKernels:
     """Kernels for one lattice and storage type, with one thread per link: `values` computes the value of each link (its
-    number of threads is a multiple of `BLOCK`), then `write` writes these into the populations; `force` sums the force
-    of the fluid on each body.
+    number of threads is a multiple of `BLOCK`, as that of `bounce`), then `write` writes these into the populations;
+    `force` sums the force of the fluid on each body. `bounce` has one thread per cell of a body's window.
     """
 
     values: wp.Kernel
     write: wp.Kernel
     force: wp.Kernel
+    bounce: wp.Kernel
 
 
 @wp.func
@@ -128,6 +134,13 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
             drho += hold * (term - drho)
         return equilibrium(t.w[q], t.c[q], drho, u)
 
+    @wp.func
+    def summed(thread: int, sums: wp.array1d[wp.float64], at: int, value: wp.float64):
+        # All threads of a block take part in its sums; most terms are 0.
+        total = wp.tile_extract(wp.tile_sum(wp.tile(value)), 0)
+        if thread % wp.block_dim() == 0 and total != wp.float64(0.0):
+            wp.atomic_add(sums, at, total)
+
     @wp.kernel(module="unique", module_options=options)
     def values(
         # in:
@@ -177,14 +190,8 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                 if kind == _OUTLET:
                     weight = wp.float64(t.w[q])
         if wp.static(balance):
-            # All threads of a block take part in its sums; most terms are 0.
-            block_net = wp.tile_extract(wp.tile_sum(wp.tile(net)), 0)
-            block_weight = wp.tile_extract(wp.tile_sum(wp.tile(weight)), 0)
-            if wp.tid() % wp.block_dim() == 0:
-                if block_net != wp.float64(0.0):
-                    wp.atomic_add(sums, 0, block_net)
-                if block_weight != wp.float64(0.0):
-                    wp.atomic_add(sums, 1, block_weight)
+            summed(wp.tid(), sums, 0, net)
+            summed(wp.tid(), sums, 1, weight)
 
     @wp.kernel(module="unique", module_options=options)
     def write(
@@ -240,7 +247,80 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         along = wp.vec3d(wp.float64(c[0]), wp.float64(c[1]), wp.float64(c[2]))
         wp.atomic_add(total, int(solid[k]), exchanged * along)
 
-    return LinkKernels(values, write, force)
+    @wp.func
+    def fill(
+        t: Tables,
+        n: wp.vec3i,
+        bounded: wp.vec3i,
+        stamp: wp.uint8,
+        solid: wp.array1d[wp.uint8],
+        fresh: wp.array1d[wp.uint8],
+        p: wp.vec3i,
+        f: wp.array2d[stored],
+    ):
+        total = wp.vec4()
+        weight = float(0.0)
+        for q in range(1, t.w.shape[0]):
+            beside = p + t.c[q]
+            if not crosses(n, bounded, beside):
+                k = index_of(n, wrapped(n, beside))
+                if solid[k] == wp.uint8(0) and fresh[k] != stamp:
+                    drho = float(0.0)
+                    j = wp.vec3()
+                    for r in range(t.w.shape[0]):
+                        g = load(f, r, k)
+                        drho += g
+                        j += g * wp.vec3(float(t.c[r][0]), float(t.c[r][1]), float(t.c[r][2]))
+                    total += t.w[q] * wp.vec4(drho, j[0] / (1.0 + drho), j[1] / (1.0 + drho), j[2] / (1.0 + drho))
+                    weight += t.w[q]
+        if weight > 0.0:
+            total = total / weight
+        for q in range(t.w.shape[0]):
+            value = equilibrium(t.w[q], t.c[q], total[0], wp.vec3(total[1], total[2], total[3]))
+            store(f, q, index_of(n, p), value)
+
+    @wp.kernel(module="unique", module_options=options)
+    def bounce(
+        # in:
+        t: Tables,
+        n: wp.vec3i,
+        bounded: wp.vec3i,
+        window: Window,
+        motion: Motion,
+        stamp: wp.uint8,
+        solid: wp.array1d[wp.uint8],
+        fresh: wp.array1d[wp.uint8],
+        # in, out:
+        f: wp.array2d[stored],
+        # out:
+        sums: wp.array1d[wp.float64],
+    ):
+        net = wp.float64(0.0)
+        place = window_cell(window, motion.centre[window.body], wp.tid())
+        # A window may extend beyond the domain, on a periodic axis by one cell on the other side.
+        live = wp.tid() < window.cells[0] * window.cells[1] * window.cells[2]
+        for a in range(3):
+            live = live and place[a] >= -1 and place[a] <= n[a]
+        if live and not crosses(n, bounded, place):
+            p = wrapped(n, place)
+            i = index_of(n, p)
+            if solid[i] == wp.uint8(0):
+                if fresh[i] == stamp:
+                    fill(t, n, bounded, stamp, solid, fresh, p, f)
+                for q in range(1, t.w.shape[0]):
+                    source = p - t.c[q]
+                    if not crosses(n, bounded, source):
+                        k = index_of(n, wrapped(n, source))
+                        if int(solid[k]) == window.body:
+                            c = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
+                            u = wall_velocity(motion, window.body, centre_of(place) - 0.5 * c)
+                            term = 6.0 * t.w[q] * wp.dot(c, u)
+                            store(f, q, k, load(f, opposite(q), i) + term)
+                            net += wp.float64(term)
+        if wp.static(balance):
+            summed(wp.tid(), sums, 0, net)
+
+    return LinkKernels(values, write, force, bounce)
 
 
 @wp.kernel
@@ -250,46 +330,66 @@ def _find(
     n: wp.vec3i,
     bounded: wp.vec3i,
     solid: wp.array1d[wp.uint8],
-    velocity: wp.array1d[wp.vec3],
+    motion: Motion,
+    every: bool,
     # in, out:
     links: Links,
     # out:
     count: wp.array1d[int],
-    fastest: wp.array1d[float],
 ):
     i = wp.tid()
-    if solid[i] != wp.uint8(0):
+    if solid[i] != wp.uint8(0) and (every or motion.moving[int(solid[i])] == wp.uint8(0)):
         return
     p = cell_of(n, i)
     for q in range(1, t.w.shape[0]):
         source = p - t.c[q]
         if not crosses(n, bounded, source):
             k = int(solid[index_of(n, wrapped(n, source))])
-            if k > 0:
-                u = velocity[k]
-                if wp.dot(u, u) > 0.0:
-                    wp.atomic_max(fastest, 0, wp.length(u))
+            if k > 0 and (every or motion.moving[k] == wp.uint8(0)):
                 at = links.faces + wp.atomic_add(count, 0, 1)
                 if at < links.cell.shape[0]:
                     links.cell[at] = i
                     links.code[at] = wp.uint8(q)
                     c = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
+                    u = wall_velocity(motion, k, centre_of(p) - 0.5 * c)
                     links.term[at] = 6.0 * t.w[q] * wp.dot(c, u)
 
 
-def find_links(tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, velocity: wp.array, links: Links):
+def find_links(
+    tables: Tables, n: wp.vec3i, bounded: wp.vec3i, solid: wp.array, motion: Motion, every: bool, links: Links
+) -> wp.array:
     """Lists the links of solid cells, in any order, after the links of faces; `links.used` is not changed.
 
-    `n` are the cells along x, y and z, N in all; `bounded` is 1 for each axis that is not periodic; `solid`, uint8 [N],
-    has the number of the body of each cell, 0 for fluid, and `velocity`, vec3 [256], that of each body.
+    Bodies that move are left out, as if they were fluid, unless `every` is true. `n` are the cells along x, y and z, N
+    in all; `bounded` is 1 for each axis that is not periodic; `solid`, uint8 [N], has the number of the body of each
+    cell, 0 for fluid.
 
     Returns the number of the solids' links, int [1], which may exceed the room in the arrays: the other links are then
-    missing; and the speed of the fastest body that has links, in cells per step, float [1].
+    missing.
     """
-    count, fastest = (wp.zeros(1, dtype=dtype, device=solid.device) for dtype in (int, float))
-    inputs = [tables, n, bounded, solid, velocity, links]
-    wp.launch(_find, solid.shape[0], inputs=inputs, outputs=[count, fastest], device=solid.device)
-    return count, fastest
+    count = wp.zeros(1, dtype=int, device=solid.device)
+    inputs = [tables, n, bounded, solid, motion, every, links]
+    wp.launch(_find, solid.shape[0], inputs=inputs, outputs=[count], device=solid.device)
+    return count
+
+
+def bounce(
+    kernels: LinkKernels,
+    tables: Tables,
+    bounded: wp.vec3i,
+    window: Window,
+    motion: Motion,
+    stamp: int,
+    solid: wp.array,
+    fresh: wp.array,
+    f: wp.array,
+    sums: wp.array,
+) -> None:
+    """Sends populations back from a moving body, after a step and before `apply`; arguments as there and for
+    `lattice_bodies.mark`."""
+    threads = -(-size_of(window) // BLOCK) * BLOCK
+    inputs = [tables, window.n, bounded, window, motion, wp.uint8(stamp), solid, fresh, f]
+    wp.launch(kernels.bounce, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=f.device)
 
 
 def apply(

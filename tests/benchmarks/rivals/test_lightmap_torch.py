@@ -4,44 +4,18 @@ import numpy as np
 import pytest
 import torch
 from builders.small_sets import moving_light, tiny_profile
-from builders.small_sets import sheet_from_arrays as from_arrays
 
 from benchmarks.lightmap_exact import decode_tile64
 from benchmarks.rivals.lightmap_torch import Features, PlainFit
 from wlm.lightmap.fit import compress, dynamic_targets
-from wlm.lightmap.profile import Profile, TimeAxis
+from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.trainer import Trainer
-
-HOURS = [0.0, 6.0, 12.0, 18.0]
-
-
-def band(steps: int):
-    """A bright band that moves over a tile during the day, and settings of a short fit."""
-    x = np.linspace(0.0, 1.0, 128)
-    frames = [np.exp(-40.0 * (x - hour / 24.0) ** 2)[None, :, None] + 0.1 * x[:, None, None] for hour in HOURS]
-    frames = np.stack([np.repeat(f, 3, 2) + 0.05 for f in frames]).astype(np.float32)
-    sizes = {"hidden": 8, "uvt_resolution": 8, "uvt_slices": 4}
-    profile = Profile(name="tiny", **sizes, metric_weight=0.0, steps=steps, samples=256)
-    return from_arrays(frames, HOURS, period=24.0), profile
 
 
 def plain_fit(lightmaps, profile, seed: int = 0, features: Features | None = None) -> PlainFit:
     axis = TimeAxis(lightmaps.times, lightmaps.period, profile.time_axis)
     return PlainFit(profile, axis, dynamic_targets(lightmaps, profile), features, seed=seed)
-
-
-def losses(steps: int, seed: int, count: int) -> np.ndarray:
-    fit = plain_fit(*band(steps), seed=seed)
-    return np.array([float(fit.step()) for _ in range(count)])
-
-
-def test_loss_falls_and_repeats():
-    first = losses(60, 3, 60)
-    # The targets have variance 1: a network that knows nothing loses about as much.
-    assert 0.5 < first[0] < 3.0 and first[-10:].mean() < 0.1
-    np.testing.assert_array_equal(losses(60, 3, 5), first[:5])
-    assert not np.array_equal(losses(60, 4, 5), first[:5])
 
 
 def put_into_trainer(fit: PlainFit, trainer: Trainer) -> None:

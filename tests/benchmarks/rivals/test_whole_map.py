@@ -45,13 +45,3 @@ def test_mips_hold_charts_alone(device):
         np.testing.assert_array_equal(light[tuple(target.T)], light[tuple(source.T)])
         inside[tuple(target.T)] = True
         assert (light[~inside] == 0).all()
-
-
-def test_mips_leave_out_tiles_that_the_file_lacks(device):
-    decoder = WholeMap(random_sheet((3, 0, 1, 3)), device)
-    decoder.decode()
-    light, whole = decoder.numpy().astype(np.float64), len(decoder.levels) - 1
-    stored = np.ones(light.shape[:2], bool)
-    stored[:128, 128:] = False
-    # The mean is rounded at each level.
-    np.testing.assert_allclose(decoder.numpy(whole)[0, 0], light[stored].mean(0), rtol=0.03)

@@ -16,7 +16,7 @@ from builders.checks import error_of
 from builders.engine_scripts import Script, assert_csharp_parses, assert_gdscript_parses, node_gives, pixels_of
 from builders.layered_sets import random_layers
 from builders.light_groups import random_groups
-from builders.shader_runs import run_glsl, run_hlsl
+from builders.shader_runs import compiled, run_glsl, run_hlsl
 from builders.synthetic import random_model as random_lightmap
 
 from benchmarks.atlas_exact import decode64
@@ -47,23 +47,6 @@ def test_a_large_lightmap_has_few_files(engine, tmp_path):
 
 
 TEXTS = {".md", ".js", ".glsl", ".gd", ".gdshader", ".hlsl", ".shader", ".cs", ".py"}
-
-
-def test_one_engines_files_take_the_place_of_anothers(tmp_path):
-    folder = tmp_path / "out"
-    (folder).mkdir()
-    export(random_lightmap(ALL), folder, "three")
-    (folder / "mine.txt").write_text("x")
-    for engine in (*ENGINES[1:], ENGINES[0]):
-        paths = export(random_lightmap((2, 1, 2, 0)), folder, engine)
-        assert set(os.listdir(folder)) == {path.name for path in paths} | {"mine.txt"}
-    model = atlas_model("tiles")
-    for engine in (*ENGINES, None):
-        paths = export(model, tmp_path / "atlas", engine)
-        assert set(os.listdir(tmp_path / "atlas")) == {path.name for path in paths}
-        info = json.loads(paths[-1].read_text())
-        assert {each["file"] for each in info["textures"].values()} < set(os.listdir(tmp_path / "atlas"))
-        assert info["uv_set"] == 0
 
 
 def test_a_shader_reads_the_textures_beside_it_and_no_others(tmp_path):
@@ -164,15 +147,6 @@ def test_blocks_that_do_not_fill_their_texture_become_half_floats(tmp_path):
     np.testing.assert_array_equal(read_light(tmp_path / "out" / "colour.dds")[0][..., :3], model.texels[0])
     export(model, tmp_path / "out")
     assert (tmp_path / "out" / "colour.dds").read_bytes().endswith(model.blocks.tobytes())
-
-
-def compiled(text, folder, *words):
-    if shutil.which("glslangValidator") is None:
-        pytest.skip("no glslangValidator: install glslang-tools")
-    (folder / "shader.comp").write_text(text)
-    words = ["glslangValidator", "-V", *words, "-o", "shader.spv", "shader.comp"]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize("kinds", [ALL, (2, 1, 0, 2)], ids=str)

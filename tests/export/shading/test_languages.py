@@ -14,7 +14,7 @@ from builders.exported import read_export
 from builders.probe_models import random_model as random_probes
 from builders.shader_runs import (
     HEADS,
-    compile_hlsl,
+    compiled,
     lightmap_uniforms,
     run_glsl,
     run_glsl_compute,
@@ -334,7 +334,7 @@ def test_the_compute_shader_decodes_a_lightmap(language, tmp_path):
     export(model, tmp_path, shader=language, exact=True)
     text = next(tmp_path.glob("lightmap_compute.*")).read_text()
     if language == "hlsl":
-        compile_hlsl(text, tmp_path)
+        compiled(text, tmp_path, "-D", "-e", "main")
         return
     (sheet,) = model.sheets.values()
     expected = SheetDecoder(sheet).frame(float(model.times[2]))

@@ -1,13 +1,11 @@
 """The exported compute shaders that update a volume, run in every language that runs here, beside our kernels."""
 
 import re
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
 from builders.probe_models import random_model
-from builders.shader_runs import device, gl
+from builders.shader_runs import compiled, device, gl
 
 from wlm import probe
 from wlm.bundle import Bundle
@@ -113,16 +111,11 @@ def _hlsl(text: str, function: str, folder) -> tuple[bytes, dict[str, int]]:
     places = {match[1]: i for i, match in enumerate(re.finditer(declared, text, re.MULTILINE))}
     text = re.sub(declared, lambda m: f"[[vk::binding({places[m[1]]}, 0)]] {m[0]}", text, flags=re.MULTILINE)
     text += f"[numthreads(64, 1, 1)] void main(uint3 id : SV_DispatchThreadID) {{ {function}(int(id.x)); }}\n"
-    (folder / "shader.comp").write_text(text)
-    words = ["glslangValidator", "-D", "-V", "-e", "main", "-o", "shader.spv", "shader.comp"]
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout
+    compiled(text, folder, "-D", "-e", "main")
     return (folder / "shader.spv").read_bytes(), places
 
 
 def _run_wgpu(made: Bundle, language: str, folder) -> dict[str, np.ndarray]:
-    if language == "hlsl" and shutil.which("glslangValidator") is None:
-        pytest.skip("no glslangValidator: install glslang-tools")
     gpu = device()
     import wgpu
 

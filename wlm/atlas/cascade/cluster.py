@@ -13,10 +13,10 @@ edges within a sample are stored, so that memory grows linearly with the triangl
 
 The following points are not specified by the paper or differ from it:
 
-- A patch has 2 ** k + 1 samples along a side, the smallest such number not below R_s (eq. 1), and at most `largest`.
+- A patch has 2 ** k + 1 samples along a side, the smallest such number not below R_s (eq. 1), and at most `patch_size`.
 - R_s uses lengths in texels, which is also right where the lightmap isn't square.
-- A triangle is excluded if its patch reads a texel above `max_radiance` in any channel. The samples of a triangle
-  larger than `largest` lie more than a texel apart, and texels between them are not read.
+- A triangle is excluded if it contains the centre of a texel above `max_radiance` in any channel, or if its patch reads
+  one.
 - Colours, lambda and lambda_h are fractions of `max_radiance`: a dark lightmap needs a lower `max_radiance`. Negative
   radiance counts as 0.
 """
@@ -27,13 +27,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from wlm.errors import WlmError
 from wlm.system import Meter, OnProgress
 from wlm_kernels.atlas import patch_graph as graphs
 from wlm_kernels.atlas import patches as kernels
 from wlm_kernels.atlas.patches import SIZES
-
-# Against 65 this is mostly 2 to 6 times as fast; edges are within 1%, and groups within a seventh.
-LARGEST = 17
 
 SAMPLE = 8192
 """Triangles among which groups are formed at once."""
@@ -71,7 +69,7 @@ def cluster(
     colour_threshold: float = 0.09,
     max_radiance: float = 2.0,
     active: np.ndarray | None = None,
-    largest: int = LARGEST,
+    patch_size: int | None = None,
     device: str = "cpu",
     progress: OnProgress | None = None,
 ) -> Clusters:
@@ -86,21 +84,29 @@ def cluster(
         threshold, colour_threshold: lambda of eq. 4 and lambda_h of section 3.2.1, fractions of `max_radiance`.
         max_radiance: Above 0. A triangle with a brighter texel shares texels with no other (section 4.1.1). It stands
             for the paper's 8-bit colour 255.
-        largest: Largest number of samples along a side of a patch, one of `wlm_kernels.atlas.patches.SIZES`.
+        patch_size: Largest number of samples along a side of a patch, one of `wlm_kernels.atlas.patches.SIZES`; None:
+            4097, the largest of these.
         progress: Called with the triangles done in the stages "compare patches" and "cluster", in turn.
+
+    Raises:
+        WlmError: All patches have 2^31 samples or more.
     """
     count = len(triangle)
     excluded = np.zeros(count, bool) if active is None else ~active
     corner = _corners(uv, triangle, lightmap.shape)
-    level = _levels(corner, largest)
+    level = _levels(corner, patch_size or SIZES[-1])
+    total = int(kernels.samples_of(np.array(SIZES, np.int64))[level].sum())
+    if total >= 2**31:
+        raise WlmError(f"patch_size: expected fewer than 2^31 samples in all patches, found {total:,}: use 129 or less")
     samples, patches, bright = kernels.sample(_texels(lightmap, max_radiance), corner, level, device)
     kernels.dominant(samples, patches)
     excluded |= bright.numpy() != 0
 
     included = np.flatnonzero(~excluded)
     nodes = wp.array(patches.numpy()[included], dtype=kernels.Patch, device=device)
-    bounds = graphs.bounds(samples, nodes, int(level.max(initial=0)) + 1)
-    graph, order = graphs.graph(samples, nodes, bounds, graphs.rule(threshold, colour_threshold, device))
+    levels = int(level.max(initial=0)) + 1
+    bounds = graphs.bounds(samples, nodes, levels)
+    graph, order = graphs.graph(samples, nodes, bounds, levels, graphs.rule(threshold, colour_threshold, device))
     number = included[order]  # the triangle of each node
     groups = _groups(graph, number, progress)
     head = np.arange(count, dtype=np.int32)  # the representative of each triangle
@@ -134,12 +140,12 @@ def _corners(uv: np.ndarray, triangle: np.ndarray, shape: tuple[int, ...]) -> np
     return np.rint(place).astype(np.int64)[triangle.astype(np.int64)]
 
 
-def _levels(corner: np.ndarray, largest: int) -> np.ndarray:
+def _levels(corner: np.ndarray, patch_size: int) -> np.ndarray:
     """Returns for each triangle the index in `SIZES` of its patch's size, int32 [F]: the smallest not below its longest
-    edge in texels (eq. 1), at most `largest`."""
+    edge in texels (eq. 1), at most `patch_size`."""
     edge = (corner - np.roll(corner, 1, 1)) / 65536.0
     longest = np.hypot(edge[..., 0], edge[..., 1]).max(1, initial=0.0)
-    return np.searchsorted(SIZES, np.minimum(np.ceil(longest), largest)).astype(np.int32)
+    return np.searchsorted(SIZES, np.minimum(np.ceil(longest), patch_size)).astype(np.int32)
 
 
 def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None) -> list[tuple[int, np.ndarray]]:

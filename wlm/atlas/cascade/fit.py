@@ -82,6 +82,7 @@ def group_triangles(sheet: Sheet, profile: Profile, stages: Stages) -> Clusters 
 
     def make() -> dict[str, np.ndarray]:
         limits = {"threshold": profile.threshold, "colour_threshold": profile.colour_threshold}
+        limits["patch_size"] = profile.patch_size
         limits["max_radiance"] = brightest if profile.max_radiance is None else profile.max_radiance
         options = {"active": sheet.active, "device": stages.device, "progress": stages.progress}
         return vars(cluster(sheet.uv, sheet.triangle, sheet.lightmap, **limits, **options))

@@ -1,12 +1,12 @@
 """Functions that write parts of an engine kit, for the kits of all kinds of models."""
 
 import re
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from wlm import bundle
 from wlm.errors import WlmError, printable
 
 ENGINES = ("three", "godot", "unity", "unreal")
@@ -21,7 +21,6 @@ README_FILE = "README.md"
 _MOST_SIDE = {"unreal": 8192, "godot": 16384, "unity": 16384, "three": 16384}
 
 _MARKDOWN = re.compile(r"[\\`*<>&!\[\]]")
-_MARK = re.compile(r"@(\w+)@")
 _SAMPLER = re.compile(
     r"#ifndef (\w+)\n#ifndef \1_BINDING\nuniform (\w+) (\w+);\n#else\n.*\n#endif\n#define \1 \3\n#endif\n"
 )
@@ -35,10 +34,9 @@ def filled(asset: str, **parts: str) -> str:
     Raises:
         KeyError: A mark of the template is not among `parts`.
     """
-    text = (resources.files("wlm.export.engines") / "assets" / asset).read_text(encoding="utf-8")
     if asset.endswith(".md"):
         parts["NAME"] = _MARKDOWN.sub(r"\\\g<0>", printable(parts["NAME"]))
-    return _MARK.sub(lambda match: parts[match[1]].rstrip("\n"), text)
+    return bundle.filled(__package__, asset, **{name: text.rstrip("\n") for name, text in parts.items()})
 
 
 def write_texts(folder: Path, texts: dict[str, str]) -> None:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from wlm.bundle import filled
 from wlm.errors import WlmError
 from wlm.export.page.html import Page, pack_triangles
 from wlm.formats.geometry import read_geometry
@@ -22,42 +23,6 @@ from wlm.system import load as load_model
 
 _BANDS = 9  # coefficients for diffuse light
 _BUFFERS = ("gaussians", "network", "probes")
-
-_BETWEEN = """
-// Light between principal components: of the probes within four times the distance of the nearest one, weighted by
-// 1 / distance^4. WLM_PROBE_OWN(i) reads the positions of the live probes.
-vec3 wlm_probe_own(int probe)
-{
-    return uintBitsToFloat(
-        uvec3(WLM_PROBE_OWN(3 * probe), WLM_PROBE_OWN(3 * probe + 1), WLM_PROBE_OWN(3 * probe + 2)));
-}
-
-void wlm_probe_sh(vec3 position, out vec3 sh[COUNT])
-{
-    float nearest = 1e30;
-    for (int i = 0; i < wlm_probe_count(); ++i) {
-        vec3 away = position - wlm_probe_own(i);
-        nearest = min(nearest, dot(away, away));
-    }
-    float total = 0.0;
-    for (int c = 0; c < COUNT; ++c)
-        sh[c] = vec3(0.0);
-    for (int i = 0; i < wlm_probe_count(); ++i) {
-        vec3 away = position - wlm_probe_own(i);
-        float square = dot(away, away);
-        if (square > 16.0 * nearest)
-            continue;
-        float weight = 1.0 / max(square * square, 1e-30);
-        vec3 here[COUNT];
-        wlm_probe_sh(i, here);
-        for (int c = 0; c < COUNT; ++c)
-            sh[c] += weight * here[c];
-        total += weight;
-    }
-    for (int c = 0; c < COUNT; ++c)
-        sh[c] /= total;
-}
-"""
 
 
 def probe_page(
@@ -86,7 +51,7 @@ def probe_page(
     arrays = {name: made.buffers[name] for name in _BUFFERS if name in made.buffers}
     if "probes" in arrays:
         arrays["own"] = places.reshape(-1).view("<u4")
-        shader += _BETWEEN.replace("COUNT", str(coefficients))
+        shader += filled(__package__, "between.glsl", COUNT=coefficients)
     arrays["places"] = places
     radius = ball_radius(places)
     light = decoded if values is None else values[live]

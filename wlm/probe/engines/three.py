@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from wlm.bundle import filled
 from wlm.errors import WlmError
 from wlm.formats.ktx2 import write_ktx2
 from wlm.probe.engines.lattice import NUMBERS, Lattice, lattice_kit
@@ -25,34 +26,6 @@ _ABOUT = (
     "with a probe at the centre of each (r187 and later); corners spans the probes themselves (up to r186). Positions "
     "are in the axes and units of the scene."
 )
-
-_LOADER = """\
-// Loads the light beside this file into a LightProbeGrid, for scene.add().
-//
-//     import { KTX2Loader } from 'three/addons/loaders/KTX2Loader.js';
-//     import { LightProbeGridWebGL } from 'three/addons/lighting/LightProbeGridWebGL.js';
-//     scene.add(await loadLightProbeGrid(new URL('grid.json', import.meta.url), renderer, THREE, KTX2Loader,
-//                                        LightProbeGridWebGL));
-//
-// With WebGPURenderer, and up to r185, the class is LightProbeGrid.
-export async function loadLightProbeGrid(url, renderer, THREE, KTX2Loader, Grid)
-{
-    const info = await (await fetch(url)).json();
-    const loader = new KTX2Loader().detectSupport(renderer);
-    const texture = await loader.loadAsync(new URL(info.texture, new URL(url, document.baseURI)).href);
-    loader.dispose();
-    texture.minFilter = texture.magFilter = THREE.LinearFilter;
-    texture.generateMipmaps = false;
-    texture.colorSpace = THREE.NoColorSpace;
-    texture.needsUpdate = true;
-    const [low, high] = parseInt(THREE.REVISION) >= 187 ? info.box : info.corners;
-    const grid = new Grid(high[0] - low[0], high[1] - low[1], high[2] - low[2], ...info.resolution);
-    grid.position.set((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2);
-    grid.texture = texture;
-    grid.updateBoundingBox();
-    return grid;
-}
-"""
 
 
 def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]:
@@ -69,7 +42,7 @@ def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]
     parts = np.moveaxis(padded.reshape(nz, ny, nx, _PARTS, 4), 3, 0)
     texels = np.concatenate([parts[:, :1], parts, parts[:, -1:]], 1)
     write_ktx2(folder / _TEXTURE_FILE, texels.tobytes(), nx, ny, "R16G16B16A16_SFLOAT", _PARTS * (nz + 2))
-    (folder / _LOADER_FILE).write_text(_LOADER, encoding="utf-8")
+    (folder / _LOADER_FILE).write_text(filled(__package__, "three_probes.js"), encoding="utf-8")
     corners = [(box[0] + size / 2).tolist(), (box[1] - size / 2).tolist()]
     return {"texture": _TEXTURE_FILE, "box": box.tolist(), "corners": corners}
 

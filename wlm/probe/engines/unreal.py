@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from wlm.bundle import filled
 from wlm.errors import WlmError
 from wlm.formats.dds import write_dds
 from wlm.probe.conventions import from_canonical
@@ -38,66 +39,6 @@ _ABOUT = (
     "the scene. WlmProbes.usf explains how to read them; box has the two corners of the lattice."
 )
 
-_SHADER = """\
-// Light of probes for Unreal, in the packing of its volumetric lightmaps.
-//
-// 1. Import ambient.dds and sh0.dds to sh5.dds as volume textures: sRGB off, no compression (ambient as half floats),
-//    no mips, clamped, bilinear filter.
-// 2. Put this file into a folder of shaders that the project maps (AddShaderSourceDirectoryMapping("/Wlm", ...)), and
-//    "/Wlm/WlmProbes.usf" under Include File Paths of a material's Custom node, with the inputs Ambient, Sh0 to Sh5
-//    (texture objects), Position and Normal, and this code:
-//
-//        return WlmProbeDiffuse(Ambient, Sh0, Sh1, Sh2, Sh3, Sh4, Sh5, AmbientSampler, Position, Normal);
-//
-// Position and Normal are in the axes and the unit of the probes. In a scene that came in as glTF, with y up and in
-// metres, they are Absolute World Position's xzy / 100 and the world normal's xzy.
-
-static const float3 WlmCorner = float3(@CORNER@);
-static const float3 WlmSize = float3(@SIZE@);
-
-// Coefficients of radiance, orthonormal, in the order 1; y, z, x; xy, yz, 3z2-1, xz, x2-y2 and with the signs of
-// FSHVector3: y, x, yz and xz have a minus.
-void WlmProbeSh(Texture3D ambient, Texture3D sh0, Texture3D sh1, Texture3D sh2, Texture3D sh3, Texture3D sh4,
-                Texture3D sh5, SamplerState state, float3 position, out float3 sh[9])
-{
-    float3 uvw = (position - WlmCorner) / WlmSize;
-    float4 low = float4(1.7320508, 1.7320508, 1.7320508, 3.8729833);
-    float4 high = float4(3.8729833, 4.4721360, 3.8729833, 3.8729833);
-    float3 mean = ambient.SampleLevel(state, uvw, 0).xyz;
-    float4 r0 = (sh0.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * low * mean.x;
-    float4 r1 = (sh1.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * high * mean.x;
-    float4 g0 = (sh2.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * low * mean.y;
-    float4 g1 = (sh3.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * high * mean.y;
-    float4 b0 = (sh4.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * low * mean.z;
-    float4 b1 = (sh5.SampleLevel(state, uvw, 0) * 2.0 - 1.0) * high * mean.z;
-    sh[0] = mean;
-    sh[1] = float3(r0.x, g0.x, b0.x);
-    sh[2] = float3(r0.y, g0.y, b0.y);
-    sh[3] = float3(r0.z, g0.z, b0.z);
-    sh[4] = float3(r0.w, g0.w, b0.w);
-    sh[5] = float3(r1.x, g1.x, b1.x);
-    sh[6] = float3(r1.y, g1.y, b1.y);
-    sh[7] = float3(r1.z, g1.z, b1.z);
-    sh[8] = float3(r1.w, g1.w, b1.w);
-}
-
-// The radiance of a white diffuse surface with a unit normal: irradiance over pi.
-float3 WlmProbeDiffuse(Texture3D ambient, Texture3D sh0, Texture3D sh1, Texture3D sh2, Texture3D sh3, Texture3D sh4,
-                       Texture3D sh5, SamplerState state, float3 position, float3 normal)
-{
-    float3 sh[9];
-    WlmProbeSh(ambient, sh0, sh1, sh2, sh3, sh4, sh5, state, position, sh);
-    float x = normal.x;
-    float y = normal.y;
-    float z = normal.z;
-    float3 light = sh[0] * 0.2820948;
-    light += (sh[2] * z - sh[1] * y - sh[3] * x) * 0.3257350;
-    light += (sh[4] * (x * y) - sh[5] * (y * z) - sh[7] * (x * z)) * 0.2731371;
-    light += sh[6] * (0.0788479 * (3.0 * z * z - 1.0)) + sh[8] * (0.1365686 * (x * x - y * y));
-    return max(light, float3(0.0, 0.0, 0.0));
-}
-"""
-
 
 def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]:
     """Writes seven volume textures in Unreal's packing, and a reader, `WlmProbes.usf`.
@@ -118,9 +59,10 @@ def _write(folder: Path, lattice: Lattice, values: np.ndarray) -> dict[str, Any]
     textures |= {name: (np.ascontiguousarray(ratios[:, i]), _RATIOS) for i, name in enumerate(SH_FILES)}
     for name, (texels, form) in textures.items():
         write_dds(folder / name, texels.tobytes(), width, height, form, depth)
-    text = _SHADER
-    for mark, numbers in (("@CORNER@", corner), ("@SIZE@", size)):
-        text = text.replace(mark, ", ".join(f"{number:.9e}" for number in numbers))
+    marks = {
+        mark: ", ".join(f"{number:.9e}" for number in numbers) for mark, numbers in (("CORNER", corner), ("SIZE", size))
+    }
+    text = filled(__package__, "unreal_probes.usf", **marks)
     (folder / "WlmProbes.usf").write_text(text, encoding="utf-8")
     return {"box": [corner.tolist(), (corner + size).tolist()]}
 

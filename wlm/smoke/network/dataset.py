@@ -205,6 +205,8 @@ class _Simulation:
         self._seconds, self._done = scene.step, 0
         moving = any(obstacle.path.moves for obstacle in solver.obstacles)
         self._graphs = solver.device.is_cuda and not moving
+        if self._graphs:
+            solver.reserve()
         self._graph: wp.Graph | None = None
 
     def advance(self, steps: int) -> None:

@@ -1,0 +1,168 @@
+"""Meshes as obstacles of a scene: their files, the solids that they make, and their surfaces in pictures."""
+
+import copy
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from builders.smoke_plumes import SCENE
+
+from wlm.errors import WlmError
+from wlm.smoke import meshes
+from wlm.smoke.data import open_frames
+from wlm.smoke.meshes import read_surface
+from wlm.smoke.scene import Scene, load_scene, obstacle_mesh
+from wlm.smoke.simulation import advance, make_solver, warnings_of
+
+CELL = 0.05
+GRID = {"cells": [14, 14, 14], "cell": CELL, "refine": 2}
+BALL = trimesh.creation.icosphere(subdivisions=3)
+
+
+def _file(folder, name="ball.glb", mesh=BALL):
+    mesh.export(folder / name)
+    return name
+
+
+def _part(kept) -> trimesh.Trimesh:
+    return trimesh.Trimesh(BALL.vertices, BALL.faces[kept], process=False)
+
+
+def _scene(folder, obstacles, **changed) -> Scene:
+    path = folder / "scene.yaml"
+    path.write_text(yaml.safe_dump(SCENE | {"grid": GRID, "obstacles": obstacles} | changed))
+    return load_scene(path)
+
+
+@pytest.mark.parametrize("suffix", ["glb", "gltf", "obj", "stl", "ply", "off"])
+def test_a_surface_from_a_file(tmp_path, suffix):
+    """Corners at one place are one, and triangles run anticlockwise from outside."""
+    inside_out = trimesh.Trimesh(BALL.vertices, BALL.faces[:, ::-1], process=False)
+    for mesh in (BALL, inside_out):
+        if suffix == "gltf":
+            for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh)).items():
+                (tmp_path / name).write_bytes(data)
+            name = "model.gltf"
+        else:
+            name = _file(tmp_path, f"{len(list(tmp_path.iterdir()))}.{suffix}", mesh)
+        read = read_surface(tmp_path / name)
+        assert (read.points.shape, read.triangles.shape) == (BALL.vertices.shape, BALL.faces.shape)
+        again = trimesh.Trimesh(read.points, read.triangles, process=False)
+        assert again.is_watertight and again.volume == pytest.approx(BALL.volume, rel=1e-5)
+        assert not read.is_open and read.thickness == pytest.approx(2 / 3, rel=0.02)
+
+
+def test_open_and_closed(tmp_path):
+    up = BALL.triangles_center[:, 1]
+    for name, mesh, is_open in (
+        ("hole", _part(up > -0.95), False),
+        ("bowl", _part(up < 0.0), True),
+        ("tube", trimesh.Trimesh(*_tube(), process=False), True),
+        ("two", trimesh.util.concatenate([BALL, BALL.copy().apply_translation((3, 0, 0))]), False),
+    ):
+        assert read_surface(tmp_path / _file(tmp_path, f"{name}.stl", mesh)).is_open == is_open
+
+
+def _tube():
+    turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = np.stack([np.cos(turn), 0 * turn, np.sin(turn)], 1)
+    k = np.arange(24)
+    a, b = k, (k + 1) % 24
+    faces = np.concatenate([np.stack([a, a + 24, b], 1), np.stack([b, a + 24, b + 24], 1)])
+    return np.concatenate([ring, ring + (0, 2, 0)]), faces
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("none.glb", None, "none.glb: cannot read the mesh: No such file or directory"),
+        ("empty.obj", "", "empty.obj: expected triangles, found none"),
+        ("flat.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "flat.obj: expected triangles, found none with an area"),
+        ("bad.ply", "ply\nx", "bad.ply: malformed PLY"),
+        ("bad.glb", "x", "bad.glb"),
+        ("ball.fbx", "x", "shape: expected sphere, box, cylinder, or a mesh file (.glb, .gltf, .obj"),
+        ("cone", "x", "shape: expected sphere, box, cylinder, or a mesh file"),
+        ("many.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + 9 * "f 1 2 3\n", "expected at most 8 triangles, found 9"),
+        ("ball.obj", "v 0 0 nan\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "expected finite positions"),
+    ],
+)
+def test_what_a_mesh_may_not_be(tmp_path, monkeypatch, name, content, said):
+    monkeypatch.setattr(meshes, "MOST_TRIANGLES", 8)
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(WlmError) as caught:
+        make_solver(_scene(tmp_path, [{"shape": name, "path": [[0, 0, 0, 0]]}]))
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_mesh_has_no_radius(tmp_path):
+    for body in ({"shape": "a.obj", "radius": 1.0}, {"shape": "box"}, {}):
+        with pytest.raises(WlmError, match=r"radius: expected one number for a sphere, .* none for a mesh"):
+            _scene(tmp_path, [body | {"path": [[0, 0, 0, 0]]}])
+
+
+def test_a_mesh_as_a_solid_and_in_pictures(tmp_path):
+    """A ball with a hole, in centimetres and off its origin: its cells, its surface, and a source within it."""
+    kept = BALL.triangles_center[:, 1] > -0.95
+    mesh = trimesh.Trimesh(20.0 * BALL.vertices + (0, 20, 0), BALL.faces[kept], process=False)
+    body = {"shape": _file(tmp_path, "holed.ply", mesh), "scale": 0.01, "offset": [0, -0.2, 0]}
+    body |= {"path": [[0, 0.35, 0.35, 0.35], [1, 0.4, 0.35, 0.35]]}
+    source = {"centre": [0.35, 0.35, 0.35], "radius": 0.05}
+    scene = _scene(tmp_path, [body], sources=[source], inlets=[])
+    assert warnings_of(scene) == ["plume: sources.0: it is inside an obstacle, and emits no smoke"]
+    solver = make_solver(scene)
+    solver.step()
+    centres = CELL * (np.stack(np.meshgrid(*3 * [np.arange(14) + 0.5], indexing="ij"), -1))
+    away = np.linalg.norm(centres - scene.obstacles[0].centre(0.0), axis=-1)
+    sure = np.abs(away - 0.2) > 0.01
+    np.testing.assert_array_equal(solver.solid.numpy()[sure] == 1, (away < 0.2)[sure])
+    points, triangles, owner = obstacle_mesh(scene.obstacles, 1.0)
+    distance = np.linalg.norm(points - scene.obstacles[0].centre(1.0), axis=1)
+    np.testing.assert_allclose(distance, 0.2, atol=1e-5)
+    assert len(triangles) == kept.sum() and not owner.any()
+
+
+@pytest.mark.parametrize("thin", ["sheet", "plate"])
+def test_a_thin_shell_stops_air(tmp_path, thin):
+    """An open sheet, and a closed plate thinner than a cell, slanted across a box in which hot smoke rises."""
+    if thin == "sheet":
+        mesh = trimesh.Trimesh([[-1, 0.3, -1], [1, 0.5, -1], [1, 0.5, 1], [-1, 0.3, 1]], [[0, 2, 1], [0, 3, 2]])
+    else:
+        mesh = trimesh.creation.box((3, 0.01, 3))
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(0.1, (0, 0, 1), (0, 0, 0)))
+        mesh.apply_translation((0.35, 0.42, 0.35))
+    body = {"shape": _file(tmp_path, "thin.obj", mesh), "path": [[0, 0, 0, 0]]}
+    source = {"centre": [0.35, 0.2, 0.35], "radius": 0.1, "temperature": 1.0}
+    faces = dict.fromkeys(("-x", "+x", "-y", "+y", "-z", "+z"), "wall")
+    more = {"inlets": [], "sources": [source], "smoke": {"buoyancy": 5.0}, "air": {"speed": 1.0}}
+    scene = _scene(tmp_path, [body], grid=GRID | {"faces": faces}, **more)
+    said = ["plume: obstacles.0: it is thinner than a cell of 0.05 m, and is simulated as a cell thick"]
+    assert warnings_of(scene) == said
+    solver = make_solver(scene)
+    for frame in range(1, 5):
+        advance(scene, solver, frame)
+    speed = np.linalg.norm(solver.velocity.numpy(), axis=-1)
+    heights = CELL * (np.arange(14) + 0.5)
+    density = solver.density.numpy()
+    assert speed[:, heights < 0.28].max() > 1e-3 and density[:, 21:].max() == 0.0
+    assert speed[:, heights > 0.58].max() == 0.0
+    free = scene.model_copy(update={"obstacles": ()})
+    solver = make_solver(free)
+    for frame in range(1, 5):
+        advance(free, solver, frame)
+    assert np.abs(solver.velocity.numpy()[:, heights > 0.58]).max() > 1e-3
+
+
+def test_a_resumed_scene_knows_its_mesh(tmp_path):
+    """The content of the file counts, not its name."""
+    body = {"shape": _file(tmp_path), "scale": 0.1, "path": [[0, 0.3, 0.3, 0.3]]}
+    scene = _scene(tmp_path, [body])
+    frames = open_frames(tmp_path / "a", scene)
+    (tmp_path / "frames").mkdir()
+    frames.file(1).write_bytes(b"")
+    moved = _scene(tmp_path, [body | {"shape": _file(tmp_path, "copy.glb")}])
+    open_frames(tmp_path / "a", copy.deepcopy(moved), resume=True)
+    other = _scene(tmp_path, [body | {"shape": _file(tmp_path, "other.glb", _part(slice(9, None)))}])
+    with pytest.raises(WlmError, match="cannot resume: its frames have another obstacles"):
+        open_frames(tmp_path / "a", other, resume=True)
