@@ -134,6 +134,14 @@ def test_a_file_is_read_region_by_region(device, model, path, damaged):
         wlm.load(damaged, "probe").check()
 
 
+def test_many_points_are_decoded_as_few_are(device, model):
+    position = model.stored_positions()
+    for each in (model, model.content.region(0)):
+        decoder = each.decoder(device)
+        many = decoder.decode(np.tile(position, (113, 1)))  # more than 1,056 blocks of 32 points
+        np.testing.assert_allclose(many, np.tile(decoder.decode(position), (113, 1)), rtol=0, atol=1e-5)
+
+
 @pytest.mark.parametrize("change", ["child", "boxes", "counts", "packed"])
 def test_contradictions_are_refused(model, change, tmp_path):
     content = model.content

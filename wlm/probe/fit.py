@@ -191,15 +191,14 @@ def _fit_regions(
     # All regions together have as many Gaussians as one fit would have.
     share = np.cumsum(np.bincount(owner)) / len(owner) * gaussian_count(profile.ratio, len(owner))
     wanted = np.maximum(np.diff(np.rint(share), prepend=0.0), 1.0)
-    results: list[Mapping[str, np.ndarray]] = []
+    results: dict[int, Mapping[str, np.ndarray]] = {}
     batches = (number + 1) * _BATCHES
     at_once = _AT_ONCE["cpu" if options["device"] == "cpu" or pixels is not None else "cuda"]
     for first in range(0, tree.count, at_once):
         jobs = []
-        regions = range(first, min(first + at_once, tree.count))
-        kept = {region: checkpoint and checkpoint.finished(batches + region, _FINISHED) for region in regions}
-        for region in regions:
-            if kept[region]:
+        for region in range(first, min(first + at_once, tree.count)):
+            if kept := checkpoint and checkpoint.finished(batches + region, _FINISHED):
+                results[region] = kept
                 continue
             own = position[owner == region]
             # The spacing of as many probes in a cube; on surfaces it is several times that of the probes.
@@ -215,17 +214,15 @@ def _fit_regions(
             of_region = partial(make, **bare, **box_of(near_set.position))
             seen = None if pixels is None else pixels.of(near)
             jobs.append(_Job(of_region, near_set, sized, batches + region, seen))
-        fitted = iter(fit(jobs, profile.steps * (regions.stop - len(jobs))) if jobs else [])
-        for region, result in kept.items():
-            if not result:
-                model = next(fitted)
-                count = np.array([model.content.settings()[name] for name in ("count", "dropped")], np.int32)
-                result = {"packed": np.frombuffer(pack(model), np.uint8), "box": box_row(model), "count": count}
-                if checkpoint is not None:
-                    checkpoint.add_finished(batches + region, result)
-            results.append(result)
-    boxes, counts = (np.stack([result[name] for result in results]) for name in ("box", "count"))
-    packed = [result["packed"].tobytes() for result in results]
+        for job, model in zip(jobs, fit(jobs, profile.steps * len(results)) if jobs else [], strict=True):
+            count = np.array([model.content.settings()[name] for name in ("count", "dropped")], np.int32)
+            result = {"packed": np.frombuffer(pack(model), np.uint8), "box": box_row(model), "count": count}
+            results[job.batch - batches] = result
+            if checkpoint is not None:
+                checkpoint.add_finished(job.batch, result)
+    ordered = [results[region] for region in range(tree.count)]
+    boxes, counts = (np.stack([result[name] for result in ordered]) for name in ("box", "count"))
+    packed = [result["packed"].tobytes() for result in ordered]
     content = Regions(tree, boxes, counts, profile, probes.outputs, hours, packed, probes.name)
     choice = f"Gaussians, in {tree.count} regions of at most {profile.region:,} live probes"
     return make(profile=profile, content=content, choice=choice)
@@ -256,10 +253,8 @@ def _fit_gaussians(
             trainers.append(Trainer(x, probes.values[probes.live], profile, seed, device, hours, pixels))
             if checkpoint is not None:
                 checkpoint.restore(batch, trainers[-1].load)
-            if checkpoint is not None and trainers[-1].step != (expected := trainers[0].step):
-                raise checkpoint.wrong(
-                    batch, ValueError(f"part control: expected {expected} steps, as in batch {jobs[0].batch}")
-                )
+                if trainers[-1].step != (done := trainers[0].step):
+                    raise checkpoint.wrong(batch, ValueError(f"part control: expected {done} steps, as its peers have"))
         trainers[0].peers = trainers[1:]
         _train(trainers, jobs, meter, before, checkpoint)
         contents = []
