@@ -103,6 +103,8 @@ _TABLES: dict[str, dict[str, Figure]] = {
     },
     "Time": {
         "encode_seconds": Figure("encode", "s", ".3g"),
+        "hours": Figure("time", "h", ".3g"),
+        "core_seconds": Figure("of a core", "s", ".3g"),
         "load_ms": Figure("load a tile", "ms", ".2g"),
         "open_ms": Figure("open the file", "ms", ".3g"),
         "open_tile_ms": Figure("open it and decode a tile", "ms", ".3g"),
@@ -128,6 +130,10 @@ _TABLES: dict[str, dict[str, Figure]] = {
         "launches": Figure("launches", form=".3g"),
         "moved_bytes": Figure("bytes", "bytes", _WHOLE),
         "operations": Figure("operations", form=".3g"),
+        "storage_busy": Figure("storage busy", "%", ".1f"),  # this and the next ones as in `benchmarks.growth`
+        "cores_busy": Figure("cores busy", "%", ".1f"),
+        "gpus_busy": Figure("GPUs busy", "%", ".1f"),
+        "repeated": Figure("repeated", form=_WHOLE),
         "of_copy": Figure("of the copy", "%", ".3g"),  # the copy's bandwidth, at the bytes that must be moved
         "worked_on": Figure("worked on", "%", ".3g"),
         "speedup": Figure("speedup", form=".2f"),

@@ -8,7 +8,7 @@ from benchmarks.figures import TABLES, Figure
 from benchmarks.rows import MEAN, Row, Run, read_runs
 
 _WIDTH = 140  # characters of a line that a screen shows
-_SYSTEMS = ("scene", "lightmap", "atlas", "probe", "smoke")
+_SYSTEMS = ("scene", "lightmap", "atlas", "probe", "smoke", "kernels", "growth")
 
 
 def pages(paths: Sequence[str | os.PathLike[str]], index: str | os.PathLike[str] = "results.md") -> dict[str, str]:

@@ -71,6 +71,7 @@ COMMANDS = [
         "kernels --quick --device cpu --only 'atlas, read'",
         {"quick": True},
     ),
+    (["growth", "--quick"], "growth --quick --device cpu", {"quick": True}),
     (["fluid-gradients", "--quick"], "fluid-gradients --quick --device cpu", {"quick": True}),
     (["smoke-orders"], "smoke-orders --device cpu", {"quick": False}),
     (

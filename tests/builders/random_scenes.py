@@ -69,6 +69,14 @@ def random_scene(seed: int) -> dict:
     air |= {"lattice_speed": float(random.uniform(0.02, 0.202)), "storage": "float16" if chance(0.2) else "float32"}
     if chance(0.2):
         air["speed"] = speed * 10 ** random.uniform(-0.5, 2)
+    if chance(0.3):
+        keys = [[0.0, *(speed * random.normal(size=3))], [frames / rate, *(speed * random.normal(size=3))]]
+        keys = [[float(number) for number in key] for key in keys]
+        air["wind"] = {"keys": keys, "gusts": float(random.uniform()), "period": frames / rate}
+    if chance(0.3):
+        air["confinement"] = rate * 10 ** random.uniform(-1, 2)
+    if chance(0.3):
+        air["turbulence"] = {"strength": pull * 10 ** random.uniform(-2, 2), "size": cell * 10 ** random.uniform(0, 1)}
     grid = {"cells": cells.tolist(), "cell": cell, "refine": int(random.integers(1, 4)), "origin": origin.tolist()}
     scene = {"name": f"random {seed}", "grid": grid | {"faces": faces}, "smoke": smoke, "air": air, "inlets": inlets}
     return scene | {"sources": sources, "obstacles": obstacles, "frames": frames, "rate": rate}

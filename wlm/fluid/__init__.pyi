@@ -1,5 +1,7 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
 from wlm.fluid.faces import FACES as FACES
+from wlm.fluid.forcing import Turbulence as Turbulence
+from wlm.fluid.forcing import Wind as Wind
 from wlm.fluid.gradients import DifferentiableLattice as DifferentiableLattice
 from wlm.fluid.gradients import DifferentiableSolver as DifferentiableSolver
 from wlm.fluid.gradients import SmokeState as SmokeState
@@ -11,6 +13,7 @@ from wlm.fluid.obstacles import Sphere as Sphere
 from wlm.fluid.obstacles import Trajectory as Trajectory
 from wlm.fluid.obstacles import box_mesh as box_mesh
 from wlm.fluid.solver import Buoyancy as Buoyancy
+from wlm.fluid.solver import Noise as Noise
 from wlm.fluid.solver import Solver as Solver
 from wlm.fluid.solver import Source as Source
 from wlm.fluid.volume import DensityVolume as DensityVolume

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from wlm_kernels.fluid.advection_places import CLOSED, OPEN, PERIODIC
-from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
+from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP, WIND
 from wlm_kernels.fluid.lattice_sets import VelocitySet
 
 FACES = ("-x", "+x", "-y", "+y", "-z", "+z")
 """The faces, by the axis that they close and the end of it."""
 
 # A link along an edge of the domain crosses two faces: the face of lower rank decides, then the order of FACES.
-_RANKS = {BOUNCE: 1, INLET: 2, OUTLET: 3, PRESSURE: 3, SLIP: 4}
+_RANKS = {BOUNCE: 1, INLET: 2, WIND: 2, OUTLET: 3, PRESSURE: 3, SLIP: 4}
 _STILL = 0  # a wall at rest
 
 

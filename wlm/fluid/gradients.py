@@ -28,7 +28,7 @@ from wlm.ops.tapes import takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.fluid import advection, advection_adjoint, advection_sources, lattice_adjoint, lattice_links
 from wlm_kernels.fluid.lattice import QUIET, step_kernel
-from wlm_kernels.fluid.lattice_links import OUTLET
+from wlm_kernels.fluid.lattice_links import OUTLET, WIND
 
 STATES = 8
 """Most states that are stored for the backward pass, by default."""
@@ -71,6 +71,8 @@ class DifferentiableLattice:
         setup = self._setup
         if setup.spec.storage != "float32":
             raise WlmError("lattice: expected storage='float32', since float16 has no gradients, got 'float16'")
+        if any((face.kind == WIND).any() for face in lattice.faces.values()):
+            raise WlmError("lattice: expected inlets in place of wind, since wind has no gradients, got wind")
         if lattice.moving:
             raise WlmError("lattice: expected bodies at rest, since others have no gradients, got one that moves")
         self._cells, self._directions = math.prod(setup.shape), setup.tables.w.shape[0]
@@ -262,6 +264,7 @@ class DifferentiableSolver:
             (self._setup.storage != "float32", "storage='float32'", "'float16'"),
             (self._setup.bricks, "bricks=False", "bricks"),
             (solver.lattice.moving, "obstacles at rest", "one that moves"),
+            (self._setup.stirred, "no confinement and no turbulence", "one of them"),
         ):
             if wrong:
                 raise WlmError(f"smoke: expected {expected}, since other smoke has no gradients, got {found}")
@@ -442,7 +445,7 @@ class _Smoke:
             if self.values is not None:
                 values = self.values[step if len(self.values) > 1 else 0][number]
             scale = source.steps(self.setup.substeps)
-            where = [self.setup.box, self.setup.walls, *source.region(self.setup.box.refinement)]
+            where = [self.setup.box, self.setup.walls, source.region(self.setup.box.refinement, str(self.air.device))]
             value = scale * values[0], scale * values[1]
             advection_sources.add_source(*where, value, fields, fixed=source.fixed)
         return f, density, heat
@@ -461,7 +464,7 @@ class _Smoke:
             on_values = on_f.new_zeros(len(setup.sources), 2)
             fields, into = _fields(on_smoke), _flat(on_values, wp.vec2)
             for number, source in reversed(list(enumerate(setup.sources))):
-                where = [setup.box, setup.walls, *source.region(setup.box.refinement), number]
+                where = [setup.box, setup.walls, source.region(setup.box.refinement, str(air.device)), number]
                 advection_adjoint.source_backward(*where, fields, into, fixed=source.fixed)
             if on_controls[1] is not None:
                 scales = [source.steps(setup.substeps) for source in setup.sources]

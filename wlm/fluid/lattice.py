@@ -20,7 +20,7 @@ from wlm.interop import free_memory, no_collection
 from wlm_kernels.fluid import lattice_bodies, lattice_links
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
 from wlm_kernels.fluid.lattice_fields import FluidKernels, fluid_kernels
-from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP
+from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP, WIND
 from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, Tables, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
@@ -198,7 +198,7 @@ class Lattice:
         self._motion, self._bodies = lattice_bodies.make_motion(self.device), None
         # The cells that bodies have just left, and the duration of a step in the unit of the bodies' paths.
         self._fresh, self._pace = self._zeros(0, wp.uint8), 1.0
-        self._forces = self._zeros(0, wp.vec3)
+        self._forces, self._wind = self._zeros(0, wp.vec3), self._zeros(1, wp.vec3)
         self._faces: dict[str, Face] = {}
         self._links: lattice_links.Links | None = None
         self._graph: wp.Graph | None = None
@@ -232,6 +232,16 @@ class Lattice:
             where: bool [A, B], true in the open part of the face; elsewhere it is a wall. None: the whole face is open.
         """
         self._set_face(face, INLET, velocity, where=where)
+
+    def set_wind(self, face: str) -> None:
+        """Makes a face (see `set_wall`) one through which the wind of `blow` comes or leaves; first there is none."""
+        self._set_face(face, WIND)
+
+    def blow(self, velocity: ArrayLike) -> None:
+        """Sets the velocity of the wind from now on, (3,) in cells per step; raises a WlmError above `MAX_SPEED`."""
+        wind = np.asarray(velocity, np.float32).reshape(1, 3)
+        _check_speed(float(np.linalg.norm(wind)), "the wind")
+        self._wind.assign(wind)
 
     def set_outlet(self, face: str, density: float | None = None) -> None:
         """Makes a face an outlet.
@@ -363,6 +373,11 @@ class Lattice:
     def faces(self) -> dict[str, Face]:
         """The faces that have been set, by name; an axis without faces is periodic."""
         return dict(self._faces)
+
+    @property
+    def clock(self) -> wp.array:
+        """Counters, int [2] on the device, of which the larger is the number of steps done."""
+        return self._clock
 
     # Running.
 
@@ -682,7 +697,7 @@ class Lattice:
             padded = np.zeros(links.faces + room, dtype)
             padded[: links.faces] = column
             setattr(links, name, wp.array(padded, device=self.device))
-        links.value = self._zeros(links.faces + room, float)
+        links.value, links.wind = self._zeros(links.faces + room, float), self._wind
         links.used = wp.full(1, links.faces, dtype=int, device=self.device)
         return links
 
@@ -723,7 +738,7 @@ class Lattice:
     def _apply_links(self, first: int, f: wp.array, stamp: int = _STALE) -> None:
         """Applies the boundary conditions from link `first` on; cells that bodies have left have the mark `stamp`."""
         for window in self._bodies.moving if self.moving else ():
-            where = [self._tables, self._bounded, window, self._motion, stamp, self._solid, self._fresh]
+            where = [self._bounded, window, self._motion, stamp, self._solid, self._fresh]
             lattice_links.bounce(self._link_kernels, *where, f, self._sums)
         where = [self._tables, self._n, self._bounded, first, self._links, self._solid]
         lattice_links.apply(self._link_kernels, *where, self._clock, self._rise, f, self._sums)

@@ -13,6 +13,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,13 +22,15 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
 from wlm.fluid.faces import axis_ends
+from wlm.fluid.forcing import CALM, Turbulence, Wind
 from wlm.fluid.lattice import Lattice
-from wlm.fluid.obstacles import Obstacle
+from wlm.fluid.obstacles import Mesh, Obstacle
 from wlm.fluid.volume import DensityVolume, gather, scatter
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.parts import Part, check_part, check_parts
-from wlm_kernels.fluid import advection, advection_places, advection_sources
+from wlm_kernels.fluid import advection, advection_places, advection_sources, forcing
 from wlm_kernels.fluid.advection_places import DENSE
+from wlm_kernels.fluid.lattice_links import WIND
 
 SCHEMES = ("maccormack", "semi-lagrangian")
 
@@ -40,41 +43,80 @@ _SOUND = math.sqrt(1.0 / 3.0)
 
 
 @dataclass(frozen=True)
+class Noise:
+    """Smooth noise by which the values of a source vary, in the source's frame: Perlin noise in space and time (Perlin,
+    "Improving noise", 2002).
+
+    Attributes:
+        amount: Largest change relative to the source's values, at least 0; values stay at least 0.
+        size: Distance in cells over which it changes, above 0.
+        phase: Time in units over which it changes; a constant one is noise at rest.
+        seed: Number of the pattern.
+    """
+
+    amount: float
+    size: float
+    phase: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.amount < math.inf and 0.0 < self.size < math.inf and math.isfinite(self.phase)):
+            raise ValueError(f"noise: expected an amount of at least 0, a size above 0 and a phase, got {self}")
+
+
+@dataclass(frozen=True)
 class Source:
     """A region that emits smoke, in cells and steps of the lattice.
 
     Attributes:
-        shape: "box" or "sphere" (with three radii, an ellipsoid).
-        centre: Centre in cells.
-        size: Half edges of the box, or radii, along x, y and z in cells; above 0.
+        shape: "box", "sphere" (with three radii, an ellipsoid), "cylinder" along y, or a mesh, of which the path, the
+            scale and the shell have no effect.
+        centre: Centre, or origin of the mesh, in cells.
+        size: Half edges of the box or cylinder, radii, or cells per unit of the mesh, along x, y and z; above 0.
         density: Density added per step of the lattice or, with `fixed`, the density to set.
         temperature: Temperature added per step or, with `fixed`, the temperature to set.
         fixed: Whether density and temperature are set instead of added.
+        turn: Unit quaternion (x, y, z, w) that turns the region about its centre.
+        shell: Distance in cells from a mesh's surface within which smoke is emitted, too.
+        noise: Variation of the values; None: none.
     """
 
-    shape: str
+    shape: str | Mesh
     centre: tuple[float, float, float]
     size: tuple[float, float, float]
     density: float
     temperature: float = 0.0
     fixed: bool = False
+    turn: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    shell: float = 0.0
+    noise: Noise | None = None
 
     def __post_init__(self) -> None:
-        if self.shape not in ("box", "sphere"):
-            raise ValueError(f"shape: expected 'box' or 'sphere', got {self.shape!r}")
+        if not (isinstance(self.shape, Mesh) or self.shape in advection_sources.SHAPES[:3]):
+            names = ", ".join(map(repr, advection_sources.SHAPES[:3]))
+            raise ValueError(f"shape: expected {names} or a mesh, got {self.shape!r}")
         for name, least in (("centre", -math.inf), ("size", 0.0)):
             value = getattr(self, name)
             if len(value) != 3 or not all(math.isfinite(v) and v > least for v in value):
                 raise ValueError(f"{name}: expected three finite numbers{' above 0' * (name == 'size')}, got {value}")
-        for name in ("density", "temperature"):
+        for name in ("density", "temperature", "shell"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}: expected a finite number of at least 0, got {value}")
+        if len(self.turn) != 4 or not abs(math.hypot(*self.turn) - 1.0) < 1e-3:
+            raise ValueError(f"turn: expected a quaternion of length 1, got {self.turn}")
 
-    def region(self, refinement: int) -> tuple[int, list[float], list[float]]:
-        """Returns the shape's code in `advection_sources`, and centre and size in cells of smoke."""
-        shape = advection_sources.BOX if self.shape == "box" else advection_sources.SPHERE
-        return shape, [refinement * v for v in self.centre], [refinement * v for v in self.size]
+    def region(self, refinement: int, device: str) -> advection_sources.Region:
+        """Returns the region in cells of smoke, with the mesh on a device."""
+        centre, size = ([refinement * v for v in values] for values in (self.centre, self.size))
+        how: dict[str, Any] = {"turn": self.turn}
+        shape = self.shape
+        if isinstance(shape, Mesh):
+            how |= {"extent": shape.extent, "shell": refinement * self.shell}
+            shape = shape.on(device)
+        if (noise := self.noise) is not None:
+            how |= {"noise": (noise.amount, refinement * noise.size, noise.phase), "seed": noise.seed}
+        return advection_sources.make_region(shape, centre, size, **how)
 
     def steps(self, substeps: int) -> float:
         """Returns the factor of density and temperature in a step of the solver."""
@@ -124,6 +166,7 @@ class SmokeSetup:
         temperature: Whether the smoke has a temperature.
         decay: Factors of density and temperature per step.
         bricks: Whether only bricks with smoke are computed.
+        stirred: Whether confinement or turbulence acts.
     """
 
     shape: tuple[int, int, int]
@@ -137,6 +180,7 @@ class SmokeSetup:
     temperature: bool
     decay: tuple[float, float]
     bricks: bool
+    stirred: bool
 
 
 def bytes_needed(shape: tuple[int, int, int], scheme: str, storage: str, temperature: bool, bricks: bool) -> int:
@@ -163,6 +207,9 @@ class Solver:
         dissipation: Decay rate of the density: exp(-dissipation t) of it remains after t steps of the lattice.
         cooling: Decay rate of the temperature, in the same unit.
         buoyancy: Acceleration of the air by smoke; None: smoke does not move the air.
+        confinement: Strength of the vorticity confinement per step of the lattice (Fedkiw, Stam and Jensen 2001: eps).
+        turbulence: Random acceleration of all air.
+        wind: Velocity of the wind at the lattice's faces for it, in cells per step at times in steps.
         substeps: Steps of the lattice per step of the solver. Above a speed of 1 / substeps smoke can jump over walls.
         bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are stored and computed.
         threshold: With bricks, the largest value in a brick that counts as empty.
@@ -192,6 +239,9 @@ class Solver:
         dissipation: float = 0.0,
         cooling: float = 0.0,
         buoyancy: Buoyancy | None = None,
+        confinement: float = 0.0,
+        turbulence: Turbulence | None = None,
+        wind: Wind | None = None,
         substeps: int = 2,
         bricks: bool = False,
         threshold: float = 1e-6,
@@ -203,7 +253,8 @@ class Solver:
         for name, count in (("refinement", refinement), ("substeps", substeps)):
             if count < 1:
                 raise ValueError(f"{name}: expected at least 1, got {count}")
-        for name, rate in (("dissipation", dissipation), ("cooling", cooling), ("threshold", threshold)):
+        rates = {"dissipation": dissipation, "cooling": cooling, "threshold": threshold, "confinement": confinement}
+        for name, rate in rates.items():
             if not (math.isfinite(rate) and rate >= 0.0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {rate}")
         # Steps after which smoke decays: only with float16 and a shortened step more than one.
@@ -239,8 +290,13 @@ class Solver:
         self._fields = self._pool.fields if self._pool else [self._make_fields(cells) for _ in range(_buffers(scheme))]
         self._touched: tuple[Source, ...] = ()
         self._velocity = self._zeros(lattice.shape, wp.vec3)
+        if wind is not None and not any((face.kind == WIND).any() for face in lattice.faces.values()):
+            raise ValueError("wind: expected a lattice with a face for it (set_wind), got none")
+        self._confinement, self._turbulence, self._wind = confinement, turbulence, wind
+        self._modes = CALM if turbulence is None else turbulence.modes(str(self.device))
+        self._stirred = confinement > 0.0 or turbulence is not None
         self._force = None
-        if buoyancy is not None:
+        if buoyancy is not None or self._stirred:
             self._force = self._zeros(lattice.shape, wp.vec3)
             lattice.set_force(self._force)
         self._walls = [self._zeros((math.prod(lattice.shape) if obstacles else 0,), wp.uint8) for _ in range(2)]
@@ -266,13 +322,15 @@ class Solver:
         capturing = self.device.is_cuda and self.device.is_capturing
         uneven = steps % self.period or self._done % self.period or self.substeps % self.lattice.period
         uneven = uneven or self._decay_every > 1 or not (self._pool is None or self._pool.is_full)
-        if capturing and (uneven or not self._done):
+        if capturing and (uneven or not self._done or self._wind is not None):
             raise ValueError(
-                f"steps: expected room for all bricks (`reserve`), substeps a multiple of "
+                f"steps: expected no wind, room for all bricks (`reserve`), substeps a multiple of "
                 f"{self.lattice.period}, and a multiple of "
                 f"{self.period} steps in the captured CUDA graph and before it; got {steps} after {self._done}"
             )
         for _ in range(steps):
+            if self._wind is not None:
+                self.lattice.blow(self._wind.at((self._done + 0.5) * self.substeps))
             self._step()
             self._done += 1
 
@@ -324,6 +382,12 @@ class Solver:
             self.buoyancy = replace(
                 self.buoyancy, lift=square * self.buoyancy.lift, weight=square * self.buoyancy.weight
             )
+        self._confinement *= factor
+        if self._wind is not None:
+            self._wind = self._wind.scaled(factor)
+        if self._turbulence is not None:
+            self._turbulence = self._turbulence.scaled(factor)
+            self._modes = self._turbulence.modes(str(self.device))
 
     @property
     def fastest(self) -> float:
@@ -447,6 +511,7 @@ class Solver:
             temperature=self._grids["temperature"],
             decay=self._decay,
             bricks=self._pool is not None,
+            stirred=self._stirred,
         )
 
     # Checkpoints.
@@ -560,6 +625,9 @@ class Solver:
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
             advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
+        if self._stirred:
+            air = [box, self._velocity.flatten(), self.solid.flatten(), self._confinement, self._modes]
+            forcing.stir(*air, self.lattice.clock, self._force.flatten(), added=self.buoyancy is not None)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)
@@ -574,7 +642,8 @@ class Solver:
         for source in self.sources:
             steps = source.steps(self.substeps)
             value = (steps * source.density, steps * source.temperature)
-            where = [self._box, self._walls[0], *source.region(self._box.refinement), value, self._fields[0]]
+            region = source.region(self._box.refinement, str(self.device))
+            where = [self._box, self._walls[0], region, value, self._fields[0]]
             advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
 
     def _carry(self) -> None:

@@ -1,0 +1,102 @@
+"""What moves the air of a `Solver` besides smoke: turbulence, and wind with gusts.
+
+Lengths and times are in any units; `scaled` converts them to those of cells and steps.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from wlm_kernels.fluid.forcing import Modes
+
+EDDY = 4.0
+"""Cells along the smallest wavelength of turbulence."""
+_MODES = 16
+
+
+@dataclass(frozen=True)
+class Turbulence:
+    """A random acceleration of all air, free of divergence; the same for a seed.
+
+    Attributes:
+        strength: Root mean square of the acceleration.
+        size: Wavelength of its largest eddies, simulated as at least `EDDY` cells; the smallest are half as large.
+        period: Mean duration in which an eddy comes and goes.
+        seed: Seed of the random modes, at least 0.
+    """
+
+    strength: float
+    size: float
+    period: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least in (("strength", 0.0), ("size", 1e-12), ("period", 1e-12), ("seed", 0)):
+            if not least <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite number of at least {least:g}, got {getattr(self, name)}")
+
+    def scaled(self, step: float, cell: float = 1.0) -> "Turbulence":
+        """Returns the same in units of `cell` and `step`."""
+        return Turbulence(self.strength * step * step / cell, self.size / cell, self.period / step, self.seed)
+
+    def modes(self, device: str) -> Modes:
+        """Makes the random Fourier modes on a device, see `wlm_kernels.fluid.forcing`."""
+        random = np.random.default_rng(self.seed)
+        way, other = random.normal(size=(2, _MODES, 3))
+        length = 2.0 * np.pi / max(self.size, EDDY) * random.uniform(1.0, 2.0, (_MODES, 1))
+        k = length * way / np.linalg.norm(way, axis=1, keepdims=True)
+        push = np.cross(np.sin(k), other)
+        push *= self.strength * math.sqrt(2.0 / _MODES) / np.linalg.norm(push, axis=1, keepdims=True)
+        turn = random.normal(size=_MODES) * 2.0 * np.pi / self.period, random.uniform(0.0, 2.0 * np.pi, _MODES)
+        out = Modes()
+        out.k, out.push = (wp.array(each.astype(np.float32), dtype=wp.vec3, device=device) for each in (k, push))
+        out.turn = wp.array(np.stack(turn, 1).astype(np.float32), dtype=wp.vec2, device=device)
+        return out
+
+
+@dataclass(frozen=True)
+class Wind:
+    """The velocity of the wind at the faces of the box that `Lattice.set_wind` opens to it.
+
+    Attributes:
+        keys: Rows (time, x, y, z) of velocities, linear between them and constant beyond, times increasing.
+        gusts: Largest change of the speed in gusts, as a share of it, at most 1.
+        period: Mean time from gust to gust.
+        seed: Seed of the gusts.
+    """
+
+    keys: tuple[tuple[float, float, float, float], ...]
+    gusts: float = 0.0
+    period: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        keys = np.asarray(self.keys, np.float64)
+        if keys.ndim != 2 or keys.shape[1] != 4 or not (np.isfinite(keys).all() and (np.diff(keys[:, 0]) > 0).all()):
+            raise ValueError(f"keys: expected rows of an increasing time and a velocity, got {self.keys}")
+        if not (0.0 <= self.gusts <= 1.0 and 0.0 < self.period < math.inf and self.seed >= 0):
+            raise ValueError("gusts, period, seed: expected 0 to 1, above 0, at least 0")
+
+    def scaled(self, step: float, cell: float = 1.0) -> "Wind":
+        """Returns the same in units of `cell` and `step`."""
+        keys = np.asarray(self.keys) * (1.0 / step, *[step / cell] * 3)
+        return Wind(keys.tolist(), self.gusts, self.period / step, self.seed)
+
+    def at(self, time: float) -> np.ndarray:
+        """Returns the velocity at a time, float64 [3]."""
+        keys = np.asarray(self.keys, np.float64)
+        mean = np.array([np.interp(time, keys[:, 0], column) for column in keys.T[1:]])
+        random = np.random.default_rng(self.seed)
+        waves = np.sin(2.0 * np.pi * (random.uniform(0.5, 2.0, 4) * time / self.period + random.random(4)))
+        return mean * (1.0 + self.gusts * float(waves.mean()))
+
+    @property
+    def fastest(self) -> float:
+        """An upper bound of the speed."""
+        return float(np.linalg.norm(np.asarray(self.keys)[:, 1:], axis=1).max()) * (1.0 + self.gusts)
+
+
+CALM = Modes()
+"""No turbulence."""
