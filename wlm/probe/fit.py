@@ -257,23 +257,20 @@ def _fit_gaussians(
                     raise checkpoint.wrong(batch, ValueError(f"part control: expected {done} steps, as its peers have"))
         trainers[0].peers = trainers[1:]
         _train(trainers, jobs, meter, before, checkpoint)
-        contents = []
-        for job, trainer in zip(jobs, trainers, strict=True):
+        models = []
+        for (make, probes, profile, _, pixels), trainer in zip(jobs, trainers, strict=True):
             trainer.finish()
             mse, content = trainer.mse(), trainer.quantised()
             if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
-                name = job.profile.name
-                raise WlmError(f"{job.probes.name}: the fit diverged; use smaller learning rates than profile {name}")
-            contents.append(content)
+                told = f"the fit diverged; use smaller learning rates than profile {profile.name}"
+                raise WlmError(f"{probes.name}: {told}")
+            fitted = make(profile=profile, content=content, choice="Gaussians, as the profile asks")
+            lit = probes.position[probes.live], probes.values[probes.live]
+            models.append(pack_model(fitted, *lit, device, pixels is not None))
+        return models
     finally:
         for trainer in trainers:
             trainer.close()
-    models = []
-    for (make, probes, profile, _, pixels), content in zip(jobs, contents, strict=True):
-        fitted = make(profile=profile, content=content, choice="Gaussians, as the profile asks")
-        lit = probes.position[probes.live], probes.values[probes.live]
-        models.append(pack_model(fitted, *lit, device, pixels is not None))
-    return models
 
 
 def _train(trainers: list[Trainer], jobs: list[_Job], meter: Meter, before: int, checkpoint: Checkpoint | None) -> None:

@@ -25,7 +25,7 @@ from wlm_kernels.probe.network import cpu_network
 
 _THREADS = 128
 _POINTS = 32  # of a block of threads on CUDA
-_MANY = (128, 64, _POINTS)  # of a block that has turns: the most for which shared memory suffices
+_MANY = (128, 64)  # of a block that has turns: the most whose inputs fit in shared memory beside the network
 _SHARED, _KEPT = 46 * 1024, 8192  # bytes of shared memory, and most words of a network that a block keeps there
 _BLOCKS = 1056  # most blocks of a launch, which take turns
 
@@ -143,14 +143,10 @@ def decode_kernels(
     sizes = {"L": latent, "H": hidden, "D": columns, "OUT": outputs, "AMBIENT": ambient}
     layout = native_source(__package__, "decode_layout", **sizes)
     words = _words(latent, hidden, columns)
-    kernels = {points: _cuda_kernels(layout, points) for points in {_POINTS, _many(latent, words)}}
-    return DecodeKernels(device_kind, words, kernels, _pack_kernel(layout))
-
-
-def _many(latent: int, words: int) -> int:
-    """Returns the points of a block that has turns, whose network and inputs must fit in shared memory."""
     kept, row = 4 * words if words <= _KEPT else 0, 64 * -(-(latent + 3) // 16) + 32
-    return next((points for points in _MANY if kept + points * row <= _SHARED), _POINTS)
+    many = next((points for points in _MANY if kept + points * row <= _SHARED), _POINTS)
+    kernels = {points: _cuda_kernels(layout, points) for points in {_POINTS, many}}
+    return DecodeKernels(device_kind, words, kernels, _pack_kernel(layout))
 
 
 def _cpu_kernels(latent: int, hidden: int, columns: int, outputs: int, ambient: int) -> tuple[Any, Any]:

@@ -32,8 +32,7 @@ class Points:
         self, x: np.ndarray, cube: np.ndarray, outputs: int, device: str, region: np.ndarray | None = None
     ) -> None:
         order = morton_order(x)
-        keys = (cube,) if region is None else (cube, region)
-        self.order = order = order[np.lexsort([each[order] for each in keys])]
+        self.order = order = order[np.lexsort([each[order] for each in (cube, region) if each is not None])]
         region = np.zeros(0, np.int32) if region is None else region[order]
         self.x, self.region = wp.array(x[order], dtype=wp.vec3, device=device), wp.array(region, device=device)
         self.out = wp.zeros((len(x), outputs), dtype=float, device=device)
