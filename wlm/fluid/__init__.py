@@ -15,6 +15,7 @@ _PLACES = {
     "FACES": "wlm.fluid.faces",
     "Lattice": "wlm.fluid.lattice",
     "Mesh": "wlm.fluid.obstacles",
+    "Noise": "wlm.fluid.solver",
     "Obstacle": "wlm.fluid.obstacles",
     "SmokeState": "wlm.fluid.gradients",
     "Solver": "wlm.fluid.solver",

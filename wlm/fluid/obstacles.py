@@ -231,6 +231,11 @@ class Mesh:
         if not 0.0 <= self.shell < np.inf:
             raise ValueError(f"shell: expected a distance of at least 0, got {self.shell}")
 
+    @functools.cached_property
+    def extent(self) -> np.ndarray:
+        """Largest distances from the origin along the mesh's axes, in its unit, (3,)."""
+        return np.abs(np.asarray(self.vertices, np.float64)).max(0)
+
     def speeds(self) -> np.ndarray:
         """As for `Sphere`."""
         fastest = np.linalg.norm(self.path.rates[0], axis=1)
