@@ -35,8 +35,8 @@ MAX_SPEED = 0.3
 is a quarter."""
 
 _MOST_STEPS = 2**31 - 1  # limit of the device's counter
-# Least number of steps for which capturing a graph saves time.
-_GRAPH_FROM = 16
+# Steps in a graph, a multiple of the period, and the least number of steps for which capturing one saves time.
+_GRAPH_STEPS, _GRAPH_FROM = 8, 16
 # A mark of no cell in `Lattice._fresh`.
 _STALE = 3
 
@@ -725,21 +725,21 @@ class Lattice:
             self._done += 1
 
     def _run_in_graphs(self, steps: int) -> None:
-        """Queues steps as replays of a CUDA graph of `self.period` steps, and remaining steps without the graph."""
+        """Queues steps as replays of a CUDA graph of `_GRAPH_STEPS` steps, and remaining steps without the graph."""
         while steps > 0:
-            if steps < self.period or self._done % self.period or self._graph is None:
+            if steps < _GRAPH_STEPS or self._done % self.period or self._graph is None:
                 # The first steps load the kernels' modules, which is not allowed during a capture.
                 eager = min(steps, self.period - self._done % self.period)
                 self._run(eager)
                 steps -= eager
-                if self._graph is None and self._done % self.period == 0:
+                if self._graph is None and self._done % self.period == 0 and steps >= _GRAPH_STEPS:
                     with no_collection(), wp.ScopedCapture(self.device) as capture:
-                        self._run(self.period)
-                    self._graph, self._done = capture.graph, self._done - self.period
+                        self._run(_GRAPH_STEPS)
+                    self._graph, self._done = capture.graph, self._done - _GRAPH_STEPS
             else:
                 wp.capture_launch(self._graph)
-                self._done += self.period
-                steps -= self.period
+                self._done += _GRAPH_STEPS
+                steps -= _GRAPH_STEPS
 
     def _write_fields(self, drho: wp.array, u: wp.array) -> None:
         """Writes the density minus 1 of each cell to `drho` and the velocity to `u`; an array of size 0 is skipped."""
