@@ -153,6 +153,7 @@ class Lattice:
 
     Attributes:
         period: A CUDA graph must contain a multiple of this number of steps, see `step`.
+        changes: Number of times that a captured graph of steps has become invalid.
 
     Raises:
         ValueError: An argument is wrong.
@@ -201,7 +202,8 @@ class Lattice:
         self._forces, self._wind = self._zeros(0, wp.vec3), self._zeros(1, wp.vec3)
         self._faces: dict[str, Face] = {}
         self._links: lattice_links.Links | None = None
-        self._graph: wp.Graph | None = None
+        self.changes = 0
+        self._graph = None
         # Steps that this object launched itself; replays of a user's CUDA graph are counted only by the clock.
         self._done, self._unchecked, self._begun = 0, 0, False
 
@@ -432,6 +434,15 @@ class Lattice:
         if key == QUIET:
             return
         raise blown_up(key, self.shape)
+
+    @property
+    def _graph(self) -> wp.Graph | None:
+        return self._captured
+
+    @_graph.setter
+    def _graph(self, graph: wp.Graph | None) -> None:
+        self._captured = graph
+        self.changes += graph is None
 
     # Results.
 
