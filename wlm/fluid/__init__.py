@@ -13,6 +13,7 @@ _PLACES = {
     "DifferentiableSolver": "wlm.fluid.gradients",
     "Domain": "wlm.fluid.lattice",
     "FACES": "wlm.fluid.faces",
+    "Fire": "wlm.fluid.forcing",
     "Lattice": "wlm.fluid.lattice",
     "Mesh": "wlm.fluid.obstacles",
     "Obstacle": "wlm.fluid.obstacles",

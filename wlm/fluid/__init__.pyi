@@ -1,5 +1,6 @@
 # Written by python -m wlm._facade from `_PLACES` of the package.
 from wlm.fluid.faces import FACES as FACES
+from wlm.fluid.forcing import Fire as Fire
 from wlm.fluid.forcing import Turbulence as Turbulence
 from wlm.fluid.forcing import Wind as Wind
 from wlm.fluid.gradients import DifferentiableLattice as DifferentiableLattice

@@ -88,7 +88,7 @@ class BrickPool:
             return
         size = min(count + max(count // 4, _MARGIN), self.most) + 1
         now, old = self.fields[0], self._size
-        parts = [part for part in (now.density, now.temperature) if part.size]
+        parts = [part for part in (now.density, now.temperature, now.fuel) if part is not None and part.size]
         brick = sum(CELLS * wp.types.type_size_in_bytes(part.dtype) for part in parts)
         # The other buffers are empty between two steps, and the kept one is copied.
         buffers = len(self.fields)
@@ -96,10 +96,10 @@ class BrickPool:
         require_memory("bricks of smoke", (size, CELLS, 1), more, self._device)
         self.fields[1:] = []
         grown = self._make(size * CELLS)
-        for name in ("density", "temperature"):
-            part = getattr(now, name)
-            wp.copy(getattr(grown, name), part, count=part.size)
-        del now
+        for name in ("density", "temperature", "fuel"):
+            if (part := getattr(now, name)) is not None:
+                wp.copy(getattr(grown, name), part, count=part.size)
+        del now, part
         self.fields[:] = [grown]
         self.fields += [self._make(size * CELLS) for _ in range(buffers - 1)]
         bricks = self.bricks
@@ -118,14 +118,14 @@ class BrickPool:
         return _cubes(field)[wp.to_torch(self.bricks.places)[numbers.long()].long()]
 
     def put(self, numbers: torch.Tensor, values: Sequence[torch.Tensor]) -> None:
-        """Stores the density and perhaps the temperature, [N, 8, 8, 8], in the bricks with the indices `numbers`, int32
-        [N], and marks these as busy; the pool must be new."""
+        """Stores the density, temperature and fuel that there are, each [N, 8, 8, 8], in the bricks with the indices
+        `numbers`, int32 [N], and marks these as busy; the pool must be new."""
         wp.to_torch(self.bricks.busy)[numbers.long()] = 1
         self.relist()
         self.store(clear=False)
         places = wp.to_torch(self.bricks.places)[numbers.long()].long()
         now = self.fields[0]
-        for field, part in zip((now.density, now.temperature), values, strict=False):
+        for field, part in zip((now.density, now.temperature, now.fuel), values, strict=False):
             _cubes(field)[places] = part
 
 
