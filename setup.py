@@ -9,6 +9,6 @@ setup(
     package_data={
         "": ["native/*.cuh", "assets/*", "*.pyi"],
         "wlm": ["py.typed", "data/*.safetensors", "data/*.npz"],
-        "wlm.configs": ["*.yaml"],
+        "wlm.configs": ["*.yaml", "meshes/*"],
     },
 )

@@ -20,6 +20,7 @@ from benchmarks.lightmap import ALL, view_of_all_pages
 from benchmarks.lightmap_run_time import random_sheet
 from benchmarks.ops import make_sphere
 from benchmarks.probe_speed import many_probes
+from benchmarks.rivals.lightmap_torch import dynamic_targets
 from benchmarks.smoke import make_cloud
 from wlm import interop, ops
 from wlm.atlas.decode import Decoder as AtlasDecoder
@@ -28,7 +29,6 @@ from wlm.atlas.model import Profile as AtlasProfile
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.volume import DensityVolume
 from wlm.lightmap.data import from_arrays
-from wlm.lightmap.fit import dynamic_targets
 from wlm.lightmap.model import LightmapModel, Sheet
 from wlm.lightmap.profile import Profile as LightmapProfile
 from wlm.lightmap.profile import TimeAxis

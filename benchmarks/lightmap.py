@@ -37,7 +37,7 @@ import numpy as np
 from benchmarks.lightmap_exact import bound64, colour_tile64, decode_tile64
 from benchmarks.plot import Panel
 from benchmarks.rivals.lightmap import RIVALS, check_rival, encode_set, usual
-from benchmarks.rivals.lightmap_torch import PlainFit
+from benchmarks.rivals.lightmap_torch import PlainFit, dynamic_targets
 from benchmarks.rivals.whole_map import WholeMap
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Fit, Note, demo_data, expect_alone
@@ -47,7 +47,7 @@ from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings import encoding_of
 from wlm.lightmap.evaluation import bits_per_texel, count_kinds
-from wlm.lightmap.fit import compress, dynamic_targets
+from wlm.lightmap.fit import compress
 from wlm.lightmap.model import PACKED_KINDS, SheetModel
 from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.runtime import (

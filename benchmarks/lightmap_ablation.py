@@ -27,13 +27,13 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from benchmarks.rivals.lightmap_torch import Features, PlainFit
+from benchmarks.rivals.lightmap_torch import Features, PlainFit, dynamic_targets
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note, check_only, demo_data
 from wlm.errors import WlmError
 from wlm.lightmap.data import LightmapSet, load
 from wlm.lightmap.evaluation import evaluate
-from wlm.lightmap.fit import compress, dynamic_targets
+from wlm.lightmap.fit import compress
 from wlm.lightmap.profile import Profile, TimeAxis
 from wlm.lightmap.tiles import TILE, TileGrid, place
 from wlm.metrics import evaluate_frame, summarise

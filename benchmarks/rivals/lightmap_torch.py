@@ -17,8 +17,11 @@ from torch.nn import functional
 from benchmarks import plain
 from benchmarks.rivals.rival import EXTRA
 from wlm.formats.hdr_blocks import need
+from wlm.lightmap.data import SheetFrames
+from wlm.lightmap.dispatch import Batch
+from wlm.lightmap.fit import SheetFit
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
-from wlm.lightmap.tiles import TILE
+from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.trainer import Targets
 
 _BLOCK = 4  # texels along a BC7 block's side
@@ -26,6 +29,13 @@ _ENCODED = 4  # numbers of gamma(t)
 _CENTRE = math.sqrt(12.0)
 _MOMENTUM = 0.9  # Adam's decay of gradients
 _LEAST = 0.02  # smallest colour, over its scale, that weights an error: it keeps black texels in the fit
+
+
+def dynamic_targets(lightmaps: SheetFrames, profile: Profile) -> Targets | None:
+    """Returns the training data of the dynamic tiles of a sheet, for use by other trainers; None without such tiles."""
+    fit = SheetFit(lightmaps, profile)
+    rows = np.flatnonzero(fit.kinds == TileKind.DYNAMIC)
+    return fit.job(Batch(0, TileKind.DYNAMIC, rows, 0, fit)).targets() if len(rows) else None
 
 
 @dataclass(frozen=True)

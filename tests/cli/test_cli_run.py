@@ -53,6 +53,8 @@ def test_a_second_run_replaces_the_first_and_weights_change_it(room, tmp_path):
 
 def test_errors_are_one_line_and_leave_no_folder(room, tmp_path):
     out = tmp_path / "out"
+    assert "expected --output DIR, or --window" in fails("run", room)
+    assert "--samples has no meaning with --window" in fails("run", room, "--window", "--samples", 1)
     assert "expected a group among sky, sun" in fails("run", room, "-o", out, "--weight", "lamp=1")
     missing = day_scenes.write_file(room.with_name("missing.yaml"), light="none.wlm")
     assert "light: there is no file" in fails("run", missing, "-o", out)

@@ -54,7 +54,7 @@ def test_simulate(jet, tmp_path):
     heights = last.density.sum((0, 2)).numpy()
     assert heights[:4].min() > 1.0 > 0.01 > heights[-2:].max()
     places = [last.origin[i] + last.voxel * (np.arange(n) + 0.5) for i, n in enumerate(last.shape)]
-    away = np.stack(np.meshgrid(*places, indexing="ij"), -1) - footage.scene.obstacles[0].centre(0.5)
+    away = np.stack(np.meshgrid(*places, indexing="ij"), -1) - footage.scene.obstacles[0].eased.at(0.5)
     assert not last.density[torch.from_numpy(np.linalg.norm(away, axis=-1) < 0.06)].any()
     # One scene gives one result, however often.
     for number in footage.numbers:

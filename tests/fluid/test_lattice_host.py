@@ -9,7 +9,7 @@ from wlm.errors import WlmError
 from wlm.fluid import lattice as lattice_module
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, MAX_SPEED, Lattice
-from wlm.fluid.obstacles import Sphere, Trajectory, cells_of
+from wlm.fluid.obstacles import Mesh, Sphere, Trajectory, cells_of, surface
 
 SHAPE = (12, 8, 8)
 
@@ -341,6 +341,68 @@ def test_sphere_in_a_cubic_array(device: str):
     np.testing.assert_allclose(force[1:], 0.0, atol=1e-4 * force[0])
     mean = box.velocity().numpy()[..., 0].mean()
     assert push * cells**3 / (6 * np.pi * viscosity * radius * mean) == pytest.approx(CUBIC_ARRAY, rel=0.08)
+
+
+def _ring(inner: float, outer: float, centre, sides: int = 96) -> Mesh:
+    """A closed ring around the z axis."""
+    angle = np.arange(sides) * (2 * np.pi / sides)
+    section = ((inner, -1), (outer, -1), (outer, 1), (inner, 1))
+    corners = [(r * np.cos(a), r * np.sin(a), z) for a in angle for r, z in section]
+    quads = [
+        (4 * k + a, 4 * ((k + 1) % sides) + a, 4 * ((k + 1) % sides) + b, 4 * k + b)
+        for k in range(sides)
+        for a, b in ((0, 1), (1, 2), (2, 3), (3, 0))
+    ]
+    triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    return Mesh(Trajectory.of(centre), np.array(corners, np.float32), np.array(triangles))
+
+
+@pytest.mark.parametrize(
+    ("radius", "storage", "most"), [(8, "float32", 0.03), (8, "float16", 0.03), (16, "float32", 0.012)]
+)
+def test_a_cylinder_turns_in_another(radius: int, storage: str, most: float, device: str):
+    """Taylor and Couette between a turning cylinder and one at rest of twice the radius: the exact profile of the
+    tangential velocity, as the RMS error over the speed of the wall."""
+    n, speed = 4 * radius + 4, 0.05
+    centre, steps = (n / 2, n / 2, 0.5), 3 * radius**2
+    angle = 2.0 * np.arange(2 + steps * speed / radius)
+    turns = np.column_stack([0 * angle, 0 * angle, np.sin(angle / 2), np.cos(angle / 2)])
+    path = Trajectory.of([centre] * len(angle), angle * (radius / speed), turns)
+    corners, triangles = surface("cylinder")
+    inner = Mesh(path, (radius * corners[:, [2, 0, 1]]).astype(np.float32), triangles)
+    box = Lattice((n, n, 1), lattice="D2Q9", viscosity=1 / 6, smagorinsky=0.0, storage=storage, device=device)
+    box.set_bodies([inner, _ring(2 * radius, 6 * radius, centre)])
+    box.step(steps)
+    x = np.stack(np.meshgrid(*[np.arange(n) + 0.5 - n / 2] * 2, indexing="ij"), -1)
+    r, u, fluid = np.linalg.norm(x, axis=-1), box.velocity().numpy()[:, :, 0], box.solid.numpy()[:, :, 0] == 0
+    assert fluid.sum() == pytest.approx(3 * np.pi * radius**2, rel=0.02)
+    around = (u[..., 1] * x[..., 0] - u[..., 0] * x[..., 1]) / r
+    exact = speed * radius * (4 * radius**2 / r - r) / (3 * radius**2)
+    assert np.sqrt(np.mean((around - exact)[fluid] ** 2)) <= most * speed
+    assert np.abs((u[..., :2] * x).sum(-1) / r)[fluid].max() <= 0.05 * speed
+
+
+@pytest.mark.parametrize("storage", ["float32", "float16"])
+def test_a_body_moves_as_air_passes(storage: str, device: str):
+    """A cylinder that moves 20 cells in air at rest, and one at rest in air and between walls that move past it."""
+    speed, steps, found = 0.05, 400, []
+    end = np.array([45.0, 20.3, 0.5])
+    for moving in (True, False):
+        settings = {"lattice": "D2Q9", "viscosity": 0.05, "smagorinsky": 0.0, "storage": storage, "device": device}
+        box, wind = Lattice((80, 40, 1), **settings), np.array([0.0 if moving else -speed, 0.0, 0.0])
+        for face in ("-y", "+y"):
+            box.set_wall(face, wind)
+        path = Trajectory.of([end - [speed * steps, 0, 0], end + [speed, 0, 0]], [0, steps + 1])
+        box.set_bodies([Sphere(path if moving else Trajectory.of(end), 5.0)])
+        box.set_flow(wind)
+        forces = []
+        for _ in range(steps):
+            box.step()
+            forces.append(box.force_on_solid())
+        found.append((np.mean(forces[300:], 0), box.velocity().numpy() - wind, box.solid.numpy() == 0))
+    (force, u, fluid), (expected, v, other) = found
+    assert force[0] == pytest.approx(expected[0], rel=0.01) and abs(force[1]) < 0.01 * abs(force[0])
+    assert np.sqrt(((u - v)[fluid & other] ** 2).sum(-1).mean()) <= 0.02 * speed
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from builders.vdb_files import ACTIVE_MASK, scaled, tree, vdb_file
 from wlm.errors import WlmError
 from wlm.fluid.black_body import black_body_luminance
 from wlm.fluid.grids import choose
-from wlm.fluid.volume import load_volume, thickness_hint
+from wlm.fluid.volume import load_volume, save_volume, thickness_hint
 from wlm.formats.vdb import GridHead
 from wlm.inspection import inspect
 from wlm.inspection.folders import input_system
@@ -217,6 +217,12 @@ def test_temperatures_in_kelvin(tmp_path: Path):
     raw = load_volume(path, up="y", kelvin=False)
     np.testing.assert_array_equal(raw.temperature, heat)
     assert raw.warnings == () and not raw.kelvin
+    with pytest.raises(
+        WlmError, match=r"b\.nvdb: temperature: expected kelvins, found their light: load .* kelvin=False"
+    ):
+        save_volume(tmp_path / "b.nvdb", volume)
+    save_volume(tmp_path / "b.nvdb", raw)
+    np.testing.assert_array_equal(load_volume(tmp_path / "b.nvdb", up="y", kelvin=False).temperature, heat)
     np.savez(tmp_path / "a.npz", density=np.ones((1, 1, 3)), temperature=np.array([[[np.nan, -5.0, 1500.0]]]))
     mended = load_volume(tmp_path / "a.npz")
     assert mended.temperature.tolist() == [[[0.0, 0.0, pytest.approx(1.0)]]] and len(mended.warnings) == 2

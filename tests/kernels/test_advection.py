@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import warp as wp
 from reference.advection import Domain
+from scipy.spatial.transform import Rotation
 
+from wlm.fluid.obstacles import surface
 from wlm_kernels.fluid import advection_sources
 from wlm_kernels.fluid.advection import STORAGES, Fields, advect
 from wlm_kernels.fluid.advection_places import (
@@ -243,27 +245,78 @@ def test_sources(storage: str, device: str):
     x = _centres(grid.shape)
     fluid = ~_fine(solid)
     ball = (((x - 3.0) / (2.2, 3.2, 2.2)) ** 2).sum(-1) <= 1
-    source = [advection_sources.SPHERE, (3.0, 3.0, 3.0), (2.2, 3.2, 2.2), (0.5, 2.0)]
-    advection_sources.add_source(*at, *source, fields, fixed=False)
+    source = advection_sources.make_region("sphere", (3.0, 3.0, 3.0), (2.2, 3.2, 2.2))
+    advection_sources.add_source(*at, source, (0.5, 2.0), fields, fixed=False)
     np.testing.assert_array_equal(grid.array(fields.density), 0.25 + 0.5 * (ball & fluid))
     np.testing.assert_array_equal(grid.array(fields.temperature), 2.0 * (ball & fluid))
     # Half out of the domain, held at a value.
     box = (np.abs(x - (8.0, 4.0, 4.0)) <= (2.0, 1.0, 9.0)).all(-1)
-    source = [advection_sources.BOX, (8.0, 4.0, 4.0), (2.0, 1.0, 9.0), (0.125, 1.0)]
-    advection_sources.add_source(*at, *source, fields, fixed=True)
+    source = advection_sources.make_region("box", (8.0, 4.0, 4.0), (2.0, 1.0, 9.0))
+    advection_sources.add_source(*at, source, (0.125, 1.0), fields, fixed=True)
     np.testing.assert_array_equal(grid.array(fields.density)[box & fluid], 0.125)
     before = grid.array(fields.density)
     for centre in ((-9.0, 4.0, 4.0), (30.0, 4.0, 4.0)):
-        source = [advection_sources.BOX, centre, (2.0, 1.0, 9.0), (9.0, 9.0)]
-        advection_sources.add_source(*at, *source, fields, fixed=False)
+        source = advection_sources.make_region("box", centre, (2.0, 1.0, 9.0))
+        advection_sources.add_source(*at, source, (9.0, 9.0), fields, fixed=False)
     np.testing.assert_array_equal(grid.array(fields.density), before)
+
+
+@pytest.mark.parametrize("shape", ["box", "cylinder", "mesh"])
+def test_turned_sources(shape: str, device: str):
+    """Regions that are stretched, turned and partly outside, against their frames in NumPy."""
+    grid, centre, size = Grid(np.zeros((5, 6, 7, 3)), 2, SHUT, device), (4.3, 6.1, 11.8), (2.1, 4.2, 1.3)
+    turn = Rotation.from_euler("xyz", (0.3, -1.1, 2.0))
+    away = turn.inv().apply((_centres(grid.shape) - centre).reshape(-1, 3)).reshape(*grid.shape, 3) / size
+    far = np.abs(away)
+    if shape == "mesh":
+        points, triangles = surface("sphere")
+        arrays = (
+            wp.array(points + (0.5, 0, 0), dtype=wp.vec3, device=device),
+            wp.array(triangles.ravel(), dtype=int, device=device),
+        )
+        mesh = wp.Mesh(*arrays, support_winding_number=True)
+        source = advection_sources.make_region(mesh, centre, size, extent=(1.5, 1.0, 1.0), turn=turn.as_quat())
+        reach = np.linalg.norm(away - (0.5, 0, 0), axis=-1)
+    else:
+        source = advection_sources.make_region(shape, centre, size, turn=turn.as_quat())
+        reach = far.max(-1) if shape == "box" else np.maximum(np.hypot(far[..., 0], far[..., 2]), far[..., 1])
+    fields = grid.fields(np.zeros(grid.shape))
+    advection_sources.add_source(grid.box, grid.walls, source, (1.0, 0.0), fields, fixed=False)
+    sure = np.abs(reach - 1.0) > 0.02
+    assert (reach < 1.0).sum() > 20
+    np.testing.assert_array_equal(grid.array(fields.density)[sure], 1.0 * (reach < 1.0)[sure])
+
+
+def test_noise_of_a_source(device: str):
+    """Warp's own noise in the source's frame: within its amount, smooth in space and time, and of its seed alone."""
+    grid = Grid(np.zeros((12, 12, 12, 3)), 2, SHUT, device)
+
+    def emitted(amount=0.8, phase=0.3, seed=5, centre=12.0):
+        source = advection_sources.make_region("box", (centre,) * 3, (40.0,) * 3, noise=(amount, 6.0, phase), seed=seed)
+        fields = grid.fields(np.zeros(grid.shape), np.zeros(grid.shape))
+        advection_sources.add_source(grid.box, grid.walls, source, (2.0, 1.0), fields, fixed=True)
+        np.testing.assert_allclose(grid.array(fields.temperature), 0.5 * grid.array(fields.density), rtol=1e-6)
+        return grid.array(fields.density)
+
+    got = emitted()
+    for p in ((0, 3, 7), (20, 11, 5), (9, 23, 14)):
+        x = (np.array(p) + 0.5 - 12.0) / 6.0
+        value = float(wp.noise(wp.rand_init(5), wp.vec4(*x, 0.3)))
+        assert got[p] == pytest.approx(2.0 * max(1.0 + 0.8 * np.clip(2.0 * value, -1.0, 1.0), 0.0), rel=1e-4)
+    assert 0.1 < got.std() < 1.0 and got.min() >= 0.4 - 1e-6 and got.max() <= 3.6 + 1e-6
+    assert max(np.abs(np.diff(got, axis=axis)).max() for axis in range(3)) < 0.8
+    np.testing.assert_array_equal(got, emitted())
+    np.testing.assert_allclose(emitted(centre=14.0)[2:, 2:, 2:], got[:-2, :-2, :-2], rtol=1e-4)
+    assert 0.0 < np.abs(emitted(phase=0.35) - got).max() < 0.5 < np.abs(emitted(seed=6) - got).max()
+    assert emitted(amount=9.0).min() == 0.0
+    np.testing.assert_array_equal(emitted(amount=0.0), 2.0)
 
 
 def test_half_floats_do_not_overflow(device: str):
     grid = Grid(np.zeros((2, 2, 2, 3)), 1, SHUT, device, storage="float16")
     fields = grid.fields(np.full(grid.shape, 60000.0))
-    source = [advection_sources.BOX, (1.0, 1.0, 1.0), (5.0, 5.0, 5.0), (60000.0, 0.0)]
-    advection_sources.add_source(grid.box, grid.walls, *source, fields, fixed=False)
+    source = advection_sources.make_region("box", (1.0, 1.0, 1.0), (5.0, 5.0, 5.0))
+    advection_sources.add_source(grid.box, grid.walls, source, (60000.0, 0.0), fields, fixed=False)
     np.testing.assert_array_equal(grid.array(fields.density), 65504.0)
     np.testing.assert_array_equal(grid.array(grid.run(fields, 1.0).density), 65504.0)
 

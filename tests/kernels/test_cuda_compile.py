@@ -33,6 +33,11 @@ MODULES = sorted(
     if "\n@wp.kernel" in path.read_text(encoding="utf-8")
 )
 """The modules with kernels of one form; factories make the others."""
+FORMS = {
+    "probe.components": ("_decode_components", "basis", [wp.array2d[wp.int8], wp.array2d[wp.float16]]),
+    "probe.hours": ("_mix_hours", "mixed", [wp.array1d[wp.float16], wp.array1d[wp.float32]]),
+}
+"""The types of an argument of kernels that are only compiled for the types of a launch, by module."""
 QUICK_MODULES = ("fluid.advection_places",)
 WIDTHS = (8, 16, 17, 32, 64)
 BOTH = (True, False)
@@ -77,7 +82,9 @@ def _smoke(dtype: type) -> list:
     variants = {"_guide": (True,), "_coarse": (dtype is wp.float16,), "_measure": (2,)}
     built = [smoke_march.occupied_kernel(dtype)]
     for module in (marches, march_six, depth_lattice, diffusion, path):
-        launchers = {name: value.build for name, value in vars(module).items() if hasattr(value, "build")}
+        # Functions of Warp have a `build`, too.
+        built_by = {name: value for name, value in vars(module).items() if not isinstance(value, wp.Function)}
+        launchers = {name: value.build for name, value in built_by.items() if hasattr(value, "build")}
         assert launchers
         for name, build in launchers.items():
             for extra in [(False,), (True,)] if name == "_trace" else [variants.get(name, ())]:
@@ -134,8 +141,15 @@ FACTORIES = [
     "name", [pytest.param(name, marks=() if name in QUICK_MODULES else pytest.mark.slow) for name in MODULES]
 )
 def test_modules(name: str, tmp_path: Path, ptx: bool):
-    """Modules whose kernels have one form."""
-    _compile(importlib.import_module(f"wlm_kernels.{name}"), tmp_path, ptx)
+    """Modules whose kernels have one form; some kernels are in a module of Warp's of their own."""
+    found = vars(importlib.import_module(f"wlm_kernels.{name}"))
+    kernel, argument, types = FORMS.get(name, ("", "", ()))
+    for each in types:
+        wp.overload(found[kernel], {argument: each})
+    made = {value.module for value in found.values() if isinstance(value, wp.Kernel)}
+    assert made
+    for i, module in enumerate(made):
+        _compile(module, tmp_path / str(i), ptx)
 
 
 @pytest.mark.parametrize(("build", "values"), FACTORIES)

@@ -22,6 +22,7 @@ VARIANTS = {
     "periodic": {"periodic": True},
     "clamped-weighted": {"periodic": False, "emphasis": 1.2},
     "one-cell": {"shape": (4, 1, 1, 1), "emphasis": -0.5},
+    "static": {"temporal": False, "emphasis": 0.7, "texels": (5000, 3)},
 }
 
 
@@ -41,24 +42,13 @@ def _hold(fit: Trainer, twin: Problem) -> None:
 @pytest.mark.parametrize("quantised", [False, True], ids=["continuous", "quantised"])
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("hidden", WIDTHS)
-def test_temporal_step(device: str, hidden: int, variant: str, quantised: bool):
-    """Loss, maps and network of dynamic tiles, against autograd."""
+def test_a_step(device: str, hidden: int, variant: str, quantised: bool):
+    """Loss, maps and network, against autograd; of static tiles, too, of which one has three valid texels."""
     case = Case(hidden=hidden, **VARIANTS[variant])
     fit = _trainer(case, device)
     twin = problem(fit, case, quantised)
     _, features = draw(fit, quantised)
     close(features, twin.features(), 2e-6, "features")
-    _hold(fit, twin)
-
-
-@pytest.mark.parametrize("quantised", [False, True], ids=["continuous", "quantised"])
-@pytest.mark.parametrize("hidden", WIDTHS)
-def test_static_step(device: str, hidden: int, quantised: bool):
-    """Tiles without temporal maps, one of them of three valid texels."""
-    case = Case(temporal=False, hidden=hidden, emphasis=0.7, texels=(5000, 3))
-    fit = _trainer(case, device)
-    twin = problem(fit, case, quantised)
-    close(draw(fit, quantised)[1], twin.features(), 2e-6, "features")
     _hold(fit, twin)
 
 

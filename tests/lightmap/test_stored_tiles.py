@@ -1,5 +1,6 @@
 """Tiles that are read from a file when they are needed: alone, together, by threads, and from files that change."""
 
+import hashlib
 import json
 import os
 import threading
@@ -9,8 +10,8 @@ import numpy as np
 import pytest
 from builders.checks import assert_same, error_of
 from builders.layered_sets import random_layers
+from builders.resigned import index_bytes
 from builders.synthetic import random_model
-from fuzz.containers import open_artifact, sign
 
 import wlm
 from wlm.errors import WlmError
@@ -123,10 +124,19 @@ def test_a_flipped_byte_is_an_error_of_its_tile(path, tmp_path, piece):
 
 def signed(path: Path, change) -> None:
     """Changes header and body of a file and gives it a right digest."""
-    header, content = open_artifact(path.read_bytes())
-    body = bytearray(content)
+    content = path.read_bytes()
+    start = 8 + int.from_bytes(content[:8], "little")
+    header, body = json.loads(content[8:start]), bytearray(content[start:])
     change(header, body)
-    path.write_bytes(sign(header, bytes(body)))
+    words = header["__metadata__"]["wlm"].split(" ")
+
+    def joined(digest):
+        header["__metadata__"]["wlm"] = " ".join([*words[:3], digest])
+        text = json.dumps(header, separators=(",", ":")).encode()
+        return len(text).to_bytes(8, "little") + text + body
+
+    whole = joined("0" * 32)
+    path.write_bytes(joined(hashlib.blake2b(whole[: index_bytes(whole)], digest_size=16).hexdigest()))
 
 
 def resized(*sizes: int):
@@ -317,7 +327,7 @@ class Held:
         monkeypatch.setattr(type(model.light), "only", waiting)
 
 
-def test_requests_are_bounded_ordered_and_can_be_replaced(path, monkeypatch):
+def test_requests_are_bounded_ordered_and_can_be_cancelled(path, monkeypatch):
     model = wlm.load(path)
     held = Held(monkeypatch, model)
     with TileLoader(model, most=3) as loader:
@@ -328,7 +338,7 @@ def test_requests_are_bounded_ordered_and_can_be_replaced(path, monkeypatch):
         assert not loader.request(LIGHT, 4, 1.0), "three wait that are as important"
         assert loader.request(LIGHT, 4, 1.5), "which takes the place of tile 1"
         assert loader.request(LIGHT, 3, 9.0), "a new priority"
-        loader.replace([(LIGHT, 3, 9.0), (LIGHT, 4, 1.5)])
+        assert loader.cancel(LIGHT, 2) == 1 and loader.cancel(LIGHT, 2) == 0
         assert loader.request(LIGHT, 5, 0.5)
         held.go.set()
         got = []
@@ -336,6 +346,14 @@ def test_requests_are_bounded_ordered_and_can_be_replaced(path, monkeypatch):
             got += loader.take()
         assert [each.number for each in got] == held.order == [0, 3, 4, 5]
         assert not loader.wait(0.0) and loader.take() == []
+        while held.begun.acquire(blocking=False):
+            continue
+        held.go.clear()
+        loader.request(LIGHT, 0)
+        assert held.begun.acquire(timeout=30.0)
+        loader.request(LIGHT, 1)
+        assert loader.cancel() == 1
+        held.go.set()
 
 
 def test_results_that_nobody_takes_pause_the_loader(path):

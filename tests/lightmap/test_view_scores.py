@@ -331,7 +331,7 @@ def test_the_error_is_that_of_the_display():
 
 def test_all_times_take_turns_and_views_from_behind_show_nothing():
     day = grey()
-    views = Views(day, floor(), 2, indices=[2])
+    views = Views(day, floor(), 8)
     views.add(2, day.frames[2], 0.5 * day.frames[2])
     assert views.score().views == 1 and views.score().worst_view["time"] == 18.0
     below = Views(day, dataclasses.replace(floor(), triangle=floor().triangle[:, ::-1].copy()), 1)

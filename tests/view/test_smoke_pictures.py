@@ -64,7 +64,7 @@ def test_an_obstacle_is_drawn_where_it_is(device, toward, perspective):
     ball = _ball(0.1, -0.05, 0.2)
     _, depth = draw_obstacles([ball], camera, [], device)
     origin, way = rays(camera)
-    middle = ball.centre(0.0) - origin
+    middle = ball.eased.at(0.0) - origin
     along = (middle * way).sum(-1)
     gap = 0.2**2 - ((middle**2).sum(-1) - along**2)
     expected = np.where(gap > 0, along - np.sqrt(np.maximum(gap, 0)), np.inf)

@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from builders import atlas_meshes, atlas_models, probe_models, probe_sets, rooms, small_sets
+from builders import atlas_meshes, atlas_models, day_scenes, probe_models, probe_sets, rooms, small_sets
 from builders.contract import FILES
 from PIL import Image
 from typer.testing import CliRunner
@@ -20,6 +20,7 @@ from wlm.probe.sphere import basis
 from wlm.view import rendering
 from wlm.view.display import Display, heat
 from wlm.view.opening import open_scene
+from wlm.view.scene_window import day_scene
 from wlm.view.window import Window
 
 SIZE = (480, 300)
@@ -337,3 +338,34 @@ def test_light_on_the_screen():
     assert heat(np.array([-1.0, 0.0, 1.0, 2.0])).tolist() == [[0] * 3, [0] * 3, [255] * 3, [255] * 3]
     one = np.full((2, 3), 0.5)
     assert Display().error(one, one).max() == 0
+
+
+def test_run_opens_a_window_only_on_a_display(tmp_path, monkeypatch, show):
+    del show  # only for its check of OpenGL
+    monkeypatch.delenv("DISPLAY", raising=False)
+    result = CliRunner().invoke(app, ["run", str(day_scenes.write_scene(tmp_path)), "--window"])
+    assert result.exit_code == 2 and "expected a display" in result.stderr and result.stderr.count("\n") == 1
+
+
+def test_a_scene_of_a_day_follows_its_hour_and_light_groups(show, tmp_path):
+    path = day_scenes.write_scene(tmp_path)
+    with wlm.scene.load(path) as content:
+        window = Window(day_scene(content), size=SIZE)
+        try:
+            assert list(window.sliders) == ["hour", "sky weight", "sun weight", "exposure"]
+            assert "3 moving" not in caption(window) and "1 moving object" in caption(window)
+            window.tone("filmic")
+            window.set("hour", 12.0)
+            noon = scene_of(window)
+            window.set("sun weight", 0.0)
+            assert changed(window, noon)
+            window.set("sun weight", 1.0)
+            assert not changed(window, noon)
+            window.set("hour", 20.0)
+            assert changed(window, noon)
+            # The background is the sky's colour.
+            colour, exposure = content.sky_at(20.0)
+            expected = Display(2.0**exposure, "filmic").picture(colour)
+            assert np.abs(scene_of(window)[2, 2] - expected).max() <= 1
+        finally:
+            window.close()

@@ -206,16 +206,7 @@ def decode(
     console.show_facts(str(file), facts)
 
 
-def export(
-    file: opt.ModelFile,
-    output: Annotated[Path, opt.output_option("DIR", "The folder to write to.")],
-    engine: opt.Engine = None,
-    shader: opt.ShaderLanguage = None,
-    exact: opt.ExactShader = False,
-    device: opt.Device = "cpu",
-) -> None:
-    """Write lightmaps for an engine: textures, buffers and a shader, or with --engine a kit that shows them."""
-    models.export(file, output, engine, shader, exact, device)
+export = models.export_lightmaps
 
 
 def info(file: opt.ModelFile, as_json: opt.AsJson = False, device: opt.Device = "cpu") -> None:

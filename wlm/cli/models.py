@@ -4,9 +4,10 @@ import time
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from wlm.cli import console
+from wlm.cli import options as opt
 from wlm.errors import WlmError
 
 
@@ -77,6 +78,18 @@ def export(
     console.show_files(
         output, export(model, output, engine, shader=shader or "glsl", exact=exact, device=device, **given)
     )
+
+
+def export_lightmaps(
+    file: opt.ModelFile,
+    output: Annotated[Path, opt.output_option("DIR", "The folder to write to.")],
+    engine: opt.Engine = None,
+    shader: opt.ShaderLanguage = None,
+    exact: opt.ExactShader = False,
+    device: opt.Device = "cpu",
+) -> None:
+    """Write lightmaps for an engine: textures and a shader, or with --engine a kit that shows them."""
+    export(file, output, engine, shader, exact, device)
 
 
 def describe(

@@ -1,4 +1,4 @@
-"""`wlm run`: draws a scene over its day into a folder."""
+"""`wlm run`: draws a scene over its day into a folder, or opens it in a window."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -7,6 +7,7 @@ import typer
 
 from wlm.cli.console import exclusive, note, note_warnings, quiet_warp, running, show_facts, show_figures
 from wlm.cli.options import Colours, Device, Weights, output_option
+from wlm.errors import WlmError
 
 if TYPE_CHECKING:
     from wlm.scene import Scene
@@ -14,7 +15,9 @@ if TYPE_CHECKING:
 
 def run(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.yaml", help="File of a scene; docs/scene.md describes it.")],
-    output: Annotated[Path, output_option("DIR", "Folder for the pictures, the film and report.json.")],
+    output: Annotated[
+        Path | None, output_option("DIR", "Folder for the pictures, the film and report.json; needed without --window.")
+    ] = None,
     hours: Annotated[
         str | None,
         typer.Option(metavar="LIST", help="Hours of the pictures, such as 7,12,18.75; default those of the originals."),
@@ -24,9 +27,14 @@ def run(
     ] = None,
     width: Annotated[int, typer.Option(min=1, help="Width in pixels.")] = 960,
     height: Annotated[int, typer.Option(min=1, help="Height in pixels.")] = 540,
-    samples: Annotated[int, typer.Option(min=1, max=4, help="Points along a side of a pixel.")] = 2,
+    samples: Annotated[
+        int | None, typer.Option(min=1, max=4, help="Points along a side of a pixel; default 2.")
+    ] = None,
     weights: Weights = None,
     colours: Colours = None,
+    window: Annotated[
+        bool, typer.Option("--window", help="Open a window instead, with sliders for the hour and the light groups.")
+    ] = False,
     device: Device = "cpu",
 ) -> None:
     """Draw a scene over its day: lightmaps, moving objects under probes, and smoke, from a path of the camera.
@@ -34,6 +42,11 @@ def run(
     Writes pictures at hours, a film of the day (H.264 with the extra "film", else an animated WebP), and report.json
     with times by stage, memory by part, and errors against the original lightmaps.
     """
+    if output is None and not window:
+        raise WlmError("wlm run: expected --output DIR, or --window")
+    drawn = {"output": output, "hours": hours, "frames": frames, "samples": samples}
+    if window and (name := next((name for name, value in drawn.items() if value is not None), None)):
+        raise WlmError(f"wlm run: --{name} has no meaning with --window; leave it out")
     quiet_warp()
     from wlm.cli.lightmap import group_weights
     from wlm.lightmap.data import parse_times
@@ -41,8 +54,25 @@ def run(
 
     given = {"weights": group_weights(weights, colours), "height": height, "width": width, "device": device}
     with load(scene) as content:
-        given |= {"hours": None if hours is None else parse_times(hours), "frames": frames, "samples": samples}
+        if window:
+            _open(content, **given)
+            return
+        given |= {"hours": None if hours is None else parse_times(hours), "frames": frames, "samples": samples or 2}
         _draw(scene=content, output=output, **given)
+
+
+def _open(scene: "Scene", weights: Any, height: int, width: int, device: str) -> None:
+    from wlm.formats.hdr_blocks import need
+    from wlm.view.scene_window import day_scene
+    from wlm.view.window import Window
+
+    need("pyvista", "view")
+    shown = Window(day_scene(scene, weights, device), size=(width, height), off_screen=False)
+    try:
+        shown.tone("filmic")
+        shown.show()
+    finally:
+        shown.close()
 
 
 @exclusive

@@ -47,7 +47,7 @@ _WARM = 2  # first frames of `run`, which compile kernels and are not timed if t
 app = typer.Typer(help="Smoke: simulation, six-way lightmaps, and pictures.")
 
 _SceneName = Annotated[
-    str, typer.Argument(metavar="SCENE", help="Scene: jet-sphere, jet-moving, explosion, chimney, or a YAML file.")
+    str, typer.Argument(metavar="SCENE", help="Scene: a shipped one such as chimney, or a YAML file.")
 ]
 _SceneFrames = Annotated[int | None, typer.Option(min=1, max=9999, help="Number of frames; default the scene's.")]
 _SceneScale = Annotated[

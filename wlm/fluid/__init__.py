@@ -16,6 +16,7 @@ _PLACES = {
     "Fire": "wlm.fluid.forcing",
     "Lattice": "wlm.fluid.lattice",
     "Mesh": "wlm.fluid.obstacles",
+    "Noise": "wlm.fluid.solver",
     "Obstacle": "wlm.fluid.obstacles",
     "SmokeState": "wlm.fluid.gradients",
     "Solver": "wlm.fluid.solver",

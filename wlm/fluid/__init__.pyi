@@ -14,6 +14,7 @@ from wlm.fluid.obstacles import Sphere as Sphere
 from wlm.fluid.obstacles import Trajectory as Trajectory
 from wlm.fluid.obstacles import box_mesh as box_mesh
 from wlm.fluid.solver import Buoyancy as Buoyancy
+from wlm.fluid.solver import Noise as Noise
 from wlm.fluid.solver import Solver as Solver
 from wlm.fluid.solver import Source as Source
 from wlm.fluid.volume import DensityVolume as DensityVolume

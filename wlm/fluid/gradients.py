@@ -445,7 +445,7 @@ class _Smoke:
             if self.values is not None:
                 values = self.values[step if len(self.values) > 1 else 0][number]
             scale = source.steps(self.setup.substeps)
-            where = [self.setup.box, self.setup.walls, *source.region(self.setup.box.refinement)]
+            where = [self.setup.box, self.setup.walls, source.region(self.setup.box.refinement, str(self.air.device))]
             value = scale * values[0], scale * values[1]
             advection_sources.add_source(*where, value, fields, fixed=source.fixed)
         return f, density, heat
@@ -464,7 +464,7 @@ class _Smoke:
             on_values = on_f.new_zeros(len(setup.sources), 2)
             fields, into = _fields(on_smoke), _flat(on_values, wp.vec2)
             for number, source in reversed(list(enumerate(setup.sources))):
-                where = [setup.box, setup.walls, *source.region(setup.box.refinement), number]
+                where = [setup.box, setup.walls, source.region(setup.box.refinement, str(air.device)), number]
                 advection_adjoint.source_backward(*where, fields, into, fixed=source.fixed)
             if on_controls[1] is not None:
                 scales = [source.steps(setup.substeps) for source in setup.sources]

@@ -749,7 +749,7 @@ class Lattice:
     def _apply_links(self, first: int, f: wp.array, stamp: int = _STALE) -> None:
         """Applies the boundary conditions from link `first` on; cells that bodies have left have the mark `stamp`."""
         for window in self._bodies.moving if self.moving else ():
-            where = [self._tables, self._bounded, window, self._motion, stamp, self._solid, self._fresh]
+            where = [self._bounded, window, self._motion, stamp, self._solid, self._fresh]
             lattice_links.bounce(self._link_kernels, *where, f, self._sums)
         where = [self._tables, self._n, self._bounded, first, self._links, self._solid]
         lattice_links.apply(self._link_kernels, *where, self._clock, self._rise, f, self._sums)

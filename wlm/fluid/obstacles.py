@@ -190,9 +190,9 @@ class Sphere:
         """Returns the lowest and highest coordinates (3,) of the obstacle relative to its origin, at any time."""
         return np.full(3, -self.radius), np.full(3, self.radius)
 
-    def form(self, device: str) -> tuple[float | wp.Mesh, float, float]:
-        """Returns shape, scale and shell, as for `wlm_kernels.fluid.lattice_bodies.mark`."""
-        return self.radius, 1.0, 0.0
+    def form(self, device: str) -> lattice_bodies.Form:
+        """Returns the form of the obstacle for kernels on a device."""
+        return lattice_bodies.make_form(self.radius, 1.0, 0.0, self.path.moves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +231,11 @@ class Mesh:
         if not 0.0 <= self.shell < np.inf:
             raise ValueError(f"shell: expected a distance of at least 0, got {self.shell}")
 
+    @functools.cached_property
+    def extent(self) -> np.ndarray:
+        """Largest distances from the origin along the mesh's axes, in its unit, (3,)."""
+        return np.abs(np.asarray(self.vertices, np.float64)).max(0)
+
     def speeds(self) -> np.ndarray:
         """As for `Sphere`."""
         fastest = np.linalg.norm(self.path.rates[0], axis=1)
@@ -259,9 +264,9 @@ class Mesh:
             self._meshes[device] = wp.Mesh(points, indices, support_winding_number=True)
         return self._meshes[device]
 
-    def form(self, device: str) -> tuple[float | wp.Mesh, float, float]:
+    def form(self, device: str) -> lattice_bodies.Form:
         """As for `Sphere`."""
-        return self.on(device), self.scale, self.shell
+        return lattice_bodies.make_form(self.on(device), self.scale, self.shell, self.path.moves)
 
 
 Obstacle = Sphere | Mesh
@@ -282,7 +287,9 @@ class Bodies:
     """
 
     def __init__(self, obstacles: Sequence[Obstacle], shape: tuple[int, int, int], device: wp.Device) -> None:
-        paths, self._shape = [obstacle.path for obstacle in obstacles], shape
+        # The obstacles own the meshes to which the kernels' forms refer.
+        self._obstacles, self._shape = tuple(obstacles), shape
+        paths = [obstacle.path for obstacle in obstacles]
         self.motion, self._keys = lattice_bodies.make_motion(device), lattice_bodies.Keys()
         columns = {
             "first": (np.cumsum([0, *(len(path.times) for path in paths)], dtype=np.int32), int),
@@ -324,7 +331,7 @@ class Bodies:
 
     def _mark(self, windows: Sequence, solid: wp.array, fresh: wp.array, stamp: int) -> None:
         for window in windows:
-            lattice_bodies.mark(window, self.motion, *self._forms[window.body - 1], stamp, solid, fresh)
+            lattice_bodies.mark(window, self.motion, self._forms[window.body - 1], stamp, solid, fresh)
 
     def fastest(self, begin: float, end: float) -> float:
         """Returns the largest speed between two times of the paths, in their unit."""

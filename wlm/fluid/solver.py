@@ -13,6 +13,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
 from wlm.fluid.faces import axis_ends
 from wlm.fluid.forcing import CALM, Fire, Turbulence, Wind
 from wlm.fluid.lattice import Lattice
-from wlm.fluid.obstacles import Obstacle
+from wlm.fluid.obstacles import Mesh, Obstacle
 from wlm.fluid.volume import DensityVolume, gather, scatter
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.parts import Part, check_part, check_parts
@@ -43,43 +44,82 @@ _SOUND = math.sqrt(1.0 / 3.0)
 
 
 @dataclass(frozen=True)
+class Noise:
+    """Smooth noise by which the values of a source vary, in the source's frame: Perlin noise in space and time (Perlin,
+    "Improving noise", 2002).
+
+    Attributes:
+        amount: Largest change relative to the source's values, at least 0; values stay at least 0.
+        size: Distance in cells over which it changes, above 0.
+        phase: Time in units over which it changes; a constant one is noise at rest.
+        seed: Number of the pattern.
+    """
+
+    amount: float
+    size: float
+    phase: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (0.0 <= self.amount < math.inf and 0.0 < self.size < math.inf and math.isfinite(self.phase)):
+            raise ValueError(f"noise: expected an amount of at least 0, a size above 0 and a phase, got {self}")
+
+
+@dataclass(frozen=True)
 class Source:
     """A region that emits smoke, in cells and steps of the lattice.
 
     Attributes:
-        shape: "box" or "sphere" (with three radii, an ellipsoid).
-        centre: Centre in cells.
-        size: Half edges of the box, or radii, along x, y and z in cells; above 0.
+        shape: "box", "sphere" (with three radii, an ellipsoid), "cylinder" along y, or a mesh, of which the path, the
+            scale and the shell have no effect.
+        centre: Centre, or origin of the mesh, in cells.
+        size: Half edges of the box or cylinder, radii, or cells per unit of the mesh, along x, y and z; above 0.
         density: Density added per step of the lattice or, with `fixed`, the density to set.
         temperature: Temperature added per step or, with `fixed`, the temperature to set.
         fuel: Fuel, likewise.
         fixed: Whether density, temperature and fuel are set instead of added.
+        turn: Unit quaternion (x, y, z, w) that turns the region about its centre.
+        shell: Distance in cells from a mesh's surface within which smoke is emitted, too.
+        noise: Variation of the values; None: none.
     """
 
-    shape: str
+    shape: str | Mesh
     centre: tuple[float, float, float]
     size: tuple[float, float, float]
     density: float
     temperature: float = 0.0
     fixed: bool = False
     fuel: float = 0.0
+    turn: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    shell: float = 0.0
+    noise: Noise | None = None
 
     def __post_init__(self) -> None:
-        if self.shape not in ("box", "sphere"):
-            raise ValueError(f"shape: expected 'box' or 'sphere', got {self.shape!r}")
+        if not (isinstance(self.shape, Mesh) or self.shape in advection_sources.SHAPES[:3]):
+            names = ", ".join(map(repr, advection_sources.SHAPES[:3]))
+            raise ValueError(f"shape: expected {names} or a mesh, got {self.shape!r}")
         for name, least in (("centre", -math.inf), ("size", 0.0)):
             value = getattr(self, name)
             if len(value) != 3 or not all(math.isfinite(v) and v > least for v in value):
                 raise ValueError(f"{name}: expected three finite numbers{' above 0' * (name == 'size')}, got {value}")
-        for name in _EMITTED:
+        for name in (*_EMITTED, "shell"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}: expected a finite number of at least 0, got {value}")
+        if len(self.turn) != 4 or not abs(math.hypot(*self.turn) - 1.0) < 1e-3:
+            raise ValueError(f"turn: expected a quaternion of length 1, got {self.turn}")
 
-    def region(self, refinement: int) -> tuple[int, list[float], list[float]]:
-        """Returns the shape's code in `advection_sources`, and centre and size in cells of smoke."""
-        shape = advection_sources.BOX if self.shape == "box" else advection_sources.SPHERE
-        return shape, [refinement * v for v in self.centre], [refinement * v for v in self.size]
+    def region(self, refinement: int, device: str) -> advection_sources.Region:
+        """Returns the region in cells of smoke, with the mesh on a device."""
+        centre, size = ([refinement * v for v in values] for values in (self.centre, self.size))
+        how: dict[str, Any] = {"turn": self.turn}
+        shape = self.shape
+        if isinstance(shape, Mesh):
+            how |= {"extent": shape.extent, "shell": refinement * self.shell}
+            shape = shape.on(device)
+        if (noise := self.noise) is not None:
+            how |= {"noise": (noise.amount, refinement * noise.size, noise.phase), "seed": noise.seed}
+        return advection_sources.make_region(shape, centre, size, **how)
 
     def steps(self, substeps: int) -> float:
         """Returns the factor of density and temperature in a step of the solver."""
@@ -233,6 +273,8 @@ class Solver:
             raise ValueError(f"obstacles: expected at most 255, got {len(obstacles)}")
         if not temperature and (fire or cooling or (buoyancy and buoyancy.lift) or any(s.temperature for s in sources)):
             raise ValueError("temperature: expected True, since a source, buoyancy, fire or cooling uses it, got False")
+        if fire is None and any(source.fuel for source in sources):
+            raise ValueError("fuel: expected a fire, since a source emits fuel, got none")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
         self.duration = duration
@@ -612,9 +654,10 @@ class Solver:
     def _emit(self, only_mark: bool = False) -> None:
         for source in self.sources:
             steps = source.steps(self.substeps)
+            region = source.region(self._box.refinement, str(self.device))
             values = (steps * source.density, steps * source.temperature), (steps * source.fuel, 0.0)
             for value, smoke in zip(values, self._carried(self._fields[0]), strict=False):
-                where = [self._box, self._walls[0], *source.region(self._box.refinement), value, smoke]
+                where = [self._box, self._walls[0], region, value, smoke]
                 advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
 
     def _carry(self) -> None:

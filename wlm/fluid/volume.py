@@ -328,9 +328,11 @@ def save_volume(
     Z, 3] in the volume's box, also in larger voxels. A `.nvdb` is compressed by zlib unless `codec` is "none".
 
     Raises:
-        WlmError: The suffix is wrong, or the file cannot be written.
+        WlmError: The suffix is wrong, the volume has the light of a file in kelvin, or the file cannot be written.
     """
     suffix = _suffix(path)
+    if volume.kelvin:
+        raise WlmError(f"{path}: temperature: expected kelvins, found their light: load the volume with kelvin=False")
     fields = {_DENSITY: volume.density}
     if volume.temperature is not None:
         fields[_TEMPERATURE] = volume.temperature

@@ -19,7 +19,7 @@ from wlm.lightmap.evaluation import lost_light
 from wlm.lightmap.model import LightmapModel, SheetModel, decode_scale, encode_scale, part_table
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, check_index, classify, cut, split
-from wlm.lightmap.trainer import Targets, TileJob
+from wlm.lightmap.trainer import TileJob
 from wlm.system import Meter, OnProgress
 from wlm.workers import each
 from wlm_kernels.lightmap.matrix_step import WIDTHS
@@ -153,13 +153,6 @@ def open_checkpoint(
         "device": "cpu" if device == "cpu" else "cuda",
     }
     return Checkpoint(output, "lightmap", fit, lightmaps.source, resume=resume, every=every)
-
-
-def dynamic_targets(lightmaps: SheetFrames, profile: Profile) -> Targets | None:
-    """Returns the training data of the dynamic tiles of a sheet, for use by other trainers; None without such tiles."""
-    fit = SheetFit(lightmaps, profile)
-    rows = np.flatnonzero(fit.kinds == TileKind.DYNAMIC)
-    return fit.job(Batch(0, TileKind.DYNAMIC, rows, 0, fit)).targets() if len(rows) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -81,7 +81,7 @@ class TileLoader:
 
     def replace(self, requests: Iterable[tuple[Sheet, int, float]]) -> None:
         """Drops all waiting requests and asks for other tiles: sheet, number and priority of each. Of more than `most`
-        the first ones count. A tile that is being read, and results that nobody has taken, are not affected.
+        the first ones count.
         """
         asked = list(islice(requests, self._most))
         for sheet, number, _ in asked:
@@ -100,6 +100,17 @@ class TileLoader:
     def _check_open(self) -> None:
         if self._closed:
             raise WlmError(f"{self._model.name}: expected an open loader, got one that was closed")
+
+    def cancel(self, sheet: Sheet | None = None, number: int | None = None) -> int:
+        """Drops waiting requests, of one tile, of all tiles of a sheet, or all, and returns their number.
+
+        A tile that is being read, and results that nobody has taken, are not affected.
+        """
+        with self._change:
+            dropped = [tile for tile in self._waiting if sheet in (None, tile[0]) and number in (None, tile[1])]
+            for tile in dropped:
+                del self._waiting[tile]
+            return len(dropped)
 
     def take(self, most: int | None = None) -> list[Loaded]:
         """Returns finished tiles in the order in which they were read, at most `most`; it does not wait for any."""

@@ -17,29 +17,6 @@ tile's side."""
 HEAD = 2
 """Groups of four floats before the records of the tiles in the table of an hour."""
 
-_GELU = {
-    "exact": """\
-// x Phi(x). erf as in Abramowitz and Stegun, Handbook of Mathematical Functions, 7.1.26: within 1.5e-7, which leaves
-// GELU within 2.2e-7.
-vec4 wlm_gelu(vec4 x)
-{
-    vec4 z = abs(x) * 0.70710678;
-    vec4 t = 1.0 / (1.0 + 0.3275911 * z);
-    vec4 p = t * (0.254829592 + t * (-0.284496736 + t * (1.421413741 + t * (-1.453152027 + t * 1.061405429))));
-    return 0.5 * x * (1.0 + sign(x) * (1.0 - p * exp(-1.0 * z * z)));
-}
-""",
-    "tanh": """\
-// The tanh form of GELU, which the model was trained with, as x / (1 + exp(-2 z)), since the tanh of drivers takes
-// several times as long; within 4.8e-4 of the exact form.
-vec4 wlm_gelu(vec4 x)
-{
-    vec4 z = x * (-2.3022082 - 0.10294324 * x * x); // for powers of 2, which end before a float overflows
-    return x / (1.0 + exp2(min(z, vec4(80.0, 80.0, 80.0, 80.0))));
-}
-""",
-}
-
 _DRAWN = """\
 // For each stored hour that is needed: bind the table of the hour, draw the map into a texture of linear light with
 // {last}(texel), and draw that one into another, each texel from wlm_source(texel), which fills the gaps between
@@ -61,17 +38,6 @@ _TEXTURES = {
     "valid": ("sampler2D", "valid.png, R8, {width} x {height}, white inside charts; fetched"),
 }
 
-_READ = """
-#ifndef {macro}
-#define {macro}(i) texelFetch({texture}, ivec2((i) & 1023, (i) >> 10), 0)
-#endif
-
-vec4 {function}(int i)
-{{
-    return {macro}(i);
-}}
-"""
-
 _UNITS = {
     "biases": "    b[{j}] = wlm_lightmap_four(third - WLM_LIGHTMAP_FOURS + {j});\n",
     "products": "        b[{j}] = wlm_lightmap_add(b[{j}], a, w + {j}, WLM_LIGHTMAP_FOURS);\n",
@@ -79,36 +45,11 @@ _UNITS = {
 }
 """Lines of the network for each four units of the second layer."""
 
-_INPUTS = """\
-    vec4 uvt = vec4(0.0, 0.0, 0.0, 0.0);
-    vec4 planes = uvt;
-    bool dynamic = int(tile.x) == 2;
-    if (dynamic) {{
-        vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
-        uvt = wlm_lightmap_volume(row, place);
-        planes = vec4(wlm_lightmap_plane(2 * row, place.x), wlm_lightmap_plane(2 * row + 1, place.y));
-        // The encoded time is in the bias.
-        second = start + 17 * WLM_LIGHTMAP_FOURS;
-    }}
-"""
-
 _SUMS = """\
         if (dynamic) {
             a = wlm_lightmap_add(a, uvt, start + 4 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
             a = wlm_lightmap_add(a, planes, start + 8 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
         }
-"""
-
-_FRAMES = """
-// Colour of a tile of frames in the first (1) or second (3) frame of its record.
-vec3 wlm_lightmap_of_frames(vec4 tile, int record, ivec2 inner)
-{{
-    int row = int(tile.y);
-    vec4 least = wlm_lightmap_entry(record);
-    ivec2 at = ivec2(row % {frames_columns}, row / {frames_columns}) * {TILE} + inner;
-    vec3 level = texelFetch(WLM_LIGHTMAP_FRAMES, ivec3(at, int(least.w)), 0).xyz;
-    return mix(least.xyz, wlm_lightmap_entry(record + 1).xyz, level);
-}}
 """
 
 _UNMAPPED = """
@@ -119,83 +60,11 @@ vec3 wlm_lightmap_unmapped(vec4 tile, int record, ivec2 inner)
 }}
 """
 
-_COLOUR = """
-// Colour of a texel of the map in gamma space, at least 0; of an empty tile 0.
-vec3 wlm_colour(ivec2 texel)
-{{
-    ivec2 place = texel / {TILE};
-    ivec2 inner = texel - place * {TILE};
-    int record = {head} + (place.y * WLM_LIGHTMAP_COLUMNS + place.x) * WLM_LIGHTMAP_RECORD;
-    vec4 tile = wlm_lightmap_entry(record);
-{kinds}    return wlm_lightmap_unmapped(tile, record, inner);
-}}
-"""
-
-_COPIES = {
-    False: """\
-    for (int i = index; i < count; i += {invocations})
-        wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i);
-""",
-    True: """\
-    // A static tile has no weights of F_uvt, F_ut and F_vt: they are 0, so that all networks have the same places.
-    int skipped = kind == 1 ? {dynamic_size} : 0;
-    for (int i = index; i < count; i += {invocations}) {{
-        if (i < {static_size})
-            wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i);
-        else if (i < {static_size} + skipped)
-            wlm_lightmap_weights[i] = vec4(0.0, 0.0, 0.0, 0.0);
-        else
-            wlm_lightmap_weights[i] = wlm_lightmap_four(int(tile.z) + i - skipped);
-    }}
-""",
-}
-"""Lines that copy a network, by whether a sheet has dynamic tiles."""
-
-_PAIR_INPUTS = """\
-    vec2 place = (vec2(inner) + vec2(0.5, 0.5)) / {TILE}.0;
-    vec2 under = (vec2(inner) + vec2(0.5, 0.5 + {below}.0)) / {TILE}.0;
-    // A static tile reads those of the first dynamic one, with weights that are 0. The encoded time is in the bias.
-    int own = int(tile.x) == 2 ? row : 0;
-    vec2 ut = wlm_lightmap_plane(2 * own, place.x);
-    vec4 uvt0 = wlm_lightmap_volume(own, place);
-    vec4 uvt1 = wlm_lightmap_volume(own, under);
-    vec4 planes0 = vec4(ut, wlm_lightmap_plane(2 * own + 1, place.y));
-    vec4 planes1 = vec4(ut, wlm_lightmap_plane(2 * own + 1, under.y));
-"""
-
 _MAPPED_KIND = """\
     if (int(tile.x) == 1 || int(tile.x) == 2)
         return wlm_lightmap_mapped(tile, record, inner);
 """
 
-_FRAMES_KIND = """\
-    if (int(tile.x) == 3) {{
-        vec3 early = wlm_lightmap_of_frames(tile, record + 1, inner);
-        if (tile.w == 0.0)
-            return early;
-        // Radiance is mixed, even if networks interpolate.
-        vec3 late = wlm_lightmap_of_frames(tile, record + 3, inner);
-        vec3 light = mix(pow(early, {gamma}), pow(late, {gamma}), tile.w);
-        return pow(light, {inverse});
-    }}
-"""
-
-_LINEAR = {
-    "radiance": """
-// Linear radiance of a colour, at most 65504: a target of half floats would make more infinite.
-vec3 wlm_lightmap_linear(vec3 colour)
-{{
-    return min(pow(colour, {gamma}), vec3(65504.0, 65504.0, 65504.0));
-}}
-""",
-    "value": """
-// The values of a colour, which has no gamma: levels from 0 to 1. They mix as radiance does.
-vec3 wlm_lightmap_linear(vec3 colour)
-{{
-    return vec3({least}, {least}, {least}) + {span} * colour;
-}}
-""",
-}
 _LAST = """
 vec3 wlm_{kind}(ivec2 texel)
 {{
@@ -230,6 +99,7 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
         Source for GLSL 3.30 and GLSL ES 3.00; it also compiles for Vulkan if the bindings are defined.
     """
     profile, names = model.profile, texture_names(model)
+    gelu = filled(__package__, f"gelu_{profile.gelu}.glsl")
     dynamic = len(model.uvt)
     side, slices = profile.uvt_resolution, profile.uvt_slices
     across = {
@@ -278,10 +148,10 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
     }
     kind = "radiance" if values is None else "value"
     least, span = (0.0, 1.0) if values is None else (values[0], values[1] - values[0])
-    linear = _LINEAR[kind].format(least=repr(least), span=repr(span), **words)
+    linear = filled(__package__, f"linear_{kind}.glsl", least=repr(least), span=repr(span), **words)
     has_frames = "frames" in names
-    unmapped = _UNMAPPED.format(frames=_FRAMES_KIND.format(**words) if has_frames else "")
-    unmapped = (_FRAMES.format(**words) if has_frames else "") + unmapped
+    unmapped = _UNMAPPED.format(frames=filled(__package__, "frames_kind.glsl", **words) if has_frames else "")
+    unmapped = (filled(__package__, "frames.glsl", **words) if has_frames else "") + unmapped
     maps = filled(__package__, "maps.glsl", **words) if "uvt" in names else ""
     if pairs:
         names.remove("valid")
@@ -290,18 +160,23 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
         text = _head(names, words | {"use": use}) + maps + unmapped + linear
         inputs = ["uv", "uvt", "planes"] if maps else ["uv"]
         lines = _pair_lines(wide, inputs, third)
-        lines |= {"copies": _COPIES[bool(maps)].format(**words), "inputs": _PAIR_INPUTS.format(**words) if maps else ""}
-        text += filled(__package__, "pair.glsl", gelu=_GELU[profile.gelu], **lines, **words)
+        lines |= {
+            "copies": filled(__package__, "copy.glsl" if maps else "copy_static.glsl", **words),
+            "inputs": filled(__package__, "pair_inputs.glsl", **words) if maps else "",
+        }
+        text += filled(__package__, "pair.glsl", gelu=gelu, **lines, **words)
         return text + filled(__package__, "pair_colours.glsl", **words)
     text, kinds = _head(names, words | {"use": _DRAWN.format(last=f"wlm_{kind}")}) + maps, ""
     if "networks" in names:
         units = {name: "".join(line.format(j=j, at=4 * j) for j in range(wide)) for name, line in _UNITS.items()}
-        inputs, sums = (_INPUTS.format(**words), _SUMS) if maps else ("", "")
-        text += filled(
-            __package__, "network.glsl", gelu=_GELU[profile.gelu], inputs=inputs, sums=sums, **units, **words
-        )
+        inputs, sums = (filled(__package__, "inputs.glsl", **words), _SUMS) if maps else ("", "")
+        text += filled(__package__, "network.glsl", gelu=gelu, inputs=inputs, sums=sums, **units, **words)
         kinds = _MAPPED_KIND
-    text += unmapped + _COLOUR.format(kinds=kinds, **words) + filled(__package__, "source.glsl", **words)
+    text += (
+        unmapped
+        + filled(__package__, "colour.glsl", kinds=kinds, **words)
+        + filled(__package__, "source.glsl", **words)
+    )
     return text + linear + _LAST.format(kind=kind)
 
 
@@ -332,7 +207,7 @@ def _pair_lines(wide: int, inputs: list[str], third: int) -> dict[str, str]:
 def _head(names: list[str], words: dict[str, object]) -> str:
     lines = [f"//   wlm_lightmap_{name}: {_TEXTURES[name][1].format(**words)}.\n" for name in names]
     reads = "".join(
-        _READ.format(macro=macro, function=function, texture=f"WLM_LIGHTMAP_{name.upper()}")
+        filled(__package__, "entry.glsl", macro=macro, function=function, texture=f"WLM_LIGHTMAP_{name.upper()}")
         for macro, function, name in (
             ("WLM_LIGHTMAP_HOUR_AT", "wlm_lightmap_entry", "hour"),
             ("WLM_LIGHTMAP_NET", "wlm_lightmap_four", "networks"),

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -69,24 +69,15 @@ NO_VIEWS = ViewScore(0, math.nan, math.nan, None)
 class Views:
     """Renders the views and accumulates their error, time by time."""
 
-    def __init__(
-        self,
-        lightmaps: SheetFrames,
-        geometry: Geometry,
-        count: int,
-        indices: Sequence[int] | np.ndarray | None = None,
-        device: str = "cpu",
-    ) -> None:
-        """Places `count` cameras for the times of a sheet that will be added, all or those with the given indices;
-        `geometry` has UVs."""
+    def __init__(self, lightmaps: SheetFrames, geometry: Geometry, count: int, device: str = "cpu") -> None:
+        """Places `count` cameras for the times of a sheet; `geometry` has UVs."""
         self._lightmaps, self._geometry, self._device = lightmaps, geometry, check_device(device)
         low, high = geometry.box
         if not (high > low).any():
             raise WlmError("expected a mesh with an extent, found all vertices at one point")
-        times = range(len(lightmaps.times)) if indices is None else [int(index) for index in indices]
-        self._cameras: dict[int, list[int]] = {index: [] for index in times}
+        self._cameras: dict[int, list[int]] = {index: [] for index in range(len(lightmaps.times))}
         for number in range(count):
-            self._cameras[times[number % len(times)]].append(number)
+            self._cameras[number % len(lightmaps.times)].append(number)
         self._views = sphere_views(count)
         self._rows: list[dict[str, float | int]] = []
         self._pictures = Pictures()
@@ -119,9 +110,7 @@ class Views:
         return ViewScore(len(self._rows), self._pictures.psnr, self._pictures.flip, worst)
 
 
-def views_of(
-    lightmaps: SheetFrames, count: int, indices: Sequence[int] | np.ndarray | None = None, device: str = "cpu"
-) -> tuple[Views | None, list[str]]:
+def views_of(lightmaps: SheetFrames, count: int, device: str = "cpu") -> tuple[Views | None, list[str]]:
     """Makes the `Views` of a sheet, from the mesh that the sheet names.
 
     Returns None without a mesh that can be read or with a count of 0; and the warnings: one line if the mesh cannot be
@@ -133,7 +122,7 @@ def views_of(
         return None, []
     device = check_device(device)
     try:
-        return Views(lightmaps, read_geometry(lightmaps.mesh), count, indices, device), []
+        return Views(lightmaps, read_geometry(lightmaps.mesh), count, device), []
     except WlmError as error:
         return None, [f"{lightmaps.name}: no views are scored: {error}"]
 

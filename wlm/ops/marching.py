@@ -155,15 +155,14 @@ class _March(torch.autograd.Function):
             if needed[0] or needed[1]:
                 on_density, on_nodes = zeros_for(density), zeros_for(nodes)
                 on_emission = zeros_for(emission) if needed[1] else None
-                single_scatter.march_backward(
-                    *arguments, to_warp(on_density), optional_array(on_emission, 3, wp.vec3, device), to_warp(on_nodes)
-                )
+                scene = to_warp(on_density), optional_array(on_emission, 3, wp.vec3, device), to_warp(on_nodes)
+                single_scatter.march_backward(*arguments, scene=scene)
                 lights = to_warp(toward, wp.vec3), ctx.step
                 single_scatter.depths_backward(*lights, to_warp(on_nodes), to_warp(on_density))
             if needed[3] or needed[4]:
                 on_origin, on_direction = torch.empty_like(origin), torch.empty_like(direction)
                 rays = to_warp(on_origin, wp.vec3), to_warp(on_direction, wp.vec3)
-                single_scatter.rays_backward(*arguments, *rays)
+                single_scatter.march_backward(*arguments, rays=rays)
         return on_density, on_emission, None, on_origin, on_direction, None
 
 

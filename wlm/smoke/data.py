@@ -34,7 +34,7 @@ from wlm.smoke.camera import DIRECTIONS, EMISSION, Camera
 from wlm.smoke.flipbook.naming import six_way_channels
 from wlm.smoke.flipbook.reading import NOTE, read_flipbook
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.scene import CameraSettings, Looks, Scene, make_camera
+from wlm.smoke.scene import CameraSettings, Looks, ObstacleSettings, Scene, SourceSettings, make_camera
 from wlm.system import Meter, OnProgress
 
 SCENE_FILE = "scene.json"
@@ -491,16 +491,24 @@ def _simulated(scene: Scene, until: float) -> dict[str, Any]:
         "smoke": {"extinction", "albedo", "glow", "scheme", "bricks"},
         "air": {"speed", "lattice_speed", "smagorinsky"},
     }
-    others = dict.fromkeys(("name", "frames", "camera", "lights", "background", "obstacles"), True)
+    others = dict.fromkeys(("name", "frames", "camera", "lights", "background", "obstacles", "sources"), True)
     settings = json.loads(scene.model_dump_json(exclude=others | free))
-    for source in settings["sources"]:
-        source["stop"] = None if source["stop"] is None or source["stop"] >= until else source["stop"]
-    settings["sources"] = [source for source in settings["sources"] if source["start"] < until]
-    settings["obstacles"] = []
-    for body in scene.obstacles:
-        places = [body.centre(time) / scene.grid.cell for time in np.linspace(0.0, until, _PLACES)]
-        # The content of a mesh counts, not its place.
-        corners = digest(*body.mesh())
-        settings["obstacles"].append([corners, body.shell, np.round(places, 6).tolist()])
+    settings["sources"] = [
+        _moved(each, scene, until)
+        + [each.density, each.temperature, each.noise]
+        + [(start, None if stop is None or stop >= until else stop) for start, stop in each.spans if start < until]
+        for each in scene.sources
+        if min(start for start, _ in each.spans) < until
+    ]
+    settings["obstacles"] = [_moved(each, scene, until) for each in scene.obstacles]
     smoke, air = settings.pop("smoke"), settings.pop("air")
     return settings | {f"smoke.{k}": v for k, v in smoke.items()} | {f"air.{k}": v for k, v in air.items()}
+
+
+def _moved(body: ObstacleSettings | SourceSettings, scene: Scene, until: float) -> list[Any]:
+    """Returns the form of a body, that of a mesh by its file's content, and its poses up to a time in seconds."""
+    poses = [
+        np.append(body.eased.at(time) / scene.grid.cell, body.eased.turn(time))
+        for time in np.linspace(0.0, until, _PLACES)
+    ]
+    return [digest(*body.mesh()), body.shell, np.round(poses, 6).tolist()]

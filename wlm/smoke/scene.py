@@ -19,12 +19,13 @@ import numpy as np
 import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
+from scipy.spatial.transform import Rotation
 
 from wlm.config import check_settings, load_settings, profile_path
 from wlm.fluid.black_body import black_body_colour, black_body_light
 from wlm.fluid.faces import FACES
 from wlm.fluid.forcing import Fire, Turbulence, Wind
-from wlm.fluid.obstacles import Trajectory, surface
+from wlm.fluid.obstacles import Mesh, Trajectory, surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.meshes import SUFFIXES, Surface, read_surface
 from wlm.smoke.shading import Light, Ramp
@@ -64,6 +65,8 @@ def _shape(shape: str, info: ValidationInfo) -> str:
     return os.path.abspath(os.path.join((info.context or {}).get("folder", ""), shape))
 
 
+# Largest angle in degrees between two poses of a path, and largest number of pieces of this size.
+_PIECE, _MOST_PIECES = 150, 2000
 _SIZES = {"sphere": float, "box": tuple, "cylinder": tuple}
 _LARGEST = 1e18  # its square is within float32
 _Number = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST)]
@@ -71,6 +74,7 @@ _Vector = tuple[_Number, _Number, _Number]
 _Direction = Annotated[_Vector, AfterValidator(_directed)]
 _Positive = Annotated[float, Field(gt=0.0, le=_LARGEST)]
 _NotNegative = Annotated[float, Field(ge=0.0, le=_LARGEST)]
+_Keys = Annotated[tuple[tuple[_Number, _Number, _Number, _Number], ...], AfterValidator(_rising)]
 _Colour = tuple[_NotNegative, _NotNegative, _NotNegative]
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 _Albedo = tuple[_Share, _Share, _Share]
@@ -200,21 +204,6 @@ class Smoke(_Settings):
         return self.emission > 0.0 or self.buoyancy > 0.0 or self.fire is not None
 
 
-class _Timed(_Settings):
-    start: _Number = 0.0
-    stop: _Number | None = None
-
-    @model_validator(mode="after")
-    def _order(self) -> _Timed:
-        if self.stop is not None and self.stop <= self.start:
-            raise PydanticCustomError("stop", "expected a time after start, or null")
-        return self
-
-    def active(self, time: float) -> bool:
-        """Returns whether the source is active at a time in seconds."""
-        return self.start <= time and (self.stop is None or time < self.stop)
-
-
 class Inlet(_Settings):
     """A steady inflow of air and smoke through a face of the box.
 
@@ -241,69 +230,74 @@ class Inlet(_Settings):
         return self
 
 
-class SourceSettings(_Timed):
-    """A ball within the box that emits smoke.
+class Noise(_Settings):
+    """Variation of a source in space and time (`wlm.fluid.solver.Noise`).
 
     Attributes:
-        centre, radius: Centre and radius of the ball in metres.
-        density, temperature, fuel: Values that are set in the ball while the source is active.
-        start, stop: Times in seconds between which the source is active; stop null: until the end.
+        amount: Largest change, relative to the source's density and temperature; they stay at least 0.
+        size: Distance in metres, and `duration` time in seconds, over which it changes.
+        seed: Number of the pattern.
     """
 
-    centre: _Vector
-    radius: _Positive
-    density: _NotNegative = 1.0
-    temperature: _NotNegative = 0.0
-    fuel: _NotNegative = 0.0
+    amount: float = Field(1.0, ge=0.0, le=100.0)
+    size: _Positive
+    duration: _Positive = 1.0
+    seed: int = Field(0, ge=0, le=2**31 - 1)
 
 
-class ObstacleSettings(_Settings):
-    """A solid obstacle.
-
-    Attributes:
-        shape: "sphere", "box", "cylinder", whose axis is y, or the path of a mesh, relative to the scene's file.
-        radius: Radius of a sphere in metres; for a box or cylinder half of its extents along x, y and z; null for a
-            mesh.
-        scale: Metres per unit of the mesh.
-        offset: Place of the shape's centre, or of the mesh's origin, relative to the obstacle's own, in metres.
-        path: Positions (time, x, y, z) between which the origin moves linearly; before and after them it rests. It
-            starts, turns and stops while it moves by its largest diameter (`Trajectory.eased`).
-        shell: Whether only the surface of a mesh is solid; null: if its holes are more than 5% of it, or if it is
-            thinner than a cell.
-        colour: Albedo R, G, B of the obstacle in pictures.
-    """
+class Body(_Settings):
+    """The form and the path of an obstacle or of a source, as `ObstacleSettings` describes them."""
 
     shape: Annotated[str, AfterValidator(_shape)] = "sphere"
     radius: _Positive | tuple[_Positive, _Positive, _Positive] | None = None
     scale: _Positive = 1.0
     offset: _Vector = (0.0, 0.0, 0.0)
-    path: Annotated[tuple[tuple[_Number, _Number, _Number, _Number], ...], Field(min_length=1), AfterValidator(_rising)]
+    centre: _Vector | None = None
+    path: _Keys = ()
+    turn: _Keys = ()
     shell: bool | None = None
-    colour: _Colour = (0.12, 0.12, 0.13)
 
     @model_validator(mode="after")
-    def _sizes(self) -> ObstacleSettings:
+    def _sizes(self) -> Body:
         if not isinstance(self.radius, _SIZES.get(self.shape, NoneType)):
             text = "expected one number for a sphere, three for a box or cylinder, none for a mesh"
             raise PydanticCustomError("radius", text)
+        if (self.centre is None) == (not self.path):
+            raise PydanticCustomError("path", "expected a centre, or positions with their times")
+        if self._pieces.sum() > _MOST_PIECES:
+            raise PydanticCustomError("turn", f"expected at most {_PIECE * _MOST_PIECES:,} degrees in all")
         return self
 
-    def centre(self, time: float) -> np.ndarray:
-        """Returns the position of the origin at a time in seconds, float64 [3]."""
-        return self.eased.at(time)
+    @property
+    def _pieces(self) -> np.ndarray:
+        """Numbers of pieces of the rows of `turn` after the first, of less than half a turn each, int64 [K - 1]."""
+        turned = np.abs(np.diff(np.array(self.turn).reshape(-1, 4)[:, 1:], axis=0)).sum(1)
+        return np.ceil(np.maximum(turned / _PIECE, 1.0))
+
+    @functools.cached_property
+    def _keyed(self) -> Trajectory:
+        """The path without ramps; positions in metres, times in seconds."""
+        places = np.array(self.path or ((0.0, *(self.centre or ())),))
+        angles = np.array(self.turn or ((0.0,) * 4,))
+        rows = np.concatenate([[0], *(k + np.arange(1, n + 1) / n for k, n in enumerate(self._pieces.astype(int)))])
+        angles = np.stack([np.interp(rows, np.arange(len(angles)), column) for column in angles.T], 1)
+        if not self.turn:
+            return Trajectory.of(places[:, 1:], places[:, 0])
+        times = np.union1d(places[:, 0], angles[:, 0])
+        at, turned = (np.stack([np.interp(times, k[:, 0], k[:, a]) for a in (1, 2, 3)], 1) for k in (places, angles))
+        return Trajectory.of(at, times, Rotation.from_euler("xyz", turned, degrees=True).as_quat())
 
     @functools.cached_property
     def eased(self) -> Trajectory:
         """The path with ramps; positions in metres, times in seconds."""
-        keys = np.array(self.path)
-        return Trajectory.of(keys[:, 1:], keys[:, 0]).eased(2.0 * float(np.abs(self.bounds).max()))
+        return self._keyed.eased(2.0 * float(np.abs(self.bounds).max()))
 
     @property
     def fastest(self) -> float:
-        """Largest speed along the path in metres per second."""
-        keys = np.array(self.path)
-        distance = np.linalg.norm(np.diff(keys[:, 1:], axis=0), axis=1)
-        return float((distance / np.diff(keys[:, 0])).max(initial=0.0))
+        """Largest speed along the path, of a body that turns on its surface, in metres per second."""
+        speeds, spins = (np.linalg.norm(rates, axis=1) for rates in self._keyed.rates)
+        reach = float(np.linalg.norm(self.mesh()[0], axis=1).max()) if spins.any() else 0.0
+        return float((speeds + reach * spins).max())
 
     @property
     def surface(self) -> Surface | None:
@@ -321,11 +315,75 @@ class ObstacleSettings(_Settings):
         points, triangles = surface(self.shape)
         return points * np.asarray(self.radius) + self.offset, triangles
 
+    @functools.cached_property
+    def solid(self) -> Mesh:
+        """The surface in metres, at rest at the origin."""
+        points, triangles = self.mesh()
+        return Mesh(Trajectory.of((0.0, 0.0, 0.0)), points.astype(np.float32), triangles.astype(np.int32))
+
     @property
     def bounds(self) -> np.ndarray:
         """Lowest and highest corner of the box around the surface, relative to the origin, float64 [2, 3]."""
         points = self.mesh()[0]
         return np.stack([points.min(0), points.max(0)])
+
+
+class SourceSettings(Body):
+    """A region within the box that emits smoke.
+
+    Attributes:
+        shape, radius, scale, offset, centre, path, turn, shell: As for `ObstacleSettings`.
+        density, temperature, fuel: Values that are set in the region while the source is active.
+        start, stop: Times in seconds between which the source is active, or as many of each; stop null: until the end.
+        noise: Variation of density and temperature; null: none.
+    """
+
+    density: _NotNegative = 1.0
+    temperature: _NotNegative = 0.0
+    fuel: _NotNegative = 0.0
+    start: _Number | tuple[_Number, ...] = 0.0
+    stop: _Number | tuple[_Number | None, ...] | None = None
+    noise: Noise | None = None
+
+    @model_validator(mode="after")
+    def _order(self) -> SourceSettings:
+        count = {len(each) if isinstance(each, tuple) else 1 for each in (self.start, self.stop)}
+        ends = [math.inf if time is None else time for span in self.spans for time in span]
+        if len(count) > 1 or any(b <= a for a, b in zip(ends[::2], ends[1::2], strict=True)):
+            raise PydanticCustomError("stop", "expected for each start a time after it, or null")
+        return self
+
+    @property
+    def spans(self) -> list[tuple[float, float | None]]:
+        """Times in seconds between which the source is active."""
+        start, stop = (each if isinstance(each, tuple) else (each,) for each in (self.start, self.stop))
+        return list(zip(start, stop, strict=False))
+
+    def active(self, time: float) -> bool:
+        """Returns whether the source is active at a time in seconds."""
+        return any(start <= time and (stop is None or time < stop) for start, stop in self.spans)
+
+
+class ObstacleSettings(Body):
+    """A solid obstacle.
+
+    Attributes:
+        shape: "sphere", "box", "cylinder", whose axis is y, or the path of a mesh, relative to the scene's file.
+        radius: Radius of a sphere in metres; for a box or cylinder half of its extents along x, y and z; null for a
+            mesh.
+        scale: Metres per unit of the mesh.
+        offset: Place of the shape's centre, or of the mesh's origin, relative to the obstacle's own, in metres.
+        centre: Position of the origin of an obstacle at rest, instead of `path`.
+        path: Positions (time, x, y, z) between which the origin moves linearly; before and after them it rests. It
+            starts, turns and stops while it moves by its largest diameter (`Trajectory.eased`).
+        turn: Angles (time, x, y, z) in degrees, also of several turns, likewise: the obstacle is turned about its
+            origin, first about the world's x, then about y, then about z.
+        shell: Whether only the surface of a mesh is solid; null: if its holes are more than 5% of it, or if it is
+            thinner than a cell.
+        colour: Albedo R, G, B of the obstacle in pictures.
+    """
+
+    colour: _Colour = (0.12, 0.12, 0.13)
 
 
 class CameraSettings(_Settings):
@@ -515,7 +573,7 @@ class Scene(_Settings):
     @property
     def _flame(self) -> float:
         """Radius of the largest source of fuel in metres, at most that of the box."""
-        radii = [each.radius or math.inf for each in (*self.inlets, *self.sources) if each.fuel]
+        radii = [float(np.max(each.radius or math.inf)) for each in (*self.inlets, *self.sources) if each.fuel]
         return min(max(radii, default=0.0), 0.5 * float(self.grid.size.max()))
 
     @property
@@ -550,8 +608,9 @@ class Scene(_Settings):
             (self.smoke.buoyancy * max(each.temperature, burning), self.smoke.weight * each.density)
             for each in emitters
         ]
+        noise = max((each.noise.amount for each in self.sources if each.noise), default=0.0)
         stirring = 0.0 if self.air.turbulence is None else _PEAK * self.air.turbulence.strength
-        return max(itertools.chain.from_iterable(pulls), default=0.0) + stirring
+        return (1.0 + noise) * max(itertools.chain.from_iterable(pulls), default=0.0) + stirring
 
     @property
     def _least_steps(self) -> float:
@@ -605,7 +664,7 @@ def obstacle_mesh(obstacles: Sequence[ObstacleSettings], time: float) -> tuple[n
     first = 0
     for number, obstacle in enumerate(obstacles):
         points, faces = obstacle.mesh()
-        corners.append(points + obstacle.centre(time))
+        corners.append(points @ obstacle.eased.turn(time).T + obstacle.eased.at(time))
         triangles.append(faces + first)
         owner.append(np.full(len(faces), number))
         first += len(points)

@@ -2,13 +2,14 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 import torch
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from wlm.errors import WlmError
 from wlm.fluid import solver as fluid
@@ -23,17 +24,18 @@ from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked
 from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
-from wlm.smoke.scene import MOST_STEPS, Inlet, ObstacleSettings, Scene, SourceSettings
+from wlm.smoke.scene import MOST_STEPS, Body, Inlet, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
 from wlm_kernels.fluid.mesh_inside import contains
 
-_Timed = tuple[fluid.Source, Callable[[float], bool]]
 # Depth in cells of the smoke at an inlet, so that the air carries smoke of full density into the box.
 _INLET_DEPTH = 1.0
 # Steps in which inlets open, per cell of the longest axis: a sudden start causes a sound wave.
 _RAMP = 4
 # Speed of air in cells per step above which the step is halved, and air steps between two looks at it.
 _FAST, _LOOK = 0.25, 8
+# After so many durations noise repeats, so that float32 resolves its time.
+_NOISE_PERIOD = 4096
 # Times at which sources and inlets inside obstacles are looked for.
 _LOOKS_AT_OBSTACLES = 17
 
@@ -50,7 +52,7 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
             scheme=smoke.scheme,
             storage=smoke.storage,
             temperature=smoke.hot,
-            sources=[source for source, _ in _sources(scene)],
+            sources=sources_at(scene),
             obstacles=_obstacles(scene),
             dissipation=smoke.dissipation * scene.step,
             cooling=smoke.cooling * scene.step if smoke.hot else 0.0,
@@ -79,35 +81,35 @@ def warnings_of(scene: Scene) -> list[str]:
         later = [_opening(scene, other) for other in scene.inlets[i + 1 :] if other.face == inlet.face]
         if not any(set(map(tuple, points)) <= set(map(tuple, other)) for other in later):
             later = []
-        if later or _is_hidden(scene, points, 0.0, end):
+        if later or all(_is_hidden(scene, points, time) for time in _looks(scene, 0.0, end)):
             warnings.append(
                 f"inlets.{i}: {'a later inlet' if later else 'an obstacle'} covers it, so that it is closed"
             )
-    for i, ball in enumerate(scene.sources):
-        points, (radius, share) = _voxels(scene, ball), _ball(scene, ball)
-        stop = end if ball.stop is None else min(ball.stop, end)
+    for i, body in enumerate(scene.sources):
         duration = scene.step * scene.smoke.substeps
-        if np.linalg.norm(np.clip(ball.centre, low, high) - ball.centre) >= ball.radius:
-            warnings.append(f"sources.{i}: {box}, and emits no smoke")
-        elif not math.ceil(max(ball.start, 0.0) / duration) * duration < stop:
+        spans = [(max(start, 0.0), end if stop is None else min(stop, end)) for start, stop in body.spans]
+        spans = [(start, stop) for start, stop in spans if math.ceil(start / duration) * duration < stop]
+        looks = [time for span in spans for time in _looks(scene, *span, body)]
+        seen = [(points, time) for time in looks if len(points := _voxels(scene, body, time))]
+        if not spans:
             warnings.append(f"sources.{i}: it is not active at a step between 0 and {end:g} s, and emits no smoke")
-        elif not len(points):
-            warnings.append(f"sources.{i}: it reaches no voxel's centre, and emits no smoke")
-        elif _is_hidden(scene, points, max(ball.start, 0.0), stop):
+        elif not seen:
+            reason = box if _is_outside(scene, body, looks) else "it reaches no voxel's centre"
+            warnings.append(f"sources.{i}: {reason}, and emits no smoke")
+        elif all(_is_hidden(scene, *each) for each in seen):
             warnings.append(f"sources.{i}: it is inside an obstacle, and emits no smoke")
-        elif not (ball.density or scene.smoke.hot) and ball.temperature:
+        elif not (body.density or scene.smoke.hot) and body.temperature:
             warnings.append(f"sources.{i}: temperature has no effect without smoke.buoyancy and smoke.emission")
-        elif share < 1.0:
+        elif (share := _share(body, grid.voxel)) < 1.0:
             warnings.append(
-                f"sources.{i}: it is smaller than a voxel of {grid.voxel:g} m, and is simulated with a radius of "
-                f"{radius:.3g} m at {share:.2g} of its density"
+                f"sources.{i}: it is smaller than a voxel of {grid.voxel:g} m, and is simulated as large as one at "
+                f"{share:.2g} of its density"
             )
     for i, obstacle in enumerate(scene.obstacles):
-        bounds, times = obstacle.bounds, obstacle.eased.times
-        places = [obstacle.centre(time) for time in (0.0, *times[(times > 0.0) & (times < end)], end)]
-        if (np.max(places, 0) + bounds[1] <= low).any() or (np.min(places, 0) + bounds[0] >= high).any():
+        times = obstacle.eased.times
+        if _is_outside(scene, obstacle, [0.0, *times[(times > 0.0) & (times < end)], end]):
             warnings.append(f"obstacles.{i}: {box}")
-        elif _is_thin(scene, obstacle):
+        elif _is_thin(obstacle, grid.cell):
             warnings.append(
                 f"obstacles.{i}: it is thinner than a cell of {grid.cell:g} m, and is simulated as a cell thick"
             )
@@ -133,38 +135,58 @@ def _opening(scene: Scene, inlet: Inlet) -> np.ndarray:
     return points
 
 
-def _voxels(scene: Scene, ball: SourceSettings) -> np.ndarray:
+def _looks(scene: Scene, start: float, stop: float, body: SourceSettings | None = None) -> np.ndarray:
+    """Returns times in seconds at which an inlet, or a source, is looked for in obstacles."""
+    still = not scene.obstacles and (body is None or not body.eased.moves)
+    return np.linspace(start, stop, 1 if still else _LOOKS_AT_OBSTACLES)
+
+
+def _around(body: Body, bounds: np.ndarray, time: float) -> np.ndarray:
+    """Returns the lowest and the highest corner of the box, [2, 3] in metres, around bounds of a body at a time."""
+    turn = body.eased.turn(time)
+    middle, half = turn @ bounds.mean(0) + body.eased.at(time), np.abs(turn) @ (0.5 * (bounds[1] - bounds[0]))
+    return np.stack([middle - half, middle + half])
+
+
+def _is_outside(scene: Scene, body: Body, times: Iterable[float]) -> bool:
+    boxes = np.array([_around(body, body.bounds, time) for time in times])
+    high = scene.grid.origin + scene.grid.size
+    return bool((boxes[:, 1].max(0) <= scene.grid.origin).any() or (boxes[:, 0].min(0) >= high).any())
+
+
+def _voxels(scene: Scene, source: SourceSettings, time: float) -> np.ndarray:
     """Returns centres of voxels in a source and the box, [N, 3] in cells; of a large source some of them."""
-    refine, radius = scene.grid.refine, _ball(scene, ball)[0] / scene.grid.voxel
-    centre = (np.asarray(ball.centre) - scene.grid.origin) / scene.grid.voxel
-    begin = np.ceil(np.maximum(centre - radius, 0.0) - 0.5)
-    end = np.floor(np.minimum(centre + radius, scene.grid.shape) - 0.5)
+    grid, edge = scene.grid, scene.grid.voxel
+    low, high = (_around(source, _bounds(source, edge), time) - grid.origin) / edge
+    begin, end = np.ceil(np.maximum(low, 0.0) - 0.5), np.floor(np.minimum(high, grid.shape) - 0.5)
     axes = [np.unique(np.linspace(*ends, 16).round()) for ends in zip(begin, np.maximum(begin, end), strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3) + 0.5
-    return points[(np.linalg.norm(points - centre, axis=1) <= radius) & (points < scene.grid.shape).all(1)] / refine
+    if source.surface is not None:
+        # A thin shell may be between these points.
+        corners, triangles = source.mesh()
+        middles = corners[triangles[:: -(-len(triangles) // 4096)]].mean(1) @ source.eased.turn(time).T
+        points = np.concatenate([points, np.floor((middles + source.eased.at(time) - grid.origin) / edge) + 0.5])
+    points = points[((points > 0.0) & (points < grid.shape)).all(1)]
+    return points[_covers(source, edge, grid.origin + edge * points, time)] / grid.refine
 
 
-def _is_hidden(scene: Scene, points: np.ndarray, start: float, stop: float) -> bool:
-    """Tests whether obstacles cover the cells of all points, [N, 3] in cells, from a time to another in seconds."""
-    places = scene.grid.origin + scene.grid.cell * (np.floor(points) + 0.5)
-    for moment in np.linspace(start, stop, _LOOKS_AT_OBSTACLES if scene.obstacles else 1):
-        covered = np.zeros(len(points), bool)
-        for obstacle in scene.obstacles:
-            covered |= _covers(scene, obstacle, places - obstacle.centre(moment))
-        if not covered.all():
-            return False
-    return True
+def _is_hidden(scene: Scene, points: np.ndarray, time: float) -> bool:
+    """Tests whether obstacles cover the cells of all points, [N, 3] in cells, at a time in seconds."""
+    cell = scene.grid.cell
+    places = scene.grid.origin + cell * (np.floor(points) + 0.5)
+    covered = [np.zeros(len(points), bool), *(_covers(each, cell, places, time) for each in scene.obstacles)]
+    return bool(np.any(covered, axis=0).all())
 
 
-def _covers(scene: Scene, obstacle: ObstacleSettings, away: np.ndarray) -> np.ndarray:
-    """Tests which places, [N, 3] in metres relative to an obstacle's origin, are in the obstacle: bool [N]."""
-    if obstacle.surface is not None:
-        mesh = _mesh(scene, obstacle)
-        return contains(mesh.on("cpu"), away, mesh.shell * scene.grid.cell)
-    away = np.abs(away - obstacle.offset) / _radius(scene, obstacle)
+def _covers(body: Body, edge: float, places: np.ndarray, time: float) -> np.ndarray:
+    """Tests which places, [N, 3] in metres, are in a body as it is simulated in cells of an edge: bool [N]."""
+    away = (places - body.eased.at(time)) @ body.eased.turn(time)
+    if body.surface is not None:
+        return contains(body.solid.on("cpu"), away, _shell(body, edge))
+    away = np.abs(away - body.offset) / _radius(body, edge)
     across, along = np.hypot(away[:, 0], away[:, 2]), away[:, 1]
     reach = {"sphere": np.hypot(across, along), "cylinder": np.maximum(across, along), "box": away.max(1)}
-    return reach[obstacle.shape] < 1.0
+    return reach[body.shape] < 1.0
 
 
 def volume_of(scene: Scene, solver: fluid.Solver, *, kelvin: bool = False) -> DensityVolume:
@@ -287,7 +309,7 @@ def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[boo
 
     The time step is halved while air is faster than `_FAST`.
     """
-    sources, every = _sources(scene), max(_LOOK // solver.substeps, 1)
+    every = max(_LOOK // solver.substeps, 1)
     count, longest = _steps_per_frame(scene, solver), scene.steps // solver.substeps
     step = solver.steps - (frame - 1) * count
     if step == 0 and count % longest:
@@ -304,8 +326,7 @@ def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[boo
                 )
             solver.change_step(0.5)
             step, count = 2 * step, 2 * count
-        active = (frame - 1 + step / count) / scene.rate
-        solver.sources = tuple(source for source, when in sources if when(active))
+        solver.sources = tuple(sources_at(scene, (frame - 1 + step / count) / scene.rate))
         solver.step()
         step += 1
         yield step == count
@@ -380,21 +401,18 @@ def _set_inlets(lattice: Lattice, scene: Scene, domain: Domain, name: str, inlet
     lattice.set_inlet(name, velocity, opened)
 
 
-def _sources(scene: Scene) -> list[_Timed]:
-    """Returns the smoke sources at inlets and in the box, in cells, each with a test whether it is active at a time."""
-    sources: list[_Timed] = []
+def sources_at(scene: Scene, time: float | None = None) -> list[fluid.Source]:
+    """Returns the smoke sources at inlets and in the box, in cells: at their places at a time in seconds those that are
+    active then; None: all, at time 0."""
+    sources: list[fluid.Source] = []
 
-    def add(
-        shape: str,
-        centre: np.ndarray,
-        size: np.ndarray,
-        settings: Inlet | SourceSettings,
-        active: Callable[[float], bool],
-        share: float = 1.0,
-    ) -> None:
-        place = tuple(map(float, centre)), tuple(map(float, size))
-        values = share * settings.density, share * settings.temperature if scene.smoke.hot else 0.0
-        sources.append((fluid.Source(shape, *place, *values, fixed=True, fuel=share * settings.fuel), active))
+    def add(shape: str | Mesh, centre: np.ndarray, size: np.ndarray, values: Inlet | SourceSettings, **how) -> None:
+        place, share = (tuple(map(float, centre)), tuple(map(float, size))), how.pop("share", 1.0)
+        heat, fuel = (
+            share * values.temperature if scene.smoke.hot else 0.0,
+            share * values.fuel if scene.smoke.fire else 0.0,
+        )
+        sources.append(fluid.Source(shape, *place, share * values.density, heat, fixed=True, fuel=fuel, **how))
 
     grid = scene.grid
     half = 0.5 * np.array(grid.cells, float)
@@ -407,59 +425,77 @@ def _sources(scene: Scene) -> list[_Timed]:
             size = np.full(3, inlet.radius / grid.cell)
         centre[axis] = grid.cells[axis] * high
         size[axis] = _INLET_DEPTH
-        add(shape, centre, size, inlet, lambda time: True)
-    for ball in scene.sources:
-        centre = (np.asarray(ball.centre) - grid.origin) / grid.cell
-        radius, share = _ball(scene, ball)
-        add("sphere", centre, np.full(3, radius / grid.cell), ball, ball.active, share)
+        add(shape, centre, size, inlet)
+    for body in scene.sources:
+        if time is not None and not body.active(time):
+            continue
+        now, how = time or 0.0, {"share": _share(body, grid.voxel), "shell": _shell(body, grid.voxel) / grid.cell}
+        turn, centre = body.eased.turn(now), body.eased.at(now)
+        if body.eased.turns or len(body.turn):
+            how["turn"] = tuple(map(float, Rotation.from_matrix(turn).as_quat()))
+        if (noise := body.noise) is not None:
+            phase = now / noise.duration % _NOISE_PERIOD
+            how["noise"] = fluid.Noise(noise.amount, max(noise.size, grid.voxel) / grid.cell, phase, noise.seed)
+        if body.surface is None:
+            shape, size, centre = body.shape, _radius(body, grid.voxel), centre + turn @ body.offset
+        else:
+            shape, size = body.solid, np.ones(3)
+        add(shape, (centre - grid.origin) / grid.cell, size / grid.cell, body, **how)
     return sources
-
-
-def _ball(scene: Scene, ball: SourceSettings) -> tuple[float, float]:
-    """Returns the radius with which a source is simulated, such that it covers the centre of a voxel wherever it is in
-    the box, and the share of its density for which the amount of smoke stays the same."""
-    radius = max(ball.radius, 0.501 * math.sqrt(3.0) * scene.grid.voxel)
-    return radius, (ball.radius / radius) ** 3
 
 
 def _obstacles(scene: Scene) -> list[Obstacle]:
     obstacles: list[Obstacle] = []
-    for settings in scene.obstacles:
-        if settings.shape == "sphere" and not any(settings.offset):
-            obstacles.append(Sphere(_path(scene, settings), float(_radius(scene, settings)[0]) / scene.grid.cell))
-        else:
-            obstacles.append(_mesh(scene, settings))
+    grid = scene.grid
+    for body in scene.obstacles:
+        eased, radius = body.eased, _radius(body, grid.cell)
+        path = Trajectory.of((eased.positions - grid.origin) / grid.cell, eased.times / scene.step, eased.rotations)
+        if body.shape == "sphere" and not any(body.offset):
+            obstacles.append(Sphere(path, float(radius[0]) / grid.cell))
+            continue
+        thick = body if body.surface else body.model_copy(update={"radius": tuple(radius)})
+        points, triangles = (
+            array.astype(kind) for array, kind in zip(thick.mesh(), (np.float32, np.int32), strict=True)
+        )
+        shell = _shell(body, grid.cell) / grid.cell
+        obstacles.append(Mesh(path, points, triangles, scale=1.0 / grid.cell, shell=shell))
     return obstacles
 
 
-def _path(scene: Scene, obstacle: ObstacleSettings) -> Trajectory:
-    eased, grid = obstacle.eased, scene.grid
-    return Trajectory.of((eased.positions - grid.origin) / grid.cell, eased.times / scene.step)
+def _is_thin(body: Body, edge: float) -> bool:
+    """Tests whether a body is simulated thicker than it is in cells of an edge in metres."""
+    if (surface := body.surface) is None:
+        return bool((_radius(body, edge) > body.radius).any())
+    return surface.thickness * body.scale < edge
 
 
-def _mesh(scene: Scene, obstacle: ObstacleSettings) -> Mesh:
-    if (surface := obstacle.surface) is None:
-        thick, shell = obstacle.model_copy(update={"radius": tuple(_radius(scene, obstacle))}), 0.0
-    else:
-        surface_only = surface.is_open if obstacle.shell is None else obstacle.shell
-        thick, shell = obstacle, SHELL if surface_only or _is_thin(scene, obstacle) else 0.0
-    points, triangles = thick.mesh()
-    places = points.astype(np.float32), triangles.astype(np.int32)
-    return Mesh(_path(scene, obstacle), *places, scale=1.0 / scene.grid.cell, shell=shell)
+def _shell(body: Body, edge: float) -> float:
+    """Returns the thickness in metres of the shell around a mesh in cells of an edge; 0: none."""
+    if body.surface is None:
+        return 0.0
+    only = body.surface.is_open if body.shell is None else body.shell
+    return SHELL * edge if only or _is_thin(body, edge) else 0.0
 
 
-def _is_thin(scene: Scene, obstacle: ObstacleSettings) -> bool:
-    """Tests whether an obstacle is simulated thicker than it is."""
-    if (surface := obstacle.surface) is None:
-        return bool((_radius(scene, obstacle) > obstacle.radius).any())
-    return surface.thickness * obstacle.scale < scene.grid.cell
+def _bounds(body: Body, edge: float) -> np.ndarray:
+    """Returns the bounds of a body as it is simulated in cells of an edge, [2, 3] in metres around its origin."""
+    more = _shell(body, edge) if body.surface else _radius(body, edge) - body.radius
+    return body.bounds + np.multiply.outer((-1.0, 1.0), np.broadcast_to(more, 3))
 
 
-def _radius(scene: Scene, obstacle: ObstacleSettings) -> np.ndarray:
-    """Returns the half extents [3] with which an obstacle is simulated: at least such that it covers the centre of a
-    cell wherever it is, so that a thin one stops the air."""
-    half = 0.5 * scene.grid.cell
-    round_axes = {"sphere": (3, 3, 3), "cylinder": (2, 1, 2), "box": (1, 1, 1)}[obstacle.shape]
+def _share(source: SourceSettings, edge: float) -> float:
+    """Returns the share of its density at which a source that is smaller than a voxel emits as much smoke."""
+    return 1.0 if source.surface else float(np.prod(np.broadcast_to(source.radius, 3) / _radius(source, edge)))
+
+
+def _radius(body: Body, edge: float) -> np.ndarray:
+    """Returns the half extents [3] with which a sphere, box or cylinder is simulated: at least such that it covers the
+    centre of a cell of an edge wherever it is, so that a thin obstacle stops the air."""
+    if body.surface is not None:
+        return np.ones(3)
+    round_axes = {"sphere": (3, 3, 3), "cylinder": (2, 1, 2), "box": (1, 1, 1)}[body.shape]
+    if body.turn:
+        round_axes = (3, 3, 3)
     # The sides of a cylinder are segments, slightly inside the circle.
-    least = half * np.sqrt(round_axes) * np.where(np.array(round_axes) == 1, 1.0 + 1e-4, 1.01)
-    return np.maximum(np.broadcast_to(np.asarray(obstacle.radius, np.float64), 3), least)
+    least = 0.5 * edge * np.sqrt(round_axes) * np.where(np.array(round_axes) == 1, 1.0 + 1e-4, 1.01)
+    return np.maximum(np.broadcast_to(np.asarray(body.radius, np.float64), 3), least)

@@ -72,6 +72,11 @@ class Canvas:
             self._add(panel, name, mesh, scalars="colours", rgb=True, lighting=shape)
         self._drawn[panel, name][0].prop.culling = "back" if one_sided else "none"
 
+    def background(self, panel: int, colour: np.ndarray) -> None:
+        """Fills a panel behind the meshes with a colour [3] in [0, 1]."""
+        self._plotter.subplot(0, panel)
+        self._plotter.set_background(tuple(map(float, colour)), all_renderers=False)
+
     def hide(self, panel: int, *names: str) -> None:
         """Hides meshes; names that were never drawn are ignored."""
         for name in names:

@@ -36,7 +36,7 @@ from wlm_kernels.fluid.advection_places import (
     stencil,
     wall_at,
 )
-from wlm_kernels.fluid.advection_sources import region_of, within
+from wlm_kernels.fluid.advection_sources import Region, cells_of, strength, within
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
@@ -343,9 +343,7 @@ def _source(
     # in:
     box: Box,
     walls: wp.array1d[wp.uint8],
-    shape: int,
-    centre: wp.vec3,
-    size: wp.vec3,
+    region: Region,
     kept: float,
     low: wp.vec3i,
     cells: wp.vec3i,
@@ -355,7 +353,7 @@ def _source(
     on_values: wp.array1d[wp.vec2],
 ):
     p = low + cell_of(cells, wp.tid())
-    if not within(box, walls, shape, centre, size, p):
+    if not within(box, walls, region, p):
         return
     i = index_of(box.n, p)
     on_both = wp.vec2(on_fields.density[i], 0.0)
@@ -363,7 +361,7 @@ def _source(
     if on_fields.temperature.shape[0] > 0:
         on_both[1] = on_fields.temperature[i]
         on_fields.temperature[i] = kept * on_both[1]
-    wp.atomic_add(on_values, number, on_both)
+    wp.atomic_add(on_values, number, strength(region, p) * on_both)
 
 
 @wp.kernel
@@ -422,9 +420,7 @@ def advect_backward(
 def source_backward(
     box: Box,
     walls: wp.array,
-    shape: int,
-    centre: Sequence[float],
-    size: Sequence[float],
+    region: Region,
     number: int,
     on_fields: Fields,
     on_values: wp.array,
@@ -437,9 +433,9 @@ def source_backward(
     `on_fields`, the gradients to the fields after it, are overwritten by those to the fields before it. Those to the
     density and the temperature that source `number` adds or sets are added to its row of `on_values`, vec2 [S].
     """
-    low, cells, total = region_of(box, centre, size)
+    low, cells, total = cells_of(box, region)
     if total > 0:
-        inputs = [box, walls, shape, wp.vec3(*centre), wp.vec3(*size), 0.0 if fixed else 1.0, low, cells, number]
+        inputs = [box, walls, region, 0.0 if fixed else 1.0, low, cells, number]
         wp.launch(_source, total, inputs=inputs, outputs=[on_fields.arrays, on_values], device=on_values.device)
 
 

@@ -1,7 +1,7 @@
 """Sources of smoke, solids that appear and disappear, and buoyancy, by which smoke moves the air.
 
-Read `test_sources` and `test_buoyancy_is_of_means` in `tests/kernels/test_advection.py` first: they compute the same in
-NumPy.
+Read `test_sources`, `test_turned_sources` and `test_buoyancy_is_of_means` in `tests/kernels/test_advection.py` first:
+they compute the same in NumPy.
 
 Fields and domains are those of `advection` and `advection_places`. Special cases:
 
@@ -18,18 +18,20 @@ cells that a solid frees        mean of the nearest cell of each neighbouring fl
 import functools
 from collections.abc import Sequence
 
+import numpy as np
 import warp as wp
 
 from wlm_kernels.fluid.advection import Fields, fields_struct
 from wlm_kernels.fluid.advection_places import BRICK, CELLS, DENSE, SOLID, Box, Bricks, address_of, is_solid, settle
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
+from wlm_kernels.fluid.mesh_inside import in_mesh
 
 _OPTIONS = {"enable_backward": False}
 
-SPHERE, BOX = 0, 1
-"""Shapes of a source."""
+SHAPES = ("sphere", "box", "cylinder", "mesh")
+"""Shapes of a source: of radius 1, of edge 2, along y with radius 1 and height 2, and in a mesh's own unit."""
 
-_SPHERE = wp.constant(SPHERE)
+_SPHERE, _BOX, _CYLINDER = wp.constant(0), wp.constant(1), wp.constant(2)
 _LARGEST_HALF = wp.constant(65504.0)
 _BRICK = wp.constant(BRICK)
 _CELLS = wp.constant(CELLS)
@@ -42,16 +44,60 @@ def _mark_busy(box: Box, p: wp.vec3i, value: float, bricks: Bricks):
         bricks.busy[index_of(box.bricks, wp.vec3i(p[0] // _BRICK, p[1] // _BRICK, p[2] // _BRICK))] = 1
 
 
+@wp.struct
+class Region:
+    """The region of a source: a shape, whose index in `SHAPES` is `shape`, in a frame with its origin at `centre`, in
+    which lengths are multiplied by `size`, which is then turned by `turn`. Its extents along the axes of the domain are
+    at most `half` on each side of the centre. All lengths are in fine cells.
+
+    `mesh` is a mesh's `id`, with `shell` around its surface, in its unit, in which points inside are within `reach` of
+    it. `noise` has amount, size and phase, and `seed` their pattern's number.
+    """
+
+    shape: int
+    centre: wp.vec3
+    size: wp.vec3
+    half: wp.vec3
+    turn: wp.quat
+    mesh: wp.uint64
+    shell: float
+    reach: float
+    noise: wp.vec3
+    seed: int
+
+
 @wp.func
-def within(box: Box, walls: wp.array1d[wp.uint8], shape: int, centre: wp.vec3, size: wp.vec3, p: wp.vec3i) -> bool:
+def _local(region: Region, p: wp.vec3i) -> wp.vec3:
+    x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
+    return wp.quat_rotate_inv(region.turn, x - region.centre)
+
+
+@wp.func
+def within(box: Box, walls: wp.array1d[wp.uint8], region: Region, p: wp.vec3i) -> bool:
     """Tests whether a source emits smoke in a fine cell: its centre is in the region, and it is not solid."""
     if is_solid(box, walls, p):
         return False
-    x = wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5)
-    away = wp.abs(wp.cw_div(x - centre, size))
-    if shape == _SPHERE:
-        return wp.dot(away, away) <= 1.0
-    return away[0] <= 1.0 and away[1] <= 1.0 and away[2] <= 1.0
+    x = wp.cw_div(_local(region, p), region.size)
+    away = wp.abs(x)
+    if region.shape == _SPHERE:
+        return wp.dot(x, x) <= 1.0
+    if region.shape == _BOX:
+        return away[0] <= 1.0 and away[1] <= 1.0 and away[2] <= 1.0
+    if region.shape == _CYLINDER:
+        return x[0] * x[0] + x[2] * x[2] <= 1.0 and away[1] <= 1.0
+    return in_mesh(region.mesh, x, region.reach, region.shell)
+
+
+@wp.func
+def strength(region: Region, p: wp.vec3i) -> float:
+    """Returns the factor of a source's values in a fine cell: 1, or 1 plus Perlin noise in the source's frame and in
+    time, of at most `noise[0]`, but at least 0."""
+    if region.noise[0] == 0.0:
+        return 1.0
+    x = _local(region, p) / region.noise[1]
+    # Perlin noise in four dimensions seldom leaves -1/2 to 1/2.
+    value = 2.0 * wp.noise(wp.rand_init(region.seed), wp.vec4(x[0], x[1], x[2], region.noise[2]))
+    return wp.max(1.0 + region.noise[0] * wp.clamp(value, -1.0, 1.0), 0.0)
 
 
 @functools.cache
@@ -72,9 +118,7 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         # in:
         box: Box,
         walls: wp.array1d[wp.uint8],
-        shape: int,
-        centre: wp.vec3,
-        size: wp.vec3,
+        region: Region,
         value: wp.vec2,
         kept: float,
         only_mark: bool,
@@ -87,13 +131,14 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         p = low + cell_of(cells, wp.tid())
         # The bricks stay stored, however little smoke the source adds.
         _mark_busy(box, p, wp.inf, bricks)
-        if only_mark or not within(box, walls, shape, centre, size, p):
+        if only_mark or not within(box, walls, region, p):
             return
         i = address_of(box, bricks, p)
-        smoke = in_range(wp.max(kept * float(fields.density[i]) + value[0], 0.0))
+        share = strength(region, p)
+        smoke = in_range(wp.max(kept * float(fields.density[i]) + share * value[0], 0.0))
         fields.density[i] = stored(smoke)
         if fields.temperature.shape[0] > 0:
-            heat = in_range(wp.max(kept * float(fields.temperature[i]) + value[1], 0.0))
+            heat = in_range(wp.max(kept * float(fields.temperature[i]) + share * value[1], 0.0))
             fields.temperature[i] = stored(heat)
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
@@ -214,10 +259,40 @@ def _launch(name: str, size: int, inputs: list, output, fields: Fields) -> None:
     wp.launch(kernel, size, inputs=inputs, outputs=[output], device=fields.density.device)
 
 
-def region_of(box: Box, centre: Sequence[float], size: Sequence[float]) -> tuple[wp.vec3i, wp.vec3i, int]:
+def make_region(
+    shape: str | wp.Mesh,
+    centre: Sequence[float],
+    size: Sequence[float],
+    *,
+    extent: Sequence[float] = (1.0, 1.0, 1.0),
+    turn: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+    shell: float = 0.0,
+    noise: tuple[float, float, float] = (0.0, 1.0, 0.0),
+    seed: int = 0,
+) -> Region:
+    """Makes the region of a source, see `Region`. Of a mesh, made with `support_winding_number=True`, `extent` are the
+    largest distances along its axes from its origin, in its unit; its shell is in fine cells."""
+    region = Region()
+    if isinstance(shape, wp.Mesh):
+        region.shape, region.mesh, region.shell = SHAPES.index("mesh"), shape.id, shell / min(size)
+        extent = np.asarray(extent) + region.shell
+        region.reach = 4.0 * float(extent.sum())
+    else:
+        region.shape = SHAPES.index(shape)
+    axes = np.array(wp.quat_to_matrix(wp.quat(*turn))).reshape(3, 3)
+    region.centre, region.size, region.half = (
+        wp.vec3(*centre),
+        wp.vec3(*size),
+        wp.vec3(*np.abs(axes) @ np.multiply(size, extent)),
+    )
+    region.turn, region.noise, region.seed = wp.quat(*turn), wp.vec3(*noise), seed
+    return region
+
+
+def cells_of(box: Box, region: Region) -> tuple[wp.vec3i, wp.vec3i, int]:
     """Returns the lowest fine cell of the box around a source, the cells of this box along each axis, and in all."""
-    low = [max(0, int(c - h)) for c, h in zip(centre, size, strict=True)]
-    high = [min(n, int(max(c + h + 1.0, 0.0))) for c, h, n in zip(centre, size, box.n, strict=True)]
+    low = [max(0, int(c - h)) for c, h in zip(region.centre, region.half, strict=True)]
+    high = [min(n, int(max(c + h + 1.0, 0.0))) for c, h, n in zip(region.centre, region.half, box.n, strict=True)]
     cells = [max(0, b - a) for a, b in zip(low, high, strict=True)]
     return wp.vec3i(*low), wp.vec3i(*cells), cells[0] * cells[1] * cells[2]
 
@@ -225,9 +300,7 @@ def region_of(box: Box, centre: Sequence[float], size: Sequence[float]) -> tuple
 def add_source(
     box: Box,
     walls: wp.array,
-    shape: int,
-    centre: Sequence[float],
-    size: Sequence[float],
+    region: Region,
     value: tuple[float, float],
     fields: Fields,
     *,
@@ -235,25 +308,21 @@ def add_source(
     bricks: Bricks = DENSE,
     only_mark: bool = False,
 ) -> None:
-    """Adds or sets smoke in the cells whose centres are in a box or an ellipsoid; density and temperature stay at
-    least 0.
+    """Adds or sets smoke in the cells whose centres are in a region; density and temperature stay at least 0.
 
     Args:
         box: The domain.
         walls: The marks of solid cells, as for `advection.advect`.
-        shape: `SPHERE` (an ellipsoid along the axes) or `BOX`.
-        centre: Centre of the source in fine cells.
-        size: Radii of the ellipsoid or half edges of the box along x, y and z, in fine cells, above 0.
-        value: Density and temperature to add or to set.
+        region: The region, from `make_region`.
+        value: Density and temperature to add or to set, before noise.
         fields: The smoke, modified.
         fixed: Whether the values are set instead of added.
         bricks: Those of the source's box, all of which must be stored, are marked as busy.
         only_mark: Whether bricks are marked and nothing else is done.
     """
-    low, cells, total = region_of(box, centre, size)
+    low, cells, total = cells_of(box, region)
     if total > 0:
-        region = [wp.vec3(*centre), wp.vec3(*size), wp.vec2(*value), 0.0 if fixed else 1.0, only_mark]
-        inputs = [box, walls, shape, *region, low, cells, bricks]
+        inputs = [box, walls, region, wp.vec2(*value), 0.0 if fixed else 1.0, only_mark, low, cells, bricks]
         _launch("source", total, inputs, fields.arrays, fields)
 
 

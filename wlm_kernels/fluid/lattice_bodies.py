@@ -17,11 +17,13 @@ import numpy as np
 import warp as wp
 
 from wlm_kernels.fluid.lattice_sets import cell_of, crosses, index_of
-from wlm_kernels.fluid.mesh_inside import in_mesh
+from wlm_kernels.fluid.mesh_inside import ACCURACY, INSIDE, in_mesh
 
 wp.set_module_options({"enable_backward": False})
 
 _MARGIN = wp.constant(2)
+_FAR = wp.constant(1e9)
+_SLACK = wp.constant(1e-3)  # rounding of distances in cells
 
 
 @wp.struct
@@ -60,6 +62,25 @@ class Window:
     body: int
     low: wp.vec3
     cells: wp.vec3i
+
+
+@wp.struct
+class Form:
+    """The form of a body: a sphere of radius `size` in cells, or a `mesh` with `size` cells per unit and a `shell` in
+    cells (`mesh_inside`), whose surface is at most `reach` units from a point inside.
+
+    A query of a mesh takes long, so that a mesh that moves is measured once: `distance`, float [P], is its signed
+    distance in cells at points one cell apart, `points` along each axis of its own frame from `low`; [0]: not measured.
+    A point's mark is then that of the nearest of them, if the surface is too far away to be between them.
+    """
+
+    mesh: wp.uint64
+    size: float
+    reach: float
+    shell: float
+    low: wp.vec3
+    points: wp.vec3i
+    distance: wp.array1d[float]
 
 
 @wp.func
@@ -119,6 +140,33 @@ def _pose(
     motion.spin[b + 1] = wp.vec3(rate * pace * keys.spin[low])
 
 
+@wp.kernel
+def _measure(form: Form, distance: wp.array1d[float]):
+    i = wp.tid()
+    p = cell_of(form.points, i)
+    x = (form.low + wp.vec3(float(p[0]), float(p[1]), float(p[2]))) / form.size
+    query = wp.mesh_query_point_sign_winding_number(form.mesh, x, form.reach, ACCURACY, INSIDE)
+    away = wp.length(wp.mesh_eval_position(form.mesh, query.face, query.u, query.v) - x)
+    distance[i] = wp.where(query.result, query.sign * away * form.size, _FAR)
+
+
+@wp.func
+def _in_form(form: Form, x: wp.vec3) -> bool:
+    """Tests a point in a mesh's own frame, in cells."""
+    if form.distance.shape[0] > 0:
+        near = x - form.low
+        p = wp.vec3i(int(wp.round(near[0])), int(wp.round(near[1])), int(wp.round(near[2])))
+        if crosses(form.points, wp.vec3i(1, 1, 1), p):
+            return False
+        away = form.distance[index_of(form.points, p)]
+        gap = wp.length(near - wp.vec3(float(p[0]), float(p[1]), float(p[2]))) + _SLACK
+        if wp.abs(away) > form.shell + gap:
+            return away < 0.0
+        if wp.abs(away) + gap < form.shell:
+            return True
+    return in_mesh(form.mesh, x / form.size, form.reach, form.shell / form.size)
+
+
 @functools.cache
 def _mark_kernel(is_mesh: bool) -> wp.Kernel:
     """Builds (once) the kernel that marks the cells of a sphere or mesh, with a thread for each cell of a window."""
@@ -128,10 +176,7 @@ def _mark_kernel(is_mesh: bool) -> wp.Kernel:
         # in:
         window: Window,
         motion: Motion,
-        mesh: wp.uint64,
-        size: float,
-        reach: float,
-        shell: float,
+        form: Form,
         stamp: wp.uint8,
         # out:
         solid: wp.array1d[wp.uint8],
@@ -144,9 +189,9 @@ def _mark_kernel(is_mesh: bool) -> wp.Kernel:
         x = wp.quat_rotate_inv(motion.turn[body], centre_of(p) - motion.centre[body])
         inside = bool(False)
         if wp.static(is_mesh):
-            inside = in_mesh(mesh, x / size, reach, shell / size)
+            inside = _in_form(form, x)
         else:
-            inside = wp.length(x) < size
+            inside = wp.length(x) < form.size
         i = index_of(window.n, p)
         was = int(solid[i])
         if inside:
@@ -196,26 +241,37 @@ def set_poses(keys: Keys, clock: wp.array, pace: float, motion: Motion) -> None:
     wp.launch(_pose, bodies, inputs=[keys, clock, wp.float64(pace)], outputs=[motion], device=clock.device)
 
 
-def mark(
-    window: Window, motion: Motion, shape: float | wp.Mesh, scale: float, shell: float, stamp: int, solid, fresh
-) -> None:
+def make_form(shape: float | wp.Mesh, scale: float, shell: float, moves: bool) -> Form:
+    """Makes the form of a sphere of a radius in cells, or of a mesh with `scale` cells per unit and a shell in cells,
+    which was made with `support_winding_number=True` and is measured if it `moves`."""
+    form = Form()
+    if not isinstance(shape, wp.Mesh):
+        form.size = shape
+        return form
+    corners = scale * shape.points.numpy().astype(np.float64)
+    extent = np.ptp(corners, axis=0) + 2.0 * shell + 3.0
+    form.mesh, form.size, form.shell, form.reach = shape.id, scale, shell, float(np.linalg.norm(extent)) / scale
+    if moves:
+        form.low = wp.vec3(*map(float, corners.min(axis=0) - shell - 1.0))
+        form.points = wp.vec3i(*(int(n) for n in np.ceil(extent)))
+        distance = wp.empty(form.points[0] * form.points[1] * form.points[2], dtype=float, device=shape.device)
+        wp.launch(_measure, distance.size, inputs=[form], outputs=[distance], device=shape.device)
+        form.distance = distance
+    return form
+
+
+def mark(window: Window, motion: Motion, form: Form, stamp: int, solid: wp.array, fresh: wp.array) -> None:
     """Marks the cells whose centres are in a body, and clears its other cells in its window.
 
     Args:
         window: The body's window.
         motion: The pose of the body.
-        shape: Radius of a sphere in cells, or a mesh, made with `support_winding_number=True`.
-        scale, shell: Cells per unit of the mesh, and its shell in cells (`mesh_inside`).
+        form: Its form.
         stamp: A number that differs from that of the step before.
         solid: uint8 [N], the bodies' marks.
         fresh: uint8 [N], set to `stamp` in the cells that the body leaves, and to 0 in the window's others without this
             stamp; [0]: not needed.
     """
-    if isinstance(shape, wp.Mesh):
-        # No cell of the domain is farther away.
-        inputs = [shape.id, scale, 4.0 * float(sum(window.n)) / scale]
-    else:
-        inputs = [wp.uint64(0), shape, 0.0]
-    inputs = [window, motion, *inputs, shell, wp.uint8(stamp)]
-    kernel = _mark_kernel(isinstance(shape, wp.Mesh))
+    kernel = _mark_kernel(form.mesh != 0)
+    inputs = [window, motion, form, wp.uint8(stamp)]
     wp.launch(kernel, size_of(window), inputs=inputs, outputs=[solid, fresh], device=solid.device)

@@ -40,6 +40,7 @@ from wlm_kernels.fluid.lattice_sets import (
     opposite,
     wrapped,
 )
+from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
 wp.set_module_options({"enable_backward": False})
 
@@ -107,9 +108,10 @@ def mirrored(t: Tables, n: wp.vec3i, bounded: wp.vec3i, i: int, q: int):
 def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
     """Builds (once) the kernels that set populations at boundaries and sum forces; `balance`: outlets conserve mass."""
     memory = memory_functions(lattice_name, storage, (False, False, False))
-    load, store = memory.load, memory.store
+    load, store, moments, vec = memory.load, memory.store, memory.moments, memory.vec
     stored = STORAGES[storage][0]
-    options = {"enable_backward": False}
+    c, w = velocity_set(lattice_name).c, velocity_set(lattice_name).w
+    count, options = len(c), {"enable_backward": False, "max_unroll": 32}
 
     @wp.func
     def outflow(
@@ -255,7 +257,6 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
 
     @wp.func
     def fill(
-        t: Tables,
         n: wp.vec3i,
         bounded: wp.vec3i,
         stamp: wp.uint8,
@@ -264,31 +265,29 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         p: wp.vec3i,
         f: wp.array2d[stored],
     ):
+        # Loops are unrolled: the latency of reads one after the other would take longer than a step.
         total = wp.vec4()
         weight = float(0.0)
-        for q in range(1, t.w.shape[0]):
-            beside = p + t.c[q]
-            if not crosses(n, bounded, beside):
-                k = index_of(n, wrapped(n, beside))
-                if solid[k] == wp.uint8(0) and fresh[k] != stamp:
-                    drho = float(0.0)
-                    j = wp.vec3()
-                    for r in range(t.w.shape[0]):
-                        g = load(f, r, k)
-                        drho += g
-                        j += g * wp.vec3(float(t.c[r][0]), float(t.c[r][1]), float(t.c[r][2]))
-                    total += t.w[q] * wp.vec4(drho, j[0] / (1.0 + drho), j[1] / (1.0 + drho), j[2] / (1.0 + drho))
-                    weight += t.w[q]
+        for q in range(1, wp.static(count)):
+            beside = p + wp.static(wp.vec3i(*c[q]))
+            k = index_of(n, wrapped(n, beside))
+            if not crosses(n, bounded, beside) and solid[k] == wp.uint8(0) and fresh[k] != stamp:
+                g = vec()
+                for r in range(wp.static(count)):
+                    g[r] = load(f, r, k) * wp.static(STORAGES[storage][1])
+                drho, j, _diagonal, _off = moments(g)
+                inverse = 1.0 / (1.0 + drho)
+                total += wp.static(w[q]) * wp.vec4(drho, inverse * j[0], inverse * j[1], inverse * j[2])
+                weight += wp.static(w[q])
         if weight > 0.0:
             total = total / weight
-        for q in range(t.w.shape[0]):
-            value = equilibrium(t.w[q], t.c[q], total[0], wp.vec3(total[1], total[2], total[3]))
-            store(f, q, index_of(n, p), value)
+        u = wp.vec3(total[1], total[2], total[3])
+        for q in range(wp.static(count)):
+            store(f, q, index_of(n, p), equilibrium(wp.static(w[q]), wp.static(wp.vec3i(*c[q])), total[0], u))
 
     @wp.kernel(module="unique", module_options=options)
     def bounce(
         # in:
-        t: Tables,
         n: wp.vec3i,
         bounded: wp.vec3i,
         window: Window,
@@ -312,17 +311,16 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
             i = index_of(n, p)
             if solid[i] == wp.uint8(0):
                 if fresh[i] == stamp:
-                    fill(t, n, bounded, stamp, solid, fresh, p, f)
-                for q in range(1, t.w.shape[0]):
-                    source = p - t.c[q]
-                    if not crosses(n, bounded, source):
-                        k = index_of(n, wrapped(n, source))
-                        if int(solid[k]) == window.body:
-                            c = wp.vec3(float(t.c[q][0]), float(t.c[q][1]), float(t.c[q][2]))
-                            u = wall_velocity(motion, window.body, centre_of(place) - 0.5 * c)
-                            term = 6.0 * t.w[q] * wp.dot(c, u)
-                            store(f, q, k, load(f, opposite(q), i) + term)
-                            net += wp.float64(term)
+                    fill(n, bounded, stamp, solid, fresh, p, f)
+                for q in range(1, wp.static(count)):
+                    source = p - wp.static(wp.vec3i(*c[q]))
+                    k = index_of(n, wrapped(n, source))
+                    if not crosses(n, bounded, source) and int(solid[k]) == window.body:
+                        way = wp.static(wp.vec3(*map(float, c[q])))
+                        u = wall_velocity(motion, window.body, centre_of(place) - 0.5 * way)
+                        term = wp.static(6.0 * w[q]) * wp.dot(way, u)
+                        store(f, q, k, load(f, wp.static(((q - 1) ^ 1) + 1), i) + term)
+                        net += wp.float64(term)
         if wp.static(balance):
             summed(wp.tid(), sums, 0, net)
 
@@ -381,7 +379,6 @@ def find_links(
 
 def bounce(
     kernels: LinkKernels,
-    tables: Tables,
     bounded: wp.vec3i,
     window: Window,
     motion: Motion,
@@ -394,7 +391,7 @@ def bounce(
     """Sends populations back from a moving body, after a step and before `apply`; arguments as there and for
     `lattice_bodies.mark`."""
     threads = -(-size_of(window) // BLOCK) * BLOCK
-    inputs = [tables, window.n, bounded, window, motion, wp.uint8(stamp), solid, fresh, f]
+    inputs = [window.n, bounded, window, motion, wp.uint8(stamp), solid, fresh, f]
     wp.launch(kernels.bounce, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=f.device)
 
 

@@ -12,14 +12,14 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 # The winding number is correct even where a sign from rays would fail because a ray grazes a triangle.
-_INSIDE = wp.constant(0.5)
-_ACCURACY = wp.constant(2.0)
+INSIDE = wp.constant(0.5)
+ACCURACY = wp.constant(2.0)
 
 
 @wp.func
 def in_mesh(mesh: wp.uint64, x: wp.vec3, reach: float, shell: float) -> bool:
     """Tests a point in the mesh's unit, which is at most `reach` from the mesh if it is inside; shell 0: none."""
-    query = wp.mesh_query_point_sign_winding_number(mesh, x, reach, _ACCURACY, _INSIDE)
+    query = wp.mesh_query_point_sign_winding_number(mesh, x, reach, ACCURACY, INSIDE)
     if not query.result:
         return False
     away = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - x)

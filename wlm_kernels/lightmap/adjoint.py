@@ -14,6 +14,7 @@ import warp as wp
 from wlm_kernels.interpolate import axis_index, cell, fraction
 from wlm_kernels.lightmap.blocks import ste_endpoint, ste_weight
 from wlm_kernels.lightmap.features import Maps, Offsets
+from wlm_kernels.native import native_source
 
 
 @wp.func
@@ -31,69 +32,18 @@ _Spread = wp.types.vector(8, float)
 # memory for each number, rather than one for four.
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const int own = threadIdx.x & 31;
-    wp::vec_t<8, float> mine;
-    #pragma unroll
-    for (int r = 0; r < 8; ++r) {
-        float of[4];
-        #pragma unroll
-        for (int c = 0; c < 4; ++c) of[c] = __shfl_sync(0xffffffffu, g.c[c], 4 * r + (own >> 3));
-        mine.c[r] = own & 2 ? (own & 1 ? of[3] : of[2]) : (own & 1 ? of[1] : of[0]);
-    }
-    return mine;
-#else
-    return wp::vec_t<8, float>();
-#endif
-""")
+@wp.func_native(native_source(__package__, "spread_texels"))
 def _spread_texels(g: wp.vec4) -> _Spread:
     """Redistributes g over a warp: component r of lane l's result is component l % 4 of g in lane 4 r + l / 8."""
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const int own = threadIdx.x & 31;
-    const unsigned any = __ballot_sync(0xffffffffu, at >= 0);
-    #pragma unroll
-    for (int r = 0; r < 8; ++r) {
-        if ((any >> (4 * r) & 15u) == 0u) continue;
-        const int from = 4 * r + (own >> 3), to = __shfl_sync(0xffffffffu, at, from);
-        const float first = __shfl_sync(0xffffffffu, a, from), second = __shfl_sync(0xffffffffu, b, from);
-        const long long steps = static_cast<long long>((own & 4 ? second : first) * g.c[r] * 1099511627776.0f);
-        if (to >= 0)
-            atomicAdd(reinterpret_cast<unsigned long long*>(acc.data + to + (own & 7)),
-                      static_cast<unsigned long long>(steps));
-    }
-#endif
-""")
+@wp.func_native(native_source(__package__, "add_endpoints"))
 def _add_endpoints(acc: wp.array2d[wp.int64], lane: int, at: int, a: float, b: float, g: _Spread):
     """Adds a * g to the sums with the indices `at` to `at` + 3, and b * g to the next four; nothing if `at` < 0. All
     lanes of a warp must call it together; their g comes from `_spread_texels`."""
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const int own = threadIdx.x & 31;
-    #pragma unroll
-    for (int r = 0; r < 4; ++r) {
-        const int from = 8 * r + (own >> 2);
-        float of[4];
-        #pragma unroll
-        for (int c = 0; c < 4; ++c) of[c] = __shfl_sync(0xffffffffu, v.c[c], from);
-        const float mine = own & 2 ? (own & 1 ? of[3] : of[2]) : (own & 1 ? of[1] : of[0]);
-        #pragma unroll
-        for (int k = 0; k < 2; ++k) {
-            const int low = __shfl_sync(0xffffffffu, k == 0 ? early.c[0] : late.c[0], from);
-            const int high = __shfl_sync(0xffffffffu, k == 0 ? early.c[1] : late.c[1], from);
-            const float share = __shfl_sync(0xffffffffu, k == 0 ? 1.0f - ft : ft, from);
-            const long long steps = static_cast<long long>(share * mine * 1099511627776.0f);
-            atomicAdd(reinterpret_cast<unsigned long long*>(acc.data + (own & 2 ? high : low) + (own & 1)),
-                      static_cast<unsigned long long>(steps));
-        }
-    }
-#endif
-""")
+@wp.func_native(native_source(__package__, "add_cells"))
 def _add_cells(acc: wp.array2d[wp.int64], early: wp.vec2i, late: wp.vec2i, ft: float, v: wp.vec4):
     """Adds two channels of each of two texels, `v`, to the texels' sums in two rows of a plane: times 1 - ft at the
     indices `early`, times ft at `late`. All lanes of a warp must call it together."""

@@ -433,9 +433,9 @@ def march_backward(
     grad_scattered,
     grad_emitted,
     grad_depth,
-    grad_density,
-    grad_emission,
-    grad_nodes,
+    *,
+    scene=(),
+    rays=(),
 ) -> None:
     """Computes the adjoint of `march`; the gradient that reaches the density through the nodes is added by
     `depths_backward`.
@@ -444,33 +444,13 @@ def march_backward(
         density, emission, nodes, origin, direction, step, depth, count: Arguments and results of `march`.
         grad_scattered, grad_emitted, grad_depth: float [R, L], vec3 [R], float [R]: gradients of the loss with respect
             to the results of `march`.
-        grad_density, grad_emission, grad_nodes: Float [X, Y, Z], vec3 [X, Y, Z], float [L, A, B, C]: the gradients with
-            respect to the inputs are added to them. With `grad_emission` of shape [0, 0, 0] it is not computed.
+        scene: Float [X, Y, Z], vec3 [X, Y, Z], float [L, A, B, C]: the gradients with respect to density, emission and
+            nodes are added to them; with an emission of shape [0, 0, 0] its gradient is not computed. Empty: none.
+        rays: vec3 [R] each, written: the gradients of origins and directions. The number of a ray's steps is constant,
+            and the three numbers of a direction count as independent. Empty: not computed.
     """
     inputs = [density, emission, nodes, origin, direction, step * _SLACK, depth, count]
     inputs += [grad_scattered, grad_emitted, grad_depth]
-    outputs = [grad_density, grad_emission, grad_nodes]
-    wp.launch(_march_backward, origin.shape, inputs=inputs, outputs=outputs, device=density.device)
-
-
-def rays_backward(
-    density,
-    emission,
-    nodes,
-    origin,
-    direction,
-    step: float,
-    depth,
-    count,
-    grad_scattered,
-    grad_emitted,
-    grad_depth,
-    grad_origin,
-    grad_direction,
-) -> None:
-    """Computes the gradients of the rays of `march`, vec3 [R], from the arguments of `march_backward`; the number of a
-    ray's steps is constant, and the three numbers of a direction count as independent."""
-    inputs = [density, emission, nodes, origin, direction, step * _SLACK, depth, count]
-    inputs += [grad_scattered, grad_emitted, grad_depth]
-    outputs = [grad_origin, grad_direction]
-    wp.launch(_rays_backward, origin.shape, inputs=inputs, outputs=outputs, device=density.device)
+    for kernel, outputs in ((_march_backward, scene), (_rays_backward, rays)):
+        if outputs:
+            wp.launch(kernel, origin.shape, inputs=inputs, outputs=list(outputs), device=density.device)

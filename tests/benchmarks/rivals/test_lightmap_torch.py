@@ -6,8 +6,8 @@ import torch
 from builders.small_sets import moving_light, tiny_profile
 
 from benchmarks.lightmap_exact import decode_tile64
-from benchmarks.rivals.lightmap_torch import Features, PlainFit
-from wlm.lightmap.fit import compress, dynamic_targets
+from benchmarks.rivals.lightmap_torch import Features, PlainFit, dynamic_targets
+from wlm.lightmap.fit import compress
 from wlm.lightmap.profile import TimeAxis
 from wlm.lightmap.sheet import LIGHT
 from wlm.lightmap.trainer import Trainer

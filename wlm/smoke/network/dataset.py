@@ -9,7 +9,7 @@ Lengths are shares of the box's edge, so that a smaller grid gives the same imag
 network must be made with `DatasetSettings.look` of the settings that it was trained with.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from wlm.smoke.network.planes import GUIDES, PLANES, Pool, encode_lightmaps, ren
 from wlm.smoke.network.scenes import draw_scene, generator
 from wlm.smoke.network.settings import EDGE, PERIOD, DatasetSettings
 from wlm.smoke.scene import CameraSettings, Scene, make_camera
-from wlm.smoke.simulation import make_solver, volume_of
+from wlm.smoke.simulation import make_solver, sources_at, volume_of
 from wlm.system import Meter, OnProgress
 
 ATTEMPTS = 8
@@ -199,10 +199,7 @@ class _Simulation:
 
     def __init__(self, scene: Scene, solver: Solver) -> None:
         self._solver, self._period = solver, PERIOD * scene.smoke.substeps
-        # In the order of the solver's sources.
-        always: list[Callable[[float], bool]] = [lambda time: True] * len(scene.inlets)
-        self._sources = list(zip(solver.sources, [*always, *(s.active for s in scene.sources)], strict=True))
-        self._seconds, self._done = scene.step, 0
+        self._scene, self._done = scene, 0
         moving = any(obstacle.path.moves for obstacle in solver.obstacles)
         self._graphs = solver.device.is_cuda and not moving
         if self._graphs:
@@ -212,8 +209,7 @@ class _Simulation:
     def advance(self, steps: int) -> None:
         """Advances the smoke by `steps` air steps, which must be a multiple of the steps in one CUDA graph."""
         for _ in range(steps // self._period):
-            now = self._done * self._seconds
-            active = tuple(source for source, is_active in self._sources if is_active(now))
+            active = tuple(sources_at(self._scene, self._done * self._scene.step))
             if active != self._solver.sources:
                 self._solver.sources, self._graph = active, None
             self._step()

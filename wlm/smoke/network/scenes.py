@@ -7,6 +7,7 @@ fastest air moves at 1 m/s, so that it crosses the box in a second.
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from wlm.fluid.solver import LEAST_HALF_LOSS
 from wlm.smoke.network.settings import EDGE, LATTICE_SPEED, SPEED, DatasetSettings
@@ -18,24 +19,6 @@ _RADIUS = (0.055, 0.14)  # radii of inlets and spheres; at least a cell of the c
 _CYLINDERS, _SPHERES = 0.65, 0.85  # cumulative probabilities of the obstacles' shapes; the rest are boxes
 # A moving obstacle is at most as fast as the air; a faster one would empty the box.
 _CROSSING = (0.9, 1.6)  # seconds in which it crosses the box
-
-
-class Tilted(ObstacleSettings):
-    """An obstacle that is rotated so that its y axis has another direction.
-
-    Attributes:
-        axis: Direction of its y axis in the world, of any length except 0.
-    """
-
-    axis: tuple[float, float, float] = (0.0, 1.0, 0.0)
-
-    def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rotated mesh; see `ObstacleSettings.mesh`."""
-        points, triangles = super().mesh()
-        up = np.array(self.axis) / np.linalg.norm(self.axis)
-        right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
-        right /= np.linalg.norm(right)
-        return points @ np.stack([right, up, np.cross(right, up)]), triangles
 
 
 def generator(validation: bool, *numbers: int) -> np.random.Generator:
@@ -149,7 +132,7 @@ def _burst(random: np.random.Generator) -> dict[str, Any]:
     return {"inlets": (), "sources": tuple(spheres), "faces": {"-y": "wall"}, "smoke": smoke, "hot": True}
 
 
-def _obstacle(random: np.random.Generator) -> Tilted:
+def _obstacle(random: np.random.Generator) -> ObstacleSettings:
     kind = random.random()
     centre = _place(random, (0.28, 0.28, 0.28), (0.72, 0.7, 0.72))
     shape = "cylinder" if kind < _CYLINDERS else "sphere" if kind < _SPHERES else "box"
@@ -158,11 +141,19 @@ def _obstacle(random: np.random.Generator) -> Tilted:
         radius = (radius, EDGE * random.uniform(0.15, 0.5), radius)
     elif shape == "box":
         radius = tuple(map(float, EDGE * random.uniform(0.05, 0.15, 3)))
-    axis = random.normal(size=3)
-    return Tilted(shape=shape, radius=radius, path=((0.0, *centre),), axis=tuple(map(float, axis)))
+    return ObstacleSettings(shape=shape, radius=radius, path=((0.0, *centre),), turn=tilted(random.normal(size=3)))
 
 
-def _moving(random: np.random.Generator, obstacle: Tilted, begin: float) -> Tilted:
+def tilted(axis: np.ndarray) -> tuple[tuple[float, float, float, float]]:
+    """Returns the `turn` of an obstacle whose y axis has a direction, of any length except 0, in the world."""
+    up = axis / np.linalg.norm(axis)
+    right = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    right /= np.linalg.norm(right)
+    turn = Rotation.from_matrix(np.stack([right, up, np.cross(right, up)], 1)).as_euler("xyz", degrees=True)
+    return ((0.0, *map(float, turn)),)
+
+
+def _moving(random: np.random.Generator, obstacle: ObstacleSettings, begin: float) -> ObstacleSettings:
     """Returns the obstacle with a path through the box; it moves after about the time `begin`, in box crossings."""
     _, *middle = obstacle.path[0]
     around = random.uniform(0.0, 2 * np.pi)

@@ -1,19 +1,22 @@
-"""Meshes as obstacles of a scene: their files, the solids that they make, and their surfaces in pictures."""
+"""Obstacles and sources of a scene: meshes from files, turns, sources that move, vary and start several times."""
 
 import copy
+import math
 
 import numpy as np
 import pytest
 import trimesh
 import yaml
 from builders.smoke_plumes import SCENE
+from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
 
 from wlm.errors import WlmError
 from wlm.smoke import meshes
 from wlm.smoke.data import open_frames
 from wlm.smoke.meshes import read_surface
-from wlm.smoke.scene import Scene, load_scene, obstacle_mesh
-from wlm.smoke.simulation import advance, make_solver, warnings_of
+from wlm.smoke.scene import ObstacleSettings, Scene, load_scene, obstacle_mesh
+from wlm.smoke.simulation import advance, make_solver, sources_at, warnings_of
 
 CELL = 0.05
 GRID = {"cells": [14, 14, 14], "cell": CELL, "refine": 2}
@@ -114,11 +117,11 @@ def test_a_mesh_as_a_solid_and_in_pictures(tmp_path):
     solver = make_solver(scene)
     solver.step()
     centres = CELL * (np.stack(np.meshgrid(*3 * [np.arange(14) + 0.5], indexing="ij"), -1))
-    away = np.linalg.norm(centres - scene.obstacles[0].centre(0.0), axis=-1)
+    away = np.linalg.norm(centres - scene.obstacles[0].eased.at(0.0), axis=-1)
     sure = np.abs(away - 0.2) > 0.01
     np.testing.assert_array_equal(solver.solid.numpy()[sure] == 1, (away < 0.2)[sure])
     points, triangles, owner = obstacle_mesh(scene.obstacles, 1.0)
-    distance = np.linalg.norm(points - scene.obstacles[0].centre(1.0), axis=1)
+    distance = np.linalg.norm(points - scene.obstacles[0].eased.at(1.0), axis=1)
     np.testing.assert_allclose(distance, 0.2, atol=1e-5)
     assert len(triangles) == kept.sum() and not owner.any()
 
@@ -166,3 +169,88 @@ def test_a_resumed_scene_knows_its_mesh(tmp_path):
     other = _scene(tmp_path, [body | {"shape": _file(tmp_path, "other.glb", _part(slice(9, None)))}])
     with pytest.raises(WlmError, match="cannot resume: its frames have another obstacles"):
         open_frames(tmp_path / "a", other, resume=True)
+
+
+def test_a_body_turns_as_its_rows_say():
+    """About x, then y, then z, by several turns at once; it starts and stops gently, and its tips are the fastest."""
+    body = ObstacleSettings(
+        shape="box", radius=(0.3, 0.1, 0.1), offset=(0.3, 0, 0), centre=(1, 2, 3), turn=[[1, 0, 0, 0], [5, 0, 0, 1440]]
+    )
+    for time, degrees in ((0.0, 0.0), (2.0, 360.0), (3.05, 738.0), (9.0, 1440.0)):
+        turned = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+        np.testing.assert_allclose(body.eased.turn(time), turned, atol=1e-9)
+    points = obstacle_mesh([body], 3.25)[0]
+    np.testing.assert_allclose((points.min(0), points.max(0)), ((0.9, 2.0, 2.9), (1.1, 2.6, 3.1)), atol=1e-5)
+    assert body.fastest == pytest.approx(2 * np.pi * math.hypot(0.6, 0.1, 0.1), rel=1e-6)
+    angles = [Rotation.from_matrix(body.eased.turn(time)).magnitude() for time in (0.8, 0.86, 0.87, 1.0)]
+    assert angles[0] == 0.0 < angles[2] - angles[1] < 0.2 * 2 * np.pi * 0.01 and angles[3] > 0.1
+    both = ObstacleSettings(radius=0.1, path=((0, 0, 0, 0), (2, 2, 0, 0)), turn=((0, 90, 0, 0), (1, 90, 30, 40)))
+    expected = Rotation.from_euler("xyz", (90, 30, 40), degrees=True).as_matrix()
+    np.testing.assert_allclose(both.eased.turn(1.9), expected, atol=1e-9)
+    np.testing.assert_allclose(both.eased.at(1.0), (1, 0, 0), atol=1e-9)
+    with pytest.raises(ValidationError, match="expected at most 300,000 degrees in all"):
+        ObstacleSettings(radius=0.1, centre=(0, 0, 0), turn=((0, 0, 0, 0), (1, 0, 0, 1e17)))
+
+
+@pytest.mark.parametrize("shape", ["sphere", "box", "cylinder", "mesh"])
+def test_a_source_that_moves_and_turns(tmp_path, shape):
+    """Density where the source is, twice, with a pause between, in voxels that the same surface in NumPy contains."""
+    body = {"path": [[0, 0.2, 0.3, 0.3], [0.4, 0.5, 0.4, 0.4]], "turn": [[0, 0, 0, 0], [0.4, 50, 70, 0]]}
+    body |= {"shape": _file(tmp_path), "scale": 0.15} if shape == "mesh" else {"shape": shape, "radius": 0.15}
+    if shape in ("box", "cylinder"):
+        body["radius"] = [0.1, 0.2, 0.1]
+    source = body | {"start": [0, 0.3], "stop": [0.2, None], "density": 0.75}
+    scene = _scene(tmp_path, [], sources=[source], inlets=[], smoke={"bricks": shape == "mesh"})
+    assert warnings_of(scene) == []
+    assert [len(sources_at(scene, time)) for time in (0.1, 0.2, 0.25, 0.3, 9.0)] == [1, 0, 0, 1, 1]
+    surface = scene.sources[0]
+    for time in (0.1, 0.35):
+        solver = make_solver(scene)
+        solver.sources = sources_at(scene, time)
+        solver.step()
+        centres = 0.5 * CELL * np.stack(np.meshgrid(*3 * [np.arange(28) + 0.5], indexing="ij"), -1)
+        corners, triangles = surface.mesh()
+        mesh = trimesh.Trimesh(corners @ surface.eased.turn(time).T + surface.eased.at(time), triangles, process=False)
+        inside = _inside(mesh, centres)
+        density = solver.density.numpy()
+        assert inside.sum() > 300 and set(np.unique(density)) == {0.0, 0.75}
+        assert (density > 0).sum() == pytest.approx(inside.sum(), rel=0.06)
+        assert ((density > 0) & inside).sum() > 0.94 * inside.sum()
+
+
+def _inside(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Tests points against the planes of a convex mesh."""
+    away = np.einsum("fk,fpk->fp", mesh.face_normals, points.reshape(1, -1, 3) - mesh.triangles[:, :1])
+    return (away < 0.0).all(0).reshape(points.shape[:3])
+
+
+def test_noise_of_a_scene_is_of_its_time(tmp_path):
+    """The same after a resumption; its phase follows the scene's time."""
+    source = {"centre": [0.35, 0.35, 0.35], "radius": 0.3, "noise": {"size": 0.1, "duration": 0.2, "seed": 3}}
+    scene = _scene(tmp_path, [], sources=[source], inlets=[], frames=2)
+    noise = [sources_at(scene, time)[0].noise for time in (0.0, 0.1, 0.2 * 4096.5)]
+    assert [each.phase for each in noise] == pytest.approx([0.0, 0.5, 0.5]) and noise[0].size == pytest.approx(2.0)
+    first, again = make_solver(scene), make_solver(scene)
+    advance(scene, first, 1)
+    first.save(tmp_path / "state")
+    advance(scene, first, 2)
+    again.load(tmp_path / "state")
+    advance(scene, again, 2)
+    np.testing.assert_array_equal(first.density.numpy(), again.density.numpy())
+    assert first.density.numpy().std() > 0.05
+
+
+def test_what_a_source_may_not_be(tmp_path):
+    where = {"centre": [0.3, 0.3, 0.3], "radius": 0.1}
+    for changed, said in (
+        ({"path": [[0, 0, 0, 0]]}, "path: expected a centre, or positions with their times"),
+        ({"centre": None}, "path: expected a centre, or positions with their times"),
+        ({"start": [0, 2], "stop": [1]}, "stop: expected for each start a time after it, or null"),
+        ({"start": [0, 2], "stop": [1, 2]}, "stop: expected for each start a time after it, or null"),
+        ({"start": []}, "stop: expected for each start a time after it, or null"),
+        ({"noise": {"size": 0}}, "noise.size: expected greater than 0"),
+        ({"turn": [[1, 0, 0, 0], [1, 0, 0, 9]]}, "turn: expected times that increase"),
+    ):
+        with pytest.raises(WlmError) as caught:
+            _scene(tmp_path, [], sources=[where | changed])
+        assert said in str(caught.value) and "\n" not in str(caught.value)
