@@ -1,13 +1,14 @@
 import gc
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 import torch
 import warp as wp
 
 from wlm.errors import WlmError
-from wlm.interop import LaunchGraph, StepGraph, check_device, no_collection, stream, to_warp
+from wlm.interop import LaunchGraph, StepGraph, check_device, fork, no_collection, stream, to_warp
 
 
 @wp.kernel(enable_backward=False, module="unique")
@@ -88,6 +89,29 @@ def test_the_stream_orders_torch_and_warp(device):
     for step in range(20):
         expected = (expected + step + 2) * 0.5 + step + 2 - 1
     assert torch.all(total == expected)
+
+
+@pytest.mark.parametrize("works", [1, 3])
+def test_forked_works_are_one_step_of_a_graph(device, works):
+    totals = torch.zeros(works, 1 << 20, device=device)
+    arrays = [to_warp(total) for total in totals]
+    first = torch.zeros_like(totals[0])
+
+    def work(number: int) -> None:
+        totals[number].add_(first)
+        wp.launch(_add, dim=1 << 20, inputs=[arrays[number]], outputs=[arrays[number]], device=device)
+
+    def step() -> None:
+        first.add_(1.0)
+        fork(device, [partial(work, number) for number in range(works)])
+        first.copy_(totals.sum(0) / works)
+
+    graph = StepGraph(step, device, warmup=1)
+    expected = 0.0
+    for _ in range(6):
+        graph()
+        expected = 2.0 * (expected + expected + 1.0)
+    assert torch.all(first == expected)
 
 
 def test_an_error_inside_the_stream_passes_through(device):

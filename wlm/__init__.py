@@ -17,9 +17,6 @@ from wlm._facade import facade
 
 __version__ = "0.1.0"
 
-_PACKAGES = ("atlas", "bake", "export", "fluid", "inspection", "lightmap", "ops", "probe", "scene", "smoke")
-_PLACES = {name: f"wlm.{name}" for name in _PACKAGES} | {"WlmError": "wlm.errors", "load": "wlm.system"}
+__getattr__, __dir__, _public = facade(__name__, __file__)
 
-__all__ = sorted([*_PLACES, "__version__"])
-
-__getattr__, __dir__ = facade(__name__, _PLACES)
+__all__ = sorted([*_public, "__version__"])

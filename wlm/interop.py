@@ -1,7 +1,7 @@
 """Interoperation of Warp and torch: devices, arrays, streams and CUDA graphs."""
 
 import gc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -205,9 +205,26 @@ class LaunchGraph(StepGraph):
         wp.capture_launch(self._launches)
 
 
+def fork(device: str, works: Sequence[Callable[[], None]]) -> None:
+    """Runs works that do not depend on each other, inside `stream`: on CUDA each on a stream of its own, so that they
+    may overlap, also within a graph. What is queued afterwards waits for all of them."""
+    if len(works) == 1 or device == "cpu":
+        for work in works:
+            work()
+        return
+    outer = torch.cuda.current_stream(device)
+    branches = [_side_stream(device, 1 + number) for number in range(len(works))]
+    for work, (side, warp_side) in zip(works, branches, strict=True):
+        side.wait_stream(outer)
+        with torch.cuda.stream(side), wp.ScopedStream(warp_side, sync_enter=False):
+            work()
+    for side, _ in branches:
+        outer.wait_stream(side)
+
+
 @cache
-def _side_stream(device: str) -> tuple[torch.cuda.Stream, wp.Stream]:
-    """Creates (once) the stream of a device for graphs; torch's allocator keeps separate memory for every stream."""
+def _side_stream(device: str, number: int = 0) -> tuple[torch.cuda.Stream, wp.Stream]:
+    """Creates (once) a stream of a device for graphs; torch's allocator keeps separate memory for every stream."""
     # Warp looks up a stream's device in a table created at initialisation, and this may be the first Warp call.
     wp.init()
     side = torch.cuda.Stream(device)

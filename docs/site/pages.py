@@ -8,6 +8,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from wlm._facade import places
+
 if TYPE_CHECKING:
     from mkdocs.structure.files import Files
 
@@ -57,7 +59,7 @@ def api_page(package: ModuleType) -> str:
     lines = [f"# {package.__name__}", "", package.__doc__.strip(), ""]
     lines += [f"- [`{room}`]({page_of(room)}): {import_module(room).__doc__.splitlines()[0]}" for room in rooms]
     lines += [""]
-    for name, module in sorted(package._PLACES.items()):
+    for name, module in sorted(places(package.__file__).items()):
         public, place = f"{package.__name__}.{name}", _place(getattr(package, name), module, name)
         home = next((each for each in PACKAGES[1:] if place == each or place.startswith(f"{each}.")), "wlm")
         if public in rooms:

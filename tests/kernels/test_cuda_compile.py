@@ -73,7 +73,9 @@ def _members(*built: object) -> list:
 def _probe_network(shape: tuple[int, int, int]) -> list:
     latent, hidden, outputs = shape
     decoder = probe_decode.decode_kernels(latent, hidden, outputs, True, 3, "cuda")
-    return _members(probe_network.network_kernels(latent, hidden, outputs + 1, "cuda"), decoder)
+    return _members(
+        probe_network.network_kernels(latent, hidden, outputs + 1, "cuda"), decoder, *decoder._kernels.values()
+    )
 
 
 def _smoke(dtype: type) -> list:

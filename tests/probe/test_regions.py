@@ -13,6 +13,7 @@ from wlm.cli.app import app
 from wlm.errors import WlmError
 from wlm.export import export
 from wlm.export.page.probe import probe_page
+from wlm.probe import fit
 from wlm.probe.data import from_arrays
 from wlm.probe.evaluation import evaluate
 from wlm.probe.fit import compress, open_checkpoint
@@ -22,6 +23,7 @@ from wlm.probe.volume.cascade import Volume
 from wlm.probe.volume.light import StoredLight, at_probes
 from wlm.probe.volume.update import update_bundle
 from wlm.probe.volume.walk import settle
+from wlm.system import Meter
 
 SMALL = Profile(name="small", ratio=0.1, latent=3, hidden=16, steps=60, region=50)
 RANDOM = np.random.default_rng(3)
@@ -132,6 +134,14 @@ def test_a_file_is_read_region_by_region(device, model, path, damaged):
         wlm.load(damaged, "probe").check()
 
 
+def test_many_points_are_decoded_as_few_are(device, model):
+    position = model.stored_positions()
+    for each in (model, model.content.region(0)):
+        decoder = each.decoder(device)
+        many = decoder.decode(np.tile(position, (113, 1)))  # more than 1,056 blocks of 32 points
+        np.testing.assert_allclose(many, np.tile(decoder.decode(position), (113, 1)), rtol=0, atol=1e-5)
+
+
 @pytest.mark.parametrize("change", ["child", "boxes", "counts", "packed"])
 def test_contradictions_are_refused(model, change, tmp_path):
     content = model.content
@@ -203,13 +213,14 @@ def test_a_damaged_region_is_dark_in_a_volume_and_told_once(damaged):
     assert (level[(owner == 7) & model.live] >= 0).any()
 
 
-def test_an_interrupted_fit_continues_with_its_region(probes, model, tmp_path):
+@pytest.mark.parametrize("at_once", [1, 2, 3])
+def test_an_interrupted_fit_continues_with_its_regions(probes, model, tmp_path, monkeypatch, at_once):
+    monkeypatch.setattr(fit, "_AT_ONCE", {"cpu": at_once})
+    monkeypatch.setattr(Meter, "due", lambda meter, done: meter._progress is not None)
     output = tmp_path / "a.wlm"
-    seen = []
 
     def stop(progress):
-        seen.append(progress.done)
-        if progress.done > 150:
+        if progress.done > 60 * at_once + 30:
             raise KeyboardInterrupt
 
     settings = {"positions": True}
@@ -218,9 +229,14 @@ def test_an_interrupted_fit_continues_with_its_region(probes, model, tmp_path):
         compress(probes, SMALL, progress=stop, checkpoint=checkpoint, **settings)
     reports = []
     checkpoint = open_checkpoint(output, probes, SMALL, resume=True)
+    if at_once > 1:
+        del checkpoint._running[1_000_000 + at_once]  # the first of the regions that were running
+        with pytest.raises(WlmError, match=r"a.wlm.partial: state of batch \d+: part control: expected 0 steps"):
+            compress(probes, SMALL, checkpoint=checkpoint, **settings)
+    checkpoint = open_checkpoint(output, probes, SMALL, resume=True)
     again = compress(probes, SMALL, progress=lambda each: reports.append(each.done), checkpoint=checkpoint, **settings)
     assert again.content.packed == model.content.packed
-    assert all(done > 120 for done in reports) and reports[-1] == 8 * 60
+    assert all(done > 60 * at_once for done in reports) and reports[-1] == 8 * 60
 
 
 def test_hours_and_bytes_hold_for_all_regions(tmp_path):

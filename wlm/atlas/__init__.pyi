@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.atlas.data import LightmappedScene as LightmappedScene
 from wlm.atlas.data import Sheet as Sheet
 from wlm.atlas.data import from_arrays as from_arrays

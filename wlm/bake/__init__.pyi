@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.bake.lightmaps import bake_lightmaps as bake_lightmaps
 from wlm.bake.lightmaps import write_lightmaps as write_lightmaps
 from wlm.bake.probes import bake_probes as bake_probes

@@ -10,15 +10,4 @@ wlm.export.write_page("city.html", ["city.wlm"])
 
 from wlm._facade import facade
 
-_PLACES = {
-    "ENGINES": "wlm.export.engines.kit",
-    "LANGUAGES": "wlm.export.shading",
-    "export": "wlm.export.writing",
-    "make_page": "wlm.export.page.pages",
-    "translate": "wlm.export.shading",
-    "write_page": "wlm.export.page.pages",
-}
-
-__all__ = sorted(_PLACES)
-
-__getattr__, __dir__ = facade(__name__, _PLACES)
+__getattr__, __dir__, __all__ = facade(__name__, __file__)

@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.export.engines.kit import ENGINES as ENGINES
 from wlm.export.page.pages import make_page as make_page
 from wlm.export.page.pages import write_page as write_page

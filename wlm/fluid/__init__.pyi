@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.fluid.faces import FACES as FACES
 from wlm.fluid.forcing import Fire as Fire
 from wlm.fluid.forcing import Turbulence as Turbulence

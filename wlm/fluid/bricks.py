@@ -1,7 +1,8 @@
 """The memory of smoke that is stored in bricks: a pool on the device that follows the smoke, and grows when it is full.
 
 The pool never becomes smaller. It grows by a quarter more than is needed, for which the host must know how many bricks
-a step needs: it reads this number while the air moves, so that neither waits for the other.
+a step needs: it reads this number while the air moves. On a GPU of which a full pool would take at most a sixteenth of
+the free memory, the pool is full from the start, so that the host need not know it.
 """
 
 from collections.abc import Callable, Sequence
@@ -52,6 +53,8 @@ class BrickPool:
         self.most, self._size = self.bricks.busy.size, 1
         self._needed = wp.zeros(2, dtype=int, device="cpu", pinned=device.is_cuda)
         self._read: wp.Event | None = None
+        if device.is_cuda and (self.most + 1) * self._brick_bytes * buffers <= device.free_memory // 16:
+            self.reserve(self.most)
 
     @property
     def is_full(self) -> bool:
@@ -88,11 +91,9 @@ class BrickPool:
             return
         size = min(count + max(count // 4, _MARGIN), self.most) + 1
         now, old = self.fields[0], self._size
-        parts = [part for part in (now.density, now.temperature, now.fuel) if part is not None and part.size]
-        brick = sum(CELLS * wp.types.type_size_in_bytes(part.dtype) for part in parts)
         # The other buffers are empty between two steps, and the kept one is copied.
         buffers = len(self.fields)
-        more = (size * buffers - old * (buffers - 1)) * brick
+        more = (size * buffers - old * (buffers - 1)) * self._brick_bytes
         require_memory("bricks of smoke", (size, CELLS, 1), more, self._device)
         self.fields[1:] = []
         grown = self._make(size * CELLS)
@@ -108,6 +109,12 @@ class BrickPool:
         bricks.depth.fill_(len(places))
         bricks.free = wp.array(np.resize(places, size), dtype=int, device=self._device)
         self._size = size
+
+    @property
+    def _brick_bytes(self) -> int:
+        now = self.fields[0]
+        parts = [part for part in (now.density, now.temperature, now.fuel) if part is not None and part.size]
+        return CELLS * len(parts) * wp.types.type_size_in_bytes(parts[0].dtype)
 
     def numbers(self) -> torch.Tensor:
         """Returns the indices of the stored bricks, int32 [N], increasing; waits for the device."""

@@ -36,8 +36,8 @@ MAX_SPEED = 0.3
 is a quarter."""
 
 _MOST_STEPS = 2**31 - 1  # limit of the device's counter
-# Least number of steps for which capturing a graph saves time.
-_GRAPH_FROM = 16
+# Steps in a graph, a multiple of the period, and the least number of steps for which capturing one saves time.
+_GRAPH_STEPS, _GRAPH_FROM = 8, 16
 # A mark of no cell in `Lattice._fresh`.
 _STALE = 3
 
@@ -154,6 +154,7 @@ class Lattice:
 
     Attributes:
         period: A CUDA graph must contain a multiple of this number of steps, see `step`.
+        changes: Number of times that a captured graph of steps has become invalid.
 
     Raises:
         ValueError: An argument is wrong.
@@ -203,7 +204,8 @@ class Lattice:
         self._forces, self._wind = self._zeros(0, wp.vec3), self._zeros(1, wp.vec3)
         self._faces: dict[str, Face] = {}
         self._links: lattice_links.Links | None = None
-        self._graph: wp.Graph | None = None
+        self.changes = 0
+        self._graph = None
         # Steps that this object launched itself; replays of a user's CUDA graph are counted only by the clock.
         self._done, self._unchecked, self._begun = 0, 0, False
 
@@ -440,6 +442,15 @@ class Lattice:
         if key == QUIET:
             return
         raise blown_up(key, self.shape)
+
+    @property
+    def _graph(self) -> wp.Graph | None:
+        return self._captured
+
+    @_graph.setter
+    def _graph(self, graph: wp.Graph | None) -> None:
+        self._captured = graph
+        self.changes += graph is None
 
     # Results.
 
@@ -725,21 +736,21 @@ class Lattice:
             self._done += 1
 
     def _run_in_graphs(self, steps: int) -> None:
-        """Queues steps as replays of a CUDA graph of `self.period` steps, and remaining steps without the graph."""
+        """Queues steps as replays of a CUDA graph of `_GRAPH_STEPS` steps, and remaining steps without the graph."""
         while steps > 0:
-            if steps < self.period or self._done % self.period or self._graph is None:
+            if steps < _GRAPH_STEPS or self._done % self.period or self._graph is None:
                 # The first steps load the kernels' modules, which is not allowed during a capture.
                 eager = min(steps, self.period - self._done % self.period)
                 self._run(eager)
                 steps -= eager
-                if self._graph is None and self._done % self.period == 0:
+                if self._graph is None and self._done % self.period == 0 and steps >= _GRAPH_STEPS:
                     with no_collection(), wp.ScopedCapture(self.device) as capture:
-                        self._run(self.period)
-                    self._graph, self._done = capture.graph, self._done - self.period
+                        self._run(_GRAPH_STEPS)
+                    self._graph, self._done = capture.graph, self._done - _GRAPH_STEPS
             else:
                 wp.capture_launch(self._graph)
-                self._done += self.period
-                steps -= self.period
+                self._done += _GRAPH_STEPS
+                steps -= _GRAPH_STEPS
 
     def _write_fields(self, drho: wp.array, u: wp.array) -> None:
         """Writes the density minus 1 of each cell to `drho` and the velocity to `u`; an array of size 0 is skipped."""

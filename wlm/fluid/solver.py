@@ -23,11 +23,12 @@ from wlm.errors import WlmError
 from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
 from wlm.fluid.faces import axis_ends
 from wlm.fluid.forcing import CALM, Fire, Turbulence, Wind
-from wlm.fluid.lattice import Lattice
+from wlm.fluid.lattice import CHECK_EVERY, Lattice
 from wlm.fluid.obstacles import Mesh, Obstacle
 from wlm.fluid.volume import DensityVolume, gather, scatter
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.parts import Part, check_part, check_parts
+from wlm.interop import no_collection
 from wlm_kernels.fluid import advection, advection_places, advection_sources, fire, forcing
 from wlm_kernels.fluid.advection_places import DENSE
 from wlm_kernels.fluid.lattice_links import WIND
@@ -318,6 +319,10 @@ class Solver:
             lattice.set_bodies(self.obstacles)
             advection_places.mark_walls(self._box, self.solid.flatten(), self._walls[0])
         self._done = 0
+        # The settings of the last steps, and a graph of steps with them; None: these steps cannot be captured.
+        graphs = self.device.is_cuda and substeps % lattice.period == 0 and wind is None
+        graphs = graphs and (self._pool is None or self._pool.is_full)
+        self._captures: tuple[tuple, wp.Graph | None] | None = ((), None) if graphs else None
 
     # Running.
 
@@ -342,11 +347,15 @@ class Solver:
                 f"{self.lattice.period}, and a multiple of "
                 f"{self.period} steps in the captured CUDA graph and before it; got {steps} after {self._done}"
             )
-        for _ in range(steps):
+        while steps > 0:
+            if not capturing and steps >= self.period and self._replay():
+                steps -= self.period
+                continue
             if self._wind is not None:
                 self.lattice.blow(self._wind.at((self._done + 0.5) * self.substeps))
             self._step()
             self._done += 1
+            steps -= 1
 
     def reserve(self) -> None:
         """Makes room for all bricks of the box, which is not needed without bricks.
@@ -598,6 +607,7 @@ class Solver:
             advection_places.mark_walls(self._box, before, self._walls[0])
             # Obstacles of the file may have been elsewhere.
             self._change_walls()
+        self._captures = self._captures and ((), None)
         self._note_checkpoint(path, air["steps"])
 
     def _note_checkpoint(self, path: str | os.PathLike[str], steps: np.ndarray) -> None:
@@ -611,6 +621,30 @@ class Solver:
             raise WlmError(f"{error}{self._kept}") from error
 
     # Within a step.
+
+    def _replay(self) -> bool:
+        """Does `period` steps by a CUDA graph, if that can be and the two steps before had the same settings; returns
+        whether it did."""
+        if self._captures is None:
+            return False
+        forces = (self.buoyancy, self._confinement, self._turbulence, self._fire)
+        settings = (self.sources, self._rates, forces, self.lattice.changes)
+        if self._done % self.period or self._decay_every > 1 or settings != self._captures[0]:
+            if self._done % self.period == 0:
+                self._captures = (settings, None)
+            return False
+        graph = self._captures[1]
+        if graph is None:
+            with no_collection(), wp.ScopedCapture(self.device) as capture:
+                for _ in range(self.period):
+                    self._step()
+            graph = capture.graph
+            self._captures = (settings, graph)
+        wp.capture_launch(graph)
+        self._done += self.period
+        if self._done * self.substeps % CHECK_EVERY < self.period * self.substeps:
+            self.check()
+        return True
 
     def _change_walls(self) -> None:
         """Follows the obstacles: cells that they cover lose their smoke, cells that they leave get some from beside."""

@@ -2,12 +2,4 @@
 
 from wlm._facade import facade
 
-_PLACES = {
-    "Finding": "wlm.inspection.finding",
-    "input_system": "wlm.inspection.folders",
-    "inspect": "wlm.inspection.folders",
-}
-
-__all__ = sorted(_PLACES)
-
-__getattr__, __dir__ = facade(__name__, _PLACES)
+__getattr__, __dir__, __all__ = facade(__name__, __file__)

@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.lightmap.data import Layer as Layer
 from wlm.lightmap.data import LightmapSet as LightmapSet
 from wlm.lightmap.data import from_arrays as from_arrays

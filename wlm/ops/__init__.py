@@ -18,25 +18,4 @@ for any float type, as the reference for the kernels. The documentation is docs/
 
 from wlm._facade import facade
 
-_PLACES = {
-    "Raster": "wlm.ops.raster",
-    "antialias": "wlm.ops.silhouettes",
-    "bc7_blocks": "wlm.ops.blocks",
-    "bc7_map": "wlm.ops.blocks",
-    "bc7_texels": "wlm.ops.blocks",
-    "funcs": "wlm.ops.funcs",
-    "gaussian_sum": "wlm.ops.gaussians",
-    "interpolate": "wlm.ops.raster",
-    "march": "wlm.ops.marching",
-    "mlp": "wlm.ops.networks",
-    "plane": "wlm.ops.sampling",
-    "rasterize": "wlm.ops.raster",
-    "rasterize_uv": "wlm.ops.raster",
-    "texture": "wlm.ops.raster",
-    "triplane": "wlm.ops.sampling",
-    "volume": "wlm.ops.sampling",
-}
-
-__all__ = sorted(_PLACES)
-
-__getattr__, __dir__ = facade(__name__, _PLACES)
+__getattr__, __dir__, __all__ = facade(__name__, __file__)

@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.ops import funcs as funcs
 from wlm.ops.blocks import bc7_blocks as bc7_blocks
 from wlm.ops.blocks import bc7_map as bc7_map

@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.probe.data import ProbeSet as ProbeSet
 from wlm.probe.data import from_arrays as from_arrays
 from wlm.probe.data import load as load

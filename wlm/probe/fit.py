@@ -3,10 +3,10 @@
 import hashlib
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from wlm.probe.selection import Candidates
 from wlm.system import Meter, OnProgress
 
 _MOST_LATENT, _MOST_HIDDEN = 32, 128  # of a fit of several hours
+_AT_ONCE = {"cpu": 1, "cuda": 4}  # regions trained together: one alone leaves parts of a GPU idle
 _BATCHES = 1_000_000  # numbers in the checkpoint for the regions of a fit; those below are of fits without regions
 _FINISHED = {
     "packed": Part(np.uint8, (None,)),
@@ -90,7 +91,7 @@ def compress(
     have less error in no more GPU memory, which is the case for a few hundred probes; `ProbeModel.choice` says why.
     With `target` the result is the smallest model found that reaches it, after up to seven fits; with `max_bytes` the
     one with the least error within them.
-    More live probes than the setting `region` are fitted in regions, one after another, by Gaussians unless the profile
+    More live probes than the setting `region` are fitted in regions, a few at once, by Gaussians unless the profile
     asks for principal components. Dead probes take no part in the fit: the model stores one bit per probe if any
     probe is dead.
 
@@ -181,100 +182,121 @@ def _fit_regions(
     checkpoint; `options` are those of `_fit_gaussians`."""
     hours, live = max(len(probes.times), 1), probes.live
     profile = profile.model_copy(update={"method": "gaussians"})
-    fit = partial(_fit_gaussians, meter=Meter(progress, "fit", profile.steps * tree.count), **options)
+    meter = Meter(progress, "fit", profile.steps * tree.count)
+    fit = partial(_fit_gaussians, meter=meter, checkpoint=checkpoint, **options)
     if tree.count == 1:
-        return fit(make, probes, profile, checkpoint=checkpoint, batch=number, before=0, pixels=pixels)
+        return fit([_Job(make, probes, profile, number, pixels)], 0)[0]
     position = probes.position[live]
     owner = tree.regions_of(position)
     # All regions together have as many Gaussians as one fit would have.
     share = np.cumsum(np.bincount(owner)) / len(owner) * gaussian_count(profile.ratio, len(owner))
     wanted = np.maximum(np.diff(np.rint(share), prepend=0.0), 1.0)
-    packed, boxes, counts = [], np.zeros((tree.count, 7)), np.zeros((tree.count, 2), np.int32)
-    for region in range(tree.count):
-        batch = (number + 1) * _BATCHES + region
-        kept = checkpoint and checkpoint.finished(batch, _FINISHED)
-        if not kept:
+    results: dict[int, Mapping[str, np.ndarray]] = {}
+    batches = (number + 1) * _BATCHES
+    at_once = _AT_ONCE["cpu" if options["device"] == "cpu" or pixels is not None else "cuda"]
+    for first in range(0, tree.count, at_once):
+        jobs = []
+        for region in range(first, min(first + at_once, tree.count)):
+            if kept := checkpoint and checkpoint.finished(batches + region, _FINISHED):
+                results[region] = kept
+                continue
             own = position[owner == region]
             # The spacing of as many probes in a cube; on surfaces it is several times that of the probes.
             margin = np.ptp(own, axis=0).max() / np.cbrt(len(own))
-            near = ((position >= own.min(0) - margin) & (position <= own.max(0) + margin)).all(1)
+            near = np.arange(len(position))
+            for column, low, high in zip(position.T, own.min(0) - margin, own.max(0) + margin, strict=True):
+                near = near[(column[near] >= low) & (column[near] <= high)]
             chosen = np.flatnonzero(live)[near]
             part = {"position": probes.position[chosen], "live": np.ones(len(chosen), bool), "normal": None}
             near_set = replace(probes, values=probes.values[chosen], **part)
             sized = profile.model_copy(update={"ratio": min(wanted[region] / len(chosen), 1.0)})
             bare = {"probes": len(chosen), "dead": np.zeros(0, bool), "positions": np.zeros((0, 3), np.uint16)}
             of_region = partial(make, **bare, **box_of(near_set.position))
-            seen = None if pixels is None else pixels.of(np.flatnonzero(near))
-            place = {"batch": batch, "before": profile.steps * region}
-            model = fit(of_region, near_set, sized, checkpoint=checkpoint, pixels=seen, **place)
+            seen = None if pixels is None else pixels.of(near)
+            jobs.append(_Job(of_region, near_set, sized, batches + region, seen))
+        for job, model in zip(jobs, fit(jobs, profile.steps * len(results)) if jobs else [], strict=True):
             count = np.array([model.content.settings()[name] for name in ("count", "dropped")], np.int32)
-            kept = {"packed": np.frombuffer(pack(model), np.uint8), "box": box_row(model), "count": count}
+            result = {"packed": np.frombuffer(pack(model), np.uint8), "box": box_row(model), "count": count}
+            results[job.batch - batches] = result
             if checkpoint is not None:
-                checkpoint.add_finished(batch, kept)
-        packed.append(kept["packed"].tobytes())
-        boxes[region], counts[region] = kept["box"], kept["count"]
+                checkpoint.add_finished(job.batch, result)
+    ordered = [results[region] for region in range(tree.count)]
+    boxes, counts = (np.stack([result[name] for result in ordered]) for name in ("box", "count"))
+    packed = [result["packed"].tobytes() for result in ordered]
     content = Regions(tree, boxes, counts, profile, probes.outputs, hours, packed, probes.name)
     choice = f"Gaussians, in {tree.count} regions of at most {profile.region:,} live probes"
     return make(profile=profile, content=content, choice=choice)
 
 
+class _Job(NamedTuple):
+    """A fit of Gaussians: what makes its model, its set and profile, its number in the checkpoint, and pixels."""
+
+    make: Callable[..., ProbeModel]
+    probes: ProbeSet
+    profile: Profile
+    batch: int
+    pixels: Pixels | None
+
+
 def _fit_gaussians(
-    make: Callable[..., ProbeModel],
-    probes: ProbeSet,
-    profile: Profile,
-    *,
-    seed: int,
-    device: str,
-    meter: Meter,
-    checkpoint: Checkpoint | None,
-    batch: int,
-    before: int,
-    pixels: Pixels | None,
-) -> ProbeModel:
-    """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3). `batch` is the fit's number in
-    the checkpoint; `meter` counts the steps from `before` on."""
-    hours, box = max(len(probes.times), 1), box_of(probes.position)
-    relative = hours * (profile.error == "relative")
-    check_outputs(probes.name, profile.latent, profile.hidden, hours * probes.outputs, relative, device)
-    position, values = probes.position[probes.live], probes.values[probes.live]
-    x = ((position - box["origin"]) / box["extent"]).astype(np.float32)
-    trainer = Trainer(x, values, profile, seed, device, hours, pixels)
+    jobs: list[_Job], before: int, *, seed: int, device: str, meter: Meter, checkpoint: Checkpoint | None
+) -> list[ProbeModel]:
+    """Trains and quantises Gaussians (gaussian-probe-compression, sections 3.2 and 3.3), of several sets at once.
+    `meter` counts the steps from `before` on."""
+    trainers: list[Trainer] = []
     try:
-        if checkpoint is not None:
-            checkpoint.restore(batch, trainer.load)
-        _train(trainer, probes, meter, before, checkpoint, batch)
-        trainer.finish()
-        mse = trainer.mse()
-        content = trainer.quantised()
+        for _, probes, profile, batch, pixels in jobs:
+            hours, box = max(len(probes.times), 1), box_of(probes.position)
+            relative = hours * (profile.error == "relative")
+            check_outputs(probes.name, profile.latent, profile.hidden, hours * probes.outputs, relative, device)
+            x = ((probes.position[probes.live] - box["origin"]) / box["extent"]).astype(np.float32)
+            trainers.append(Trainer(x, probes.values[probes.live], profile, seed, device, hours, pixels))
+            if checkpoint is not None:
+                checkpoint.restore(batch, trainers[-1].load)
+                if trainers[-1].step != (done := trainers[0].step):
+                    raise checkpoint.wrong(batch, ValueError(f"part control: expected {done} steps, as its peers have"))
+        trainers[0].peers = trainers[1:]
+        _train(trainers, jobs, meter, before, checkpoint)
+        models = []
+        for (make, probes, profile, _, pixels), trainer in zip(jobs, trainers, strict=True):
+            trainer.finish()
+            mse, content = trainer.mse(), trainer.quantised()
+            if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
+                told = f"the fit diverged; use smaller learning rates than profile {profile.name}"
+                raise WlmError(f"{probes.name}: {told}")
+            fitted = make(profile=profile, content=content, choice="Gaussians, as the profile asks")
+            lit = probes.position[probes.live], probes.values[probes.live]
+            models.append(pack_model(fitted, *lit, device, pixels is not None))
+        return models
     finally:
-        trainer.close()
-    if not (math.isfinite(mse) and np.isfinite(content.bounds).all() and np.isfinite(content.net).all()):
-        raise WlmError(f"{probes.name}: the fit diverged; use smaller learning rates than profile {profile.name}")
-    fitted = make(profile=profile, content=content, choice="Gaussians, as the profile asks")
-    return pack_model(fitted, position, values, device, pixels is not None)
+        for trainer in trainers:
+            trainer.close()
 
 
-def _train(
-    trainer: Trainer, probes: ProbeSet, meter: Meter, before: int, checkpoint: Checkpoint | None, batch: int
-) -> None:
-    steps, chunk = trainer.steps, _CHUNK["cpu" if trainer.device == "cpu" else "cuda"]
+def _train(trainers: list[Trainer], jobs: list[_Job], meter: Meter, before: int, checkpoint: Checkpoint | None) -> None:
+    first, probes = trainers[0], jobs[0].probes
+    steps, chunk = first.steps, _CHUNK["cpu" if first.device == "cpu" else "cuda"]
     peak, live = float(np.ptp(probes.values)), probes.live.mean()  # dead probes decode exactly, and count
 
     def figures() -> dict[str, float]:
-        error = trainer.mse()
-        if trainer.relative:
+        error = first.mse()
+        if first.relative:
             return {"error": math.sqrt(error * (probes.outputs + 1))}
         return {"PSNR_dB": psnr_from_mse(error * live, peak)}
 
-    for start in range(trainer.step, steps, chunk):
+    def save() -> None:
+        if checkpoint is not None:
+            checkpoint.save({job.batch: trainer.state() for job, trainer in zip(jobs, trainers, strict=True)})
+
+    for start in range(first.step, steps, chunk):
         step = min(start + chunk, steps)
-        trainer.run(step - start)
-        if meter.due(before + step):
+        first.run(step - start)
+        done = before + step * len(jobs)
+        if meter.due(done):
             try:
-                meter.report(before + step, **figures())
+                meter.report(done, **figures())
             except KeyboardInterrupt:
-                if checkpoint is not None:
-                    checkpoint.save({batch: trainer.state()})
+                save()
                 raise
         if checkpoint is not None and checkpoint.due():
-            checkpoint.save({batch: trainer.state()})
+            save()

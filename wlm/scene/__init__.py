@@ -2,16 +2,4 @@
 
 from wlm._facade import facade
 
-_PLACES = {
-    "Frame": "wlm.scene.frame",
-    "Mesh": "wlm.scene.mesh",
-    "Moving": "wlm.scene.content",
-    "Puff": "wlm.scene.content",
-    "Renderer": "wlm.scene.frame",
-    "Scene": "wlm.scene.content",
-    "load": "wlm.scene.content",
-}
-
-__all__ = sorted(_PLACES)
-
-__getattr__, __dir__ = facade(__name__, _PLACES)
+__getattr__, __dir__, __all__ = facade(__name__, __file__)

@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.scene.content import Moving as Moving
 from wlm.scene.content import Puff as Puff
 from wlm.scene.content import Scene as Scene

@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.fluid.volume import DensityVolume as DensityVolume
 from wlm.smoke.camera import Camera as Camera
 from wlm.smoke.data import load as load

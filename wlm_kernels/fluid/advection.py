@@ -56,6 +56,7 @@ from wlm_kernels.fluid.advection_places import (
     line_along_x,
     lowest_cell,
     pair,
+    place_at,
     share_of,
     side_of,
     stencil,
@@ -69,10 +70,10 @@ from wlm_kernels.fluid.lattice_sets import cell_of, index_of
 _OPTIONS = {"enable_backward": False, "max_unroll": 4}
 
 # Threads per block, and blocks per multiprocessor: fewer blocks, with more registers, are slower.
-_BOUNDS = (256, 4)
+_BOUNDS, _BRICK_BOUNDS = (256, 4), (256, 3)
 
 # Cells along x that one thread computes, so that cells between the same eight velocities read them once.
-_RUN, _BRICK_RUN = 16, 2
+_RUN, _BRICK_RUN = 16, BRICK
 
 # Threads of a block along y and z: neighbours share most of their reads.
 _TILE = 16
@@ -189,11 +190,18 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         out = Corners()
         out.f = f
         if wp.static(in_bricks):
+            # Brick and cell in the brick along each axis, of the lower and of the upper cells.
+            brick_x = wp.vec2i(x >> 3, (x + along[0]) >> 3) * (box.bricks[1] * box.bricks[2])
+            brick_y = wp.vec2i(y >> 3, (y + along[1]) >> 3) * box.bricks[2]
+            brick_z = wp.vec2i(z >> 3, (z + along[2]) >> 3)
+            cell_x = wp.vec2i((x & 7) << 6, ((x + along[0]) & 7) << 6)
+            cell_y = wp.vec2i((y & 7) << 3, ((y + along[1]) & 7) << 3)
+            cell_z = wp.vec2i(z & 7, (z + along[2]) & 7)
             for k in range(4):
-                row = wp.vec3i(x + (k // 2) * along[0], y + (k % 2) * along[1], z)
-                out.low[k] = stored_index(box, bricks, row)
-                row[2] += along[2]
-                out.high[k] = stored_index(box, bricks, row)
+                b = brick_x[k // 2] + brick_y[k % 2]
+                c = cell_x[k // 2] + cell_y[k % 2]
+                out.low[k] = (place_at(bricks.places, b + brick_z[0]) << 9) + c + cell_z[0]
+                out.high[k] = (place_at(bricks.places, b + brick_z[1]) << 9) + c + cell_z[1]
         else:
             i = (x * box.n[1] + y) * box.n[2] + z
             j = i + along[0] * box.n[1] * box.n[2]
@@ -325,8 +333,11 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 smoke = value_at(predicted.density, i)
                 if wp.static(hot):
                     heat = value_at(predicted.temperature, i)
-                q, left_q, beside_q = departure_point(box, u, walls, around, start.f, x, v, -dt, wall)
-                if not (left or left_q or beside or beside_q):
+                uncorrected = left or beside
+                if not uncorrected:
+                    q, left_q, beside_q = departure_point(box, u, walls, around, start.f, x, v, -dt, wall)
+                    uncorrected = left_q or beside_q
+                if not uncorrected:
                     to = corners_around(box, bricks, q)
                     low, high = extremes(fields.density, at)
                     smoke = corrected(fields.density, predicted.density, i, to, low, high)
@@ -368,8 +379,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])
-            within = cell_of(wp.vec3i(wp.static(BRICK // run), BRICK, BRICK), r)
-            return BRICK * b + wp.vec3i(wp.static(run) * within[0], within[1], within[2])
+            return BRICK * b + wp.vec3i(0, r // BRICK, r % BRICK)
         tile = cell_of(
             wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE), i // (_TILE * _TILE)
         )
@@ -474,7 +484,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                     most = wp.max(most, write(at_cell, any_smoke, any_heat, decay, out))
         return most
 
-    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BOUNDS)
+    @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BRICK_BOUNDS if in_bricks else _BOUNDS)
     def carry(
         # in:
         box: Box,

@@ -31,7 +31,7 @@ REACH = 0.25
 still be extrapolated from them: reading the next eight, which are mostly the same, would double the time."""
 
 FREE, _BESIDE, SOLID = wp.constant(wp.uint8(0)), wp.constant(wp.uint8(1)), wp.constant(wp.uint8(2))
-_OPEN, _CELLS = wp.constant(OPEN), wp.constant(CELLS)
+_OPEN = wp.constant(OPEN)
 _HALVINGS = wp.constant(6)
 _REACH = wp.constant(REACH)
 # Groups of threads that share the list of bricks; enough to fill any GPU.
@@ -72,7 +72,8 @@ class Bricks:
         rings: Distance in bricks by which smoke may move beyond a busy brick in a step.
         workers: Groups of threads that share the listed bricks; 0: there are no bricks, all cells are stored.
         threshold: Largest value of a brick that counts as empty.
-        busy: int [B], 1 where a value above the threshold has been written since the last `store`.
+        busy: int [B], 1 where a value above the threshold has been written since the last `store`, else 0; between
+            `relist` and `store` plus 2 in bricks that are listed.
         places: int [B], the place of each listed brick in the pool; 0 for all others.
         listed: int [B], its first `counts[0]` elements are the indices of the listed bricks, in any order.
         fresh: int [B], its first `counts[1]` elements are the listed bricks that have no place yet.
@@ -166,11 +167,20 @@ def stencil(n: wp.vec3i, periodic: wp.vec3i, p: wp.vec3) -> Stencil:
     return out
 
 
+# Addresses from Warp's 64-bit strides would take twice as long.
+@wp.func_native("return places.data[b];")
+def place_at(places: wp.array1d[int], b: int) -> int: ...
+
+
+@wp.func_native("return walls.data[i];")
+def _wall(walls: wp.array1d[wp.uint8], i: int) -> wp.uint8: ...
+
+
 @wp.func
 def stored_index(box: Box, bricks: Bricks, cell: wp.vec3i) -> int:
     """Returns the index of a cell in a pool, or of one of the empty brick if the cell is not stored."""
     b = index_of(box.bricks, wp.vec3i(cell[0] >> 3, cell[1] >> 3, cell[2] >> 3))
-    return bricks.places[b] * _CELLS + ((cell[0] & 7) << 6) + ((cell[1] & 7) << 3) + (cell[2] & 7)
+    return (place_at(bricks.places, b) << 9) + ((cell[0] & 7) << 6) + ((cell[1] & 7) << 3) + (cell[2] & 7)
 
 
 @wp.func
@@ -295,7 +305,7 @@ def wall_at(box: Box, walls: wp.array1d[wp.uint8], p: wp.vec3) -> wp.uint8:
     x = wp.clamp(int(p[0] * box.voxel), 0, box.coarse[0] - 1)
     y = wp.clamp(int(p[1] * box.voxel), 0, box.coarse[1] - 1)
     z = wp.clamp(int(p[2] * box.voxel), 0, box.coarse[2] - 1)
-    return walls[(x * box.coarse[1] + y) * box.coarse[2] + z]
+    return _wall(walls, (x * box.coarse[1] + y) * box.coarse[2] + z)
 
 
 @wp.func
@@ -303,10 +313,11 @@ def is_solid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
     """Tests whether a fine cell is solid; false if `walls` is empty."""
     if walls.shape[0] == 0:
         return False
-    x = cell[0] // box.refinement
-    y = cell[1] // box.refinement
-    z = cell[2] // box.refinement
-    return walls[(x * box.coarse[1] + y) * box.coarse[2] + z] == SOLID
+    # Divisions of integers would take several times as long.
+    x = int((float(cell[0]) + 0.5) * box.voxel)
+    y = int((float(cell[1]) + 0.5) * box.voxel)
+    z = int((float(cell[2]) + 0.5) * box.voxel)
+    return _wall(walls, (x * box.coarse[1] + y) * box.coarse[2] + z) == SOLID
 
 
 @wp.func
@@ -411,15 +422,16 @@ def make_bricks(box: Box, rings: int, threshold: float, device: str) -> Bricks:
 
 
 @wp.kernel
-def _list(
+def _spread(
     # in:
     box: Box,
     # in, out:
     bricks: Bricks,
 ):
     b = wp.tid()
+    if bricks.busy[b] % 2 == 0:
+        return
     at = cell_of(box.bricks, b)
-    needed = int(0)
     # Nested loops need no division.
     for dx in range(-bricks.rings, bricks.rings + 1):
         for dy in range(-bricks.rings, bricks.rings + 1):
@@ -431,9 +443,19 @@ def _list(
                         near[a] = (near[a] % box.bricks[a] + box.bricks[a]) % box.bricks[a]
                     exists = exists and near[a] >= 0 and near[a] < box.bricks[a]
                 if exists:
-                    needed = wp.max(needed, bricks.busy[index_of(box.bricks, near)])
+                    # Threads only ever add 2, so that they need not wait for each other.
+                    i = index_of(box.bricks, near)
+                    bricks.busy[i] = bricks.busy[i] | 2
+
+
+@wp.kernel
+def _list(
+    # in, out:
+    bricks: Bricks,
+):
+    b = wp.tid()
     place = bricks.places[b]
-    if needed != 0:
+    if bricks.busy[b] != 0:
         bricks.listed[wp.atomic_add(bricks.counts, 0, 1)] = b
         if place == 0:
             bricks.fresh[wp.atomic_add(bricks.counts, 1, 1)] = b
@@ -446,7 +468,8 @@ def relist(box: Box, bricks: Bricks) -> None:
     """Lists the bricks to compute in the next step, and frees the places of the others. `store` must follow, with at
     least `counts[0]` places beside the empty brick in the pool."""
     bricks.counts.zero_()
-    wp.launch(_list, bricks.busy.shape, inputs=[box, bricks], device=bricks.busy.device)
+    wp.launch(_spread, bricks.busy.shape, inputs=[box, bricks], device=bricks.busy.device)
+    wp.launch(_list, bricks.busy.shape, inputs=[bricks], device=bricks.busy.device)
 
 
 @wp.kernel
@@ -457,8 +480,9 @@ def _settle(
     bricks: Bricks,
 ):
     b = wp.tid()
-    if clear:
-        bricks.busy[b] = 0
+    busy = bricks.busy[b]
+    if busy != 0:
+        bricks.busy[b] = wp.where(clear, 0, busy % 2)
     if b == 0:
         # The places of fresh bricks were at the top of the stack.
         bricks.depth[0] -= bricks.counts[1]

@@ -23,6 +23,7 @@ MOST_PAIRS = 2**30 - 1
 # Finer cubes make shorter sums, and lists that take longer to build. Cubes of a quarter of the reach sum 1.2 to 1.6
 # times as fast as cubes of the whole reach.
 _FIRST_SIZE = 0.25  # of the median reach
+_COARSER = 1.25  # factor of the size until there are few enough cubes and pairs
 _CUBES_EACH = 8  # cubes per Gaussian
 _PAIRS_EACH = 256  # pairs per Gaussian
 _FEW = 4096  # cubes and pairs that are always allowed
@@ -279,8 +280,8 @@ def build(shapes, low, high, size: float | None = None) -> Cubes:
         low, high: Lowest and highest corner of the box that contains the points, three numbers each; the box may be
             flat along any axis.
         size: Edge of a cube, positive, in the unit of the points. None: a quarter of the median reach of the Gaussians
-            along their widest axis, doubled until there are at most 8 K + 4,096 cubes and 256 K + 4,096 pairs of a
-            cube and a Gaussian to test.
+            along their widest axis, times 1.25 until there are at most 8 K + 4,096 cubes and 256 K + 4,096 pairs of
+            a cube and a Gaussian to test.
 
     Returns:
         The grid with its lists, on the shapes' device.
@@ -362,6 +363,6 @@ def _chosen_grid(shapes, corners: np.ndarray) -> Cubes:
     while math.prod(cubes.counts) > 1 and (
         math.prod(cubes.counts) > _FEW + _CUBES_EACH * count or _tested(shapes, cubes) > _FEW + _PAIRS_EACH * count
     ):
-        size *= 2.0
+        size *= _COARSER
         cubes = _grid(corners, size)
     return cubes

@@ -5,10 +5,13 @@ regions of its points one after another, so points are best sorted by region.
 
 On CUDA a block of 128 threads decodes 32 points after another: four threads share the Gaussians that a point's cube
 lists, and the network of 16 points is evaluated together on the matrix units (`native/decode.cuh`), from arrays that
-`DecodeKernels.pack` arranges. On the CPU a thread decodes one point. The reference is `benchmarks/probe_exact.py`.
+`DecodeKernels.pack` arranges. Of very many points it decodes up to 128, so that a warp loads the same Gaussians for all
+of its points where these are sorted by cube. On the CPU a thread decodes one point. The reference is
+`benchmarks/probe_exact.py`.
 """
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +25,8 @@ from wlm_kernels.probe.network import cpu_network
 
 _THREADS = 128
 _POINTS = 32  # of a block of threads on CUDA
+_MANY = (128, 64)  # of a block that has turns: the most whose inputs fit in shared memory beside the network
+_SHARED, _KEPT = 46 * 1024, 8192  # bytes of shared memory, and most words of a network that a block keeps there
 _BLOCKS = 1056  # most blocks of a launch, which take turns
 
 
@@ -48,8 +53,7 @@ class DecodeKernels:
 
     device_kind: str
     words: int
-    _kernel: Any
-    _regional: Any
+    _kernels: Mapping[int, tuple[Any, Any]]  # by the points of a block: for one model, and for regions
     _pack: Any
 
     def pack(self, rows, shapes, net):
@@ -95,8 +99,7 @@ class DecodeKernels:
             x: vec3 [M], the points in normalised coordinates.
             out: float [M, D], the light at the points, written.
         """
-        inputs = [rows, shapes, cubes, cut, net, gain, x]
-        wp.launch(self._kernel, self._dims(x), inputs=inputs, outputs=[out], device=x.device, block_dim=_THREADS)
+        self._launch(0, x, [rows, shapes, cubes, cut, net, gain, x], [out])
 
     def launch_regions(self, table, region, cut, x, asked, out) -> None:
         """Decodes the light at M points in several of R regions.
@@ -109,12 +112,14 @@ class DecodeKernels:
             asked: int [R], set to 1 for each region that has a point.
             out: float [M, D], the light at the points, written.
         """
-        inputs, outputs = [table, region, cut, x], [asked, out]
-        wp.launch(self._regional, self._dims(x), inputs=inputs, outputs=outputs, device=x.device, block_dim=_THREADS)
+        self._launch(1, x, [table, region, cut, x], [asked, out])
 
-    def _dims(self, x) -> tuple[int, ...]:
-        blocks = min(-(-x.shape[0] // _POINTS), _BLOCKS)
-        return (blocks, _THREADS) if self.device_kind == "cuda" else x.shape
+    def _launch(self, kind: int, x, inputs: list, outputs: list) -> None:
+        points = (min if x.shape[0] <= _BLOCKS * _POINTS else max)(self._kernels)
+        blocks = min(-(-x.shape[0] // points), _BLOCKS)
+        dims = (blocks, _THREADS) if self.device_kind == "cuda" else x.shape
+        kernel = self._kernels[points][kind]
+        wp.launch(kernel, dims, inputs=inputs, outputs=outputs, device=x.device, block_dim=_THREADS)
 
 
 @functools.cache
@@ -133,10 +138,15 @@ def decode_kernels(
     """
     columns = outputs + relative
     if device_kind == "cpu":
-        return DecodeKernels(device_kind, 0, *_cpu_kernels(latent, hidden, columns, outputs, ambient), None)
+        kernels = {_POINTS: _cpu_kernels(latent, hidden, columns, outputs, ambient)}
+        return DecodeKernels(device_kind, 0, kernels, None)
     sizes = {"L": latent, "H": hidden, "D": columns, "OUT": outputs, "AMBIENT": ambient}
     layout = native_source(__package__, "decode_layout", **sizes)
-    return DecodeKernels(device_kind, _words(latent, hidden, columns), *_cuda_kernels(layout), _pack_kernel(layout))
+    words = _words(latent, hidden, columns)
+    kept, row = 4 * words if words <= _KEPT else 0, 64 * -(-(latent + 3) // 16) + 32
+    many = next((points for points in _MANY if kept + points * row <= _SHARED), _POINTS)
+    kernels = {points: _cuda_kernels(layout, points) for points in {_POINTS, many}}
+    return DecodeKernels(device_kind, words, kernels, _pack_kernel(layout))
 
 
 def _cpu_kernels(latent: int, hidden: int, columns: int, outputs: int, ambient: int) -> tuple[Any, Any]:
@@ -217,9 +227,10 @@ def _cpu_kernels(latent: int, hidden: int, columns: int, outputs: int, ambient: 
     return decode, regional
 
 
-def _cuda_kernels(layout: str) -> tuple[Any, Any]:
-    code = layout + native_source(__package__, "decode", T=_THREADS, P=_POINTS)
-    options, share = {"enable_backward": False}, _THREADS // _POINTS
+def _cuda_kernels(layout: str, points: int) -> tuple[Any, Any]:
+    """Builds the kernels of which a block decodes so many points after another, of one model and of regions."""
+    code = layout + native_source(__package__, "decode", T=_THREADS, P=points, MOST_KEPT=_KEPT)
+    options, share = {"enable_backward": False}, _THREADS // points
 
     @wp.func_native(native_source("wlm_kernels", "matrix_units") + code)
     def decode_block(
@@ -240,10 +251,11 @@ def _cuda_kernels(layout: str) -> tuple[Any, Any]:
         out: wp.array2d[float],
     ): ...
 
-    # A warp has a thread for each point of a block.
-    @wp.func_native("""
-    const int i = first + threadIdx.x % 32, r = i < region.shape[0] ? region.data[i] : -1;
-    return __reduce_min_sync(~0u, r > after ? r : 1 << 30);
+    @wp.func_native(f"""
+    int lowest = 1 << 30;
+    for (int i = first + threadIdx.x % 32; i < min(first + {points}, region.shape[0]); i += 32)
+        if (region.data[i] > after) lowest = min(lowest, region.data[i]);
+    return __reduce_min_sync(~0u, lowest);
     """)
     def next_region(region: wp.array1d[int], first: int, after: int) -> int:
         """Returns the lowest region above `after` among the points of a block; a large number if there is none."""
@@ -264,9 +276,9 @@ def _cuda_kernels(layout: str) -> tuple[Any, Any]:
         block, t = wp.tid()
         fresh = int(1)
         count = x.shape[0]
-        while block * wp.static(_POINTS) < count:
+        while block * wp.static(points) < count:
             # Threads past the end repeat the last point, since all threads of a block must synchronise.
-            at = x[wp.min(block * wp.static(_POINTS) + t // share, count - 1)]
+            at = x[wp.min(block * wp.static(points) + t // share, count - 1)]
             cube = cube_of(cubes, at)
             begin = cubes.start[cube]
             end = cubes.start[cube + 1]
@@ -289,13 +301,13 @@ def _cuda_kernels(layout: str) -> tuple[Any, Any]:
         block, t = wp.tid()
         count = x.shape[0]
         # A block decodes neighbouring points, most of which are in the region whose network it has.
-        pieces = (count + wp.static(_POINTS - 1)) // wp.static(_POINTS)
+        pieces = (count + wp.static(points - 1)) // wp.static(points)
         blocks = wp.min(pieces, _BLOCKS)
         piece = block * (pieces // blocks) + wp.min(block, pieces % blocks)
         end = (block + 1) * (pieces // blocks) + wp.min(block + 1, pieces % blocks)
         kept = int(-1)
         while piece < end:
-            first = piece * wp.static(_POINTS)
+            first = piece * wp.static(points)
             i = wp.min(first + t // share, count - 1)
             r = next_region(region, first, -1)
             while r < table.shape[0]:

@@ -8,7 +8,7 @@ import warp as wp
 from wlm.probe.decode import Decoder
 from wlm.probe.gaussian.model import CUT, Gaussians, check_outputs
 from wlm.probe.model import ProbeModel, check_points
-from wlm.probe.morton import morton_order
+from wlm.probe.morton import morton_keys, morton_order
 from wlm.probe.sphere import ambient_numbers
 from wlm.probe.volume.light import Light
 from wlm_kernels.probe import cubes as probe_cubes
@@ -21,19 +21,20 @@ class Points:
     """Points on a device, in the order in which decoding them is fastest.
 
     Attributes:
-        x: vec3 [M], the points relative to the probes' box, sorted along a Z-curve (Morton order).
-        region: int [M], region of each point, by which they are sorted first; [0] for a model without regions.
+        x: vec3 [M], the points relative to the probes' box, sorted by region, then by cube, whose list neighbouring
+            threads share, then along a Z-curve (Morton order).
+        region: int [M], region of each point; [0] for a model without regions.
         order: int [M], index in the input of each point of `x`.
         out: float [M, D], written by the decoder's `run`.
     """
 
-    def __init__(self, x: np.ndarray, outputs: int, device: str, region: np.ndarray | None = None) -> None:
-        self.order = morton_order(x)
-        region = np.zeros(0, np.int32) if region is None else region
-        if len(region):
-            self.order = self.order[np.argsort(region[self.order], kind="stable")]
-            region = region[self.order]
-        self.x, self.region = wp.array(x[self.order], dtype=wp.vec3, device=device), wp.array(region, device=device)
+    def __init__(
+        self, x: np.ndarray, cube: np.ndarray, outputs: int, device: str, region: np.ndarray | None = None
+    ) -> None:
+        order = morton_order(x)
+        self.order = order = order[np.lexsort([each[order] for each in (cube, region) if each is not None])]
+        region = np.zeros(0, np.int32) if region is None else region[order]
+        self.x, self.region = wp.array(x[order], dtype=wp.vec3, device=device), wp.array(region, device=device)
         self.out = wp.zeros((len(x), outputs), dtype=float, device=device)
 
     def values(self) -> np.ndarray:
@@ -109,8 +110,14 @@ class GaussianDecoder(PointDecoder):
         made.gain = self._gain
         return made
 
+    def cubes_of(self, x: np.ndarray) -> np.ndarray:
+        """Returns keys of the cubes of points, [M, 3] relative to the probes' box, along a Z-curve, uint64 [M]."""
+        cell = np.clip(x / self._cubes.size, 0, np.array(list(self._cubes.counts)) - 1)
+        return morton_keys(cell.astype(np.int64))
+
     def points(self, position: np.ndarray) -> Points:
-        return Points(self.model.normalise(check_points(position)), self.model.outputs, self.device)
+        x = self.model.normalise(check_points(position))
+        return Points(x, self.cubes_of(x), self.model.outputs, self.device)
 
     def run(self, points: Points) -> None:
         self.launch(points.x, points.out)

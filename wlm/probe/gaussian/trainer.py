@@ -68,6 +68,7 @@ class Trainer:
         count: K, number of Gaussians.
         needed: bool [K], false where a Gaussian is dropped; all true before the last stage.
         dropped_change: Largest change of a number of a probe that results from dropping Gaussians.
+        peers: Other fits of as many steps, which take their steps with this one; on CUDA they overlap.
     """
 
     def __init__(
@@ -124,8 +125,9 @@ class Trainer:
         self._optimiser.adan = int(profile.optimiser == "adan")
         self.needed = np.ones(self.count, bool)
         self.dropped_change = 0.0
+        self.peers: list[Trainer] = []
         self._pool = None if self._cuda else ThreadPoolExecutor(CPU_LANES)
-        stages = [partial(self._step, stage, pictured) for pictured in (False, True) for stage in range(3)]
+        stages = [partial(self._step_all, stage, pictured) for pictured in (False, True) for stage in range(3)]
         self._stages = [interop.StepGraph(step, device, warmup=1) for step in stages]
         self._entered = 0
         # Loaded before two threads launch kernels, since two threads must not load a module at once.
@@ -205,7 +207,8 @@ class Trainer:
             for step in range(first, first + steps):
                 stage = self.stage(step)
                 while self._entered < stage:
-                    self._enter(self._entered + 1)
+                    for each in (self, *self.peers):
+                        each._enter(each._entered + 1)
                 pictured = self._pictures is not None and step >= round(_PICTURES_FROM * self.steps)
                 self._stages[stage + 3 * pictured]()
 
@@ -230,6 +233,9 @@ class Trainer:
         sphere, used = int(self._support == "sphere"), (a["used"], self._shapes)
         self._step_kernels.shapes(a["rows"], a["bounds"], int(quantised), self._levels, CUT, sphere, *used)
         probe_step.touch(self._groups, self._shapes, self._by_group, self._by_gaussian)
+
+    def _step_all(self, stage: int, pictured: bool) -> None:
+        interop.fork(self.device, [partial(each._step, stage, pictured) for each in (self, *self.peers)])
 
     def _step(self, stage: int, pictured: bool) -> None:
         a, t = self._arrays, self._tensors
@@ -412,7 +418,7 @@ class Trainer:
 
     def close(self) -> None:
         """Ends the CPU's threads and frees the CUDA graphs, which hold references to the trainer."""
-        self._stages = []
+        self._stages, self.peers = [], []
         if self._pool is not None:
             self._pool.shutdown()
 

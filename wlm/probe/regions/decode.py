@@ -104,8 +104,13 @@ class RegionDecoder(PointDecoder):
     def points(self, position: np.ndarray) -> Points:
         """Uploads points and loads their regions; see `PointDecoder.points`."""
         region, x = self._content.place(self._inside(position))
-        self.load(np.unique(region))
-        return Points(x, self.model.outputs, self.device, region)
+        order = np.argsort(region, kind="stable")
+        numbers, first = np.unique(region[order], return_index=True)
+        self.load(numbers)
+        cube = np.zeros(len(x), np.uint64)
+        for number, own in zip(numbers.tolist(), np.split(order, first)[1:], strict=True):
+            cube[own] = self._loaded[number].cubes_of(x[own])
+        return Points(x, cube, self.model.outputs, self.device, region)
 
     def run(self, points: Points) -> None:
         """Decodes uploaded points into `Points.out`: -infinity where others took the place of their region. On CUDA the

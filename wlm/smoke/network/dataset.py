@@ -15,11 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
-from wlm.interop import check_device, no_collection, stream
+from wlm.interop import check_device, stream
 from wlm.smoke.camera import Camera
 from wlm.smoke.march.motion import motion
 from wlm.smoke.march.six_way import bake
@@ -195,33 +194,15 @@ class _Maker:
 
 
 class _Simulation:
-    """Advances a solver, on a GPU by replaying a graph, and switches the scene's sources on and off."""
+    """Advances a solver and switches the scene's sources on and off."""
 
     def __init__(self, scene: Scene, solver: Solver) -> None:
         self._solver, self._period = solver, PERIOD * scene.smoke.substeps
         self._scene, self._done = scene, 0
-        moving = any(obstacle.path.moves for obstacle in solver.obstacles)
-        self._graphs = solver.device.is_cuda and not moving
-        if self._graphs:
-            solver.reserve()
-        self._graph: wp.Graph | None = None
 
     def advance(self, steps: int) -> None:
         """Advances the smoke by `steps` air steps, which must be a multiple of the steps in one CUDA graph."""
         for _ in range(steps // self._period):
-            active = tuple(sources_at(self._scene, self._done * self._scene.step))
-            if active != self._solver.sources:
-                self._solver.sources, self._graph = active, None
-            self._step()
-            self._done += self._period
-
-    def _step(self) -> None:
-        # The first steps load the kernels' modules, which is not allowed during a capture.
-        if not self._graphs or not self._done:
+            self._solver.sources = tuple(sources_at(self._scene, self._done * self._scene.step))
             self._solver.step(PERIOD)
-            return
-        if self._graph is None:
-            with no_collection(), wp.ScopedCapture(self._solver.device) as capture:
-                self._solver.step(PERIOD)
-            self._graph = capture.graph
-        wp.capture_launch(self._graph)
+            self._done += self._period

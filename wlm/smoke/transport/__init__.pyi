@@ -1,4 +1,4 @@
-# Written by python -m wlm._facade from `_PLACES` of the package.
+# The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.smoke.shading import PointLight as PointLight
 from wlm.smoke.shading import sky_lights as sky_lights
 from wlm.smoke.transport.lighting import LitSmoke as LitSmoke

@@ -1,6 +1,6 @@
 // Decodes P points with a block of T threads, or those of them in the region `own` if that is not negative. T / P neighbouring
 // threads share the Gaussians that a point's cube lists (gaussian-probe-compression, eq. 5); then a warp evaluates the network
-// (eq. 7) of 16 points on the matrix units. Behind matrix_units.cuh and decode_layout.cuh; constants and the packed arrays are
+// (eq. 7) of 16 points at a time on the matrix units. Behind matrix_units.cuh and decode_layout.cuh; constants and packed arrays are
 // of wlm_kernels/probe/decode.py, the reference is benchmarks/probe_exact.py. The code is native for the matrix units and for
 // loads of 16 bytes: a thread's Gaussians lie scattered, and loads of single floats would keep the load units busy.
 //
@@ -8,11 +8,11 @@
 // of float32; sums of Gaussians are clamped at the largest half float. Weights of the hidden layers are half floats in every
 // model; those of the last layer, which may be mixed from two hours, are pairs too.
 
-constexpr int SHARE = T / P;
+constexpr int SHARE = T / P, TILES = P / 16;
 constexpr int R = (14 + L + 3) / 4, MOST = KI > KH ? KI : KH;
-constexpr bool KEPT = WORDS <= 8192;
+constexpr bool KEPT = WORDS <= MOST_KEPT;
 __shared__ uint4 kept[KEPT ? WORDS / 4 : 1];
-__shared__ __align__(16) float inputs[P][16 * KI + 8], outputs[P / 16][16][40];
+__shared__ __align__(16) float rows_of[P][16 * KI + 8];  // inputs, then outputs
 const int t = threadIdx.x, share = t % SHARE, point = t / SHARE;
 if (!fresh || own >= 0) __syncthreads();  // a call before still reads what is shared
 if (KEPT && fresh)
@@ -63,13 +63,13 @@ for (int c = 0; c < 16 * KI; ++c) {
     if (c < L)
         #pragma unroll
         for (int step = 1; step < SHARE; step *= 2) sum += __shfl_xor_sync(~0u, sum, step);
-    if (c % SHARE == share) inputs[point][c] = sum;
+    if (c % SHARE == share) rows_of[point][c] = sum;
 }
 asm volatile("cp.async.wait_all;" ::: "memory");
 __syncthreads();
 
 const int warp = t / 32, lane = t % 32, g = lane / 4, q = lane % 4;
-if (warp < P / 16) {
+for (int tile = warp; tile < TILES; tile += T / 32) {
     const uint4* weights = KEPT ? kept : reinterpret_cast<const uint4*>(net.data);
     const float* biases = reinterpret_cast<const float*>(weights + END);
     unsigned high[MOST][4], low[MOST][4];  // left operands, see matrix_units.cuh
@@ -107,22 +107,22 @@ if (warp < P / 16) {
     for (int k = 0; k < KI; ++k)
         #pragma unroll
         for (int piece = 0; piece < 4; ++piece) {
-            const float* row = inputs[16 * warp + g + piece % 2 * 8] + 16 * k + piece / 2 * 8 + 2 * q;
+            const float* row = rows_of[16 * tile + g + piece % 2 * 8] + 16 * k + piece / 2 * 8 + 2 * q;
             split(k, piece, half(row[0]), half(row[1]));
         }
     hidden(KI, weights, biases);
     hidden(KH, weights + SECOND, biases + 16 * KH);
 
     float scale[2] = {gain, gain};
-    for (int start = 0; start < N; start += 4) {
-        float sum[4][4];
+    for (int start = 0; start < N; start += 2) {
+        float sum[2][4];
         #pragma unroll
-        for (int n = 0; n < 4; ++n)
+        for (int n = 0; n < 2; ++n)
             for (int e = 0; e < 4; ++e) sum[n][e] = start + n < N ? biases[32 * KH + 8 * (start + n) + 2 * q + e % 2] : 0.0f;
         #pragma unroll
         for (int k = 0; k < KH; ++k)
             #pragma unroll
-            for (int n = 0; n < 4; ++n)
+            for (int n = 0; n < 2; ++n)
                 if (start + n < N) {
                     const uint4 b = weights[THIRD + (k * N + start + n) * 32 + lane];
                     Units::multiply(sum[n], high[k], b.x, b.y);
@@ -132,14 +132,14 @@ if (warp < P / 16) {
         if (FIRST && start == 0)
             for (int v = 0; v < 2; ++v) scale[v] *= expf(fminf(__shfl_sync(~0u, sum[0][2 * v], lane & ~3), 0.0f));
         #pragma unroll
-        for (int n = 0; n < 4; ++n)
-            for (int e = 0; e < 4; ++e) outputs[warp][g + e / 2 * 8][8 * n + 2 * q + e % 2] = scale[e / 2] * sum[n][e];
+        for (int n = 0; n < 2; ++n)
+            for (int e = 0; e < 4; ++e) rows_of[16 * tile + g + e / 2 * 8][8 * n + 2 * q + e % 2] = scale[e / 2] * sum[n][e];
         __syncwarp();
-        const int from = max(8 * start - FIRST, 0), width = min(8 * start + 32 - FIRST, OUT) - from;
-        const int top = block * P + 16 * warp;
+        const int from = max(8 * start - FIRST, 0), width = min(8 * start + 16 - FIRST, OUT) - from;
+        const int top = block * P + 16 * tile;
         for (int m = lane; m < 16 * width; m += 32) {
             const int p = m / width, c = from + m % width;
-            const float value = outputs[warp][p][c + FIRST - 8 * start];
+            const float value = rows_of[16 * tile + p][c + FIRST - 8 * start];
             if (top + p < points && (own < 0 || region.data[top + p] == own))
                 out.data[size_t(top + p) * OUT + c] = c < AMBIENT ? fmaxf(value, 0.0f) : value;
         }
