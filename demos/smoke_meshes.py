@@ -55,7 +55,7 @@ def rabbit() -> trimesh.Trimesh:
 
 
 def fan() -> trimesh.Trimesh:
-    """A wheel of twisted blades around a hub, of radius 1, whose axis is x; turned about +x it blows towards +x."""
+    """A wheel of twisted blades around a hub, of radius 1, with its axis along x, which throws air outwards."""
     hub = trimesh.creation.cylinder(0.2, 0.36, sections=24)
     hub.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (0, 1, 0)))
     parts = [hub]

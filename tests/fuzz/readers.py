@@ -455,7 +455,9 @@ def _settings(name: str, model: Callable[[], type], files: str, check: Callable[
         paths = sorted(_PROFILES.glob(f"{files}.yaml"))
         if model() is Scene:
             paths = [path for path in paths if not path.name.startswith("smoke-network")]
-        return tuple(path.read_bytes() for path in paths) or corpus(f"{files}.yaml")()
+        # The meshes of scenes stay where they are.
+        texts = (path.read_text().replace("meshes/", f"{_PROFILES}/meshes/") for path in paths)
+        return tuple(text.encode() for text in texts) or corpus(f"{files}.yaml")()
 
     def read(path: Path) -> None:
         settings = load_settings(model(), path)
