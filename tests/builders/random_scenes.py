@@ -77,6 +77,12 @@ def random_scene(seed: int) -> dict:
         air["confinement"] = rate * 10 ** random.uniform(-1, 2)
     if chance(0.3):
         air["turbulence"] = {"strength": pull * 10 ** random.uniform(-2, 2), "size": cell * 10 ** random.uniform(0, 1)}
+    if chance(0.4):
+        parts = {name: float(10 ** random.uniform(-2, 1)) for name in ("heat", "smoke", "radiation", "expansion")}
+        smoke["fire"] = parts | {"rate": rate * 10 ** random.uniform(-2, 1), "ignition": float(pick([0.0, 0.5]))}
+        smoke["fire"]["radiation"] *= rate
+        for each in (*inlets, *sources):
+            each["fuel"] = float(pick([0.0, 1.0, 10.0]))
     grid = {"cells": cells.tolist(), "cell": cell, "refine": int(random.integers(1, 4)), "origin": origin.tolist()}
     scene = {"name": f"random {seed}", "grid": grid | {"faces": faces}, "smoke": smoke, "air": air, "inlets": inlets}
     return scene | {"sources": sources, "obstacles": obstacles, "frames": frames, "rate": rate}

@@ -153,5 +153,5 @@ def test_wind_follows_its_keys(device: str):
 
 
 def test_forced_air_has_no_gradients(device: str):
-    with pytest.raises(WlmError, match="expected no confinement and no turbulence"):
+    with pytest.raises(WlmError, match="expected no confinement, turbulence or fire"):
         fluid.DifferentiableSolver(_swirl(device, confinement=1e-3))

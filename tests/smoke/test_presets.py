@@ -17,7 +17,7 @@ PRESETS = [name for name in profile_names("smoke") if not name.startswith("netwo
 def test_presets_do_what_they_say():
     for name in PRESETS:
         assert warnings_of(load_scene(name)) == []
-    assert {"chimney", "explosion", "fan", "rabbit"} <= set(PRESETS)
+    assert {"candle", "chimney", "explosion", "fan", "rabbit"} <= set(PRESETS)
 
 
 @pytest.mark.slow

@@ -16,8 +16,10 @@ from pydantic import ValidationError
 
 from wlm.config import check_settings, profile_names
 from wlm.errors import WlmError
+from wlm.fluid.black_body import black_body_luminance
 from wlm.fluid.faces import FACES
 from wlm.fluid.obstacles import Trajectory, cells_of
+from wlm.fluid.volume import load_volume
 from wlm.formats.exr import read_planes, write_planes
 from wlm.smoke import simulation
 from wlm.smoke.data import CHECKPOINT, NumberedFiles, load_frames, open_frames, read_six_way, spread, write_six_way
@@ -143,6 +145,32 @@ def test_random_scenes(seed, tmp_path):
     assert smoke or emitters <= sum("sources" in each or "inlets" in each for each in warnings)
 
 
+def test_fire_of_a_scene(tmp_path):
+    """Its frames have kelvins, its picture the light and the colours of black bodies; it needs room and short steps."""
+    smoke = {"emission": 2.0, "fire": {"rate": 1.0, "expansion": 0.1, "flame": 2000.0}}
+    source = {"centre": [0, 0.6, 0], "radius": 0.2, "density": 0, "temperature": 1.0, "fuel": 1.0}
+    scene = _scene(tmp_path, inlets=[], sources=[source], smoke=smoke, frames=1)
+    assert warnings_of(scene) == []
+    assert scene.steps * scene.rate >= 0.1 * (2000 / 293 - 1) / 0.01
+    frames = open_frames(tmp_path / "fire", scene)
+    assert simulation.simulate(frames) == 1
+    assert load_volume(frames.file(1), kelvin=False).temperature.max() == pytest.approx(2000.0, rel=0.01)
+    volume = load_frames(tmp_path / "fire").load(1)
+    hot = float(black_body_luminance(2000.0) / black_body_luminance(1500.0))
+    assert volume.kelvin and volume.temperature.max() == pytest.approx(hot, rel=0.02)
+    solver = simulation.make_solver(scene)
+    simulation.advance(scene, solver, 1)
+    torch.testing.assert_close(
+        simulation.volume_of(scene, solver).temperature, volume.temperature, rtol=2e-3, atol=1e-6
+    )
+    # A flame as thick as the source is white where it is 2,000 K, in the light of a black body.
+    (red, green, blue), light = scene.looks(1).ramp(torch.tensor([2.0 * 0.2 * hot]))[0].tolist(), 2.0 * 0.2 * hot
+    assert 0.2126 * red + 0.7152 * green + 0.0722 * blue == pytest.approx(light, rel=0.01) and red > green > 4 * blue
+    assert "only together" in warnings_of(_scene(tmp_path, sources=[source]))[-1]
+    with pytest.raises(WlmError, match="for the gas to expand"):
+        _scene(tmp_path, smoke=smoke, grid=GRID | {"faces": dict.fromkeys(FACES, "wall")}, inlets=[])
+
+
 def test_wind_of_a_scene(tmp_path):
     """It takes the open faces through which it ever enters, bounds the step, and needs a way out."""
     air = {"wind": {"keys": [[0, 1, 0, 0.5], [1, 4, 0, -0.5]], "gusts": 0.5}}
@@ -186,7 +214,8 @@ def test_the_scenes_that_there_are(name):
     small = scene.scaled(0.2)
     assert small.grid.cells == tuple(n // 5 for n in cells)
     np.testing.assert_allclose(small.grid.size, scene.grid.size)
-    assert small.steps * 5 < scene.steps * 2
+    # The growth of fire is the same in any cells.
+    assert small.steps * 5 < scene.steps * 2 or scene.smoke.fire
 
 
 def test_scaling_keeps_one_cell(tmp_path):

@@ -1,5 +1,6 @@
 # The public names of the package; `wlm._facade` reads these lines, too.
 from wlm.fluid.faces import FACES as FACES
+from wlm.fluid.forcing import Fire as Fire
 from wlm.fluid.forcing import Turbulence as Turbulence
 from wlm.fluid.forcing import Wind as Wind
 from wlm.fluid.gradients import DifferentiableLattice as DifferentiableLattice

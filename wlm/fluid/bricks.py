@@ -97,10 +97,10 @@ class BrickPool:
         require_memory("bricks of smoke", (size, CELLS, 1), more, self._device)
         self.fields[1:] = []
         grown = self._make(size * CELLS)
-        for name in ("density", "temperature"):
-            part = getattr(now, name)
-            wp.copy(getattr(grown, name), part, count=part.size)
-        del now
+        for name in ("density", "temperature", "fuel"):
+            if (part := getattr(now, name)) is not None:
+                wp.copy(getattr(grown, name), part, count=part.size)
+        del now, part
         self.fields[:] = [grown]
         self.fields += [self._make(size * CELLS) for _ in range(buffers - 1)]
         bricks = self.bricks
@@ -112,7 +112,8 @@ class BrickPool:
 
     @property
     def _brick_bytes(self) -> int:
-        parts = [part for part in (self.fields[0].density, self.fields[0].temperature) if part.size]
+        now = self.fields[0]
+        parts = [part for part in (now.density, now.temperature, now.fuel) if part is not None and part.size]
         return CELLS * len(parts) * wp.types.type_size_in_bytes(parts[0].dtype)
 
     def numbers(self) -> torch.Tensor:
@@ -124,14 +125,14 @@ class BrickPool:
         return _cubes(field)[wp.to_torch(self.bricks.places)[numbers.long()].long()]
 
     def put(self, numbers: torch.Tensor, values: Sequence[torch.Tensor]) -> None:
-        """Stores the density and perhaps the temperature, [N, 8, 8, 8], in the bricks with the indices `numbers`, int32
-        [N], and marks these as busy; the pool must be new."""
+        """Stores the density, temperature and fuel that there are, each [N, 8, 8, 8], in the bricks with the indices
+        `numbers`, int32 [N], and marks these as busy; the pool must be new."""
         wp.to_torch(self.bricks.busy)[numbers.long()] = 1
         self.relist()
         self.store(clear=False)
         places = wp.to_torch(self.bricks.places)[numbers.long()].long()
         now = self.fields[0]
-        for field, part in zip((now.density, now.temperature), values, strict=False):
+        for field, part in zip((now.density, now.temperature, now.fuel), values, strict=False):
             _cubes(field)[places] = part
 
 

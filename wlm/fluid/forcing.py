@@ -1,12 +1,13 @@
-"""What moves the air of a `Solver` besides smoke: turbulence, and wind with gusts.
+"""What moves the air of a `Solver` besides smoke: turbulence, wind with gusts, and fire.
 
 Lengths and times are in any units; `scaled` converts them to those of cells and steps.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 import warp as wp
 
 from wlm_kernels.fluid.forcing import Modes
@@ -96,6 +97,49 @@ class Wind:
     def fastest(self) -> float:
         """An upper bound of the speed."""
         return float(np.linalg.norm(np.asarray(self.keys)[:, 1:], axis=1).max()) * (1.0 + self.gusts)
+
+
+@dataclass(frozen=True)
+class Fire:
+    """Fuel that burns, and hot gas that radiates and expands; see `wlm_kernels.fluid.fire` for the model.
+
+    Attributes:
+        rate: Fuel that burns per unit of time.
+        heat: Temperature that a unit of fuel adds, up to 1.
+        smoke: Density that it makes.
+        ignition: Least temperature at which it burns.
+        radiation: c of the cooling dT/dt = -c T^4 per unit of time.
+        expansion: Factor on the expansion of an ideal gas; 0: none.
+        ambient, flame: Kelvins at the temperatures 0 and 1.
+    """
+
+    rate: float
+    heat: float = 1.0
+    smoke: float = 1.0
+    ignition: float = 0.0
+    radiation: float = 0.0
+    expansion: float = 1.0
+    ambient: float = 293.0
+    flame: float = 1900.0
+
+    def __post_init__(self) -> None:
+        if not all(0.0 <= value <= 1e6 for value in vars(self).values()):
+            raise ValueError(f"fire: expected numbers from 0 to 1e6, got {self}")
+        if not 100.0 <= self.ambient < self.flame:
+            raise ValueError(f"ambient, flame: expected 100 K <= ambient < flame, got {self.ambient} and {self.flame}")
+
+    def scaled(self, step: float) -> "Fire":
+        """Returns the same in units of `step`."""
+        return replace(self, rate=self.rate * step, radiation=self.radiation * step)
+
+    @property
+    def growth(self) -> float:
+        """Largest growth of burning gas per unit of time, as a share."""
+        return self.expansion * self.rate * self.heat * (self.flame / self.ambient - 1.0)
+
+    def kelvin(self, temperature: torch.Tensor) -> torch.Tensor:
+        """Converts temperatures to kelvins; air at 0 stays 0, like space without smoke."""
+        return torch.where(temperature > 0.0, self.ambient + (self.flame - self.ambient) * temperature, 0.0)
 
 
 CALM = Modes()

@@ -264,7 +264,7 @@ class DifferentiableSolver:
             (self._setup.storage != "float32", "storage='float32'", "'float16'"),
             (self._setup.bricks, "bricks=False", "bricks"),
             (solver.lattice.moving, "obstacles at rest", "one that moves"),
-            (self._setup.stirred, "no confinement and no turbulence", "one of them"),
+            (self._setup.stirred, "no confinement, turbulence or fire", "one of them"),
         ):
             if wrong:
                 raise WlmError(f"smoke: expected {expected}, since other smoke has no gradients, got {found}")

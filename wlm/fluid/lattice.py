@@ -18,6 +18,7 @@ from wlm.fluid.obstacles import Bodies, Obstacle
 from wlm.formats.parts import Part, check_parts
 from wlm.interop import free_memory, no_collection
 from wlm_kernels.fluid import lattice_bodies, lattice_links
+from wlm_kernels.fluid.fire import expand_kernel
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
 from wlm_kernels.fluid.lattice_fields import FluidKernels, fluid_kernels
 from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP, WIND
@@ -199,6 +200,7 @@ class Lattice:
         self._motion, self._bodies = lattice_bodies.make_motion(self.device), None
         # The cells that bodies have just left, and the duration of a step in the unit of the bodies' paths.
         self._fresh, self._pace = self._zeros(0, wp.uint8), 1.0
+        self._growth: wp.array | None = None
         self._forces, self._wind = self._zeros(0, wp.vec3), self._zeros(1, wp.vec3)
         self._faces: dict[str, Face] = {}
         self._links: lattice_links.Links | None = None
@@ -375,6 +377,12 @@ class Lattice:
     def faces(self) -> dict[str, Face]:
         """The faces that have been set, by name; an axis without faces is periodic."""
         return dict(self._faces)
+
+    def set_growth(self, growth: wp.array) -> None:
+        """Lets the air expand: `growth`, float [X, Y, Z] on the device, is the share of its volume that a cell gains
+        in a step. It is not copied, and its values may change between steps. A face needs an outlet with a density.
+        """
+        self._growth, self._graph = growth.flatten(), None
 
     @property
     def clock(self) -> wp.array:
@@ -718,6 +726,9 @@ class Lattice:
             now, out = self._buffers
             inputs = [self._n, now, self._solid, self._tau, self._eddy, self._forces, self._done % 2]
             self._launch(step_kernel(self._spec), self._cells, inputs, [self._clock, self._trouble, self._sums, out])
+            if self._growth is not None:
+                expand = expand_kernel(self._spec.lattice, self._spec.storage)
+                self._launch(expand, self._cells, [self._tables, self._growth], [out])
             stamp = 1 + self._done % 2
             if self.moving:
                 self._bodies.move(self._clock, self._pace, self._solid, self._fresh, stamp)

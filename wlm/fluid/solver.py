@@ -22,14 +22,14 @@ import warp as wp
 from wlm.errors import WlmError
 from wlm.fluid.bricks import INDEX_BYTES, BrickPool, require_memory
 from wlm.fluid.faces import axis_ends
-from wlm.fluid.forcing import CALM, Turbulence, Wind
+from wlm.fluid.forcing import CALM, Fire, Turbulence, Wind
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
 from wlm.fluid.obstacles import Mesh, Obstacle
 from wlm.fluid.volume import DensityVolume, gather, scatter
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.parts import Part, check_part, check_parts
 from wlm.interop import no_collection
-from wlm_kernels.fluid import advection, advection_places, advection_sources, forcing
+from wlm_kernels.fluid import advection, advection_places, advection_sources, fire, forcing
 from wlm_kernels.fluid.advection_places import DENSE
 from wlm_kernels.fluid.lattice_links import WIND
 
@@ -39,6 +39,7 @@ LEAST_HALF_LOSS = 2.0**-10
 """Smallest relative decay per step that half floats of 11 bits can represent; less would be lost to rounding."""
 
 _SYSTEM = "smoke-checkpoint"
+_EMITTED = ("density", "temperature", "fuel")
 # The speed of sound in cells per step. The lattice treats faster air as an error, so that smoke moves at most this far.
 _SOUND = math.sqrt(1.0 / 3.0)
 
@@ -76,7 +77,8 @@ class Source:
         size: Half edges of the box or cylinder, radii, or cells per unit of the mesh, along x, y and z; above 0.
         density: Density added per step of the lattice or, with `fixed`, the density to set.
         temperature: Temperature added per step or, with `fixed`, the temperature to set.
-        fixed: Whether density and temperature are set instead of added.
+        fuel: Fuel, likewise.
+        fixed: Whether density, temperature and fuel are set instead of added.
         turn: Unit quaternion (x, y, z, w) that turns the region about its centre.
         shell: Distance in cells from a mesh's surface within which smoke is emitted, too.
         noise: Variation of the values; None: none.
@@ -88,6 +90,7 @@ class Source:
     density: float
     temperature: float = 0.0
     fixed: bool = False
+    fuel: float = 0.0
     turn: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     shell: float = 0.0
     noise: Noise | None = None
@@ -100,7 +103,7 @@ class Source:
             value = getattr(self, name)
             if len(value) != 3 or not all(math.isfinite(v) and v > least for v in value):
                 raise ValueError(f"{name}: expected three finite numbers{' above 0' * (name == 'size')}, got {value}")
-        for name in ("density", "temperature", "shell"):
+        for name in (*_EMITTED, "shell"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name}: expected a finite number of at least 0, got {value}")
@@ -167,7 +170,7 @@ class SmokeSetup:
         temperature: Whether the smoke has a temperature.
         decay: Factors of density and temperature per step.
         bricks: Whether only bricks with smoke are computed.
-        stirred: Whether confinement or turbulence acts.
+        stirred: Whether confinement, turbulence or fire acts.
     """
 
     shape: tuple[int, int, int]
@@ -184,11 +187,13 @@ class SmokeSetup:
     stirred: bool
 
 
-def bytes_needed(shape: tuple[int, int, int], scheme: str, storage: str, temperature: bool, bricks: bool) -> int:
+def bytes_needed(
+    shape: tuple[int, int, int], scheme: str, storage: str, temperature: bool, bricks: bool, fuel: bool = False
+) -> int:
     """Returns the memory that smoke takes at the start, in bytes; arguments as for `Solver`, and its cells."""
     if bricks:
         return INDEX_BYTES * math.prod(-(-n // advection_places.BRICK) for n in shape)
-    fields = _buffers(scheme) * (2 if temperature else 1)
+    fields = _buffers(scheme) * (1 + temperature + fuel)
     return math.prod(shape) * fields * wp.types.type_size_in_bytes(advection.STORAGES[storage])
 
 
@@ -210,6 +215,7 @@ class Solver:
         buoyancy: Acceleration of the air by smoke; None: smoke does not move the air.
         confinement: Strength of the vorticity confinement per step of the lattice (Fedkiw, Stam and Jensen 2001: eps).
         turbulence: Random acceleration of all air.
+        fire: How fuel burns, in steps; the smoke must have a temperature. None: there is no fuel.
         wind: Velocity of the wind at the lattice's faces for it, in cells per step at times in steps.
         substeps: Steps of the lattice per step of the solver. Above a speed of 1 / substeps smoke can jump over walls.
         bricks: Whether only bricks of 8^3 cells that contain smoke, and their neighbours, are stored and computed.
@@ -242,6 +248,7 @@ class Solver:
         buoyancy: Buoyancy | None = None,
         confinement: float = 0.0,
         turbulence: Turbulence | None = None,
+        fire: Fire | None = None,
         wind: Wind | None = None,
         substeps: int = 2,
         bricks: bool = False,
@@ -265,14 +272,16 @@ class Solver:
             raise ValueError(f"dissipation, cooling: with float16 expected {least}, got less")
         if len(obstacles) > 255:
             raise ValueError(f"obstacles: expected at most 255, got {len(obstacles)}")
-        if not temperature and (cooling or (buoyancy and buoyancy.lift) or any(s.temperature for s in sources)):
-            raise ValueError("temperature: expected True, since a source, buoyancy or cooling uses it, got False")
+        if not temperature and (fire or cooling or (buoyancy and buoyancy.lift) or any(s.temperature for s in sources)):
+            raise ValueError("temperature: expected True, since a source, buoyancy, fire or cooling uses it, got False")
+        if fire is None and any(source.fuel for source in sources):
+            raise ValueError("fuel: expected a fire, since a source emits fuel, got none")
         self.lattice, self.device, self.scheme, self.substeps = lattice, lattice.device, scheme, substeps
         self.sources, self.obstacles, self.buoyancy = tuple(sources), tuple(obstacles), buoyancy
         self.duration = duration
         self.shape = tuple(refinement * size for size in lattice.shape)
         self._stored = advection.STORAGES[storage]
-        needed = bytes_needed(self.shape, scheme, storage, temperature, bricks)
+        needed = bytes_needed(self.shape, scheme, storage, temperature, bricks, fire is not None)
         require_memory("smoke", self.shape, needed, self.device)
         self._box = advection_places.make_box(lattice.shape, refinement, axis_ends(lattice.faces))
         self._kept = ""
@@ -284,7 +293,9 @@ class Solver:
             "temperature": temperature,
             "substeps": substeps,
             "obstacles": len(obstacles),
-        }
+        } | ({} if fire is None else {"fuel": True})
+        self._parts = ("density", *["temperature"] * temperature, *["fuel"] * (fire is not None))
+        self._fire = fire
         self._threshold = threshold
         self._pool = self._make_pool() if bricks else None
         cells = math.prod(self.shape)
@@ -296,6 +307,9 @@ class Solver:
         self._confinement, self._turbulence, self._wind = confinement, turbulence, wind
         self._modes = CALM if turbulence is None else turbulence.modes(str(self.device))
         self._stirred = confinement > 0.0 or turbulence is not None
+        if fire is not None:
+            self._growth = self._zeros(lattice.shape, float)
+            lattice.set_growth(self._growth)
         self._force = None
         if buoyancy is not None or self._stirred:
             self._force = self._zeros(lattice.shape, wp.vec3)
@@ -381,9 +395,7 @@ class Solver:
             while 1.0 - math.exp(-least * self._decay_every) < LEAST_HALF_LOSS:
                 self._decay_every *= 2
         self.sources = tuple(
-            source
-            if source.fixed
-            else replace(source, density=factor * source.density, temperature=factor * source.temperature)
+            source if source.fixed else replace(source, **{name: factor * getattr(source, name) for name in _EMITTED})
             for source in self.sources
         )
         if self.buoyancy is not None:
@@ -392,6 +404,7 @@ class Solver:
                 self.buoyancy, lift=square * self.buoyancy.lift, weight=square * self.buoyancy.weight
             )
         self._confinement *= factor
+        self._fire = self._fire and self._fire.scaled(factor)
         if self._wind is not None:
             self._wind = self._wind.scaled(factor)
         if self._turbulence is not None:
@@ -438,10 +451,10 @@ class Solver:
         return self._whole(self._fields[0].temperature) if self._grids["temperature"] else None
 
     def bricks(self) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """Returns the bricks that have smoke or heat, as `wlm.fluid.volume.gather` does; a solver with bricks makes no
-        array of all cells for it."""
+        """Returns the bricks that have smoke, heat or fuel, as `wlm.fluid.volume.gather` does; a solver with bricks
+        makes no array of all cells for it."""
         now = self._fields[0]
-        parts = [now.density, now.temperature] if self._grids["temperature"] else [now.density]
+        parts = [getattr(now, name) for name in self._parts]
         if self._pool is None:
             return gather([wp.to_torch(part.reshape(self.shape)) for part in parts])
         numbers = self._pool.numbers()
@@ -477,7 +490,7 @@ class Solver:
     @property
     def stored_bytes(self) -> int:
         """Memory of density and temperature with all buffers of a step, in bytes."""
-        return sum(part.capacity for each in self._fields for part in (each.density, each.temperature))
+        return sum(getattr(each, name).capacity for each in self._fields for name in self._parts)
 
     def frame(
         self,
@@ -520,7 +533,7 @@ class Solver:
             temperature=self._grids["temperature"],
             decay=self._decay,
             bricks=self._pool is not None,
-            stirred=self._stirred,
+            stirred=self._stirred or self._fire is not None,
         )
 
     # Checkpoints.
@@ -537,7 +550,7 @@ class Solver:
         # On a CPU .numpy() shares the array's memory; it is written before the next step changes it.
         numbers, values = self.bricks()
         tensors |= {"velocity": self._velocity.numpy(), "bricks": numbers.cpu().numpy()}
-        tensors |= {name: part.cpu().numpy() for name, part in zip(("density", "temperature"), values, strict=False)}
+        tensors |= {name: part.cpu().numpy() for name, part in zip(self._parts, values, strict=True)}
         settings = self._grids | {"duration": self.duration}
         text = json.dumps(settings, sort_keys=True).encode()
         source = hashlib.blake2b(text, digest_size=16).hexdigest()
@@ -567,7 +580,7 @@ class Solver:
         air = {name.removeprefix("lattice."): v for name, v in state.items() if name.startswith("lattice.")}
         try:
             count = len(check_part(state, "bricks", table["bricks"]))
-            for name in ("density", "temperature")[: 1 + self._grids["temperature"]]:
+            for name in self._parts:
                 table[name] = Part(wp.dtype_to_numpy(self._stored), (count, edge, edge, edge), least=0)
             parts = check_parts({name: v for name, v in state.items() if not name.startswith("lattice.")}, table)
         except ValueError as error:
@@ -578,15 +591,11 @@ class Solver:
             raise WlmError(f"{error} (in {path})") from error
         self._convert_settings(duration / self.duration)
         device = wp.device_to_torch(self.device)
-        numbers, *values = (
-            torch.from_numpy(np.array(parts[name])).to(device)
-            for name in ("bricks", "density", "temperature")
-            if name in parts
-        )
+        numbers, *values = (torch.from_numpy(np.array(parts[name])).to(device) for name in ("bricks", *self._parts))
         if self._pool is None:
             now = self._fields[0]
-            for array, part in zip((now.density, now.temperature), values, strict=False):
-                wp.to_torch(array).copy_(scatter(numbers, part, self.shape).flatten())
+            for name, part in zip(self._parts, values, strict=True):
+                wp.to_torch(getattr(now, name)).copy_(scatter(numbers, part, self.shape).flatten())
         else:
             self._pool, self._touched = self._make_pool(), ()
             self._pool.put(numbers, values)
@@ -618,7 +627,8 @@ class Solver:
         whether it did."""
         if self._captures is None:
             return False
-        settings = (self.sources, self.buoyancy, self._rates, self._confinement, self._turbulence, self.lattice.changes)
+        forces = (self.buoyancy, self._confinement, self._turbulence, self._fire)
+        settings = (self.sources, self._rates, forces, self.lattice.changes)
         if self._done % self.period or self._decay_every > 1 or settings != self._captures[0]:
             if self._done % self.period == 0:
                 self._captures = (settings, None)
@@ -644,7 +654,8 @@ class Solver:
             # A cell that an obstacle leaves gets smoke of its neighbours.
             self._pool.relist()
             self._pool.store(clear=False)
-        advection_sources.change_solids(self._box, old, new, self._fields[0], self._bricks)
+        for smoke in self._carried(self._fields[0]):
+            advection_sources.change_solids(self._box, old, new, smoke, self._bricks)
         self._walls = [new, old]
 
     def _step(self) -> None:
@@ -655,6 +666,9 @@ class Solver:
                 self._emit(only_mark=True)
             self._touched = self.sources
             self._pool.relist()
+        if self._fire is not None:
+            where = [box, walls, bricks, self._burning(self._fire), self.lattice.clock, self._fields[0]]
+            fire.burn(*where, self._growth.flatten())
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
             advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
@@ -674,22 +688,33 @@ class Solver:
     def _emit(self, only_mark: bool = False) -> None:
         for source in self.sources:
             steps = source.steps(self.substeps)
-            value = (steps * source.density, steps * source.temperature)
             region = source.region(self._box.refinement, str(self.device))
-            where = [self._box, self._walls[0], region, value, self._fields[0]]
-            advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
+            values = (steps * source.density, steps * source.temperature), (steps * source.fuel, 0.0)
+            for value, smoke in zip(values, self._carried(self._fields[0]), strict=False):
+                where = [self._box, self._walls[0], region, value, smoke]
+                advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
 
     def _carry(self) -> None:
-        now, *spare = self._fields
-        where = [self._box, self._velocity.flatten(), self._walls[0], now]
-        if self.scheme == "maccormack":
-            predicted, out = spare
-            advection.advect(*where, predicted, self.substeps, bricks=self._bricks)
-            advection.advect(*where, out, self.substeps, self._decay, self._bricks, predicted)
-            self._fields[:] = [out, predicted, now]
-        else:
-            advection.advect(*where, spare[0], self.substeps, self._decay, self._bricks)
-            self._fields[:] = [spare[0], now]
+        decays, where = (self._decay, (1.0, 1.0)), [self._box, self._velocity.flatten(), self._walls[0]]
+        for decay, buffers in zip(decays, zip(*map(self._carried, self._fields), strict=True), strict=False):
+            now, predicted, out = buffers[0], buffers[1], buffers[-1]
+            if self.scheme == "maccormack":
+                advection.advect(*where, now, predicted, self.substeps, bricks=self._bricks)
+                advection.advect(*where, now, out, self.substeps, decay, self._bricks, predicted)
+            else:
+                advection.advect(*where, now, out, self.substeps, decay, self._bricks)
+        self._fields[:] = self._fields[::-1]
+
+    def _carried(self, fields: advection.Fields) -> list[advection.Fields]:
+        """Returns what is moved separately: smoke with its temperature, and fuel."""
+        return [fields] if self._fire is None else [fields, fields.burning]
+
+    def _burning(self, settings: Fire) -> fire.Burning:
+        out = fire.Burning()
+        out.fuel, out.radiation = settings.rate * self.substeps, settings.radiation * self.substeps
+        out.heat, out.smoke, out.ignition = settings.heat, settings.smoke, settings.ignition
+        out.ratio, out.expansion = settings.flame / settings.ambient - 1.0, settings.expansion / self.substeps
+        return out
 
     @property
     def _bricks(self) -> advection_places.Bricks:
@@ -703,7 +728,8 @@ class Solver:
 
     def _make_fields(self, cells: int) -> advection.Fields:
         heat = cells if self._grids["temperature"] else 0
-        return advection.Fields(self._zeros((cells,), self._stored), self._zeros((heat,), self._stored))
+        fuel = None if self._fire is None else self._zeros((cells,), self._stored)
+        return advection.Fields(self._zeros((cells,), self._stored), self._zeros((heat,), self._stored), fuel)
 
     def _zeros(self, shape: tuple[int, ...], dtype) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)

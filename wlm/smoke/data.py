@@ -134,6 +134,8 @@ class Frames:
         """Reads the volume of a frame."""
         factors = self._factors
         options = dict(self.options)
+        if self.scene is not None and self.scene.smoke.fire is not None:
+            options.setdefault("kelvin", True)
         if self.scene is not None or self.single:
             return load_volume(self.file(number), **factors, device=self.device, **options)
         if heads := grid_heads(self.file(number)):

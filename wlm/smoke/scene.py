@@ -16,13 +16,15 @@ from types import NoneType
 from typing import Annotated, Literal
 
 import numpy as np
+import torch
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
 from scipy.spatial.transform import Rotation
 
 from wlm.config import check_settings, load_settings, profile_path
+from wlm.fluid.black_body import black_body_colour, black_body_light
 from wlm.fluid.faces import FACES
-from wlm.fluid.forcing import Turbulence, Wind
+from wlm.fluid.forcing import Fire, Turbulence, Wind
 from wlm.fluid.obstacles import Mesh, Trajectory, surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.meshes import SUFFIXES, Surface, read_surface
@@ -35,8 +37,8 @@ FASTEST = 0.2
 """Largest speed of inlets and obstacles in cells per step; a flow with faster ones may blow up."""
 # Bounds of a stable step: acceleration in cells per step squared, viscosity in square cells per step.
 _ACCELERATION, _VISCOSITY = 0.01, 1.0
-# Confinement per step, and the largest acceleration of turbulence over its root mean square.
-_CONFINEMENT, _PEAK = 0.02, 3.0
+# Growth of burning gas and confinement per step, and the peak of turbulence over its root mean square.
+_GROWTH, _CONFINEMENT, _PEAK = 0.01, 0.02, 3.0
 # Without eddy viscosity, of less than this Smagorinsky constant, the largest Reynolds number of a cell.
 _LEAST_EDDIES, _CELL_REYNOLDS = 0.05, 100.0
 
@@ -170,13 +172,15 @@ class Smoke(_Settings):
     Attributes:
         extinction: Extinction per metre at density 1.
         albedo: R, G, B, share of light that survives a scattering, 0 to 1.
-        emission: Radiance emitted per metre at temperature 1.
+        emission: Radiance emitted per metre at temperature 1; with fire at 1,500 kelvin, as by black bodies.
         dissipation, cooling: Rates of decay of density and temperature per second: a share exp(-rate t) remains.
         buoyancy: Upward acceleration at temperature 1, metres per second squared.
         weight: Downward acceleration at density 1, metres per second squared.
         up: Direction opposite to gravity.
         scheme, storage, bricks, substeps: Settings of the advection, as for `wlm.fluid.solver.Solver`.
-        glow: Colour ramp of the emission, a list of stops (emission, R, G, B); empty: grey.
+        glow: Colour ramp of the emission, a list of stops (emission, R, G, B); empty: grey, or that of black bodies if
+            there is fire (`Scene.glow`).
+        fire: How the fuel of sources burns, in seconds; null: there is none.
     """
 
     extinction: _Positive = 10.0
@@ -192,11 +196,12 @@ class Smoke(_Settings):
     bricks: bool = False
     substeps: int = Field(2, ge=1, le=16)
     glow: _Glow = ()
+    fire: Fire | None = None
 
     @property
     def hot(self) -> bool:
         """Whether the temperature has any effect."""
-        return self.emission > 0.0 or self.buoyancy > 0.0
+        return self.emission > 0.0 or self.buoyancy > 0.0 or self.fire is not None
 
 
 class Inlet(_Settings):
@@ -206,7 +211,7 @@ class Inlet(_Settings):
         face: Name of the face, such as "-y".
         centre, radius: Centre and radius in metres of a circular opening; radius null: the whole face is open.
         velocity: Velocity of the air in metres per second; it must point into the box.
-        density, temperature: Density and temperature of the incoming smoke.
+        density, temperature, fuel: Density, temperature and fuel of the incoming smoke.
     """
 
     face: _Face
@@ -215,6 +220,7 @@ class Inlet(_Settings):
     radius: _Positive | None = None
     density: _NotNegative = 1.0
     temperature: _NotNegative = 0.0
+    fuel: _NotNegative = 0.0
 
     @model_validator(mode="after")
     def _inwards(self) -> Inlet:
@@ -327,13 +333,14 @@ class SourceSettings(Body):
 
     Attributes:
         shape, radius, scale, offset, centre, path, turn, shell: As for `ObstacleSettings`.
-        density, temperature: Values that are set in the region while the source is active.
+        density, temperature, fuel: Values that are set in the region while the source is active.
         start, stop: Times in seconds between which the source is active, or as many of each; stop null: until the end.
         noise: Variation of density and temperature; null: none.
     """
 
     density: _NotNegative = 1.0
     temperature: _NotNegative = 0.0
+    fuel: _NotNegative = 0.0
     start: _Number | tuple[_Number, ...] = 0.0
     stop: _Number | tuple[_Number | None, ...] | None = None
     noise: Noise | None = None
@@ -479,13 +486,15 @@ class Scene(_Settings):
         faces |= set(self.windy)
         if faces and all(face in faces or self.grid.face(face) != "open" for face in FACES):
             raise PydanticCustomError("inlets", "expected an open face without inlet or wind, for the air to leave")
+        if self._growth and not set(self._free) - set(self.windy):
+            raise PydanticCustomError("fire", "expected an open face without inlet or wind, for the gas to expand")
         if not self._least_steps <= MOST_STEPS:
             raise PydanticCustomError(
                 "steps",
                 f"expected at most {MOST_STEPS:,} steps per frame, found {self._least_steps:.3g}, for a speed of "
                 f"{self.fastest:g} m/s, an acceleration of {self._acceleration:g} m/s2, a confinement of "
-                f"{self.air.confinement:g} per second and a viscosity of {self.air.viscosity:g} m2/s in cells of "
-                f"{self.grid.cell:g} m at {self.rate:g} frames per second",
+                f"{self.air.confinement:g} and a growth of {self._growth:g} per second and a viscosity of "
+                f"{self.air.viscosity:g} m2/s in cells of {self.grid.cell:g} m at {self.rate:g} frames per second",
             )
         speed = max(self._speeds, default=0.0)
         if not speed * self.step <= FASTEST * self.grid.cell * (1.0 + 1e-9):
@@ -511,7 +520,7 @@ class Scene(_Settings):
     def looks(self, frame: int) -> Looks:
         """Returns the settings for the picture of a frame; frames count from 1."""
         parts = {"lights": self.lights, "background": self.background, "obstacles": self.obstacles}
-        return Looks(**parts, albedo=self.smoke.albedo, glow=self.smoke.glow, time=self.time(frame))
+        return Looks(**parts, albedo=self.smoke.albedo, glow=self.glow, time=self.time(frame))
 
     def scaled(self, factor: float) -> Scene:
         """Returns the scene with its number of cells along each axis multiplied by a factor and rounded, at least 1.
@@ -557,6 +566,29 @@ class Scene(_Settings):
         return [*inlets, *(obstacle.fastest for obstacle in self.obstacles)]
 
     @property
+    def _growth(self) -> float:
+        """Largest growth of burning gas per second, as a share."""
+        return 0.0 if self.smoke.fire is None else self.smoke.fire.growth
+
+    @property
+    def _flame(self) -> float:
+        """Radius of the largest source of fuel in metres, at most that of the box."""
+        radii = [float(np.max(each.radius or math.inf)) for each in (*self.inlets, *self.sources) if each.fuel]
+        return min(max(radii, default=0.0), 0.5 * float(self.grid.size.max()))
+
+    @property
+    def glow(self) -> _Glow:
+        """Colour ramp of the emission: the smoke's own, or else, of fire, that of black bodies. A ray has
+        the colour of a flame of one temperature, as thick as the radius of the largest source of fuel."""
+        fire, thick = self.smoke.fire, self.smoke.emission * (self._flame or self.grid.cell)
+        if self.smoke.glow or fire is None or not thick:
+            return self.smoke.glow
+        kelvin = np.geomspace(900.0, max(2.0 * fire.flame, 4000.0), 24)
+        light = thick * black_body_light(torch.from_numpy(kelvin)).numpy()
+        stops = np.concatenate([light[:, None], light[:, None] * black_body_colour(kelvin)], 1)
+        return ((0.0, 0.0, 0.0, 0.0), *map(tuple, stops.tolist()))
+
+    @property
     def _outflow(self) -> float:
         """An upper bound of the speed in metres per second at which what comes in leaves through the open faces."""
         area = {face: float(np.prod(np.delete(self.grid.size, k // 2))) for k, face in enumerate(FACES)}
@@ -571,7 +603,11 @@ class Scene(_Settings):
     def _acceleration(self) -> float:
         """Largest acceleration of air by smoke or turbulence, in metres per second squared."""
         emitters = [*self.inlets, *self.sources]
-        pulls = [(self.smoke.buoyancy * each.temperature, self.smoke.weight * each.density) for each in emitters]
+        burning = self.smoke.fire is not None  # up to a temperature of 1
+        pulls = [
+            (self.smoke.buoyancy * max(each.temperature, burning), self.smoke.weight * each.density)
+            for each in emitters
+        ]
         noise = max((each.noise.amount for each in self.sources if each.noise), default=0.0)
         stirring = 0.0 if self.air.turbulence is None else _PEAK * self.air.turbulence.strength
         return (1.0 + noise) * max(itertools.chain.from_iterable(pulls), default=0.0) + stirring
@@ -580,9 +616,10 @@ class Scene(_Settings):
     def _least_steps(self) -> float:
         """Air steps per frame for which speed, acceleration, confinement and viscosity stay within their bounds."""
         cell = self.grid.cell
-        by_speed = max(self.fastest / self.air.lattice_speed, self._outflow / FASTEST) / (self.rate * cell)
+        outflow = max(self._outflow, self._growth * self._flame / 3.0)
+        by_speed = max(self.fastest / self.air.lattice_speed, outflow / FASTEST) / (self.rate * cell)
         by_acceleration = math.sqrt(self._acceleration / (_ACCELERATION * cell)) / self.rate
-        by_confinement = self.air.confinement / (_CONFINEMENT * self.rate)
+        by_confinement = max(self.air.confinement / _CONFINEMENT, self._growth / _GROWTH) / self.rate
         by_viscosity = self.air.viscosity / (_VISCOSITY * cell * cell * self.rate)
         return max(by_speed, by_acceleration, by_confinement, by_viscosity)
 

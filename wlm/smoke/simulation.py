@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from wlm.errors import WlmError
 from wlm.fluid import solver as fluid
+from wlm.fluid.black_body import black_body_light
 from wlm.fluid.bricks import require_memory
 from wlm.fluid.faces import FACES
 from wlm.fluid.forcing import EDDY
@@ -57,6 +59,7 @@ def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
             buoyancy=_buoyancy(scene),
             confinement=air.confinement * scene.step,
             turbulence=air.turbulence and air.turbulence.scaled(scene.step, scene.grid.cell),
+            fire=smoke.fire and smoke.fire.scaled(scene.step),
             wind=air.wind and air.wind.scaled(scene.step, scene.grid.cell),
             substeps=smoke.substeps,
             bricks=smoke.bricks,
@@ -112,6 +115,9 @@ def warnings_of(scene: Scene) -> list[str]:
             )
     if (stirring := scene.air.turbulence) is not None and stirring.size < EDDY * grid.cell:
         warnings.append(f"air.turbulence: its size is below {EDDY} cells, and is simulated as {EDDY * grid.cell:g} m")
+    fuel = any(each.fuel for each in (*scene.inlets, *scene.sources))
+    if fuel != (scene.smoke.fire is not None):
+        warnings.append("smoke.fire, fuel: only together they burn; one of them has no effect")
     if not (scene.sources or scene.inlets):
         warnings.append("sources, inlets: there are none, and thus there is no smoke")
     return [f"{scene.name}: {warning}" for warning in warnings]
@@ -183,10 +189,17 @@ def _covers(body: Body, edge: float, places: np.ndarray, time: float) -> np.ndar
     return reach[body.shape] < 1.0
 
 
-def volume_of(scene: Scene, solver: fluid.Solver) -> DensityVolume:
-    """Returns the solver's smoke, as `wlm.fluid.solver.Solver.frame`."""
+def volume_of(scene: Scene, solver: fluid.Solver, *, kelvin: bool = False) -> DensityVolume:
+    """Returns the solver's smoke, in the solver's memory if there are no bricks, and valid until the next step.
+
+    The temperature of fire becomes the light of black bodies or, with `kelvin`, kelvins.
+    """
     smoke, grid = scene.smoke, scene.grid
-    return solver.frame(extinction=smoke.extinction, emission=smoke.emission, cell=grid.cell, origin=grid.origin)
+    volume = solver.frame(extinction=smoke.extinction, emission=smoke.emission, cell=grid.cell, origin=grid.origin)
+    if smoke.fire is None:
+        return volume
+    hot = smoke.fire.kelvin(volume.temperature)
+    return replace(volume, temperature=hot if kelvin else black_body_light(hot))
 
 
 def simulate(
@@ -252,9 +265,16 @@ def simulate(
                         velocity = solver.velocity.numpy() * (scene.grid.cell / solver.duration)
                         suffix, _, raw = volumes.partition("-")
                         copy = frames.file(frame).with_suffix(f".{suffix}")
-                        save_volume(copy, volume_of(scene, solver), velocity=velocity, codec="none" if raw else "zip")
+                        save_volume(
+                            copy,
+                            volume_of(scene, solver, kelvin=True),
+                            velocity=velocity,
+                            codec="none" if raw else "zip",
+                        )
                     # Written before the state: a state without its frame could not be resumed.
                     numbers, values = solver.bricks()
+                    if scene.smoke.fire is not None:
+                        values = [values[0], scene.smoke.fire.kelvin(values[1])]
                     place = (solver.shape, scene.grid.voxel, scene.grid.origin)
                     save_bricks(frames.file(frame), numbers, values, *place)
                 if pace.due():
@@ -320,7 +340,9 @@ def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[boo
 def _require_memory(scene: Scene, device: str) -> None:
     """Checks before the allocation that air and smoke fit into the free memory; raises a WlmError if not."""
     grid, smoke = scene.grid, scene.smoke
-    smoke_bytes = fluid.bytes_needed(grid.shape, smoke.scheme, smoke.storage, smoke.hot, smoke.bricks)
+    smoke_bytes = fluid.bytes_needed(
+        grid.shape, smoke.scheme, smoke.storage, smoke.hot, smoke.bricks, smoke.fire is not None
+    )
     needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + smoke_bytes
     warp_device = wp.get_device(device)
     free = free_memory(warp_device)
@@ -345,6 +367,7 @@ def _make_lattice(scene: Scene, device: str) -> Lattice:
         device=device,
         ramp=_RAMP * max(grid.cells),
     )
+    balanced = (scene.inlets or scene.windy) and not (scene.smoke.fire and scene.smoke.fire.expansion)
     for name in FACES:
         inlets = [(i, inlet) for i, inlet in enumerate(scene.inlets) if inlet.face == name]
         kind = grid.face(name)
@@ -355,8 +378,8 @@ def _make_lattice(scene: Scene, device: str) -> Lattice:
         elif kind in ("wall", "slip"):
             lattice.set_wall(name, slip=kind == "slip")
         elif kind == "open":
-            # With inlets, the outflow equals the inflow; without, the outside is at rest.
-            lattice.set_outlet(name, density=None if scene.inlets or scene.windy else 1.0)
+            # With inlets, the outflow equals the inflow; without, or if gas expands, the outside is at rest.
+            lattice.set_outlet(name, density=None if balanced else 1.0)
     return lattice
 
 
@@ -390,8 +413,11 @@ def sources_at(scene: Scene, time: float | None = None) -> list[fluid.Source]:
 
     def add(shape: str | Mesh, centre: np.ndarray, size: np.ndarray, values: Inlet | SourceSettings, **how) -> None:
         place, share = (tuple(map(float, centre)), tuple(map(float, size))), how.pop("share", 1.0)
-        heat = share * values.temperature if scene.smoke.hot else 0.0
-        sources.append(fluid.Source(shape, *place, share * values.density, heat, fixed=True, **how))
+        heat, fuel = (
+            share * values.temperature if scene.smoke.hot else 0.0,
+            share * values.fuel if scene.smoke.fire else 0.0,
+        )
+        sources.append(fluid.Source(shape, *place, share * values.density, heat, fixed=True, fuel=fuel, **how))
 
     grid = scene.grid
     half = 0.5 * np.array(grid.cells, float)

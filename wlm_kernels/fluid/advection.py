@@ -118,10 +118,16 @@ def fields_struct(stored: type) -> Any:
 @dataclass(frozen=True, eq=False)
 class Fields:
     """The smoke: flat arrays [cells], or [512 P] of a pool of P bricks, of one type, float or half; [0] for the
-    temperature of smoke that has none."""
+    temperature of smoke that has none; `fuel` like the density, of smoke that burns."""
 
     density: wp.array
     temperature: wp.array
+    fuel: wp.array | None = None
+
+    @functools.cached_property
+    def burning(self) -> "Fields":
+        """The fuel as the density of cold smoke, which is moved alike."""
+        return Fields(self.fuel, wp.empty(0, dtype=self.fuel.dtype, device=self.fuel.device))
 
     @functools.cached_property
     def arrays(self) -> Any:

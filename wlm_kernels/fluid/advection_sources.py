@@ -362,5 +362,6 @@ def store(bricks: Bricks, fields: Fields, clear: bool = True) -> None:
     """Gives the bricks that `advection_places.relist` added to its list their places in the pool, and empties them in
     the smoke before the step; other buffers of the step may hold anything there. With `clear` no brick is busy then."""
     groups = min(bricks.workers, _STORING)
-    _launch("store", groups * CELLS, [groups, bricks], fields.arrays, fields)
+    for each in (fields, fields.burning) if fields.fuel is not None else (fields,):
+        _launch("store", groups * CELLS, [groups, bricks], each.arrays, each)
     settle(bricks, clear)
