@@ -460,6 +460,11 @@ class Lattice:
         return self._bodies is not None and bool(self._bodies.moving)
 
     @property
+    def too_fast(self) -> bool:
+        """Whether a body of `set_bodies` becomes faster than `MAX_SPEED`, at any time of its path."""
+        return self.moving and self._pace * self._bodies.fastest(-math.inf, math.inf) > MAX_SPEED
+
+    @property
     def solid(self) -> wp.array:
         """The number of the body in each cell, uint8 [X, Y, Z], 0 for fluid; [0] while no cell has ever been solid."""
         return self._solid.reshape(self.shape) if self._solid.size else self._solid

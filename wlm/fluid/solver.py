@@ -625,7 +625,8 @@ class Solver:
     def _replay(self) -> bool:
         """Does `period` steps by a CUDA graph, if that can be and the two steps before had the same settings; returns
         whether it did."""
-        if self._captures is None:
+        # Steps before a body is too fast are done one by one.
+        if self._captures is None or self.lattice.too_fast:
             return False
         forces = (self.buoyancy, self._confinement, self._turbulence, self._fire)
         settings = (self.sources, self._rates, forces, self.lattice.changes)
