@@ -23,7 +23,7 @@ def test_presets_do_what_they_say():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_small(name: str):
-    """Twelve cells or more along each axis: finite air and smoke that is seen, and obstacles that are seen where smoke is not."""
+    """Twelve cells or more along each axis: finite air, smoke that is seen, and obstacles where it is not."""
     scene = load_scene(name)
     scene = scene.scaled(12 / min(scene.grid.cells))
     solver, pictures = make_solver(scene), []
