@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from wlm.fluid.obstacles import surface
 from wlm_kernels.fluid import advection_sources
 from wlm_kernels.fluid.advection import STORAGES, Fields, advect
+from wlm_kernels.fluid.advection_adjoint import source_backward
 from wlm_kernels.fluid.advection_places import (
     BRICK,
     CLOSED,
@@ -310,6 +311,13 @@ def test_noise_of_a_source(device: str):
     assert 0.0 < np.abs(emitted(phase=0.35) - got).max() < 0.5 < np.abs(emitted(seed=6) - got).max()
     assert emitted(amount=9.0).min() == 0.0
     np.testing.assert_array_equal(emitted(amount=0.0), 2.0)
+    # What is emitted is linear in the source's values, and so are their gradients in those of the smoke.
+    weights = np.random.default_rng(4).normal(size=(2, *grid.shape))
+    noisy = advection_sources.make_region("box", (12.0,) * 3, (40.0,) * 3, noise=(0.8, 6.0, 0.3), seed=5)
+    on_values = wp.zeros(2, dtype=wp.vec2, device=device)
+    source_backward(grid.box, grid.walls, noisy, 1, grid.fields(*weights), on_values, fixed=True)
+    expected = (0.5 * weights * got).sum((1, 2, 3))
+    np.testing.assert_allclose(on_values.numpy(), [(0.0, 0.0), expected], rtol=1e-3, atol=1e-2)
 
 
 def test_half_floats_do_not_overflow(device: str):
