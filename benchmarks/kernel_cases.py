@@ -134,10 +134,12 @@ def _lightmap_pages(device: str, pages: int) -> tuple[Callable[[], object], Work
     model, stored = _lightmap("M", side)
     texture = VirtualTexture(model, device, budget=ALL, decodes=pages, tolerance=1e-6)
     texture.frame(9.3, *view_of_all_pages(texture))
-    decoded = texture.report()["decoded"]
-    texels = decoded * (TILE + 2.0 * texture.layout.border) ** 2
+    # A texel of a coarser page is the mean of all texels of the map below it.
+    levels = texture.layout.place[:, 1]
+    written = len(levels) * (TILE + 2.0 * texture.layout.border) ** 2
+    texels = float((4.0**levels).sum()) * TILE**2
     operations, activations = _network_work(model.profile)
-    work = Work(bytes=stored + 4.0 * texels, tensor=operations * texels, special=activations * texels)
+    work = Work(bytes=stored + 4.0 * written, tensor=operations * texels, special=activations * texels)
     return texture.stages["decode"], work
 
 
@@ -241,7 +243,7 @@ def _rasterize(device: str, pixels: int) -> tuple[Callable[[], object], Work]:
 def _lattice(storage: str, walls: bool) -> Callable[[str, int], tuple[Callable[[], object], Work]]:
     def make(device: str, cells: int) -> tuple[Callable[[], object], Work]:
         edge = round(cells ** (1 / 3))
-        lattice = Lattice((edge,) * 3, viscosity=1e-6, storage=storage, device=device)
+        lattice = Lattice((edge,) * 3, viscosity=1e-6, storage=storage, device=device, ramp=4 * edge)
         if walls:
             for face in ("-y", "+y", "-z", "+z"):
                 lattice.set_wall(face)

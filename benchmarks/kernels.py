@@ -5,14 +5,13 @@ row is one case of `benchmarks.kernel_cases` at one size. "floor" is the time in
 the case cannot avoid, by the ceiling that takes longest, which the notes name; "of the floor" is floor over time.
 "launches" counts the kernels of a call, as a profiler sees them on CUDA. "slope" is the exponent of the time over the
 size between this size and the next smaller one: 1 where the time is proportional, near 0 where latency or launches
-decide. Where a case is below half of its floor's speed on CUDA, the notes say why, by a profile of an H100.
+decide.
 
 `--baseline OLD.json` ends with an error if a case's share of its floor fell by more than a twentieth and by more than
 the scatter of the samples of both runs. Shares and not times are compared, since a ceiling of the same run also follows
 the clock and the load of the machine. `--plot PICTURE.png` draws time against size with the floors.
 """
 
-import json
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -29,7 +28,6 @@ from wlm.formats.atomic import atomic_path
 
 _LEAST = 0.05  # loss of a share of the floor that counts as slower, of the share
 _MOST = 0.5  # a larger loss is never taken for scatter
-_REASONS = Path(__file__).with_name("kernel_reasons.json")
 
 
 def run(
@@ -94,12 +92,10 @@ def _case_row(
     slope = None
     if previous is not None:
         slope = math.log(ms / previous["time_ms"]) / math.log(size / previous["size"])
-    far = bench.device != "cpu" and floors[bound] < 0.5 * ms
-    reason = json.loads(_REASONS.read_text()).get(name, "") if far else ""
-    row = bench.row(
+    return bench.row(
         name,
         f"{size:,} {case.unit}",
-        "; ".join(filter(None, (f"floor by {bound}", reason))),
+        f"floor by {bound}",
         timing=timing,
         calls=calls,
         size=size,
@@ -110,7 +106,6 @@ def _case_row(
         of_floor=floors[bound] / ms,
         slope=slope,
     )
-    return row
 
 
 def _launches(call: Callable[[], object], calls: int) -> float:

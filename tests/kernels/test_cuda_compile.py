@@ -14,7 +14,7 @@ import warp as wp
 
 import wlm_kernels
 from wlm_kernels import mlp
-from wlm_kernels.fluid import advection, advection_sources, lattice, lattice_bodies, lattice_fields, lattice_links
+from wlm_kernels.fluid import advection, advection_sources, fire, lattice, lattice_bodies, lattice_fields, lattice_links
 from wlm_kernels.lightmap import decode as lightmap_decode
 from wlm_kernels.lightmap import matrix_decode, matrix_pages, pages
 from wlm_kernels.lightmap import step as lightmap_step
@@ -131,6 +131,8 @@ FACTORIES = [
     *_cases(
         "lattice_boundaries", _boundaries, [], (("D3Q19", "float32"), ("D2Q9", "float32"), ("D3Q27", "float16")), BOTH
     ),
+    *_cases("fire", lambda stored: [fire.burn_kernel(stored)], [], FLOATS),
+    *_cases("expansion", lambda storage: [fire.expand_kernel("D3Q19", storage)], [], ("float32", "float16")),
     *_cases("marks", lambda is_mesh: [lattice_bodies._mark_kernel(is_mesh)], [], BOTH),
     *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
     *_cases("planes", _planes, [], BOTH),

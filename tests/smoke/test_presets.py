@@ -23,8 +23,9 @@ def test_presets_do_what_they_say():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_small(name: str):
-    """A sixth of the cells: finite air and smoke that is seen, and obstacles that are seen where smoke is not."""
-    scene = load_scene(name).scaled(1 / 6)
+    """Twelve cells or more along each axis: finite air, smoke that is seen, and obstacles where it is not."""
+    scene = load_scene(name)
+    scene = scene.scaled(12 / min(scene.grid.cells))
     solver, pictures = make_solver(scene), []
     view = scene.camera.model_copy(update={"resolution": 48})
     camera, lights = make_camera(view, scene.grid.origin, scene.grid.size), [light.light() for light in scene.lights]
@@ -38,6 +39,6 @@ def test_a_preset_small(name: str):
             pictures.append(picture(lit, background=looks.background, **how))
     before, after = pictures
     assert torch.isfinite(after).all() and np.isfinite(solver.velocity.numpy()).all()
-    assert ((after - before).abs().amax(-1) > 0.02).float().mean() > 0.005
+    assert ((after - before).abs().amax(-1) > 0.02).float().mean() > 0.001
     background = torch.tensor(scene.background)
     assert ((before - background).abs().amax(-1) > 0.02).any() == bool(scene.obstacles)

@@ -36,6 +36,7 @@ from wlm.smoke.scene import (
     make_camera,
     obstacle_mesh,
 )
+from wlm.smoke.shading import PointLight
 from wlm.smoke.simulation import warnings_of
 
 BOX = {"shape": "box"}
@@ -327,6 +328,20 @@ def test_lights_and_glow():
     scene = Scene.model_validate(SCENE | {"smoke": {"glow": ((0, 0, 0, 0), (2, 4, 2, 0))}, "obstacles": [SPHERE]})
     looks = scene.looks(2)
     np.testing.assert_allclose(looks.ramp(torch.tensor([1.0])), [[2, 1, 0]])
+    place = {"position": [0.0, 3.0, 0.0], "intensity": [4.0, 2.0, 0.0], "radius": 0.1}
+    lit = Scene.model_validate(SCENE | {"lights": [place]})
+    assert lit.lights[0].light() == PointLight((0.0, 3.0, 0.0), (4.0, 2.0, 0.0), 0.1)
+    # From the box's centre; within half of its shortest edge a light is as bright as from there.
+    centre = np.asarray(lit.grid.origin) + 0.5 * lit.grid.size
+    away = np.array([0.0, 3.0, 0.0]) - centre
+    (seen,) = lit.looks(1).lights
+    np.testing.assert_allclose(seen.irradiance, np.array([4.0, 2.0, 0.0]) / (away @ away))
+    np.testing.assert_allclose(seen.toward, away / np.linalg.norm(away))
+    (near,) = Scene.model_validate(SCENE | {"lights": [place | {"position": centre.tolist()}]}).looks(1).lights
+    np.testing.assert_allclose(near.irradiance, np.array([4.0, 2.0, 0.0]) / (0.5 * lit.grid.size.min()) ** 2)
+    for wrong in ({}, place | {"toward": [0, 1, 0]}):
+        with pytest.raises(ValidationError, match="expected either a direction"):
+            LightSettings.model_validate(wrong)
     assert (looks.time, looks.lights, looks.obstacles) == (pytest.approx(0.2), scene.lights, scene.obstacles)
 
 

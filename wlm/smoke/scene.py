@@ -28,7 +28,7 @@ from wlm.fluid.forcing import Fire, Turbulence, Wind
 from wlm.fluid.obstacles import Mesh, Trajectory, surface
 from wlm.smoke.camera import Camera
 from wlm.smoke.meshes import SUFFIXES, Surface, read_surface
-from wlm.smoke.shading import Light, Ramp
+from wlm.smoke.shading import AnyLight, Light, PointLight, Ramp
 
 _SHORTEST = 1e-12
 MOST_STEPS = 1_000_000
@@ -414,19 +414,42 @@ class CameraSettings(_Settings):
 
 
 class LightSettings(_Settings):
-    """A directional light.
+    """A directional light, or a point light: either `toward` or `position` is given.
 
     Attributes:
         toward: Direction from the smoke to the light.
         irradiance: R, G, B on a surface that faces the light; lightmaps store the light for 4 pi, the default.
+        position, intensity, radius: As for `wlm.smoke.shading.PointLight`, in metres.
     """
 
-    toward: _Direction
+    toward: _Direction | None = None
     irradiance: _Colour = (4 * math.pi,) * 3
+    position: _Vector | None = None
+    intensity: _Colour = (1.0, 1.0, 1.0)
+    radius: _NotNegative = 0.0
 
-    def light(self) -> Light:
-        """Returns the light that `SixWay.shade` takes."""
-        return Light(self.toward, self.irradiance)
+    @model_validator(mode="after")
+    def _place(self) -> LightSettings:
+        if (self.toward is None) == (self.position is None):
+            raise PydanticCustomError("toward", "expected either a direction, toward, or a position")
+        return self
+
+    def light(self) -> AnyLight:
+        """Returns the light that marches through smoke take."""
+        if self.position is not None:
+            return PointLight(self.position, self.intensity, self.radius)
+        return Light(self.toward or (0.0, 1.0, 0.0), self.irradiance)
+
+    def at(self, place: np.ndarray, least: float) -> LightSettings:
+        """Returns the directional light that a light is at a place in metres, a point light from at least `least`
+        metres away."""
+        if self.position is None:
+            return self
+        away = np.asarray(self.position) - place
+        length = float(np.linalg.norm(away))
+        toward = away / length if length > _SHORTEST else np.array([0.0, 1.0, 0.0])
+        irradiance = np.asarray(self.intensity) / max(length, least) ** 2
+        return LightSettings(toward=tuple(toward.tolist()), irradiance=tuple(irradiance.tolist()))
 
 
 class Looks(_Settings):
@@ -518,8 +541,11 @@ class Scene(_Settings):
         return frame / self.rate
 
     def looks(self, frame: int) -> Looks:
-        """Returns the settings for the picture of a frame; frames count from 1."""
-        parts = {"lights": self.lights, "background": self.background, "obstacles": self.obstacles}
+        """Returns the settings for the picture of a frame; frames count from 1. Point lights become directional
+        ones from the box's centre, since lightmaps know no others."""
+        size = self.grid.size
+        lights = tuple(light.at(self.grid.origin + 0.5 * size, 0.5 * float(size.min())) for light in self.lights)
+        parts = {"lights": lights, "background": self.background, "obstacles": self.obstacles}
         return Looks(**parts, albedo=self.smoke.albedo, glow=self.glow, time=self.time(frame))
 
     def scaled(self, factor: float) -> Scene:

@@ -89,7 +89,8 @@ def run(
     lighting = Lighting(scene.smoke.albedo) if lighting is None else lighting
     solver = make_solver(scene, device=device)
     camera = make_camera(scene.camera, scene.grid.origin, scene.grid.size)
-    looks, lights = scene.looks(1), [light.light() for light in scene.lights]
+    looks = scene.looks(1)
+    lights = [light.light() for light in (looks if lighting.albedo is None else scene).lights]
     parts = {"background": looks.background, "ramp": looks.ramp, "obstacles": looks.obstacles}
     drawing = Drawing(camera, lights, albedo=looks.albedo, **parts, device=device)
     graph = None
