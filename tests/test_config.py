@@ -105,7 +105,7 @@ def test_a_profile_is_found_in_the_installed_package(tmp_path, monkeypatch):
     source = Path(wlm.config.__file__)
     (site / "wlm" / "formats").mkdir()
     formats = [f"formats/{name}.py" for name in ("__init__", "limits", "reading")]
-    for file in ("__init__.py", "config.py", "errors.py", *formats):
+    for file in ("__init__.py", "__init__.pyi", "_facade.py", "config.py", "errors.py", *formats):
         (site / "wlm" / file).write_bytes((source.parent / file).read_bytes())
     code = "import wlm.config as c; print(c.profile_names('atlas'), c.profile_path('atlas', 'M'))"
     environment = {**os.environ, "PYTHONPATH": str(site)}

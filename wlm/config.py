@@ -178,7 +178,7 @@ def _first_problem(cls: type[BaseModel], error: ValidationError, as_option: bool
         name = [] if ": " in problem["msg"] else [problem["type"]]
         text = ": ".join(filter(None, [".".join([*map(str, problem["loc"]), *name]), problem["msg"]]))
     else:
-        expected = problem["msg"].replace("Input should be", "expected", 1)
+        expected = problem["msg"].replace("Input should be", "expected", 1).removeprefix("Value error, ")
         text = f"{field}: {expected}, got {_shown(problem['input'])}"
     return text if len(problems) == 1 else f"{text} (and {len(problems) - 1} more)"
 

@@ -31,6 +31,18 @@ def test_two_other_decoders_agree_bit_for_bit(blocks):
     assert np.array_equal(ours, np.frombuffer(bgra, np.uint8).reshape(shape)[..., [2, 1, 0, 3]])
 
 
+def test_every_partition_is_read():
+    """The number of a partition is in the bits above those of the mode."""
+    for mode in (0, 1, 2, 3, 7):
+        count = 16 if mode == 0 else 64
+        blocks = np.random.default_rng(mode).integers(0, 256, (count, 64, 16), np.uint8)
+        low = blocks[..., :2].copy().view("<u2")[..., 0] & ~np.uint16((2 * count << mode) - 1)
+        low |= np.arange(count, dtype=np.uint16)[:, None] << mode + 1 | np.uint16(1 << mode)
+        blocks[..., :2] = low.astype("<u2")[..., None].view(np.uint8)
+        other = imagecodecs.bcn_decode(blocks.tobytes(), 7, shape=(4 * count, 256, 4))
+        assert np.array_equal(decode_image(blocks), other), mode
+
+
 def test_packing_keeps_the_texels():
     endpoints, indices = _parameters(4, 5)
     assert np.any(indices[..., 0] >= 8) and np.any(indices[..., 0] < 8)

@@ -78,7 +78,8 @@ class Wind:
         if keys.ndim != 2 or keys.shape[1] != 4 or not (np.isfinite(keys).all() and (np.diff(keys[:, 0]) > 0).all()):
             raise ValueError(f"keys: expected rows of an increasing time and a velocity, got {self.keys}")
         if not (0.0 <= self.gusts <= 1.0 and 0.0 < self.period < math.inf and self.seed >= 0):
-            raise ValueError("gusts, period, seed: expected 0 to 1, above 0, at least 0")
+            values = f"{self.gusts}, {self.period}, {self.seed}"
+            raise ValueError(f"gusts, period, seed: expected 0 to 1, above 0, at least 0, got {values}")
 
     def scaled(self, step: float, cell: float = 1.0) -> "Wind":
         """Returns the same in units of `cell` and `step`."""
