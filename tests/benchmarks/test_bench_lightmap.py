@@ -88,3 +88,10 @@ def test_frames_have_nothing_to_fit(lightmaps):
     assert keys(rows) == [("ours", "frames"), ("texture", "frames")]
     assert [rows[0].get(figure) for figure in ("frames_tiles", "constant_tiles", "steps")] == [2, 1, None]
     assert rows[0]["psnr"] > 45.0 and rows[0]["decode_ms"] > 0.0 and rows[0]["load_ms"] > 0.0
+
+
+def test_texture_and_pages_agree_with_the_decode(rows):
+    ours, texture, pages = (next(row for row in rows if row.method == each) for each in ("ours", "texture", "pages"))
+    # 8 bits lose little at such errors.
+    assert abs(texture["seen"] - ours["seen"]) < 0.1 and abs(texture["worst_seen"] - ours["worst_seen"]) < 0.1
+    assert pages["pages_decoded"] == 3 + 2 + 1 and abs(pages["psnr"] - texture["psnr"]) < 0.1
