@@ -22,12 +22,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rivals.lightmap_torch import dynamic_targets
 from benchmarks.rows import Row, read_runs
 from benchmarks.runner import Bench, Note
 from wlm.errors import WlmError
 from wlm.formats.exr import read_exr, write_exr
 from wlm.lightmap.data import from_arrays
-from wlm.lightmap.fit import dynamic_targets
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.tiles import TILE
 

@@ -124,6 +124,18 @@ def test_a_firefly_that_is_lost_is_said():
     assert compress(plain, tiny_profile(steps=60)).warnings == ()
 
 
+def test_a_bright_patch_that_hides_the_rest_is_said():
+    """Errors of a tile are relative to its range, which hides that the dim texels are off by half of their light."""
+    plain = moving_light(128, 128)
+    frames = plain.light.frames.copy()
+    frames[:, 20:60, 20:60] = 6e4
+    lightmaps = from_arrays(frames, plain.times, period=24.0, name="patch")
+    model = compress(lightmaps, tiny_profile(steps=60))
+    report = evaluate(model, lightmaps, metrics=("psnr",))
+    (line,) = (line for line in model.warnings if "most of their tile" in line)
+    assert line.startswith("patch: ") and line in report.warnings
+
+
 def test_times_that_the_model_lacks_are_scored_by_themselves(fitted):
     whole, _, _ = fitted
     stored = whole.without([5.0, 13.5])
