@@ -103,6 +103,9 @@ def test_a_mesh_has_no_radius(tmp_path):
     for body in ({"shape": "a.obj", "radius": 1.0}, {"shape": "box"}, {}):
         with pytest.raises(WlmError, match=r"radius: expected one number for a sphere, .* none for a mesh"):
             _scene(tmp_path, [body | {"path": [[0, 0, 0, 0]]}])
+    for extra in ({"scale": 2.0}, {"shell": True}):
+        with pytest.raises(WlmError, match=r"expected scale and shell only for a mesh, found a sphere"):
+            _scene(tmp_path, [{"radius": 0.1, "path": [[0, 0, 0, 0]]} | extra])
 
 
 def test_a_mesh_as_a_solid_and_in_pictures(tmp_path):

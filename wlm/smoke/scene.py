@@ -262,6 +262,8 @@ class Body(_Settings):
         if not isinstance(self.radius, _SIZES.get(self.shape, NoneType)):
             text = "expected one number for a sphere, three for a box or cylinder, none for a mesh"
             raise PydanticCustomError("radius", text)
+        if self.shape in _SIZES and (self.scale != 1.0 or self.shell is not None):
+            raise PydanticCustomError("scale", f"expected scale and shell only for a mesh, found a {self.shape}")
         if (self.centre is None) == (not self.path):
             raise PydanticCustomError("path", "expected a centre, or positions with their times")
         if self._pieces.sum() > _MOST_PIECES:
