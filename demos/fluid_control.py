@@ -70,10 +70,7 @@ def scene(device: str) -> fluid.DifferentiableSolver:
     places = HEART[0] + WIDTH * (np.arange(NOZZLES) - (NOZZLES - 1) / 2)
     nozzles = [fluid.Source("box", (x, FLOOR, 0.5), (0.5 * WIDTH, 0.5, 1.0), 0.1) for x in places.tolist()]
     cylinder = fluid.Sphere(fluid.Trajectory.of([[*CYLINDER, 0.5]]), RADIUS)
-    solver = fluid.Solver(air, refinement=REFINEMENT, sources=nozzles, obstacles=[cylinder])
-    # The air flows round the cylinder before there is smoke.
-    air.step(200)
-    return fluid.DifferentiableSolver(solver)
+    return fluid.DifferentiableSolver(fluid.Solver(air, refinement=REFINEMENT, sources=nozzles, obstacles=[cylinder]))
 
 
 def heart(device: str) -> torch.Tensor:
