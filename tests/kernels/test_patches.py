@@ -159,7 +159,8 @@ def test_neighbours_without_bounds(device: str, threshold: float):
     np.testing.assert_array_equal(joined.numpy(), np.where(like, rank, len(level)).min(1))
     means = [reference.upsampled(split[t], SIZES[level[t]] if len(split[t]) > 3 else 2, 129) for t in number]
     means = [np.mean(list(colours.values()), 0).sum() for colours in means]
-    assert (graph.low.numpy() <= np.array(means) + 1e-3).all() and (graph.high.numpy() >= np.array(means) - 1e-3).all()
+    low, high = graph.nodes.low.numpy(), graph.nodes.high.numpy()
+    assert (low <= np.array(means) + 1e-3).all() and (high >= np.array(means) - 1e-3).all()
 
 
 @pytest.mark.parametrize(("step", "alike"), [(50, True), (51, False)])

@@ -1,5 +1,7 @@
 """Light of black bodies, for temperatures in kelvin."""
 
+import functools
+
 import numpy as np
 import torch
 
@@ -13,10 +15,9 @@ _WAVELENGTHS, _STEP = 1e-9 * np.arange(400, 761, 10), 1e-8  # metres
 _EFFICACY = 683.0  # lumens per watt
 _PLANCK, _LIGHT, _BOLTZMANN = 6.62607015e-34, 299792458.0, 1.380649e-23
 _COLD, _HOT, _SAMPLES = 100.0, 1e5, 1024
-
-
 _TO_RGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
-_GLOWING = 1500.0
+GLOWING = 1500.0
+"""Kelvins at which a black body emits 1, as `wlm.fluid.volume` and scenes define the light of a temperature."""
 
 
 def black_body_colour(kelvin: np.ndarray) -> np.ndarray:
@@ -39,13 +40,28 @@ def black_body_colour(kelvin: np.ndarray) -> np.ndarray:
 
 def black_body_light(kelvin: torch.Tensor) -> torch.Tensor:
     """Returns the luminance of black bodies relative to 1,500 K, at most 65,504, like `kelvin` in shape and type."""
-    inverse = np.linspace(1 / _COLD, 1 / _HOT, 4 * _SAMPLES)
-    table = np.log(np.maximum(black_body_luminance(1 / inverse) / black_body_luminance(_GLOWING), 1e-30))
-    table = torch.from_numpy(table.astype(np.float32)).to(kelvin.device)
-    at = (1 / _COLD - 1 / kelvin.float().clamp(_COLD, _HOT)) * ((len(inverse) - 1) / (1 / _COLD - 1 / _HOT))
-    first = at.long().clamp(max=len(inverse) - 2)
+    table = torch.from_numpy(_lights()).to(kelvin.device)
+    at = (1 / _COLD - 1 / kelvin.float().clamp(_COLD, _HOT)) * ((len(table) - 1) / (1 / _COLD - 1 / _HOT))
+    first = at.long().clamp(max=len(table) - 2)
     light = torch.exp(torch.lerp(table[first], table[first + 1], at - first))
     return torch.where(kelvin > _COLD, light, 0.0).clamp(max=65504.0).to(kelvin.dtype)
+
+
+@functools.cache
+def _lights() -> np.ndarray:
+    """Returns the logarithm of the light of black bodies at equal steps of 1 / T, float32 [4096]."""
+    inverse = np.linspace(1 / _COLD, 1 / _HOT, 4 * _SAMPLES)
+    light = black_body_luminance(1 / inverse) / black_body_luminance(np.array(GLOWING))
+    return np.log(np.maximum(light, 1e-30)).astype(np.float32)
+
+
+@functools.cache
+def _luminances() -> tuple[np.ndarray, np.ndarray]:
+    """Returns inverse temperatures, falling, and the logarithm of the luminance at each, float64 [1024]."""
+    inverse = np.geomspace(1 / _COLD, 1 / _HOT, _SAMPLES)[:, None]
+    exponent = _PLANCK * _LIGHT / (_BOLTZMANN * _WAVELENGTHS) * inverse
+    radiance = 2 * _PLANCK * _LIGHT**2 / _WAVELENGTHS**5 / np.expm1(np.minimum(exponent, 700.0))
+    return inverse[:, 0], np.log(_EFFICACY * _STEP * (radiance * _EFFICIENCY).sum(1))
 
 
 def black_body_luminance(kelvin: np.ndarray) -> np.ndarray:
@@ -54,9 +70,5 @@ def black_body_luminance(kelvin: np.ndarray) -> np.ndarray:
     Planck's law, weighted by the CIE's luminous efficiency; the logarithm is interpolated in 1 / T to 1e-4. It is 0
     up to 100 K and constant above 100,000 K.
     """
-    inverse = np.geomspace(1 / _COLD, 1 / _HOT, _SAMPLES)[:, None]
-    exponent = _PLANCK * _LIGHT / (_BOLTZMANN * _WAVELENGTHS) * inverse
-    radiance = 2 * _PLANCK * _LIGHT**2 / _WAVELENGTHS**5 / np.expm1(np.minimum(exponent, 700.0))
-    table = np.log(_EFFICACY * _STEP * (radiance * _EFFICIENCY).sum(1))
-    kelvin = np.asarray(kelvin, np.float64)
-    return np.where(kelvin > _COLD, np.exp(np.interp(-1 / np.maximum(kelvin, _COLD), -inverse[:, 0], table)), 0.0)
+    (inverse, table), kelvin = _luminances(), np.asarray(kelvin, np.float64)
+    return np.where(kelvin > _COLD, np.exp(np.interp(-1 / np.maximum(kelvin, _COLD), -inverse, table)), 0.0)

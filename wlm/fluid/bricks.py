@@ -97,9 +97,8 @@ class BrickPool:
         require_memory("bricks of smoke", (size, CELLS, 1), more, self._device)
         self.fields[1:] = []
         grown = self._make(size * CELLS)
-        for name in ("density", "temperature", "fuel"):
-            if (part := getattr(now, name)) is not None:
-                wp.copy(getattr(grown, name), part, count=part.size)
+        for to, part in zip(grown.parts, now.parts, strict=True):
+            wp.copy(to, part, count=part.size)
         del now, part
         self.fields[:] = [grown]
         self.fields += [self._make(size * CELLS) for _ in range(buffers - 1)]
@@ -112,8 +111,7 @@ class BrickPool:
 
     @property
     def _brick_bytes(self) -> int:
-        now = self.fields[0]
-        parts = [part for part in (now.density, now.temperature, now.fuel) if part is not None and part.size]
+        parts = self.fields[0].parts
         return CELLS * len(parts) * wp.types.type_size_in_bytes(parts[0].dtype)
 
     def numbers(self) -> torch.Tensor:
@@ -131,8 +129,7 @@ class BrickPool:
         self.relist()
         self.store(clear=False)
         places = wp.to_torch(self.bricks.places)[numbers.long()].long()
-        now = self.fields[0]
-        for field, part in zip((now.density, now.temperature, now.fuel), values, strict=False):
+        for field, part in zip(self.fields[0].parts, values, strict=True):
             _cubes(field)[places] = part
 
 

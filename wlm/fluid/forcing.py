@@ -1,8 +1,9 @@
-"""What moves the air of a `Solver` besides smoke: turbulence, wind with gusts, and fire.
+"""Turbulence, wind with gusts, and fire, which move the air of a `Solver` besides smoke.
 
 Lengths and times are in any units; `scaled` converts them to those of cells and steps.
 """
 
+import functools
 import math
 from dataclasses import dataclass, replace
 
@@ -88,11 +89,16 @@ class Wind:
 
     def at(self, time: float) -> np.ndarray:
         """Returns the velocity at a time, float64 [3]."""
-        keys = np.asarray(self.keys, np.float64)
+        keys, (rates, phases) = np.asarray(self.keys, np.float64), self._waves
         mean = np.array([np.interp(time, keys[:, 0], column) for column in keys.T[1:]])
-        random = np.random.default_rng(self.seed)
-        waves = np.sin(2.0 * np.pi * (random.uniform(0.5, 2.0, 4) * time / self.period + random.random(4)))
+        waves = np.sin(2.0 * np.pi * (rates * time / self.period + phases))
         return mean * (1.0 + self.gusts * float(waves.mean()))
+
+    @functools.cached_property
+    def _waves(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rates, relative to the mean one, and phases of the waves of which gusts are made."""
+        random = np.random.default_rng(self.seed)
+        return random.uniform(0.5, 2.0, 4), random.random(4)
 
     @property
     def fastest(self) -> float:

@@ -453,8 +453,7 @@ class Solver:
     def bricks(self) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Returns the bricks that have smoke, heat or fuel, as `wlm.fluid.volume.gather` does; a solver with bricks
         makes no array of all cells for it."""
-        now = self._fields[0]
-        parts = [getattr(now, name) for name in self._parts]
+        parts = self._fields[0].parts
         if self._pool is None:
             return gather([wp.to_torch(part.reshape(self.shape)) for part in parts])
         numbers = self._pool.numbers()
@@ -490,7 +489,7 @@ class Solver:
     @property
     def stored_bytes(self) -> int:
         """Memory of density and temperature with all buffers of a step, in bytes."""
-        return sum(getattr(each, name).capacity for each in self._fields for name in self._parts)
+        return sum(part.capacity for each in self._fields for part in each.parts)
 
     def frame(
         self,
@@ -593,9 +592,8 @@ class Solver:
         device = wp.device_to_torch(self.device)
         numbers, *values = (torch.from_numpy(np.array(parts[name])).to(device) for name in ("bricks", *self._parts))
         if self._pool is None:
-            now = self._fields[0]
-            for name, part in zip(self._parts, values, strict=True):
-                wp.to_torch(getattr(now, name)).copy_(scatter(numbers, part, self.shape).flatten())
+            for field, part in zip(self._fields[0].parts, values, strict=True):
+                wp.to_torch(field).copy_(scatter(numbers, part, self.shape).flatten())
         else:
             self._pool, self._touched = self._make_pool(), ()
             self._pool.put(numbers, values)

@@ -19,7 +19,7 @@ import warp as wp
 from torch.nn.functional import pad
 
 from wlm.errors import WlmError
-from wlm.fluid.black_body import black_body_luminance
+from wlm.fluid.black_body import GLOWING, black_body_luminance
 from wlm.fluid.grids import UPS, Grid, choose, is_level_set, on_one_lattice
 from wlm.formats.atomic import atomic_path, atomic_write
 from wlm.formats.exr import HALF_MAX
@@ -66,7 +66,6 @@ _TINY, _HUGE = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 _THIN, _THICK = 0.1, 1000.0  # optical thickness of smoke that hides 10% of the light, and that looks solid
 _KELVIN = 250.0  # temperatures above it are kelvins; those of smoke simulations are about 1
-_GLOWING = 1500.0  # kelvins at which a black body emits `emission` per length
 
 SUFFIXES = (".npz", ".nvdb", ".vdb")
 """Suffixes of the files that `load_volume` reads and `save_volume` writes."""
@@ -261,7 +260,7 @@ def _in_kelvin(
     hottest = float(np.max(values, where=np.isfinite(values), initial=0.0))
     if not (kelvin or hottest > _KELVIN):
         return arrays, False, []
-    light, unit = np.empty(values.shape, np.float32), black_body_luminance(_GLOWING)
+    light, unit = np.empty(values.shape, np.float32), black_body_luminance(np.array(GLOWING))
     for out, plane in zip(light, values, strict=True):
         out[...] = np.where(np.isfinite(plane), black_body_luminance(plane) / unit, plane)
     if kelvin:

@@ -303,7 +303,7 @@ class Body(_Settings):
 
     @property
     def surface(self) -> Surface | None:
-        """What the mesh file contains; None for other shapes.
+        """The surface in the mesh file; None for other shapes.
 
         Raises:
             WlmError: The file cannot be read.

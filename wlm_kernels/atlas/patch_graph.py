@@ -75,6 +75,19 @@ class Rule:
     mixed: wp.array1d[wp.int64]
 
 
+@wp.struct
+class Nodes:
+    """The input of comparisons of M patches: the samples of all patches; the patches; their `Bounds`, [M, L]; the rule;
+    and the least and greatest mean colour of each, see `Graph`."""
+
+    samples: wp.array1d[int]
+    patches: wp.array1d[Patch]
+    bounds: wp.array2d[Bounds]
+    rule: Rule
+    low: wp.array1d[float]
+    high: wp.array1d[float]
+
+
 @wp.kernel(enable_backward=False)
 def _bounds(
     # in:
@@ -145,12 +158,16 @@ def _near(rule: Rule, a: int, b: int) -> bool:
 
 
 @wp.func
-def _alike(
-    samples: wp.array1d[int], patches: wp.array1d[Patch], bounds: wp.array2d[Bounds], rule: Rule, x: int, y: int
-) -> bool:
+def _has_bounds(nodes: Nodes, x: int) -> bool:
+    return nodes.patches[x].level < nodes.bounds.shape[1]
+
+
+@wp.func
+def _alike(nodes: Nodes, x: int, y: int) -> bool:
     """Tests whether patches x and y are alike: Dist is below lambda in some order of the vertices (eq. 3 and 4)."""
-    a = patches[x]
-    b = patches[y]
+    rule = nodes.rule
+    a = nodes.patches[x]
+    b = nodes.patches[y]
     if not _near(rule, a.colour, b.colour):
         return False
     # Interpolation stays within a patch's range, so bounds from two ranges are valid for all samples and orders.
@@ -173,9 +190,9 @@ def _alike(
     level = wp.max(a.level, b.level)
     undecided = int(63)
     first = int(0)
-    if level < bounds.shape[1]:
-        f = bounds[large, level]
-        g = bounds[small, level]
+    if level < nodes.bounds.shape[1]:
+        f = nodes.bounds[large, level]
+        g = nodes.bounds[small, level]
         below = _row_differences(f.moment, g.moment)
         above = _row_differences(f.corner, g.corner)
         undecided = 0
@@ -198,9 +215,23 @@ def _alike(
         # The likeliest order comes first: if the patches are alike in it, the others need no comparison.
         order = (first + i) % 6
         if ((undecided >> order) & 1) == 1:
-            if distance_sum(samples, patches[large], patches[small], order, limit) < limit:
+            if distance_sum(nodes.samples, nodes.patches[large], nodes.patches[small], order, limit) < limit:
                 return True
     return False
+
+
+@wp.func
+def _far(nodes: Nodes, x: int, y: int) -> bool:
+    """Tests whether the means of patches x and y are so different that the patches cannot be alike."""
+    margin = nodes.rule.level + _MARGIN
+    return nodes.low[y] > nodes.high[x] + margin or nodes.low[x] > nodes.high[y] + margin
+
+
+@wp.func
+def _connect(nodes: Nodes, x: int, y: int, edge: wp.array2d[wp.uint8]):
+    if _alike(nodes, x, y):
+        edge[x, y] = wp.uint8(1)
+        edge[y, x] = wp.uint8(1)
 
 
 @wp.kernel(enable_backward=False)
@@ -249,39 +280,27 @@ def _spans(
 @wp.kernel(enable_backward=False)
 def _edges(
     # in:
-    samples: wp.array1d[int],
-    patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
-    rule: Rule,
-    low: wp.array1d[float],
-    high: wp.array1d[float],
+    nodes: Nodes,
     offset: int,
     # out:
     edge: wp.array2d[wp.uint8],
 ):
     """Finds the edges between one patch per thread and all later patches, so that each pair is tested once."""
     a = offset + wp.tid()
-    if patches[a].level >= bounds.shape[1]:
+    if not _has_bounds(nodes, a):
         return
-    last = high[a] + rule.level + _MARGIN
-    for b in range(a + 1, low.shape[0]):
-        if low[b] > last:
+    last = nodes.high[a] + nodes.rule.level + _MARGIN
+    for b in range(a + 1, nodes.low.shape[0]):
+        if nodes.low[b] > last:
             break
-        if patches[b].level < bounds.shape[1]:
-            if _alike(samples, patches, bounds, rule, a, b):
-                edge[a, b] = wp.uint8(1)
-                edge[b, a] = wp.uint8(1)
+        if _has_bounds(nodes, b):
+            _connect(nodes, a, b, edge)
 
 
 @wp.kernel(enable_backward=False)
 def _large_edges(
     # in:
-    samples: wp.array1d[int],
-    patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
-    rule: Rule,
-    low: wp.array1d[float],
-    high: wp.array1d[float],
+    nodes: Nodes,
     large: wp.array1d[int],
     # out:
     edge: wp.array2d[wp.uint8],
@@ -289,27 +308,17 @@ def _large_edges(
     """Finds the edges of patches that have no bounds, with a thread for each pair, since a comparison takes long."""
     k, b = wp.tid()
     a = large[k]
-    if b == a or (b < a and patches[b].level >= bounds.shape[1]):
+    if b == a or (b < a and not _has_bounds(nodes, b)) or _far(nodes, a, b):
         return
-    margin = rule.level + _MARGIN
-    if low[b] > high[a] + margin or low[a] > high[b] + margin:
-        return
-    if _alike(samples, patches, bounds, rule, a, b):
-        edge[a, b] = wp.uint8(1)
-        edge[b, a] = wp.uint8(1)
+    _connect(nodes, a, b, edge)
 
 
 @wp.kernel(enable_backward=False)
 def _join(
     # in:
-    samples: wp.array1d[int],
-    patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
-    rule: Rule,
-    low: wp.array1d[float],
-    high: wp.array1d[float],
+    nodes: Nodes,
     reach: float,
-    nodes: wp.array1d[int],
+    each: wp.array1d[int],
     offset: int,
     heads: wp.array1d[int],
     head_low: wp.array1d[float],
@@ -319,17 +328,17 @@ def _join(
 ):
     """Finds for one node per thread the least rank of a group whose representative is alike; H if none of H is."""
     i = offset + wp.tid()
-    a = nodes[i]
-    margin = rule.level + _MARGIN
+    a = each[i]
+    margin = nodes.rule.level + _MARGIN
     best = int(rank.shape[0])
-    if patches[a].level >= bounds.shape[1]:
+    if not _has_bounds(nodes, a):
         joined[i] = best
         return
-    for k in range(wp.lower_bound(head_low, low[a] - margin - reach), heads.shape[0]):
-        if head_low[k] > high[a] + margin:
+    for k in range(wp.lower_bound(head_low, nodes.low[a] - margin - reach), heads.shape[0]):
+        if head_low[k] > nodes.high[a] + margin:
             break
         if rank[k] < best:
-            if _alike(samples, patches, bounds, rule, heads[k], a):
+            if _alike(nodes, heads[k], a):
                 best = rank[k]
     joined[i] = best
 
@@ -337,13 +346,8 @@ def _join(
 @wp.kernel(enable_backward=False)
 def _join_large(
     # in:
-    samples: wp.array1d[int],
-    patches: wp.array1d[Patch],
-    bounds: wp.array2d[Bounds],
-    rule: Rule,
-    low: wp.array1d[float],
-    high: wp.array1d[float],
-    nodes: wp.array1d[int],
+    nodes: Nodes,
+    each: wp.array1d[int],
     large: wp.array1d[int],
     heads: wp.array1d[int],
     rank: wp.array1d[int],
@@ -353,12 +357,9 @@ def _join_large(
     """Does the same for nodes whose patches have no bounds, with a thread for each pair of a node and a group."""
     j, k = wp.tid()
     i = large[j]
-    a = nodes[i]
-    margin = rule.level + _MARGIN
-    head = heads[k]
-    if low[head] > high[a] + margin or low[a] > high[head] + margin or rank[k] >= joined[i]:
+    if _far(nodes, each[i], heads[k]) or rank[k] >= joined[i]:
         return
-    if _alike(samples, patches, bounds, rule, head, a):
+    if _alike(nodes, heads[k], each[i]):
         wp.atomic_min(joined, i, rank[k])
 
 
@@ -390,75 +391,62 @@ class Graph:
     """The similarity graph of M patches (eq. 5), sorted by `low`. Its edges are computed when they are needed.
 
     Attributes:
-        samples: The samples of all patches.
-        patches, bounds: The M patches, which are the graph's nodes, and their `Bounds`.
-        rule: Thresholds below which two patches are alike.
-        low, high: float [M], a patch's least and greatest mean colour on any lattice, in levels. If two patches are
-            alike, their means on the larger one's lattice differ by less than `rule.level`.
+        nodes: The M patches, sorted, and what is compared. `low` and `high` are the least and greatest mean of a patch
+            on any lattice, in levels: if two patches are alike, their means on the larger one's lattice differ by less
+            than `rule.level`.
         means: float32 [M], copy of `low` in the CPU's memory.
         large: bool [M], on the CPU: whether a patch has no bounds.
         reach: The largest difference of `high` and `low` in any patch.
     """
 
-    samples: wp.array
-    patches: wp.array
-    bounds: wp.array
-    rule: Rule
-    low: wp.array
-    high: wp.array
+    nodes: Nodes
     means: np.ndarray
     large: np.ndarray
     reach: float
-
-    def _inputs(self) -> list:
-        return [self.samples, self.patches, self.bounds, self.rule]
 
 
 def graph(samples, patches, bounds, levels: int, rule: Rule) -> tuple[Graph, np.ndarray]:
     """Makes the graph of M patches of the sizes `SIZES[:levels]`. Also returns the index in `patches` of each of its
     nodes, int64 [M]."""
     count, device = patches.shape[0], samples.device
-    low, high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
-    wp.launch(_spans, count, inputs=[samples, patches, levels], outputs=[low, high], device=device)
-    least, most = low.numpy(), high.numpy()
+    nodes = Nodes()
+    nodes.samples, nodes.patches, nodes.bounds, nodes.rule = samples, patches, bounds, rule
+    nodes.low, nodes.high = (wp.empty(count, dtype=float, device=device) for _ in range(2))
+    wp.launch(_spans, count, inputs=[samples, patches, levels], outputs=[nodes.low, nodes.high], device=device)
+    least, most = nodes.low.numpy(), nodes.high.numpy()
     order = np.argsort(least, kind="stable")
-    spans = [wp.array(values[order], dtype=float, device=device) for values in (least, most)]
-    reach = float((most - least).max(initial=0.0))
-    large = patches.numpy()["level"][order] >= bounds.shape[1]
-    return Graph(samples, *_taken(patches, bounds, order), rule, *spans, least[order], large, reach), order
+    large = patches.numpy()["level"] >= bounds.shape[1]
+    return part(Graph(nodes, least, large, float((most - least).max(initial=0.0))), order), order
 
 
 def part(whole: Graph, nodes: np.ndarray) -> Graph:
-    """Makes the subgraph of N nodes, whose numbers `nodes`, int [N], must ascend."""
-    spans = [wp.array(values.numpy()[nodes], dtype=float, device=values.device) for values in (whole.low, whole.high)]
-    taken = _taken(whole.patches, whole.bounds, nodes)
-    return Graph(whole.samples, *taken, whole.rule, *spans, whole.means[nodes], whole.large[nodes], whole.reach)
-
-
-def _taken(patches, bounds, nodes: np.ndarray) -> tuple[wp.array, wp.array]:
-    pairs = (patches, Patch), (bounds, Bounds)
-    return tuple(wp.array(each.numpy()[nodes], dtype=kind, device=each.device) for each, kind in pairs)
+    """Makes the subgraph of N nodes, whose numbers are `nodes`, int [N], with `low` rising."""
+    out = Nodes()
+    out.samples, out.rule = whole.nodes.samples, whole.nodes.rule
+    for name, kind in (("patches", Patch), ("bounds", Bounds), ("low", float), ("high", float)):
+        values = getattr(whole.nodes, name)
+        setattr(out, name, wp.array(values.numpy()[nodes], dtype=kind, device=values.device))
+    return Graph(out, whole.means[nodes], whole.large[nodes], whole.reach)
 
 
 def find_edges(graph: Graph, begin: int, end: int, edge) -> None:
     """Finds the edges between the nodes `begin` to `end` - 1 and all later ones. For an edge between a and b it writes
     1 to `edge`, uint8 [M, M], at (a, b) and at (b, a); all of `edge` must be 0 before."""
-    inputs = [*graph._inputs(), graph.low, graph.high]
-    wp.launch(_edges, end - begin, inputs=[*inputs, begin], outputs=[edge], device=edge.device)
+    wp.launch(_edges, end - begin, inputs=[graph.nodes, begin], outputs=[edge], device=edge.device)
     large = begin + np.flatnonzero(graph.large[begin:end])
     if len(large):
-        inputs.append(wp.array(large, dtype=int, device=edge.device))
-        wp.launch(_large_edges, (len(large), graph.low.shape[0]), inputs=inputs, outputs=[edge], device=edge.device)
+        inputs = [graph.nodes, wp.array(large, dtype=int, device=edge.device)]
+        wp.launch(_large_edges, (len(large), len(graph.means)), inputs=inputs, outputs=[edge], device=edge.device)
 
 
 def join(graph: Graph, nodes, begin: int, end: int, heads, head_low, rank, joined) -> None:
     """Finds for each of the nodes `nodes[begin:end]` the first of H groups whose representative it is like, and writes
     the group's rank to `joined`, int [N], or H if there is none. `heads`, int [H], are the representatives in ascending
     order; `head_low` is the `low` of each, and `rank` its place in the order in which groups are tried."""
-    device, means = joined.device, [graph.low, graph.high]
-    inputs = [*graph._inputs(), *means, graph.reach, nodes, begin, heads, head_low, rank]
+    device = joined.device
+    inputs = [graph.nodes, graph.reach, nodes, begin, heads, head_low, rank]
     wp.launch(_join, end - begin, inputs=inputs, outputs=[joined], device=device)
     large = begin + np.flatnonzero(graph.large[nodes.numpy()[begin:end]])
     if len(large):
-        inputs = [*graph._inputs(), *means, nodes, wp.array(large, dtype=int, device=device), heads, rank]
+        inputs = [graph.nodes, nodes, wp.array(large, dtype=int, device=device), heads, rank]
         wp.launch(_join_large, (len(large), heads.shape[0]), inputs=inputs, outputs=[joined], device=device)

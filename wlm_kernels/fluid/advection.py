@@ -125,6 +125,11 @@ class Fields:
     fuel: wp.array | None = None
 
     @functools.cached_property
+    def parts(self) -> list[wp.array]:
+        """The arrays that the smoke has: density, temperature and fuel."""
+        return [part for part in (self.density, self.temperature, self.fuel) if part is not None and part.size]
+
+    @functools.cached_property
     def burning(self) -> "Fields":
         """The fuel as the density of cold smoke, which is moved alike."""
         return Fields(self.fuel, wp.empty(0, dtype=self.fuel.dtype, device=self.fuel.device))

@@ -183,7 +183,7 @@ def _groups(graph: graphs.Graph, number: np.ndarray, progress: OnProgress | None
 def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Meter, done: int) -> np.ndarray:
     """Finds for each of N triangles the index in `heads` of the first representative whose light is alike, int [N];
     `len(heads)` where none is."""
-    device, by_mean = graph.patches.device, np.argsort(heads, kind="stable")
+    device, by_mean = graph.nodes.samples.device, np.argsort(heads, kind="stable")
 
     def on_device(values: np.ndarray) -> wp.array:
         return wp.array(values.astype(np.int32), dtype=int, device=device)
@@ -202,7 +202,7 @@ def _joined(graph: graphs.Graph, nodes: np.ndarray, heads: np.ndarray, meter: Me
 
 def _edges(graph: graphs.Graph, meter: Meter, done: int) -> np.ndarray:
     """Compares the light of all pairs of M triangles: uint8 [M, M], 1 where two are alike, which is an edge."""
-    count, device = graph.patches.shape[0], graph.patches.device
+    count, device = len(graph.means), graph.nodes.samples.device
     edge = wp.zeros((count, count), dtype=wp.uint8, device=device)
     piece = max(_PAIRS_AT_ONCE // max(count, 1), 1)
     for begin in range(0, count, piece):
