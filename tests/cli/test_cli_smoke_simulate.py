@@ -245,7 +245,7 @@ def test_earlier_results_outlast_a_command_that_fails(jet, tmp_path, monkeypatch
     call(*bake, code=2)
     (tmp_path / "bake" / "six_0001.exr").write_bytes(b"x")
     fails("smoke", "shade", tmp_path / "bake", "-o", tmp_path / "baked")
-    monkeypatch.setattr(simulation, "free_memory", lambda device: 3 * 2**10)
+    monkeypatch.setattr("wlm.fluid.slabs.free_memory", lambda device: 3 * 2**10)
     line = fails("smoke", "simulate", jet / "jet.yaml", "-o", frames)
     assert re.search(
         r"8 x 10 x 8 cells of air and 16 x 20 x 16 voxels of smoke need .* but only 0.0 GiB are free", line

@@ -115,7 +115,7 @@ def test_bricks_take_memory_where_smoke_is(device: str, monkeypatch: pytest.Monk
     small.step()
     assert small.active_cells == 16**3 and (_numbers(small) == 1.0).all() and small.stored_bytes > empty
     scarce = Solver(_room(device, (8, 8, 8)), sources=small.sources, bricks=True)
-    monkeypatch.setattr("wlm.fluid.lattice.free_memory", lambda device: 1000)
+    monkeypatch.setattr("wlm.fluid.slabs.free_memory", lambda device: 1000)
     with pytest.raises(WlmError, match="bricks of smoke: 65 x 512 x 1 cells need 0.0 GiB on .*: expected at most"):
         scarce.step()
 

@@ -188,7 +188,7 @@ class DifferentiableLattice:
         setup = self._setup
         spec = replace(setup.spec, forced=forces.shape[0] > 0)
         work.done.fill_(done)
-        inputs = [wp.vec3i(*setup.shape), f, setup.solid, setup.tau, setup.eddy, forces, 0]
+        inputs = [0, wp.vec3i(*setup.shape), f, setup.solid, setup.tau, setup.eddy, forces, 0]
         outputs = [work.clock, work.trouble, work.sums, out]
         wp.launch(step_kernel(spec), self._cells, inputs=inputs, outputs=outputs, device=f.device)
 
@@ -203,9 +203,11 @@ class DifferentiableLattice:
             lattice_adjoint.set_inlets(setup.tables, work.links, setup.inlet, _flat(inlet, wp.vec3))
         left = self._populations(out)
         self._collide(work, self._populations(f), done, forces, left)
-        where = [setup.tables, wp.vec3i(*setup.shape), setup.bounded, 0, work.links, setup.solid]
-        rise = 1.0 / max(setup.ramp, 1)
-        lattice_links.apply(setup.link_kernels, *where, work.clock, rise, left, work.sums)
+        n, rise = wp.vec3i(*setup.shape), 1.0 / max(setup.ramp, 1)
+        every = lattice_links.LinkRange(left.device, setup.tables, 0, work.links.cell.shape[0])
+        where = [setup.bounded, work.links, setup.solid, work.clock, rise, left, work.sums]
+        lattice_links.evaluate(setup.link_kernels, every, n, *where)
+        lattice_links.write(setup.link_kernels, every, n, work.links, work.sums, left)
         return out
 
     def _reverse(
@@ -241,7 +243,7 @@ class DifferentiableLattice:
 
     def _read(self, f: torch.Tensor, forces: wp.array, drho: wp.array, u: wp.array) -> None:
         setup = self._setup
-        inputs = [wp.vec3i(*setup.shape), self._populations(f), setup.solid, setup.bodies, forces]
+        inputs = [0, wp.vec3i(*setup.shape), self._populations(f), setup.solid, setup.bodies, forces]
         wp.launch(setup.fluid_kernels.fields, self._cells, inputs=inputs, outputs=[drho, u], device=u.device)
 
 

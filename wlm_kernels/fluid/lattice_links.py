@@ -152,6 +152,8 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         n: wp.vec3i,
         bounded: wp.vec3i,
         first: int,
+        last: int,
+        part: int,
         solid: wp.array1d[wp.uint8],
         clock: wp.array1d[int],
         rise: float,
@@ -164,7 +166,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         at = first + wp.tid()
         net = wp.float64(0.0)
         weight = wp.float64(0.0)
-        live = at < links.used[0]
+        live = at < wp.min(last, links.used[0])
         if live:
             i = links.cell[at]
             q = int(links.code[at]) & 31
@@ -198,8 +200,8 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                 if kind == _OUTLET:
                     weight = wp.float64(t.w[q])
         if wp.static(balance):
-            summed(wp.tid(), sums, 0, net)
-            summed(wp.tid(), sums, 1, weight)
+            summed(wp.tid(), sums, 2 * part, net)
+            summed(wp.tid(), sums, 2 * part + 1, weight)
 
     @wp.kernel(module="unique", module_options=options)
     def write(
@@ -219,8 +221,14 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         q = int(links.code[at]) & 31
         v = links.value[at]
         if wp.static(balance):
-            if int(links.code[at]) >> 5 == _OUTLET and sums[1] > wp.float64(0.0):
-                v -= t.w[q] * float(sums[0] / sums[1])
+            if int(links.code[at]) >> 5 == _OUTLET:
+                net = wp.float64(0.0)
+                weight = wp.float64(0.0)
+                for k in range(sums.shape[0] // 2):
+                    net += sums[2 * k]
+                    weight += sums[2 * k + 1]
+                if weight > wp.float64(0.0):
+                    v -= t.w[q] * float(net / weight)
         store(f, q, index_of(n, wrapped(n, cell_of(n, i) - t.c[q])), v)
 
     @wp.kernel(module="unique", module_options=options)
@@ -388,19 +396,30 @@ def bounce(
     f: wp.array,
     sums: wp.array,
 ) -> None:
-    """Sends populations back from a moving body, after a step and before `apply`; arguments as there and for
+    """Sends populations back from a moving body, after a step and before `evaluate`; arguments as there and for
     `lattice_bodies.mark`."""
     threads = -(-size_of(window) // BLOCK) * BLOCK
     inputs = [window.n, bounded, window, motion, wp.uint8(stamp), solid, fresh, f]
     wp.launch(kernels.bounce, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=f.device)
 
 
-def apply(
+@dataclass(frozen=True)
+class LinkRange:
+    """The links from index `first` to `last` - 1, computed by a device, which has its own copy of the velocity set;
+    the sums of these links are at `part` of P parts."""
+
+    device: wp.Device
+    tables: Tables
+    first: int
+    last: int
+    part: int = 0
+
+
+def evaluate(
     kernels: LinkKernels,
-    tables: Tables,
+    links_range: LinkRange,
     n: wp.vec3i,
     bounded: wp.vec3i,
-    first: int,
     links: Links,
     solid: wp.array,
     clock: wp.array,
@@ -408,27 +427,32 @@ def apply(
     f: wp.array,
     sums: wp.array,
 ) -> None:
-    """Applies the boundary conditions after a step: runs both passes over the links from index `first` on.
+    """Applies the boundary conditions after a step, first pass: computes the values of links.
 
     Args:
         kernels: Kernels for the lattice and storage type of `f`.
-        tables: The velocity set, with Q velocities.
+        links_range: The links to compute.
         n: Cells along x, y and z; N in all.
         bounded: 1 for each axis that is not periodic, else 0.
-        first: 0 for all links, or the index of the first link of a solid for solids alone.
         links: The links; `value` is modified.
         solid: uint8 [N], number of the body of each cell, or [0] if no cell is solid.
         clock: int [2], see `lattice.step_kernel`.
         rise: Inlets reach their full velocity after 1 / rise steps.
-        f: [Q, N], the populations that have just left the cells, modified.
-        sums: float64 [2], 0 at the call; receives the net mass that all links add before the outlets' shift, and the
-            sum of the weights w_q of outlet links.
+        f: [Q, N], the populations that have just left the cells.
+        sums: float64 [2 P], 0 at the call; receives the net mass that the links of a part add before the outlets'
+            shift, and the sum of the weights w_q of outlet links.
     """
-    size, device = links.cell.shape[0] - first, f.device
-    if size <= 0:
-        return
-    threads = -(-size // BLOCK) * BLOCK
-    inputs = [tables, n, bounded, first, solid, clock, rise, f, links]
-    wp.launch(kernels.values, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=device)
-    inputs = [tables, n, first, links, sums]
-    wp.launch(kernels.write, size, inputs=inputs, outputs=[f], device=device)
+    of, size = links_range, links_range.last - links_range.first
+    if size > 0:
+        inputs = [of.tables, n, bounded, of.first, of.last, of.part, solid, clock, rise, f, links]
+        threads = -(-size // BLOCK) * BLOCK
+        wp.launch(kernels.values, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=of.device)
+
+
+def write(kernels: LinkKernels, links_range: LinkRange, n: wp.vec3i, links: Links, sums: wp.array, f: wp.array) -> None:
+    """Applies the boundary conditions, second pass: writes the values of links into the populations. Arguments: see
+    `evaluate`, which must be done for all links."""
+    of, size = links_range, links_range.last - links_range.first
+    if size > 0:
+        inputs = [of.tables, n, of.first, links, sums]
+        wp.launch(kernels.write, size, inputs=inputs, outputs=[f], device=of.device)
