@@ -140,5 +140,5 @@ def test_free_memory_is_that_of_the_fullest_device(device: str, monkeypatch: pyt
     """A device named three times of four takes the memory of three quarters of the planes."""
     monkeypatch.setattr("wlm.fluid.slabs.free_memory", lambda _device: 300)
     slabs = Slabs((8, 2, 2), [device] * 4)
-    assert [(slab.begin, slab.end) for slab in slabs] == [(0, 2), (2, 4), (4, 6), (6, 8)]
+    assert [(slab.begin, slab.end) for slab in slabs.parts] == [(0, 2), (2, 4), (4, 6), (6, 8)]
     assert slabs.free == 300 and slabs.home == wp.get_device(device)

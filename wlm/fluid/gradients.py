@@ -29,6 +29,7 @@ from wlm.ops.tensors import check, check_finite, dense, on_stream
 from wlm_kernels.fluid import advection, advection_adjoint, advection_sources, lattice_adjoint, lattice_links
 from wlm_kernels.fluid.lattice import QUIET, step_kernel
 from wlm_kernels.fluid.lattice_links import OUTLET, WIND
+from wlm_kernels.fluid.lattice_sets import Slab
 
 STATES = 8
 """Most states that are stored for the backward pass, by default."""
@@ -203,11 +204,11 @@ class DifferentiableLattice:
             lattice_adjoint.set_inlets(setup.tables, work.links, setup.inlet, _flat(inlet, wp.vec3))
         left = self._populations(out)
         self._collide(work, self._populations(f), done, forces, left)
-        n, rise = wp.vec3i(*setup.shape), 1.0 / max(setup.ramp, 1)
-        every = lattice_links.LinkRange(left.device, setup.tables, 0, work.links.cell.shape[0])
-        where = [setup.bounded, work.links, setup.solid, work.clock, rise, left, work.sums]
-        lattice_links.evaluate(setup.link_kernels, every, n, *where)
-        lattice_links.write(setup.link_kernels, every, n, work.links, work.sums, left)
+        slab, links = Slab(left.device, 0, setup.shape[0]), work.links
+        where = [setup.tables, slab, 0, links.cell.shape[0], wp.vec3i(*setup.shape), setup.bounded, links, setup.solid]
+        rise = 1.0 / max(setup.ramp, 1)
+        for writing in (False, True):
+            lattice_links.apply(setup.link_kernels, *where, work.clock, rise, left, work.sums, writing=writing)
         return out
 
     def _reverse(

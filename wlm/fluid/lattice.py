@@ -7,6 +7,7 @@ Lengths are in cells, times in steps, and the density of air at rest is 1; `Doma
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -197,7 +198,7 @@ class Lattice:
         # A ramp of one step is no ramp: inflow begins after it.
         self._tau, self._eddy, self._rise = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky), 1.0 / max(ramp, 1)
         # The counter of steps and the first error, see `wlm_kernels.fluid.lattice.step_kernel`.
-        self._clock, self._sums = self._zeros(2, int), self._zeros(2 * len(self.slabs), wp.float64)
+        self._clock, self._sums = self._zeros(2, int), self._zeros(2 * len(self.slabs.parts), wp.float64)
         self._trouble = wp.full(1, QUIET, dtype=wp.int64, device=self.device)
         # The number of the body of each cell, 0 for fluid; of size 0 while no cell has ever been solid.
         self._solid = self._zeros(0, wp.uint8)
@@ -697,7 +698,7 @@ class Lattice:
         self._fluid_kernels = fluid_kernels(*sets, walls)
         links = face_links(self.shape, self._set, self._faces)
         # The links of one slab after those of the other.
-        ends = [slab.end * math.prod(self.shape[1:]) for slab in self.slabs]
+        ends = [slab.end * math.prod(self.shape[1:]) for slab in self.slabs.parts]
         owner = np.searchsorted(ends, links[0], side="right")
         *self._face_columns, self._decides = (column[np.argsort(owner, kind="stable")] for column in links)
         self._parts = np.searchsorted(np.sort(owner), np.arange(len(ends))).tolist()
@@ -781,19 +782,19 @@ class Lattice:
             where = [self._bounded, window, self._motion, stamp, self._solid, self._fresh]
             lattice_links.bounce(self._link_kernels, *where, f, self._sums)
         links = self._links
-        if links.cell.shape[0] > first:
-            kernels, n = self._link_kernels, self._n
-            where = [n, self._bounded, links, self._solid, self._clock, self._rise, f, self._sums]
-            self.slabs.each(lambda slab: lattice_links.evaluate(kernels, self._range(slab, first), *where))
-            self.slabs.each(
-                lambda slab: lattice_links.write(kernels, self._range(slab, first), n, links, self._sums, f)
-            )
+        if first == links.cell.shape[0]:
+            return
+        # The links of solids are the last slab's.
+        ends = [*self._parts, links.cell.shape[0]]
+        where = [self._n, self._bounded, links, self._solid, self._clock, self._rise, f, self._sums]
 
-    def _range(self, slab: Slab, first: int) -> lattice_links.LinkRange:
-        """Returns the links of a slab from link `first` on; those of solids are the last slab's."""
-        begin, end = [*self._parts, self._links.cell.shape[0]][slab.number : slab.number + 2]
-        of = tables(self._spec.lattice, str(slab.device)), max(begin, first), end, slab.number
-        return lattice_links.LinkRange(slab.device, *of)
+        def apply(slab: Slab, *, writing: bool) -> None:
+            of = tables(self._spec.lattice, str(slab.device)), slab
+            span = max(ends[slab.number], first), ends[slab.number + 1]
+            lattice_links.apply(self._link_kernels, *of, *span, *where, writing=writing)
+
+        for writing in (False, True):
+            self.slabs.each(partial(apply, writing=writing))
 
     def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)

@@ -9,7 +9,7 @@ import ctypes
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import warp as wp
@@ -34,6 +34,7 @@ class Slabs:
     Attributes:
         home: The first device; what is not divided is there.
         name: The names of the devices.
+        parts: The slabs.
 
     Raises:
         ValueError: There are more devices than cells along x, or GPUs and CPUs are mixed.
@@ -48,36 +49,33 @@ class Slabs:
         if len({device.is_cuda for device in found}) > 1:
             raise ValueError(f"device: expected only GPUs or only CPUs, got {', '.join(names)}")
         self.name = ",".join(map(str, found))
-        self.home, *self._others = self._devices = list({str(device): device for device in found}.values())
-        for owner, reader in itertools.permutations(self._devices, 2):
+        self.home, *self._others = devices = list({str(device): device for device in found}.values())
+        for owner, reader in itertools.permutations(devices, 2):
             try:
                 wp.set_peer_access_enabled(owner, reader, True)
                 wp.set_mempool_access_enabled(owner, reader, True)
             except RuntimeError as error:
                 raise WlmError(f"device: expected GPUs that read each other's memory: {error}") from error
         ends = [planes * (k + 1) // len(found) for k in range(len(found))]
-        self._n, self._slabs = wp.vec3i(*shape), list(map(Slab, found, [0, *ends[:-1]], ends, range(len(ends))))
-
-    def __iter__(self) -> Iterator[Slab]:
-        return iter(self._slabs)
-
-    def __len__(self) -> int:
-        return len(self._slabs)
+        self._n, self.parts = wp.vec3i(*shape), list(map(Slab, found, [0, *ends[:-1]], ends, range(len(ends))))
 
     @property
     def free(self) -> int:
         """Number of bytes that divided arrays can take in all."""
-        planes = [sum(slab.end - slab.begin for slab in self if slab.device == device) for device in self._devices]
-        return min(free_memory(device) * self._n[0] // n for device, n in zip(self._devices, planes, strict=True))
+        planes = dict.fromkeys(self.name.split(","), 0)
+        for slab in self.parts:
+            planes[str(slab.device)] += slab.end - slab.begin
+        return min(free_memory(wp.get_device(name)) * self._n[0] // count for name, count in planes.items())
 
     def zeros(self, shape: int | tuple[int, ...], dtype: Any) -> wp.array:
         """Makes an array of zeros whose last or only axis, or whose first three axes, are cells: if it has two axes,
         the first is of rows that are divided one by one."""
         make = functools.partial(wp.zeros, shape, dtype=dtype, device=self.home)
-        shape = (shape,) if isinstance(shape, int) else shape
-        if len(self) == 1 or not self.home.is_cuda or math.prod(shape) * wp.types.type_size_in_bytes(dtype) < _WHOLE:
+        sizes = (shape,) if isinstance(shape, int) else shape
+        small = math.prod(sizes) * wp.types.type_size_in_bytes(dtype) < _WHOLE
+        if small or len(self.parts) == 1 or not self.home.is_cuda:
             return make()
-        with wp.ScopedAllocator(self.home, _Divided(self, shape[0] if len(shape) == 2 else 1)):
+        with wp.ScopedAllocator(self.home, _Divided(self.parts, sizes[0] if len(sizes) == 2 else 1)):
             return make()
 
     def each(self, compute: Callable[[Slab], None]) -> None:
@@ -85,7 +83,7 @@ class Slabs:
         later work of the first device begins after it."""
         for device in self._others:
             device.stream.wait_stream(self.home.stream)
-        for slab in self:
+        for slab in self.parts:
             compute(slab)
         for device in self._others:
             self.home.stream.wait_stream(device.stream)
@@ -98,17 +96,17 @@ class Slabs:
 class _Divided(wp.CudaManagedAllocator):
     """Allocates memory of which each of a number of equal rows is divided among the devices of slabs."""
 
-    def __init__(self, slabs: Slabs, rows: int) -> None:
+    def __init__(self, slabs: Sequence[Slab], rows: int) -> None:
         self._slabs, self._rows = slabs, rows
 
     def allocate(self, size_in_bytes: int) -> int:
         start = super().allocate(size_in_bytes)
-        driver, slabs, row = ctypes.CDLL("libcuda.so.1"), list(self._slabs), size_in_bytes // self._rows
-        for k, slab in itertools.product(range(self._rows), slabs):
-            begin, end = (k * row + row * plane // slabs[-1].end for plane in (slab.begin, slab.end))
+        driver, row, planes = ctypes.CDLL("libcuda.so.1"), size_in_bytes // self._rows, self._slabs[-1].end
+        for k, slab in itertools.product(range(self._rows), self._slabs):
+            begin, end = (k * row + row * plane // planes for plane in (slab.begin, slab.end))
             part = ctypes.c_uint64(start + begin), ctypes.c_size_t(end - begin)
             driver.cuMemAdvise(*part, _PREFERRED, slab.device.ordinal)
-            for other in slabs:
+            for other in self._slabs:
                 driver.cuMemAdvise(*part, _ACCESSED_BY, other.device.ordinal)
             driver.cuMemPrefetchAsync(*part, slab.device.ordinal, None)
         return start

@@ -283,7 +283,7 @@ class Solver:
         self._stored = advection.STORAGES[storage]
         needed = bytes_needed(self.shape, scheme, storage, temperature, bricks, fire is not None)
         require_memory("smoke", self.shape, needed, lattice.slabs)
-        if bricks and len(lattice.slabs) > 1:
+        if bricks and len(lattice.slabs.parts) > 1:
             raise ValueError("bricks: expected none on several devices, since a device computes all cells of its part")
         self._box = advection_places.make_box(lattice.shape, refinement, axis_ends(lattice.faces))
         self._kept = ""

@@ -166,7 +166,7 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         parity: 0 or 1: `clock[parity]` is the number of steps done; the step writes one more to the other element.
         clock: int [2], counts steps.
         trouble: int64 [1], lowered to the key of the first cell in which the flow blew up, see `trouble_of`.
-        sums: float64 [2 P], set to 0, for `lattice_links.evaluate`.
+        sums: float64 [2 P], set to 0, for `lattice_links.apply`.
         out: [Q, N], the populations that leave every cell in this step.
     """
     memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide), _relax(spec)

@@ -394,7 +394,7 @@ def links_backward(
     on_f: wp.array,
     on_inlet: wp.array,
 ) -> None:
-    """Computes the gradients of `lattice_links.evaluate` and `write`, in place.
+    """Computes the gradients of `lattice_links.apply`, in place.
 
     Args:
         tables: The velocity set, with Q velocities.
@@ -402,9 +402,9 @@ def links_backward(
         links: The links; `value` is overwritten.
         row: int [L], the inlet cell of each link of an inlet.
         risen: The factor of the inlets' velocities in this step, 1 after their ramp.
-        f: [Q, N], the populations before them; read only if there are outlets.
-        sums: float64 [2], as they left them: the sum of the weights of outlet links is read.
-        on_f: [Q, N], the gradient to the populations after them, overwritten by that to `f`.
+        f: [Q, N], the populations before `apply`; read only if there are outlets.
+        sums: float64 [2], as `apply` left them: the sum of the weights of outlet links is read.
+        on_f: [Q, N], the gradient to the populations after `apply`, overwritten by that to `f`.
         on_inlet: vec3 [I], the gradient to the velocities of inlet cells, added to; [0] without.
     """
     size, device = links.cell.shape[0], on_f.device

@@ -31,6 +31,7 @@ import warp as wp
 from wlm_kernels.fluid.lattice_bodies import Motion, Window, centre_of, size_of, wall_velocity, window_cell
 from wlm_kernels.fluid.lattice_sets import (
     STORAGES,
+    Slab,
     Tables,
     cell_of,
     crosses,
@@ -153,7 +154,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         bounded: wp.vec3i,
         first: int,
         last: int,
-        part: int,
+        slab: int,
         solid: wp.array1d[wp.uint8],
         clock: wp.array1d[int],
         rise: float,
@@ -200,8 +201,8 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                 if kind == _OUTLET:
                     weight = wp.float64(t.w[q])
         if wp.static(balance):
-            summed(wp.tid(), sums, 2 * part, net)
-            summed(wp.tid(), sums, 2 * part + 1, weight)
+            summed(wp.tid(), sums, 2 * slab, net)
+            summed(wp.tid(), sums, 2 * slab + 1, weight)
 
     @wp.kernel(module="unique", module_options=options)
     def write(
@@ -396,28 +397,19 @@ def bounce(
     f: wp.array,
     sums: wp.array,
 ) -> None:
-    """Sends populations back from a moving body, after a step and before `evaluate`; arguments as there and for
+    """Sends populations back from a moving body, after a step and before `apply`; arguments as there and for
     `lattice_bodies.mark`."""
     threads = -(-size_of(window) // BLOCK) * BLOCK
     inputs = [window.n, bounded, window, motion, wp.uint8(stamp), solid, fresh, f]
     wp.launch(kernels.bounce, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=f.device)
 
 
-@dataclass(frozen=True)
-class LinkRange:
-    """The links from index `first` to `last` - 1, computed by a device, which has its own copy of the velocity set;
-    the sums of these links are at `part` of P parts."""
-
-    device: wp.Device
-    tables: Tables
-    first: int
-    last: int
-    part: int = 0
-
-
-def evaluate(
+def apply(
     kernels: LinkKernels,
-    links_range: LinkRange,
+    tables: Tables,
+    slab: Slab,
+    first: int,
+    last: int,
     n: wp.vec3i,
     bounded: wp.vec3i,
     links: Links,
@@ -426,33 +418,33 @@ def evaluate(
     rise: float,
     f: wp.array,
     sums: wp.array,
+    *,
+    writing: bool,
 ) -> None:
-    """Applies the boundary conditions after a step, first pass: computes the values of links.
+    """Applies the boundary conditions after a step, one pass over the links of a slab.
 
     Args:
         kernels: Kernels for the lattice and storage type of `f`.
-        links_range: The links to compute.
+        tables: The velocity set, with Q velocities, on the slab's device.
+        slab: The slab, one of P; only its device and its number matter.
+        first, last: Its links are those from `first` to `last` - 1.
         n: Cells along x, y and z; N in all.
         bounded: 1 for each axis that is not periodic, else 0.
         links: The links; `value` is modified.
         solid: uint8 [N], number of the body of each cell, or [0] if no cell is solid.
         clock: int [2], see `lattice.step_kernel`.
         rise: Inlets reach their full velocity after 1 / rise steps.
-        f: [Q, N], the populations that have just left the cells.
-        sums: float64 [2 P], 0 at the call; receives the net mass that the links of a part add before the outlets'
-            shift, and the sum of the weights w_q of outlet links.
+        f: [Q, N], the populations that have just left the cells, modified.
+        sums: float64 [2 P], 0 before the first pass; receives the net mass that the links of each slab add before the
+            outlets' shift, and the sum of the weights w_q of its outlet links.
+        writing: Whether this is the second pass, which begins after the first of all slabs.
     """
-    of, size = links_range, links_range.last - links_range.first
-    if size > 0:
-        inputs = [of.tables, n, bounded, of.first, of.last, of.part, solid, clock, rise, f, links]
-        threads = -(-size // BLOCK) * BLOCK
-        wp.launch(kernels.values, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=of.device)
-
-
-def write(kernels: LinkKernels, links_range: LinkRange, n: wp.vec3i, links: Links, sums: wp.array, f: wp.array) -> None:
-    """Applies the boundary conditions, second pass: writes the values of links into the populations. Arguments: see
-    `evaluate`, which must be done for all links."""
-    of, size = links_range, links_range.last - links_range.first
-    if size > 0:
-        inputs = [of.tables, n, of.first, links, sums]
-        wp.launch(kernels.write, size, inputs=inputs, outputs=[f], device=of.device)
+    size, device = last - first, slab.device
+    if size <= 0:
+        return
+    if writing:
+        wp.launch(kernels.write, size, inputs=[tables, n, first, links, sums], outputs=[f], device=device)
+        return
+    threads = -(-size // BLOCK) * BLOCK
+    inputs = [tables, n, bounded, first, last, slab.number, solid, clock, rise, f, links]
+    wp.launch(kernels.values, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=device)
