@@ -700,8 +700,9 @@ class Lattice:
         # The links of one slab after those of the other.
         ends = [slab.end * math.prod(self.shape[1:]) for slab in self.slabs.parts]
         owner = np.searchsorted(ends, links[0], side="right")
-        *self._face_columns, self._decides = (column[np.argsort(owner, kind="stable")] for column in links)
-        self._parts = np.searchsorted(np.sort(owner), np.arange(len(ends))).tolist()
+        order = np.argsort(owner, kind="stable")
+        *self._face_columns, self._decides = (column[order] for column in links)
+        self._parts = np.searchsorted(owner[order], np.arange(len(ends))).tolist()
         self._links = self._make_links(0)
         self._find_links()
 
