@@ -61,7 +61,7 @@ TUTORIALS = {
 }
 # Of the tutorials' pages of three.js, by file: the folder, the size, what is done in turn, and the label.
 PAGES = {
-    "tutorial-bake.png": ("bake", (360, 260), {f"hour.value = {hour}, hour.hidden = true": f"{hour}:00" for hour in (8, 12, 20)}),
+    "tutorial-bake.png": ("bake", (360, 260), {f"hour.value = {h}; hour.hidden = true": f"{h}:00" for h in (8, 12, 20)}),
     "tutorial-smoke.png": ("smoke", (260, 300), {"0": "", "1": "", "2": ""}),
 }
 WEBGPU_PAGES = {"tutorial-probes.png": ("probes", (640, 360), {"0": ""})}
@@ -192,7 +192,7 @@ def tutorial_page(pages: Browser, name: str) -> Image.Image:
         page, taken = pages.chromium.new_page(viewport={"width": width, "height": height}), []
         page.goto(f"{address}/index.html", wait_until="networkidle")
         for script, label in states.items():
-            page.evaluate(f"void ({script})")
+            page.evaluate(script)
             page.wait_for_timeout(4000)
             taken.append((Image.open(io.BytesIO(page.screenshot(timeout=200_000))).convert("RGB"), label))
         page.close()
