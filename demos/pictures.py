@@ -61,7 +61,7 @@ TUTORIALS = {
 }
 # Of the tutorials' pages of three.js, by file: the folder, the size, what is done in turn, and the label.
 PAGES = {
-    "tutorial-bake.png": ("bake", (360, 260), {f"hour.value = {h}; hour.hidden = true": f"{h}:00" for h in (8, 12, 20)}),
+    "tutorial-bake.png": ("bake", (360, 260), {f"hour.value = {h}; hour.hidden = 1": f"{h}:00" for h in (8, 12, 20)}),
     "tutorial-smoke.png": ("smoke", (260, 300), {"0": "", "1": "", "2": ""}),
 }
 WEBGPU_PAGES = {"tutorial-probes.png": ("probes", (640, 360), {"0": ""})}
