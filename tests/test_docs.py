@@ -113,6 +113,21 @@ def test_every_picture_is_shown_and_small():
     assert max(pictures.values()) <= 400_000
 
 
+def test_pages_are_short():
+    for document in DOCUMENTS:
+        most = 120 if document.parent.name == "tutorials" else 250
+        assert document.read_text(encoding="utf-8").count("\n") <= most, named(document)
+
+
+def test_links_lead_to_headings():
+    for document in DOCUMENTS:
+        for path, anchor in re.findall(r"\]\(([^)#:]*)#([^)]*)\)", document.read_text(encoding="utf-8")):
+            target = document.parent / path if path else document
+            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.M)
+            slugs = [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+            assert anchor in slugs, f"{named(document)}: {path}#{anchor}"
+
+
 def test_files_that_documents_link_are_there():
     for document in DOCUMENTS + RESULTS:
         for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", document.read_text(encoding="utf-8")):
