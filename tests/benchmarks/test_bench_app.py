@@ -133,7 +133,7 @@ def test_errors_are_one_line(words, line):
 
 def test_report_makes_pages(tmp_path):
     file, index = tmp_path / "here.json", tmp_path / "index.md"
-    row = Row("lightmap", "city", "ours", "M", {"psnr": 45.98})
+    row = Row("lightmap", "city", "ours", "M", {"bytes": 1.0, "psnr": 45.98})
     write_json(file, [row], describe_environment("cpu", "python -m benchmarks"))
     text = call("report", file)
     assert "`here.json`" in text and "| 45.98 |" in text
