@@ -1,4 +1,4 @@
-"""The pages of three.js that tutorials print, in Chromium; that of probes needs WebGPU on a screen, see test_three_volume."""
+"""The pages of three.js that tutorials print, in Chromium, except that of probes: test_three_volume runs its module."""
 
 import io
 import shlex
