@@ -12,7 +12,6 @@ import numpy as np
 from wlm import interop
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import Checkpoint
-from wlm.lightmap.tiles import TileKind
 from wlm.lightmap.trainer import CPU_LANES, Advance, Fitter
 from wlm.metrics import nanmean
 from wlm.system import Meter
@@ -29,16 +28,11 @@ Parts = dict[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Tiles of one sheet (three channels) and of one kind, STATIC or DYNAMIC, which are fitted together.
-
-    `rows`, int [n], are indices of the tiles in `SheetFit.index`; `first` is the number of tiles of the same kind in
-    earlier batches of the sheet. Batches are numbered from 0.
-    """
+    """Dynamic tiles of one sheet (three channels), which are fitted together; `rows` are theirs in the arrays of the
+    sheet's model. Batches are numbered from 0."""
 
     number: int
-    kind: TileKind
-    rows: np.ndarray
-    first: int
+    rows: range
     fit: Any
 
 
@@ -99,7 +93,7 @@ class Dispatch:
         self._waiting = deque(batches)
         self._running: dict[int, _Running] = {}
         self._dead: set[int] = set()
-        self._compiled: set[TileKind] = set()
+        self._compiled = False
         self._figures: dict[int, tuple[float, float]] = {}
         self._states: dict[int, Parts] | None = None  # the states of a save that is under way
         self._stop: KeyboardInterrupt | None = None
@@ -117,7 +111,7 @@ class Dispatch:
         """
         free = list(range(self._workers.count))[::-1]
         while self._waiting or self._running:
-            while self._waiting and free and self._may_begin(self._waiting[0].kind):
+            while self._waiting and free and self._may_begin():
                 self._begin(free.pop(), _Running(self._waiting.popleft()))
             answer, finished = self._workers.wait(_POLL), None
             if answer is None:
@@ -130,11 +124,9 @@ class Dispatch:
             if finished is not None:
                 yield finished
 
-    def _may_begin(self, kind: TileKind) -> bool:
-        """Returns whether a batch may start: the first batch of a kind runs alone until its kernels are compiled."""
-        if self._stop is not None:
-            return False
-        return kind in self._compiled or all(run.batch.kind != kind for run in self._running.values())
+    def _may_begin(self) -> bool:
+        """Returns whether a batch may start: the first batch runs alone until its kernels are compiled."""
+        return self._stop is None and (self._compiled or not self._running)
 
     def _begin(self, number: int, run: _Running) -> None:
         if number in self._dead:
@@ -170,7 +162,7 @@ class Dispatch:
                 finished = run.batch, answer.parts
                 self._finish(number, answer.parts)
             if not begun:
-                self._compiled.add(run.batch.kind)
+                self._compiled = True
                 self._figures[number] = answer.loss, answer.psnr
                 self._report(moved=True)
         else:
