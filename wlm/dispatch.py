@@ -37,11 +37,13 @@ class Task:
         numbers: Numbers of the batches in it, which a checkpoint keeps separately; the first is the task's own.
         steps: Its share of the work, in the unit of the progress.
         job: Returns what a worker needs to begin; called then.
+        kind: Tasks of one kind use the same kernels: the first runs alone until these are compiled. None: no such kind.
     """
 
     numbers: tuple[int, ...]
     steps: int
     job: Callable[[], Any]
+    kind: Any = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +182,7 @@ class Dispatch:
         """
         free = list(range(self._workers.count))[::-1]
         while self._waiting or self._running:
-            while self._waiting and free and self._may_begin():
+            while self._waiting and free and self._may_begin(self._waiting[0].kind):
                 self._begin(free.pop(), _Running(self._waiting.popleft()))
             answer = self._workers.wait(_POLL)
             if answer is None:
@@ -192,9 +194,11 @@ class Dispatch:
                 yield finished
             self._save()
 
-    def _may_begin(self) -> bool:
-        """Returns whether a task may start: the first runs alone until its kernels are compiled."""
-        return self._stop is None and (self._compiled or not self._running)
+    def _may_begin(self, kind: Any) -> bool:
+        """Returns whether a task may start: the first of a kind runs alone until its kernels are compiled."""
+        if self._stop is not None:
+            return False
+        return kind in self._compiled or all(run.task.kind != kind for run in self._running.values())
 
     def _begin(self, number: int, run: _Running) -> None:
         if number in self._dead:
@@ -232,7 +236,7 @@ class Dispatch:
                 for each in run.task.numbers if self._states is not None else ():
                     self._states.pop(each, None)
             if not begun:
-                self._compiled = True
+                self._compiled.add(run.task.kind)
                 self._figures[number] = answer.figures
                 self._report(moved=True)
             if answer.finished:
