@@ -62,12 +62,12 @@ def _frames() -> Kept:
 
 def _layers() -> Kept:
     ranges = {"0.kind": (0, 7), "times": (3, 24.5), "2.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
-    return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing"}, ranges)
+    return Kept(_written(random_layers(uvt_slices=1).save), wlm.load, {"0.mask": "missing size"}, ranges)
 
 
 def _groups() -> Kept:
     ranges = {"0.kind": (0, 7), "1.times": (0, 24.5), "0.constant": (0, -1.0), "1.ranges": ((0, 0, 0), 3.0)}
-    return Kept(_written(few_texels().save), wlm.load, {"0.mask": "missing"}, ranges)
+    return Kept(_written(few_texels().save), wlm.load, {"0.mask": "missing size"}, ranges)
 
 
 def _atlas(kind: str, colour: str) -> Kept:
