@@ -8,8 +8,9 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -84,51 +85,81 @@ class Whole:
         """Frees memory and ends threads."""
 
 
-def worker_devices(device: str, workers: int | None, cluster: str | None, usual: int = 1) -> list[str]:
-    """Returns the device of each worker, or that of all on a cluster; `usual` is the number on a CPU by default.
+class Place(NamedTuple):
+    """Where tasks run.
 
-    Args:
+    Attributes:
         device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs of this machine.
-        workers: Number of workers, None for the default: on a GPU one, on a cluster as many as it has room for.
-        cluster: Address of a Ray cluster; None: this machine.
-
-    Raises:
-        WlmError: There are no workers, or no such device.
+        workers: Number of workers; None: one on a GPU, the usual number on a CPU, on a cluster as many as have room.
+        cluster: Address of a Ray cluster, whose workers take two CPUs or a GPU each; None: processes of this machine.
     """
-    if workers is not None and workers < 1:
-        raise WlmError(f"workers: expected at least 1, got {workers}")
-    if cluster is not None:
-        if device not in ("cpu", "cuda"):
-            raise WlmError(f"device '{device}': expected cpu or cuda when the work runs on a cluster")
-        return [device]
-    checked = interop.check_device(device)
-    if device == "cpu":
-        return ["cpu"] * (workers or usual)
-    gpus = interop.available_devices()[1:] if device == "cuda" else [checked]
-    return [gpus[i % len(gpus)] for i in range(workers or 1)]
+
+    device: str = "cpu"
+    workers: int | None = None
+    cluster: str | None = None
+
+    def devices(self, usual: int = 1) -> list[str]:
+        """Returns the device of each worker, or that of all on a cluster; `usual` is the usual number on a CPU.
+
+        Raises:
+            WlmError: There are no workers, or no such device.
+        """
+        if self.workers is not None and self.workers < 1:
+            raise WlmError(f"workers: expected at least 1, got {self.workers}")
+        if self.cluster is not None:
+            if self.device not in ("cpu", "cuda"):
+                raise WlmError(f"device '{self.device}': expected cpu or cuda when the work runs on a cluster")
+            return [self.device]
+        checked = interop.check_device(self.device)
+        if checked == "cpu":
+            return ["cpu"] * (self.workers or usual)
+        gpus = interop.available_devices()[1:] if self.device == "cuda" else [checked]
+        return [gpus[i % len(gpus)] for i in range(self.workers or 1)]
+
+    @property
+    def here(self) -> str:
+        """The device for work beside the tasks; that of a cluster is not on this machine."""
+        device = self.devices()[0]
+        return "cpu" if self.cluster is not None else device
 
 
-def start_workers(
-    make: type,
-    arguments: tuple[Any, ...],
-    device: str,
-    workers: int | None,
-    cluster: str | None,
-    tasks: int,
-    usual: int = 1,
-) -> Workers:
-    """Starts workers of a class, at most one for each of so many tasks.
-
-    `make`, from a module that can be imported, is called with a device and the `arguments`; the other arguments are
-    those of `worker_devices`. One worker on this machine is in this process.
-    """
-    devices = worker_devices(device, workers, cluster, usual)[: max(tasks, 1)]
-    if cluster is not None:
-        share = {"CPU": float(CPU_LANES)} if device == "cpu" else {"GPU": 1.0}
-        return Actors(make, (device, *arguments), workers, max(tasks, 1), cluster, share)
+def start_workers(make: type, arguments: tuple[Any, ...], place: Place, tasks: int, usual: int = 1) -> Workers:
+    """Starts workers of a class, at most one for each of so many tasks; a single one on this machine is in this
+    process. `make`, from a module that can be imported, is called with a device and the `arguments`."""
+    devices = place.devices(usual)[: max(tasks, 1)]
+    if place.cluster is not None:
+        share = {"CPU": float(CPU_LANES)} if place.device == "cpu" else {"GPU": 1.0}
+        return Actors(make, (place.device, *arguments), place.workers, max(tasks, 1), place.cluster, share)
     if len(devices) == 1:
         return Here(make(devices[0], *arguments))
     return Processes(make, [(each, *arguments) for each in devices])
+
+
+def run(
+    make: type,
+    arguments: tuple[Any, ...],
+    tasks: Sequence[Task],
+    meter: Meter,
+    place: Place,
+    *,
+    done: int = 0,
+    checkpoint: Checkpoint | None = None,
+    usual: int = 1,
+) -> Iterator[tuple[Task, Any]]:
+    """Runs tasks by workers that end with the last task; the first two arguments are those of `start_workers`, others
+    those of `Dispatch` and `Place.devices`. Finished batches are written to the checkpoint when the work is stopped.
+
+    Yields, Raises:
+        As `Dispatch.run`.
+    """
+    if tasks:
+        try:
+            with closing(start_workers(make, arguments, place, len(tasks), usual)) as pool:
+                yield from Dispatch(pool, tasks, meter, done, checkpoint if hasattr(make, "state") else None).run()
+        except (WlmError, KeyboardInterrupt):
+            if checkpoint is not None:
+                checkpoint.flush()
+            raise
 
 
 @dataclass(eq=False)
@@ -170,11 +201,11 @@ class Dispatch:
         self._patience = math.inf
         workers.on_share(self._share)
 
-    def run(self) -> Iterator[tuple[int, Any]]:
+    def run(self) -> Iterator[tuple[Task, Any]]:
         """Runs the tasks.
 
         Yields:
-            The number and the result of each finished task. The caller adds results to the checkpoint.
+            Each finished task with its result. The caller adds results to the checkpoint.
 
         Raises:
             WlmError: A task failed, a saved state is wrong, or the workers of a task died again and again.
@@ -220,7 +251,7 @@ class Dispatch:
             raise WlmError(f"{self._meter.stage}: {_DEATHS} workers died of task {run.task.numbers[0]}: {why}")
         self._begin(number, run)
 
-    def _take(self, number: int, answer: Any) -> tuple[int, Any] | None:
+    def _take(self, number: int, answer: Any) -> tuple[Task, Any] | None:
         """Handles a worker's answer and gives the worker more work. Returns the task and its result if it is done."""
         run = self._running[number]
         if isinstance(answer, BaseException):
@@ -240,7 +271,7 @@ class Dispatch:
                 self._figures[number] = answer.figures
                 self._report(moved=True)
             if answer.finished:
-                return run.task.numbers[0], answer.result
+                return run.task, answer.result
         else:
             self._states |= zip(run.task.numbers, answer, strict=True)
             run.saving, run.deaths = False, 0

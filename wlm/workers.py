@@ -162,10 +162,6 @@ class Processes(Workers):
         self._end(number)
         self._start(number)
 
-    def kill(self, number: int) -> None:
-        """Ends a worker at once, whatever it does; `wait` then returns it as lost."""
-        self._processes[number].kill()
-
     def close(self) -> None:
         for process in self._processes.values():
             with suppress(OSError):

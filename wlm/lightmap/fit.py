@@ -1,15 +1,14 @@
 """Fits a compressed model to a lightmap set (neural-dynamic-gi, sections 3.4 and 4)."""
 
-import functools
 import os
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from wlm.dispatch import CPU_LANES, Dispatch, Task, start_workers, worker_devices
+from wlm.dispatch import CPU_LANES, Place, Task, run
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
@@ -79,7 +78,7 @@ def compress(
             process. None: on the CPU one for every two cores, since a batch keeps two busy, but fewer for short fits; 1
             on a GPU; on a cluster as many as it has room for.
         cluster: Address of a Ray cluster whose machines fit the tiles, as `ray.init` takes it ("auto",
-            "ray://host:10001"); each worker takes two CPUs, or a GPU if the device is "cuda". None: this machine.
+            "ray://host:10001"); see `wlm.dispatch.Place`. None: this machine.
         progress: Called about twice a second; in the stage "fit" with the loss and "PSNR dB" of the latest samples,
             relative to each tile's range. The stages "tiles" and "frames" may come before it.
         checkpoint: From `open_checkpoint`: keeps a running fit, and resumes an interrupted one.
@@ -94,7 +93,8 @@ def compress(
             diverged; workers died again and again; or the settings ask for frames without a BC7 encoder.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
-    worker_devices(device, workers, cluster)  # an error before the set is classified
+    place = Place(device, workers, cluster)
+    here = place.here  # an error before the set is classified
     profile = Profile.load(profile).override(settings)
     if device != "cpu" and profile.hidden not in WIDTHS:
         raise WlmError(f"hidden: expected {', '.join(map(str, WIDTHS))} on a GPU, got {profile.hidden}")
@@ -106,27 +106,16 @@ def compress(
         batches += fit.batches(len(batches), CPU_TILES if device == "cpu" else None)
     waiting = [batch for batch in batches if not batch.fit.restore(batch, checkpoint)]
     sheets = {sheet: fit.model for sheet, fit in fits.items()}
-    if waiting:
-        meter = Meter(progress, "fit", profile.steps * len(batches))
-        samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in waiting)
-        usual = max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE))
-        arguments = (seed, progress is not None)
-        pool = start_workers(Fitter, arguments, device, workers, cluster, len(waiting), usual)
-        tasks = [
-            Task((batch.number,), profile.steps, functools.partial(batch.fit.job, batch), batch.kind)
-            for batch in waiting
-        ]
-        try:
-            with closing(pool):
-                done = profile.steps * (len(batches) - len(waiting))
-                for number, parts in Dispatch(pool, tasks, meter, done, checkpoint).run():
-                    batches[number].fit.store(batches[number], parts)
-                    if checkpoint is not None:
-                        checkpoint.add_finished(number, parts)
-        except (WlmError, KeyboardInterrupt):
-            if checkpoint is not None:
-                checkpoint.flush()
-            raise
+    meter, done = Meter(progress, "fit", profile.steps * len(batches)), profile.steps * (len(batches) - len(waiting))
+    samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in waiting)
+    usual = max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE))
+    tasks = [Task((each.number,), profile.steps, partial(each.fit.job, each), each.kind) for each in waiting]
+    arguments, options = (seed, progress is not None), {"done": done, "checkpoint": checkpoint, "usual": usual}
+    for task, parts in run(Fitter, arguments, tasks, meter, place, **options):
+        batch = batches[task.numbers[0]]
+        batch.fit.store(batch, parts)
+        if checkpoint is not None:
+            checkpoint.add_finished(batch.number, parts)
     # Sheets of an atlas and a size share one mask.
     masks = {(sheet.atlas, own.mask.shape): own.mask for sheet, own in reversed(sheets.items())}
     for sheet, own in sheets.items():
@@ -136,8 +125,7 @@ def compress(
     # Groups with other numbers of times have maps of other sizes.
     stored = profile.for_times(*counts) if len(counts) == 1 else profile
     model = LightmapModel(lightmaps.name, lightmaps.source, stored, sheets, warnings)
-    # The device of a cluster is not on this machine.
-    model.warnings += tuple(lost_light(model, lightmaps, "cpu" if cluster is not None else device))
+    model.warnings += tuple(lost_light(model, lightmaps, here))
     return model
 
 
