@@ -5,6 +5,7 @@ order of completion, and if workers are lost.
 """
 
 import math
+import pickle
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,8 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wlm import interop
-from wlm.errors import WlmError
+from wlm.errors import WlmError, one_line
 from wlm.formats.checkpoint import Checkpoint
+from wlm.formats.parts import Part
 from wlm.metrics import nanmean
 from wlm.system import Meter
 from wlm.workers import Actors, Here, Lost, Processes, Workers
@@ -32,25 +34,23 @@ _STOPPING = 30.0  # seconds that workers get to return their state before a stop
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """An independent part of long work.
+    """An independent part of long work, of so many `steps` in the unit of the progress.
 
-    Attributes:
-        numbers: Numbers of the batches in it, which a checkpoint keeps separately; the first is the task's own.
-        steps: Its share of the work, in the unit of the progress.
-        job: Returns what a worker needs to begin; called then.
-        kind: Tasks of one kind use the same kernels: the first runs alone until these are compiled. None: no such kind.
+    Its `numbers` are those of the batches in it in a checkpoint; the first is the task's own. `job` returns what a
+    worker needs to begin, and is called then. Of the tasks of a `kind`, other than None, the first runs alone until
+    their kernels are compiled. `table` has types and shapes of the arrays of a result that `gathered` keeps.
     """
 
     numbers: tuple[int, ...]
     steps: int
     job: Callable[[], Any]
     kind: Any = None
+    table: Mapping[str, Part] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Advance:
-    """The progress of a task: steps done, measured values as for `wlm.system.Meter.report`, and the result once the
-    task is `finished`."""
+    """The progress of a task: steps done, measured values as for `Meter.report`, and the result once it is finished."""
 
     step: int
     figures: Mapping[str, float] = field(default_factory=dict)
@@ -59,11 +59,11 @@ class Advance:
 
 
 class Whole:
-    """Base of workers whose tasks are a single call of `run`, without a state to save.
+    """Base of workers whose tasks are a single call of `run`, without a state to save. A long call may report the
+    finished share of the task by `report`, which has no effect in other processes.
 
-    Within a long call, `run` may report the finished share of the task by `report`, which has no effect in other
-    processes. Workers whose tasks can be interrupted have these methods themselves, and a method `state`, which returns
-    a list with the arrays of each batch by name.
+    Workers whose tasks have a state have these methods themselves, but for `run`, and a method `state`, which returns a
+    list with the arrays of each batch by name.
     """
 
     report: Callable[[float], None] = staticmethod(lambda share: None)
@@ -90,7 +90,7 @@ class Place(NamedTuple):
 
     Attributes:
         device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs of this machine.
-        workers: Number of workers; None: one on a GPU, the usual number on a CPU, on a cluster as many as have room.
+        workers: Number of workers; None: on a GPU one, on a CPU a usual number, on a cluster as many as have room.
         cluster: Address of a Ray cluster, whose workers take two CPUs or a GPU each; None: processes of this machine.
     """
 
@@ -99,11 +99,8 @@ class Place(NamedTuple):
     cluster: str | None = None
 
     def devices(self, usual: int = 1) -> list[str]:
-        """Returns the device of each worker, or that of all on a cluster; `usual` is the usual number on a CPU.
-
-        Raises:
-            WlmError: There are no workers, or no such device.
-        """
+        """Returns the device of each worker, or that of all on a cluster, of which there must be one at least; `usual`
+        is the usual number on a CPU."""
         if self.workers is not None and self.workers < 1:
             raise WlmError(f"workers: expected at least 1, got {self.workers}")
         if self.cluster is not None:
@@ -146,20 +143,53 @@ def run(
     checkpoint: Checkpoint | None = None,
     usual: int = 1,
 ) -> Iterator[tuple[Task, Any]]:
-    """Runs tasks by workers that end with the last task; the first two arguments are those of `start_workers`, others
-    those of `Dispatch` and `Place.devices`. Finished batches are written to the checkpoint when the work is stopped.
+    """Runs tasks by workers of a class that has the methods of `Whole`, see `start_workers`.
 
-    Yields, Raises:
-        As `Dispatch.run`.
+    Tasks begin in their order. Those of lost workers begin again, and `meter` reports the progress, with `done` steps
+    before. The checkpoint has the states of running tasks; the caller adds results, which are written when the work
+    is stopped.
+
+    Yields:
+        Each finished task with its result.
+
+    Raises:
+        WlmError: A task failed, a saved state is wrong, or the workers of a task died again and again.
+        KeyboardInterrupt: Raised by the progress callback; the states of running tasks have been saved.
     """
     if tasks:
         try:
             with closing(start_workers(make, arguments, place, len(tasks), usual)) as pool:
-                yield from Dispatch(pool, tasks, meter, done, checkpoint if hasattr(make, "state") else None).run()
+                yield from _Dispatch(pool, tasks, meter, done, checkpoint if hasattr(make, "state") else None).run()
         except (WlmError, KeyboardInterrupt):
             if checkpoint is not None:
                 checkpoint.flush()
             raise
+
+
+def gathered(
+    make: type,
+    arguments: tuple[Any, ...],
+    tasks: Sequence[Task],
+    meter: Meter,
+    place: Place,
+    *,
+    done: int = 0,
+    checkpoint: Checkpoint | None = None,
+    usual: int = 1,
+) -> dict[int, Any]:
+    """Returns the result of each task by its number: from the checkpoint if it has it, or else by `run`."""
+    results, left = {}, []
+    for task in tasks:
+        kept = None if checkpoint is None else checkpoint.finished(task.numbers[0], task.table)
+        if kept is None:
+            left.append(task)
+        else:
+            results[task.numbers[0]], done = kept, done + task.steps
+    for task, result in run(make, arguments, left, meter, place, done=done, checkpoint=checkpoint, usual=usual):
+        results[task.numbers[0]] = result
+        if checkpoint is not None:
+            checkpoint.add_finished(task.numbers[0], result)
+    return results
 
 
 @dataclass(eq=False)
@@ -170,26 +200,12 @@ class _Running:
     saving: bool = False
 
 
-class Dispatch:
+class _Dispatch:
     """Hands out tasks, restarts those of lost workers, reports progress and saves the states of running tasks."""
 
     def __init__(
-        self,
-        workers: Workers,
-        tasks: Sequence[Task],
-        meter: Meter,
-        done: int = 0,
-        checkpoint: Checkpoint | None = None,
+        self, workers: Workers, tasks: Sequence[Task], meter: Meter, done: int, checkpoint: Checkpoint | None
     ) -> None:
-        """Prepares the tasks; nothing starts before `run`.
-
-        Args:
-            workers: From `start_workers`, of a class with the methods of `Whole`.
-            tasks: The tasks, which begin in this order.
-            meter: Reports the progress.
-            done: Steps that are finished already.
-            checkpoint: Keeps the states of running tasks, and has those of an earlier run; None: they have none.
-        """
         self._workers, self._meter, self._done, self._checkpoint = workers, meter, done, checkpoint
         self._waiting = deque(tasks)
         self._running: dict[int, _Running] = {}
@@ -202,15 +218,6 @@ class Dispatch:
         workers.on_share(self._share)
 
     def run(self) -> Iterator[tuple[Task, Any]]:
-        """Runs the tasks.
-
-        Yields:
-            Each finished task with its result. The caller adds results to the checkpoint.
-
-        Raises:
-            WlmError: A task failed, a saved state is wrong, or the workers of a task died again and again.
-            KeyboardInterrupt: Raised by the progress callback; the states of running tasks have been saved.
-        """
         free = list(range(self._workers.count))[::-1]
         while self._waiting or self._running:
             while self._waiting and free and self._may_begin(self._waiting[0].kind):
@@ -239,7 +246,11 @@ class Dispatch:
         self._running[number] = run
         kept = self._checkpoint
         states = [None if kept is None else kept.running(each) for each in run.task.numbers]
-        self._workers.call(number, "start", run.task.job(), states)
+        try:
+            self._workers.call(number, "start", run.task.job(), states)
+        except (TypeError, AttributeError, pickle.PicklingError) as error:
+            told = f"{self._meter.stage}: task {run.task.numbers[0]} cannot be sent to a worker: {one_line(error)}"
+            raise WlmError(told) from error
 
     def _restart(self, number: int, why: Lost) -> None:
         self._dead.add(number)

@@ -70,6 +70,8 @@ def compress(
     encoding: opt.Encoding = None,
     flip: _Flip = False,
     slot: _Slot = None,
+    workers: opt.Workers = None,
+    cluster: opt.Cluster = None,
     seed: opt.Seed = 0,
     device: opt.Device = "cpu",
     resume: opt.Resume = False,
@@ -89,6 +91,7 @@ def compress(
         return load(mesh, lightmaps, mask_path=mask, **reading, trust=trust)
 
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
+    options |= {"workers": workers, "cluster": cluster}
     _, model, facts = models.fit("atlas", load, output, profile, settings, **options)
     console.show_facts(model.name, facts | _facts(model))
     console.note_warnings(model.report.get("lost light", ()))

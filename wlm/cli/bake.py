@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from wlm.cli.console import check_output, exclusive, note, note_start, quiet_warp, running, show, table
-from wlm.cli.options import Device, Resume, Trust, output_option
+from wlm.cli.options import Cluster, Device, Resume, Trust, Workers, output_option
 
 app = typer.Typer(help="Make inputs by path tracing: lightmaps and probes, by Mitsuba (extra `bake`).")
 
@@ -23,6 +23,8 @@ _Scene = Annotated[
 def lightmaps(
     scene: _Scene,
     output: Annotated[Path, output_option("DIR", "Folder to write the set to.")],
+    workers: Workers = None,
+    cluster: Cluster = None,
     device: Device = "cpu",
     resume: Resume = False,
     trust: Trust = False,
@@ -37,11 +39,11 @@ def lightmaps(
     from wlm.formats.folder import claim
 
     claim(output, INDEX, FORMAT)
-    task = open_task(scene, trust)
+    task, place = open_task(scene, trust), {"device": device, "workers": workers, "cluster": cluster}
     checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
     note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
-        baked = bake_lightmaps(task, device=device, checkpoint=checkpoint, progress=progress)
+        baked = bake_lightmaps(task, **place, checkpoint=checkpoint, progress=progress)
         files = write_lightmaps(output, task, baked)
         checkpoint.remove()
     rows = table(str(output), ["hour", "mean", "largest", "relative noise"])
@@ -58,6 +60,8 @@ def lightmaps(
 def probes(
     scene: _Scene,
     output: Annotated[Path, output_option("OUT.npz", "The file to write.")],
+    workers: Workers = None,
+    cluster: Cluster = None,
     device: Device = "cpu",
     resume: Resume = False,
     trust: Trust = False,
@@ -71,11 +75,11 @@ def probes(
     from wlm.bake.probes import bake_probes, write_probes
     from wlm.bake.work import open_checkpoint, open_task
 
-    task = open_task(scene, trust)
+    task, place = open_task(scene, trust), {"device": device, "workers": workers, "cluster": cluster}
     checkpoint = open_checkpoint(output, task, "probes", device, resume=resume)
     note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
-        baked = bake_probes(task, device=device, checkpoint=checkpoint, progress=progress)
+        baked = bake_probes(task, **place, checkpoint=checkpoint, progress=progress)
         write_probes(output, baked)
         checkpoint.remove()
     rows = table(str(output), ["hour", "probes", "lit probes", "mean L00", "relative noise"])

@@ -89,18 +89,8 @@ def compress(
     layers: _Layers = None,
     encoding: opt.Encoding = None,
     groups: _Groups = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Processes that fit tiles in parallel, with the same result; default one per two cores, one on a GPU.",
-        ),
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help='Fit on a Ray cluster (extra `cluster`): ray://HOST:10001, or "auto".'),
-    ] = None,
+    workers: opt.Workers = None,
+    cluster: opt.Cluster = None,
     seed: opt.Seed = 0,
     device: opt.Device = "cpu",
     resume: opt.Resume = False,

@@ -17,6 +17,18 @@ CheckpointEvery = Annotated[
         help="Seconds between two checkpoints (saved states), from which --resume continues after a crash.",
     ),
 ]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        min=1, metavar="N", help="Processes that share the work, with the same result; with --device cuda on all GPUs."
+    ),
+]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS", help='Share the work on a Ray cluster (extra `cluster`): ray://HOST:10001, or "auto".'
+    ),
+]
 ReportFile = Annotated[
     Path | None, typer.Option("--json", metavar="REPORT.json", help="Also write the scores to this file, as JSON.")
 ]

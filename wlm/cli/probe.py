@@ -62,6 +62,8 @@ def compress(
     convention: _Convention = None,
     order: _Order = None,
     axes: _Axes = None,
+    workers: opt.Workers = None,
+    cluster: opt.Cluster = None,
     seed: opt.Seed = 0,
     device: opt.Device = "cpu",
     resume: opt.Resume = False,
@@ -84,6 +86,7 @@ def compress(
 
     inputs = {} if mesh is None else {"geometry": read_geometry(mesh, with_uv=False)}
     options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every, "positions": positions}
+    options |= {"workers": workers, "cluster": cluster}
     data, model, facts = models.fit("probe", load, output, profile, settings, inputs=inputs, **options)
     size = facts["bytes on disk"]
     facts |= {

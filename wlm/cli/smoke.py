@@ -1,6 +1,5 @@
 """`wlm smoke`: simulates and lights smoke, and makes six-way lightmaps by ray marching or with a network."""
 
-from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -9,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from wlm.cli import console, smoke_book, smoke_network
-from wlm.cli.options import CheckpointEvery, Device, Resume, Seed, output_option
+from wlm.cli.options import CheckpointEvery, Cluster, Device, Resume, Seed, Workers, output_option
 from wlm.cli.smoke_network import evaluate, info
 from wlm.cli.smoke_options import (
     SHEET,
@@ -30,9 +29,6 @@ from wlm.errors import WlmError
 from wlm_kernels.smoke.settings import March
 
 if TYPE_CHECKING:
-    from wlm.fluid.volume import DensityVolume
-    from wlm.smoke.camera import Camera
-    from wlm.smoke.lightmaps import SixWay
     from wlm.smoke.scene import Scene
 
 __all__ = ["INSTEAD", "app", "evaluate", "info"]
@@ -155,6 +151,8 @@ def bake(
         float | None,
         typer.Option(min=0.0, max=1.0, help="With --fit sphere: add multiple scattering of this albedo; default none."),
     ] = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     resume: Resume = False,
 ) -> None:
     """Make six-way lightmaps by fine ray marching, and estimate the error due to the step length.
@@ -167,17 +165,13 @@ def bake(
     if albedo is not None and fit == "axes":
         raise WlmError("--albedo needs --fit sphere: with --fit axes lightmaps have single scattering only")
     console.quiet_warp()
-    from wlm.smoke.march.six_way import bake
-
-    frames = options.open(smoke)
-    settings = {"step": step, "g": g, "supersample": supersample}
-    make, made = partial(bake, **settings), {"made": "bake"} | settings
+    settings: dict[str, Any] = {"step": step, "g": g, "supersample": supersample}
+    method, made = "bake", {"made": "bake"} | settings
     if fit == "sphere":
-        from wlm.smoke.transport.sphere import bake_sphere
-
-        make = partial(bake_sphere, march=March(step, jitter=0.0, g=g), albedo=albedo)
+        method, settings = fit, {"march": March(step, jitter=0.0, g=g), "albedo": albedo}
         made |= {"fit": fit, "albedo": albedo}
-    write_lightmaps(frames, options.view(frames), output, make, made, resume=resume, errors=fit == "axes")
+    place, errors = (options.device, workers, cluster), fit == "axes"
+    write_lightmaps(options, smoke, output, (method, settings), made, place, resume=resume, errors=errors)
 
 
 @app.command()
@@ -192,6 +186,8 @@ def predict(
     ] = None,
     coarse: Annotated[bool, typer.Option("--coarse", help="Only use a coarse ray march, without a network.")] = False,
     seed: Seed = 0,
+    workers: Workers = None,
+    cluster: Cluster = None,
     resume: Resume = False,
 ) -> None:
     """Predict six-way lightmaps with a network from a coarse march: like bake, in less time.
@@ -203,24 +199,14 @@ def predict(
         raise WlmError("--coarse: expected no --network, since --coarse uses no network")
     console.quiet_warp()
     from wlm.smoke.codec import open_network
-    from wlm.smoke.march.six_way import bake_coarse, coarse_march
-    from wlm.smoke.network.prediction import SmokePredictor
 
-    frames = options.open(smoke)
-    predictor = None
-    if coarse:
-        made: dict[str, Any] = {"made": "coarse", "seed": seed}
-
-        def make(volume: "DensityVolume", camera: "Camera") -> "SixWay":
-            return bake_coarse(volume, camera, coarse_march(volume, seed))
-    else:
-        model = open_network(network)
-        made = {"made": "network", "seed": seed, "of": dict(model.summary)}
-        predictor = SmokePredictor(model, frames.device)
-        make = partial(predictor, seed=seed)
-    write_lightmaps(frames, options.view(frames), output, make, made, resume=resume)
-    if predictor is not None and (line := predictor.note()):
-        console.note(line)
+    made: dict[str, Any] = {"made": "coarse", "seed": seed}
+    method: Any = "coarse"
+    if not coarse:
+        method = open_network(network)
+        made |= {"made": "network", "of": dict(method.summary)}
+    place = (options.device, workers, cluster)
+    write_lightmaps(options, smoke, output, (method, {"seed": seed}), made, place, resume=resume)
 
 
 @app.command()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from wlm.cli import console
-from wlm.cli.options import AsJson, CheckpointEvery, Device, ModelFile, ReportFile, Resume, Seed, output_option
+from wlm.cli import options as opt
 from wlm.cli.settings import Generated, with_settings
 
 if TYPE_CHECKING:
@@ -24,18 +24,21 @@ def register(app: typer.Typer) -> None:
 @console.exclusive
 def train(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Settings: fast, paper, or a YAML file.")],
-    output: Annotated[Path, output_option("NETWORK", "The .safetensors to write.")],
+    output: Annotated[Path, opt.output_option("NETWORK", "The .safetensors to write.")],
     settings: dict[str, Any],
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="Minutes after which the training stops; --resume continues.")
     ] = None,
-    resume: Resume = False,
-    checkpoint_every: CheckpointEvery = 30.0,
-    seed: Seed = 0,
-    device: Device = "cpu",
+    workers: opt.Workers = None,
+    cluster: opt.Cluster = None,
+    resume: opt.Resume = False,
+    checkpoint_every: opt.CheckpointEvery = 30.0,
+    seed: opt.Seed = 0,
+    device: opt.Device = "cpu",
 ) -> None:
     """Train a network on smoke simulated during the training, and keep the state with the best validation.
 
+    --workers and --cluster simulate sequences side by side; the network is trained in this process.
     The state is saved in NETWORK.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume
     to continue exactly. NETWORK.csv has the loss curves.
     """
@@ -49,8 +52,8 @@ def train(
     checkpoint = Path(f"{output}{SUFFIX}")
     if resume and not checkpoint.exists() and not output.exists():
         console.note(f"{checkpoint}: there is nothing to resume; starting at step 0")
-    options = {"seed": seed, "device": device, "minutes": minutes, "resume": resume}
-    options["checkpoint_every"] = checkpoint_every
+    options: dict[str, Any] = {"seed": seed, "device": device, "minutes": minutes, "resume": resume}
+    options |= {"checkpoint_every": checkpoint_every, "workers": workers, "cluster": cluster}
     with console.running("train", checkpoint) as progress:
         training = fit(checked, output, progress=progress, **options)
     if not training.finished:
@@ -72,7 +75,7 @@ def train(
 
 
 def export_onnx(
-    output: Annotated[Path, output_option("NETWORK.onnx", "The file to write.")],
+    output: Annotated[Path, opt.output_option("NETWORK.onnx", "The file to write.")],
     network: Annotated[
         Path | None,
         typer.Argument(metavar="NETWORK", help="Network that wlm smoke train wrote; default the shipped one."),
@@ -96,14 +99,14 @@ def export_onnx(
 
 
 def evaluate(
-    network: ModelFile,
+    network: opt.ModelFile,
     resolution: Annotated[int, typer.Option(min=8, max=4096, help="Edge of the test images in pixels.")] = 512,
     cells: Annotated[
         int | None,
         typer.Option(min=16, max=512, help="Air cells along an edge of the simulated box; default as trained."),
     ] = None,
-    json_path: ReportFile = None,
-    device: Device = "cpu",
+    json_path: opt.ReportFile = None,
+    device: opt.Device = "cpu",
 ) -> None:
     """Measure a network on simulated smoke that it was not trained on.
 
@@ -141,7 +144,7 @@ def evaluate(
     console.show_facts(str(network), facts | {f"PSNR of {name}, dB": value for name, value in planes})
 
 
-def info(file: ModelFile, as_json: AsJson = False) -> None:
+def info(file: opt.ModelFile, as_json: opt.AsJson = False) -> None:
     """Show the shape of a network and facts about its training."""
     console.quiet_warp()
     from wlm.formats.artifact import read_artifact

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wlm.dispatch import CPU_LANES, Place, Task, run
+from wlm.dispatch import CPU_LANES, Place, Task, gathered
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
@@ -73,12 +73,9 @@ def compress(
         tiles: Numbers of the tiles to compress, only for a set with one sheet; None: all. Other tiles are stored as
             empty.
         seed: One seed gives one result on one device.
-        device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs.
-        workers: Processes that fit batches of tiles side by side; the result does not depend on it. 1: only this
-            process. None: on the CPU one for every two cores, since a batch keeps two busy, but fewer for short fits; 1
-            on a GPU; on a cluster as many as it has room for.
-        cluster: Address of a Ray cluster whose machines fit the tiles, as `ray.init` takes it ("auto",
-            "ray://host:10001"); see `wlm.dispatch.Place`. None: this machine.
+        device: "cpu", "cuda" or "cuda:N".
+        workers, cluster: Where batches of tiles are fitted side by side, with the same result: see
+            `wlm.dispatch.Place`. On a CPU there is usually one worker for two cores, fewer for short fits.
         progress: Called about twice a second; in the stage "fit" with the loss and "PSNR dB" of the latest samples,
             relative to each tile's range. The stages "tiles" and "frames" may come before it.
         checkpoint: From `open_checkpoint`: keeps a running fit, and resumes an interrupted one.
@@ -104,18 +101,16 @@ def compress(
     batches: list[Batch] = []
     for fit in fits.values():
         batches += fit.batches(len(batches), CPU_TILES if device == "cpu" else None)
-    waiting = [batch for batch in batches if not batch.fit.restore(batch, checkpoint)]
     sheets = {sheet: fit.model for sheet, fit in fits.items()}
-    meter, done = Meter(progress, "fit", profile.steps * len(batches)), profile.steps * (len(batches) - len(waiting))
-    samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in waiting)
-    usual = max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE))
-    tasks = [Task((each.number,), profile.steps, partial(each.fit.job, each), each.kind) for each in waiting]
-    arguments, options = (seed, progress is not None), {"done": done, "checkpoint": checkpoint, "usual": usual}
-    for task, parts in run(Fitter, arguments, tasks, meter, place, **options):
-        batch = batches[task.numbers[0]]
-        batch.fit.store(batch, parts)
-        if checkpoint is not None:
-            checkpoint.add_finished(batch.number, parts)
+    samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in batches)
+    options = {"checkpoint": checkpoint, "usual": max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE))}
+    tasks = [
+        Task((each.number,), profile.steps, partial(each.fit.job, each), each.kind, each.fit.table(each))
+        for each in batches
+    ]
+    meter, arguments = Meter(progress, "fit", profile.steps * len(batches)), (seed, progress is not None)
+    for number, parts in gathered(Fitter, arguments, tasks, meter, place, **options).items():
+        batches[number].fit.store(batches[number], parts, checkpoint)
     # Sheets of an atlas and a size share one mask.
     masks = {(sheet.atlas, own.mask.shape): own.mask for sheet, own in reversed(sheets.items())}
     for sheet, own in sheets.items():
@@ -276,26 +271,18 @@ class SheetFit:
             return {"net": table["net_static"], "uv": table["uv"]}
         return {name: table[name] for name in ("net", "uv", "uvt", "ut", "vt")}
 
-    def store(self, batch: Batch, parts: Parts) -> None:
-        """Copies the maps and networks of a finished batch into the model."""
+    def store(self, batch: Batch, parts: Parts, checkpoint: Checkpoint | None = None) -> None:
+        """Copies the maps and networks of a finished batch, which may come from a checkpoint, into the model."""
         dynamic, model = batch.kind == TileKind.DYNAMIC, self.model
+        try:
+            check_packable(parts, model.profile, dynamic)
+        except WlmError as error:
+            raise WlmError(f"{checkpoint and checkpoint.path}: finished batch {batch.number}: {error}") from error
         model.uv[np.searchsorted(self._mapped, batch.rows)] = parts["uv"]
         arrays = ("uvt", "ut", "vt", "net") if dynamic else ("net",)
         for name in arrays:
             stored = getattr(model, name if dynamic else "net_static")
             stored[batch.first : batch.first + len(batch.rows)] = parts[name]
-
-    def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool:
-        """Copies a batch that a checkpoint holds as finished into the model; returns False if it does not hold it."""
-        parts = None if checkpoint is None else checkpoint.finished(batch.number, self.table(batch))
-        if parts is None:
-            return False
-        try:
-            check_packable(parts, self.model.profile, batch.kind == TileKind.DYNAMIC)
-        except WlmError as error:
-            raise WlmError(f"{checkpoint.path}: finished batch {batch.number}: {error}") from error
-        self.store(batch, parts)
-        return True
 
 
 def _classify(

@@ -38,7 +38,7 @@ class Fitter:
         self._trainers: list[Trainer] = []
 
     def start(self, job: list[Region], states: list[dict[str, np.ndarray] | None]) -> Advance:
-        """Starts a group, or continues it from saved states; raises ValueError if they are of another one."""
+        """Starts a group, or continues it from saved states; raises ValueError if they are wrong."""
         self.close()
         self._job = job
         for (_, probes, profile, pixels), state in zip(job, states, strict=True):

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from wlm.dispatch import Place, Task, Whole, run
+from wlm.dispatch import Place, Task, Whole, gathered
 from wlm.errors import WlmError
 from wlm.fluid.solver import Solver
 from wlm.interop import check_device, stream
@@ -88,7 +88,7 @@ def _pool(
 ) -> Pool:
     """Makes sequences by `SequenceMaker`, which takes the arguments; returns the samples of all in one pool."""
     meter, tasks = Meter(progress, "dataset", len(numbers)), [Task((each,), 1, partial(int, each)) for each in numbers]
-    made = {task.numbers[0]: pool for task, pool in run(SequenceMaker, arguments, tasks, meter, place or Place(device))}
+    made = gathered(SequenceMaker, arguments, tasks, meter, place or Place(device))
     parts = ([getattr(made[each], name.name) for each in numbers] for name in fields(Pool))
     return Pool(*map(torch.cat, parts)).to(check_device(device))
 
