@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -282,7 +282,9 @@ class Solver:
         self.shape = tuple(refinement * size for size in lattice.shape)
         self._stored = advection.STORAGES[storage]
         needed = bytes_needed(self.shape, scheme, storage, temperature, bricks, fire is not None)
-        require_memory("smoke", self.shape, needed, self.device)
+        require_memory("smoke", self.shape, needed, lattice.slabs)
+        if bricks and len(lattice.slabs.parts) > 1:
+            raise ValueError("bricks: expected none on several devices, since a device computes all cells of its part")
         self._box = advection_places.make_box(lattice.shape, refinement, axis_ends(lattice.faces))
         self._kept = ""
         # The settings on which the arrays of a checkpoint depend.
@@ -667,13 +669,15 @@ class Solver:
             self._pool.relist()
         if self._fire is not None:
             where = [box, walls, bricks, self._burning(self._fire), self.lattice.clock, self._fields[0]]
-            fire.burn(*where, self._growth.flatten())
+            self._on_slabs(fire.burn, *where, self._growth.flatten())
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
-            advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
+            where = [box, walls, self._fields[0], *by, self._force.flatten(), bricks]
+            self._on_slabs(advection_sources.buoyancy, *where)
         if self._stirred:
             air = [box, self._velocity.flatten(), self.solid.flatten(), self._confinement, self._modes]
-            forcing.stir(*air, self.lattice.clock, self._force.flatten(), added=self.buoyancy is not None)
+            air += [self.lattice.clock, self._force.flatten()]
+            self._on_slabs(forcing.stir, *air, added=self.buoyancy is not None)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)
@@ -698,11 +702,14 @@ class Solver:
         for decay, buffers in zip(decays, zip(*map(self._carried, self._fields), strict=True), strict=False):
             now, predicted, out = buffers[0], buffers[1], buffers[-1]
             if self.scheme == "maccormack":
-                advection.advect(*where, now, predicted, self.substeps, bricks=self._bricks)
-                advection.advect(*where, now, out, self.substeps, decay, self._bricks, predicted)
+                self._on_slabs(advection.advect, *where, now, predicted, self.substeps, bricks=self._bricks)
+                self._on_slabs(advection.advect, *where, now, out, self.substeps, decay, self._bricks, predicted)
             else:
-                advection.advect(*where, now, out, self.substeps, decay, self._bricks)
+                self._on_slabs(advection.advect, *where, now, out, self.substeps, decay, self._bricks)
         self._fields[:] = self._fields[::-1]
+
+    def _on_slabs(self, compute: Callable[..., None], *args, **settings) -> None:
+        self.lattice.slabs.each(lambda slab: compute(*args, slab=slab, **settings))
 
     def _carried(self, fields: advection.Fields) -> list[advection.Fields]:
         """Returns what is moved separately: smoke with its temperature, and fuel."""
@@ -723,7 +730,9 @@ class Solver:
         # Smoke also moves by a cell of the lattice when an obstacle leaves it.
         reach = max(_SOUND * self.substeps, float(bool(self.obstacles))) * self._box.refinement
         rings = advection_places.rings_for(reach)
-        return BrickPool(self._box, rings, self._threshold, self._make_fields, _buffers(self.scheme), self.device)
+        return BrickPool(
+            self._box, rings, self._threshold, self._make_fields, _buffers(self.scheme), self.lattice.slabs
+        )
 
     def _make_fields(self, cells: int) -> advection.Fields:
         heat = cells if self._grids["temperature"] else 0
@@ -731,7 +740,7 @@ class Solver:
         return advection.Fields(self._zeros((cells,), self._stored), self._zeros((heat,), self._stored), fuel)
 
     def _zeros(self, shape: tuple[int, ...], dtype) -> wp.array:
-        return wp.zeros(shape, dtype=dtype, device=self.device)
+        return self.lattice.slabs.zeros(shape, dtype)
 
 
 def _buffers(scheme: str) -> int:

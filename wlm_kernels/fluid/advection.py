@@ -64,7 +64,7 @@ from wlm_kernels.fluid.advection_places import (
     trace_back,
     wall_at,
 )
-from wlm_kernels.fluid.lattice_sets import cell_of, index_of
+from wlm_kernels.fluid.lattice_sets import Slab, cell_of, index_of
 
 # Loops over eight cells run only beside solids; unrolled they would use registers in all other cells too.
 _OPTIONS = {"enable_backward": False, "max_unroll": 4}
@@ -380,7 +380,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return (2 * i + 1 + box.refinement) // (2 * box.refinement) - 1
 
     @wp.func
-    def first_of_run(box: Box, bricks: Bricks, i: int, k: int) -> wp.vec3i:
+    def first_of_run(box: Box, bricks: Bricks, begin: int, i: int, k: int) -> wp.vec3i:
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])
@@ -389,12 +389,13 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE), i // (_TILE * _TILE)
         )
         thread = i % (_TILE * _TILE)
-        return wp.vec3i(tile[0] * _RUN, tile[1] * _TILE + thread // _TILE, tile[2] * _TILE + thread % _TILE)
+        return wp.vec3i(begin + tile[0] * _RUN, tile[1] * _TILE + thread // _TILE, tile[2] * _TILE + thread % _TILE)
 
     @wp.func
     def carry_run(
         box: Box,
         first: wp.vec3i,
+        last: int,
         u: wp.array1d[wp.vec3],
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
@@ -404,13 +405,13 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         bricks: Bricks,
         out: fields_type,
     ) -> float:
-        """Advects up to `run` cells along x and returns their largest density or temperature."""
+        """Advects up to `run` cells along x, below cell `last`, and returns their largest density or temperature."""
         most = float(0.0)
         others = int(0)
         fine = dt * float(box.refinement)
         sheet = wp.where(wp.static(in_bricks), BRICK * BRICK, box.n[1] * box.n[2])
         x = int(first[0])
-        end = wp.min(first[0] + wp.static(run), box.n[0])
+        end = wp.min(first[0] + wp.static(run), last)
         begin = address(box, bricks, first)
         i = int(begin)
         patch = patch_of(box, first[0])
@@ -499,6 +500,8 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         predicted: fields_type,
         dt: float,
         decay: wp.vec2,
+        begin: int,
+        end: int,
         bricks: Bricks,
         # out:
         out: fields_type,
@@ -506,15 +509,15 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         i = wp.tid()
         if wp.static(in_bricks):
             for k in range(i // _BRICK_RUNS, bricks.counts[0], bricks.workers):
-                first = first_of_run(box, bricks, i, k)
+                first = first_of_run(box, bricks, begin, i, k)
                 if first[0] < box.n[0] and first[1] < box.n[1] and first[2] < box.n[2]:
-                    most = carry_run(box, first, u, walls, fields, predicted, dt, decay, bricks, out)
+                    most = carry_run(box, first, end, u, walls, fields, predicted, dt, decay, bricks, out)
                     if most > bricks.threshold:
                         bricks.busy[bricks.listed[k]] = 1
         else:
-            first = first_of_run(box, bricks, i, 0)
+            first = first_of_run(box, bricks, begin, i, 0)
             if first[1] < box.n[1] and first[2] < box.n[2]:
-                carry_run(box, first, u, walls, fields, predicted, dt, decay, bricks, out)
+                carry_run(box, first, end, u, walls, fields, predicted, dt, decay, bricks, out)
 
     return carry
 
@@ -529,6 +532,7 @@ def advect(
     decay: tuple[float, float] = (1.0, 1.0),
     bricks: Bricks = DENSE,
     predicted: Fields | None = None,
+    slab: Slab | None = None,
 ) -> None:
     """Does a semi-Lagrangian step, which is also the first half of a MacCormack step, or with `predicted` the second.
 
@@ -543,11 +547,15 @@ def advect(
             MacCormack step.
         bricks: The bricks to compute, stored by `advection_sources.store`; default all cells.
         predicted: The result of the first half, in a third set of arrays.
+        slab: The coarse cells to compute, without bricks; default all.
     """
+    slab = slab or Slab(velocity.device, 0, box.coarse[0])
+    begin, end = slab.begin * box.refinement, slab.end * box.refinement
     stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0
     kernel = carry_kernel(predicted is not None, stored, bricks.workers > 0, solids, hot)
-    tiles = -(-box.n[0] // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE)
+    tiles = -(-(end - begin) // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE)
     threads = bricks.workers * int(_BRICK_RUNS) or tiles * _TILE * _TILE
     # A semi-Lagrangian step does not read the prediction.
-    inputs = [box, velocity, walls, fields.arrays, (predicted or fields).arrays, float(dt), wp.vec2(*decay), bricks]
-    wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=fields.density.device)
+    smoke = [fields.arrays, (predicted or fields).arrays]
+    inputs = [box, velocity, walls, *smoke, float(dt), wp.vec2(*decay), begin, end, bricks]
+    wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=slab.device)
