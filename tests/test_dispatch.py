@@ -3,7 +3,6 @@
 import functools
 import os
 import shutil
-import signal
 from functools import partial
 
 import numpy as np
@@ -51,8 +50,9 @@ def objects(folder, monkeypatch, **place):
 
 
 def sequences(folder, monkeypatch, **place):
-    settings = DatasetSettings(cells=16, refine=1, frames=1, views_a_frame=1, sequences=3, resolution=16, warmup=0.2)
-    pool = make_pool(settings, seed=5, place=Place(**place))
+    settings = {"cells": 16, "refine": 1, "frames": 1, "views_a_frame": 2, "sequences": 3, "resolution": 24}
+    pool = make_pool(DatasetSettings(**settings, warmup=0.6, kept_empty=1.0), seed=5, place=Place(**place))
+    assert len(pool) == 6
     return [vars(pool)[name].numpy().tobytes() for name in vars(pool)]
 
 
@@ -161,7 +161,7 @@ def test_an_interrupt_leaves_no_process(monkeypatch):
     before = children()
 
     def stop(progress):
-        os.kill(os.getpid(), signal.SIGINT)
+        raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         toys([1, "sleep"], stop, workers=2)

@@ -15,11 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wlm import interop
 from wlm.errors import WlmError, one_line
 from wlm.formats.checkpoint import Checkpoint
 from wlm.formats.parts import Part
-from wlm.metrics import nanmean
 from wlm.system import Meter
 from wlm.workers import Actors, Here, Lost, Processes, Workers
 
@@ -101,6 +99,8 @@ class Place(NamedTuple):
     def devices(self, usual: int = 1) -> list[str]:
         """Returns the device of each worker, or that of all on a cluster, of which there must be one at least; `usual`
         is the usual number on a CPU."""
+        from wlm import interop  # torch and Warp take seconds to import, which small workers need not spend
+
         if self.workers is not None and self.workers < 1:
             raise WlmError(f"workers: expected at least 1, got {self.workers}")
         if self.cluster is not None:
@@ -305,10 +305,11 @@ class _Dispatch:
             return
         done = self._done + sum(run.step or 0 for run in self._running.values())
         if self._meter.due(done):
-            names = dict.fromkeys(name for each in self._figures.values() for name in each)
-            known = ((name, [each[name] for each in self._figures.values() if name in each]) for name in names)
+            known: dict[str, list[float]] = {}
+            for name, value in (item for each in self._figures.values() for item in each.items()):
+                known.setdefault(name, []).extend([value] * (not math.isnan(value)))
             try:
-                self._meter.report(done, **{name: float(nanmean(np.array(values))) for name, values in known})
+                self._meter.report(done, **{name: sum(some) / (len(some) or math.nan) for name, some in known.items()})
             except KeyboardInterrupt as stop:
                 # Between two steps the states are complete; an interrupt anywhere else saves nothing.
                 self._stop, self._patience = stop, time.monotonic() + _STOPPING
