@@ -55,7 +55,7 @@ def make_pool(
         round: Number of the round, from 0.
         device: "cpu", "cuda" or "cuda:N".
         place: Where sequences are made side by side, with the same result; None: one after another on the device.
-        progress: Called after sequences.
+        progress: Called after each sequence.
 
     Returns:
         At most sequences x frames x views_a_frame samples, on the device. The same arguments give the same bits on one
@@ -87,7 +87,8 @@ def _pool(
     progress: OnProgress | None,
 ) -> Pool:
     """Makes sequences by `SequenceMaker`, which takes the arguments; returns the samples of all in one pool."""
-    meter, tasks = Meter(progress, "dataset", len(numbers)), [Task((each,), 1, partial(int, each)) for each in numbers]
+    meter = Meter(progress, "dataset", len(numbers), every=0.0)
+    tasks = [Task((each,), 1, partial(int, each)) for each in numbers]
     made = gathered(SequenceMaker, arguments, tasks, meter, place or Place(device))
     parts = ([getattr(made[each], name.name) for each in numbers] for name in fields(Pool))
     return Pool(*map(torch.cat, parts)).to(check_device(device))
