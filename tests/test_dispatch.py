@@ -127,7 +127,7 @@ def cluster():
 
 def toys(jobs, progress=None, **place):
     tasks = [Task((number,), 1, partial(lambda each: each, job)) for number, job in enumerate(jobs)]
-    return gathered(ToyWorker, (3,), tasks, Meter(progress, "toys", len(tasks)), Place(**place))
+    return gathered((ToyWorker, 3), tasks, Meter(progress, "toys", len(tasks)), Place(**place))
 
 
 def children():

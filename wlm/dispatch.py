@@ -88,7 +88,7 @@ class Place(NamedTuple):
 
     Attributes:
         device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs of this machine.
-        workers: Number of workers; None: on a GPU one, on a CPU a usual number, on a cluster as many as have room.
+        workers: Number of workers; None: one, on a cluster as many as have room.
         cluster: Address of a Ray cluster, whose workers take two CPUs or a GPU each; None: processes of this machine.
     """
 
@@ -96,9 +96,8 @@ class Place(NamedTuple):
     workers: int | None = None
     cluster: str | None = None
 
-    def devices(self, usual: int = 1) -> list[str]:
-        """Returns the device of each worker, or that of all on a cluster, of which there must be one at least; `usual`
-        is the usual number on a CPU."""
+    def devices(self) -> list[str]:
+        """Returns the device of each worker, or that of all on a cluster; there must be one at least."""
         from wlm import interop  # torch and Warp take seconds to import, which small workers need not spend
 
         if self.workers is not None and self.workers < 1:
@@ -107,11 +106,10 @@ class Place(NamedTuple):
             if self.device not in ("cpu", "cuda"):
                 raise WlmError(f"device '{self.device}': expected cpu or cuda when the work runs on a cluster")
             return [self.device]
-        checked = interop.check_device(self.device)
-        if checked == "cpu":
-            return ["cpu"] * (self.workers or usual)
-        gpus = interop.available_devices()[1:] if self.device == "cuda" else [checked]
-        return [gpus[i % len(gpus)] for i in range(self.workers or 1)]
+        each = [interop.check_device(self.device)]
+        if self.device == "cuda":
+            each = interop.available_devices()[1:]
+        return [each[i % len(each)] for i in range(self.workers or 1)]
 
     @property
     def here(self) -> str:
@@ -120,30 +118,29 @@ class Place(NamedTuple):
         return "cpu" if self.cluster is not None else device
 
 
-def start_workers(make: type, arguments: tuple[Any, ...], place: Place, tasks: int, usual: int = 1) -> Workers:
-    """Starts workers of a class, at most one for each of so many tasks; a single one on this machine is in this
-    process. `make`, from a module that can be imported, is called with a device and the `arguments`."""
-    devices = place.devices(usual)[: max(tasks, 1)]
+def start_workers(worker: tuple[Any, ...], place: Place, tasks: int) -> Workers:
+    """Starts workers, at most one for each of so many tasks; a single one on this machine is in this process.
+
+    `worker` is a class, from a module that can be imported, and its arguments after the first, a device."""
+    make, *arguments = worker
+    devices = place.devices()[:tasks]
     if place.cluster is not None:
         share = {"CPU": float(CPU_LANES)} if place.device == "cpu" else {"GPU": 1.0}
-        return Actors(make, (place.device, *arguments), place.workers, max(tasks, 1), place.cluster, share)
+        return Actors(make, (place.device, *arguments), place.workers, tasks, place.cluster, share)
     if len(devices) == 1:
         return Here(make(devices[0], *arguments))
     return Processes(make, [(each, *arguments) for each in devices])
 
 
 def run(
-    make: type,
-    arguments: tuple[Any, ...],
+    worker: tuple[Any, ...],
     tasks: Sequence[Task],
     meter: Meter,
     place: Place,
-    *,
-    done: int = 0,
     checkpoint: Checkpoint | None = None,
-    usual: int = 1,
+    done: int = 0,
 ) -> Iterator[tuple[Task, Any]]:
-    """Runs tasks by workers of a class that has the methods of `Whole`, see `start_workers`.
+    """Runs tasks by workers, see `start_workers`, of a class that has the methods of `Whole`.
 
     Tasks begin in their order. Those of lost workers begin again, and `meter` reports the progress, with `done` steps
     before. The checkpoint has the states of running tasks; the caller adds results, which are written when the work
@@ -158,8 +155,9 @@ def run(
     """
     if tasks:
         try:
-            with closing(start_workers(make, arguments, place, len(tasks), usual)) as pool:
-                yield from _Dispatch(pool, tasks, meter, done, checkpoint if hasattr(make, "state") else None).run()
+            with closing(start_workers(worker, place, len(tasks))) as pool:
+                states = checkpoint if hasattr(worker[0], "state") else None
+                yield from _Dispatch(pool, tasks, meter, done, states).run()
         except (WlmError, KeyboardInterrupt):
             if checkpoint is not None:
                 checkpoint.flush()
@@ -167,15 +165,12 @@ def run(
 
 
 def gathered(
-    make: type,
-    arguments: tuple[Any, ...],
+    worker: tuple[Any, ...],
     tasks: Sequence[Task],
     meter: Meter,
     place: Place,
-    *,
-    done: int = 0,
     checkpoint: Checkpoint | None = None,
-    usual: int = 1,
+    done: int = 0,
 ) -> dict[int, Any]:
     """Returns the result of each task by its number: from the checkpoint if it has it, or else by `run`."""
     results, left = {}, []
@@ -185,7 +180,7 @@ def gathered(
             left.append(task)
         else:
             results[task.numbers[0]], done = kept, done + task.steps
-    for task, result in run(make, arguments, left, meter, place, done=done, checkpoint=checkpoint, usual=usual):
+    for task, result in run(worker, left, meter, place, checkpoint, done):
         results[task.numbers[0]] = result
         if checkpoint is not None:
             checkpoint.add_finished(task.numbers[0], result)

@@ -53,9 +53,8 @@ def device_name(device: torch.device) -> str:
 
 def moved(value: Any, device: str | torch.device) -> Any:
     """Returns a copy of a dataclass with its tensors on a device."""
-    parts = {each.name: getattr(value, each.name) for each in fields(value)}
-    tensors = {name: part.to(device) for name, part in parts.items() if isinstance(part, torch.Tensor)}
-    return replace(value, **tensors)
+    parts = ((each.name, getattr(value, each.name)) for each in fields(value))
+    return replace(value, **{name: part.to(device) for name, part in parts if isinstance(part, torch.Tensor)})
 
 
 def free_memory(device: wp.Device) -> int:

@@ -20,8 +20,8 @@ class Several(Workers):
 
     remote = False
 
-    def __init__(self, make, arguments, place, tasks, usual=1, *, order=0, lose=()):
-        self.count, self._make = min(place.workers or 1, tasks), lambda: Here(make(place.device, *arguments))
+    def __init__(self, worker, place, tasks, *, order=0, lose=()):
+        self.count, self._make = min(place.workers or 1, tasks), lambda: Here(worker[0](place.device, *worker[1:]))
         self._random, self._lose = random.Random(order), lose
         self._workers = [self._make() for _ in range(self.count)]
         self._called, self._answers = [], 0

@@ -125,8 +125,8 @@ def each_hour(
     }
     # Workers need no part of the file but the surfaces.
     bare = replace(geometry, document=replace(geometry.document, content={}, buffers=()), replacements=())
-    arguments, hours = (task.scene, bare, task.sky, gather, points), sorted(task.scene.hours)
+    worker, hours = (HourBaker, task.scene, bare, task.sky, gather, points), sorted(task.scene.hours)
     meter = Meter(progress, "bake", _REPORTS * len(hours))
     tasks = [Task((i,), _REPORTS, partial(float, hour), table=table) for i, hour in enumerate(hours)]
-    results = gathered(HourBaker, arguments, tasks, meter, place, checkpoint=checkpoint)
+    results = gathered(worker, tasks, meter, place, checkpoint)
     return [results[number] for number in range(len(hours))]

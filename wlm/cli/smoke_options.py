@@ -272,7 +272,7 @@ def write_lightmaps(
     tasks = [Task((frame,), 1, functools.partial(job, frame)) for frame in numbers]
     with running("six", None if files is None else files.partial, "frame", whole=False) as progress:
         meter = Meter(progress, "frames", len(tasks), every=0.0)
-        for task, (six, looks, said) in run(FrameMaker, arguments, tasks, meter, where):
+        for task, (six, looks, said) in run((FrameMaker, *arguments), tasks, meter, where):
             (frame,) = task.numbers
             path = output if files is None else files.file(frame)
             for fault in axis_faults(six.lightmaps):

@@ -102,14 +102,15 @@ def compress(
     for fit in fits.values():
         batches += fit.batches(len(batches), CPU_TILES if device == "cpu" else None)
     sheets = {sheet: fit.model for sheet, fit in fits.items()}
-    samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in batches)
-    options = {"checkpoint": checkpoint, "usual": max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE))}
+    if place == Place():
+        samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in batches)
+        place = Place(workers=max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE)))
     tasks = [
         Task((each.number,), profile.steps, partial(each.fit.job, each), each.kind, each.fit.table(each))
         for each in batches
     ]
-    meter, arguments = Meter(progress, "fit", profile.steps * len(batches)), (seed, progress is not None)
-    for number, parts in gathered(Fitter, arguments, tasks, meter, place, **options).items():
+    meter, worker = Meter(progress, "fit", profile.steps * len(batches)), (Fitter, seed, progress is not None)
+    for number, parts in gathered(worker, tasks, meter, place, checkpoint).items():
         batches[number].fit.store(batches[number], parts, checkpoint)
     # Sheets of an atlas and a size share one mask.
     masks = {(sheet.atlas, own.mask.shape): own.mask for sheet, own in reversed(sheets.items())}

@@ -187,7 +187,7 @@ def _fit_regions(
     profile = profile.model_copy(update={"method": "gaussians"})
     meter = Meter(progress, "fit", profile.steps * tree.count)
 
-    fit = partial(run, Fitter, (seed,), meter=meter, place=place, checkpoint=checkpoint)
+    fit = partial(run, (Fitter, seed), meter=meter, place=place, checkpoint=checkpoint)
     if tree.count == 1:
         task = Task((number,), profile.steps, lambda: [Region(make, probes, profile, pixels)])
         ((_, (model,)),) = fit([task])

@@ -27,7 +27,7 @@ from wlm.atlas.tiles.layout import Size, allocate
 from wlm.dispatch import Task, Whole, gathered
 from wlm.formats.float_texels import MOST_SIDE
 from wlm.formats.parts import Part
-from wlm.interop import check_device
+from wlm.interop import check_device, moved
 from wlm.system import Meter
 
 _RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # candidate numbers of components
@@ -168,8 +168,8 @@ def candidates(
             table["error"] = Part(np.float64, (len(choices), len(piece)), least=0.0)
             job = functools.partial(_job, tiles, piece, mixtures, sizes, choices)
             tasks.append(Task((i,), len(piece), job, table=table))
-        options = {"done": done * count, "checkpoint": stages.checkpoint}
-        for i, kept in gathered(CurveMaker, (), tasks, meter, stages.place, **options).items():
+        options = stages.place, stages.checkpoint, done * count
+        for i, kept in gathered((CurveMaker,), tasks, meter, *options).items():
             piece = pieces[i - (batch + done) * _PIECES]
             number[piece], error[:, piece] = kept["number"], kept["error"]
         tried.append(Candidate(mixtures, number, choices, error, 0.0))
@@ -201,7 +201,7 @@ class CurveMaker(Whole):
 
 def _curves(tiles: SceneTiles, mixtures: Mixtures, sizes: list[Size], choices: list[Choice]) -> dict[str, np.ndarray]:
     device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
-    mixtures = mixtures.to(device)
+    mixtures = moved(mixtures, device)
     factor, offset = mixtures.factor, mixtures.offset
     block = next((i for i, size in enumerate(sizes) if size.second and size.nx * size.ny == BLOCK_SIDE**2), 0)
     place = {size: i for i, size in enumerate(sizes)}

@@ -89,7 +89,7 @@ def _pool(
     """Makes sequences by `SequenceMaker`, which takes the arguments; returns the samples of all in one pool."""
     meter = Meter(progress, "dataset", len(numbers), every=0.0)
     tasks = [Task((each,), 1, partial(int, each)) for each in numbers]
-    made = gathered(SequenceMaker, arguments, tasks, meter, place or Place(device))
+    made = gathered((SequenceMaker, *arguments), tasks, meter, place or Place(device))
     parts = ([getattr(made[each], name.name) for each in numbers] for name in fields(Pool))
     return Pool(*map(torch.cat, parts)).to(check_device(device))
 
