@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,12 +46,11 @@ class Task:
     table: Mapping[str, Part] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Advance:
+class Advance(NamedTuple):
     """The progress of a task: steps done, measured values as for `Meter.report`, and the result once it is finished."""
 
     step: int
-    figures: Mapping[str, float] = field(default_factory=dict)
+    figures: Mapping[str, float] = {}
     finished: bool = False
     result: Any = None
 
@@ -206,7 +205,7 @@ class _Dispatch:
         self._running: dict[int, _Running] = {}
         self._dead: set[int] = set()
         self._compiled: set[Any] = {None}
-        self._figures: dict[int, Mapping[str, float]] = {}
+        self._figures: Mapping[str, float] = {}  # of the task that advanced last
         self._states: dict[int, dict[str, np.ndarray]] | None = None  # the states of a save that is under way
         self._stop: KeyboardInterrupt | None = None
         self._patience = math.inf
@@ -274,7 +273,7 @@ class _Dispatch:
                     self._states.pop(each, None)
             if not begun:
                 self._compiled.add(run.task.kind)
-                self._figures[number] = answer.figures
+                self._figures = answer.figures
                 self._report(moved=True)
             if answer.finished:
                 return run.task, answer.result
@@ -300,11 +299,8 @@ class _Dispatch:
             return
         done = self._done + sum(run.step or 0 for run in self._running.values())
         if self._meter.due(done):
-            known: dict[str, list[float]] = {}
-            for name, value in (item for each in self._figures.values() for item in each.items()):
-                known.setdefault(name, []).extend([value] * (not math.isnan(value)))
             try:
-                self._meter.report(done, **{name: sum(some) / (len(some) or math.nan) for name, some in known.items()})
+                self._meter.report(done, **self._figures)
             except KeyboardInterrupt as stop:
                 # Between two steps the states are complete; an interrupt anywhere else saves nothing.
                 self._stop, self._patience = stop, time.monotonic() + _STOPPING

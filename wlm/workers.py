@@ -213,15 +213,7 @@ class Processes(Workers):
 class Actors(Workers):
     """Workers on a Ray cluster, each with its own resources."""
 
-    def __init__(
-        self,
-        make: type,
-        arguments: tuple[Any, ...],
-        count: int | None,
-        most: int,
-        address: str,
-        share: dict[str, float],
-    ) -> None:
+    def __init__(self, make: type, arguments: tuple, count: int | None, most: int, address: str, share: dict) -> None:
         """Connects to the cluster at an address, as for `ray.init`, and requests the workers; they start when resources
         become free.
 

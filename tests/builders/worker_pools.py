@@ -49,7 +49,7 @@ class Several(Workers):
 class ToyBaker(Whole):
     """Stands for `wlm.bake.work.HourBaker`, which needs Mitsuba: the light of an hour is the hour."""
 
-    def __init__(self, device, scene, geometry, sky, gather, points):
+    def __init__(self, device, gather, points, scene, geometry, sky):
         assert geometry.surfaces and not geometry.document.buffers
         self._count = len(points)
 

@@ -86,13 +86,12 @@ def noise_share(values: np.ndarray, noise: np.ndarray) -> float:
 
 
 class HourBaker(Whole):
-    """Bakes hours of a scene at points: `gather` is the function of `wlm.bake.paths` that takes them."""
+    """Bakes hours of a scene at points: `gather` is the function of `wlm.bake.paths` that takes them, and `world` the
+    arguments of `wlm.bake.world.make_hour`."""
 
-    def __init__(
-        self, device: str, scene: BakeScene, geometry: Geometry, sky: np.ndarray | None, gather: str, points: Any
-    ) -> None:
+    def __init__(self, device: str, gather: str, points: Any, *world: Any) -> None:
         start(device.partition(":")[0])
-        self._world, self._gather, self._points = (scene, geometry, sky), gather, points
+        self._gather, self._points, self._world = gather, points, world
 
     def run(self, job: float) -> dict[str, np.ndarray]:
         """Returns the arrays of an hour, as `wlm.bake.paths.Gathered` has them."""
@@ -125,7 +124,7 @@ def each_hour(
     }
     # Workers need no part of the file but the surfaces.
     bare = replace(geometry, document=replace(geometry.document, content={}, buffers=()), replacements=())
-    worker, hours = (HourBaker, task.scene, bare, task.sky, gather, points), sorted(task.scene.hours)
+    worker, hours = (HourBaker, gather, points, task.scene, bare, task.sky), sorted(task.scene.hours)
     meter = Meter(progress, "bake", _REPORTS * len(hours))
     tasks = [Task((i,), _REPORTS, partial(float, hour), table=table) for i, hour in enumerate(hours)]
     results = gathered(worker, tasks, meter, place, checkpoint)

@@ -1,12 +1,13 @@
 """`wlm bake`: makes lightmaps and probes of a scene by path tracing."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from wlm.cli.console import check_output, exclusive, note, note_start, quiet_warp, running, show, table
-from wlm.cli.options import Cluster, Device, Resume, Trust, Workers, output_option
+from wlm.cli.options import PlaceOptions, Resume, Trust, output_option, with_options
 
 app = typer.Typer(help="Make inputs by path tracing: lightmaps and probes, by Mitsuba (extra `bake`).")
 
@@ -19,13 +20,12 @@ _Scene = Annotated[
 
 
 @app.command()
+@with_options
 @exclusive
 def lightmaps(
     scene: _Scene,
     output: Annotated[Path, output_option("DIR", "Folder to write the set to.")],
-    workers: Workers = None,
-    cluster: Cluster = None,
-    device: Device = "cpu",
+    place: PlaceOptions,
     resume: Resume = False,
     trust: Trust = False,
 ) -> None:
@@ -39,11 +39,11 @@ def lightmaps(
     from wlm.formats.folder import claim
 
     claim(output, INDEX, FORMAT)
-    task, place = open_task(scene, trust), {"device": device, "workers": workers, "cluster": cluster}
-    checkpoint = open_checkpoint(output, task, "lightmaps", device, resume=resume)
+    task = open_task(scene, trust)
+    checkpoint = open_checkpoint(output, task, "lightmaps", place.device, resume=resume)
     note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
-        baked = bake_lightmaps(task, **place, checkpoint=checkpoint, progress=progress)
+        baked = bake_lightmaps(task, **asdict(place), checkpoint=checkpoint, progress=progress)
         files = write_lightmaps(output, task, baked)
         checkpoint.remove()
     rows = table(str(output), ["hour", "mean", "largest", "relative noise"])
@@ -56,13 +56,12 @@ def lightmaps(
 
 
 @app.command()
+@with_options
 @exclusive
 def probes(
     scene: _Scene,
     output: Annotated[Path, output_option("OUT.npz", "The file to write.")],
-    workers: Workers = None,
-    cluster: Cluster = None,
-    device: Device = "cpu",
+    place: PlaceOptions,
     resume: Resume = False,
     trust: Trust = False,
 ) -> None:
@@ -75,11 +74,11 @@ def probes(
     from wlm.bake.probes import bake_probes, write_probes
     from wlm.bake.work import open_checkpoint, open_task
 
-    task, place = open_task(scene, trust), {"device": device, "workers": workers, "cluster": cluster}
-    checkpoint = open_checkpoint(output, task, "probes", device, resume=resume)
+    task = open_task(scene, trust)
+    checkpoint = open_checkpoint(output, task, "probes", place.device, resume=resume)
     note_start(checkpoint, resume, "from the beginning")
     with running("bake", checkpoint.path, "percent", whole=False) as progress:
-        baked = bake_probes(task, **place, checkpoint=checkpoint, progress=progress)
+        baked = bake_probes(task, **asdict(place), checkpoint=checkpoint, progress=progress)
         write_probes(output, baked)
         checkpoint.remove()
     rows = table(str(output), ["hour", "probes", "lit probes", "mean L00", "relative noise"])

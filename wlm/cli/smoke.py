@@ -8,11 +8,12 @@ import typer
 from rich.markup import escape
 
 from wlm.cli import console, smoke_book, smoke_network
-from wlm.cli.options import CheckpointEvery, Cluster, Device, Resume, Seed, Workers, output_option
+from wlm.cli.options import CheckpointEvery, Device, Resume, Seed, output_option, with_options
 from wlm.cli.smoke_network import evaluate, info
 from wlm.cli.smoke_options import (
     SHEET,
     Background,
+    FrameOptions,
     Input,
     Lights,
     SmokeOptions,
@@ -22,7 +23,6 @@ from wlm.cli.smoke_options import (
     outputs,
     parse_lights,
     vector,
-    with_smoke,
     write_lightmaps,
 )
 from wlm.errors import WlmError
@@ -134,12 +134,12 @@ def _note_no_smoke(scene: "Scene") -> None:
 
 
 @app.command()
-@with_smoke
+@with_options
 @console.exclusive
 def bake(
     smoke: Input,
     output: _Lightmaps,
-    options: SmokeOptions,
+    options: FrameOptions,
     step: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Longest step of the ray march in voxels.")] = 0.5,
     supersample: Annotated[int, typer.Option(min=1, max=16, help="N: a pixel is the mean of N x N rays.")] = 1,
     g: _G = 0.0,
@@ -153,9 +153,6 @@ def bake(
         float | None,
         typer.Option(min=0.0, max=1.0, help="With --fit sphere: add multiple scattering of this albedo; default none."),
     ] = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    resume: Resume = False,
 ) -> None:
     """Make six-way lightmaps by fine ray marching, and estimate the error due to the step length.
 
@@ -172,25 +169,21 @@ def bake(
     if fit == "sphere":
         method, settings = fit, {"march": March(step, jitter=0.0, g=g), "albedo": albedo}
         made |= {"fit": fit, "albedo": albedo}
-    place, errors = (options.device, workers, cluster), fit == "axes"
-    write_lightmaps(options, smoke, output, (method, settings), made, place, resume=resume, errors=errors)
+    write_lightmaps(options, smoke, output, (method, settings), made, errors=fit == "axes")
 
 
 @app.command()
-@with_smoke
+@with_options
 @console.exclusive
 def predict(
     smoke: Input,
     output: _Lightmaps,
-    options: SmokeOptions,
+    options: FrameOptions,
     network: Annotated[
         Path | None, typer.Option(metavar="FILE", help='File of wlm smoke train; default "fast", which ships with wlm.')
     ] = None,
     coarse: Annotated[bool, typer.Option("--coarse", help="Only use a coarse ray march, without a network.")] = False,
     seed: Seed = 0,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    resume: Resume = False,
 ) -> None:
     """Predict six-way lightmaps with a network from a coarse march: like bake, in less time.
 
@@ -207,12 +200,11 @@ def predict(
     if not coarse:
         method = open_network(network)
         made |= {"made": "network", "of": dict(method.summary)}
-    place = (options.device, workers, cluster)
-    write_lightmaps(options, smoke, output, (method, {"seed": seed}), made, place, resume=resume)
+    write_lightmaps(options, smoke, output, (method, {"seed": seed}), made)
 
 
 @app.command()
-@with_smoke
+@with_options
 @console.exclusive
 def light(
     smoke: Input,

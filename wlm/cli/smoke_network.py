@@ -1,5 +1,6 @@
 """`wlm smoke train` and `export-onnx`, and `wlm evaluate` and `info` for networks."""
 
+from dataclasses import asdict
 from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,20 +22,16 @@ def register(app: typer.Typer) -> None:
 
 
 @with_settings("wlm.smoke:Profile")
+@opt.with_options
 @console.exclusive
 def train(
     profile: Annotated[str, typer.Argument(metavar="PROFILE", help="Settings: fast, paper, or a YAML file.")],
     output: Annotated[Path, opt.output_option("NETWORK", "The .safetensors to write.")],
     settings: dict[str, Any],
+    work: opt.FitOptions,
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="Minutes after which the training stops; --resume continues.")
     ] = None,
-    workers: opt.Workers = None,
-    cluster: opt.Cluster = None,
-    resume: opt.Resume = False,
-    checkpoint_every: opt.CheckpointEvery = 30.0,
-    seed: opt.Seed = 0,
-    device: opt.Device = "cpu",
 ) -> None:
     """Train a network on smoke simulated during the training, and keep the state with the best validation.
 
@@ -50,12 +47,10 @@ def train(
 
     checked = Profile.load(profile).override(settings, "--")
     checkpoint = Path(f"{output}{SUFFIX}")
-    if resume and not checkpoint.exists() and not output.exists():
+    if work.resume and not checkpoint.exists() and not output.exists():
         console.note(f"{checkpoint}: there is nothing to resume; starting at step 0")
-    options: dict[str, Any] = {"seed": seed, "device": device, "minutes": minutes, "resume": resume}
-    options |= {"checkpoint_every": checkpoint_every, "workers": workers, "cluster": cluster}
     with console.running("train", checkpoint) as progress:
-        training = fit(checked, output, progress=progress, **options)
+        training = fit(checked, output, progress=progress, minutes=minutes, **asdict(work))
     if not training.finished:
         console.note(
             f"out of time at step {training.steps}: repeat the command with --resume to continue from {checkpoint}"

@@ -1,9 +1,8 @@
 """Options, output files and tables that the commands of `wlm smoke` have in common."""
 
-import functools
-import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from wlm.cli.console import check_output, note, note_warnings, number, running, show, table
-from wlm.cli.options import Device, Trust
+from wlm.cli.options import Device, PlaceOptions, Resume, Trust
 from wlm.errors import WlmError
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ Input = Annotated[
 
 @dataclass(frozen=True)
 class SmokeOptions:
-    """Options of a volume, its camera and the device, for the commands marked by `with_smoke`."""
+    """Options of a volume, its camera and the device, for `wlm.cli.options.with_options`."""
 
     resolution: Annotated[
         int | None, typer.Option(min=1, max=16384, help="Height of the image in pixels; default the scene's, or 512.")
@@ -104,24 +103,11 @@ class SmokeOptions:
         return settings
 
 
-def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command the options of `SmokeOptions`, which it receives as its parameter `options`."""
-    signature = inspect.signature(command)
-    names = [field.name for field in fields(SmokeOptions)]
+@dataclass(frozen=True)
+class FrameOptions(SmokeOptions, PlaceOptions):
+    """Options of work on frames, which workers may share."""
 
-    @functools.wraps(command)
-    def run(**values: Any) -> None:
-        command(options=SmokeOptions(**{name: values.pop(name) for name in names}), **values)
-
-    own = [parameter for name, parameter in signature.parameters.items() if name != "options"]
-    shared = [
-        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
-        for field in fields(SmokeOptions)
-    ]
-    # typer reads both.
-    run.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *shared)}
-    return run
+    resume: Resume = False
 
 
 def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> dict[str, Any]:
@@ -209,27 +195,23 @@ def _check_folder(smoke: Path, output: Path) -> None:
 
 
 def write_lightmaps(
-    options: SmokeOptions,
+    options: FrameOptions,
     smoke: Path,
     output: Path,
     arguments: tuple[Any, Mapping[str, Any]],
     settings: Mapping[str, Any],
-    place: tuple[str, int | None, str | None],
-    *,
-    resume: bool,
     errors: bool = False,
 ) -> None:
     """Makes and writes the lightmaps of each frame, and shows a table.
 
     Args:
-        options: The options of the smoke.
+        options: The options of the command. With `resume` the frames are kept that an interrupted run of the same
+            settings has made.
         smoke: A volume or a folder of frames.
         output: A file, or for frames a folder.
         arguments: Method and settings of `wlm.smoke.frames.FrameMaker`.
         settings: JSON values that the results depend on, besides smoke and camera. An "albedo" other than None means
             that the lightmaps already include it.
-        place: Where frames are made, see `wlm.dispatch.Place`.
-        resume: Whether to keep the frames that an interrupted run of the same settings has made.
         errors: Whether the lightmaps state the error due to the step length.
     """
     from wlm.dispatch import Place, Task, run
@@ -238,7 +220,7 @@ def write_lightmaps(
     from wlm.smoke.lightmaps import axis_faults
     from wlm.system import Meter
 
-    where = Place(*place)
+    where, resume = Place(options.device, options.workers, options.cluster), options.resume
     # What is sent to other processes is in the host's memory.
     frames = options.open(smoke, where.here if len(where.devices()) == 1 else "cpu")
     camera, files = options.view(frames), None
@@ -269,7 +251,7 @@ def write_lightmaps(
             looks = looks.model_copy(update={"albedo": (1.0, 1.0, 1.0)})
         return str(frames.file(frame)), volume, frames.view(camera, volume), looks
 
-    tasks = [Task((frame,), 1, functools.partial(job, frame)) for frame in numbers]
+    tasks = [Task((frame,), 1, partial(job, frame)) for frame in numbers]
     with running("six", None if files is None else files.partial, "frame", whole=False) as progress:
         meter = Meter(progress, "frames", len(tasks), every=0.0)
         for task, (six, looks, said) in run((FrameMaker, *arguments), tasks, meter, where):

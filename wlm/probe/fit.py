@@ -216,9 +216,6 @@ def _fit_regions(
         of_region = partial(make, **bare, **box_of(near_set.position))
         return Region(of_region, near_set, sized, None if pixels is None else pixels.of(near))
 
-    def regions(group: list[int]) -> list[Region]:
-        return [region(index) for index in group]
-
     tasks = []
     for first in range(0, tree.count, at_once):
         group: list[int] = []
@@ -228,7 +225,10 @@ def _fit_regions(
             else:
                 group.append(index)
         if group:
-            numbers, job = tuple(batches + index for index in group), partial(regions, group)
+            numbers, job = (
+                tuple(batches + index for index in group),
+                partial(lambda each: list(map(region, each)), group),
+            )
             tasks.append(Task(numbers, profile.steps * len(group), job, "Gaussians"))
     for task, models in fit(tasks, done=profile.steps * len(results)):
         for batch, model in zip(task.numbers, models, strict=True):

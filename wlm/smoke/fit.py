@@ -101,7 +101,6 @@ def train(
     # A training is on a device of this machine, that of a cluster is any of its kind.
     place = Place(device if cluster is None else device.partition(":")[0], workers, cluster)
     profile, device = Profile.load(profile).override(overrides), check_device(device)
-    place.devices()
     fit = {
         **profile.model_dump(mode="json", include={"network", "training", "dataset"}),
         "seed": int(seed),

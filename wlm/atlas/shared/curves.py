@@ -195,36 +195,33 @@ class CurveMaker(Whole):
 
     def run(self, job: tuple[SceneTiles, Mixtures, list[Size], list[Choice]]) -> dict[str, np.ndarray]:
         """Returns for T tiles their mixtures, int [T], and errors for each choice, [choices, T], by name."""
+        tiles, mixtures, sizes, choices = replace(job[0], device=self._device), *job[1:]
         with one_thread(self._device):
-            return _curves(replace(job[0], device=self._device), *job[1:])
-
-
-def _curves(tiles: SceneTiles, mixtures: Mixtures, sizes: list[Size], choices: list[Choice]) -> dict[str, np.ndarray]:
-    device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
-    mixtures = moved(mixtures, device)
-    factor, offset = mixtures.factor, mixtures.offset
-    block = next((i for i, size in enumerate(sizes) if size.second and size.nx * size.ny == BLOCK_SIDE**2), 0)
-    place = {size: i for i, size in enumerate(sizes)}
-    texels, weight = tiles.light(slice(None))
-    light = tiles.points(texels)
-    chosen = mixtures.nearest(moments(light, weight))
-    components = tiles.points(tiles.components(texels, mixtures, chosen))
-    rest = torch.einsum("tmkc,tkcp->tmcp", factor[chosen], components - offset[chosen][..., None]) - light
-    lost = (rest.square().mean((1, 2)) * weight).double().sum(1)
-    whole, shares = chosen.repeat_interleave(rank), weight.repeat_interleave(rank, 0)
-    piece = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
-    # The error of each component alone.
-    alone = torch.empty((len(sizes), len(chosen), rank), dtype=torch.float64, device=device)
-    for i, size in enumerate(sizes):
-        samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
-        held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
-        alone[i] = errors(piece, held).unflatten(0, (-1, rank)) / states
-    error = np.zeros((len(choices), len(chosen)))
-    for i, choice in enumerate(choices):
-        whole = rank - choice.coarse
-        left = alone[place[choice.size], :, :whole].sum(1) + alone[block, :, whole:].sum(1)
-        error[i] = (left + lost).cpu().numpy()
-    return {"number": chosen.cpu().numpy(), "error": error}
+            device, (_, states, rank, _) = tiles.device, mixtures.factor.shape
+            mixtures = moved(mixtures, device)
+            factor, offset = mixtures.factor, mixtures.offset
+            block = next((i for i, size in enumerate(sizes) if size.second and size.nx * size.ny == BLOCK_SIDE**2), 0)
+            place = {size: i for i, size in enumerate(sizes)}
+            texels, weight = tiles.light(slice(None))
+            light = tiles.points(texels)
+            chosen = mixtures.nearest(moments(light, weight))
+            components = tiles.points(tiles.components(texels, mixtures, chosen))
+            rest = torch.einsum("tmkc,tkcp->tmcp", factor[chosen], components - offset[chosen][..., None]) - light
+            lost = (rest.square().mean((1, 2)) * weight).double().sum(1)
+            whole, shares = chosen.repeat_interleave(rank), weight.repeat_interleave(rank, 0)
+            piece = Tiles(whole, components.flatten(0, 1).contiguous(), shares, tiles.size)
+            # The error of each component alone.
+            alone = torch.empty((len(sizes), len(chosen), rank), dtype=torch.float64, device=device)
+            for i, size in enumerate(sizes):
+                samples = solve(piece, size.nx, size.ny, _MEDIUM if size.second else _ROUGH).clamp(min=0.0)
+                held = stored(samples, sample_weights(piece, size.nx, size.ny), size.format)
+                alone[i] = errors(piece, held).unflatten(0, (-1, rank)) / states
+            error = np.zeros((len(choices), len(chosen)))
+            for i, choice in enumerate(choices):
+                whole = rank - choice.coarse
+                left = alone[place[choice.size], :, :whole].sum(1) + alone[block, :, whole:].sum(1)
+                error[i] = (left + lost).cpu().numpy()
+            return {"number": chosen.cpu().numpy(), "error": error}
 
 
 def costs(tried: list[Candidate]) -> np.ndarray:

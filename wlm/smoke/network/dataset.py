@@ -79,13 +79,7 @@ def make_validation(
     return _pool((settings, seed, True), range(settings.validation_sequences), device, place, progress)
 
 
-def _pool(
-    arguments: tuple[DatasetSettings, int, bool],
-    numbers: range,
-    device: str,
-    place: Place | None,
-    progress: OnProgress | None,
-) -> Pool:
+def _pool(arguments: tuple, numbers: range, device: str, place: Place | None, progress: OnProgress | None) -> Pool:
     """Makes sequences by `SequenceMaker`, which takes the arguments; returns the samples of all in one pool."""
     meter = Meter(progress, "dataset", len(numbers), every=0.0)
     tasks = [Task((each,), 1, partial(int, each)) for each in numbers]
