@@ -46,7 +46,7 @@ def lightmaps(
         baked = bake_lightmaps(task, **asdict(place), checkpoint=checkpoint, progress=progress)
         files = write_lightmaps(output, task, baked)
         checkpoint.remove()
-    rows = table(str(output), ["hour", "mean", "largest", "relative noise"])
+    rows = table(str(output), ["hour", "mean irradiance", "largest", "relative noise"])
     for hour, light, error in zip(baked.hours, baked.light, baked.error, strict=True):
         seen = light[baked.mask].astype("float32")
         rows.add_row(f"{hour:g}", f"{seen.mean():.4g}", f"{seen.max():.4g}", f"{error:.2%}")
@@ -81,7 +81,7 @@ def probes(
         baked = bake_probes(task, **asdict(place), checkpoint=checkpoint, progress=progress)
         write_probes(output, baked)
         checkpoint.remove()
-    rows = table(str(output), ["hour", "probes", "lit probes", "mean L00", "relative noise"])
+    rows = table(str(output), ["hour", "probes", "lit probes", "mean ambient light", "relative noise"])
     for hour, values, error in zip(baked.hours, baked.values, baked.error, strict=True):
         lit = values.any(axis=(1, 2))
         mean = f"{values[lit, 0].mean():.4g}" if lit.any() else "–"

@@ -114,7 +114,7 @@ def simulate(
         "steps per frame": round(1.0 / (scene.rate * solver.duration)),
     }
     if figures:
-        facts |= {"smoke in the last frame": figures["smoke"], "seconds per frame": figures["frame s"]}
+        facts |= {"smoke at the end, m³ of density 1": figures["smoke"], "seconds per frame": figures["frame s"]}
         if not most and not warnings:
             _note_no_smoke(scene)
     console.show_facts(f"{output}: {scene.name}", facts)
@@ -264,7 +264,7 @@ def light(
     colour, highest = colour or (1.0, 1.0, 1.0), 1 if orders == "single" else HIGHEST
     file = outputs(smoke, frames.single, output, "light", ".png", ".exr")
     rows = console.table(
-        str(smoke), ["file", "mean", "largest", "clipped pixels", *(["noise"] * (samples is not None))]
+        str(smoke), ["file", "mean radiance", "largest", "pixels above white", *(["noise"] * (samples is not None))]
     )
     pictures, thickness = [], 0.0
     with console.running("light") as progress:

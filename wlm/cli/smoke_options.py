@@ -237,7 +237,7 @@ def write_lightmaps(
         if resume:
             done = len(files.done)
             note(f"{output}: {done} frames are finished" if done else f"{files.partial}: there is nothing to resume")
-    columns = ["file", "covered pixels", "mean light", *(["largest error", "RMS error"] * errors)]
+    columns = ["file", "pixels with smoke", "their mean light", *(["largest error of light", "RMS error"] * errors)]
     rows = table(str(frames.path), columns)
     numbers = [each for each in frames.numbers if files is None or each not in files.done]
     made: dict[int, tuple[Any, ...]] = {}
