@@ -8,7 +8,7 @@ import math
 import pickle
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -117,7 +117,7 @@ class Place(NamedTuple):
         return "cpu" if self.cluster is not None else device
 
 
-def start_workers(worker: tuple[Any, ...], place: Place, tasks: int) -> Workers:
+def start_workers(worker: tuple, place: Place, tasks: int) -> Workers:
     """Starts workers, at most one for each of so many tasks; a single one on this machine is in this process.
 
     `worker` is a class, from a module that can be imported, and its arguments after the first, a device."""
@@ -132,12 +132,7 @@ def start_workers(worker: tuple[Any, ...], place: Place, tasks: int) -> Workers:
 
 
 def run(
-    worker: tuple[Any, ...],
-    tasks: Sequence[Task],
-    meter: Meter,
-    place: Place,
-    checkpoint: Checkpoint | None = None,
-    done: int = 0,
+    worker: tuple, tasks: list[Task], meter: Meter, place: Place, checkpoint: Checkpoint | None = None, done: int = 0
 ) -> Iterator[tuple[Task, Any]]:
     """Runs tasks by workers, see `start_workers`, of a class that has the methods of `Whole`.
 
@@ -164,12 +159,7 @@ def run(
 
 
 def gathered(
-    worker: tuple[Any, ...],
-    tasks: Sequence[Task],
-    meter: Meter,
-    place: Place,
-    checkpoint: Checkpoint | None = None,
-    done: int = 0,
+    worker: tuple, tasks: list[Task], meter: Meter, place: Place, checkpoint: Checkpoint | None = None, done: int = 0
 ) -> dict[int, Any]:
     """Returns the result of each task by its number: from the checkpoint if it has it, or else by `run`."""
     results, left = {}, []
@@ -198,7 +188,7 @@ class _Dispatch:
     """Hands out tasks, restarts those of lost workers, reports progress and saves the states of running tasks."""
 
     def __init__(
-        self, workers: Workers, tasks: Sequence[Task], meter: Meter, done: int, checkpoint: Checkpoint | None
+        self, workers: Workers, tasks: list[Task], meter: Meter, done: int, checkpoint: Checkpoint | None
     ) -> None:
         self._workers, self._meter, self._done, self._checkpoint = workers, meter, done, checkpoint
         self._waiting = deque(tasks)
@@ -209,7 +199,8 @@ class _Dispatch:
         self._states: dict[int, dict[str, np.ndarray]] | None = None  # the states of a save that is under way
         self._stop: KeyboardInterrupt | None = None
         self._patience = math.inf
-        workers.on_share(self._share)
+        if isinstance(workers, Here):
+            workers.worker.report = self._share
 
     def run(self) -> Iterator[tuple[Task, Any]]:
         free = list(range(self._workers.count))[::-1]

@@ -4,6 +4,7 @@ import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -61,13 +62,7 @@ class BakedLightmaps:
 
 
 def bake_lightmaps(
-    task: Bake,
-    *,
-    device: str = "cpu",
-    workers: int | None = None,
-    cluster: str | None = None,
-    checkpoint: Checkpoint | None = None,
-    progress: OnProgress | None = None,
+    task: Bake, *, checkpoint: Checkpoint | None = None, progress: OnProgress | None = None, **place: Any
 ) -> BakedLightmaps:
     """Bakes the lightmap of a scene at each of its hours.
 
@@ -76,23 +71,23 @@ def bake_lightmaps(
     Args:
         task: The scene, from `wlm.bake.work.open_task`.
         checkpoint: From `wlm.bake.work.open_checkpoint`; None: the bake can't be resumed.
-        device: "cpu" or "cuda" (the first GPU).
-        workers, cluster: Where hours are baked side by side, with the same result: see `wlm.dispatch.Place`.
         progress: Called from time to time; a KeyboardInterrupt that it raises leaves a written checkpoint.
+        place: `device`, "cpu" or "cuda" (the first GPU), and `workers` and `cluster`, by which hours are baked side by
+            side with the same result: see `wlm.dispatch.Place`.
 
     Raises:
         WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, lacks lightmap UVs or they overlap, or
             a lamp names a material that doesn't exist.
     """
-    scene, place = task.scene, Place(device, workers, cluster)
-    if cluster is None:
-        start(device)
+    scene, where = task.scene, Place(**place)
+    if where.cluster is None:
+        start(where.device)
     denoise = need("pyoidn", "bake").denoise if scene.denoise else None
     geometry = read_geometry(task.geometry, scene.lightmap, task.trust)
     check_lamps(task.path, scene, geometry)
     texels = place_texels(str(task.geometry), geometry.surfaces, scene.lightmap.resolution, scene.lightmap.supersample)
     shape = len(texels.index), 3
-    results = each_hour(task, geometry, "irradiance", texels, shape, place, checkpoint, progress)
+    results = each_hour(task, geometry, "irradiance", texels, shape, where, checkpoint, progress)
     back = np.mean([each["back"] for each in results], axis=0)
     visible = back <= _HIDDEN
     if not visible.any():

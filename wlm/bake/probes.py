@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,33 +55,27 @@ def place_probes(settings: ProbeSettings, geometry: Geometry) -> np.ndarray:
 
 
 def bake_probes(
-    task: Bake,
-    *,
-    device: str = "cpu",
-    workers: int | None = None,
-    cluster: str | None = None,
-    checkpoint: Checkpoint | None = None,
-    progress: OnProgress | None = None,
+    task: Bake, *, checkpoint: Checkpoint | None = None, progress: OnProgress | None = None, **place: Any
 ) -> BakedProbes:
     """Bakes a scene's probes at each of its hours.
 
     Args:
-        task, device, workers, cluster, checkpoint, progress: As for `wlm.bake.bake_lightmaps`.
+        task, checkpoint, progress, place: As for `wlm.bake.bake_lightmaps`.
 
     Raises:
         WlmError: Mitsuba, LLVM or a GPU is missing, the geometry can't be read, there are too many probes, or a lamp
             names a material that doesn't exist.
     """
-    scene, place = task.scene, Place(device, workers, cluster)
-    if cluster is None:
-        start(device)
+    scene, where = task.scene, Place(**place)
+    if where.cluster is None:
+        start(where.device)
     geometry = read_geometry(task.geometry, None, task.trust)
     check_lamps(task.path, scene, geometry)
     position = place_probes(scene.probes, geometry)
     hours = sorted(scene.hours)
 
     count = len(position)
-    results = each_hour(task, geometry, "harmonics", position, (count, _NUMBERS), place, checkpoint, progress)
+    results = each_hour(task, geometry, "harmonics", position, (count, _NUMBERS), where, checkpoint, progress)
     hidden = np.mean([each["back"] for each in results], axis=0) > _HIDDEN
     shape = (len(hours), count, 9, 3)
     values = np.stack([np.where(hidden[:, None], 0.0, each["mean"]) for each in results]).astype(np.float32)

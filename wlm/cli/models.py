@@ -34,13 +34,12 @@ def fit(
     checked = package.Profile.load(profile).override(settings, "--")
     data = load()
     console.note_warnings(data.warnings)
-    shared = {"seed": work.seed, "device": work.device} | dict(inputs or {})
-    keeping = {"resume": work.resume, "every": work.checkpoint_every}
-    checkpoint = package.open_checkpoint(output, data, checked, **keeping, **shared)
+    same = {"seed": work.seed, "device": work.device} | dict(inputs or {})
+    checkpoint = package.open_checkpoint(output, data, checked, resume=work.resume, every=work.checkpoint_every, **same)
     console.note_start(checkpoint, work.resume, "at step 0")
     start = time.perf_counter()
     with console.running("fit", checkpoint.path) as progress:
-        options |= shared | {"workers": work.workers, "cluster": work.cluster}
+        options |= same | {"workers": work.workers, "cluster": work.cluster}
         model = package.compress(data, checked, progress=progress, checkpoint=checkpoint, **options)
         seconds = time.perf_counter() - start
         size = model.save(output)

@@ -131,8 +131,9 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
-        names = {name: [field.name for field in fields(kind)] for name, kind in kinds.items()}
-        made = {name: kinds[name](**{each: values.pop(each) for each in names[name]}) for name in kinds}
+        made = {
+            name: kind(**{each.name: values.pop(each.name) for each in fields(kind)}) for name, kind in kinds.items()
+        }
         command(**made, **values)
 
     own = [parameter for name, parameter in signature.parameters.items() if name not in kinds]
