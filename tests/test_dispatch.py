@@ -115,6 +115,8 @@ def test_a_killed_actor_of_a_cluster_changes_nothing(job, tmp_path, monkeypatch,
     whole = job(tmp_path, monkeypatch)
     killed = kills_one(monkeypatch, workers.Actors, lambda pool, number: cluster.kill(pool._actors[number]))
     assert job(tmp_path, monkeypatch, cluster="auto") == whole and killed
+    with pytest.raises(WlmError, match="cluster auto: expected at least 1 GPU for a worker"):
+        toys([1], cluster="auto", device="cuda")
 
 
 @pytest.fixture(scope="module")

@@ -107,25 +107,6 @@ def processes_of(parent):
 
 
 @pytest.mark.slow
-def test_a_killed_process_changes_nothing(lightmaps, tmp_path, monkeypatch):
-    profile = tiny_profile(steps=400)
-    whole = bytes_of(fit.compress(lightmaps, profile), tmp_path)
-    killed = []
-
-    def kill(progress):
-        # One of two that are at work: both have batches by then.
-        if progress.done > 500 and not killed:
-            killed.extend(processes_of(os.getpid())[:1])
-            os.kill(killed[0], signal.SIGKILL)
-
-    report_always(monkeypatch)
-    checkpoint = fit.open_checkpoint(tmp_path / "a.wlm", lightmaps, profile, every=0.1)
-    model = fit.compress(lightmaps, profile, workers=2, progress=kill, checkpoint=checkpoint)
-    assert bytes_of(model, tmp_path) == whole
-    assert killed and processes_of(os.getpid()) == []
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_stopped_command_leaves_no_process_behind(number, lightmaps, tmp_path):
     folder, out = tmp_path / "set", tmp_path / "out" / "a.wlm"
@@ -181,36 +162,6 @@ def test_a_process_answers_or_says_why_not():
     finally:
         workers.close()
     assert processes_of(os.getpid()) == before
-
-
-@pytest.mark.slow
-def test_a_cluster_gives_the_same_bytes(lightmaps, tmp_path, monkeypatch):
-    ray = pytest.importorskip("ray")
-    whole = bytes_of(fit.compress(lightmaps, PROFILE), tmp_path)
-    ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False)
-    try:
-        made = []
-        begin = dispatch.Actors.__init__
-
-        def remember(self, *arguments):
-            begin(self, *arguments)
-            made.append(self)
-
-        monkeypatch.setattr(dispatch.Actors, "__init__", remember)
-        report_always(monkeypatch)
-        killed = []
-
-        def kill(progress):
-            if progress.done >= 60 and not killed:
-                killed.append(made[0]._actors[0])
-                ray.kill(killed[0])
-
-        assert bytes_of(fit.compress(lightmaps, PROFILE, cluster="auto", progress=kill), tmp_path) == whole
-        assert made[0].count == 2 and killed
-        with pytest.raises(WlmError, match="cluster auto: expected at least 1 GPU for a worker"):
-            fit.compress(lightmaps, PROFILE, cluster="auto", device="cuda")
-    finally:
-        ray.shutdown()
 
 
 def test_a_mapped_set_is_the_same_set(tmp_path, monkeypatch):
