@@ -142,18 +142,19 @@ def _probe_running() -> Kept:
 def _training() -> Kept:
     settings = TrainSettings(rounds=1, steps=4, batch=2, warmup=2, average=0.5)
     profile = Profile(name="tiny", network=NetworkSettings(width=8, levels=2), training=settings)
-    pools = {"make_pool": lambda *a, **k: _samples(), "make_validation": lambda *a, **k: _samples()}
+    made = dict.fromkeys(("make_pool", "make_validation"), lambda *a, **k: _samples())
+    pools = functools.partial(mock.patch.multiple, "wlm.smoke.network.dataset", **made)
 
     def write(path: Path) -> None:
         # Out of time after the first two steps.
-        with mock.patch("wlm.smoke.fit._CHUNK", 2):
-            train(profile, path, minutes=0.0, **pools)
+        with mock.patch("wlm.smoke.fit._CHUNK", 2), pools():
+            train(profile, path, minutes=0.0)
         for other in (path, Path(f"{path}.csv")):
             other.unlink(missing_ok=True)
 
     def read(path: Path) -> Any:
-        with mock.patch("wlm.smoke.fit._CHUNK", 2):
-            return train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0, **pools)
+        with mock.patch("wlm.smoke.fit._CHUNK", 2), pools():
+            return train(profile, str(path).removesuffix(".partial"), resume=True, minutes=0.0)
 
     free = {"clock": "nan", "curve": "nan size"}
     ranges = {"step": ((), -1), "skipped": ((), 99.0), "counts": (0, -1), "adam.step.heads.0.bias": ((), -1.0)}

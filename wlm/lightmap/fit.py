@@ -1,15 +1,14 @@
 """Fits a compressed model to a lightmap set (neural-dynamic-gi, sections 3.4 and 4)."""
 
-import functools
 import os
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from wlm.dispatch import CPU_LANES, Dispatch, Task, start_workers, worker_devices
+from wlm.dispatch import CPU_LANES, Place, Task, gathered
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
@@ -70,12 +69,9 @@ def compress(
         tiles: Numbers of the tiles to compress, only for a set with one sheet; None: all. Other tiles are stored as
             empty.
         seed: One seed gives one result on one device.
-        device: "cpu", "cuda" or "cuda:N". Several workers on "cuda" are spread over the GPUs.
-        workers: Processes that fit batches of tiles side by side; the result does not depend on it. 1: only this
-            process. None: on the CPU one for every two cores, since a batch keeps two busy, but fewer for short fits; 1
-            on a GPU; on a cluster as many as it has room for.
-        cluster: Address of a Ray cluster whose machines fit the tiles, as `ray.init` takes it ("auto",
-            "ray://host:10001"); each worker takes two CPUs, or a GPU if the device is "cuda". None: this machine.
+        device: "cpu", "cuda" or "cuda:N".
+        workers, cluster: Where batches of tiles are fitted side by side, with the same result: see
+            `wlm.dispatch.Place`. On a CPU there is usually one worker for two cores, fewer for short fits.
         progress: Called about twice a second; in the stage "fit" with the loss and "PSNR dB" of the latest samples,
             relative to each tile's range. The stages "tiles" and "frames" may come before it.
         checkpoint: From `open_checkpoint`: keeps a running fit, and resumes an interrupted one.
@@ -90,7 +86,8 @@ def compress(
             diverged; workers died again and again; or the settings ask for frames without a BC7 encoder.
         KeyboardInterrupt: Raised by `progress`, after the checkpoint, if there is one, has been written.
     """
-    worker_devices(device, workers, cluster)  # an error before the set is classified
+    place = Place(device, workers, cluster)
+    here = place.here  # an error before the set is classified
     profile = Profile.load(profile).override(settings)
     if device != "cpu" and profile.hidden not in WIDTHS:
         raise WlmError(f"hidden: expected {', '.join(map(str, WIDTHS))} on a GPU, got {profile.hidden}")
@@ -100,26 +97,17 @@ def compress(
     batches: list[Batch] = []
     for fit in fits.values():
         batches += fit.batches(len(batches), CPU_TILES if device == "cpu" else None)
-    waiting = [batch for batch in batches if not batch.fit.restore(batch, checkpoint)]
     sheets = {sheet: fit.model for sheet, fit in fits.items()}
-    if waiting:
-        meter = Meter(progress, "fit", profile.steps * len(batches))
-        samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in waiting)
-        usual = max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE))
-        arguments = (seed, progress is not None)
-        pool = start_workers(Fitter, arguments, device, workers, cluster, len(waiting), usual)
-        tasks = [Task((batch.number,), profile.steps, functools.partial(batch.fit.job, batch)) for batch in waiting]
-        try:
-            with closing(pool):
-                done = profile.steps * (len(batches) - len(waiting))
-                for number, parts in Dispatch(pool, tasks, meter, done, checkpoint).run():
-                    batches[number].fit.store(batches[number], parts)
-                    if checkpoint is not None:
-                        checkpoint.add_finished(number, parts)
-        except (WlmError, KeyboardInterrupt):
-            if checkpoint is not None:
-                checkpoint.flush()
-            raise
+    if place == Place():
+        samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in batches)
+        place = Place(workers=max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE)))
+    tasks = [
+        Task((each.number,), profile.steps, partial(each.fit.job, each), "tiles", each.fit.table(each))
+        for each in batches
+    ]
+    meter, worker = Meter(progress, "fit", profile.steps * len(batches)), (Fitter, seed, progress is not None)
+    for number, parts in gathered(worker, tasks, meter, place, checkpoint).items():
+        batches[number].fit.store(batches[number], parts, checkpoint)
     # Sheets of an atlas and a size share one mask.
     masks = {(sheet.atlas, own.mask.shape): own.mask for sheet, own in reversed(sheets.items())}
     for sheet, own in sheets.items():
@@ -129,8 +117,7 @@ def compress(
     # Groups with other numbers of times have maps of other sizes.
     stored = profile.for_times(*counts) if len(counts) == 1 else profile
     model = LightmapModel(lightmaps.name, lightmaps.source, stored, sheets, warnings)
-    # The device of a cluster is not on this machine.
-    model.warnings += tuple(lost_light(model, lightmaps, "cpu" if cluster is not None else device))
+    model.warnings += tuple(lost_light(model, lightmaps, here))
     return model
 
 
@@ -270,22 +257,14 @@ class SheetFit:
         table = part_table(self.model.profile, kind, len(self.model.times))
         return {name: table[name] for name in _FITTED}
 
-    def store(self, batch: Batch, parts: Parts) -> None:
-        """Copies the maps and networks of a finished batch into the model."""
-        for name in _FITTED:
-            getattr(self.model, name)[batch.rows] = parts[name]
-
-    def restore(self, batch: Batch, checkpoint: Checkpoint | None) -> bool:
-        """Copies a batch that a checkpoint holds as finished into the model; returns False if it does not hold it."""
-        parts = None if checkpoint is None else checkpoint.finished(batch.number, self.table(batch))
-        if parts is None:
-            return False
+    def store(self, batch: Batch, parts: Parts, checkpoint: Checkpoint | None = None) -> None:
+        """Copies the maps and networks of a finished batch, which may come from a checkpoint, into the model."""
         try:
             check_packable(parts, self.model.profile)
         except WlmError as error:
-            raise WlmError(f"{checkpoint.path}: finished batch {batch.number}: {error}") from error
-        self.store(batch, parts)
-        return True
+            raise WlmError(f"{checkpoint and checkpoint.path}: finished batch {batch.number}: {error}") from error
+        for name in _FITTED:
+            getattr(self.model, name)[batch.rows] = parts[name]
 
 
 def _classify(
