@@ -21,6 +21,7 @@ from wlm_kernels.fluid.advection_places import (
     mark_walls,
     relist,
     rings_for,
+    trace,
 )
 
 WRAPPED = ((PERIODIC, PERIODIC),) * 3
@@ -95,18 +96,20 @@ class Grid:
 
     def run(self, fields: Fields, dt: float, steps: int = 1, decay=(1.0, 1.0)) -> Fields:
         spare = [Fields(wp.zeros_like(fields.density), wp.zeros_like(fields.temperature)) for _ in range(2)]
-        at = [self.box, self.u, self.walls]
+        traces = wp.empty(2 * self.u.size, dtype=wp.vec3, device=self.device)
+        trace(self.box, self.u, dt, traces)
+        at = [self.box, traces, self.walls]
         for _ in range(steps):
             if self.bricks is not DENSE:
                 relist(self.box, self.bricks)
                 self.computed += int(self.bricks.counts.numpy()[0]) * BRICK**3
                 advection_sources.store(self.bricks, fields)
             if self.scheme == "maccormack":
-                advect(*at, fields, spare[0], dt, bricks=self.bricks)
-                advect(*at, fields, spare[1], dt, decay, self.bricks, spare[0])
+                advect(*at, fields, spare[0], bricks=self.bricks)
+                advect(*at, fields, spare[1], decay, self.bricks, spare[0])
                 fields, spare[1] = spare[1], fields
             else:
-                advect(*at, fields, spare[0], dt, decay, self.bricks)
+                advect(*at, fields, spare[0], decay, self.bricks)
                 fields, spare[0] = spare[0], fields
         return fields
 

@@ -302,6 +302,7 @@ class Solver:
         self._fields = self._pool.fields if self._pool else [self._make_fields(cells) for _ in range(_buffers(scheme))]
         self._touched: tuple[Source, ...] = ()
         self._velocity = self._zeros(lattice.shape, wp.vec3)
+        self._traces = self._zeros((trace_count(lattice.shape, scheme),), wp.vec3)
         if wind is not None and not any((face.kind == WIND).any() for face in lattice.faces.values()):
             raise ValueError("wind: expected a lattice with a face for it (set_wind), got none")
         self._confinement, self._turbulence, self._wind = confinement, turbulence, wind
@@ -694,14 +695,15 @@ class Solver:
                 advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
 
     def _carry(self) -> None:
-        decays, where = (self._decay, (1.0, 1.0)), [self._box, self._velocity.flatten(), self._walls[0]]
+        advection_places.trace(self._box, self._velocity.flatten(), self.substeps, self._traces)
+        decays, where = (self._decay, (1.0, 1.0)), [self._box, self._traces, self._walls[0]]
         for decay, buffers in zip(decays, zip(*map(self._carried, self._fields), strict=True), strict=False):
             now, predicted, out = buffers[0], buffers[1], buffers[-1]
             if self.scheme == "maccormack":
-                advection.advect(*where, now, predicted, self.substeps, bricks=self._bricks)
-                advection.advect(*where, now, out, self.substeps, decay, self._bricks, predicted)
+                advection.advect(*where, now, predicted, bricks=self._bricks)
+                advection.advect(*where, now, out, decay, self._bricks, predicted)
             else:
-                advection.advect(*where, now, out, self.substeps, decay, self._bricks)
+                advection.advect(*where, now, out, decay, self._bricks)
         self._fields[:] = self._fields[::-1]
 
     def _carried(self, fields: advection.Fields) -> list[advection.Fields]:
@@ -732,6 +734,11 @@ class Solver:
 
     def _zeros(self, shape: tuple[int, ...], dtype) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self.device)
+
+
+def trace_count(cells: Sequence[int], scheme: str) -> int:
+    """Returns the number of traces that advection on this many cells of the lattice takes."""
+    return math.prod(cells) * (2 if scheme == "maccormack" else 1)
 
 
 def _buffers(scheme: str) -> int:

@@ -44,16 +44,12 @@ from wlm_kernels.fluid.advection_places import (
     Box,
     Bricks,
     Stencil,
-    TrilinearVelocity,
     beyond_open_face,
     clip_at_solid,
-    evaluate,
-    fetch,
     in_domain,
-    in_reach,
+    interpolate_vectors,
     into_domain,
     is_solid,
-    line_along_x,
     lowest_cell,
     pair,
     place_at,
@@ -61,7 +57,7 @@ from wlm_kernels.fluid.advection_places import (
     side_of,
     stencil,
     stored_index,
-    trace_back,
+    vector_at,
     wall_at,
 )
 from wlm_kernels.fluid.lattice_sets import cell_of, index_of
@@ -91,16 +87,6 @@ asm volatile("prefetch.global.L2 [%0];" :: "l"(field.data + i));
 
 _LARGEST_HALF = wp.constant(65504.0)
 _BRICK_RUNS = wp.constant(CELLS // _BRICK_RUN)
-
-
-@wp.struct
-class Corners:
-    """Indices of the eight cells around a point in a field, the lower and the upper of each pair along z, and the
-    fractions between them; the pairs are those of (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1)."""
-
-    low: wp.vec4i
-    high: wp.vec4i
-    f: wp.vec3
 
 
 @functools.cache
@@ -190,43 +176,49 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return index_of(box.n, cell)
 
     @wp.func
-    def corners_of(box: Box, bricks: Bricks, x: int, y: int, z: int, along: wp.vec3i, f: wp.vec3) -> Corners:
-        """Returns the eight cells from (x, y, z) to (x, y, z) + along, with the fractions f between them."""
-        out = Corners()
-        out.f = f
+    def side_values(
+        field: wp.array1d[stored], box: Box, bricks: Bricks, x: int, y: int, z: int, along_y: int, along_z: int
+    ) -> wp.vec4:
+        """Returns the values of the cells (x, y, z), (x, y, z + along_z), (x, y + along_y, z) and of the last."""
+        out = wp.vec4()
         if wp.static(in_bricks):
             # Brick and cell in the brick along each axis, of the lower and of the upper cells.
-            brick_x = wp.vec2i(x >> 3, (x + along[0]) >> 3) * (box.bricks[1] * box.bricks[2])
-            brick_y = wp.vec2i(y >> 3, (y + along[1]) >> 3) * box.bricks[2]
-            brick_z = wp.vec2i(z >> 3, (z + along[2]) >> 3)
-            cell_x = wp.vec2i((x & 7) << 6, ((x + along[0]) & 7) << 6)
-            cell_y = wp.vec2i((y & 7) << 3, ((y + along[1]) & 7) << 3)
-            cell_z = wp.vec2i(z & 7, (z + along[2]) & 7)
+            brick_y = wp.vec2i(y >> 3, (y + along_y) >> 3) * box.bricks[2]
+            brick_z = wp.vec2i(z >> 3, (z + along_z) >> 3)
+            cell_y = wp.vec2i((y & 7) << 3, ((y + along_y) & 7) << 3)
+            cell_z = wp.vec2i(z & 7, (z + along_z) & 7)
+            b = (x >> 3) * (box.bricks[1] * box.bricks[2])
+            c = (x & 7) << 6
             for k in range(4):
-                b = brick_x[k // 2] + brick_y[k % 2]
-                c = cell_x[k // 2] + cell_y[k % 2]
-                out.low[k] = (place_at(bricks.places, b + brick_z[0]) << 9) + c + cell_z[0]
-                out.high[k] = (place_at(bricks.places, b + brick_z[1]) << 9) + c + cell_z[1]
+                place = place_at(bricks.places, b + brick_y[k // 2] + brick_z[k % 2])
+                out[k] = value_at(field, (place << 9) + c + cell_y[k // 2] + cell_z[k % 2])
         else:
             i = (x * box.n[1] + y) * box.n[2] + z
-            j = i + along[0] * box.n[1] * box.n[2]
-            row_step = along[1] * box.n[2]
-            out.low = wp.vec4i(i, i + row_step, j, j + row_step)
-            out.high = out.low + wp.vec4i(along[2], along[2], along[2], along[2])
+            j = i + along_y * box.n[2]
+            out = wp.vec4(
+                value_at(field, i), value_at(field, i + along_z), value_at(field, j), value_at(field, j + along_z)
+            )
         return out
 
     @wp.func
-    def corners_around(box: Box, bricks: Bricks, p: wp.vec3) -> Corners:
-        cell, along, f = lowest_cell(box.n, box.periodic, p)
-        return corners_of(box, bricks, cell[0], cell[1], cell[2], along, f)
+    def blend(near: wp.vec4, far: wp.vec4, f: wp.vec3) -> float:
+        """Interpolates between the values of `side_values` on both sides of a point."""
+        a = between(between(near[0], near[1], f[2]), between(near[2], near[3], f[2]), f[1])
+        b = between(between(far[0], far[1], f[2]), between(far[2], far[3], f[2]), f[1])
+        return between(a, b, f[0])
 
     @wp.func
-    def interpolate(field: wp.array1d[stored], at: Corners) -> float:
-        a = between(value_at(field, at.low[0]), value_at(field, at.high[0]), at.f[2])
-        b = between(value_at(field, at.low[1]), value_at(field, at.high[1]), at.f[2])
-        c = between(value_at(field, at.low[2]), value_at(field, at.high[2]), at.f[2])
-        d = between(value_at(field, at.low[3]), value_at(field, at.high[3]), at.f[2])
-        return between(between(a, b, at.f[1]), between(c, d, at.f[1]), at.f[0])
+    def sides_around(field: wp.array1d[stored], box: Box, bricks: Bricks, p: wp.vec3):
+        """Returns the values of the eight cells around a point, in two halves, and the fractions between them."""
+        cell, along, f = lowest_cell(box.n, box.periodic, p)
+        near = side_values(field, box, bricks, cell[0], cell[1], cell[2], along[1], along[2])
+        far = side_values(field, box, bricks, cell[0] + along[0], cell[1], cell[2], along[1], along[2])
+        return near, far, f
+
+    @wp.func
+    def interpolate(field: wp.array1d[stored], box: Box, bricks: Bricks, p: wp.vec3) -> float:
+        near, far, f = sides_around(field, box, bricks, p)
+        return blend(near, far, f)
 
     @wp.func
     def interpolate_beside(
@@ -246,21 +238,24 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return total / wp.max(weight, 1.0e-6)
 
     @wp.func
-    def extremes(field: wp.array1d[stored], at: Corners):
-        """Returns the least and the largest of the eight stored values around a point."""
-        a = wp.vec4()
-        b = wp.vec4()
-        for k in range(4):
-            a[k] = value_at(field, at.low[k])
-            b[k] = value_at(field, at.high[k])
-        return wp.min(wp.min(a, b)), wp.max(wp.max(a, b))
+    def corrected(value: float, predicted: float, back: float, low: float, high: float) -> float:
+        return wp.clamp(predicted + 0.5 * (value - back), low, high)
 
     @wp.func
-    def corrected(
-        field: wp.array1d[stored], predicted: wp.array1d[stored], i: int, to: Corners, low: float, high: float
+    def correct(
+        field: wp.array1d[stored],
+        predicted: wp.array1d[stored],
+        box: Box,
+        bricks: Bricks,
+        i: int,
+        p: wp.vec3,
+        q: wp.vec3,
     ) -> float:
-        change = 0.5 * (value_at(field, i) - interpolate(predicted, to))
-        return wp.clamp(value_at(predicted, i) + change, low, high)
+        near, far, _f = sides_around(field, box, bricks, p)
+        low = wp.min(wp.min(near, far))
+        high = wp.max(wp.max(near, far))
+        back = interpolate(predicted, box, bricks, q)
+        return corrected(value_at(field, i), value_at(predicted, i), back, low, high)
 
     @wp.func
     def write(i: int, smoke: float, heat: float, decay: wp.vec2, out: fields_type) -> float:
@@ -279,20 +274,13 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return wp.max(wp.abs(away)) <= 0.5 * float(box.refinement)
 
     @wp.func
-    def departure_point(
-        box: Box,
-        u: wp.array1d[wp.vec3],
-        walls: wp.array1d[wp.uint8],
-        around: TrilinearVelocity,
-        f: wp.vec3,
-        x: wp.vec3,
-        v: wp.vec3,
-        dt: float,
-        wall: wp.uint8,
+    def end_of_trace(
+        box: Box, traces: wp.array1d[wp.vec3], walls: wp.array1d[wp.uint8], x: wp.vec3, at: Stencil, wall: wp.uint8
     ):
-        """Traces a point x back in time. Returns the end of the trace within the domain, whether the trace left the
-        domain through an open face, and whether its end is beside a solid; `wall` is the mark of the cell of x."""
-        end = trace_back(box, u, around, f, x, v, dt)
+        """Traces a point x by the traces of the coarse cells around it. Returns the end within the domain, whether the
+        trace left the domain through an open face, and whether its end is beside a solid; `wall` is the mark of the
+        cell of x."""
+        end = x + interpolate_vectors(traces, at)
         p = wp.vec3(end)
         left = bool(False)
         beside = bool(False)
@@ -315,11 +303,10 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         bricks: Bricks,
         cell: wp.vec3i,
         i: int,
-        u: wp.array1d[wp.vec3],
+        traces: wp.array1d[wp.vec3],
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
         predicted: fields_type,
-        dt: float,
     ):
         """Returns the density and the temperature of any cell, of index i, after a step, before their decay."""
         smoke = float(0.0)
@@ -330,25 +317,20 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             wall = wall_at(box, walls, x)
         if wall != SOLID:
             start = stencil(box.coarse, box.periodic, box.voxel * x)
-            around = fetch(u, start)
-            v = evaluate(around, start.f)
-            p, left, beside = departure_point(box, u, walls, around, start.f, x, v, dt, wall)
-            at = corners_around(box, bricks, p)
+            p, left, beside = end_of_trace(box, traces, walls, x, start, wall)
             if wp.static(correcting):
                 smoke = value_at(predicted.density, i)
                 if wp.static(hot):
                     heat = value_at(predicted.temperature, i)
                 uncorrected = left or beside
                 if not uncorrected:
-                    q, left_q, beside_q = departure_point(box, u, walls, around, start.f, x, v, -dt, wall)
+                    start.base += box.coarse[0] * box.coarse[1] * box.coarse[2]
+                    q, left_q, beside_q = end_of_trace(box, traces, walls, x, start, wall)
                     uncorrected = left_q or beside_q
                 if not uncorrected:
-                    to = corners_around(box, bricks, q)
-                    low, high = extremes(fields.density, at)
-                    smoke = corrected(fields.density, predicted.density, i, to, low, high)
+                    smoke = correct(fields.density, predicted.density, box, bricks, i, p, q)
                     if wp.static(hot):
-                        low, high = extremes(fields.temperature, at)
-                        heat = corrected(fields.temperature, predicted.temperature, i, to, low, high)
+                        heat = correct(fields.temperature, predicted.temperature, box, bricks, i, p, q)
             elif not left:
                 if wp.static(solids):
                     if beside:
@@ -356,23 +338,42 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                         if wp.static(hot):
                             heat = interpolate_beside(fields.temperature, walls, box, bricks, p)
                 if not beside:
-                    smoke = interpolate(fields.density, at)
+                    smoke = interpolate(fields.density, box, bricks, p)
                     if wp.static(hot):
-                        heat = interpolate(fields.temperature, at)
+                        heat = interpolate(fields.temperature, box, bricks, p)
         return smoke, heat
 
     @wp.func
-    def between_cells(box: Box, bricks: Bricks, end: wp.vec3):
-        """Returns the eight cells around a point, relative to the centre of cell (0, 0, 0), and whether all exist."""
-        x = int(wp.floor(end[0]))
-        y = int(wp.floor(end[1]))
-        z = int(wp.floor(end[2]))
-        f = end - wp.vec3(float(x), float(y), float(z))
-        inside = is_below(x, box.n[0] - 1) and is_below(y, box.n[1] - 1) and is_below(z, box.n[2] - 1)
-        if wp.static(in_bricks) and not inside:
-            # Cells that do not exist have no brick.
-            return Corners(), False
-        return corners_of(box, bricks, x, y, z, wp.vec3i(1, 1, 1), f), inside
+    def between_cells(box: Box, end: wp.vec3):
+        """Returns the lowest of the eight cells around a point, relative to the centre of cell (0, 0, 0), the fractions
+        between them, and whether all exist."""
+        at = wp.vec3i(int(wp.floor(end[0])), int(wp.floor(end[1])), int(wp.floor(end[2])))
+        f = end - wp.vec3(float(at[0]), float(at[1]), float(at[2]))
+        inside = is_below(at[0], box.n[0] - 1) and is_below(at[1], box.n[1] - 1) and is_below(at[2], box.n[2] - 1)
+        return at, f, inside
+
+    @wp.func
+    def trace_beside(
+        box: Box,
+        traces: wp.array1d[wp.vec3],
+        which: int,
+        low: wp.vec3i,
+        along_y: int,
+        along_z: int,
+        fy: float,
+        fz: float,
+    ) -> wp.vec3:
+        i = index_of(box.coarse, low) + which * box.coarse[0] * box.coarse[1] * box.coarse[2]
+        j = i + along_y * box.coarse[2]
+        a = vector_at(traces, i)
+        a += fz * (vector_at(traces, i + along_z) - a)
+        b = vector_at(traces, j)
+        b += fz * (vector_at(traces, j + along_z) - b)
+        return a + fy * (b - a)
+
+    @wp.func
+    def side_at(field: wp.array1d[stored], box: Box, bricks: Bricks, at: wp.vec3i, x: int) -> wp.vec4:
+        return side_values(field, box, bricks, at[0] + x, at[1], at[2], 1, 1)
 
     @wp.func
     def patch_of(box: Box, i: int) -> int:
@@ -395,11 +396,10 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
     def carry_run(
         box: Box,
         first: wp.vec3i,
-        u: wp.array1d[wp.vec3],
+        traces: wp.array1d[wp.vec3],
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
         predicted: fields_type,
-        dt: float,
         decay: wp.vec2,
         bricks: Bricks,
         out: fields_type,
@@ -407,7 +407,6 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         """Advects up to `run` cells along x and returns their largest density or temperature."""
         most = float(0.0)
         others = int(0)
-        fine = dt * float(box.refinement)
         sheet = wp.where(wp.static(in_bricks), BRICK * BRICK, box.n[1] * box.n[2])
         x = int(first[0])
         end = wp.min(first[0] + wp.static(run), box.n[0])
@@ -420,13 +419,33 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         low_z, along_z = pair(patch_z, box.coarse[2], box.periodic[2])
         fy = box.voxel * (float(first[1]) + 0.5) - 0.5 - float(patch_y)
         fz = box.voxel * (float(first[2]) + 0.5) - 0.5 - float(patch_z)
-        corners = Stencil()
+        # Traces at the fractions fy and fz, on both sides of the cells along x; the upper side is the next lower one.
+        first_x, _along = pair(patch, box.coarse[0], box.periodic[0])
+        far_trace = trace_beside(box, traces, 0, wp.vec3i(first_x, low_y, low_z), along_y, along_z, fy, fz)
+        far_back = wp.vec3()
+        if wp.static(correcting):
+            far_back = trace_beside(box, traces, 1, wp.vec3i(first_x, low_y, low_z), along_y, along_z, fy, fz)
+        # The cell whose side has been read last for each point, and that side: mostly the next cell needs it again.
+        last = int(-1)
+        kept = wp.vec4()
+        kept_low = float(0.0)
+        kept_high = float(0.0)
+        kept_heat = wp.vec4()
+        last_back = int(-1)
+        back = wp.vec4()
+        back_heat = wp.vec4()
         while x < end:
             low_x, along_x = pair(patch, box.coarse[0], box.periodic[0])
-            corners.base = (low_x * box.coarse[1] + low_y) * box.coarse[2] + low_z
-            corners.step = wp.vec3i(along_x * box.coarse[1] * box.coarse[2], along_y * box.coarse[2], along_z)
-            around = fetch(u, corners)
-            near, slope = line_along_x(around, fy, fz)
+            near_trace = wp.vec3(far_trace)
+            far_trace = trace_beside(box, traces, 0, wp.vec3i(low_x + along_x, low_y, low_z), along_y, along_z, fy, fz)
+            slope = far_trace - near_trace
+            near_back = wp.vec3(far_back)
+            slope_back = wp.vec3()
+            if wp.static(correcting):
+                far_back = trace_beside(
+                    box, traces, 1, wp.vec3i(low_x + along_x, low_y, low_z), along_y, along_z, fy, fz
+                )
+                slope_back = far_back - near_back
             centre = float(patch) + 0.5
             stop = wp.min(end, (2 * patch + 3) * box.refinement // 2)
             for k in range(x, stop):
@@ -436,43 +455,74 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                     if wp.static(correcting):
                         prefetch(predicted.density, ahead)
                 cell = wp.vec3(float(k), float(first[1]), float(first[2]))
-                f = wp.vec3(box.voxel * (cell[0] + 0.5) - centre, fy, fz)
+                fx = box.voxel * (cell[0] + 0.5) - centre
                 # The order of the tests matters: it decides whether the compiler makes branches of them.
                 if wp.static(solids):
                     wall = wall_at(box, walls, cell + wp.vec3(0.5, 0.5, 0.5))
-                half = 0.5 * dt * (slope * f[0] + near)
-                simple = in_reach(f - half)
-                away = fine * evaluate(around, f - half)
-                at, inside = between_cells(box, bricks, cell - away)
-                simple = simple and inside
+                away = slope * fx + near_trace
+                at, part, simple = between_cells(box, cell + away)
                 if wp.static(solids):
                     simple = simple and wall == FREE and is_short(box, away)
                 smoke = float(0.0)
                 heat = float(0.0)
                 if simple:
+                    place = index_of(box.n, at)
+                    if place != last:
+                        kept = side_at(fields.density, box, bricks, at, 0)
+                        if wp.static(correcting):
+                            kept_low = wp.min(kept)
+                            kept_high = wp.max(kept)
+                        if wp.static(hot):
+                            kept_heat = side_at(fields.temperature, box, bricks, at, 0)
+                    last = place + box.n[1] * box.n[2]
+                    far = side_at(fields.density, box, bricks, at, 1)
+                    if wp.static(hot):
+                        far_heat = side_at(fields.temperature, box, bricks, at, 1)
                     if wp.static(correcting):
                         smoke = value_at(predicted.density, i)
-                        low, high = extremes(fields.density, at)
+                        far_low = wp.min(far)
+                        far_high = wp.max(far)
+                        low = wp.min(kept_low, far_low)
+                        high = wp.max(kept_high, far_high)
+                        kept_low = far_low
+                        kept_high = far_high
                         varies = low < high
                         if wp.static(hot):
                             heat = value_at(predicted.temperature, i)
-                            coldest, hottest = extremes(fields.temperature, at)
+                            coldest = wp.min(wp.min(kept_heat, far_heat))
+                            hottest = wp.max(wp.max(kept_heat, far_heat))
                             varies = varies or coldest < hottest
                         # Nothing is corrected between equal values.
                         if varies:
-                            away = -fine * evaluate(around, f + half)
-                            to, inside = between_cells(box, bricks, cell - away)
-                            simple = in_reach(f + half) and inside
+                            away = slope_back * fx + near_back
+                            to, part, simple = between_cells(box, cell + away)
                             if wp.static(solids):
                                 simple = simple and is_short(box, away)
                             if simple:
-                                smoke = corrected(fields.density, predicted.density, i, to, low, high)
+                                place = index_of(box.n, to)
+                                if place != last_back:
+                                    back = side_at(predicted.density, box, bricks, to, 0)
+                                    if wp.static(hot):
+                                        back_heat = side_at(predicted.temperature, box, bricks, to, 0)
+                                last_back = place + box.n[1] * box.n[2]
+                                ahead_back = side_at(predicted.density, box, bricks, to, 1)
+                                smoke = corrected(
+                                    value_at(fields.density, i), smoke, blend(back, ahead_back, part), low, high
+                                )
+                                back = ahead_back
                                 if wp.static(hot):
-                                    heat = corrected(fields.temperature, predicted.temperature, i, to, coldest, hottest)
+                                    ahead_heat = side_at(predicted.temperature, box, bricks, to, 1)
+                                    warm = blend(back_heat, ahead_heat, part)
+                                    heat = corrected(value_at(fields.temperature, i), heat, warm, coldest, hottest)
+                                    back_heat = ahead_heat
                     else:
-                        smoke = interpolate(fields.density, at)
+                        smoke = blend(kept, far, part)
                         if wp.static(hot):
-                            heat = interpolate(fields.temperature, at)
+                            heat = blend(kept_heat, far_heat, part)
+                    if wp.static(not correcting):
+                        kept = far
+                    if wp.static(hot):
+                        kept_heat = far_heat
                 if simple:
                     most = wp.max(most, write(i, smoke, heat, decay, out))
                 else:
@@ -485,7 +535,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 if (others >> k) & 1 != 0:
                     any_cell = wp.vec3i(first[0] + k, first[1], first[2])
                     at_cell = begin + k * sheet
-                    any_smoke, any_heat = carry_cell(box, bricks, any_cell, at_cell, u, walls, fields, predicted, dt)
+                    any_smoke, any_heat = carry_cell(box, bricks, any_cell, at_cell, traces, walls, fields, predicted)
                     most = wp.max(most, write(at_cell, any_smoke, any_heat, decay, out))
         return most
 
@@ -493,11 +543,10 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
     def carry(
         # in:
         box: Box,
-        u: wp.array1d[wp.vec3],
+        traces: wp.array1d[wp.vec3],
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
         predicted: fields_type,
-        dt: float,
         decay: wp.vec2,
         bricks: Bricks,
         # out:
@@ -508,24 +557,23 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             for k in range(i // _BRICK_RUNS, bricks.counts[0], bricks.workers):
                 first = first_of_run(box, bricks, i, k)
                 if first[0] < box.n[0] and first[1] < box.n[1] and first[2] < box.n[2]:
-                    most = carry_run(box, first, u, walls, fields, predicted, dt, decay, bricks, out)
+                    most = carry_run(box, first, traces, walls, fields, predicted, decay, bricks, out)
                     if most > bricks.threshold:
                         bricks.busy[bricks.listed[k]] = 1
         else:
             first = first_of_run(box, bricks, i, 0)
             if first[1] < box.n[1] and first[2] < box.n[2]:
-                carry_run(box, first, u, walls, fields, predicted, dt, decay, bricks, out)
+                carry_run(box, first, traces, walls, fields, predicted, decay, bricks, out)
 
     return carry
 
 
 def advect(
     box: Box,
-    velocity: wp.array,
+    traces: wp.array,
     walls: wp.array,
     fields: Fields,
     out: Fields,
-    dt: float,
     decay: tuple[float, float] = (1.0, 1.0),
     bricks: Bricks = DENSE,
     predicted: Fields | None = None,
@@ -534,11 +582,10 @@ def advect(
 
     Args:
         box: The domain, see `advection_places.make_box`.
-        velocity: Velocity of the air, vec3 [coarse cells], coarse cells per lattice step.
+        traces: The ways of the smoke in the step, from `advection_places.trace`; of twice the length with `predicted`.
         walls: uint8 [coarse cells] from `advection_places.mark_walls`, or [0] without solids.
         fields: The smoke before the step.
         out: The smoke after the step, in other arrays of the same shapes and types.
-        dt: Duration in lattice steps.
         decay: Factors by which density and temperature are multiplied, at most 1; (1, 1) in the first half of a
             MacCormack step.
         bricks: The bricks to compute, stored by `advection_sources.store`; default all cells.
@@ -549,5 +596,5 @@ def advect(
     tiles = -(-box.n[0] // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE)
     threads = bricks.workers * int(_BRICK_RUNS) or tiles * _TILE * _TILE
     # A semi-Lagrangian step does not read the prediction.
-    inputs = [box, velocity, walls, fields.arrays, (predicted or fields).arrays, float(dt), wp.vec2(*decay), bricks]
+    inputs = [box, traces, walls, fields.arrays, (predicted or fields).arrays, wp.vec2(*decay), bricks]
     wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=fields.density.device)

@@ -26,14 +26,9 @@ PERIODIC, OPEN, CLOSED = 0, 1, 2
 BRICK, CELLS = 8, 512
 """Cells along an edge of a brick, and in a brick."""
 
-REACH = 0.25
-"""Distance in coarse cells by which the midpoint of a trace may be outside the eight velocities around its start and
-still be extrapolated from them: reading the next eight, which are mostly the same, would double the time."""
-
 FREE, _BESIDE, SOLID = wp.constant(wp.uint8(0)), wp.constant(wp.uint8(1)), wp.constant(wp.uint8(2))
 _OPEN = wp.constant(OPEN)
 _HALVINGS = wp.constant(6)
-_REACH = wp.constant(REACH)
 # Groups of threads that share the list of bricks; enough to fill any GPU.
 _WORKERS = 8192
 
@@ -105,20 +100,6 @@ class Stencil:
     base: int
     step: wp.vec3i
     f: wp.vec3
-
-
-@wp.struct
-class TrilinearVelocity:
-    """Coefficients of the trilinear polynomial through eight velocities, in the fractions 0 to 1 between them."""
-
-    c: wp.vec3
-    x: wp.vec3
-    y: wp.vec3
-    z: wp.vec3
-    xy: wp.vec3
-    xz: wp.vec3
-    yz: wp.vec3
-    xyz: wp.vec3
 
 
 @wp.func
@@ -213,56 +194,17 @@ def corner(at: Stencil, k: int):
     return at.base + wp.dot(side, at.step), share_of(side, at.f)
 
 
-@wp.func_native("return u.data[i];")
-def _velocity(u: wp.array1d[wp.vec3], i: int) -> wp.vec3: ...
+@wp.func_native("return vectors.data[i];")
+def vector_at(vectors: wp.array1d[wp.vec3], i: int) -> wp.vec3: ...
 
 
 @wp.func
-def fetch(u: wp.array1d[wp.vec3], at: Stencil) -> TrilinearVelocity:
-    """Reads the velocities of eight coarse cells and returns the polynomial that interpolates them."""
-    row01 = at.base + at.step[1]
-    row10 = at.base + at.step[0]
-    row11 = row10 + at.step[1]
-    a = _velocity(u, at.base)
-    b = _velocity(u, at.base + at.step[2]) - a
-    c = _velocity(u, row01)
-    d = _velocity(u, row01 + at.step[2]) - c
-    e = _velocity(u, row10)
-    f = _velocity(u, row10 + at.step[2]) - e
-    g = _velocity(u, row11)
-    h = _velocity(u, row11 + at.step[2]) - g
-    out = TrilinearVelocity()
-    out.c = a
-    out.z = b
-    out.y = c - a
-    out.yz = d - b
-    out.x = e - a
-    out.xz = f - b
-    out.xy = (g - e) - (c - a)
-    out.xyz = (h - f) - (d - b)
-    return out
-
-
-@wp.func
-def line_along_x(around: TrilinearVelocity, y: float, z: float):
-    """Returns the velocity at the fractions 0, y and z, and its slope along x."""
-    near = (around.yz * z + around.y) * y + (around.z * z + around.c)
-    slope = (around.xyz * z + around.xy) * y + (around.xz * z + around.x)
-    return near, slope
-
-
-@wp.func
-def evaluate(around: TrilinearVelocity, f: wp.vec3) -> wp.vec3:
-    near, slope = line_along_x(around, f[1], f[2])
-    return slope * f[0] + near
-
-
-@wp.func
-def in_reach(half: wp.vec3) -> bool:
-    """Tests whether the eight velocities around a start also give that at its midpoint, at these fractions."""
-    least = wp.min(half[0], wp.min(half[1], half[2]))
-    most = wp.max(half[0], wp.max(half[1], half[2]))
-    return least >= -_REACH and most <= 1.0 + _REACH
+def interpolate_vectors(vectors: wp.array1d[wp.vec3], at: Stencil) -> wp.vec3:
+    total = wp.vec3()
+    for k in range(8):
+        i, weight = corner(at, k)
+        total += weight * vector_at(vectors, i)
+    return total
 
 
 @wp.func
@@ -321,22 +263,11 @@ def is_solid(box: Box, walls: wp.array1d[wp.uint8], cell: wp.vec3i) -> bool:
 
 
 @wp.func
-def trace_back(
-    box: Box, u: wp.array1d[wp.vec3], around: TrilinearVelocity, f: wp.vec3, x: wp.vec3, v: wp.vec3, dt: float
-) -> wp.vec3:
-    """Computes the departure point x - dt u(x - dt v / 2) in fine cells.
-
-    `around` has the velocities around x, f the fractions of x between them, and v = u(x) in coarse cells per step.
-    """
-    fine = dt * float(box.refinement)
-    half = f - 0.5 * dt * v
-    w = wp.vec3()
-    if in_reach(half):
-        w = evaluate(around, half)
-    else:
-        at = stencil(box.coarse, box.periodic, box.voxel * into_domain(box, x - 0.5 * fine * v))
-        w = evaluate(fetch(u, at), at.f)
-    return x - fine * w
+def midpoint(box: Box, u: wp.array1d[wp.vec3], i: int, dt: float) -> wp.vec3:
+    """Returns the midpoint of the trace from the centre of coarse cell i back in time, before it is clamped."""
+    p = cell_of(box.coarse, i)
+    r = float(box.refinement)
+    return r * (wp.vec3(float(p[0]) + 0.5, float(p[1]) + 0.5, float(p[2]) + 0.5) - 0.5 * dt * u[i])
 
 
 @wp.func
@@ -369,6 +300,36 @@ def make_box(coarse: Sequence[int], refinement: int, ends: Sequence[tuple[int, i
     box.below, box.above = wp.vec3i(*(low for low, _ in ends)), wp.vec3i(*(high for _, high in ends))
     box.bricks = wp.vec3i(*(-(-size // BRICK) for size in fine))
     return box
+
+
+@wp.kernel
+def _trace(
+    # in:
+    box: Box,
+    u: wp.array1d[wp.vec3],
+    dt: float,
+    # out:
+    traces: wp.array1d[wp.vec3],
+):
+    i = wp.tid()
+    start = i % u.shape[0]
+    duration = wp.where(i < u.shape[0], dt, -dt)
+    middle = into_domain(box, midpoint(box, u, start, duration))
+    at = stencil(box.coarse, box.periodic, box.voxel * middle)
+    traces[i] = -duration * float(box.refinement) * interpolate_vectors(u, at)
+
+
+def trace(box: Box, velocity: wp.array, dt: float, traces: wp.array) -> None:
+    """Computes how far smoke at the centres of coarse cells has come in a time, by the midpoint rule.
+
+    Args:
+        box: The domain.
+        velocity: Velocity of the air, vec3 [coarse cells], coarse cells per lattice step.
+        dt: Duration in lattice steps.
+        traces: vec3 [coarse cells], written: from each centre to its departure point, in fine cells. Of twice the
+            length, it has after these the way from each centre to where its smoke goes in the same time.
+    """
+    wp.launch(_trace, traces.shape[0], inputs=[box, velocity, float(dt)], outputs=[traces], device=traces.device)
 
 
 @wp.kernel
