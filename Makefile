@@ -33,11 +33,11 @@ test: lint
 	$(BIN)/pytest -n 2 --dist loadfile
 
 test-all: lint
-	$(BIN)/pytest -n 2 --dist loadfile -m ""
+	WLM_FUZZ_CASES=200 $(BIN)/pytest -n 2 --dist loadfile -m ""
 
-# Reads up to 20,000 changed files of each kind, which takes some hours on two cores; writes the counts to out/fuzz.json.
+# Reads up to 20,000 changed files of each kind, which takes some hours on two cores.
 fuzz: $(STAMP)
-	$(BIN)/python -m tests.fuzz --cases 20000 --json out/fuzz.json
+	WLM_FUZZ_CASES=20000 $(BIN)/pytest -n auto -m "" tests/fuzz
 
 # Builds the documents as a site, out/docs/index.html; a broken link is an error.
 docs: $(STAMP)

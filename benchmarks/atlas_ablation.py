@@ -7,7 +7,10 @@ lightmap, even if that has less error. The rows of method "ablation":
 - "no repacking": the mesh keeps its UVs, and the cascade begins as the lightmap itself (table 3).
 - "no cascade": the repacked lightmap as it is, without a lookup table and without a fit (table 3).
 - "not tuned": the cascade before its textures are fitted.
-- "ASTC": the colour texture T_p in ASTC blocks of 4 x 4 texels (table 2).
+- "ASTC": the colour texture T_p of "whole" in ASTC blocks of 4 x 4 texels (table 2).
+- "downsampling", "downsampling, paper": the lightmap at a lower resolution, in the bits of "whole" (table 1). The first
+  is the best that we know; the second is bilinear and has as many texels as half floats of 48 bits allow, where the
+  colours of "whole" count 48 bits too, as in the paper.
 
 Rows of method "sweep" (figure 7) change one of the paper's size factors: epsilon ("scale"), epsilon_p ("colour_scale")
 or epsilon_c ("lut_scale").
@@ -18,7 +21,10 @@ borders, in the UVs of the variant. A texel of half floats counts as 64 bits, as
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
 
 from benchmarks.atlas import (
     QUICK_RESOLUTION,
@@ -31,12 +37,15 @@ from benchmarks.atlas import (
     read_lightmaps,
     warm_up,
 )
+from benchmarks.rivals.atlas import RIVALS, share_of
 from benchmarks.rows import Row
 from benchmarks.runner import Bench, Note, check_only
 from wlm.atlas.cascade.fit import fit_cascade, group_triangles
+from wlm.atlas.colour import quantise
+from wlm.atlas.data import LightmappedScene
 from wlm.atlas.decode import Decoder
-from wlm.atlas.evaluation import chart_labels, compare
-from wlm.atlas.model import SOURCE_BITS, AtlasModel, Profile
+from wlm.atlas.evaluation import Sampler, chart_labels, compare
+from wlm.atlas.model import COLOUR_BITS, SOURCE_BITS, TEXELS, AtlasModel, Profile
 from wlm.atlas.stages import Stages
 from wlm.errors import WlmError
 
@@ -48,9 +57,13 @@ ABLATION = {
     KEPT_UVS: {},
     "no cascade": {"lut_scale": 0.0, "colour_scale": 1.0, "steps": 0},
     "not tuned": {"steps": 0},
-    "ASTC": {"colour": "astc"},
 }
 """The changed settings of each row."""
+
+OF_WHOLE = ("ASTC", "downsampling", "downsampling, paper")
+"""The rows that are made from the model of "whole"."""
+
+_PAPER_BITS = 48  # of a texel of colours in eq. 9
 
 SWEEPS = {
     "scale": (0.3, 0.4, 0.5, 0.6, 0.7),
@@ -135,6 +148,7 @@ def variants(base: Profile) -> list[tuple[str, str, Profile]]:
     Values of `SWEEPS` that the profile already has are left out.
     """
     rows = [("ablation", name, base.override(changes)) for name, changes in ABLATION.items()]
+    rows += [("ablation", name, base) for name in OF_WHOLE]
     for setting, values in SWEEPS.items():
         for value in values:
             if value != getattr(base, setting):
@@ -156,7 +170,8 @@ def choose(base: Profile, only: Sequence[str]) -> list[tuple[str, str, Profile]]
         raise WlmError(f"--profile: expected a profile of method cascade, found {base.name} of method {base.method}")
     rows = variants(base)
     check_only(only, [option for _, option, _ in rows])
-    return [row for row in rows if not only or row[1] in only]
+    wanted = {*only, WHOLE} if any(name in OF_WHOLE for name in only) else only
+    return [row for row in rows if not only or row[1] in wanted]
 
 
 def _rows(
@@ -172,37 +187,66 @@ def _rows(
     if any(option != KEPT_UVS for _, option, _ in chosen):
         bench.note("grouping triangles")
         clusters = group_triangles(scene.sheets[0], base, Stages(device))
-    rows, models = [], {}
-    for i, (method, option, variant) in enumerate(chosen):
+    rows: list[Row] = []
+    samplers: dict[str, Sampler] = {}
+    labels: dict[str, np.ndarray] = {}
+    whole = None
+    for method, option, variant in chosen:
         bench.note(f"fitting {option}")
         stages, start = Stages(device), time.perf_counter()
         try:
-            model = fit_cascade(scene, clusters, variant, _SEED, stages, repack=option != KEPT_UVS)
+            if option not in OF_WHOLE:
+                model = fit_cascade(scene, clusters, variant, _SEED, stages, repack=option != KEPT_UVS)
+                whole = model if option == WHOLE else whole
+            elif whole is None:
+                raise WlmError(f"it is made from {WHOLE}, which failed")
+            elif option == "ASTC":
+                texels = quantise(whole.texels[0].astype(np.float32), "astc")
+                parts = {name: texture[None] for name, texture in texels.items()}
+                model = replace(whole, profile=variant.override({"colour": "astc"}), colour="astc", **parts)
+            else:
+                row, samplers[str(len(rows))] = _downsampled(bench, scene, whole, option)
+                rows.append(row)
+                continue
         except WlmError as error:  # a package is missing, or the fit diverged
             rows.append(bench.missing_row(method, option, error))
             continue
+        samplers[str(len(rows))] = Decoder(model, device)
+        labels[str(len(rows))] = chart_labels(model, scene, device)
         rows.append(_row(bench, method, option, variant, model, stages, time.perf_counter() - start))
-        models[str(i)] = model
     bench.note(f"measuring errors in {views} views of {resolution} x {resolution} pixels")
-    decoders = {i: Decoder(model, device) for i, model in models.items()}
-    labels = {i: chart_labels(model, scene, device) for i, model in models.items()}
-    scores = compare(scene, decoders, labels=labels, views=views, resolution=resolution, device=device)
+    scores = compare(scene, samplers, labels=labels, views=views, resolution=resolution, device=device)
     for i, score in scores.items():
         rows[int(i)] = rows[int(i)].with_figures(**{name: getattr(score, name) for name in SCORES})
     return rows
 
 
+def _downsampled(bench: Bench, scene: LightmappedScene, whole: AtlasModel, option: str) -> tuple[Row, Sampler]:
+    """Makes a smaller lightmap in as many bits as a cascade. Returns its row and a decoder."""
+    share, drawn = 1.0 - whole.compression_ratio, 1.0
+    if option != "downsampling":
+        saved = whole.texels[0, ..., 0].size * (COLOUR_BITS[whole.colour] - _PAPER_BITS)
+        share -= saved / (scene.texels * SOURCE_BITS)
+        drawn = COLOUR_BITS[TEXELS] / _PAPER_BITS
+    rival = RIVALS["downsampling" if drawn == 1.0 else "downsampling bilinear"](scene, share * drawn)
+    height, width = rival.size
+    share = share_of(rival, scene) / drawn
+    figures = {"bpp": SOURCE_BITS * share, "compression_ratio": 1.0 - share}
+    figures |= {"colour_width": width, "colour_height": height, "encode_seconds": rival.encode_seconds}
+    return bench.row("ablation", option, **figures), rival.decoded
+
+
 def _row(
     bench: Bench, method: str, option: str, profile: Profile, model: AtlasModel, stages: Stages, seconds: float
 ) -> Row:
-    fit = stages.seconds["fit"]
+    fit = stages.seconds.get("fit")  # None where the textures are those of another row
     return bench.row(
         method,
         option,
         bpp=SOURCE_BITS * (1.0 - model.compression_ratio),
         compression_ratio=model.compression_ratio,
         encode_seconds=seconds,
-        step_ms=1e3 * fit / profile.steps if profile.steps else None,
+        step_ms=1e3 * fit / profile.steps if fit and profile.steps else None,
         steps=profile.steps,
         resolution=profile.resolution if profile.space == "views" and profile.steps else None,
         colour_width=model.texels.shape[2],

@@ -27,7 +27,7 @@ from wlm.atlas.decode import Decoder as AtlasDecoder
 from wlm.atlas.fit import compress as compress_atlas
 from wlm.atlas.model import Profile as AtlasProfile
 from wlm.fluid.lattice import Lattice
-from wlm.fluid.solver import trace_count
+from wlm.fluid.solver import ways_of
 from wlm.fluid.volume import DensityVolume
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.model import LightmapModel, Sheet
@@ -272,7 +272,7 @@ def _advection(scheme: str) -> Callable[[str, int], tuple[Callable[[], object], 
         fields = [advection.Fields(interop.to_warp(smoke.clone()), nothing) for _ in range(3)]
         velocity = wp.array(np.random.default_rng(0).normal(0, 0.05, (n**3, 3)), dtype=wp.vec3, device=device)
         walls = wp.zeros(0, dtype=wp.uint8, device=device)
-        traces = wp.empty(trace_count((n,) * 3, scheme), dtype=wp.vec3, device=device)
+        traces = wp.empty(ways_of(scheme) * n**3, dtype=wp.vec3, device=device)
 
         def step() -> None:
             advection_places.trace(box, velocity, 2, traces)

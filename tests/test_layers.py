@@ -7,8 +7,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 BASE = (
-    "wlm_kernels wlm wlm._facade wlm.bundle wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop wlm.texels "
-    "wlm.system wlm.workers"
+    "wlm_kernels wlm wlm._facade wlm.bundle wlm.dispatch wlm.errors wlm.formats wlm.metrics wlm.config wlm.interop "
+    "wlm.texels wlm.system wlm.workers"
 )
 LAYERS = (
     BASE.split(),

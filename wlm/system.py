@@ -115,6 +115,7 @@ class Meter:
     """Reports progress about twice a second.
 
     Attributes:
+        stage: Name of the stage.
         seconds: Time since the work began, seconds.
     """
 
@@ -122,7 +123,7 @@ class Meter:
         """Starts the clock; `every` is the number of seconds between two reports, and without a callback there are
         none.
         """
-        self._progress, self._stage, self._total, self._every = progress, stage, total, every
+        self._progress, self.stage, self._total, self._every = progress, stage, total, every
         self._start = self._last = time.perf_counter()
 
     @property
@@ -141,7 +142,7 @@ class Meter:
             return
         self._last = time.perf_counter()
         named = {name.replace("_", " "): value for name, value in figures.items()}
-        self._progress(Progress(self._stage, done, self._total, self.seconds, named))
+        self._progress(Progress(self.stage, done, self._total, self.seconds, named))
 
 
 class Report:

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
@@ -79,6 +80,9 @@ class Workers(ABC):
         no longer exists.
         """
 
+    def on_share(self, report: Callable[[float], None]) -> None:  # noqa: B027  (only a worker of this process can)
+        """Sets what the worker calls with the finished share of a long call, if it is in this process."""
+
     @abstractmethod
     def renew(self, number: int) -> None:
         """Creates a lost worker again."""
@@ -107,6 +111,9 @@ class Here(Workers):
             return 0, getattr(self._worker, method)(*arguments)
         except Exception as error:
             return 0, error
+
+    def on_share(self, report: Callable[[float], None]) -> None:
+        self._worker.report = report
 
     def renew(self, number: int) -> None:
         raise AssertionError("this process is not lost")
@@ -163,8 +170,9 @@ class Processes(Workers):
         for process in self._processes.values():
             with suppress(OSError):
                 process.stdin.close()
+        end = time.monotonic() + _PATIENCE
         for number in list(self._processes):
-            self._end(number, _PATIENCE)
+            self._end(number, max(0.0, end - time.monotonic()))
 
     def _start(self, number: int) -> None:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path)}

@@ -18,8 +18,7 @@ from benchmarks import plain
 from benchmarks.rivals.rival import EXTRA
 from wlm.formats.hdr_blocks import need
 from wlm.lightmap.data import SheetFrames
-from wlm.lightmap.dispatch import Batch
-from wlm.lightmap.fit import SheetFit
+from wlm.lightmap.fit import Batch, SheetFit
 from wlm.lightmap.profile import Profile, TimeAxis, encode_time
 from wlm.lightmap.tiles import TILE, TileKind
 from wlm.lightmap.trainer import Targets

@@ -6,7 +6,7 @@ from builders.bench_rows import check_outputs, keys
 
 from benchmarks import Panel
 from benchmarks.atlas import Lightmap
-from benchmarks.atlas_ablation import ABLATION, run_rows
+from benchmarks.atlas_ablation import ABLATION, OF_WHOLE, run_rows
 from wlm.atlas.model import Profile
 
 PROFILE = Profile(name="small", method="cascade", steps=6, resolution=32, fallback=False, space="uv")
@@ -21,12 +21,12 @@ def lightmaps():
 
 @pytest.fixture(scope="module")
 def rows(lightmaps):
-    return run_rows(lightmaps, PROFILE, [*ABLATION, *SWEPT], device="cpu", **VIEWS)
+    return run_rows(lightmaps, PROFILE, [*ABLATION, *OF_WHOLE, *SWEPT], device="cpu", **VIEWS)
 
 
 def test_rows_and_means(rows, tmp_path):
     check_outputs(rows, tmp_path, (Panel("bpp"),))
-    names = [*(("ablation", name) for name in ABLATION), *(("sweep", name) for name in SWEPT)]
+    names = [*(("ablation", name) for name in (*ABLATION, *OF_WHOLE)), *(("sweep", name) for name in SWEPT)]
     scenes = [f"{scene}, ablation of small" for scene in ("sheet day", "cube night", "mean over 2 lightmaps")]
     assert keys(rows) == names * 3
     assert [row.scene for row in rows] == [scene for scene in scenes for _ in names]
@@ -46,5 +46,8 @@ def test_each_row_lacks_its_part(rows):
     assert bare["colour_width"] > 2 * whole["colour_width"]
     assert cube["not tuned"]["psnr"] != whole["psnr"] and cube["not tuned"]["bpp"] == whole["bpp"]
     assert cube["ASTC"]["bpp"] < whole["bpp"] and cube["ASTC"]["colour_width"] == whole["colour_width"]
+    best, paper = cube["downsampling"], cube["downsampling, paper"]
+    assert 0.9 * whole["bpp"] < best["bpp"] <= whole["bpp"] and 0.8 * best["bpp"] < paper["bpp"] < best["bpp"]
+    assert paper["colour_width"] < best["colour_width"]
     assert cube["scale 0.3"]["lut_width"] < whole["lut_width"] < cube["lut_scale 1"]["lut_width"]
     assert cube["colour_scale 0.8"]["colour_width"] == pytest.approx(2 * whole["colour_width"], abs=1)

@@ -250,8 +250,7 @@ def test_every_command_for_a_folder_works(names, command, tmp_path, monkeypatch)
 def test_one_texture_of_a_flip_book_is_no_lightmap(tmp_path):
     copy(tmp_path, {"x_RLT.exr": "light.exr", "y_BBF.png": "flipbook.png", "rltd.exr": "light.exr"})
     text = told(tmp_path)
-    half = "by its name half of a flip book of six-way lightmaps of smoke, without"
-    assert f"{half} x_BBF.exr -> \n" in text and f"{half} y_RLT.png or y_TLR.png -> " in text
+    assert text.count("half of a flip book of six-way lightmaps of smoke, without the other texture -> ") == 2
     assert "rltd.exr: a lightmap" in text
 
 

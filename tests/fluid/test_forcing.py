@@ -13,6 +13,7 @@ from wlm.fluid.lattice import Lattice
 from wlm.fluid.solver import Solver
 from wlm_kernels.fluid import forcing
 from wlm_kernels.fluid.advection_places import Box
+from wlm_kernels.fluid.lattice_sets import Slab
 
 ENDS = [(0, 0, 0), (1, 0, 1), (1, 1, 1)]
 
@@ -50,7 +51,7 @@ def _stir(u, periodic, solid, confinement, modes, step, force, device, *, added=
     marks = wp.array(solid.ravel().astype(np.uint8), device=device)
     box = Box()
     box.coarse, box.periodic = wp.vec3i(*shape), wp.vec3i(*periodic)
-    forcing.stir(box, air, marks, confinement, modes, clock, out, added=added)
+    forcing.stir(box, air, marks, confinement, modes, clock, out, added=added, slab=Slab(air.device, 0, shape[0]))
     return out.numpy().reshape(u.shape)
 
 

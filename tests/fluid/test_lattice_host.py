@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from wlm.errors import WlmError
-from wlm.fluid import lattice as lattice_module
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, MAX_SPEED, Lattice
 from wlm.fluid.obstacles import Mesh, Sphere, Trajectory, cells_of, surface
@@ -107,7 +106,7 @@ def test_too_fast(device: str):
 
 def test_too_large_for_the_memory(device: str, monkeypatch: pytest.MonkeyPatch):
     """The error names the memory needed and that available, before anything is allocated."""
-    monkeypatch.setattr(lattice_module, "free_memory", lambda _device: 3 * 2**29)
+    monkeypatch.setattr("wlm.fluid.slabs.free_memory", lambda _device: 3 * 2**29)
     with pytest.raises(WlmError, match=r"256 x 256 x 256 cells need 2\.4 GiB on .*: expected at most the 1\.5 GiB"):
         Lattice((256, 256, 256), viscosity=0.02, device=device)
     with pytest.raises(WlmError, match="fewer than 2"):

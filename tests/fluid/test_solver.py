@@ -14,6 +14,7 @@ from wlm.fluid.bricks import require_memory
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import CHECK_EVERY, Lattice
 from wlm.fluid.obstacles import Sphere, Trajectory, box_mesh, surface
+from wlm.fluid.slabs import Slabs
 from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
 
 SHAPE = (20, 10, 10)
@@ -115,7 +116,7 @@ def test_bricks_take_memory_where_smoke_is(device: str, monkeypatch: pytest.Monk
     small.step()
     assert small.active_cells == 16**3 and (_numbers(small) == 1.0).all() and small.stored_bytes > empty
     scarce = Solver(_room(device, (8, 8, 8)), sources=small.sources, bricks=True)
-    monkeypatch.setattr("wlm.fluid.lattice.free_memory", lambda device: 1000)
+    monkeypatch.setattr("wlm.fluid.slabs.free_memory", lambda device: 1000)
     with pytest.raises(WlmError, match="bricks of smoke: 65 x 512 x 1 cells need 0.0 GiB on .*: expected at most"):
         scarce.step()
 
@@ -364,7 +365,7 @@ def test_too_large(device: str):
     with pytest.raises(WlmError, match="1600 x 1600 x 1600 cells: expected fewer than 2\\^31"):
         Solver(Lattice((8, 8, 8), viscosity=0.1, device=device), refinement=200)
     with pytest.raises(WlmError, match=r"100 x 100 x 100 cells need .* GiB on .*: expected at most"):
-        require_memory("smoke", (100, 100, 100), 10**15, wp.get_device(device))
+        require_memory("smoke", (100, 100, 100), 10**15, Slabs((1, 1, 1), device))
 
 
 def test_a_frame_is_the_smoke_as_it_is(device: str):

@@ -24,7 +24,7 @@ from PIL import Image
 from rich.markup import escape
 
 from benchmarks.rows import read_runs
-from tests.fuzz.worker import Limits
+from tests.fuzz.bench import Limits
 from wlm import atlas, lightmap
 from wlm.atlas.stored import with_uvs
 from wlm.bake.geometry import read_geometry

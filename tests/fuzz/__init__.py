@@ -5,9 +5,8 @@
     readers.py     the table of readers: what a case is made of, how it is read, what an accepted one must be
     models.py      those of artifacts and checkpoints
     corpus/        the small good files
-    worker.py      reads cases within limits of time and memory
-    campaign.py    processes for many cases, and the table of counts
-    __main__.py    `python -m tests.fuzz`
+    bench.py       reads cases within limits of time and memory
+    __main__.py    `python -m tests.fuzz`, for one case
 
 A case depends on its reader's name and its index alone. It must be accepted, or be refused with one `WlmError` of one
 line; an accepted one must be what docs/formats.md says. Anything else is a failure.

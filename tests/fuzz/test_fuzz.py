@@ -1,43 +1,42 @@
-"""Some cases of every reader, and that the faults which they look for would be found."""
+"""Cases of every reader, and that the faults which they look for would be found."""
 
-import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
-from . import faulty
-from .campaign import campaign
+from wlm.errors import WlmError
+
+from .bench import ROOT, Bench, Limits
+from .reader import Reader
 from .readers import READERS
-from .worker import Bench, Limits
 
-CASES = 40
-"""A reader; five times as many in `make test-all`, and five hundred times in `make fuzz`."""
+CASES, PART = int(os.environ.get("WLM_FUZZ_CASES", "40")), 1000
+"""Cases of a reader, and of one test at the most."""
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    return Bench(tmp_path_factory.mktemp("fuzz"), Limits())
+def _parts():
+    for name, reader in READERS.items():
+        cases = range(max(CASES // reader.cost, 1))
+        for first in cases[::PART]:
+            # Fits that go on to their end cost most.
+            marks = [pytest.mark.slow] * (reader.cost > 2)
+            yield pytest.param(name, cases[first : first + PART], marks=marks, id=f"{name}-{first}")
 
 
 @pytest.mark.filterwarnings("ignore")  # of Pillow
-# Fits that go on to their end cost most.
-@pytest.mark.parametrize("name", [name for name, reader in READERS.items() if reader.cost <= 2])
-def test_a_changed_file_is_accepted_or_refused_in_one_line(bench, name):
-    """In this process, which ends with "Profiling timer expired" if a case takes too long."""
+@pytest.mark.parametrize("name, cases", list(_parts()))
+def test_a_changed_file_is_accepted_or_refused_in_one_line(tmp_path, name, cases):
+    """In this process, which ends with "Profiling timer expired" or "Alarm clock" if a case takes too long; its file
+    is in the folder of temporary files then."""
+    bench = Bench(tmp_path, Limits(), READERS)
     bench.prepare(name)
-    outcomes = [bench.run(name, index) for index in range(CASES // READERS[name].cost)]
+    outcomes = [bench.run(name, index) for index in cases]
     assert [outcome for outcome in outcomes if outcome.failed] == []
     assert any(outcome.kind == "refused" for outcome in outcomes)
-
-
-@pytest.mark.slow
-def test_more_files_in_processes_of_their_own():
-    seen = []
-    cases = {name: range(5 * CASES // reader.cost) for name, reader in READERS.items()}
-    tallies = campaign(cases, 2, done=lambda name, tally: seen.append(name))
-    assert sorted(seen) == sorted(READERS)
-    rows = {name: tally.to_json() for name, tally in tallies.items()}
-    assert json.dumps([row["failures"] for row in rows.values() if row["failures"]], indent=1) == "[]"
-    assert all(row["refused"] and row["cases"] == len(cases[name]) for name, row in rows.items())
 
 
 def test_a_case_depends_on_its_reader_and_index_alone():
@@ -46,30 +45,75 @@ def test_a_case_depends_on_its_reader_and_index_alone():
         assert cases == [READERS[name].case(index) for index in range(20)] and len(set(cases)) > 15, name
 
 
+def _refuse(path):
+    raise WlmError(f"{path}: expected something else")
+
+
+def _raise(path):
+    raise KeyError("part")
+
+
+def _control(path):
+    error = WlmError(path)
+    # Its maker escapes them.
+    error.args = (f"{path}: found \x1b[31m",)
+    raise error
+
+
+def _nameless(path):
+    raise WlmError("expected something else")
+
+
+def _hog(path):
+    try:
+        path.write_bytes(bytes(1 << 40))
+    except MemoryError as error:
+        raise WlmError(f"{path}: too large") from error
+
+
+def _accept_wrong(path):
+    raise AssertionError("accepted, but it is not")
+
+
 FAULTS = {
-    "accepted": ("accepted", None),
-    "refused": ("refused", None),
-    "traceback": ("traceback", "KeyError: 'part'"),
-    "control": ("message", "control characters"),
-    "nameless": ("message", "does not name the file"),
-    "memory": ("memory", "too large"),
-    "left": ("left", "temporary"),
-    "wrong": ("wrong", "accepted, but it is not"),
-    "spin": ("time", "0.5 s of the processor"),
-    "wait": ("time", "no answer in 2 s"),
-    "crash": ("crash", "SIGABRT"),
+    "accepted": (Path.exists, ""),
+    "refused": (_refuse, "expected something else"),
+    "traceback": (_raise, "KeyError: 'part'"),
+    "message": (_control, "control characters"),
+    "nameless": (_nameless, "does not name the file"),
+    "memory": (_hog, "too large"),
+    "left": (lambda path: path.with_name("temporary").touch(), "temporary"),
+    "wrong": (_accept_wrong, "accepted, but it is not"),
 }
 
 
-def test_every_fault_is_found_and_the_next_case_runs():
-    limits = Limits(seconds=0.5, wait=2.0, memory=1 << 30)
-    tallies = campaign(dict.fromkeys([*FAULTS, "accepted"], range(5, 6)), 1, limits, faulty.__name__)
-    for name, (kind, detail) in FAULTS.items():
-        assert tallies[name].counts == {kind: 1}, name
-        assert [outcome.index for outcome in tallies[name].failures] == ([] if detail is None else [5])
-        assert detail is None or detail in tallies[name].failures[0].detail, name
+def _reader(name, fault):
+    """Makes a reader that accepts its good file, as every reader must, and has a fault with any other."""
+
+    def read(path):
+        if path.read_bytes() != b"good":
+            fault(path)
+
+    return Reader(name, "a", lambda: (b"good",), lambda draw, data: b"bad", read, blind=0.0)
 
 
-def test_a_reader_that_refuses_its_own_good_file_is_an_error():
-    with pytest.raises(RuntimeError, match="picky: .*expected seed 0 to be accepted: .*expected something else"):
-        campaign({"picky": range(1)}, 1, Limits(), faulty.__name__)
+def test_every_fault_is_found_and_the_next_case_runs(tmp_path):
+    readers = {name: _reader(name, fault) for name, (fault, _) in FAULTS.items()}
+    readers["picky"] = Reader("picky", "a", lambda: (b"good",), lambda draw, data: b"bad", _refuse)
+    bench = Bench(tmp_path, Limits(memory=1 << 30), readers)
+    for name, (_, detail) in FAULTS.items():
+        bench.prepare(name)
+        for index in (5, 6):
+            outcome = bench.run(name, index)
+            assert outcome.kind == ("message" if name == "nameless" else name) and outcome.index == index
+            assert detail in outcome.detail and outcome.failed == (name not in ("accepted", "refused"))
+    with pytest.raises(AssertionError, match="picky: expected seed 0 to be accepted: .*expected something else"):
+        bench.prepare("picky")
+
+
+@pytest.mark.parametrize(
+    "work, ended", [("[0 for _ in iter(int, 1)]", signal.SIGPROF), ("time.sleep(60)", signal.SIGALRM)]
+)
+def test_a_case_that_takes_too_long_ends_its_process(work, ended):
+    code = f"import time; from tests.fuzz.bench import Limits\nwith Limits(0.2, 0.6).held(): {work}"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == -ended

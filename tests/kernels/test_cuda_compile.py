@@ -23,7 +23,7 @@ from wlm_kernels.probe import decode as probe_decode
 from wlm_kernels.probe import gaussian_sum
 from wlm_kernels.probe import network as probe_network
 from wlm_kernels.probe import step as probe_step
-from wlm_kernels.smoke import depth_lattice, diffusion, march_six, marches, naf_block, path, planes
+from wlm_kernels.smoke import depth_lattice, diffusion, march_six, marches, naf_block, path, planes, single_scatter
 from wlm_kernels.smoke import march as smoke_march
 
 KERNELS = Path(wlm_kernels.__file__).parent
@@ -136,6 +136,7 @@ FACTORIES = [
     *_cases("marks", lambda is_mesh: [lattice_bodies._mark_kernel(is_mesh)], [], BOTH),
     *_cases("advection", _advection, [], BOTH, BOTH, FLOATS),
     *_cases("planes", _planes, [], BOTH),
+    *_cases("march_backward", lambda rays: [single_scatter._backward(rays)], [], BOTH),
     *_cases(
         "naf_block", lambda of: naf_block.kernels(*of, True), [((128, True),)], ((24, False), (24, True), (128, True))
     ),

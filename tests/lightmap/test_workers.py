@@ -2,7 +2,6 @@
 
 import functools
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -14,51 +13,21 @@ import numpy as np
 import pytest
 from builders.running import report_always
 from builders.small_sets import moving_light, static_light, tiny_profile, write_set
+from builders.worker_pools import Several
 
 import wlm
+from wlm import dispatch
 from wlm.errors import WlmError
 from wlm.formats import scratch
 from wlm.formats.artifact import read_artifact, write_artifact
 from wlm.formats.checkpoint import Checkpoint, Pace
 from wlm.formats.parts import Part
-from wlm.lightmap import dispatch, fit
+from wlm.lightmap import fit
 from wlm.lightmap.data import from_arrays, load
 from wlm.lightmap.fit import open_checkpoint
-from wlm.lightmap.trainer import Fitter
-from wlm.workers import Here, Lost, Processes, Workers
+from wlm.workers import Processes
 
 PROFILE = tiny_profile(steps=40)
-
-
-class Several(Workers):
-    """Fitters in this process: any may answer next, and those of the answers of some numbers are lost."""
-
-    remote = False
-
-    def __init__(self, devices, workers, cluster, batches, seed, track, order=0, lose=()):
-        self.count, self._make = len(devices), lambda: Here(Fitter(seed, devices[0], track))
-        self._random, self._lose = random.Random(order), lose
-        self._workers = [self._make() for _ in devices]
-        self._called, self._answers = [], 0
-
-    def call(self, number, method, *arguments):
-        self._workers[number].call(number, method, *arguments)
-        self._called.append(number)
-
-    def wait(self, seconds):
-        number = self._called.pop(self._random.randrange(len(self._called)))
-        self._answers += 1
-        if self._answers in self._lose:
-            return number, Lost("it was unlucky")
-        return number, self._workers[number].wait(seconds)[1]
-
-    def renew(self, number):
-        self._workers[number].close()
-        self._workers[number] = self._make()
-
-    def close(self):
-        for worker in self._workers:
-            worker.close()
 
 
 @pytest.fixture
@@ -109,7 +78,7 @@ def test_what_several_workers_were_at_is_resumed_by_another_number(lightmaps, tm
 
 def test_a_batch_that_no_worker_survives_is_named(lightmaps, monkeypatch):
     monkeypatch.setattr(fit, "start_workers", functools.partial(Several, lose=range(100)))
-    with pytest.raises(WlmError, match="^fit: 3 workers died while fitting batch 0: it was unlucky$"):
+    with pytest.raises(WlmError, match="^fit: 3 workers died of task 0: it was unlucky$"):
         fit.compress(lightmaps, PROFILE, workers=2)
 
 

@@ -76,7 +76,9 @@ def simulate(
     ] = None,
     resume: Resume = False,
     checkpoint_every: CheckpointEvery = 30.0,
-    device: Device = "cpu",
+    device: Annotated[
+        str, typer.Option(help='Device: "cpu", "cuda", "cuda:N", or GPUs that share the work: "cuda:0,cuda:1".')
+    ] = "cpu",
 ) -> None:
     """Simulate a scene into a folder of volumes, one for each frame.
 
@@ -89,7 +91,7 @@ def simulate(
     from wlm.smoke.simulation import make_solver, simulate, warnings_of
     from wlm.system import Progress
 
-    device = check_device(device)
+    device = ",".join(map(check_device, device.split(",")))
     scene = _scene(scene_name, scale, frames)
     # The solver comes first, so that a simulation that cannot start removes no earlier frames.
     solver = make_solver(scene, device=device)

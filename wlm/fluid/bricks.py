@@ -13,6 +13,7 @@ import warp as wp
 
 from wlm.errors import WlmError
 from wlm.fluid.lattice import require_free
+from wlm.fluid.slabs import Slabs
 from wlm_kernels.fluid import advection_places, advection_sources
 from wlm_kernels.fluid.advection import Fields
 from wlm_kernels.fluid.advection_places import CELLS, Box
@@ -23,13 +24,13 @@ INDEX_BYTES = 16
 _MARGIN = 64  # bricks by which the pool grows at least
 
 
-def require_memory(name: str, shape: tuple[int, int, int], needed: int, device: wp.Device) -> None:
+def require_memory(name: str, shape: tuple[int, int, int], needed: int, slabs: Slabs) -> None:
     """Checks that cells of smoke can be indexed, and `needed` bytes for them allocated; `name` is for the message."""
     x, y, z = shape
     if x * y * z >= 2**31:
         raise WlmError(f"{name}: {x} x {y} x {z} cells: expected fewer than 2^31 cells in all: use a lower refinement")
     remedy = "a lower refinement, bricks, storage='float16' or the scheme 'semi-lagrangian'"
-    require_free(name, shape, needed, device, remedy)
+    require_free(name, shape, needed, slabs, remedy)
 
 
 class BrickPool:
@@ -44,9 +45,10 @@ class BrickPool:
     """
 
     def __init__(
-        self, box: Box, rings: int, threshold: float, make: Callable[[int], Fields], buffers: int, device: wp.Device
+        self, box: Box, rings: int, threshold: float, make: Callable[[int], Fields], buffers: int, slabs: Slabs
     ):
         """`make` allocates a buffer of a number of cells, all 0, and `buffers` is their number."""
+        self._slabs, device = slabs, slabs.home
         self.box, self.bricks = box, advection_places.make_bricks(box, rings, threshold, str(device))
         self.fields = [make(CELLS) for _ in range(buffers)]
         self._make, self._device = make, device
@@ -94,7 +96,7 @@ class BrickPool:
         # The other buffers are empty between two steps, and the kept one is copied.
         buffers = len(self.fields)
         more = (size * buffers - old * (buffers - 1)) * self._brick_bytes
-        require_memory("bricks of smoke", (size, CELLS, 1), more, self._device)
+        require_memory("bricks of smoke", (size, CELLS, 1), more, self._slabs)
         self.fields[1:] = []
         grown = self._make(size * CELLS)
         for to, part in zip(grown.parts, now.parts, strict=True):

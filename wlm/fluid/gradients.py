@@ -22,7 +22,7 @@ from torch.autograd.function import once_differentiable
 from wlm.errors import WlmError
 from wlm.fluid import reversal
 from wlm.fluid.lattice import BODIES, MAX_SPEED, Lattice, blown_up
-from wlm.fluid.solver import Solver, trace_count
+from wlm.fluid.solver import Solver, ways_of
 from wlm.interop import to_warp
 from wlm.ops.tapes import takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream
@@ -36,6 +36,7 @@ from wlm_kernels.fluid import (
 )
 from wlm_kernels.fluid.lattice import QUIET, step_kernel
 from wlm_kernels.fluid.lattice_links import OUTLET, WIND
+from wlm_kernels.fluid.lattice_sets import Slab
 
 STATES = 8
 """Most states that are stored for the backward pass, by default."""
@@ -195,7 +196,7 @@ class DifferentiableLattice:
         setup = self._setup
         spec = replace(setup.spec, forced=forces.shape[0] > 0)
         work.done.fill_(done)
-        inputs = [wp.vec3i(*setup.shape), f, setup.solid, setup.tau, setup.eddy, forces, 0]
+        inputs = [0, wp.vec3i(*setup.shape), f, setup.solid, setup.tau, setup.eddy, forces, 0]
         outputs = [work.clock, work.trouble, work.sums, out]
         wp.launch(step_kernel(spec), self._cells, inputs=inputs, outputs=outputs, device=f.device)
 
@@ -210,9 +211,11 @@ class DifferentiableLattice:
             lattice_adjoint.set_inlets(setup.tables, work.links, setup.inlet, _flat(inlet, wp.vec3))
         left = self._populations(out)
         self._collide(work, self._populations(f), done, forces, left)
-        where = [setup.tables, wp.vec3i(*setup.shape), setup.bounded, 0, work.links, setup.solid]
+        slab, links = Slab(left.device, 0, setup.shape[0]), work.links
+        where = [setup.tables, slab, 0, links.cell.shape[0], wp.vec3i(*setup.shape), setup.bounded, links, setup.solid]
         rise = 1.0 / max(setup.ramp, 1)
-        lattice_links.apply(setup.link_kernels, *where, work.clock, rise, left, work.sums)
+        for writing in (False, True):
+            lattice_links.apply(setup.link_kernels, *where, work.clock, rise, left, work.sums, writing=writing)
         return out
 
     def _reverse(
@@ -248,7 +251,7 @@ class DifferentiableLattice:
 
     def _read(self, f: torch.Tensor, forces: wp.array, drho: wp.array, u: wp.array) -> None:
         setup = self._setup
-        inputs = [wp.vec3i(*setup.shape), self._populations(f), setup.solid, setup.bodies, forces]
+        inputs = [0, wp.vec3i(*setup.shape), self._populations(f), setup.solid, setup.bodies, forces]
         wp.launch(setup.fluid_kernels.fields, self._cells, inputs=inputs, outputs=[drho, u], device=u.device)
 
 
@@ -366,7 +369,7 @@ class DifferentiableSolver:
     # On the device.
 
     def _traces(self, zero: bool = False) -> wp.array:
-        size = trace_count(self.air._setup.shape, self._setup.scheme), 3
+        size = ways_of(self._setup.scheme) * self.air._cells, 3
         return _flat((torch.zeros if zero else torch.empty)(size, device=self.air.device), wp.vec3)
 
     def _advect(self, u: wp.array, smoke: _Tensors) -> tuple[_Tensors, _Tensors | None]:

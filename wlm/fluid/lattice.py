@@ -7,6 +7,7 @@ Lengths are in cells, times in steps, and the density of air at rest is 1; `Doma
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -15,14 +16,15 @@ from numpy.typing import ArrayLike
 from wlm.errors import WlmError
 from wlm.fluid.faces import Face, bounded_axes, face_links, inlet_rows, make_face, walled_axes
 from wlm.fluid.obstacles import Bodies, Obstacle
+from wlm.fluid.slabs import Slabs
 from wlm.formats.parts import Part, check_parts
-from wlm.interop import free_memory, no_collection
+from wlm.interop import no_collection
 from wlm_kernels.fluid import lattice_bodies, lattice_links
 from wlm_kernels.fluid.fire import expand_kernel
 from wlm_kernels.fluid.lattice import QUIET, Spec, eddy_factor, step_kernel, trouble_of
 from wlm_kernels.fluid.lattice_fields import FluidKernels, fluid_kernels
 from wlm_kernels.fluid.lattice_links import BOUNCE, INLET, OUTLET, PRESSURE, SLIP, WIND
-from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, Tables, tables
+from wlm_kernels.fluid.lattice_sets import NARROW, STORAGES, Slab, Tables, tables
 from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 
 BODIES = 256
@@ -73,13 +75,12 @@ class Domain:
         return value * self.step**2 / self.cell
 
 
-def require_free(name: str, shape: tuple[int, int, int], needed: int, device: wp.Device, remedy: str) -> None:
+def require_free(name: str, shape: tuple[int, int, int], needed: int, slabs: Slabs, remedy: str) -> None:
     """Checks that `needed` bytes for a grid are free; `name` and `remedy` are words for the error message."""
-    free = free_memory(device)
-    if needed > free:
+    if needed > (free := slabs.free):
         cells = " x ".join(map(str, shape))
         raise WlmError(
-            f"{name}: {cells} cells need {needed / 2**30:.1f} GiB on {device}: expected at most the"
+            f"{name}: {cells} cells need {needed / 2**30:.1f} GiB on {slabs.name}: expected at most the"
             f" {free / 2**30:.1f} GiB that are free: use {remedy}"
         )
 
@@ -148,11 +149,14 @@ class Lattice:
             by less than 0.2% of its speed (RMS, before the chaotic flows diverge), and the total mass drifts by about
             3e-5 in 5,000 steps.
         lattice: "D2Q9" (Z = 1), "D3Q19" or "D3Q27".
-        device: "cpu" or "cuda:N".
+        device: "cpu" or "cuda:N", or several GPUs that read each other's memory, such as "cuda:0,cuda:1", among which
+            the cells are divided along x. Results are the same up to rounding.
         ramp: Number of steps in which inlets rise to their velocity. A sudden start causes a sound wave, which walls
             and mass-conserving outlets reflect; with a ramp of four times the cells of the longest axis it is weak.
 
     Attributes:
+        slabs: The division among devices.
+        device: The first device.
         period: A CUDA graph must contain a multiple of this number of steps, see `step`.
         changes: Number of times that a captured graph of steps has become invalid.
 
@@ -171,7 +175,7 @@ class Lattice:
         smagorinsky: float = 0.17,
         storage: str = "float32",
         lattice: str = "D3Q19",
-        device: str = "cpu",
+        device: str | Sequence[str] = "cpu",
         ramp: int = 0,
     ) -> None:
         self.shape = _checked_shape(shape, lattice)
@@ -180,20 +184,21 @@ class Lattice:
                 raise ValueError(f"{name}: expected a number of at least 0, got {value}")
         if ramp < 0:
             raise ValueError(f"ramp: expected at least 0 steps, got {ramp}")
-        self.device = wp.get_device(device)
+        self.slabs = Slabs(self.shape, device)
+        self.device = self.slabs.home
         spec = Spec(lattice, storage, eddies=smagorinsky > 0.0)
         needed = self.bytes_needed(self.shape, storage, lattice)
-        require_free("lattice", self.shape, needed, self.device, "fewer cells or storage='float16'")
+        require_free("lattice", self.shape, needed, self.slabs, "fewer cells or storage='float16'")
         self._n, self._cells = wp.vec3i(*self.shape), math.prod(self.shape)
         self._set, self._tables = velocity_set(lattice), tables(lattice, str(self.device))
         size = (len(self._set.c), self._cells)
         # The settings for which the kernel of a step is specialised.
         self._spec = replace(spec, wide=math.prod(size) > NARROW)
-        self._f = [wp.zeros(size, dtype=STORAGES[storage][0], device=self.device) for _ in range(2)]
+        self._f = [self._zeros(size, STORAGES[storage][0]) for _ in range(2)]
         # A ramp of one step is no ramp: inflow begins after it.
         self._tau, self._eddy, self._rise = 0.5 + 3.0 * viscosity, eddy_factor(smagorinsky), 1.0 / max(ramp, 1)
         # The counter of steps and the first error, see `wlm_kernels.fluid.lattice.step_kernel`.
-        self._clock, self._sums = self._zeros(2, int), self._zeros(2, wp.float64)
+        self._clock, self._sums = self._zeros(2, int), self._zeros(2 * len(self.slabs.parts), wp.float64)
         self._trouble = wp.full(1, QUIET, dtype=wp.int64, device=self.device)
         # The number of the body of each cell, 0 for fluid; of size 0 while no cell has ever been solid.
         self._solid = self._zeros(0, wp.uint8)
@@ -472,14 +477,14 @@ class Lattice:
     def velocity(self, out: wp.array | None = None) -> wp.array:
         """Returns the velocity, vec3 [X, Y, Z], in cells per step; in a solid cell it is the velocity of the body."""
         self._prepare()
-        out = wp.empty(self.shape, dtype=wp.vec3, device=self.device) if out is None else out
+        out = self._zeros(self.shape, wp.vec3) if out is None else out
         self._write_fields(self._zeros(0, float), out.flatten())
         return out
 
     def excess_density(self, out: wp.array | None = None) -> wp.array:
         """Returns the density minus 1, float [X, Y, Z], which float32 resolves better; 0 in a solid cell."""
         self._prepare()
-        out = wp.empty(self.shape, dtype=float, device=self.device) if out is None else out
+        out = self._zeros(self.shape, float) if out is None else out
         self._write_fields(out.flatten(), self._zeros(0, wp.vec3))
         return out
 
@@ -546,7 +551,8 @@ class Lattice:
         self._begun, self._done, self._graph = True, int(state["steps"]), None
         self._clock.fill_(self._done)
         self._trouble.fill_(QUIET)
-        self._solid = wp.array(state["solid"], dtype=wp.uint8, device=self.device)
+        self._solid = self._zeros(len(state["solid"]), wp.uint8)
+        self._solid.assign(state["solid"])
         self._spec = replace(self._spec, solids=len(state["solid"]) > 0)
         now, spare = self._buffers
         now.assign(state["populations"])
@@ -646,7 +652,9 @@ class Lattice:
             shapes = f"(3,) or {(*self.shape, 3)}"
             raise ValueError(f"{name}: expected finite numbers of shape {shapes}, got NaN or shape {vectors.shape}")
         vectors = np.ascontiguousarray(np.broadcast_to(vectors, (*self.shape, 3)).reshape(-1, 3))
-        return wp.array(vectors, dtype=wp.vec3, device=self.device)
+        out = self._zeros(self._cells, wp.vec3)
+        out.assign(vectors)
+        return out
 
     def _set_face(self, name: str, kind: int, *args, **settings) -> None:
         face = make_face(self.shape, name, kind, *args, **settings)
@@ -688,7 +696,13 @@ class Lattice:
         sets = self._spec.lattice, self._spec.storage
         self._link_kernels = lattice_links.link_kernels(*sets, OUTLET in kinds)
         self._fluid_kernels = fluid_kernels(*sets, walls)
-        *self._face_columns, self._decides = face_links(self.shape, self._set, self._faces)
+        links = face_links(self.shape, self._set, self._faces)
+        # The links of one slab after those of the other.
+        ends = [slab.end * math.prod(self.shape[1:]) for slab in self.slabs.parts]
+        owner = np.searchsorted(ends, links[0], side="right")
+        order = np.argsort(owner, kind="stable")
+        *self._face_columns, self._decides = (column[order] for column in links)
+        self._parts = np.searchsorted(owner[order], np.arange(len(ends))).tolist()
         self._links = self._make_links(0)
         self._find_links()
 
@@ -720,7 +734,8 @@ class Lattice:
         for (name, dtype), column in zip(dtypes.items(), self._face_columns, strict=True):
             padded = np.zeros(links.faces + room, dtype)
             padded[: links.faces] = column
-            setattr(links, name, wp.array(padded, device=self.device))
+            setattr(links, name, self._zeros(len(padded), wp.dtype_from_numpy(dtype)))
+            getattr(links, name).assign(padded)
         links.value, links.wind = self._zeros(links.faces + room, float), self._wind
         links.used = wp.full(1, links.faces, dtype=int, device=self.device)
         return links
@@ -730,10 +745,10 @@ class Lattice:
         for _ in range(steps):
             now, out = self._buffers
             inputs = [self._n, now, self._solid, self._tau, self._eddy, self._forces, self._done % 2]
-            self._launch(step_kernel(self._spec), self._cells, inputs, [self._clock, self._trouble, self._sums, out])
+            self.slabs.launch(step_kernel(self._spec), inputs, [self._clock, self._trouble, self._sums, out])
             if self._growth is not None:
                 expand = expand_kernel(self._spec.lattice, self._spec.storage)
-                self._launch(expand, self._cells, [self._tables, self._growth], [out])
+                self.slabs.launch(expand, [self._tables, self._growth], [out])
             stamp = 1 + self._done % 2
             if self.moving:
                 self._bodies.move(self._clock, self._pace, self._solid, self._fresh, stamp)
@@ -760,21 +775,33 @@ class Lattice:
     def _write_fields(self, drho: wp.array, u: wp.array) -> None:
         """Writes the density minus 1 of each cell to `drho` and the velocity to `u`; an array of size 0 is skipped."""
         inputs = [self._n, self._buffers[0], self._solid, self._motion, self._forces]
-        self._launch(self._fluid_kernels.fields, self._cells, inputs, [drho, u])
+        self.slabs.launch(self._fluid_kernels.fields, inputs, [drho, u])
 
     def _apply_links(self, first: int, f: wp.array, stamp: int = _STALE) -> None:
         """Applies the boundary conditions from link `first` on; cells that bodies have left have the mark `stamp`."""
         for window in self._bodies.moving if self.moving else ():
             where = [self._bounded, window, self._motion, stamp, self._solid, self._fresh]
             lattice_links.bounce(self._link_kernels, *where, f, self._sums)
-        where = [self._tables, self._n, self._bounded, first, self._links, self._solid]
-        lattice_links.apply(self._link_kernels, *where, self._clock, self._rise, f, self._sums)
+        links = self._links
+        if first == links.cell.shape[0]:
+            return
+        # The links of solids are the last slab's.
+        ends = [*self._parts, links.cell.shape[0]]
+        where = [self._n, self._bounded, links, self._solid, self._clock, self._rise, f, self._sums]
+
+        def apply(slab: Slab, *, writing: bool) -> None:
+            of = tables(self._spec.lattice, str(slab.device)), slab
+            span = max(ends[slab.number], first), ends[slab.number + 1]
+            lattice_links.apply(self._link_kernels, *of, *span, *where, writing=writing)
+
+        for writing in (False, True):
+            self.slabs.each(partial(apply, writing=writing))
 
     def _launch(self, kernel, size: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, size, inputs=inputs, outputs=outputs, device=self.device)
 
-    def _zeros(self, size: int, dtype) -> wp.array:
-        return wp.zeros(size, dtype=dtype, device=self.device)
+    def _zeros(self, size: int | tuple[int, ...], dtype) -> wp.array:
+        return self.slabs.zeros(size, dtype)
 
 
 def _checked_shape(shape, lattice: str) -> tuple[int, int, int]:

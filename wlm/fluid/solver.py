@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -282,7 +282,9 @@ class Solver:
         self.shape = tuple(refinement * size for size in lattice.shape)
         self._stored = advection.STORAGES[storage]
         needed = bytes_needed(self.shape, scheme, storage, temperature, bricks, fire is not None)
-        require_memory("smoke", self.shape, needed, self.device)
+        require_memory("smoke", self.shape, needed, lattice.slabs)
+        if bricks and len(lattice.slabs.parts) > 1:
+            raise ValueError("bricks: expected none on several devices, since a device computes all cells of its part")
         self._box = advection_places.make_box(lattice.shape, refinement, axis_ends(lattice.faces))
         self._kept = ""
         # The settings on which the arrays of a checkpoint depend.
@@ -302,7 +304,7 @@ class Solver:
         self._fields = self._pool.fields if self._pool else [self._make_fields(cells) for _ in range(_buffers(scheme))]
         self._touched: tuple[Source, ...] = ()
         self._velocity = self._zeros(lattice.shape, wp.vec3)
-        self._traces = self._zeros((trace_count(lattice.shape, scheme),), wp.vec3)
+        self._traces = self._zeros((ways_of(scheme), math.prod(lattice.shape)), wp.vec3).flatten()
         if wind is not None and not any((face.kind == WIND).any() for face in lattice.faces.values()):
             raise ValueError("wind: expected a lattice with a face for it (set_wind), got none")
         self._confinement, self._turbulence, self._wind = confinement, turbulence, wind
@@ -668,13 +670,15 @@ class Solver:
             self._pool.relist()
         if self._fire is not None:
             where = [box, walls, bricks, self._burning(self._fire), self.lattice.clock, self._fields[0]]
-            fire.burn(*where, self._growth.flatten())
+            self._on_slabs(fire.burn, *where, self._growth.flatten())
         if self.buoyancy is not None:
             by = self.buoyancy.by_density, self.buoyancy.by_temperature
-            advection_sources.buoyancy(box, walls, self._fields[0], *by, self._force.flatten(), bricks)
+            where = [box, walls, self._fields[0], *by, self._force.flatten(), bricks]
+            self._on_slabs(advection_sources.buoyancy, *where)
         if self._stirred:
             air = [box, self._velocity.flatten(), self.solid.flatten(), self._confinement, self._modes]
-            forcing.stir(*air, self.lattice.clock, self._force.flatten(), added=self.buoyancy is not None)
+            air += [self.lattice.clock, self._force.flatten()]
+            self._on_slabs(forcing.stir, *air, added=self.buoyancy is not None)
         with self._naming_checkpoint():
             self.lattice.step(self.substeps)
         self.lattice.velocity(out=self._velocity)
@@ -695,16 +699,19 @@ class Solver:
                 advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
 
     def _carry(self) -> None:
-        advection_places.trace(self._box, self._velocity.flatten(), self.substeps, self._traces)
+        self._on_slabs(advection_places.trace, self._box, self._velocity.flatten(), self.substeps, self._traces)
         decays, where = (self._decay, (1.0, 1.0)), [self._box, self._traces, self._walls[0]]
         for decay, buffers in zip(decays, zip(*map(self._carried, self._fields), strict=True), strict=False):
             now, predicted, out = buffers[0], buffers[1], buffers[-1]
             if self.scheme == "maccormack":
-                advection.advect(*where, now, predicted, bricks=self._bricks)
-                advection.advect(*where, now, out, decay, self._bricks, predicted)
+                self._on_slabs(advection.advect, *where, now, predicted, bricks=self._bricks)
+                self._on_slabs(advection.advect, *where, now, out, decay, self._bricks, predicted)
             else:
-                advection.advect(*where, now, out, decay, self._bricks)
+                self._on_slabs(advection.advect, *where, now, out, decay, self._bricks)
         self._fields[:] = self._fields[::-1]
+
+    def _on_slabs(self, compute: Callable[..., None], *args, **settings) -> None:
+        self.lattice.slabs.each(lambda slab: compute(*args, slab=slab, **settings))
 
     def _carried(self, fields: advection.Fields) -> list[advection.Fields]:
         """Returns what is moved separately: smoke with its temperature, and fuel."""
@@ -725,7 +732,9 @@ class Solver:
         # Smoke also moves by a cell of the lattice when an obstacle leaves it.
         reach = max(_SOUND * self.substeps, float(bool(self.obstacles))) * self._box.refinement
         rings = advection_places.rings_for(reach)
-        return BrickPool(self._box, rings, self._threshold, self._make_fields, _buffers(self.scheme), self.device)
+        return BrickPool(
+            self._box, rings, self._threshold, self._make_fields, _buffers(self.scheme), self.lattice.slabs
+        )
 
     def _make_fields(self, cells: int) -> advection.Fields:
         heat = cells if self._grids["temperature"] else 0
@@ -733,12 +742,12 @@ class Solver:
         return advection.Fields(self._zeros((cells,), self._stored), self._zeros((heat,), self._stored), fuel)
 
     def _zeros(self, shape: tuple[int, ...], dtype) -> wp.array:
-        return wp.zeros(shape, dtype=dtype, device=self.device)
+        return self.lattice.slabs.zeros(shape, dtype)
 
 
-def trace_count(cells: Sequence[int], scheme: str) -> int:
-    """Returns the number of traces that advection on this many cells of the lattice takes."""
-    return math.prod(cells) * (2 if scheme == "maccormack" else 1)
+def ways_of(scheme: str) -> int:
+    """Returns 2 for a scheme that traces smoke back and ahead, 1 for one that traces it back alone."""
+    return 2 if scheme == "maccormack" else 1
 
 
 def _buffers(scheme: str) -> int:

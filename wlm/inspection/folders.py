@@ -26,7 +26,7 @@ from wlm.inspection.files import (
     scene_command,
 )
 from wlm.inspection.finding import UNREADABLE, Finding, command, compress_command
-from wlm.inspection.pictures import Picture, half_of, picture_of, said, size_of
+from wlm.inspection.pictures import Picture, is_half, picture_of, said, size_of
 from wlm.inspection.sets import UNREADABLE_SET, assumed, inspect_set, named, together
 from wlm.lightmap.listing import SET_FILE, count_of, list_set, natural, state_folders
 from wlm.lightmap.sheet import BASE
@@ -295,7 +295,7 @@ def _light(files: Sequence[Path]) -> dict[Path, Picture]:
         if file.suffix.lower() in SUFFIXES:
             with suppress(WlmError):  # an unreadable file is described by itself
                 picture = picture_of(file)
-                if picture is not None and not picture.is_cube and picture.is_light and not half_of(file):
+                if picture is not None and not picture.is_cube and picture.is_light and not is_half(file):
                     found[file] = picture
     return found
 

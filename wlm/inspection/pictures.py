@@ -2,7 +2,6 @@
 
 import re
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +24,7 @@ _FIRST = 80  # bytes that include the size, except in EXR, Radiance, TIFF, JPEG,
 _FACES = 6  # faces of a cube
 _TEXTURE = re.compile(r"(^|[_. -])(rlt|bbf|tlr|rtbk?|lbt?f|tlrb)(?=[_. -]|$)", re.IGNORECASE)
 """Directions in the name of a texture of a flip book, `PAIRS` of `wlm.smoke.flipbook.naming` without short ones."""
+_HALF = "by its name half of a flip book of six-way lightmaps of smoke, without the other texture"
 
 
 @dataclass(frozen=True)
@@ -129,42 +129,21 @@ def inspect_picture(path: Path) -> Finding:
     if not picture.is_light:
         pixels, names, _ = read_channels(path, notes)
         height, width = pixels.shape[:2]
-        use = half_of(path) or "a mask, colours, or light with an --encoding"
+        use = _HALF if is_half(path) else "a mask, colours, or light with an --encoding"
         what = f"a {picture.kind} of {width}x{height}, {''.join(names)}: {use}"
         return Finding(path, what, problems=tuple(notes))
     pixels, names = read_light(path, notes)
     height, width = pixels.shape[:2]
-    use = "; compress it together with its mesh"
-    if others := _halves(picture.channels):
-        use = f", or half of six-way lightmaps of smoke without their layer {' or '.join(others)}"
-    elif half := half_of(path):
-        return Finding(path, f"{picture.kind}, {width}x{height}, {''.join(names)}: {half}", problems=tuple(notes))
-    what = f"a lightmap, {picture.kind}, {width}x{height}, {''.join(names)}{use}"
+    what = f"{picture.kind}, {width}x{height}, {''.join(names)}"
+    if is_half(path):
+        return Finding(path, f"{what}: {_HALF}", problems=tuple(notes))
+    what = f"a lightmap, {what}; compress it together with its mesh"
     return Finding(path, what, problems=(*notes, *problems_of(pixels)))
 
 
-def half_of(path: Path) -> str:
-    """Describes a texture of a flip book without the other, by its name, such as `smoke_RLT.png`; "" for others."""
-    if not _TEXTURE.search(path.stem):
-        return ""
-    # This imports torch, too.
-    from wlm.smoke.flipbook.naming import second_names
-
-    others = dict.fromkeys(
-        name + path.suffix for back in (False, True) for name, at in second_names(path.stem, back) if at
-    )
-    return f"by its name half of a flip book of six-way lightmaps of smoke, without {' or '.join(others)}"
-
-
-def _halves(channels: Sequence[str]) -> list[str]:
-    """Returns the names that the other layer of six-way lightmaps may have, for each layer of the channels."""
-    layers = {name.rpartition(".")[0] for name in channels} - {""}
-    if not layers:
-        return []
-    # This imports torch, too.
-    from wlm.smoke.flipbook.naming import second_names
-
-    return [name for layer in layers for back in (False, True) for name, _ in second_names(layer, back)]
+def is_half(path: Path) -> bool:
+    """Whether the name is that of one texture of a flip book, such as `smoke_RLT.png`."""
+    return _TEXTURE.search(path.stem) is not None
 
 
 def problems_of(pixels: np.ndarray) -> tuple[str, ...]:

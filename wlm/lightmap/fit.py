@@ -1,5 +1,6 @@
 """Fits a compressed model to a lightmap set (neural-dynamic-gi, sections 3.4 and 4)."""
 
+import functools
 import os
 from collections.abc import Sequence
 from contextlib import closing
@@ -8,20 +9,20 @@ from typing import Any
 
 import numpy as np
 
+from wlm.dispatch import CPU_LANES, Dispatch, Task, start_workers, worker_devices
 from wlm.errors import WlmError
 from wlm.formats.checkpoint import EVERY, Checkpoint
 from wlm.formats.parts import Part
 from wlm.lightmap.data import LightmapSet, SheetFrames
-from wlm.lightmap.dispatch import Batch, Dispatch, Parts, start_workers, worker_devices
 from wlm.lightmap.encodings.frames import choose_frames, encode_frames, missing_encoder
 from wlm.lightmap.encodings.maps import check_packable
 from wlm.lightmap.evaluation import lost_light
 from wlm.lightmap.model import LightmapModel, SheetModel, decode_scale, encode_scale, part_table
 from wlm.lightmap.profile import Profile
 from wlm.lightmap.tiles import TILE, TileGrid, TileKind, channel_means, check_index, classify, cut, split
-from wlm.lightmap.trainer import TileJob
+from wlm.lightmap.trainer import Fitter, TileJob
 from wlm.system import Meter, OnProgress
-from wlm.workers import each
+from wlm.workers import cores, each
 from wlm_kernels.lightmap.matrix_step import WIDTHS
 
 BATCH_TEXELS = 64 * 26 * TILE * TILE
@@ -31,7 +32,25 @@ CPU_TILES = 4
 """Largest number of tiles in a batch on a CPU: two cores gain nothing from more, and many cores want many batches."""
 
 _LOOK = 32  # tiles that are classified between two looks at the clock: some seconds
+_WORTHWHILE = 20_000_000  # samples that take two cores about 20 s: a process takes 3 s to start
 _CONSTANT_ERROR = 0.01  # largest relative error of half floats of constant radiance; near 6e-8 they are further off
+
+Parts = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Tiles of one sheet (three channels) and of one kind, STATIC or DYNAMIC, which are fitted together.
+
+    `rows`, int [n], are indices of the tiles in `SheetFit.index`; `first` is the number of tiles of the same kind in
+    earlier batches of the sheet. Batches are numbered from 0.
+    """
+
+    number: int
+    kind: TileKind
+    rows: np.ndarray
+    first: int
+    fit: "SheetFit"
 
 
 def compress(
@@ -90,13 +109,20 @@ def compress(
     if waiting:
         meter = Meter(progress, "fit", profile.steps * len(batches))
         samples = profile.steps * profile.samples * sum(len(batch.rows) for batch in waiting)
-        devices = worker_devices(device, workers, cluster, samples)[: len(waiting)]
-        pool = start_workers(devices, workers, cluster, len(waiting), seed, progress is not None)
+        usual = max(1, min(cores() // CPU_LANES, samples // _WORTHWHILE))
+        arguments = (seed, progress is not None)
+        pool = start_workers(Fitter, arguments, device, workers, cluster, len(waiting), usual)
+        tasks = [
+            Task((batch.number,), profile.steps, functools.partial(batch.fit.job, batch), batch.kind)
+            for batch in waiting
+        ]
         try:
             with closing(pool):
-                done = len(batches) - len(waiting)
-                for batch, parts in Dispatch(pool, waiting, profile.steps, done, meter, checkpoint).run():
-                    batch.fit.store(batch, parts)
+                done = profile.steps * (len(batches) - len(waiting))
+                for number, parts in Dispatch(pool, tasks, meter, done, checkpoint).run():
+                    batches[number].fit.store(batches[number], parts)
+                    if checkpoint is not None:
+                        checkpoint.add_finished(number, parts)
         except (WlmError, KeyboardInterrupt):
             if checkpoint is not None:
                 checkpoint.flush()

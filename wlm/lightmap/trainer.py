@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 from wlm import interop
+from wlm.dispatch import CPU_LANES, Advance
 from wlm.errors import WlmError
 from wlm.formats.bc7 import pack_mode6
 from wlm.formats.parts import Part, check_part, check_parts
@@ -26,9 +27,6 @@ _STATE = ("maps", "hidden", "output", "loss", "control")
 _MOMENTUM = 0.9  # Adam's decay of gradients
 _ADAM_EPSILON = 1e-8  # the loss is a mean over the samples and channels of a tile
 _CHUNK = {"cpu": 5, "cuda": 50}  # steps between two looks at the clock
-
-CPU_LANES = 2
-"""Number of CPU threads, which sum gradients separately; fixed, so that results do not depend on the cores."""
 
 
 class Targets:
@@ -455,44 +453,31 @@ class Trainer:
             self._pool.shutdown()
 
 
-@dataclass(frozen=True, eq=False)
-class Advance:
-    """The progress of a batch.
-
-    Attributes:
-        step: Number of steps done.
-        loss, psnr: Mean loss and mean PSNR in dB over the batch's tiles, from the latest samples; NaN if not tracked.
-            After the last step they describe the maps as the file holds them.
-        parts: The maps and networks as the file holds them, once the batch is done.
-    """
-
-    step: int
-    loss: float = math.nan
-    psnr: float = math.nan
-    parts: dict[str, np.ndarray] | None = None
-
-
 class Fitter:
-    """Fits batches of tiles one after another, in this process or in another one (`wlm.workers`)."""
+    """Fits batches of tiles one after another, in this process or in another one (`wlm.dispatch`)."""
 
-    def __init__(self, seed: int, device: str, track: bool) -> None:
-        """Takes settings for all batches: the seed, the device, and whether to report the PSNR (`track`)."""
+    def __init__(self, device: str, seed: int, track: bool) -> None:
+        """Takes settings for all batches: the device, the seed, and whether to report the PSNR (`track`)."""
         self._seed, self._track, self._device = seed, track, interop.check_device(device)
         self._trainer: Trainer | None = None
 
-    def start(self, job: TileJob, state: dict[str, np.ndarray] | None) -> Advance:
-        """Starts a batch, or continues it from a saved `state`; raises ValueError if it is another batch's."""
+    def start(self, job: TileJob, states: list[dict[str, np.ndarray] | None]) -> Advance:
+        """Starts a batch, or continues it from its saved state; raises ValueError if it is another batch's."""
         self.close()
         options = job.dynamic, self._seed, self._device, self._track
         self._trainer = Trainer(job.profile, job.axis, job.targets(), *options)
         # All kernels of a batch are compiled before its first steps are reported.
         wp.load_module(blocks, self._device)
-        if state is not None:
-            self._trainer.load(state)
+        if states[0] is not None:
+            self._trainer.load(states[0])
         return Advance(self._trainer.step)
 
     def advance(self, seconds: float) -> Advance:
-        """Trains the batch for about `seconds`, at least a few steps, or to its end; returns the progress."""
+        """Trains the batch for about `seconds`, at least a few steps, or to its end; returns the progress.
+
+        Its figures are means over the batch's tiles, from the latest samples; after the last step they describe the
+        maps as the file holds them. The result are the maps and networks as the file holds them.
+        """
         trainer = self._trainer
         chunk, frozen, steps = _CHUNK["cpu" if self._device == "cpu" else "cuda"], trainer.frozen, trainer.steps
         step, end = trainer.step, time.monotonic() + seconds
@@ -504,17 +489,17 @@ class Fitter:
                 break
             if self._track and step - count < frozen <= step < steps:
                 trainer.psnr()  # samples before the maps were frozen do not count
-        figures = (float(trainer.losses().mean()), trainer.psnr()) if self._track else (math.nan, math.nan)
+        figures = {"loss": float(trainer.losses().mean()), "PSNR_dB": trainer.psnr()} if self._track else {}
         if step < steps:
-            return Advance(step, *figures)
+            return Advance(step, figures)
         trainer.check()
         parts = trainer.quantised()
         self.close()
-        return Advance(step, *figures, parts)
+        return Advance(step, figures, True, parts)
 
-    def state(self) -> dict[str, np.ndarray]:
+    def state(self) -> list[dict[str, np.ndarray]]:
         """Returns all arrays that later steps of the batch depend on, by name."""
-        return self._trainer.state()
+        return [self._trainer.state()]
 
     def close(self) -> None:
         """Drops the batch and frees its memory."""

@@ -8,7 +8,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-import warp as wp
 from scipy.spatial.transform import Rotation
 
 from wlm.errors import WlmError
@@ -19,10 +18,10 @@ from wlm.fluid.faces import FACES
 from wlm.fluid.forcing import EDDY
 from wlm.fluid.lattice import Domain, Lattice
 from wlm.fluid.obstacles import SHELL, Mesh, Obstacle, Sphere, Trajectory
+from wlm.fluid.slabs import Slabs
 from wlm.fluid.volume import DensityVolume, save_bricks, save_volume
 from wlm.formats.checkpoint import EVERY, Pace
 from wlm.formats.lock import locked
-from wlm.interop import free_memory
 from wlm.smoke.data import CHECKPOINT, Frames
 from wlm.smoke.scene import MOST_STEPS, Body, Inlet, Scene, SourceSettings
 from wlm.system import Meter, OnProgress
@@ -41,10 +40,10 @@ _LOOKS_AT_OBSTACLES = 17
 
 
 def make_solver(scene: Scene, *, device: str = "cpu") -> fluid.Solver:
-    """Builds the solver of a scene on a device, which `wlm.interop.check_device` must have returned."""
+    """Builds the solver of a scene on a device, or on several as for `Lattice`."""
     smoke, air = scene.smoke, scene.air
-    _require_memory(scene, device)
     try:
+        _require_memory(scene, Slabs(scene.grid.cells, device))
         lattice = _make_lattice(scene, device)
         return fluid.Solver(
             lattice,
@@ -222,7 +221,7 @@ def simulate(
         frames: The folder, prepared by `wlm.smoke.data.open_frames`.
         solver: Solver from `make_solver`, before its first step; None: made on `device`. If a caller makes it before
             opening the folder, a failure leaves earlier frames in the folder.
-        device: Device that `wlm.interop.check_device` returned.
+        device: As for `make_solver`.
         resume: Whether to continue from a saved state, if there is one. A state past the last requested frame is kept.
         volumes: Format in which each frame is written, too, with the velocity of the air in metres per second:
             `frame_0001.vdb`, or `frame_0001.nvdb`, compressed or as a GPU holds it (nvdb-raw). None: no second file.
@@ -337,23 +336,22 @@ def _frame_steps(scene: Scene, solver: fluid.Solver, frame: int) -> Iterator[boo
         yield step == count
 
 
-def _require_memory(scene: Scene, device: str) -> None:
+def _require_memory(scene: Scene, slabs: Slabs) -> None:
     """Checks before the allocation that air and smoke fit into the free memory; raises a WlmError if not."""
     grid, smoke = scene.grid, scene.smoke
     smoke_bytes = fluid.bytes_needed(
         grid.shape, smoke.scheme, smoke.storage, smoke.hot, smoke.bricks, smoke.fire is not None
     )
     needed = Lattice.bytes_needed(grid.cells, scene.air.storage) + smoke_bytes
-    warp_device = wp.get_device(device)
-    free = free_memory(warp_device)
-    if needed > free:
+    if needed > (free := slabs.free):
         air, dense = (" x ".join(map(str, shape)) for shape in (grid.cells, grid.shape))
         raise WlmError(
-            f"{scene.name}: {air} cells of air and {dense} voxels of smoke need {needed / 2**30:.1f} GiB on {device},"
-            f" but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, bricks, or storage: float16"
+            f"{scene.name}: {air} cells of air and {dense} voxels of smoke need {needed / 2**30:.1f} GiB on "
+            f"{slabs.name}, but only {free / 2**30:.1f} GiB are free: use fewer cells, a lower refine, bricks, or "
+            "storage: float16"
         )
     # A grid may also have more voxels than can be indexed.
-    require_memory("smoke", grid.shape, smoke_bytes, warp_device)
+    require_memory("smoke", grid.shape, smoke_bytes, slabs)
 
 
 def _make_lattice(scene: Scene, device: str) -> Lattice:

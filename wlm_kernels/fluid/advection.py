@@ -60,7 +60,7 @@ from wlm_kernels.fluid.advection_places import (
     vector_at,
     wall_at,
 )
-from wlm_kernels.fluid.lattice_sets import cell_of, index_of
+from wlm_kernels.fluid.lattice_sets import Slab, cell_of, index_of
 
 # Loops over eight cells run only beside solids; unrolled they would use registers in all other cells too.
 _OPTIONS = {"enable_backward": False, "max_unroll": 4}
@@ -381,7 +381,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return (2 * i + 1 + box.refinement) // (2 * box.refinement) - 1
 
     @wp.func
-    def first_of_run(box: Box, bricks: Bricks, i: int, k: int) -> wp.vec3i:
+    def first_of_run(box: Box, bricks: Bricks, begin: int, i: int, k: int) -> wp.vec3i:
         if wp.static(in_bricks):
             r = i % _BRICK_RUNS
             b = cell_of(box.bricks, bricks.listed[k])
@@ -390,12 +390,13 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
             wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE), i // (_TILE * _TILE)
         )
         thread = i % (_TILE * _TILE)
-        return wp.vec3i(tile[0] * _RUN, tile[1] * _TILE + thread // _TILE, tile[2] * _TILE + thread % _TILE)
+        return wp.vec3i(begin + tile[0] * _RUN, tile[1] * _TILE + thread // _TILE, tile[2] * _TILE + thread % _TILE)
 
     @wp.func
     def carry_run(
         box: Box,
         first: wp.vec3i,
+        last: int,
         traces: wp.array1d[wp.vec3],
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
@@ -404,12 +405,12 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         bricks: Bricks,
         out: fields_type,
     ) -> float:
-        """Advects up to `run` cells along x and returns their largest density or temperature."""
+        """Advects up to `run` cells along x, below cell `last`, and returns their largest density or temperature."""
         most = float(0.0)
         others = int(0)
         sheet = wp.where(wp.static(in_bricks), BRICK * BRICK, box.n[1] * box.n[2])
         x = int(first[0])
-        end = wp.min(first[0] + wp.static(run), box.n[0])
+        end = wp.min(first[0] + wp.static(run), last)
         begin = address(box, bricks, first)
         i = int(begin)
         patch = patch_of(box, first[0])
@@ -426,12 +427,12 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         if wp.static(correcting):
             far_back = trace_beside(box, traces, 1, wp.vec3i(first_x, low_y, low_z), along_y, along_z, fy, fz)
         # The cell whose side has been read last for each point, and that side: mostly the next cell needs it again.
-        last = int(-1)
+        kept_place = int(-1)
         kept = wp.vec4()
         kept_low = float(0.0)
         kept_high = float(0.0)
         kept_heat = wp.vec4()
-        last_back = int(-1)
+        back_place = int(-1)
         back = wp.vec4()
         back_heat = wp.vec4()
         while x < end:
@@ -467,14 +468,14 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 heat = float(0.0)
                 if simple:
                     place = index_of(box.n, at)
-                    if place != last:
+                    if place != kept_place:
                         kept = side_at(fields.density, box, bricks, at, 0)
                         if wp.static(correcting):
                             kept_low = wp.min(kept)
                             kept_high = wp.max(kept)
                         if wp.static(hot):
                             kept_heat = side_at(fields.temperature, box, bricks, at, 0)
-                    last = place + box.n[1] * box.n[2]
+                    kept_place = place + box.n[1] * box.n[2]
                     far = side_at(fields.density, box, bricks, at, 1)
                     if wp.static(hot):
                         far_heat = side_at(fields.temperature, box, bricks, at, 1)
@@ -500,11 +501,11 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                                 simple = simple and is_short(box, away)
                             if simple:
                                 place = index_of(box.n, to)
-                                if place != last_back:
+                                if place != back_place:
                                     back = side_at(predicted.density, box, bricks, to, 0)
                                     if wp.static(hot):
                                         back_heat = side_at(predicted.temperature, box, bricks, to, 0)
-                                last_back = place + box.n[1] * box.n[2]
+                                back_place = place + box.n[1] * box.n[2]
                                 ahead_back = side_at(predicted.density, box, bricks, to, 1)
                                 smoke = corrected(
                                     value_at(fields.density, i), smoke, blend(back, ahead_back, part), low, high
@@ -548,6 +549,8 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         fields: fields_type,
         predicted: fields_type,
         decay: wp.vec2,
+        begin: int,
+        end: int,
         bricks: Bricks,
         # out:
         out: fields_type,
@@ -555,15 +558,15 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         i = wp.tid()
         if wp.static(in_bricks):
             for k in range(i // _BRICK_RUNS, bricks.counts[0], bricks.workers):
-                first = first_of_run(box, bricks, i, k)
+                first = first_of_run(box, bricks, begin, i, k)
                 if first[0] < box.n[0] and first[1] < box.n[1] and first[2] < box.n[2]:
-                    most = carry_run(box, first, traces, walls, fields, predicted, decay, bricks, out)
+                    most = carry_run(box, first, end, traces, walls, fields, predicted, decay, bricks, out)
                     if most > bricks.threshold:
                         bricks.busy[bricks.listed[k]] = 1
         else:
-            first = first_of_run(box, bricks, i, 0)
+            first = first_of_run(box, bricks, begin, i, 0)
             if first[1] < box.n[1] and first[2] < box.n[2]:
-                carry_run(box, first, traces, walls, fields, predicted, decay, bricks, out)
+                carry_run(box, first, end, traces, walls, fields, predicted, decay, bricks, out)
 
     return carry
 
@@ -577,6 +580,7 @@ def advect(
     decay: tuple[float, float] = (1.0, 1.0),
     bricks: Bricks = DENSE,
     predicted: Fields | None = None,
+    slab: Slab | None = None,
 ) -> None:
     """Does a semi-Lagrangian step, which is also the first half of a MacCormack step, or with `predicted` the second.
 
@@ -590,11 +594,15 @@ def advect(
             MacCormack step.
         bricks: The bricks to compute, stored by `advection_sources.store`; default all cells.
         predicted: The result of the first half, in a third set of arrays.
+        slab: The coarse cells to compute, without bricks; default all.
     """
+    slab = slab or Slab(traces.device, 0, box.coarse[0])
+    begin, end = slab.begin * box.refinement, slab.end * box.refinement
     stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0
     kernel = carry_kernel(predicted is not None, stored, bricks.workers > 0, solids, hot)
-    tiles = -(-box.n[0] // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE)
+    tiles = -(-(end - begin) // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE)
     threads = bricks.workers * int(_BRICK_RUNS) or tiles * _TILE * _TILE
     # A semi-Lagrangian step does not read the prediction.
-    inputs = [box, traces, walls, fields.arrays, (predicted or fields).arrays, wp.vec2(*decay), bricks]
-    wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=fields.density.device)
+    smoke = [fields.arrays, (predicted or fields).arrays]
+    inputs = [box, traces, walls, *smoke, wp.vec2(*decay), begin, end, bricks]
+    wp.launch(kernel, threads, inputs=inputs, outputs=[out.arrays], device=slab.device)

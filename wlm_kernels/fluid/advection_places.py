@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import warp as wp
 
-from wlm_kernels.fluid.lattice_sets import cell_of, index_of
+from wlm_kernels.fluid.lattice_sets import Slab, cell_of, index_of, launch_slab
 
 wp.set_module_options({"enable_backward": False})
 
@@ -305,31 +305,35 @@ def make_box(coarse: Sequence[int], refinement: int, ends: Sequence[tuple[int, i
 @wp.kernel
 def _trace(
     # in:
+    first: int,
     box: Box,
     u: wp.array1d[wp.vec3],
     dt: float,
     # out:
     traces: wp.array1d[wp.vec3],
 ):
-    i = wp.tid()
-    start = i % u.shape[0]
-    duration = wp.where(i < u.shape[0], dt, -dt)
-    middle = into_domain(box, midpoint(box, u, start, duration))
-    at = stencil(box.coarse, box.periodic, box.voxel * middle)
-    traces[i] = -duration * float(box.refinement) * interpolate_vectors(u, at)
+    i = first + wp.tid()
+    duration = float(dt)
+    for at in range(i, traces.shape[0], u.shape[0]):
+        middle = into_domain(box, midpoint(box, u, i, duration))
+        around = stencil(box.coarse, box.periodic, box.voxel * middle)
+        traces[at] = -duration * float(box.refinement) * interpolate_vectors(u, around)
+        duration = -duration
 
 
-def trace(box: Box, velocity: wp.array, dt: float, traces: wp.array) -> None:
-    """Computes how far smoke at the centres of coarse cells has come in a time, by the midpoint rule.
+def trace(box: Box, velocity: wp.array, dt: float, traces: wp.array, slab: Slab | None = None) -> None:
+    """Computes the ways of smoke from and to the centres of coarse cells, by the midpoint rule.
 
     Args:
-        box: The domain.
-        velocity: Velocity of the air, vec3 [coarse cells], coarse cells per lattice step.
+        box: The domain, of N coarse cells.
+        velocity: Velocity of the air, vec3 [N], coarse cells per lattice step.
         dt: Duration in lattice steps.
-        traces: vec3 [coarse cells], written: from each centre to its departure point, in fine cells. Of twice the
-            length, it has after these the way from each centre to where its smoke goes in the same time.
+        traces: vec3 [N] or [2 N], written: the ways from the centres to their departure points, in fine cells; then
+            those to the points where smoke goes from the centres in the same time.
+        slab: The coarse cells to compute; default all.
     """
-    wp.launch(_trace, traces.shape[0], inputs=[box, velocity, float(dt)], outputs=[traces], device=traces.device)
+    slab = slab or Slab(traces.device, 0, box.coarse[0])
+    launch_slab(_trace, box.coarse, slab, [box, velocity, float(dt)], [traces])
 
 
 @wp.kernel

@@ -23,7 +23,7 @@ import warp as wp
 
 from wlm_kernels.fluid.advection import Fields, fields_struct
 from wlm_kernels.fluid.advection_places import BRICK, CELLS, DENSE, SOLID, Box, Bricks, address_of, is_solid, settle
-from wlm_kernels.fluid.lattice_sets import cell_of, index_of
+from wlm_kernels.fluid.lattice_sets import Slab, cell_of, index_of, launch_slab
 from wlm_kernels.fluid.mesh_inside import in_mesh
 
 _OPTIONS = {"enable_backward": False}
@@ -103,7 +103,8 @@ def strength(region: Region, p: wp.vec3i) -> float:
 @functools.cache
 def source_kernels(stored: type) -> dict[str, wp.Kernel]:
     """Builds (once) the kernels for smoke stored as `wp.float32` or `wp.float16`, by their names: "source" has a thread
-    for each fine cell of a box, "cover" and "lift" for each coarse cell, "store" for each cell of a brick and group.
+    for each fine cell of a box, "cover" for each coarse cell, "lift" for each of a slab, "store" for each cell of a
+    brick and group.
     """
     fields_type = fields_struct(stored)
 
@@ -198,6 +199,7 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def lift(
         # in:
+        begin: int,
         box: Box,
         walls: wp.array1d[wp.uint8],
         fields: fields_type,
@@ -207,7 +209,7 @@ def source_kernels(stored: type) -> dict[str, wp.Kernel]:
         # out:
         force: wp.array1d[wp.vec3],
     ):
-        i = wp.tid()
+        i = begin + wp.tid()
         coarse = cell_of(box.coarse, i)
         r = box.refinement
         first = r * coarse
@@ -343,6 +345,7 @@ def buoyancy(
     by_temperature: Sequence[float],
     force: wp.array,
     bricks: Bricks = DENSE,
+    slab: Slab | None = None,
 ) -> None:
     """Computes the acceleration of the air by smoke, linear in the mean density and temperature of a coarse cell.
 
@@ -353,9 +356,11 @@ def buoyancy(
         by_density, by_temperature: (3,), acceleration at density 1 and at temperature 1, coarse cells per step squared.
         force: vec3 [coarse cells], the acceleration, written; 0 in solids.
         bricks: Cells outside the listed bricks count as empty.
+        slab: The coarse cells to compute; default all.
     """
     inputs = [box, walls, fields.arrays, wp.vec3(*by_density), wp.vec3(*by_temperature), bricks]
-    _launch("lift", force.shape[0], inputs, force, fields)
+    slab = slab or Slab(force.device, 0, box.coarse[0])
+    launch_slab(source_kernels(fields.density.dtype)["lift"], box.coarse, slab, inputs, [force])
 
 
 def store(bricks: Bricks, fields: Fields, clear: bool = True) -> None:

@@ -18,7 +18,7 @@ import warp as wp
 
 from wlm_kernels.fluid.advection import Fields, fields_struct
 from wlm_kernels.fluid.advection_places import Box, Bricks, address_of, is_solid
-from wlm_kernels.fluid.lattice_sets import STORAGES, Tables, cell_of, equilibrium, memory_functions
+from wlm_kernels.fluid.lattice_sets import STORAGES, Slab, Tables, cell_of, equilibrium, launch_slab, memory_functions
 
 # Largest growth of the gas in a cell and step of the lattice.
 _MOST = wp.constant(0.02)
@@ -41,7 +41,8 @@ class Burning:
 
 @functools.cache
 def burn_kernel(stored: type) -> wp.Kernel:
-    """Builds (once) the kernel that burns fuel in fields of `wp.float32` or `wp.float16`, a thread per coarse cell."""
+    """Builds (once) the kernel that burns fuel in fields of `wp.float32` or `wp.float16`, a thread per coarse cell
+    of a slab."""
     fields_type = fields_struct(stored)
 
     @wp.func
@@ -54,6 +55,7 @@ def burn_kernel(stored: type) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def burn(
         # in:
+        begin: int,
         box: Box,
         walls: wp.array1d[wp.uint8],
         bricks: Bricks,
@@ -65,7 +67,7 @@ def burn_kernel(stored: type) -> wp.Kernel:
         # out:
         growth: wp.array1d[float],
     ):
-        i = wp.tid()
+        i = begin + wp.tid()
         r = box.refinement
         first = r * cell_of(box.coarse, i)
         total = float(0.0)
@@ -90,19 +92,21 @@ def burn_kernel(stored: type) -> wp.Kernel:
     return burn
 
 
-def burn(box: Box, walls: wp.array, bricks: Bricks, fire: Burning, clock: wp.array, fields: Fields, growth: wp.array):
-    """Burns the fuel of the smoke and cools it; writes to `growth`, float [coarse cells], how much the gas of a cell
-    expands in a step of the lattice, as a share. `clock` is that of `lattice.step_kernel`; for others see `advection`.
+def burn(box: Box, walls: wp.array, bricks: Bricks, fire: Burning, clock: wp.array, fields: Fields, growth, slab: Slab):
+    """Burns the fuel of a slab's smoke and cools it; writes to `growth`, float [coarse cells], how much the gas of a
+    cell expands in a step of the lattice, as a share. `clock` is that of `lattice.step_kernel`; for others see
+    `advection`.
     """
     inputs = [box, walls, bricks, fire, clock]
     outputs = [fields.arrays, fields.burning.arrays, growth]
     kernel = burn_kernel(fields.density.dtype)
-    wp.launch(kernel, growth.shape[0], inputs=inputs, outputs=outputs, device=growth.device)
+    launch_slab(kernel, box.coarse, slab, inputs, outputs)
 
 
 @functools.cache
 def expand_kernel(lattice_name: str, storage: str) -> wp.Kernel:
-    """Builds (once) the kernel that adds mass to N cells after a step: a share `growth`, [N], at the cell's velocity.
+    """Builds (once) the kernel that adds mass to a slab's cells after a step: a share `growth`, [N], at the cell's
+    velocity.
 
     It changes the populations `f`, [Q, N], that leave the cells, before boundary conditions act; solid cells have none.
     """
@@ -110,8 +114,8 @@ def expand_kernel(lattice_name: str, storage: str) -> wp.Kernel:
     load, store = memory.load, memory.store
 
     @wp.kernel(module="unique", module_options=_OPTIONS)
-    def expand(t: Tables, growth: wp.array1d[float], f: wp.array2d[stored]):
-        i = wp.tid()
+    def expand(first: int, t: Tables, growth: wp.array1d[float], f: wp.array2d[stored]):
+        i = first + wp.tid()
         if growth[i] == 0.0:
             return
         rho = float(1.0)

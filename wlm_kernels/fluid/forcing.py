@@ -14,7 +14,7 @@ Nothing acts in solid cells. Gradients do not exist: `wlm.fluid.gradients` refus
 import warp as wp
 
 from wlm_kernels.fluid.advection_places import Box
-from wlm_kernels.fluid.lattice_sets import cell_of, index_of
+from wlm_kernels.fluid.lattice_sets import Slab, cell_of, index_of, launch_slab
 
 wp.set_module_options({"enable_backward": False})
 
@@ -60,6 +60,7 @@ def _curl(n: wp.vec3i, periodic: wp.vec3i, u: wp.array1d[wp.vec3], p: wp.vec3i) 
 @wp.kernel
 def _stir(
     # in:
+    first: int,
     n: wp.vec3i,
     periodic: wp.vec3i,
     u: wp.array1d[wp.vec3],
@@ -71,7 +72,7 @@ def _stir(
     # in, out:
     force: wp.array1d[wp.vec3],
 ):
-    i = wp.tid()
+    i = first + wp.tid()
     push = wp.vec3()
     if solid.shape[0] == 0 or solid[i] == wp.uint8(0):
         p = cell_of(n, i)
@@ -91,11 +92,11 @@ def _stir(
     force[i] = push
 
 
-def stir(box: Box, u: wp.array, solid: wp.array, confinement: float, modes: Modes, clock: wp.array, force, *, added):
-    """Writes the acceleration of the N cells of the air to `force`, vec3 [N], in cells per step squared, or adds it.
+def stir(box: Box, u: wp.array, solid, confinement: float, modes: Modes, clock, force, *, added, slab: Slab) -> None:
+    """Writes the acceleration of a slab's air to `force`, vec3 [N cells], in cells per step squared, or adds it.
 
     `u`, vec3 [N], is the air's velocity; `solid`, uint8 [N] or [0], above 0 in solids; `confinement` eps per step;
     and `clock`, int [2], that of `lattice.step_kernel`.
     """
     inputs = [box.coarse, box.periodic, u, solid, confinement, modes, clock, float(added)]
-    wp.launch(_stir, force.shape[0], inputs=inputs, outputs=[force], device=force.device)
+    launch_slab(_stir, box.coarse, slab, inputs, [force])

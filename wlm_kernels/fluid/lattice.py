@@ -152,9 +152,11 @@ def _relax(spec: Spec) -> Any:
 
 @functools.cache
 def step_kernel(spec: Spec) -> wp.Kernel:
-    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell.
+    """Builds (once) the kernel that does a step with the settings of a spec, one thread per cell of a
+    slab.
 
     Args of the kernel, for N cells and Q velocities:
+        first: Index of the slab's first cell.
         n: Cells along x, y and z.
         f: [Q, N], the populations that left every cell in the last step.
         solid: uint8 [N], above 0 where a cell is solid; used if `spec.solids`.
@@ -164,7 +166,7 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         parity: 0 or 1: `clock[parity]` is the number of steps done; the step writes one more to the other element.
         clock: int [2], counts steps.
         trouble: int64 [1], lowered to the key of the first cell in which the flow blew up, see `trouble_of`.
-        sums: float64 [2], set to 0, for `lattice_links.apply`.
+        sums: float64 [2 P], set to 0, for `lattice_links.apply`.
         out: [Q, N], the populations that leave every cell in this step.
     """
     memory, relax = memory_functions(spec.lattice, spec.storage, spec.walls, spec.wide), _relax(spec)
@@ -174,6 +176,7 @@ def step_kernel(spec: Spec) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=_OPTIONS)
     def step(
         # in:
+        first: int,
         n: wp.vec3i,
         f: wp.array2d[stored],
         solid: wp.array1d[wp.uint8],
@@ -187,11 +190,11 @@ def step_kernel(spec: Spec) -> wp.Kernel:
         sums: wp.array1d[wp.float64],
         out: wp.array2d[stored],
     ):
-        i = wp.tid()
+        i = first + wp.tid()
         if i == 0:
             clock[1 - parity] = clock[parity] + 1
-            sums[0] = wp.float64(0.0)
-            sums[1] = wp.float64(0.0)
+            for k in range(sums.shape[0]):
+                sums[k] = wp.float64(0.0)
         if wp.static(spec.solids):
             if solid[i] != wp.uint8(0):
                 return

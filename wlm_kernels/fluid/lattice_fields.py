@@ -28,9 +28,9 @@ from wlm_kernels.fluid.lattice_sets import lattice as velocity_set
 @dataclass(frozen=True)
 class FluidKernels:
     """Kernels for one lattice and storage type, with one thread per cell: `fields` computes the density minus 1 and the
-    velocity, `start` sets the equilibrium of given ones; for each cell that becomes fluid, `neighbours` computes the
-    means of the fluid around it, and `uncover` sets the equilibrium of these; `convert` converts all cells to another
-    time step.
+    velocity in a slab, `start` sets the equilibrium of given ones; for each cell that becomes fluid, `neighbours`
+    computes the means of the fluid around it, and `uncover` sets the equilibrium of these; `convert` converts all cells
+    to another time step.
     """
 
     fields: wp.Kernel
@@ -52,6 +52,7 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
     @wp.kernel(module="unique", module_options=options)
     def fields(
         # in:
+        first: int,
         n: wp.vec3i,
         f: wp.array2d[stored],
         solid: wp.array1d[wp.uint8],
@@ -61,7 +62,7 @@ def fluid_kernels(lattice_name: str, storage: str, walls: tuple[bool, bool, bool
         drho: wp.array1d[float],
         u: wp.array1d[wp.vec3],
     ):
-        i = wp.tid()
+        i = first + wp.tid()
         excess = float(0.0)
         v = wp.vec3()
         body = int(0)

@@ -31,6 +31,7 @@ import warp as wp
 from wlm_kernels.fluid.lattice_bodies import Motion, Window, centre_of, size_of, wall_velocity, window_cell
 from wlm_kernels.fluid.lattice_sets import (
     STORAGES,
+    Slab,
     Tables,
     cell_of,
     crosses,
@@ -152,6 +153,8 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         n: wp.vec3i,
         bounded: wp.vec3i,
         first: int,
+        last: int,
+        slab: int,
         solid: wp.array1d[wp.uint8],
         clock: wp.array1d[int],
         rise: float,
@@ -164,7 +167,7 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         at = first + wp.tid()
         net = wp.float64(0.0)
         weight = wp.float64(0.0)
-        live = at < links.used[0]
+        live = at < wp.min(last, links.used[0])
         if live:
             i = links.cell[at]
             q = int(links.code[at]) & 31
@@ -198,8 +201,8 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
                 if kind == _OUTLET:
                     weight = wp.float64(t.w[q])
         if wp.static(balance):
-            summed(wp.tid(), sums, 0, net)
-            summed(wp.tid(), sums, 1, weight)
+            summed(wp.tid(), sums, 2 * slab, net)
+            summed(wp.tid(), sums, 2 * slab + 1, weight)
 
     @wp.kernel(module="unique", module_options=options)
     def write(
@@ -219,8 +222,14 @@ def link_kernels(lattice_name: str, storage: str, balance: bool) -> LinkKernels:
         q = int(links.code[at]) & 31
         v = links.value[at]
         if wp.static(balance):
-            if int(links.code[at]) >> 5 == _OUTLET and sums[1] > wp.float64(0.0):
-                v -= t.w[q] * float(sums[0] / sums[1])
+            if int(links.code[at]) >> 5 == _OUTLET:
+                net = wp.float64(0.0)
+                weight = wp.float64(0.0)
+                for k in range(sums.shape[0] // 2):
+                    net += sums[2 * k]
+                    weight += sums[2 * k + 1]
+                if weight > wp.float64(0.0):
+                    v -= t.w[q] * float(net / weight)
         store(f, q, index_of(n, wrapped(n, cell_of(n, i) - t.c[q])), v)
 
     @wp.kernel(module="unique", module_options=options)
@@ -398,37 +407,44 @@ def bounce(
 def apply(
     kernels: LinkKernels,
     tables: Tables,
+    slab: Slab,
+    first: int,
+    last: int,
     n: wp.vec3i,
     bounded: wp.vec3i,
-    first: int,
     links: Links,
     solid: wp.array,
     clock: wp.array,
     rise: float,
     f: wp.array,
     sums: wp.array,
+    *,
+    writing: bool,
 ) -> None:
-    """Applies the boundary conditions after a step: runs both passes over the links from index `first` on.
+    """Applies the boundary conditions after a step, one pass over the links of a slab.
 
     Args:
         kernels: Kernels for the lattice and storage type of `f`.
-        tables: The velocity set, with Q velocities.
+        tables: The velocity set, with Q velocities, on the slab's device.
+        slab: The slab, one of P; only its device and its number matter.
+        first, last: Its links are those from `first` to `last` - 1.
         n: Cells along x, y and z; N in all.
         bounded: 1 for each axis that is not periodic, else 0.
-        first: 0 for all links, or the index of the first link of a solid for solids alone.
         links: The links; `value` is modified.
         solid: uint8 [N], number of the body of each cell, or [0] if no cell is solid.
         clock: int [2], see `lattice.step_kernel`.
         rise: Inlets reach their full velocity after 1 / rise steps.
         f: [Q, N], the populations that have just left the cells, modified.
-        sums: float64 [2], 0 at the call; receives the net mass that all links add before the outlets' shift, and the
-            sum of the weights w_q of outlet links.
+        sums: float64 [2 P], 0 before the first pass; receives the net mass that the links of each slab add before the
+            outlets' shift, and the sum of the weights w_q of its outlet links.
+        writing: Whether this is the second pass, which begins after the first of all slabs.
     """
-    size, device = links.cell.shape[0] - first, f.device
+    size, device = last - first, slab.device
     if size <= 0:
         return
+    if writing:
+        wp.launch(kernels.write, size, inputs=[tables, n, first, links, sums], outputs=[f], device=device)
+        return
     threads = -(-size // BLOCK) * BLOCK
-    inputs = [tables, n, bounded, first, solid, clock, rise, f, links]
+    inputs = [tables, n, bounded, first, last, slab.number, solid, clock, rise, f, links]
     wp.launch(kernels.values, threads, inputs=inputs, outputs=[sums], block_dim=BLOCK, device=device)
-    inputs = [tables, n, first, links, sums]
-    wp.launch(kernels.write, size, inputs=inputs, outputs=[f], device=device)

@@ -64,6 +64,24 @@ def lattice(name: str) -> VelocitySet:
     return LATTICES[name]
 
 
+@dataclass(frozen=True)
+class Slab:
+    """The cells whose index along x is `begin` to `end` - 1, the device that computes them, and the slab's number."""
+
+    device: wp.Device
+    begin: int
+    end: int
+    number: int = 0
+
+
+def launch_slab(kernel: wp.Kernel, n: wp.vec3i, slab: Slab, inputs: list, outputs: list) -> None:
+    """Launches a kernel with one thread for each cell of a slab of n cells along x, y and z; the first input of the
+    kernel, here added, is the index of the slab's first cell."""
+    plane = n[1] * n[2]
+    inputs = [slab.begin * plane, *inputs]
+    wp.launch(kernel, (slab.end - slab.begin) * plane, inputs=inputs, outputs=outputs, device=slab.device)
+
+
 @wp.struct
 class Tables:
     """A velocity set in arrays, for kernels that index its Q velocities `c` and weights `w`; `index`, int [27], has the

@@ -16,13 +16,15 @@ gradients of the density, the emission and the nodes by atomic additions: on CUD
 vary from run to run. The gradients of the rays themselves are a kernel of their own, as few callers need them.
 """
 
+import functools
 from typing import Any
 
 import warp as wp
 
 from wlm_kernels.smoke.march import absorbed, clip, mean_transparency, node_position, point_on, size_of, steps_along
 
-wp.set_module_options({"enable_backward": False})
+_OPTIONS = {"enable_backward": False}
+wp.set_module_options(_OPTIONS)
 
 # Rounding must not add a step to a length that is a whole number of steps.
 _SLACK = 1.0001
@@ -241,148 +243,119 @@ def _march(
     count[i] = n
 
 
-@wp.kernel
-def _march_backward(
-    # in:
-    density: wp.array3d[float],
-    emission: wp.array3d[wp.vec3],
-    nodes: wp.array4d[float],
-    origin: wp.array1d[wp.vec3],
-    direction: wp.array1d[wp.vec3],
-    step: float,
-    depth: wp.array1d[float],
-    count: wp.array1d[int],
-    grad_scattered: wp.array2d[float],
-    grad_emitted: wp.array1d[wp.vec3],
-    grad_depth: wp.array1d[float],
-    # out:
-    grad_density: wp.array3d[float],
-    grad_emission: wp.array3d[wp.vec3],
-    grad_nodes: wp.array4d[float],
-):
-    i = wp.tid()
-    size = size_of(density)
-    r = steps_along(size, origin[i], direction[i], step)
-    tau = depth[i]
-    hidden = float(0.0)  # contribution of the samples behind this one to the objective
-    for back in range(count[i]):
-        n = count[i] - 1 - back
-        p = point_on(r, n, 0.5)
-        voxel = _voxel(density, p)
-        x = _read(density, voxel) * r.length
-        tau -= wp.min(x, _OPAQUE)
-        t = wp.exp(-tau)
-        lit = float(0.0)
-        if nodes.shape[0] > 0:
-            node = _node(nodes[0], size, p)
-            for light in range(nodes.shape[0]):
-                share = grad_scattered[i, light] * wp.exp(-_read(nodes[light], node))
-                lit += share
-                if x > 0.0:
-                    _add(grad_nodes[light], node, -t * absorbed(x) * share)
-        glow = float(0.0)
-        if emission.shape[0] > 0:
-            glow = r.length * wp.dot(_read(emission, voxel), grad_emitted[i])
-            if grad_emission.shape[0] > 0:
-                _add(grad_emission, voxel, t * mean_transparency(x) * r.length * grad_emitted[i])
-        on_x = t * (wp.exp(-x) * lit + _share_slope(x) * glow) - hidden + grad_depth[i]
-        _add(grad_density, voxel, on_x * r.length)
-        hidden += t * (absorbed(x) * lit + mean_transparency(x) * glow)
+@functools.cache
+def _backward(rays: bool) -> wp.Kernel:
+    """Builds (once) the adjoint of `_march` by the grids, or by the `rays`: by each sample's place and by the start and
+    the length of the steps. The gradients of the other kind are not read."""
 
+    @wp.kernel(module="unique", module_options=_OPTIONS)
+    def kernel(
+        # in:
+        density: wp.array3d[float],
+        emission: wp.array3d[wp.vec3],
+        nodes: wp.array4d[float],
+        origin: wp.array1d[wp.vec3],
+        direction: wp.array1d[wp.vec3],
+        step: float,
+        depth: wp.array1d[float],
+        count: wp.array1d[int],
+        grad_scattered: wp.array2d[float],
+        grad_emitted: wp.array1d[wp.vec3],
+        grad_depth: wp.array1d[float],
+        # out:
+        grad_density: wp.array3d[float],
+        grad_emission: wp.array3d[wp.vec3],
+        grad_nodes: wp.array4d[float],
+        grad_origin: wp.array1d[wp.vec3],
+        grad_direction: wp.array1d[wp.vec3],
+    ):
+        i = wp.tid()
+        size = size_of(density)
+        way = direction[i]
+        r = steps_along(size, origin[i], way, step)
+        tau = depth[i]
+        hidden = float(0.0)  # contribution of the samples behind this one to the objective
+        on_origin = wp.vec3()
+        on_direction = wp.vec3()
+        on_first = float(0.0)
+        on_length = float(0.0)
+        for back in range(count[i]):
+            n = count[i] - 1 - back
+            p = point_on(r, n, 0.5)
+            voxel = _voxel(density, p)
+            sigma = _read(density, voxel)
+            x = sigma * r.length
+            tau -= wp.min(x, _OPAQUE)
+            t = wp.exp(-tau)
+            on_p = wp.vec3()
+            lit = float(0.0)
+            if nodes.shape[0] > 0:
+                node = _node(nodes[0], size, p)
+                on_q = wp.vec3()
+                if wp.static(rays):
+                    steep_node = _steep(_among_nodes(nodes[0], size, p), _counts(nodes[0]))
+                for light in range(nodes.shape[0]):
+                    share = grad_scattered[i, light] * wp.exp(-_read(nodes[light], node))
+                    lit += share
+                    if wp.static(rays):
+                        on_q += _slope(nodes[light], node, steep_node, -t * absorbed(x) * share)
+                    elif x > 0.0:
+                        _add(grad_nodes[light], node, -t * absorbed(x) * share)
+                for axis in range(3):
+                    on_p[axis] = on_q[axis] * float(_counts(nodes[0])[axis] - 1) / (size[axis] + 1.0)
+            if wp.static(rays):
+                steep = _steep(p - wp.vec3(0.5, 0.5, 0.5), _counts(density))
+            glow = float(0.0)
+            if emission.shape[0] > 0:
+                colour = wp.dot(_read(emission, voxel), grad_emitted[i])
+                glow = r.length * colour
+                reaching = t * mean_transparency(x)
+                if wp.static(rays):
+                    on_p += _slope(emission, voxel, steep, reaching * r.length * grad_emitted[i])
+                    on_length += reaching * colour
+                elif grad_emission.shape[0] > 0:
+                    _add(grad_emission, voxel, reaching * r.length * grad_emitted[i])
+            on_x = t * (wp.exp(-x) * lit + _share_slope(x) * glow) - hidden + grad_depth[i]
+            hidden += t * (absorbed(x) * lit + mean_transparency(x) * glow)
+            if wp.static(rays):
+                on_p += _slope(density, voxel, steep, on_x * r.length)
+                steps = float(n) + 0.5
+                on_origin += on_p
+                on_direction += (r.first + steps * r.length) * on_p
+                along = wp.dot(on_p, way)
+                on_first += along
+                on_length += on_x * sigma + steps * along
+            else:
+                _add(grad_density, voxel, on_x * r.length)
+        if wp.static(rays):
+            if r.count > 0:
+                # The length of a step is (last - first) / count, and the ray begins and ends on a face or its origin.
+                on_last = on_length / float(r.count)
+                on_first -= on_last
+                span = clip(size, origin[i], way)
+                begun = bool(False)
+                ended = bool(False)
+                for axis in range(3):
+                    d = way[axis]
+                    if wp.abs(d) > 1.0e-9:
+                        low = (-0.5 - origin[i][axis]) / d
+                        high = (size[axis] + 0.5 - origin[i][axis]) / d
+                        on_axis = float(0.0)
+                        on_way = float(0.0)
+                        if not begun and span[0] > 0.0 and wp.min(low, high) == span[0]:
+                            begun = True
+                            on_axis -= on_first / d
+                            on_way -= on_first * span[0] / d
+                        if not ended and wp.max(low, high) == span[1]:
+                            ended = True
+                            on_axis -= on_last / d
+                            on_way -= on_last * span[1] / d
+                        on_origin[axis] = on_origin[axis] + on_axis
+                        on_direction[axis] = on_direction[axis] + on_way
+            grad_origin[i] = on_origin
+            grad_direction[i] = on_direction
 
-@wp.kernel
-def _rays_backward(
-    # in:
-    density: wp.array3d[float],
-    emission: wp.array3d[wp.vec3],
-    nodes: wp.array4d[float],
-    origin: wp.array1d[wp.vec3],
-    direction: wp.array1d[wp.vec3],
-    step: float,
-    depth: wp.array1d[float],
-    count: wp.array1d[int],
-    grad_scattered: wp.array2d[float],
-    grad_emitted: wp.array1d[wp.vec3],
-    grad_depth: wp.array1d[float],
-    # out:
-    grad_origin: wp.array1d[wp.vec3],
-    grad_direction: wp.array1d[wp.vec3],
-):
-    """Follows `_march_backward`, and takes the derivative by each sample's place and by the steps' start and length."""
-    i = wp.tid()
-    size = size_of(density)
-    way = direction[i]
-    r = steps_along(size, origin[i], way, step)
-    tau = depth[i]
-    hidden = float(0.0)
-    on_origin = wp.vec3()
-    on_direction = wp.vec3()
-    on_first = float(0.0)
-    on_length = float(0.0)
-    for back in range(count[i]):
-        n = count[i] - 1 - back
-        p = point_on(r, n, 0.5)
-        voxel = _voxel(density, p)
-        steep = _steep(p - wp.vec3(0.5, 0.5, 0.5), _counts(density))
-        sigma = _read(density, voxel)
-        x = sigma * r.length
-        tau -= wp.min(x, _OPAQUE)
-        t = wp.exp(-tau)
-        on_p = wp.vec3()
-        lit = float(0.0)
-        if nodes.shape[0] > 0:
-            node = _node(nodes[0], size, p)
-            steep_node = _steep(_among_nodes(nodes[0], size, p), _counts(nodes[0]))
-            on_q = wp.vec3()
-            for light in range(nodes.shape[0]):
-                share = grad_scattered[i, light] * wp.exp(-_read(nodes[light], node))
-                lit += share
-                on_q += _slope(nodes[light], node, steep_node, -t * absorbed(x) * share)
-            for axis in range(3):
-                on_p[axis] = on_q[axis] * float(_counts(nodes[0])[axis] - 1) / (size[axis] + 1.0)
-        glow = float(0.0)
-        if emission.shape[0] > 0:
-            colour = wp.dot(_read(emission, voxel), grad_emitted[i])
-            glow = r.length * colour
-            reaching = t * mean_transparency(x)
-            on_p += _slope(emission, voxel, steep, reaching * r.length * grad_emitted[i])
-            on_length += reaching * colour
-        on_x = t * (wp.exp(-x) * lit + _share_slope(x) * glow) - hidden + grad_depth[i]
-        on_p += _slope(density, voxel, steep, on_x * r.length)
-        on_length += on_x * sigma
-        hidden += t * (absorbed(x) * lit + mean_transparency(x) * glow)
-        steps = float(n) + 0.5
-        on_origin += on_p
-        on_direction += (r.first + steps * r.length) * on_p
-        along = wp.dot(on_p, way)
-        on_first += along
-        on_length += steps * along
-    if r.count > 0:
-        # The length of a step is (last - first) / count, and the ray begins and ends on a face or at its origin.
-        on_last = on_length / float(r.count)
-        on_first -= on_last
-        span = clip(size, origin[i], way)
-        begun = bool(False)
-        ended = bool(False)
-        for axis in range(3):
-            d = way[axis]
-            if wp.abs(d) > 1.0e-9:
-                low = (-0.5 - origin[i][axis]) / d
-                high = (size[axis] + 0.5 - origin[i][axis]) / d
-                on_axis = float(0.0)
-                on_way = float(0.0)
-                if not begun and span[0] > 0.0 and wp.min(low, high) == span[0]:
-                    begun = True
-                    on_axis -= on_first / d
-                    on_way -= on_first * span[0] / d
-                if not ended and wp.max(low, high) == span[1]:
-                    ended = True
-                    on_axis -= on_last / d
-                    on_way -= on_last * span[1] / d
-                on_origin[axis] = on_origin[axis] + on_axis
-                on_direction[axis] = on_direction[axis] + on_way
-    grad_origin[i] = on_origin
-    grad_direction[i] = on_direction
+    return kernel
 
 
 def depths(density, toward, step: float, nodes) -> None:
@@ -451,6 +424,8 @@ def march_backward(
     """
     inputs = [density, emission, nodes, origin, direction, step * _SLACK, depth, count]
     inputs += [grad_scattered, grad_emitted, grad_depth]
-    for kernel, outputs in ((_march_backward, scene), (_rays_backward, rays)):
-        if outputs:
-            wp.launch(kernel, origin.shape, inputs=inputs, outputs=list(outputs), device=density.device)
+    # The others are not read.
+    others = density, emission, nodes, origin, direction
+    for wanted, outputs in ((scene, [*scene, *others[3:]]), (rays, [*others[:3], *rays])):
+        if wanted:
+            wp.launch(_backward(wanted is rays), origin.shape, inputs=inputs, outputs=outputs, device=density.device)

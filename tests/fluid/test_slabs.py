@@ -1,0 +1,144 @@
+"""Several devices compute the slabs of a box: the result is that of one device."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import warp as wp
+
+from wlm.errors import WlmError
+from wlm.fluid.faces import FACES
+from wlm.fluid.forcing import Fire, Turbulence, Wind
+from wlm.fluid.lattice import Lattice
+from wlm.fluid.obstacles import Sphere, Trajectory, box_mesh
+from wlm.fluid.slabs import Slabs
+from wlm.fluid.solver import SCHEMES, Buoyancy, Solver, Source
+
+SHAPE = (11, 9, 10)
+RESTING = box_mesh(Trajectory.of([[5.5, 2.0, 5.0]]), (4.0, 2.5, 2.5))
+MOVING = Sphere(Trajectory.of([[3.0, 5.0, 5.0], [8.0, 6.0, 5.0]], [0, 60]), 1.9)
+
+
+def _periodic(device: str, **settings) -> Lattice:
+    lattice = Lattice(SHAPE, viscosity=1e-3, device=device, **settings)
+    lattice.set_flow(np.random.default_rng(1).normal(0.0, 0.03, (*SHAPE, 3)))
+    lattice.set_force((1e-4, 0.0, 0.0))
+    return lattice
+
+
+def _tunnel(device: str, outlet: float | None = 1.0, **settings) -> Lattice:
+    """All kinds of boundaries, with slip walls that cross the slabs."""
+    lattice = Lattice(SHAPE, viscosity=1e-3, ramp=8, device=device, **settings)
+    lattice.set_inlet("-x", (0.08, 0.01, 0.0), np.indices(SHAPE[1:])[0] < 6)
+    lattice.set_outlet("+x", outlet)
+    lattice.set_wind("-y")
+    lattice.set_outlet("+y", outlet)
+    lattice.set_wall("-z", slip=True)
+    lattice.set_wall("+z", (0.05, 0.0, 0.0))
+    lattice.blow((0.02, 0.03, 0.0))
+    return lattice
+
+
+def _closed(device: str, **settings) -> Lattice:
+    lattice = Lattice(SHAPE, viscosity=1e-2, device=device, **settings)
+    for face in FACES:
+        lattice.set_wall(face)
+    lattice.set_force(np.random.default_rng(2).normal(0.0, 1e-3, (*SHAPE, 3)))
+    return lattice
+
+
+def _assert_same(one: Lattice, other: Lattice) -> None:
+    for first, second in zip(one.state().values(), other.state().values(), strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize("parts", [2, 3, 11])
+@pytest.mark.parametrize("make", [_periodic, _tunnel, _closed])
+def test_air_is_that_of_one_device(make: Callable[..., Lattice], parts: int, device: str):
+    """To the last bit, with bodies at rest and moving, a change of the step, and cells that become solid."""
+    one, several = (make(names) for names in (device, [device] * parts))
+    for lattice in (one, several):
+        lattice.set_bodies([RESTING, MOVING])
+        lattice.step(20)
+        lattice.change_step(0.5)
+        lattice.step(7)
+        lattice.set_solid(np.indices(SHAPE)[0] % 4 == 1, (0.0, 0.01, 0.0))
+        lattice.step(5)
+    _assert_same(one, several)
+    np.testing.assert_allclose(one.force_on_solid(), several.force_on_solid(), rtol=1e-12)
+
+
+@pytest.mark.parametrize("storage", ["float32", "float16"])
+def test_outlets_of_all_slabs_conserve_mass(storage: str, device: str):
+    """Their shift is of sums over all slabs, whose order of summation differs."""
+    one, several = (_tunnel(names, outlet=None, storage=storage) for names in (device, [device] * 3))
+    for lattice in (one, several):
+        lattice.step(60)
+    fields = [
+        np.dstack([lattice.density(), lattice.velocity().numpy().reshape(*SHAPE[:2], -1)]) for lattice in (one, several)
+    ]
+    np.testing.assert_allclose(*fields, atol=1e-6 if storage == "float32" else 2e-4)
+    assert abs(several.mass() / np.prod(SHAPE) - 1.0) < (1e-6 if storage == "float32" else 1e-3)
+
+
+def test_a_blow_up_names_the_cell_of_the_box(device: str):
+    several = Lattice(SHAPE, viscosity=0.0, device=[device] * 2)
+    velocity = np.zeros((*SHAPE, 3))
+    velocity[9, 4, 3] = 0.9
+    several.set_flow(velocity)
+    several.step(1)
+    with pytest.raises(WlmError, match=r"step 0 at cell \(9, 4, 3\)"):
+        several.check()
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("storage", ["float32", "float16"])
+def test_smoke_is_that_of_one_device(scheme: str, storage: str, device: str, tmp_path):
+    """To the last bit, with all that moves air and smoke, also after a checkpoint of another number of devices."""
+
+    def make(names) -> Solver:
+        return Solver(
+            _tunnel(names),
+            refinement=3,
+            scheme=scheme,
+            storage=storage,
+            temperature=True,
+            sources=[Source("sphere", (5, 5, 5), (3, 2, 2), 0.6, 0.5, fixed=True, fuel=1.0)],
+            obstacles=[RESTING, MOVING],
+            buoyancy=Buoyancy(1e-3, 1e-4),
+            confinement=0.02,
+            turbulence=Turbulence(1e-4, 5.0, 20.0),
+            fire=Fire(rate=0.02, ignition=0.3, radiation=0.01, expansion=0.1),
+            wind=Wind(((0, 0.0, 0.03, 0.0), (40, 0.05, 0.0, 0.0))),
+        )
+
+    one, several = make(device), make([device] * 3)
+    for solver in (one, several):
+        solver.step(9)
+    several.save(tmp_path / "state")
+    resumed = make([device] * 2)
+    resumed.load(tmp_path / "state")
+    for solver in (one, resumed):
+        solver.step(6)
+    _assert_same(one.lattice, resumed.lattice)
+    for first, second in zip(one.bricks()[1], resumed.bricks()[1], strict=True):
+        assert (first == second).all() and first.any()
+
+
+def test_what_is_refused(device: str):
+    for names, message in (
+        ([device] * 12, "device: expected 1 to 11, the number of cells along x, got 12 devices"),
+        ([], "got 0 devices"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Lattice(SHAPE, viscosity=0.1, device=names)
+    with pytest.raises(ValueError, match="bricks: expected none on several devices"):
+        Solver(Lattice(SHAPE, viscosity=0.1, device=f"{device},{device}"), bricks=True)
+
+
+def test_free_memory_is_that_of_the_fullest_device(device: str, monkeypatch: pytest.MonkeyPatch):
+    """A device named three times of four takes the memory of three quarters of the planes."""
+    monkeypatch.setattr("wlm.fluid.slabs.free_memory", lambda _device: 300)
+    slabs = Slabs((8, 2, 2), [device] * 4)
+    assert [(slab.begin, slab.end) for slab in slabs.parts] == [(0, 2), (2, 4), (4, 6), (6, 8)]
+    assert slabs.free == 300 and slabs.home == wp.get_device(device)
