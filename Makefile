@@ -20,8 +20,9 @@ demo: $(STAMP)
 demo-network: $(STAMP)
 	$(BIN)/python demos/smoke_network.py --train
 
-# Makes the pictures of README and docs from the output of the demos.
+# Makes the pictures of README and docs from the output of the demos and of the tutorials; WLM_THREE names three.js.
 pictures: demo
+	$(BIN)/python demos/tutorials.py
 	$(BIN)/python demos/pictures.py
 
 # Python keeps the compiled form of modules and tests, even where the environment turns that off: each of the many

@@ -18,6 +18,8 @@ Each method has a table of its own:
 - "weights": six lightmaps weighted for twelve lights, against a ray march for each of these lights.
 - "frame": the stages of a frame of the scene `jet-sphere`, except the network that makes lightmaps of the guiding map,
   which `smoke_network` measures; the ray march that the network replaces is measured too.
+- "devices": steps of air, and of the simulation of `jet-sphere`, on all GPUs of the host; the speedup over one, and the
+  largest difference of velocities. A CPU computes both halves, one after the other.
 
 A largest error has the unit of the compared quantity: cells per step, light, or density. Times are of the calls that a
 user makes. On CUDA the lattice itself replays graphs where it does many steps, and steps of advection are replayed as
@@ -43,6 +45,7 @@ from wlm.fluid.bricks import BrickPool
 from wlm.fluid.faces import FACES
 from wlm.fluid.lattice import Lattice
 from wlm.fluid.obstacles import Sphere, Trajectory, cells_of
+from wlm.fluid.slabs import Slabs
 from wlm.fluid.volume import DensityVolume, gather
 from wlm.interop import stream, to_warp
 from wlm.metrics import psnr_from_mse
@@ -313,7 +316,7 @@ def smoke_brick_rows(bench: SmokeBench) -> list[Row]:
 
 def _jet(bench: SmokeBench, size: int, faces: str = "all", **settings) -> Lattice:
     """Makes a fluid lattice with a round inlet, a sphere, an outlet and walls, or a lattice of air at rest."""
-    lattice = Lattice((size,) * 3, viscosity=_VISCOSITY, ramp=4 * size, device=bench.device, **settings)
+    lattice = Lattice((size,) * 3, viscosity=_VISCOSITY, ramp=4 * size, **{"device": bench.device} | settings)
     if faces != "periodic":
         for face in ("-x", "+x", "-y", "+y", "-z", "+z"):
             lattice.set_wall(face)
@@ -403,7 +406,7 @@ def _carry_bricks(bench, scheme: str, fill: float, box, velocity, walls):
         return _fields(torch.zeros(cells), "float32", bench.device)
 
     buffers = 3 if scheme == "maccormack" else 2
-    pool = BrickPool(box, rings, _THRESHOLD, make, buffers, wp.get_device(bench.device))
+    pool = BrickPool(box, rings, _THRESHOLD, make, buffers, Slabs(tuple(box.coarse), bench.device))
     # A graph has no pool that grows.
     pool.reserve(pool.most)
     pool.put(*gather([_cube(bench, fill)]))
@@ -655,6 +658,37 @@ def frame_rows(bench: SmokeBench) -> list[Row]:
     return [*rows, bench.row("frame", "all but the network", notes, scene="jet-sphere", **figures)]
 
 
+def device_rows(bench: SmokeBench) -> list[Row]:
+    """Times the air and a simulation on one device and on several."""
+    sizes, cuda = bench.sizes, bench.device != "cpu"
+    names = [str(device) for device in wp.get_cuda_devices()] if cuda else ["cpu", "cpu"]
+    rows, edge = [], _RATIO * sizes.coarse
+    cases = {
+        "float32, periodic": {"faces": "periodic"},
+        "float32, all boundaries": {},
+        "float16, all boundaries": {"storage": "float16"},
+    }
+    scene = load_scene("jet-sphere").scaled(sizes.scale)
+    for name in (*cases, "jet-sphere") if len(names) > 1 else ():
+        bench.note(f"timing {name} on {len(names)} devices")
+        settings = cases.get(name)
+        one, several = (
+            make_solver(scene, device=of) if settings is None else _jet(bench, edge, device=of, **settings)
+            for of in (bench.device, ",".join(names))
+        )
+        count = scene.steps // scene.smoke.substeps if settings is None else sizes.chunk
+        times = bench.time({"one": partial(one.step, count), "several": partial(several.step, count)})
+        velocities = [wp.to_torch(each.velocity if settings is None else each.velocity()) for each in (one, several)]
+        figures = {
+            "cells": scene.grid.cells[0] if settings is None else edge,
+            "speedup": times["one"].median_ms / times["several"].median_ms,
+            "max_error": float((velocities[0] - velocities[1]).abs().max()),
+        }
+        option, notes = f"{name}, {len(names)}", f"{times['one'].median_ms / count:.4g} ms on one"
+        rows.append(bench.row("devices", option, notes, scene="jet", timing=times["several"], calls=count, **figures))
+    return rows
+
+
 def _drawn(
     scene: Scene, volume: DensityVolume, camera: Camera, time: float, device: str
 ) -> dict[str, Callable[[], object]]:
@@ -730,6 +764,7 @@ _PARTS: tuple[Callable[[SmokeBench], Iterable[Row]], ...] = (
     six_rows,
     weight_rows,
     frame_rows,
+    device_rows,
 )
 
 

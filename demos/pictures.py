@@ -1,16 +1,22 @@
-"""The pictures of README and docs: the street, and what `wlm view` and `wlm web` show of what the demos leave.
+"""The pictures of README and docs: the street, what `wlm view` and `wlm web` show of the demos' files, and what the
+tutorials leave, with their pages of three.js.
 
     make pictures
 
-It needs a Chromium and playwright, and for `wlm view` pyvista.
+It needs a Chromium and playwright, for `wlm view` pyvista, and for the tutorials' pages three.js: WLM_THREE names the
+folder of an unpacked `three` from npm, 0.187 or later.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
+import http.server
 import io
+import os
 import shutil
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,6 +36,8 @@ HERE = Path(__file__).resolve().parent
 DATA = HERE / "data"
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 SOFTWARE_GL = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+SOFTWARE_GPU = ("--no-sandbox", "--use-angle=vulkan", "--use-vulkan=swiftshader", "--enable-features=Vulkan")
+SOFTWARE_GPU += ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader")
 PAPER, INK = "#1b1b1f", "#e8e8e8"
 GAP = 10  # between pictures
 STREET = (7.0, 12.0, 18.75, 22.0)  # hours of the street
@@ -46,6 +54,17 @@ VIEWS: dict[str, tuple[str, dict[str, Any], str, dict[str, float]]] = {
         {"sigma": 0.6},
     ),
 }
+# Of the tutorials, by file: pictures side by side, with labels and the lines to keep.
+TUTORIALS = {
+    "tutorial-optimise.png": ({f"optimise/{name}.png": name for name in ("front", "between", "side")}, (40, 224)),
+    "tutorial-scene.png": ({f"scene/room/view_{hour:02}_00h.png": f"{hour}:00" for hour in (8, 12, 20)}, (0, 300)),
+}
+# Of the tutorials' pages of three.js, by file: the folder, the size, what is done in turn, and the label.
+PAGES = {
+    "tutorial-bake.png": ("bake", (360, 260), {f"hour.value = {h}; hour.hidden = 1": f"{h}:00" for h in (8, 12, 20)}),
+    "tutorial-smoke.png": ("smoke", (260, 300), {"0": "", "1": "", "2": ""}),
+}
+WEBGPU_PAGES = {"tutorial-probes.png": ("probes", (640, 360), {"0": ""})}
 # Those that demos make themselves.
 DEMOS = {
     "fluid-control.png": "fluid_control.png",
@@ -61,12 +80,12 @@ class Browser:
     """Chromium that takes pictures of pages."""
 
     def __init__(self, chromium: Any, folder: Path) -> None:
-        self._chromium, self._folder = chromium, folder
+        self.chromium, self.folder = chromium, folder
 
     def open(self, name: str, width: int, height: int, **options: Any) -> Any:
         """Opens a page of `gallery.py` or a report; a size in pixels."""
-        page = self._chromium.new_page(viewport={"width": width, "height": height}, **options)
-        page.goto((self._folder / f"{name}.html").as_uri())
+        page = self.chromium.new_page(viewport={"width": width, "height": height}, **options)
+        page.goto((self.folder / f"{name}.html").as_uri())
         return page
 
 
@@ -82,8 +101,8 @@ def do(page: Any, script: str) -> None:
 
 
 @contextmanager
-def browser(folder: Path) -> Iterator[Browser]:
-    """Chromium with WebGL2 in software."""
+def browser(folder: Path, options: Sequence[str] = SOFTWARE_GL) -> Iterator[Browser]:
+    """Chromium with WebGL2, or WebGPU, in software."""
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     try:
         from playwright.sync_api import sync_playwright
@@ -92,7 +111,7 @@ def browser(folder: Path) -> Iterator[Browser]:
     if program is None:
         raise WlmError(f"expected one of {', '.join(BROWSERS)}, found none")
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=program, args=list(SOFTWARE_GL))
+        chromium = playwright.chromium.launch(executable_path=program, args=list(options))
         yield Browser(chromium, folder)
         chromium.close()
 
@@ -145,6 +164,48 @@ def page_and_phone(pages: Browser) -> Image.Image:
     return row([(take(desk), ""), (take(phone), "")])
 
 
+@contextmanager
+def serve(folder: Path) -> Iterator[str]:
+    """Serves a tutorial's folder, with three.js in it, on this machine's loopback; gives its address."""
+    three = os.environ.get("WLM_THREE")
+    if not three:
+        raise WlmError("WLM_THREE names no three.js: npm install three, and name its folder")
+    (folder / "node_modules").mkdir(exist_ok=True)
+    link = folder / "node_modules" / "three"
+    link.unlink(missing_ok=True)
+    link.symlink_to(Path(three).resolve())
+
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *words: object) -> None:
+            """Says nothing."""
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+
+
+def tutorial_page(pages: Browser, name: str) -> Image.Image:
+    """A tutorial's page of three.js, in each of its states."""
+    folder, (width, height), states = (PAGES | WEBGPU_PAGES)[name]
+    with serve(pages.folder / "tutorials" / folder) as address:
+        page, taken = pages.chromium.new_page(viewport={"width": width, "height": height}), []
+        page.goto(f"{address}/index.html", wait_until="networkidle")
+        for script, label in states.items():
+            page.evaluate(script)
+            page.wait_for_timeout(4000)
+            taken.append((Image.open(io.BytesIO(page.screenshot(timeout=200_000))).convert("RGB"), label))
+        page.close()
+    return row(taken)
+
+
+def tutorial_row(out: Path, name: str) -> Image.Image:
+    """Pictures that the commands of a tutorial write, side by side."""
+    files, (top, bottom) = TUTORIALS[name]
+    pictures = [(Image.open(out / "tutorials" / file).convert("RGB"), label) for file, label in files.items()]
+    return row([(picture.crop((0, top, picture.width, bottom)), label) for picture, label in pictures])
+
+
 def window(out: Path, name: str) -> Image.Image:
     """Takes a picture of the window of `wlm view`."""
     file, options, view, values = VIEWS[name]
@@ -178,6 +239,13 @@ def main() -> None:
         save(args.out / "street.png", street())
         with browser(args.demos) as pages:
             save(args.out / "web.png", page_and_phone(pages))
+            for name in PAGES:
+                save(args.out / name, tutorial_page(pages, name))
+        with browser(args.demos, SOFTWARE_GPU) as pages:
+            for name in WEBGPU_PAGES:
+                save(args.out / name, tutorial_page(pages, name))
+        for name in TUTORIALS:
+            save(args.out / name, tutorial_row(args.demos, name))
         for name in VIEWS:
             save(args.out / name, window(args.demos, name))
         for name, made in DEMOS.items():

@@ -25,8 +25,15 @@ import pytest
 from benchmarks import FIGURES, pages, read_json
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-STATED = json.loads((ROOT / "docs" / "figures.json").read_text(encoding="utf-8"))
+DOCS = ROOT / "docs"
+DOCUMENTS = [ROOT / "README.md", *sorted([*DOCS.glob("*.md"), *DOCS.glob("notes/*.md"), *DOCS.glob("tutorials/*.md")])]
+RESULTS = sorted((DOCS / "results").glob("*.md"))
+STATED = json.loads((DOCS / "figures.json").read_text(encoding="utf-8"))
+
+
+def named(document: Path) -> str:
+    """A document's name in `figures.json`, with the folder below docs."""
+    return str(document.relative_to(DOCS)) if document.is_relative_to(DOCS) else document.name
 
 
 @functools.cache
@@ -62,14 +69,14 @@ def paragraph_of(text: str, entry: dict) -> str:
 
 
 def test_every_entry_is_of_a_document():
-    assert STATED.keys() <= {path.name for path in DOCUMENTS}
+    assert STATED.keys() <= {named(path) for path in DOCUMENTS}
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
 def test_figures_are_those_of_the_benchmarks(document):
     text = document.read_text(encoding="utf-8")
     assert "<!--" not in text, "sources of figures belong into docs/figures.json"
-    for entry in STATED.get(document.name, []):
+    for entry in STATED.get(named(document), []):
         paragraph = paragraph_of(text, entry)
         start = 0
         for source, *figures in entry.get("figures", []):
@@ -95,18 +102,33 @@ def test_pages_of_results_are_those_that_the_command_makes(monkeypatch):
     for name, page in pages(
         ["benchmarks/nvidia-h200.json", "benchmarks/nvidia-h100.json", "benchmarks/cpu.json"], "docs/results.md"
     ).items():
-        assert (ROOT / "docs" / name).read_text(encoding="utf-8") == page, name
+        assert (DOCS / name).read_text(encoding="utf-8") == page, name
 
 
 def test_every_picture_is_shown_and_small():
-    pages = [*DOCUMENTS, *sorted((ROOT / "docs" / "results").glob("*.md"))]
-    shown = {name for page in pages for name in re.findall(r"images/([\w.-]+)\)", page.read_text(encoding="utf-8"))}
-    pictures = {path.name: path.stat().st_size for path in (ROOT / "docs" / "images").iterdir()}
+    texts = [page.read_text(encoding="utf-8") for page in DOCUMENTS + RESULTS]
+    shown = {name for text in texts for name in re.findall(r"images/([\w.-]+)\)", text)}
+    pictures = {path.name: path.stat().st_size for path in (DOCS / "images").iterdir()}
     assert pictures.keys() == shown
     assert max(pictures.values()) <= 400_000
 
 
+def test_pages_are_short():
+    for document in DOCUMENTS:
+        most = 120 if document.parent.name == "tutorials" else 250
+        assert document.read_text(encoding="utf-8").count("\n") <= most, named(document)
+
+
+def test_links_lead_to_headings():
+    for document in DOCUMENTS:
+        for path, anchor in re.findall(r"\]\(([^)#:]*)#([^)]*)\)", document.read_text(encoding="utf-8")):
+            target = document.parent / path if path else document
+            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.M)
+            slugs = [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+            assert anchor in slugs, f"{named(document)}: {path}#{anchor}"
+
+
 def test_files_that_documents_link_are_there():
-    for document in [*DOCUMENTS, *sorted((ROOT / "docs" / "results").glob("*.md"))]:
+    for document in DOCUMENTS + RESULTS:
         for link in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", document.read_text(encoding="utf-8")):
             assert (document.parent / link).exists(), f"{document.name}: {link}"

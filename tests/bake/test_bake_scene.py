@@ -213,7 +213,8 @@ def test_probes_of_several_hours_have_their_keys(tmp_path):
     values = np.random.default_rng(0).random((2, 5, 9, 3)).astype(np.float32)
     position = np.random.default_rng(1).random((5, 3)).astype(np.float32)
     write_probes(tmp_path / "p.npz", BakedProbes((6.0, 18.5), position, values, values))
-    assert (load_probes(tmp_path / "p.npz", key="18.5").values == values[1].reshape(5, 27)).all()
+    assert (load_probes(tmp_path / "p.npz", key="18.5h").values == values[1].reshape(5, 27)).all()
+    assert load_probes(tmp_path / "p.npz").times.tolist() == [6.0, 18.5]
 
 
 def test_without_the_extra_a_line_says_what_to_install(tmp_path, monkeypatch):

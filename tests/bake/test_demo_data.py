@@ -28,6 +28,6 @@ def test_probes_are_where_the_scene_has_them():
     scene, path = task.scene, task.geometry
     places = place_probes(scene.probes, read_geometry(path, None))
     for hour in scene.hours:
-        probes = load_probes(BAKED / "probes.npz", key=f"{hour:g}")
+        probes = load_probes(BAKED / "probes.npz", key=f"{hour:g}h")
         np.testing.assert_allclose(probes.position, places, atol=1e-6)
         assert probes.live.any()

@@ -25,6 +25,7 @@ TINY = replace(
     frames=2,
     repeats=1,
 )
+BOUNDED = ("float32, all boundaries", "float16, all boundaries")
 METHODS = [
     ("jet", "lattice"),
     ("jet", "lattice storage"),
@@ -35,6 +36,7 @@ METHODS = [
     ("cloud", "six ways"),
     ("plume", "weights"),
     ("jet-sphere", "frame"),
+    ("jet", "devices"),
 ]
 
 
@@ -87,3 +89,9 @@ def test_a_frame_is_the_sum_of_its_stages(rows):
     assert drawn | {"six ways, drawn", *(f"six planes by paths, {what}" for what in ("one order", "all orders"))} < set(
         frame
     )
+
+
+def test_several_devices_are_as_one(rows):
+    devices = by_option(rows, "devices")
+    assert list(devices) == [f"{name}, 2" for name in ("float32, periodic", *BOUNDED, "jet-sphere")]
+    assert all(row["speedup"] > 0.0 and row["max_error"] < 1e-5 for row in devices.values())

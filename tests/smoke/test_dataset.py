@@ -49,14 +49,6 @@ def pool():
     return make_pool(SMALL, seed=5, progress=reports.append), reports
 
 
-def test_scenes_are_repeatable():
-    first = draw_scene(SMALL, 3, 7)
-    assert draw_scene(SMALL, 3, 7) == first
-    others = [draw_scene(SMALL, 4, 7), draw_scene(SMALL, 3, 8), draw_scene(SMALL, 3, 7, validation=True)]
-    drawn = [scene.model_copy(update={"name": ""}) for scene in (first, *others)]
-    assert all(scene != earlier for i, scene in enumerate(drawn) for earlier in drawn[:i])
-
-
 def test_storage_of_fine_grids():
     """Half floats are used except where they would round away the cooling in a short step."""
     fine = DatasetSettings(cells=256)

@@ -96,7 +96,7 @@ def bake_probes(
 
 
 def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
-    """Writes probes as `.npz`: `position`; for one hour `sh` and `noise`, for several `sh_HOUR` and `noise_HOUR`.
+    """Writes probes as `.npz`: `position`; for one hour `sh` and `noise`, for several `sh_HOURh` and `noise_HOURh`.
 
     Raises:
         WlmError: The file can't be written.
@@ -104,7 +104,7 @@ def write_probes(path: str | os.PathLike[str], baked: BakedProbes) -> None:
     single = len(baked.hours) == 1
     arrays: dict[str, np.ndarray] = {"position": baked.position, "convention": np.array(CANONICAL)}
     for hour, values, noise in zip(baked.hours, baked.values, baked.noise, strict=True):
-        key = "" if single else f"_{hour:.9g}"
+        key = "" if single else f"_{hour:.9g}h"
         arrays |= {f"sh{key}": values, f"noise{key}": noise}
     with atomic_path(Path(path)) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **arrays)

@@ -331,7 +331,8 @@ def _raw(path: Path, position: np.ndarray, names: list[str], read: Callable[[str
         return _Raw(position, [read(names[0])], names[0], **known)
     hours, _ = hours_of_names(names)
     if None in hours:
-        raise WlmError(f"{path}: found several arrays of values; choose one by its key: {', '.join(names)}")
+        listed = f"{', '.join(names)}; hours are read from names such as sh_6h"
+        raise WlmError(f"{path}: found several arrays of values; choose one by its key: {listed}")
     times = _checked_hours(str(path), hours)
     order = np.argsort(times)
     key = ", ".join(names[i] for i in order)
