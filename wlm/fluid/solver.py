@@ -300,6 +300,9 @@ class Solver:
         self._fire = fire
         self._threshold = threshold
         self._pool = self._make_pool() if bricks else None
+        # Without a pool, the bricks that smoke may reach in a step; the cells of others need only be set to 0.
+        self._near = DENSE if bricks else advection_places.make_bricks(self._box, self._rings, 0.0, str(self.device))
+        self._near.workers = 0
         cells = math.prod(self.shape)
         self._fields = self._pool.fields if self._pool else [self._make_fields(cells) for _ in range(_buffers(scheme))]
         self._touched: tuple[Source, ...] = ()
@@ -703,11 +706,16 @@ class Solver:
         decays, where = (self._decay, (1.0, 1.0)), [self._box, self._traces, self._walls[0]]
         for decay, buffers in zip(decays, zip(*map(self._carried, self._fields), strict=True), strict=False):
             now, predicted, out = buffers[0], buffers[1], buffers[-1]
+            bricks = self._bricks
+            if self._pool is None:
+                bricks = self._near
+                self._on_slabs(advection.mark_smoke, self._box, now, bricks)
+                advection_places.choose(self._box, bricks)
             if self.scheme == "maccormack":
-                self._on_slabs(advection.advect, *where, now, predicted, bricks=self._bricks)
-                self._on_slabs(advection.advect, *where, now, out, decay, self._bricks, predicted)
+                self._on_slabs(advection.advect, *where, now, predicted, bricks=bricks)
+                self._on_slabs(advection.advect, *where, now, out, decay, bricks, predicted)
             else:
-                self._on_slabs(advection.advect, *where, now, out, decay, self._bricks)
+                self._on_slabs(advection.advect, *where, now, out, decay, bricks)
         self._fields[:] = self._fields[::-1]
 
     def _on_slabs(self, compute: Callable[..., None], *args, **settings) -> None:
@@ -728,12 +736,15 @@ class Solver:
     def _bricks(self) -> advection_places.Bricks:
         return DENSE if self._pool is None else self._pool.bricks
 
-    def _make_pool(self) -> BrickPool:
+    @property
+    def _rings(self) -> int:
         # Smoke also moves by a cell of the lattice when an obstacle leaves it.
         reach = max(_SOUND * self.substeps, float(bool(self.obstacles))) * self._box.refinement
-        rings = advection_places.rings_for(reach)
+        return advection_places.rings_for(reach)
+
+    def _make_pool(self) -> BrickPool:
         return BrickPool(
-            self._box, rings, self._threshold, self._make_fields, _buffers(self.scheme), self.lattice.slabs
+            self._box, self._rings, self._threshold, self._make_fields, _buffers(self.scheme), self.lattice.slabs
         )
 
     def _make_fields(self, cells: int) -> advection.Fields:

@@ -4,8 +4,8 @@
 Read `tests/reference/advection.py` first: it is the same step in float64 NumPy, cell by cell.
 
 - Semi-Lagrangian: rho'(x) = rho(x_d), trilinear, at the departure point x_d = x - dt u(x - dt u(x) / 2), the midpoint
-  rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. The velocity at a midpoint at
-  most `REACH` coarse cells outside the eight velocities around x is extrapolated from them.
+  rule (second-order Runge-Kutta). Unconditionally stable, no new extrema, first order. x_d - x is computed at the
+  centres of coarse cells (`advection_places.trace`) and is trilinear between them, as the velocities are.
 - MacCormack (Selle et al. 2008): with A a semi-Lagrangian step and A* the step back in time, rho' = A rho + (rho - A* A
   rho) / 2, clamped to the eight values that A interpolates. Second order where the field is smooth.
 
@@ -89,6 +89,16 @@ _LARGEST_HALF = wp.constant(65504.0)
 _BRICK_RUNS = wp.constant(CELLS // _BRICK_RUN)
 
 
+@wp.struct
+class Corners:
+    """Indices of the eight cells around a point in a field, the lower and the upper of each pair along z, and the
+    fractions between them; the pairs are those of (x, y), (x, y + 1), (x + 1, y) and (x + 1, y + 1)."""
+
+    low: wp.vec4i
+    high: wp.vec4i
+    f: wp.vec3
+
+
 @functools.cache
 def fields_struct(stored: type) -> Any:
     """Builds (once) the struct in which kernels take fields of `wp.float32` or `wp.float16`."""
@@ -125,6 +135,21 @@ class Fields:
         struct = fields_struct(self.density.dtype)()
         struct.density, struct.temperature = self.density, self.temperature
         return struct
+
+
+@wp.func
+def run_of_brick(box: Box, brick: int, i: int) -> wp.vec3i:
+    """Returns the first cell of run i of a brick."""
+    return BRICK * cell_of(box.bricks, brick) + wp.vec3i(0, i // BRICK, i % BRICK)
+
+
+@wp.func
+def run_of_tile(box: Box, begin: int, i: int) -> wp.vec3i:
+    """Returns the first cell of run i of the cells from `begin` along x on; it may be outside the domain."""
+    tiles = wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE)
+    tile = cell_of(tiles, i // (_TILE * _TILE))
+    thread = i % (_TILE * _TILE)
+    return wp.vec3i(begin + tile[0] * _RUN, tile[1] * _TILE + thread // _TILE, tile[2] * _TILE + thread % _TILE)
 
 
 @functools.cache
@@ -176,49 +201,43 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return index_of(box.n, cell)
 
     @wp.func
-    def side_values(
-        field: wp.array1d[stored], box: Box, bricks: Bricks, x: int, y: int, z: int, along_y: int, along_z: int
-    ) -> wp.vec4:
-        """Returns the values of the cells (x, y, z), (x, y, z + along_z), (x, y + along_y, z) and of the last."""
-        out = wp.vec4()
+    def corners_of(box: Box, bricks: Bricks, x: int, y: int, z: int, along: wp.vec3i, f: wp.vec3) -> Corners:
+        """Returns the eight cells from (x, y, z) to (x, y, z) + along, with the fractions f between them."""
+        out = Corners()
+        out.f = f
         if wp.static(in_bricks):
             # Brick and cell in the brick along each axis, of the lower and of the upper cells.
-            brick_y = wp.vec2i(y >> 3, (y + along_y) >> 3) * box.bricks[2]
-            brick_z = wp.vec2i(z >> 3, (z + along_z) >> 3)
-            cell_y = wp.vec2i((y & 7) << 3, ((y + along_y) & 7) << 3)
-            cell_z = wp.vec2i(z & 7, (z + along_z) & 7)
-            b = (x >> 3) * (box.bricks[1] * box.bricks[2])
-            c = (x & 7) << 6
+            brick_x = wp.vec2i(x >> 3, (x + along[0]) >> 3) * (box.bricks[1] * box.bricks[2])
+            brick_y = wp.vec2i(y >> 3, (y + along[1]) >> 3) * box.bricks[2]
+            brick_z = wp.vec2i(z >> 3, (z + along[2]) >> 3)
+            cell_x = wp.vec2i((x & 7) << 6, ((x + along[0]) & 7) << 6)
+            cell_y = wp.vec2i((y & 7) << 3, ((y + along[1]) & 7) << 3)
+            cell_z = wp.vec2i(z & 7, (z + along[2]) & 7)
             for k in range(4):
-                place = place_at(bricks.places, b + brick_y[k // 2] + brick_z[k % 2])
-                out[k] = value_at(field, (place << 9) + c + cell_y[k // 2] + cell_z[k % 2])
+                b = brick_x[k // 2] + brick_y[k % 2]
+                c = cell_x[k // 2] + cell_y[k % 2]
+                out.low[k] = (place_at(bricks.places, b + brick_z[0]) << 9) + c + cell_z[0]
+                out.high[k] = (place_at(bricks.places, b + brick_z[1]) << 9) + c + cell_z[1]
         else:
             i = (x * box.n[1] + y) * box.n[2] + z
-            j = i + along_y * box.n[2]
-            out = wp.vec4(
-                value_at(field, i), value_at(field, i + along_z), value_at(field, j), value_at(field, j + along_z)
-            )
+            j = i + along[0] * box.n[1] * box.n[2]
+            row_step = along[1] * box.n[2]
+            out.low = wp.vec4i(i, i + row_step, j, j + row_step)
+            out.high = out.low + wp.vec4i(along[2], along[2], along[2], along[2])
         return out
 
     @wp.func
-    def blend(near: wp.vec4, far: wp.vec4, f: wp.vec3) -> float:
-        """Interpolates between the values of `side_values` on both sides of a point."""
-        a = between(between(near[0], near[1], f[2]), between(near[2], near[3], f[2]), f[1])
-        b = between(between(far[0], far[1], f[2]), between(far[2], far[3], f[2]), f[1])
-        return between(a, b, f[0])
-
-    @wp.func
-    def sides_around(field: wp.array1d[stored], box: Box, bricks: Bricks, p: wp.vec3):
-        """Returns the values of the eight cells around a point, in two halves, and the fractions between them."""
+    def corners_around(box: Box, bricks: Bricks, p: wp.vec3) -> Corners:
         cell, along, f = lowest_cell(box.n, box.periodic, p)
-        near = side_values(field, box, bricks, cell[0], cell[1], cell[2], along[1], along[2])
-        far = side_values(field, box, bricks, cell[0] + along[0], cell[1], cell[2], along[1], along[2])
-        return near, far, f
+        return corners_of(box, bricks, cell[0], cell[1], cell[2], along, f)
 
     @wp.func
-    def interpolate(field: wp.array1d[stored], box: Box, bricks: Bricks, p: wp.vec3) -> float:
-        near, far, f = sides_around(field, box, bricks, p)
-        return blend(near, far, f)
+    def interpolate(field: wp.array1d[stored], at: Corners) -> float:
+        a = between(value_at(field, at.low[0]), value_at(field, at.high[0]), at.f[2])
+        b = between(value_at(field, at.low[1]), value_at(field, at.high[1]), at.f[2])
+        c = between(value_at(field, at.low[2]), value_at(field, at.high[2]), at.f[2])
+        d = between(value_at(field, at.low[3]), value_at(field, at.high[3]), at.f[2])
+        return between(between(a, b, at.f[1]), between(c, d, at.f[1]), at.f[0])
 
     @wp.func
     def interpolate_beside(
@@ -238,24 +257,21 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return total / wp.max(weight, 1.0e-6)
 
     @wp.func
-    def corrected(value: float, predicted: float, back: float, low: float, high: float) -> float:
-        return wp.clamp(predicted + 0.5 * (value - back), low, high)
+    def extremes(field: wp.array1d[stored], at: Corners):
+        """Returns the least and the largest of the eight stored values around a point."""
+        a = wp.vec4()
+        b = wp.vec4()
+        for k in range(4):
+            a[k] = value_at(field, at.low[k])
+            b[k] = value_at(field, at.high[k])
+        return wp.min(wp.min(a, b)), wp.max(wp.max(a, b))
 
     @wp.func
-    def correct(
-        field: wp.array1d[stored],
-        predicted: wp.array1d[stored],
-        box: Box,
-        bricks: Bricks,
-        i: int,
-        p: wp.vec3,
-        q: wp.vec3,
+    def corrected(
+        field: wp.array1d[stored], predicted: wp.array1d[stored], i: int, to: Corners, low: float, high: float
     ) -> float:
-        near, far, _f = sides_around(field, box, bricks, p)
-        low = wp.min(wp.min(near, far))
-        high = wp.max(wp.max(near, far))
-        back = interpolate(predicted, box, bricks, q)
-        return corrected(value_at(field, i), value_at(predicted, i), back, low, high)
+        change = 0.5 * (value_at(field, i) - interpolate(predicted, to))
+        return wp.clamp(value_at(predicted, i) + change, low, high)
 
     @wp.func
     def write(i: int, smoke: float, heat: float, decay: wp.vec2, out: fields_type) -> float:
@@ -318,6 +334,7 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         if wall != SOLID:
             start = stencil(box.coarse, box.periodic, box.voxel * x)
             p, left, beside = end_of_trace(box, traces, walls, x, start, wall)
+            at = corners_around(box, bricks, p)
             if wp.static(correcting):
                 smoke = value_at(predicted.density, i)
                 if wp.static(hot):
@@ -328,9 +345,12 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                     q, left_q, beside_q = end_of_trace(box, traces, walls, x, start, wall)
                     uncorrected = left_q or beside_q
                 if not uncorrected:
-                    smoke = correct(fields.density, predicted.density, box, bricks, i, p, q)
+                    to = corners_around(box, bricks, q)
+                    low, high = extremes(fields.density, at)
+                    smoke = corrected(fields.density, predicted.density, i, to, low, high)
                     if wp.static(hot):
-                        heat = correct(fields.temperature, predicted.temperature, box, bricks, i, p, q)
+                        low, high = extremes(fields.temperature, at)
+                        heat = corrected(fields.temperature, predicted.temperature, i, to, low, high)
             elif not left:
                 if wp.static(solids):
                     if beside:
@@ -338,59 +358,38 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                         if wp.static(hot):
                             heat = interpolate_beside(fields.temperature, walls, box, bricks, p)
                 if not beside:
-                    smoke = interpolate(fields.density, box, bricks, p)
+                    smoke = interpolate(fields.density, at)
                     if wp.static(hot):
-                        heat = interpolate(fields.temperature, box, bricks, p)
+                        heat = interpolate(fields.temperature, at)
         return smoke, heat
 
     @wp.func
-    def between_cells(box: Box, end: wp.vec3):
-        """Returns the lowest of the eight cells around a point, relative to the centre of cell (0, 0, 0), the fractions
-        between them, and whether all exist."""
-        at = wp.vec3i(int(wp.floor(end[0])), int(wp.floor(end[1])), int(wp.floor(end[2])))
-        f = end - wp.vec3(float(at[0]), float(at[1]), float(at[2]))
-        inside = is_below(at[0], box.n[0] - 1) and is_below(at[1], box.n[1] - 1) and is_below(at[2], box.n[2] - 1)
-        return at, f, inside
+    def between_cells(box: Box, bricks: Bricks, end: wp.vec3):
+        """Returns the eight cells around a point, relative to the centre of cell (0, 0, 0), and whether all exist."""
+        x = int(wp.floor(end[0]))
+        y = int(wp.floor(end[1]))
+        z = int(wp.floor(end[2]))
+        f = end - wp.vec3(float(x), float(y), float(z))
+        inside = is_below(x, box.n[0] - 1) and is_below(y, box.n[1] - 1) and is_below(z, box.n[2] - 1)
+        if wp.static(in_bricks) and not inside:
+            # Cells that do not exist have no brick.
+            return Corners(), False
+        return corners_of(box, bricks, x, y, z, wp.vec3i(1, 1, 1), f), inside
 
     @wp.func
-    def trace_beside(
-        box: Box,
-        traces: wp.array1d[wp.vec3],
-        which: int,
-        low: wp.vec3i,
-        along_y: int,
-        along_z: int,
-        fy: float,
-        fz: float,
-    ) -> wp.vec3:
-        i = index_of(box.coarse, low) + which * box.coarse[0] * box.coarse[1] * box.coarse[2]
-        j = i + along_y * box.coarse[2]
-        a = vector_at(traces, i)
-        a += fz * (vector_at(traces, i + along_z) - a)
-        b = vector_at(traces, j)
-        b += fz * (vector_at(traces, j + along_z) - b)
-        return a + fy * (b - a)
-
-    @wp.func
-    def side_at(field: wp.array1d[stored], box: Box, bricks: Bricks, at: wp.vec3i, x: int) -> wp.vec4:
-        return side_values(field, box, bricks, at[0] + x, at[1], at[2], 1, 1)
+    def trace_beside(traces: wp.array1d[wp.vec3], at: Stencil) -> wp.vec3:
+        """Returns the trace between the four lower of eight coarse cells along x, at the fractions along y and z."""
+        row = at.base + at.step[1]
+        a = vector_at(traces, at.base)
+        a += at.f[2] * (vector_at(traces, at.base + at.step[2]) - a)
+        b = vector_at(traces, row)
+        b += at.f[2] * (vector_at(traces, row + at.step[2]) - b)
+        return a + at.f[1] * (b - a)
 
     @wp.func
     def patch_of(box: Box, i: int) -> int:
         """Returns the coarse cell, -1 or above, between whose centre and the next the centre of a fine cell is."""
         return (2 * i + 1 + box.refinement) // (2 * box.refinement) - 1
-
-    @wp.func
-    def first_of_run(box: Box, bricks: Bricks, begin: int, i: int, k: int) -> wp.vec3i:
-        if wp.static(in_bricks):
-            r = i % _BRICK_RUNS
-            b = cell_of(box.bricks, bricks.listed[k])
-            return BRICK * b + wp.vec3i(0, r // BRICK, r % BRICK)
-        tile = cell_of(
-            wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE), i // (_TILE * _TILE)
-        )
-        thread = i % (_TILE * _TILE)
-        return wp.vec3i(begin + tile[0] * _RUN, tile[1] * _TILE + thread // _TILE, tile[2] * _TILE + thread % _TILE)
 
     @wp.func
     def carry_run(
@@ -420,33 +419,29 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         low_z, along_z = pair(patch_z, box.coarse[2], box.periodic[2])
         fy = box.voxel * (float(first[1]) + 0.5) - 0.5 - float(patch_y)
         fz = box.voxel * (float(first[2]) + 0.5) - 0.5 - float(patch_z)
-        # Traces at the fractions fy and fz, on both sides of the cells along x; the upper side is the next lower one.
-        first_x, _along = pair(patch, box.coarse[0], box.periodic[0])
-        far_trace = trace_beside(box, traces, 0, wp.vec3i(first_x, low_y, low_z), along_y, along_z, fy, fz)
-        far_back = wp.vec3()
+        # Traces on both sides of the cells along x; the upper side is the lower one of the next cells.
+        corners = Stencil()
+        corners.f = wp.vec3(0.0, fy, fz)
+        corners.step = wp.vec3i(0, along_y * box.coarse[2], along_z)
+        cells = box.coarse[0] * box.coarse[1] * box.coarse[2]
+        low_x, along_x = pair(patch, box.coarse[0], box.periodic[0])
+        corners.base = (low_x * box.coarse[1] + low_y) * box.coarse[2] + low_z
+        far = trace_beside(traces, corners)
+        far_ahead = wp.vec3()
         if wp.static(correcting):
-            far_back = trace_beside(box, traces, 1, wp.vec3i(first_x, low_y, low_z), along_y, along_z, fy, fz)
-        # The cell whose side has been read last for each point, and that side: mostly the next cell needs it again.
-        kept_place = int(-1)
-        kept = wp.vec4()
-        kept_low = float(0.0)
-        kept_high = float(0.0)
-        kept_heat = wp.vec4()
-        back_place = int(-1)
-        back = wp.vec4()
-        back_heat = wp.vec4()
+            corners.base += cells
+            far_ahead = trace_beside(traces, corners)
         while x < end:
             low_x, along_x = pair(patch, box.coarse[0], box.periodic[0])
-            near_trace = wp.vec3(far_trace)
-            far_trace = trace_beside(box, traces, 0, wp.vec3i(low_x + along_x, low_y, low_z), along_y, along_z, fy, fz)
-            slope = far_trace - near_trace
-            near_back = wp.vec3(far_back)
-            slope_back = wp.vec3()
+            corners.base = ((low_x + along_x) * box.coarse[1] + low_y) * box.coarse[2] + low_z
+            near = wp.vec3(far)
+            far = trace_beside(traces, corners)
+            slope = far - near
+            near_ahead = wp.vec3(far_ahead)
             if wp.static(correcting):
-                far_back = trace_beside(
-                    box, traces, 1, wp.vec3i(low_x + along_x, low_y, low_z), along_y, along_z, fy, fz
-                )
-                slope_back = far_back - near_back
+                corners.base += cells
+                far_ahead = trace_beside(traces, corners)
+            slope_ahead = far_ahead - near_ahead
             centre = float(patch) + 0.5
             stop = wp.min(end, (2 * patch + 3) * box.refinement // 2)
             for k in range(x, stop):
@@ -460,70 +455,35 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                 # The order of the tests matters: it decides whether the compiler makes branches of them.
                 if wp.static(solids):
                     wall = wall_at(box, walls, cell + wp.vec3(0.5, 0.5, 0.5))
-                away = slope * fx + near_trace
-                at, part, simple = between_cells(box, cell + away)
+                away = slope * fx + near
+                at, simple = between_cells(box, bricks, cell + away)
                 if wp.static(solids):
                     simple = simple and wall == FREE and is_short(box, away)
                 smoke = float(0.0)
                 heat = float(0.0)
                 if simple:
-                    place = index_of(box.n, at)
-                    if place != kept_place:
-                        kept = side_at(fields.density, box, bricks, at, 0)
-                        if wp.static(correcting):
-                            kept_low = wp.min(kept)
-                            kept_high = wp.max(kept)
-                        if wp.static(hot):
-                            kept_heat = side_at(fields.temperature, box, bricks, at, 0)
-                    kept_place = place + box.n[1] * box.n[2]
-                    far = side_at(fields.density, box, bricks, at, 1)
-                    if wp.static(hot):
-                        far_heat = side_at(fields.temperature, box, bricks, at, 1)
                     if wp.static(correcting):
                         smoke = value_at(predicted.density, i)
-                        far_low = wp.min(far)
-                        far_high = wp.max(far)
-                        low = wp.min(kept_low, far_low)
-                        high = wp.max(kept_high, far_high)
-                        kept_low = far_low
-                        kept_high = far_high
+                        low, high = extremes(fields.density, at)
                         varies = low < high
                         if wp.static(hot):
                             heat = value_at(predicted.temperature, i)
-                            coldest = wp.min(wp.min(kept_heat, far_heat))
-                            hottest = wp.max(wp.max(kept_heat, far_heat))
+                            coldest, hottest = extremes(fields.temperature, at)
                             varies = varies or coldest < hottest
                         # Nothing is corrected between equal values.
                         if varies:
-                            away = slope_back * fx + near_back
-                            to, part, simple = between_cells(box, cell + away)
+                            away = slope_ahead * fx + near_ahead
+                            to, simple = between_cells(box, bricks, cell + away)
                             if wp.static(solids):
                                 simple = simple and is_short(box, away)
                             if simple:
-                                place = index_of(box.n, to)
-                                if place != back_place:
-                                    back = side_at(predicted.density, box, bricks, to, 0)
-                                    if wp.static(hot):
-                                        back_heat = side_at(predicted.temperature, box, bricks, to, 0)
-                                back_place = place + box.n[1] * box.n[2]
-                                ahead_back = side_at(predicted.density, box, bricks, to, 1)
-                                smoke = corrected(
-                                    value_at(fields.density, i), smoke, blend(back, ahead_back, part), low, high
-                                )
-                                back = ahead_back
+                                smoke = corrected(fields.density, predicted.density, i, to, low, high)
                                 if wp.static(hot):
-                                    ahead_heat = side_at(predicted.temperature, box, bricks, to, 1)
-                                    warm = blend(back_heat, ahead_heat, part)
-                                    heat = corrected(value_at(fields.temperature, i), heat, warm, coldest, hottest)
-                                    back_heat = ahead_heat
+                                    heat = corrected(fields.temperature, predicted.temperature, i, to, coldest, hottest)
                     else:
-                        smoke = blend(kept, far, part)
+                        smoke = interpolate(fields.density, at)
                         if wp.static(hot):
-                            heat = blend(kept_heat, far_heat, part)
-                    if wp.static(not correcting):
-                        kept = far
-                    if wp.static(hot):
-                        kept_heat = far_heat
+                            heat = interpolate(fields.temperature, at)
                 if simple:
                     most = wp.max(most, write(i, smoke, heat, decay, out))
                 else:
@@ -539,6 +499,16 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
                     any_smoke, any_heat = carry_cell(box, bricks, any_cell, at_cell, traces, walls, fields, predicted)
                     most = wp.max(most, write(at_cell, any_smoke, any_heat, decay, out))
         return most
+
+    @wp.func
+    def is_needed(box: Box, bricks: Bricks, first: wp.vec3i, last: int) -> bool:
+        """Tests whether smoke may reach the cells from `first` to below `last` along x."""
+        needed = bool(bricks.places.shape[0] == 0)
+        for x in range(first[0] // BRICK, (last - 1) // BRICK + 1):
+            if not needed:
+                b = index_of(box.bricks, wp.vec3i(x, first[1] // BRICK, first[2] // BRICK))
+                needed = place_at(bricks.places, b) != 0
+        return needed
 
     @wp.kernel(module="unique", module_options=_OPTIONS, launch_bounds=_BRICK_BOUNDS if in_bricks else _BOUNDS)
     def carry(
@@ -558,17 +528,76 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         i = wp.tid()
         if wp.static(in_bricks):
             for k in range(i // _BRICK_RUNS, bricks.counts[0], bricks.workers):
-                first = first_of_run(box, bricks, begin, i, k)
+                first = run_of_brick(box, bricks.listed[k], i % _BRICK_RUNS)
                 if first[0] < box.n[0] and first[1] < box.n[1] and first[2] < box.n[2]:
                     most = carry_run(box, first, end, traces, walls, fields, predicted, decay, bricks, out)
                     if most > bricks.threshold:
                         bricks.busy[bricks.listed[k]] = 1
         else:
-            first = first_of_run(box, bricks, begin, i, 0)
+            first = run_of_tile(box, begin, i)
             if first[1] < box.n[1] and first[2] < box.n[2]:
-                carry_run(box, first, end, traces, walls, fields, predicted, decay, bricks, out)
+                last = wp.min(first[0] + _RUN, end)
+                if is_needed(box, bricks, first, last):
+                    carry_run(box, first, end, traces, walls, fields, predicted, decay, bricks, out)
+                else:
+                    for x in range(first[0], last):
+                        write(index_of(box.n, wp.vec3i(x, first[1], first[2])), 0.0, 0.0, decay, out)
 
     return carry
+
+
+@functools.cache
+def mark_kernel(stored: type) -> wp.Kernel:
+    """Builds (once) a kernel that marks bricks in which smoke of the type `stored` is not 0; a thread reads a run."""
+    fields_type = fields_struct(stored)
+
+    @wp.func_native("return (float)field.data[i] != 0.0f;")
+    def is_some(field: wp.array1d[stored], i: int) -> bool: ...
+
+    @wp.kernel(module="unique", module_options={"enable_backward": False})
+    def mark(
+        # in:
+        box: Box,
+        fields: fields_type,
+        begin: int,
+        end: int,
+        # out:
+        bricks: Bricks,
+    ):
+        first = run_of_tile(box, begin, wp.tid())
+        if first[1] >= box.n[1] or first[2] >= box.n[2]:
+            return
+        some = bool(False)
+        for k in range(_RUN):
+            x = first[0] + k
+            if x < end:
+                i = index_of(box.n, wp.vec3i(x, first[1], first[2]))
+                some = some or is_some(fields.density, i)
+                if fields.temperature.shape[0] > 0:
+                    some = some or is_some(fields.temperature, i)
+                if some and (x % BRICK == BRICK - 1 or k == _RUN - 1 or x == end - 1):
+                    bricks.busy[index_of(box.bricks, wp.vec3i(x // BRICK, first[1] // BRICK, first[2] // BRICK))] = 1
+                if x % BRICK == BRICK - 1:
+                    some = False
+
+    return mark
+
+
+def _run_threads(box: Box, slab: Slab) -> int:
+    cells = (slab.end - slab.begin) * box.refinement
+    return -(-cells // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE) * _TILE * _TILE
+
+
+def mark_smoke(box: Box, fields: Fields, bricks: Bricks, slab: Slab | None = None) -> None:
+    """Marks as busy the bricks of smoke without a pool in which a density or temperature is not 0, so that `advect`
+    computes the others no more, after `advection_places.choose`.
+
+    `slab` are the coarse cells in which smoke is looked for; default all.
+    """
+    slab = slab or Slab(fields.density.device, 0, box.coarse[0])
+    inputs = [box, fields.arrays, slab.begin * box.refinement, slab.end * box.refinement]
+    kernel = mark_kernel(fields.density.dtype)
+    wp.launch(kernel, _run_threads(box, slab), inputs=inputs, outputs=[bricks], device=slab.device)
 
 
 def advect(
@@ -586,13 +615,14 @@ def advect(
 
     Args:
         box: The domain, see `advection_places.make_box`.
-        traces: The ways of the smoke in the step, from `advection_places.trace`; of twice the length with `predicted`.
+        traces: The ways of the smoke, from `advection_places.trace`; back and ahead with `predicted`.
         walls: uint8 [coarse cells] from `advection_places.mark_walls`, or [0] without solids.
         fields: The smoke before the step.
         out: The smoke after the step, in other arrays of the same shapes and types.
         decay: Factors by which density and temperature are multiplied, at most 1; (1, 1) in the first half of a
             MacCormack step.
-        bricks: The bricks to compute, stored by `advection_sources.store`; default all cells.
+        bricks: The bricks to compute, stored by `advection_sources.store`, or chosen by `advection_places.choose`; in
+            the latter case, smoke elsewhere becomes 0. Default all cells.
         predicted: The result of the first half, in a third set of arrays.
         slab: The coarse cells to compute, without bricks; default all.
     """
@@ -600,8 +630,7 @@ def advect(
     begin, end = slab.begin * box.refinement, slab.end * box.refinement
     stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0
     kernel = carry_kernel(predicted is not None, stored, bricks.workers > 0, solids, hot)
-    tiles = -(-(end - begin) // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE)
-    threads = bricks.workers * int(_BRICK_RUNS) or tiles * _TILE * _TILE
+    threads = bricks.workers * int(_BRICK_RUNS) or _run_threads(box, slab)
     # A semi-Lagrangian step does not read the prediction.
     smoke = [fields.arrays, (predicted or fields).arrays]
     inputs = [box, traces, walls, *smoke, wp.vec2(*decay), begin, end, bricks]

@@ -438,6 +438,23 @@ def relist(box: Box, bricks: Bricks) -> None:
 
 
 @wp.kernel
+def _choose(
+    # in, out:
+    bricks: Bricks,
+):
+    b = wp.tid()
+    bricks.places[b] = wp.min(bricks.busy[b], 1)
+    bricks.busy[b] = 0
+
+
+def choose(box: Box, bricks: Bricks) -> None:
+    """Chooses busy bricks, and those that smoke in them may reach, for the next step, where no pool stores the smoke:
+    their `places` are 1 and those of others 0. Then no brick is busy."""
+    wp.launch(_spread, bricks.busy.shape, inputs=[box, bricks], device=bricks.busy.device)
+    wp.launch(_choose, bricks.busy.shape, inputs=[bricks], device=bricks.busy.device)
+
+
+@wp.kernel
 def _settle(
     # in:
     clear: bool,
