@@ -702,7 +702,7 @@ class Solver:
                 advection_sources.add_source(*where, fixed=source.fixed, bricks=self._bricks, only_mark=only_mark)
 
     def _carry(self) -> None:
-        self._on_slabs(advection_places.trace, self._box, self._velocity.flatten(), self.substeps, self._traces)
+        air = [self._box, self._velocity.flatten(), self.substeps, self._traces]
         decays, where = (self._decay, (1.0, 1.0)), [self._box, self._traces, self._walls[0]]
         for decay, buffers in zip(decays, zip(*map(self._carried, self._fields), strict=True), strict=False):
             now, predicted, out = buffers[0], buffers[1], buffers[-1]
@@ -711,6 +711,7 @@ class Solver:
                 bricks = self._near
                 self._on_slabs(advection.mark_smoke, self._box, now, bricks)
                 advection_places.choose(self._box, bricks)
+            self._on_slabs(advection_places.trace, *air, bricks)
             if self.scheme == "maccormack":
                 self._on_slabs(advection.advect, *where, now, predicted, bricks=bricks)
                 self._on_slabs(advection.advect, *where, now, out, decay, bricks, predicted)

@@ -302,6 +302,26 @@ def make_box(coarse: Sequence[int], refinement: int, ends: Sequence[tuple[int, i
     return box
 
 
+@wp.func
+def _is_used(box: Box, bricks: Bricks, p: wp.vec3i) -> bool:
+    """Tests whether a chosen brick may be less than a coarse cell from the centre of a coarse cell."""
+    used = bool(bricks.places.shape[0] == 0)
+    low = wp.vec3i()
+    high = wp.vec3i()
+    for a in range(3):
+        least = box.refinement * p[a] - box.refinement // 2 - 1
+        most = box.refinement * (p[a] + 1) + box.refinement // 2
+        used = used or (box.periodic[a] != 0 and (least < 0 or most >= box.n[a]))
+        low[a] = wp.max(least, 0) // BRICK
+        high[a] = wp.min(most, box.n[a] - 1) // BRICK + 1
+    if not used:
+        for x in range(low[0], high[0]):
+            for y in range(low[1], high[1]):
+                for z in range(low[2], high[2]):
+                    used = used or place_at(bricks.places, index_of(box.bricks, wp.vec3i(x, y, z))) != 0
+    return used
+
+
 @wp.kernel
 def _trace(
     # in:
@@ -309,10 +329,13 @@ def _trace(
     box: Box,
     u: wp.array1d[wp.vec3],
     dt: float,
+    bricks: Bricks,
     # out:
     traces: wp.array1d[wp.vec3],
 ):
     i = first + wp.tid()
+    if not _is_used(box, bricks, cell_of(box.coarse, i)):
+        return
     duration = float(dt)
     for at in range(i, traces.shape[0], u.shape[0]):
         middle = into_domain(box, midpoint(box, u, i, duration))
@@ -321,7 +344,9 @@ def _trace(
         duration = -duration
 
 
-def trace(box: Box, velocity: wp.array, dt: float, traces: wp.array, slab: Slab | None = None) -> None:
+def trace(
+    box: Box, velocity: wp.array, dt: float, traces: wp.array, bricks: Bricks = DENSE, slab: Slab | None = None
+) -> None:
     """Computes the ways of smoke from and to the centres of coarse cells, by the midpoint rule.
 
     Args:
@@ -330,10 +355,11 @@ def trace(box: Box, velocity: wp.array, dt: float, traces: wp.array, slab: Slab 
         dt: Duration in lattice steps.
         traces: vec3 [N] or [2 N], written: the ways from the centres to their departure points, in fine cells; then
             those to the points where smoke goes from the centres in the same time.
+        bricks: The bricks that the step computes; elsewhere `traces` stay as they are. Default all cells.
         slab: The coarse cells to compute; default all.
     """
     slab = slab or Slab(traces.device, 0, box.coarse[0])
-    launch_slab(_trace, box.coarse, slab, [box, velocity, float(dt)], [traces])
+    launch_slab(_trace, box.coarse, slab, [box, velocity, float(dt), bricks], [traces])
 
 
 @wp.kernel
