@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ import wlm
 from benchmarks.lightmap_exact import bound64, colour_tile64, decode_tile64
 from benchmarks.rivals.lightmap import encode_set
 from wlm.errors import WlmError
-from wlm.formats.bc7 import pack_mode6
 from wlm.lightmap.data import from_arrays
 from wlm.lightmap.decode import SheetDecoder
 from wlm.lightmap.encodings.frames import choose_frames, round_half
@@ -68,32 +66,6 @@ def test_the_decoder_agrees(settings, device):
                 runtime.bounds, [bound64(model, number, time) for number in runtime.numbers], rtol=1e-6
             )
             assert np.abs(codes[..., :3] - 255.0 * shares_of(model, runtime.numbers, time)).max() < most
-
-
-def test_a_network_that_passes_its_features_through():
-    """One texel by hand: the first layer reads F_uv's red alone, far on GELU's linear side, and the rest copies it."""
-    model = random_sheet(kinds=(2, 0), seed=3)
-    net = np.zeros_like(model.net_static)
-    hidden, width = net[0], model.profile.hidden
-    hidden[0 * width] = 1.0  # input 0 to unit 0
-    hidden[4 * width] = 64.0  # its bias, from where on GELU is the identity
-    hidden[5 * width] = 1.0  # unit 0 to unit 0 of the second layer
-    hidden[-3 * (width + 1)] = 1.0  # and to red
-    hidden[-3] = -64.0  # the bias taken off again
-    affine = np.zeros_like(model.affine)
-    affine[0, :, 0] = 2.0, 1.0
-    scale = np.full_like(model.scale_static, 8.0)
-    model = replace(model, net_static=net, affine=affine, scale_static=scale)
-    red = np.array([[64, 192]], np.float64) / 255.0
-    endpoints = np.zeros((1, 32, 32, 2, 4), np.uint8)
-    endpoints[..., 0, 0], endpoints[..., 1, 0] = 64, 192
-    indices = np.zeros((1, 32, 32, 16), np.uint8)
-    indices[..., 1::2] = 15
-    model = replace(model, uv=pack_mode6(endpoints, indices))
-    expected = 8.0 * (2.0 + (red - 0.5) * math.sqrt(12.0))
-    colour = colour_tile64(model, 0, 5.0)
-    np.testing.assert_allclose(colour[:, :, 0], np.tile(expected, (128, 64)), rtol=1e-12)
-    assert not colour[..., 1:].any()
 
 
 def test_what_is_not_there():

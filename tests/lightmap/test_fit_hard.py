@@ -44,16 +44,6 @@ def test_an_all_zero_set_is_constant_and_exact(tmp_path):
     assert (tmp_path / "a.wlm").stat().st_size < 1024
 
 
-def test_a_constant_tile_is_within_half_a_step_of_half_float(tmp_path):
-    levels = np.array([[0.1, 2.0, 300.0], [1e-4, 0.0, 1.0], [7.0, 7.0, 7.0]])
-    frames = np.broadcast_to(levels[:, None, None], (3, 128, 128, 3))
-    decoder = through_file(tmp_path, from_arrays(frames, (0.0, 1.0, 2.0)))
-    assert only(decoder, "constant")
-    np.testing.assert_allclose(decoded(decoder), frames, rtol=2**-10)
-    # Between two times a constant tile is interpolated as light is.
-    np.testing.assert_allclose(decoder.frame(0.25)[5, 5], 0.75 * levels[0] + 0.25 * levels[1], rtol=2**-10)
-
-
 @pytest.mark.parametrize("level", [1e-40, 1e-7, 6.26e-7])
 def test_a_constant_below_what_half_floats_hold_is_kept(tmp_path, level):
     """Beside one that they hold, in as many bytes as before where all are such."""

@@ -1,5 +1,9 @@
 """Options that several commands share, each defined once."""
 
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -90,3 +94,24 @@ Colours = Annotated[
 def output_option(metavar: str, help_text: str) -> Any:
     """Returns the typer option `--output` (`-o`) for the annotation of a path."""
     return typer.Option("--output", "-o", metavar=metavar, help=help_text)
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Gives a command an option for each field of a dataclass, the type of the command's parameter `options`."""
+    signature = inspect.signature(command)
+    kind = signature.parameters["options"].annotation
+    names = [field.name for field in fields(kind)]
+
+    @functools.wraps(command)
+    def run(**values: Any) -> None:
+        command(options=kind(**{name: values.pop(name) for name in names}), **values)
+
+    own = [parameter for name, parameter in signature.parameters.items() if name != "options"]
+    shared = [
+        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
+        for field in fields(kind)
+    ]
+    # typer reads both.
+    run.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *shared)}
+    return run

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from wlm.cli import console, smoke_book, smoke_network
-from wlm.cli.options import CheckpointEvery, Device, Resume, Seed, output_option
+from wlm.cli.options import CheckpointEvery, Device, Resume, Seed, output_option, with_options
 from wlm.cli.smoke_network import evaluate, info
 from wlm.cli.smoke_options import (
     SHEET,
@@ -23,7 +23,6 @@ from wlm.cli.smoke_options import (
     outputs,
     parse_lights,
     vector,
-    with_smoke,
     write_lightmaps,
 )
 from wlm.errors import WlmError
@@ -138,7 +137,7 @@ def _note_no_smoke(scene: "Scene") -> None:
 
 
 @app.command()
-@with_smoke
+@with_options
 @console.exclusive
 def bake(
     smoke: Input,
@@ -183,7 +182,7 @@ def bake(
 
 
 @app.command()
-@with_smoke
+@with_options
 @console.exclusive
 def predict(
     smoke: Input,
@@ -226,7 +225,7 @@ def predict(
 
 
 @app.command()
-@with_smoke
+@with_options
 @console.exclusive
 def light(
     smoke: Input,

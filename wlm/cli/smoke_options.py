@@ -1,9 +1,7 @@
 """Options, output files and tables that the commands of `wlm smoke` have in common."""
 
-import functools
-import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -45,7 +43,7 @@ Input = Annotated[
 
 @dataclass(frozen=True)
 class SmokeOptions:
-    """Options of a volume, its camera and the device, for the commands marked by `with_smoke`."""
+    """Options of a volume, its camera and the device, for `wlm.cli.options.with_options`."""
 
     resolution: Annotated[
         int | None, typer.Option(min=1, max=16384, help="Height of the image in pixels; default the scene's, or 512.")
@@ -105,26 +103,6 @@ class SmokeOptions:
         if orthographic and settings.perspective:
             raise WlmError(f"{frames.path}: camera.perspective: expected false for six-way lightmaps, found true")
         return settings
-
-
-def with_smoke(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command the options of `SmokeOptions`, which it receives as its parameter `options`."""
-    signature = inspect.signature(command)
-    names = [field.name for field in fields(SmokeOptions)]
-
-    @functools.wraps(command)
-    def run(**values: Any) -> None:
-        command(options=SmokeOptions(**{name: values.pop(name) for name in names}), **values)
-
-    own = [parameter for name, parameter in signature.parameters.items() if name != "options"]
-    shared = [
-        inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
-        for field in fields(SmokeOptions)
-    ]
-    # typer reads both.
-    run.__signature__ = signature.replace(parameters=[*own, *shared])  # type: ignore[attr-defined]
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *shared)}
-    return run
 
 
 def _pairs(option: str, texts: Sequence[str] | None, names: Sequence[str]) -> dict[str, Any]:

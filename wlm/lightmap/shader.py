@@ -45,34 +45,6 @@ _UNITS = {
 }
 """Lines of the network for each four units of the second layer."""
 
-_SUMS = """\
-        if (dynamic) {
-            a = wlm_lightmap_add(a, uvt, start + 4 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
-            a = wlm_lightmap_add(a, planes, start + 8 * WLM_LIGHTMAP_FOURS + i, WLM_LIGHTMAP_FOURS);
-        }
-"""
-
-_UNMAPPED = """
-// Colour of a tile of frames, or of one colour.
-vec3 wlm_lightmap_unmapped(vec4 tile, int record, ivec2 inner)
-{{
-{frames}    return wlm_lightmap_entry(record + 1).xyz;
-}}
-"""
-
-_MAPPED_KIND = """\
-    if (int(tile.x) == 1 || int(tile.x) == 2)
-        return wlm_lightmap_mapped(tile, record, inner);
-"""
-
-_LAST = """
-vec3 wlm_{kind}(ivec2 texel)
-{{
-    vec3 colour = wlm_colour(texel);  // glslang's HLSL takes no call with textures as an argument here
-    return wlm_lightmap_linear(colour);
-}}
-"""
-
 
 def record_fours(model: SheetModel) -> int:
     """Returns the number of groups of four floats in a tile's record, see `wlm.lightmap.bundle.hour_tables`."""
@@ -150,7 +122,8 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
     least, span = (0.0, 1.0) if values is None else (values[0], values[1] - values[0])
     linear = filled(__package__, f"linear_{kind}.glsl", least=repr(least), span=repr(span), **words)
     has_frames = "frames" in names
-    unmapped = _UNMAPPED.format(frames=filled(__package__, "frames_kind.glsl", **words) if has_frames else "")
+    frames = filled(__package__, "frames_kind.glsl", **words) if has_frames else ""
+    unmapped = filled(__package__, "unmapped.glsl", frames=frames)
     unmapped = (filled(__package__, "frames.glsl", **words) if has_frames else "") + unmapped
     maps = filled(__package__, "maps.glsl", **words) if "uvt" in names else ""
     if pairs:
@@ -169,15 +142,15 @@ def decode_glsl(model: SheetModel, values: tuple[float, float] | None = None, *,
     text, kinds = _head(names, words | {"use": _DRAWN.format(last=f"wlm_{kind}")}) + maps, ""
     if "networks" in names:
         units = {name: "".join(line.format(j=j, at=4 * j) for j in range(wide)) for name, line in _UNITS.items()}
-        inputs, sums = (filled(__package__, "inputs.glsl", **words), _SUMS) if maps else ("", "")
+        inputs, sums = (filled(__package__, f"{name}.glsl", **words) if maps else "" for name in ("inputs", "sums"))
         text += filled(__package__, "network.glsl", gelu=gelu, inputs=inputs, sums=sums, **units, **words)
-        kinds = _MAPPED_KIND
+        kinds = filled(__package__, "mapped_kind.glsl")
     text += (
         unmapped
         + filled(__package__, "colour.glsl", kinds=kinds, **words)
         + filled(__package__, "source.glsl", **words)
     )
-    return text + linear + _LAST.format(kind=kind)
+    return text + linear + filled(__package__, "last.glsl", kind=kind)
 
 
 def _pair_lines(wide: int, inputs: list[str], third: int) -> dict[str, str]:
