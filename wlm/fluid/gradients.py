@@ -26,14 +26,8 @@ from wlm.fluid.solver import Solver, ways_of
 from wlm.interop import to_warp
 from wlm.ops.tapes import takes_arrays
 from wlm.ops.tensors import check, check_finite, dense, on_stream
-from wlm_kernels.fluid import (
-    advection,
-    advection_adjoint,
-    advection_places,
-    advection_sources,
-    lattice_adjoint,
-    lattice_links,
-)
+from wlm_kernels.fluid import advection, advection_adjoint, advection_sources, lattice_adjoint, lattice_links
+from wlm_kernels.fluid.advection_places import trace
 from wlm_kernels.fluid.lattice import QUIET, step_kernel
 from wlm_kernels.fluid.lattice_links import OUTLET, WIND
 from wlm_kernels.fluid.lattice_sets import Slab
@@ -376,7 +370,7 @@ class DifferentiableSolver:
         """Returns smoke after a step without sources, and the prediction of a MacCormack step."""
         setup, predicted, last = self._setup, None, tuple(torch.empty_like(part) for part in smoke)
         traces = self._traces()
-        advection_places.trace(setup.box, u, setup.substeps, traces)
+        trace(setup.box, u, setup.substeps, traces)
         where = [setup.box, traces, setup.walls, _fields(smoke)]
         if setup.scheme == "maccormack":
             predicted = tuple(torch.empty_like(part) for part in smoke)
@@ -391,7 +385,7 @@ class DifferentiableSolver:
         """Returns the gradients to the smoke before a step; that to the velocity is added to `on_u`."""
         setup, on_smoke = self._setup, tuple(torch.zeros_like(part) for part in smoke)
         traces, on_traces = self._traces(), self._traces(zero=True)
-        advection_places.trace(setup.box, u, setup.substeps, traces)
+        trace(setup.box, u, setup.substeps, traces)
         where = [setup.box, traces, setup.walls, _fields(smoke)]
         into, decay = [_fields(on_smoke), on_traces], setup.decay
         on_last = _fields(on_out)

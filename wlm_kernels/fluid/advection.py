@@ -139,17 +139,8 @@ class Fields:
 
 @wp.func
 def run_of_brick(box: Box, brick: int, i: int) -> wp.vec3i:
-    """Returns the first cell of run i of a brick."""
+    """Returns the first of the cells along x in run i of a brick."""
     return BRICK * cell_of(box.bricks, brick) + wp.vec3i(0, i // BRICK, i % BRICK)
-
-
-@wp.func
-def run_of_tile(box: Box, begin: int, i: int) -> wp.vec3i:
-    """Returns the first cell of run i of the cells from `begin` along x on; it may be outside the domain."""
-    tiles = wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE)
-    tile = cell_of(tiles, i // (_TILE * _TILE))
-    thread = i % (_TILE * _TILE)
-    return wp.vec3i(begin + tile[0] * _RUN, tile[1] * _TILE + thread // _TILE, tile[2] * _TILE + thread % _TILE)
 
 
 @functools.cache
@@ -392,6 +383,14 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return (2 * i + 1 + box.refinement) // (2 * box.refinement) - 1
 
     @wp.func
+    def run_of_tile(box: Box, begin: int, i: int) -> wp.vec3i:
+        tile = cell_of(
+            wp.vec3i(1, (box.n[1] + _TILE - 1) // _TILE, (box.n[2] + _TILE - 1) // _TILE), i // (_TILE * _TILE)
+        )
+        thread = i % (_TILE * _TILE)
+        return wp.vec3i(begin + tile[0] * _RUN, tile[1] * _TILE + thread // _TILE, tile[2] * _TILE + thread % _TILE)
+
+    @wp.func
     def carry_run(
         box: Box,
         first: wp.vec3i,
@@ -548,11 +547,11 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
 
 @functools.cache
 def mark_kernel(stored: type) -> wp.Kernel:
-    """Builds (once) a kernel that marks bricks in which smoke of the type `stored` is not 0; a thread reads a run."""
+    """Builds (once) a kernel that marks bricks in which smoke of the type `stored` is not 0; a thread reads 8 cells."""
     fields_type = fields_struct(stored)
 
-    @wp.func_native("return (float)field.data[i] != 0.0f;")
-    def is_some(field: wp.array1d[stored], i: int) -> bool: ...
+    @wp.func_native("return fabsf((float)field.data[i]);")
+    def size_at(field: wp.array1d[stored], i: int) -> float: ...
 
     @wp.kernel(module="unique", module_options={"enable_backward": False})
     def mark(
@@ -560,44 +559,33 @@ def mark_kernel(stored: type) -> wp.Kernel:
         box: Box,
         fields: fields_type,
         begin: int,
-        end: int,
         # out:
         bricks: Bricks,
     ):
-        first = run_of_tile(box, begin, wp.tid())
-        if first[1] >= box.n[1] or first[2] >= box.n[2]:
-            return
-        some = bool(False)
-        for k in range(_RUN):
-            x = first[0] + k
-            if x < end:
-                i = index_of(box.n, wp.vec3i(x, first[1], first[2]))
-                some = some or is_some(fields.density, i)
+        b = begin + wp.tid() // _BRICK_RUNS
+        first = run_of_brick(box, b, wp.tid() % _BRICK_RUNS)
+        if first[1] < box.n[1] and first[2] < box.n[2]:
+            total = float(0.0)
+            for k in range(BRICK):
+                # Beyond the domain, its last cell is read again.
+                i = index_of(box.n, wp.vec3i(wp.min(first[0] + k, box.n[0] - 1), first[1], first[2]))
+                total += size_at(fields.density, i)
                 if fields.temperature.shape[0] > 0:
-                    some = some or is_some(fields.temperature, i)
-                if some and (x % BRICK == BRICK - 1 or k == _RUN - 1 or x == end - 1):
-                    bricks.busy[index_of(box.bricks, wp.vec3i(x // BRICK, first[1] // BRICK, first[2] // BRICK))] = 1
-                if x % BRICK == BRICK - 1:
-                    some = False
+                    total += size_at(fields.temperature, i)
+            # Also true for NaN.
+            if not (total == 0.0):
+                bricks.busy[b] = 1
 
     return mark
 
 
-def _run_threads(box: Box, slab: Slab) -> int:
-    cells = (slab.end - slab.begin) * box.refinement
-    return -(-cells // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE) * _TILE * _TILE
-
-
 def mark_smoke(box: Box, fields: Fields, bricks: Bricks, slab: Slab | None = None) -> None:
-    """Marks as busy the bricks of smoke without a pool in which a density or temperature is not 0, so that `advect`
-    computes the others no more, after `advection_places.choose`.
-
-    `slab` are the coarse cells in which smoke is looked for; default all.
-    """
-    slab = slab or Slab(fields.density.device, 0, box.coarse[0])
-    inputs = [box, fields.arrays, slab.begin * box.refinement, slab.end * box.refinement]
-    kernel = mark_kernel(fields.density.dtype)
-    wp.launch(kernel, _run_threads(box, slab), inputs=inputs, outputs=[bricks], device=slab.device)
+    """Marks as busy the bricks of smoke without a pool in which a density or temperature is not 0, for
+    `advection_places.choose`. `slab` are the coarse cells in which smoke is looked for; default all."""
+    slab, plane = slab or Slab(fields.density.device, 0, box.coarse[0]), box.bricks[1] * box.bricks[2]
+    begin, end = slab.begin * box.refinement // BRICK, -(-slab.end * box.refinement // BRICK)
+    kernel, threads = mark_kernel(fields.density.dtype), (end - begin) * plane * int(_BRICK_RUNS)
+    wp.launch(kernel, threads, inputs=[box, fields.arrays, begin * plane], outputs=[bricks], device=slab.device)
 
 
 def advect(
@@ -630,7 +618,8 @@ def advect(
     begin, end = slab.begin * box.refinement, slab.end * box.refinement
     stored, solids, hot = fields.density.dtype, walls.shape[0] > 0, fields.temperature.shape[0] > 0
     kernel = carry_kernel(predicted is not None, stored, bricks.workers > 0, solids, hot)
-    threads = bricks.workers * int(_BRICK_RUNS) or _run_threads(box, slab)
+    tiles = -(-(end - begin) // _RUN) * -(-box.n[1] // _TILE) * -(-box.n[2] // _TILE)
+    threads = bricks.workers * int(_BRICK_RUNS) or tiles * _TILE * _TILE
     # A semi-Lagrangian step does not read the prediction.
     smoke = [fields.arrays, (predicted or fields).arrays]
     inputs = [box, traces, walls, *smoke, wp.vec2(*decay), begin, end, bricks]

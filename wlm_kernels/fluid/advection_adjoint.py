@@ -179,15 +179,11 @@ def _read_backward(
 
 @wp.func
 def _interpolate(field: wp.array1d[float], at: Stencil) -> float:
-    i00 = at.base
-    i01 = at.base + at.step[1]
-    i10 = at.base + at.step[0]
-    i11 = i10 + at.step[1]
-    a = wp.lerp(field[i00], field[i00 + at.step[2]], at.f[2])
-    b = wp.lerp(field[i01], field[i01 + at.step[2]], at.f[2])
-    c = wp.lerp(field[i10], field[i10 + at.step[2]], at.f[2])
-    d = wp.lerp(field[i11], field[i11 + at.step[2]], at.f[2])
-    return wp.lerp(wp.lerp(a, b, at.f[1]), wp.lerp(c, d, at.f[1]), at.f[0])
+    total = float(0.0)
+    for k in range(8):
+        i, weight = corner(at, k)
+        total += weight * field[i]
+    return total
 
 
 @wp.func
