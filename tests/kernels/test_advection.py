@@ -100,7 +100,7 @@ class Grid:
 
     def run(self, fields: Fields, dt: float, steps: int = 1, decay=(1.0, 1.0)) -> Fields:
         spare = [Fields(wp.zeros_like(fields.density), wp.zeros_like(fields.temperature)) for _ in range(2)]
-        traces = wp.zeros(2 * self.u.size, dtype=wp.vec3, device=self.device)
+        traces = wp.full(2 * self.u.size, np.nan, dtype=wp.vec3, device=self.device)
         at = [self.box, traces, self.walls]
         for _ in range(steps):
             if self.bricks.workers > 0:

@@ -334,13 +334,15 @@ def _trace(
     traces: wp.array1d[wp.vec3],
 ):
     i = first + wp.tid()
-    if not _is_used(box, bricks, cell_of(box.coarse, i)):
-        return
-    duration = float(dt)
+    # Where no smoke is, any way is right that does not lead to some.
+    duration = wp.where(_is_used(box, bricks, cell_of(box.coarse, i)), dt, 0.0)
     for at in range(i, traces.shape[0], u.shape[0]):
-        middle = into_domain(box, midpoint(box, u, i, duration))
-        around = stencil(box.coarse, box.periodic, box.voxel * middle)
-        traces[at] = -duration * float(box.refinement) * interpolate_vectors(u, around)
+        way = wp.vec3()
+        if duration != 0.0:
+            middle = into_domain(box, midpoint(box, u, i, duration))
+            around = stencil(box.coarse, box.periodic, box.voxel * middle)
+            way = -duration * float(box.refinement) * interpolate_vectors(u, around)
+        traces[at] = way
         duration = -duration
 
 
@@ -355,7 +357,7 @@ def trace(
         dt: Duration in lattice steps.
         traces: vec3 [N] or [2 N], written: the ways from the centres to their departure points, in fine cells; then
             those to the points where smoke goes from the centres in the same time.
-        bricks: The bricks that the step computes; elsewhere `traces` stay as they are. Default all cells.
+        bricks: The bricks that the step computes; elsewhere the ways are 0. Default all cells.
         slab: The coarse cells to compute; default all.
     """
     slab = slab or Slab(traces.device, 0, box.coarse[0])
