@@ -368,14 +368,19 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         return corners_of(box, bricks, x, y, z, wp.vec3i(1, 1, 1), f), inside
 
     @wp.func
-    def trace_beside(traces: wp.array1d[wp.vec3], at: Stencil) -> wp.vec3:
-        """Returns the trace between the four lower of eight coarse cells along x, at the fractions along y and z."""
-        row = at.base + at.step[1]
-        a = vector_at(traces, at.base)
-        a += at.f[2] * (vector_at(traces, at.base + at.step[2]) - a)
-        b = vector_at(traces, row)
-        b += at.f[2] * (vector_at(traces, row + at.step[2]) - b)
-        return a + at.f[1] * (b - a)
+    def line_along_x(traces: wp.array1d[wp.vec3], at: Stencil):
+        """Returns the trace at the fractions 0, y and z between eight coarse cells, and its slope along x."""
+        near = wp.vec3()
+        far = wp.vec3()
+        for k in range(2):
+            i = at.base + k * at.step[0]
+            a = vector_at(traces, i)
+            a += at.f[2] * (vector_at(traces, i + at.step[2]) - a)
+            b = vector_at(traces, i + at.step[1])
+            b += at.f[2] * (vector_at(traces, i + at.step[1] + at.step[2]) - b)
+            near = wp.vec3(far)
+            far = a + at.f[1] * (b - a)
+        return near, far - near
 
     @wp.func
     def patch_of(box: Box, i: int) -> int:
@@ -418,29 +423,16 @@ def carry_kernel(correcting: bool, stored: type, in_bricks: bool, solids: bool, 
         low_z, along_z = pair(patch_z, box.coarse[2], box.periodic[2])
         fy = box.voxel * (float(first[1]) + 0.5) - 0.5 - float(patch_y)
         fz = box.voxel * (float(first[2]) + 0.5) - 0.5 - float(patch_z)
-        # Traces on both sides of the cells along x; the upper side is the lower one of the next cells.
         corners = Stencil()
         corners.f = wp.vec3(0.0, fy, fz)
-        corners.step = wp.vec3i(0, along_y * box.coarse[2], along_z)
-        cells = box.coarse[0] * box.coarse[1] * box.coarse[2]
-        low_x, along_x = pair(patch, box.coarse[0], box.periodic[0])
-        corners.base = (low_x * box.coarse[1] + low_y) * box.coarse[2] + low_z
-        far = trace_beside(traces, corners)
-        far_ahead = wp.vec3()
-        if wp.static(correcting):
-            corners.base += cells
-            far_ahead = trace_beside(traces, corners)
         while x < end:
             low_x, along_x = pair(patch, box.coarse[0], box.periodic[0])
-            corners.base = ((low_x + along_x) * box.coarse[1] + low_y) * box.coarse[2] + low_z
-            near = wp.vec3(far)
-            far = trace_beside(traces, corners)
-            slope = far - near
-            near_ahead = wp.vec3(far_ahead)
+            corners.base = (low_x * box.coarse[1] + low_y) * box.coarse[2] + low_z
+            corners.step = wp.vec3i(along_x * box.coarse[1] * box.coarse[2], along_y * box.coarse[2], along_z)
+            near, slope = line_along_x(traces, corners)
             if wp.static(correcting):
-                corners.base += cells
-                far_ahead = trace_beside(traces, corners)
-            slope_ahead = far_ahead - near_ahead
+                corners.base += box.coarse[0] * box.coarse[1] * box.coarse[2]
+                near_ahead, slope_ahead = line_along_x(traces, corners)
             centre = float(patch) + 0.5
             stop = wp.min(end, (2 * patch + 3) * box.refinement // 2)
             for k in range(x, stop):
