@@ -65,11 +65,12 @@ class Bricks:
 
     Attributes:
         rings: Distance in bricks by which smoke may move beyond a busy brick in a step.
-        workers: Groups of threads that share the listed bricks; 0: there are no bricks, all cells are stored.
+        workers: Groups of threads that share the listed bricks; 0: there is no pool, all cells are stored.
         threshold: Largest value of a brick that counts as empty.
         busy: int [B], 1 where a value above the threshold has been written since the last `store`, else 0; between
             `relist` and `store` plus 2 in bricks that are listed.
-        places: int [B], the place of each listed brick in the pool; 0 for all others.
+        places: int [B], the place of each listed brick in the pool, or 1 in each chosen brick without a pool; 0 for all
+            others; [0]: all cells are computed.
         listed: int [B], its first `counts[0]` elements are the indices of the listed bricks, in any order.
         fresh: int [B], its first `counts[1]` elements are the listed bricks that have no place yet.
         counts: int [2].
