@@ -6,12 +6,12 @@ first: `guide` is algorithm 1 of neural-six-way-lightmaps in 20 lines, and `lit`
 `tests/smoke/test_motion.py` computes `motion` pixel by pixel.
 """
 
-from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import warp as wp
 
-from wlm_kernels.smoke.depth_lattice import Lattice, add_up, axis, depths_at, make_lattice, spacing_of
+from wlm_kernels.smoke.depth_lattice import Lattice, add_up, axis, depths_at, make_lattice, reach, spacing_of
 from wlm_kernels.smoke.march import (
     BRICK,
     OPTIONS,
@@ -25,8 +25,6 @@ from wlm_kernels.smoke.march import (
     emitted,
     for_smoke,
     look,
-    node_position,
-    nodes_along,
     optical_depth,
     parameters,
     pass_step,
@@ -55,23 +53,6 @@ def _both_depths(smoke: Any, p: wp.vec3, up: wp.vec3, step: float) -> wp.vec2:
 
 
 @for_smoke
-def _guide_nodes(smoke_type: Any) -> wp.Kernel:
-    @wp.kernel(module="unique", module_options=OPTIONS)
-    def kernel(
-        # in:
-        smoke: smoke_type,
-        up: wp.vec3,
-        step: float,
-        # out:
-        nodes: wp.array3d[wp.vec2],
-    ):
-        a, b, c = wp.tid()
-        nodes[a, b, c] = _both_depths(smoke, node_position(nodes, size_of(smoke.density), a, b, c), up, step)
-
-    return kernel
-
-
-@for_smoke
 def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
     @wp.kernel(module="unique", module_options=OPTIONS)
     def kernel(
@@ -79,6 +60,7 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
         smoke: smoke_type,
         nodes: wp.array3d[wp.vec2],
         view: View,
+        lattice: Lattice,
         march: MarchParameters,
         # out:
         out: wp.array3d[float],
@@ -86,7 +68,6 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
         row, column = wp.tid()
         random = wp.rand_init(march.seed, row * view.width + column)
         r = begin(view, row, column, smoke, march.step, 0.5 + march.jitter * (wp.randf(random) - 0.5))
-        size = size_of(smoke.density)
         light = float(0.0)
         depth = float(0.0)
         rise = wp.dot(view.up, r.direction)
@@ -99,9 +80,7 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
                 depth = surface(depth, r, view, march.threshold)
                 tau = wp.vec2()
                 if wp.static(from_lattice):
-                    last = wp.vec3(float(nodes.shape[0] - 1), float(nodes.shape[1] - 1), float(nodes.shape[2] - 1))
-                    one = wp.vec3(1.0, 1.0, 1.0)
-                    tau = between_nodes(nodes, wp.cw_div(wp.cw_mul(r.place + 0.5 * one, last), size + one))
+                    tau = depths_at(nodes, lattice, r.place)
                 else:
                     tau = _both_depths(smoke, r.place, view.up, march.step)
                 # The light from the front comes along the ray, through the smoke that the ray has passed.
@@ -113,18 +92,6 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
         out[2, row, column] = depth
 
     return kernel
-
-
-def guide_nodes(medium: Medium, up: Sequence[float], step: float) -> wp.array:
-    """Computes optical depths towards the top, a direction of length 1, and the bottom at the nodes of a lattice over
-    the grid's box: vec2 [A, B, C], see `march.node_position`.
-
-    `step` is the largest distance between nodes (at least a voxel is used) and longest step of a march from a node, in
-    voxels.
-    """
-    nodes = medium.buffer(nodes_along(medium.density.shape, step), wp.vec2)
-    _guide_nodes(medium, nodes.shape, [wp.vec3(*map(float, up)), step], [nodes])
-    return nodes
 
 
 def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bool = True) -> None:
@@ -143,11 +110,15 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
         out: float [3, H, W], written: sum of the light scattered under the three lights, each of irradiance 4 pi;
             transparency; distance from the camera, in the unit of `View.voxel`, to the first sample denser than the
             threshold, 0 if there is none.
-        shared: Whether the optical depths to the top and the bottom are interpolated from `guide_nodes`; otherwise each
-            sample marches to the lights itself, which is slower and more exact.
+        shared: Whether the optical depths to the top and the bottom are interpolated between the nodes of a lattice,
+            at least a voxel apart; otherwise each sample marches to the lights itself, which is slower and more exact.
     """
-    nodes = guide_nodes(medium, view.up, march.step) if shared else medium.buffer((0, 0, 0), wp.vec2)
-    _guide(medium, out.shape[1:], [nodes, view, parameters(march)], [out], shared)
+    lattice, nodes = Lattice(), medium.buffer((0, 0, 0), wp.vec2)
+    if shared:
+        lattice, nodes = reach(
+            medium, view.up, None, replace(march, spacing=max(march.step, 1.0), light_step=march.step)
+        )
+    _guide(medium, out.shape[1:], [nodes, view, lattice, parameters(march)], [out], shared)
 
 
 @wp.func

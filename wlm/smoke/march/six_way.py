@@ -155,4 +155,4 @@ def guide(volume: DensityVolume, camera: Camera, march: March = March(), *, shar
 def with_surface(six: SixWay, volume: DensityVolume, looks: Looks | None) -> SixWay:
     """Returns lightmaps with the depth of the smoke's surface if `looks` has obstacles, else without a depth."""
     obstacles = looks is not None and looks.obstacles
-    return replace(six, depth=guide(volume, six.camera, _SURFACE).depth if obstacles else None)
+    return replace(six, depth=run(marches.unlit, volume, six.camera, (3,), _SURFACE)[2] if obstacles else None)
