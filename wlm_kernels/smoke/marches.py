@@ -125,8 +125,8 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
 def _in_plane(nodes: wp.array4d[wp.vec2], i: int, j: int, k: int, fx: float, fy: float) -> wp.vec4:
     sides = wp.vec4()
     for pair in range(2):
-        a = wp.lerp(nodes[i, j, k, pair], nodes[i, j + 1, k, pair], fy)
-        b = wp.lerp(nodes[i + 1, j, k, pair], nodes[i + 1, j + 1, k, pair], fy)
+        a = wp.lerp(nodes[pair, i, j, k], nodes[pair, i, j + 1, k], fy)
+        b = wp.lerp(nodes[pair, i + 1, j, k], nodes[pair, i + 1, j + 1, k], fy)
         c = wp.lerp(a, b, fx)
         sides[2 * pair] = c[0]
         sides[2 * pair + 1] = c[1]
@@ -154,8 +154,8 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
         # All samples of the ray share its place in the lattice's first two axes.
         x = (wp.dot(r.origin - view.origin, view.right) - lattice.low[0]) / lattice.gap[0]
         y = (wp.dot(r.origin - view.origin, view.up) - lattice.low[1]) / lattice.gap[1]
-        i = wp.clamp(int(x), 0, nodes.shape[0] - 2)
-        j = wp.clamp(int(y), 0, nodes.shape[1] - 2)
+        i = wp.clamp(int(x), 0, nodes.shape[1] - 2)
+        j = wp.clamp(int(y), 0, nodes.shape[2] - 2)
         fx = wp.clamp(x - float(i), 0.0, 1.0)
         fy = wp.clamp(y - float(j), 0.0, 1.0)
         loaded = int(-1)  # the plane of nodes whose depths are in `near`
@@ -168,7 +168,7 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
             if r.x > 0.0:
                 depth = surface(depth, r, view, march.threshold)
                 z = (r.distance - lattice.low[2]) / lattice.gap[2]
-                k = wp.clamp(int(z), 0, nodes.shape[2] - 2)
+                k = wp.clamp(int(z), 0, nodes.shape[3] - 2)
                 if k != loaded:
                     near = _in_plane(nodes, i, j, k, fx, fy)
                     far = _in_plane(nodes, i, j, k + 1, fx, fy)
