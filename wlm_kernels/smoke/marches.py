@@ -24,11 +24,13 @@ from wlm_kernels.smoke.march import (
     between_nodes,
     emitted,
     for_smoke,
+    in_tiles,
     look,
     optical_depth,
     parameters,
     pass_step,
     phase,
+    pixel_of,
     require_orthographic,
     size_of,
     surface,
@@ -65,7 +67,12 @@ def _guide(smoke_type: Any, from_lattice: bool) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         random = wp.rand_init(march.seed, row * view.width + column)
         r = begin(view, row, column, smoke, march.step, 0.5 + march.jitter * (wp.randf(random) - 0.5))
         light = float(0.0)
@@ -118,7 +125,7 @@ def guide(medium: Medium, view: View, march: March, out: wp.array, *, shared: bo
         lattice, nodes = reach(
             medium, view.up, None, replace(march, spacing=max(march.step, 1.0), light_step=march.step)
         )
-    _guide(medium, out.shape[1:], [nodes, view, lattice, parameters(march)], [out], shared)
+    _guide(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], shared)
 
 
 @wp.func
@@ -146,7 +153,12 @@ def _coarse(smoke_type: Any, hot: bool) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         r = begin_jittered(view, row, column, smoke, march)
         sides = wp.vec4()
         glow = float(0.0)
@@ -215,7 +227,7 @@ def coarse_six_way(medium: Medium, view: View, march: March, out: wp.array) -> N
     lattice, counts = make_lattice(medium.density.shape, (view.right, view.up, view.forward), spacing, view.origin)
     nodes = add_up(medium, lattice, counts, 2, light_step)
     hot = medium.temperature is not None
-    _coarse(medium, out.shape[1:], [nodes, view, lattice, parameters(march)], [out], hot)
+    _coarse(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march)], [out], hot)
 
 
 @for_smoke
@@ -232,7 +244,12 @@ def _light(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         r = begin_jittered(view, row, column, smoke, march)
         light = wp.vec2()
         cosine = wp.dot(axis(lattice, 0), r.direction)
@@ -270,7 +287,12 @@ def _unlit(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         r = begin_jittered(view, row, column, smoke, march)
         glow = float(0.0)
         depth = float(0.0)
@@ -302,12 +324,12 @@ def light(
             irradiance 4 pi. For a point light [1, H, W]: its irradiance is 4 pi at a distance of one voxel.
     """
     lattice, nodes = depths
-    _light(medium, out.shape[1:], [nodes, view, lattice, parameters(march), shadow], [out])
+    _light(medium, in_tiles(*out.shape[1:]), [nodes, view, lattice, parameters(march), shadow], [out])
 
 
 def unlit(medium: Medium, view: View, march: March, out: wp.array) -> None:
     """Renders unlit smoke: writes the images `UNLIT_PLANES` to `out`, float [3, H, W]; arguments as for `light`."""
-    _unlit(medium, out.shape[1:], [view, parameters(march)], [out])
+    _unlit(medium, in_tiles(*out.shape[1:]), [view, parameters(march)], [out])
 
 
 @for_smoke
@@ -323,7 +345,12 @@ def _motion(smoke_type: Any) -> wp.Kernel:
         # out:
         out: wp.array3d[float],
     ):
-        row, column = wp.tid()
+        a, b, lane = wp.tid()
+        pixel = pixel_of(a, b, lane)
+        row = pixel[0]
+        column = pixel[1]
+        if row >= view.height or column >= view.width:
+            return
         r = begin(view, row, column, smoke, march.step, 0.5)
         size = size_of(smoke.density)
         cells = wp.vec3(float(velocity.shape[0]), float(velocity.shape[1]), float(velocity.shape[2]))
@@ -373,4 +400,4 @@ def motion(medium: Medium, view: View, velocity: wp.array, reach: float, march: 
         out: float [2, H, W], written: pixels to the right and down; 0 where there is no smoke.
     """
     require_orthographic(view, "motion vectors")
-    _motion(medium.in_bricks(), out.shape[1:], [velocity, reach, view, parameters(march)], [out])
+    _motion(medium.in_bricks(), in_tiles(*out.shape[1:]), [velocity, reach, view, parameters(march)], [out])
