@@ -1,4 +1,5 @@
-"""Makes an HTML page of each of the four systems from the files of the other demos, and a page that frames these four.
+"""Makes an HTML page of each of the four systems from the files of the other demos, a page that frames these four, and
+a viewer.
 
 The pages need no server: a double click on `gallery.html` opens them.
 """
@@ -8,7 +9,7 @@ import sys
 from pathlib import Path
 
 from wlm.errors import WlmError
-from wlm.export import write_page
+from wlm.export import write_page, write_viewer
 
 HERE = Path(__file__).resolve().parent
 DATA = HERE / "data"
@@ -39,8 +40,8 @@ iframe {{ width: 100%; height: 540px; border: 1px solid #3a3a42; }}
 
 
 def pages(out: Path) -> int:
-    """Writes a page of each system and one that frames them; returns their bytes."""
-    sections, size = [], 0
+    """Writes a page of each system, one that frames them, and a viewer of other files; returns their bytes."""
+    sections, size = [], write_viewer(out / "viewer.html")
     for name, (title, files, options) in PAGES.items():
         size += write_page(out / f"{name}.html", [out / file for file in files], **options)
         link = f'<a href="{name}.html">{title}</a>'

@@ -103,6 +103,8 @@ def test_pages_of_results_are_those_that_the_command_makes(monkeypatch):
         ["benchmarks/nvidia-h200.json", "benchmarks/nvidia-h100.json", "benchmarks/cpu.json"], "docs/results.md"
     ).items():
         assert (DOCS / name).read_text(encoding="utf-8") == page, name
+        rows = re.findall(r"^\| (?!---|method).*$", page, re.M)
+        assert len(rows) <= 60 and max(map(len, (row.split("|") for row in rows)), default=0) <= 12, name
 
 
 def test_every_picture_is_shown_and_small():
@@ -111,6 +113,21 @@ def test_every_picture_is_shown_and_small():
     pictures = {path.name: path.stat().st_size for path in (DOCS / "images").iterdir()}
     assert pictures.keys() == shown
     assert max(pictures.values()) <= 400_000
+
+
+def test_pages_are_short():
+    for document in DOCUMENTS:
+        most = 120 if document.parent.name == "tutorials" else 250
+        assert document.read_text(encoding="utf-8").count("\n") <= most, named(document)
+
+
+def test_links_lead_to_headings():
+    for document in DOCUMENTS:
+        for path, anchor in re.findall(r"\]\(([^)#:]*)#([^)]*)\)", document.read_text(encoding="utf-8")):
+            target = document.parent / path if path else document
+            headings = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.M)
+            slugs = [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings]
+            assert anchor in slugs, f"{named(document)}: {path}#{anchor}"
 
 
 def test_files_that_documents_link_are_there():

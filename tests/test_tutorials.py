@@ -1,7 +1,6 @@
-"""README and tutorials: their size and links, and all of their steps, run as printed in a temporary folder."""
+"""README and tutorials: all of their steps, run as printed in a temporary folder."""
 
 import json
-import re
 import shlex
 import shutil
 import subprocess
@@ -75,20 +74,6 @@ def test_all_steps(document, tmp_path, monkeypatch):
         take(*step)
 
 
-def test_readme_is_short_and_tutorials_too():
+def test_readme_is_short_and_every_step_is_found():
     assert len(README.read_bytes()) <= MOST_BYTES
-    assert len(list(steps(README))) >= 13 and len(TUTORIALS) == 5
-    for document in TUTORIALS:
-        assert document.read_text(encoding="utf-8").count("\n") <= 120, document.name
-
-
-@pytest.mark.parametrize("document", [*DOCUMENTS, ROOT / "docs" / "start.md"], ids=lambda path: path.stem)
-def test_links_lead_to_headings(document):
-    for target in re.findall(r"\]\((?!http)([^)\s]+)\)", document.read_text(encoding="utf-8")):
-        path, _, anchor = target.partition("#")
-        assert (document.parent / path).exists(), target
-        if anchor:
-            headings = re.findall(r"^#+ (.*)$", (document.parent / path).read_text(encoding="utf-8"), re.M)
-            assert anchor in [re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings], (
-                target
-            )
+    assert len(list(steps(README))) >= 14 and sum(len(list(steps(tutorial))) for tutorial in TUTORIALS) >= 45

@@ -14,7 +14,7 @@ the colours at all hours are the channels, so that what hours share is stored on
 
 The output levels are colours with a gamma, scaled by a tile's range over the day (`benchmarks.rivals.lightmap_levels`).
 Errors have weights half-way between equal ones and PSNR's, like ours, and texels just outside charts weigh a quarter.
-`docs/lightmap.md` compares these choices. The fit needs torch alone, and takes minutes on a GPU or hours on a CPU.
+The fit needs torch alone, and takes minutes on a GPU or hours on a CPU.
 """
 
 import itertools

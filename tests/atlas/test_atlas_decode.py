@@ -73,19 +73,6 @@ def test_against_float64(device: str, name: str):
     assert decoder.read(torch.empty((0, 2), device=device)).shape == (0, 3)
 
 
-def test_a_sampler_takes_the_meshs_own_uvs(device: str):
-    """A model with new UVs interpolates them by triangle and weights; one without reads at the mesh's."""
-    mesh = sheet()
-    for name, model in models(sheet).items():
-        drawn = points(mesh)
-        model_uv = drawn.uv
-        if len(model.uv):
-            model_uv = torch.tensor((model.uv[drawn.triangle.numpy()] * drawn.weight.numpy()[:, :, None]).sum(1))
-        decoder = Decoder(model, device)
-        light = decoder(points(mesh, device=device))
-        assert torch.allclose(light, decoder.read(model_uv.to(device)), atol=1e-4), name
-
-
 def test_new_uvs_show_the_same_light(device: str):
     """A lightmap turned by its UVs and by its texels alike is the lightmap."""
     mesh = sheet()
@@ -125,18 +112,3 @@ def test_another_mesh_is_refused():
         wlm.atlas.evaluate(model, sheet(quads=5))
     with pytest.raises(WlmError, match="device 'tpu'"):
         Decoder(model, "tpu")
-
-
-def test_reading_into_an_existing_array(device: str):
-    """As a CUDA graph replays it."""
-    import warp as wp
-
-    from wlm import interop
-
-    for model in models(sheet).values():
-        decoder = Decoder(model, device)
-        uv = points(sheet(), device=device).uv
-        out = torch.full((len(uv), 3), -1.0, device=device)
-        decoder.run(interop.to_warp(uv, wp.vec2), out)
-        wp.synchronize()
-        assert torch.equal(out, decoder.read(uv))

@@ -99,17 +99,6 @@ def test_pictures_smaller_than_the_window_of_ssim():
     assert _one(mesh, _reader(mesh, _offset(0.1)), resolution=12).one_minus_ssim > 0.0
 
 
-def test_decoders_do_not_mix():
-    mesh = lit_cube()
-    decoders = {"bad": _reader(mesh, _offset(0.3)), "exact": _reader(mesh), "good": _reader(mesh, _offset(0.001))}
-    reports = compare(mesh, decoders, views=FACES, resolution=64)
-    assert list(reports) == list(decoders)
-    for name, decoder in decoders.items():
-        alone = _one(mesh, decoder)
-        assert json.dumps(alone.to_json()) == json.dumps(reports[name].to_json())
-    assert compare(mesh, {}, views=FACES, resolution=16) == {}
-
-
 def test_charts():
     mesh = lit_cube(2)
     number = sheet_charts(mesh.sheets[0])
@@ -187,13 +176,6 @@ def test_views_that_see_nothing_are_left_out():
     numbers = [nothing.peak, nothing.psnr, nothing.psnr_worst, nothing.one_minus_ssim, nothing.rest_error]
     assert all(math.isnan(number) for number in numbers)
     assert json.dumps(nothing.to_json(), allow_nan=False)
-
-
-def test_views_that_are_exact_count_as_the_cap():
-    mesh = lit_cube(2)
-    report = _one(mesh, _reader(mesh, lambda c, uv, t: torch.where((t < 8)[:, None], c + 0.1, c)), views=FACES[:2])
-    assert report.psnr == pytest.approx((report.psnr_worst + metrics.PSNR_CAP_DB) / 2.0)
-    assert report.worst_view == 0 and 20.0 < report.psnr_worst < 40.0
 
 
 def test_a_light_of_one_colour_has_no_scale():

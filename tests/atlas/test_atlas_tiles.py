@@ -8,13 +8,9 @@ import pytest
 import torch
 
 from wlm.atlas.colour import BLOCK_CODECS, block_grid, decode, encode, quantise, stored
-from wlm.atlas.decode import Decoder
 from wlm.atlas.model import (
     FIRST_BLOCK_CODE,
     NO_BLOCKS,
-    AtlasModel,
-    Profile,
-    SheetPlace,
     first_block_code,
     pack_entries,
     tile_counts,
@@ -170,32 +166,6 @@ def test_solve_with_few_weights(nx: int, ny: int):
     low, high = light.min((1, 2)), light.max((1, 2))
     margin = high - low
     assert ((samples.min((1, 2, 3)) > low - margin) & (samples.max((1, 2, 3)) < high + margin)).all()
-
-
-def test_errors_are_those_of_the_decoder():
-    """The sum is the weighted mean squared error of what is read at the points from the file's own numbers."""
-    height, width, size = 22, 29, 7
-    image = _image(height, width)
-    tiles = grid.cut(image, _weight(height, width), size, "cpu")
-    rows, columns = tile_counts(height, width, size)
-    nx, ny = 4, 3
-    samples = grid.solve(tiles, nx, ny).clamp(min=0.0).half()
-    texels = np.zeros((rows * ny, columns * nx, 3), np.float16)
-    y, x = np.mgrid[:rows, :columns]
-    first = np.stack([x * nx, y * ny], -1)
-    for index, values in zip(tiles.index.tolist(), samples.numpy(), strict=True):
-        row, column = divmod(index, columns)
-        texels[row * ny : (row + 1) * ny, column * nx : (column + 1) * nx] = values
-    lut = pack_entries(first, np.broadcast_to([nx, ny], first.shape))
-    place = SheetPlace("a", height, width, 0, 0, rows, columns)
-    settings = ("a", "0", Profile(name="a", tile=size), "tiles", "half", ("0",), (place,))
-    model = AtlasModel(*settings, texels[None], lut=lut)
-    x, y = _places(tiles, rows, columns)
-    uv = np.stack([(x.ravel() + 0.5) / width, (y.ravel() + 0.5) / height], 1).astype(np.float32)
-    decoded = Decoder(model).read(torch.from_numpy(uv)).double().numpy().reshape(len(tiles.index), -1, 3)
-    light = tiles.light.double().numpy().transpose(0, 2, 1)
-    expected = (((decoded - light) ** 2).mean(2) * tiles.weight.double().numpy()).sum(1)
-    np.testing.assert_allclose(grid.errors(tiles, samples.float()).numpy(), expected, rtol=2e-3)
 
 
 def test_curves_and_solved():

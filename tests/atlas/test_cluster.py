@@ -225,15 +225,6 @@ def test_too_many_samples():
         cluster(uv, np.arange(900).reshape(-1, 3), np.zeros((4096, 4096, 3), np.float32))
 
 
-def test_ties_go_to_the_lowest_number(device: str):
-    """Two pairs, each of one colour: the pair with the lower triangle is taken first, by its lower triangle."""
-    lightmap = np.zeros((*SIDE, 3), np.float32)
-    lightmap[:, 32:] = 1.0
-    dark, light = ([[x, 10], [x + 4, 10], [x, 14]] for x in (8, 50))
-    clusters = cluster(_uv([light, dark, light, dark]), np.arange(12).reshape(-1, 3), lightmap, device=device)
-    assert clusters.representative.tolist() == [0, 1] and clusters.group.tolist() == [0, 1, 0, 1]
-
-
 @pytest.mark.slow
 def test_many_triangles_of_one_colour():
     """132,000 triangles, all alike, with patches of 65: within 8 GB."""

@@ -197,21 +197,6 @@ def test_regenerated_colours():
         np.testing.assert_allclose(rendered[row, column], np.array([px, py, px + 2 * py]) / 100, atol=1e-5)
 
 
-def test_the_mask_has_no_more_than_is_read():
-    """The outline grown by a texel, against distances."""
-    mesh = _mesh([[[3.3, 4.1], [25.2, 9.7], [11.9, 22.6]]])
-    packed = pack(mesh, None, 1.0)
-    _, mask = regenerate(mesh, packed)
-    weights = np.random.default_rng(5).dirichlet([1, 1, 1], 100000)
-    points = weights @ packed.corner[0]
-    low = np.floor(points - 0.5).astype(int)
-    read = np.zeros_like(mask)
-    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        read[low[:, 1] + dy, low[:, 0] + dx] = True
-    assert not (read & ~mask).any()
-    assert np.count_nonzero(mask & ~read) <= 0.03 * np.count_nonzero(read)
-
-
 def test_the_packer_is_missing(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "uvunwrap", None)
     mesh = _mesh(_quad(5, 5, 8, 6))

@@ -5,9 +5,8 @@ from dataclasses import replace
 from xml.etree import ElementTree
 
 import pytest
-from PIL import Image
 
-from benchmarks import Panel, Row, pareto_front, plot
+from benchmarks import Row, pareto_front, plot
 
 NAN = math.nan
 ROWS = [
@@ -68,13 +67,3 @@ def test_panels_name_the_rows_that_have_their_values(tmp_path, as_text):
     assert texts.count("half slow") == texts.count("not measured") == 1
     assert texts.count("Pareto front") >= 2
     assert [p.name for p in tmp_path.iterdir()] == ["p.svg"]
-
-
-def test_zero_cost_one_point_and_equal_points(tmp_path):
-    """No logarithm of zero, no empty range."""
-    for rows in ([ROWS[0].with_figures(bpp=0.0), ROWS[1]], ROWS[:1], [ROWS[0]] * 3):
-        errors = [row.with_figures(max_error=0.1 * i) for i, row in enumerate(rows)]
-        path = tmp_path / "p.png"
-        plot(errors, path, x=(Panel("bpp"), Panel("bpp", "max_error")))
-        with Image.open(path) as picture:
-            assert picture.height == 585

@@ -16,14 +16,12 @@ class Case:
         leaves: Tensors with a gradient, by argument.
         constants: Other tensors, by argument.
         options: Other arguments.
-        sizes: Of the step for differences, by leaf, where 1e-2 isn't right; 0: the gradient isn't the slope.
     """
 
     op: str
     leaves: dict[str, np.ndarray]
     constants: dict[str, np.ndarray] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
-    sizes: dict[str, float] = field(default_factory=dict)
 
     def tensors(self, device: str, dtype: torch.dtype = torch.float32) -> dict[str, torch.Tensor]:
         """All tensors, of one float type; the leaves require a gradient."""
@@ -93,26 +91,19 @@ def _smoke(density: np.ndarray, lights: int = 2, emitting: bool = True, distance
         leaves["colour"], constants["toward"] = uniform(0.2, 1.0, lights, 3), _units(lights, seed=8)
     if emitting:
         leaves["emission"] = uniform(0.0, 1.0, *density.shape, 3)
-    # Opaque smoke hardly answers to a small step, and thin smoke must stay above 0.
-    size = 0.5 if density.max() > 10.0 else min(1e-2, 0.6 * float(density.min()))
-    # A ray that moves gains or loses a step.
-    return Case("march", leaves, constants, options, {"density": size, "origin": 0.0, "direction": 0.0})
+    return Case("march", leaves, constants, options)
 
 
 _BLOCKS = {"endpoints": uniform(0.1, 0.9, 2, 3, 2, 4), "weights": uniform(0.1, 0.9, 8, 12)}
 _BEYOND = {"endpoints": uniform(-0.3, 1.3, 2, 3, 2, 4), "weights": uniform(-0.3, 1.3, 8, 12)}
-_STRAIGHT = {"endpoints": 0.0, "weights": 0.0, "uv": 1e-3}
 _THIN = uniform(0.05, 0.3, 6, 7, 8)
 _THIRDS = {"xy": normal(4, 5, 3), "xz": normal(6, 5, 3, seed=9), "yz": normal(6, 4, 3, seed=10)}
-_IN_CELLS = {"points": 5e-3}
 _SPACE = {"points": points_between(60, 60, 60, 60)}
 
 CASES = {
-    "bc7_map": Case("bc7_map", {**_BLOCKS, "uv": points_between(50, 12, 8)}, sizes={"uv": 5e-3}),
-    "bc7_map-beyond": Case("bc7_map", {**_BEYOND, "uv": points_between(50, 12, 8, outside=0.5)}, sizes=_STRAIGHT),
-    "bc7_map-quantised": Case(
-        "bc7_map", {**_BEYOND, "uv": points_between(50, 12, 8)}, options={"quantised": True}, sizes=_STRAIGHT
-    ),
+    "bc7_map": Case("bc7_map", {**_BLOCKS, "uv": points_between(50, 12, 8)}),
+    "bc7_map-beyond": Case("bc7_map", {**_BEYOND, "uv": points_between(50, 12, 8, outside=0.5)}),
+    "bc7_map-quantised": Case("bc7_map", {**_BEYOND, "uv": points_between(50, 12, 8)}, options={"quantised": True}),
     "bc7_map-layers": Case(
         "bc7_map",
         {
@@ -121,33 +112,26 @@ CASES = {
             "uv": points_between(50, 8, 4),
         },
         {"layer": _layers(50, 3)},
-        sizes={"uv": 5e-3},
     ),
     "bc7_texels": Case("bc7_texels", _BLOCKS),
-    "plane": Case(
-        "plane", {"values": normal(5, 7, 3), "points": points_between(60, 7, 5, outside=0.5)}, sizes=_IN_CELLS
-    ),
+    "plane": Case("plane", {"values": normal(5, 7, 3), "points": points_between(60, 7, 5, outside=0.5)}),
     "plane-periodic-layers": Case(
         "plane",
         {"values": normal(3, 5, 7, 2), "points": points_between(60, 7, 5, outside=1.5)},
         {"layer": _layers(60, 3).astype(np.int32)},
         {"periodic": True},
-        _IN_CELLS,
     ),
-    "plane-one-cell": Case("plane", {"values": normal(1, 1, 17), "points": points_between(9, 1, 1)}, sizes=_IN_CELLS),
-    "volume": Case(
-        "volume", {"values": normal(4, 5, 7, 3), "points": points_between(60, 7, 5, 4, outside=0.5)}, sizes=_IN_CELLS
-    ),
+    "plane-one-cell": Case("plane", {"values": normal(1, 1, 17), "points": points_between(9, 1, 1)}),
+    "volume": Case("volume", {"values": normal(4, 5, 7, 3), "points": points_between(60, 7, 5, 4, outside=0.5)}),
     "volume-periodic-layers": Case(
         "volume",
         {"values": normal(3, 4, 1, 6, 2), "points": points_between(60, 6, 1, 4, outside=1.5)},
         {"layer": _layers(60, 3)},
         {"periodic": True},
-        _IN_CELLS,
     ),
-    "triplane": Case("triplane", _THIRDS | _SPACE, sizes={"points": 1e-4}),
-    "triplane-product": Case("triplane", _THIRDS | _SPACE, {}, {"reduce": "product"}, {"points": 1e-4}),
-    "triplane-concatenate": Case("triplane", _THIRDS | _SPACE, {}, {"reduce": "concatenate"}, {"points": 1e-4}),
+    "triplane": Case("triplane", _THIRDS | _SPACE),
+    "triplane-product": Case("triplane", _THIRDS | _SPACE, {}, {"reduce": "product"}),
+    "triplane-concatenate": Case("triplane", _THIRDS | _SPACE, {}, {"reduce": "concatenate"}),
     **{f"mlp-{width}": Case("mlp", network_of(16, width, 3, 3)) for width in (8, 16, 17, 32, 64)},
     "mlp-tanh": Case("mlp", network_of(5, 16, 4, 2), options={"gelu": "tanh"}),
     "mlp-fast": Case("mlp", network_of(5, 17, 1), options={"gelu": "fast"}),
@@ -158,12 +142,10 @@ CASES = {
         "gaussian_sum",
         {"rows": gaussians(9, 17), "points": uniform(0.0, 1.0, 80, 3)},
         options={"support": "sphere"},
-        sizes={"rows": 0.0, "points": 0.0},  # what is reached changes at a step
     ),
     "gaussian_sum-lists": Case(
         "gaussian_sum",
         {"rows": gaussians(300, 1), "points": uniform(0.0, 1.0, 500, 3)},
-        sizes={"rows": 0.0, "points": 0.0},
     ),
     "march": _smoke(_THIN, step=0.8, g=0.4),
     "march-inside": _smoke(_THIN, distance=1.0, step=2.5, g=-0.6),

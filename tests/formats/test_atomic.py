@@ -7,7 +7,7 @@ import pytest
 from builders.checks import error_of
 
 from wlm.errors import WlmError
-from wlm.formats.atomic import atomic_path, atomic_write
+from wlm.formats.atomic import atomic_write
 
 
 @pytest.fixture
@@ -95,12 +95,3 @@ def test_the_longest_name_and_the_usual_mode(tmp_path):
     assert path.read_bytes() == b"x" and path.stat().st_mode & 0o777 == 0o640
     assert "name too long" in error_of(atomic_write, tmp_path / ("n" * 256), b"x")
     assert len(os.listdir(tmp_path)) == 1
-
-
-def test_a_path_for_others_to_write(target):
-    with atomic_path(target) as temporary:
-        assert temporary.parent == target.parent
-        temporary.write_bytes(b"after")
-        assert target.read_bytes() == b"before"
-    assert target.read_bytes() == b"after"
-    assert os.listdir(target.parent) == [target.name]

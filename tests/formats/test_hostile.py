@@ -538,8 +538,3 @@ def test_integers_of_json_fit_arrays(tmp_path, number):
     text = f'{{"lightmaps": [{{"time_hours": {number}, "file": "a.exr"}}]}}'
     for read in (lightmap.load, load_probes, read_gltf, read_runs):
         assert "expected integers within 64 bits" in refused(read, write(tmp_path / "set.json", text))
-
-
-@pytest.mark.parametrize("number", ["1" + ":59" * 300 + ".5", "1" + ":59" * 5000 + ".5", "1:2:x.5"])
-def test_yaml_numbers_of_base_60(tmp_path, number):
-    assert "a.yaml: " in refused(load_settings, Profile, write(tmp_path / "a.yaml", f"name: x\nrate: {number}\n"))

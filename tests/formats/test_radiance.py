@@ -54,14 +54,6 @@ def test_runs_are_read_as_another_reader_has_them(tmp_path, shape):
     assert (abs(pixels - light) <= light.max(-1, keepdims=True) / 128).all()
 
 
-def test_the_run_length_code_by_hand(tmp_path):
-    row = b"\x02\x02\x00\x09" + b"\x89\xc8" + b"\x02\x01\x02\x87\x03" + b"\x84\x04\x85\x05" + b"\x88\x80\x01\x81"
-    pixels = read_radiance(_file(tmp_path / "a.hdr", row + row, size="-Y 2 +X 9"))[0]
-    green, blue, exponent = [1, 2] + 7 * [3], 4 * [4] + 5 * [5], 8 * [128] + [129]
-    expected = _values(np.array([9 * [200], green, blue, exponent]).T)
-    np.testing.assert_array_equal(pixels, [expected, expected])
-
-
 def test_the_old_run_length_code_is_refused(tmp_path):
     a, b = _noise(1, 2)[0]
     data = bytes(a) + b"\1\1\1\3" + bytes(b)  # a, three times repeated, and b

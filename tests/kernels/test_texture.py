@@ -6,7 +6,7 @@ import warp as wp
 
 from benchmarks import plain
 from kernels.compare import array, close, exact
-from wlm_kernels.raster import texture
+from wlm_kernels.raster import mips, texture
 from wlm_kernels.raster.texture import BOUNDARIES, FILTERS
 
 SHAPES = [(7, 5, 3), (4, 8, 1), (1, 6, 2), (6, 1, 2), (1, 1, 4), (3, 3, 17)]  # H, W, C
@@ -21,12 +21,12 @@ class Reading:
 
     def forward(self) -> np.ndarray:
         out = wp.full((len(self.uv), self.image.shape[2]), 7.0, dtype=float, device=self.device)
-        texture.sample(self.image, self.uv, out, **self.mode)
+        mips.sample(self.image, self.uv, out, **self.mode)
         return out.numpy()
 
     def backward(self, toward: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         grads = wp.zeros_like(self.image), wp.full(len(self.uv), 7.0, dtype=wp.vec2, device=self.device)
-        texture.sample_backward(self.image, self.uv, array(toward, float, self.device), *grads, **self.mode)
+        mips.sample_backward(self.image, self.uv, array(toward, float, self.device), *grads, **self.mode)
         return grads[0].numpy(), grads[1].numpy()
 
 

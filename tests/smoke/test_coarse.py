@@ -117,21 +117,6 @@ def test_sums_are_the_guiding_map(device: str):
     assert float((light - maps.light).abs().mean()) < 0.005 * float(maps.light.max())
 
 
-def test_emission_knows_no_nodes(device: str):
-    """Emission does not depend on the lattice, and is absent without a temperature."""
-    volume = plume(hot=True, device=device)
-    camera = _camera(volume)
-    rough, fine = (_planes(volume, camera, step=2.0, spacing=spacing, seed=2) for spacing in (12.0, 1.0))
-    assert torch.equal(rough[4:], fine[4:]) and not torch.equal(rough[:4], fine[:4])
-    emission = marches.PLANES.index("emission")
-    assert float(fine[emission].max()) > 0.05
-    cold = replace(volume, temperature=None)
-    assert _march(cold, camera).emission is None
-    assert torch.equal(_planes(cold, camera, step=2.0, seed=2)[4:emission], fine[4:emission])
-    clear = replace(volume, density=torch.zeros_like(volume.density))
-    assert float(_march(clear, camera, step=2.0).emission.max()) > float(fine[emission].max())
-
-
 def test_empty_bricks_change_nothing(device: str, monkeypatch):
     volume = plume(1, hot=True, device=device)
     volume = replace(volume, density=volume.density.half(), temperature=volume.temperature.half())

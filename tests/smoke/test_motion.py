@@ -56,22 +56,6 @@ def test_uniform_motion(device: str, way: tuple):
     assert error < 0.02 * still
 
 
-@pytest.mark.parametrize("thickness", [0.02, 0.3, 20.0])
-def test_hidden_smoke(device: str, thickness: float):
-    """Two slabs that move in opposite directions count by their visibility."""
-    density = np.zeros((16, 16, 16))
-    density[:, :, 2:6] = density[:, :, 10:14] = 1.0
-    volume = from_array(density, extinction=thickness, device=device)
-    velocity = np.zeros((16, 16, 16, 3))
-    velocity[..., :8, 0], velocity[..., 8:, 0] = 1.0, -1.0
-    moved = motion(volume, _velocity(velocity, device), facing(volume, size=12), reach=1.5, step=0.125)
-    before = 1 - np.exp(-4 * thickness)
-    behind = (1 - before) * before
-    expected = 1.5 * (behind - before) / (behind + before) / (1.1 * 16 / 12)
-    np.testing.assert_allclose(moved[0, 4:8, 4:8].cpu(), expected, rtol=0.01)
-    assert not moved[1].any()
-
-
 def test_against_a_loop(device: str):
     """An oblique view, air with other cells than the smoke, and a step that divides no length."""
     random = np.random.default_rng(5)

@@ -11,7 +11,7 @@ from builders.smoke_samples import view_of
 
 from wlm.smoke.camera import Camera
 from wlm.smoke.lightmaps import SixWay
-from wlm.smoke.march.six_way import bake, bake_coarse, guide
+from wlm.smoke.march.six_way import bake, bake_coarse
 from wlm.smoke.network.planes import (
     GUIDES,
     OPACITY_PLANE,
@@ -49,17 +49,6 @@ def test_span_is_of_the_ball_around_the_box_for_all_turns():
             position = volume.centre + 5 * np.array(way) / np.linalg.norm(way)
             camera = Camera.look_at(position, volume.centre, extent=1.0, height=4, width=4, perspective=perspective)
             assert np.allclose(span(volume, camera), (5 - radius, 5 + radius))
-
-
-def test_the_nearest_depth_is_one_and_guides_are_encoded_in_batches(device):
-    volume = plume(device=device)
-    camera = view_of(volume)
-    near, far = span(volume, camera)
-    encoded = encode_guide(guide(volume, camera, March(2.0)).maps, near, far)
-    at_ends = encode_guide(torch.tensor([0.0, 0.5, near + 1e-6])[:, None, None], near, far)
-    assert at_ends[2].item() == pytest.approx(1.0, abs=1e-4)
-    batch = encode_guide(torch.stack([guide(volume, camera, March(2.0)).maps] * 2), near, far)
-    assert torch.equal(batch[1], encoded)
 
 
 MARCH = March(2.5, threshold=0.05, seed=7)

@@ -463,7 +463,7 @@ def test_files_that_are_no_lightmaps(tmp_path):
 
 def test_the_scene_in_the_document(tmp_path):
     """The complete scene of the documentation loads and names every setting."""
-    page = (Path(__file__).resolve().parents[2] / "docs" / "fluid.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[2] / "docs" / "smoke-scenes.md").read_text(encoding="utf-8")
     block = page[page.index("    name: jet\n") : page.index("A row of `path`")]
     path = tmp_path / "scene.yaml"
     path.write_text("\n".join(line[4:] for line in block.splitlines()))

@@ -24,38 +24,6 @@ _TEXTURES = {
 }
 """Texture declarations of each method and of colour "mixed"; every model has those of "plain"."""
 
-# In assets/tiles.glsl coordinates are in texels, so that arithmetic within a tile stays exact.
-_BLOCKS = """\
-    if (steps.x >= {code}u) {{
-        // Its first block, and from {code} on its blocks less one, of {side} texels a side.
-        first *= {side}u;
-        steps = (steps - uvec2({code}u, {code}u)) * {side}u + uvec2({last}u, {last}u);
-        return wlm_atlas_blocks_at(vec2(first) + (x - vec2(tile)) * vec2(steps) + vec2(0.5, 0.5));
-    }}
-"""
-
-_WHOLE_BLOCKS = """\
-    // Both count blocks of {side} texels a side.
-    first *= {side}u;
-    steps = steps * {side}u + uvec2({last}u, {last}u);
-"""
-
-_CASCADE = """
-vec3 wlm_atlas(vec2 uv)
-{
-    // The triangle wave of eq. 8 is the identity on what 16 bits without a sign hold.
-    vec2 place = wlm_atlas_lut_at(uv * vec2(textureSize(WLM_ATLAS_LUT, 0)));
-    return wlm_atlas_colour_at(place * vec2(textureSize(WLM_ATLAS_COLOUR, 0)));
-}
-"""
-
-_PLAIN = """
-vec3 wlm_atlas(vec2 uv)
-{
-    return wlm_atlas_colour_at(uv * vec2(textureSize(WLM_ATLAS_COLOUR, 0)));
-}
-"""
-
 _WHAT = {
     "tiles": "each of its tiles is a rectangle of a small texture, found by a lookup texture",
     "cascade": "a lookup texture of coordinates leads into a small texture",
@@ -84,8 +52,10 @@ def _one_lightmap(model: AtlasModel) -> str:
                 __package__, "read.glsl", type=type, name=name, image=f"WLM_ATLAS_{name.upper()}", channels=channels
             )
     if method != "tiles":
-        return text + (_CASCADE if method == "cascade" else _PLAIN)
-    lines = _BLOCKS if mixed else "" if model.first_block_code else _WHOLE_BLOCKS
+        return text + filled(__package__, f"{method}.glsl")
+    blocks = "blocks" if mixed else "" if model.first_block_code else "whole_blocks"
+    sizes = {"code": FIRST_BLOCK_CODE, "side": BLOCK_SIDE, "last": BLOCK_SIDE - 1}
+    # Coordinates are in texels, so that arithmetic within a tile stays exact.
     return text + filled(
         __package__,
         "tiles.glsl",
@@ -94,7 +64,7 @@ def _one_lightmap(model: AtlasModel) -> str:
         tile=model.profile.tile,
         bits=SIDE_BITS,
         mask=(1 << SIDE_BITS) - 1,
-        blocks=lines.format(code=FIRST_BLOCK_CODE, side=BLOCK_SIDE, last=BLOCK_SIDE - 1),
+        blocks=filled(__package__, f"{blocks}.glsl", **sizes) if blocks else "",
     )
 
 

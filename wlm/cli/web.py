@@ -8,18 +8,19 @@ from rich.markup import escape
 
 from wlm.cli.console import check_output, quiet_warp, running, show, table
 from wlm.cli.options import Key, Original, SceneFile, Time, Up, output_option
+from wlm.errors import WlmError
 
 
 def web(
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE...",
-            help="A .wlm of lightmaps, meshes or probes; six-way lightmaps (.exr, one per frame, or a folder); or a "
-            "scene (.yaml).",
-        ),
-    ],
     output: Annotated[Path, output_option("PAGE.html", "The page to write.")],
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[FILE...]",
+            help="A .wlm of lightmaps, meshes or probes; six-way lightmaps (.exr, one per frame, or a folder); or a "
+            "scene (.yaml). Without a file, the page is a viewer that opens such files in the browser.",
+        ),
+    ] = None,
     mesh: SceneFile = None,
     original: Original = None,
     key: Key = None,
@@ -33,11 +34,16 @@ def web(
     """Write one HTML file that decodes and shows the light on the GPU of a browser. It works without a network."""
     check_output(output, ".html")
     quiet_warp()
-    from wlm.export import write_page
+    from wlm.export import write_page, write_viewer
 
-    options = {"mesh": mesh, "original": original, "key": key, "time": time, "hours": hours, "rate": rate, "up": up}
-    with running("page") as progress:
-        size = write_page(output, files, **options, progress=progress)
-    rows = table(str(files[0]), ["page", "bytes"])
+    options = {"mesh": mesh, "original": original, "key": key, "time": time}
+    if files:
+        with running("page") as progress:
+            size = write_page(output, files, **options, hours=hours, rate=rate, up=up, progress=progress)
+    elif given := [name for name, value in options.items() if value is not None]:
+        raise WlmError(f"--{given[0]}: has no meaning for a viewer: expected a file, found none")
+    else:
+        size = write_viewer(output)
+    rows = table(str(files[0]) if files else "viewer", ["page", "bytes"])
     rows.add_row(escape(str(output)), f"{size:,}")
     show(rows)

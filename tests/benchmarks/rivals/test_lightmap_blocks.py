@@ -58,12 +58,3 @@ def test_sizes_that_no_block_divides(name, shape):
     assert result.decoded.shape == image.shape
     np.testing.assert_allclose(result.decoded, image, atol=0.25)
     assert result.bytes * 8 >= BITS[name] * image[..., 0].size - 1e-9  # padding is paid for
-
-
-@pytest.mark.parametrize("profile", ["ldr", "hdr"])
-def test_a_reused_astc_context_forgets_the_last_lightmap(profile):
-    mask = np.ones((36, 36), bool)
-    first = encode_astc(smooth_light(36, 36), mask, profile=profile)
-    encode_astc(1000.0 * smooth_light(36, 36)[::-1], mask, profile=profile)
-    again = encode_astc(smooth_light(36, 36), mask, profile=profile)
-    np.testing.assert_array_equal(first.decoded, again.decoded)

@@ -1,13 +1,10 @@
 """Every kind of rival of lightmaps keeps the same contract: gaps, extreme values, errors and missing packages."""
 
-import sys
-
 import numpy as np
 import pytest
 from builders.lightmaps import smooth_light
 
 from benchmarks.rivals.lightmap import RIVALS
-from wlm.errors import WlmError
 
 # One of each kind with a package that it needs; other names differ in a number.
 PACKAGES = {
@@ -45,31 +42,3 @@ def test_texels_in_gaps_have_no_influence(name):
     np.testing.assert_array_equal(a, b)
     # The ring that a filtered read reaches is like the texels beside it.
     np.testing.assert_allclose(a[:, 7, 21:32], frames[:, 6, 21:32], atol=0.12 * frames.max())
-
-
-@pytest.mark.parametrize("name", PACKAGES)
-def test_empty_mask_black_constant_and_one_texel(name):
-    every = np.ones((16, 16), bool)
-    nothing = np.full((2, 16, 16, 3), np.nan, np.float32)
-    assert not decoded(name, nothing, ~every).any()
-    assert not decoded(name, np.zeros((2, 16, 16, 3)), every).any()
-    np.testing.assert_allclose(decoded(name, np.full((2, 16, 16, 3), 0.7), every), 0.7, rtol=0.01)
-    one = ~every
-    one[3, 4] = True
-    nothing[:, 3, 4] = [[3.0, 2.0, 1.0], [0.3, 0.2, 0.1]]
-    np.testing.assert_allclose(decoded(name, nothing, one)[:, 3, 4], nothing[:, 3, 4], rtol=0.03, atol=0.02)
-
-
-@pytest.mark.parametrize("name", PACKAGES)
-def test_bad_valid_texels_are_refused(name):
-    frames = hours(16, 16)
-    frames[1, 3, 3, 1] = np.nan
-    with pytest.raises(WlmError, match="NaN or infinite"):
-        decoded(name, frames, np.ones((16, 16), bool))
-
-
-@pytest.mark.parametrize(("name", "package"), PACKAGES.items())
-def test_a_missing_package_names_the_extra(name, package, monkeypatch):
-    monkeypatch.setitem(sys.modules, package, None)  # makes the import fail
-    with pytest.raises(WlmError, match=rf"{package} is missing.*wlm\[baselines\]"):
-        decoded(name, hours(16, 16), np.ones((16, 16), bool))

@@ -220,3 +220,12 @@ def test_the_command_writes_a_page_of_a_folder(tmp_path):
     assert result.exit_code == 0, result.output
     manifest, _ = parts(tmp_path / "page.html")
     assert manifest["kind"] == "atlas" and dict(manifest["figures"])["profile"] == "tiny"
+
+
+def test_the_command_without_files_writes_a_viewer(tmp_path):
+    said = CliRunner().invoke(app, ["web", "--time", "12", "-o", str(tmp_path / "viewer.html")])
+    assert said.exit_code and "--time: has no meaning for a viewer" in said.output
+    assert not (tmp_path / "viewer.html").exists()
+    result = CliRunner().invoke(app, ["web", "-o", str(tmp_path / "viewer.html")])
+    assert result.exit_code == 0, result.output
+    assert parts(tmp_path / "viewer.html")[0]["kind"] == "viewer"

@@ -13,10 +13,11 @@ from wlm.atlas import codec
 from wlm.atlas.model import BLOCK_SIDE, SIDE_BITS
 from wlm.atlas.shader import glsl
 from wlm.errors import WlmError
-from wlm.export.page.html import Page, pack_triangles
+from wlm.export.page.html import Page, compare_sizes, pack_triangles
 from wlm.formats.geometry import Geometry
 from wlm.formats.light import read_light
 from wlm.formats.shared_exponent import pack_rgb9e5
+from wlm.metrics import psnr_from_mse
 from wlm.system import load
 from wlm.texels import exposure, fill_gaps
 
@@ -64,6 +65,7 @@ def atlas_page(
         },
         **box,
     }
+    scores: list[tuple[str, str]] = []
     if original is not None:
         lightmap = read_light(original)[0][..., :3]
         if lightmap.shape[:2] != (height, width):
@@ -74,9 +76,14 @@ def atlas_page(
         arrays["original_0"] = pack_rgb9e5(fill_gaps(light, mesh.mask))
         arrays["mask"] = mesh.mask.astype(np.uint8) * 255
         manifest["reference"] = {"times": [0.0]}
+        error = float(np.square(model.decoder().lightmap() - light)[mesh.mask].mean(dtype=np.float64))
+        scores = [("PSNR of texels", f"{psnr_from_mse(error, float(np.ptp(light[mesh.mask]))):.2f} dB")]
+    stored = int(np.subtract(*codec.sizes(model)))
     figures = [
-        ("file without the mesh", f"{np.subtract(*codec.sizes(model)):,} bytes"),
-        ("size of textures", f"{100 * (1.0 - model.compression_ratio):.1f}% of half floats"),
+        ("file without the mesh", f"{stored:,} bytes"),
+        *compare_sizes(stored, 6 * width * height),
+        *scores,
+        ("textures on a GPU", f"{100 * (1.0 - model.compression_ratio):.1f}% of half floats"),
         ("lightmap", f"{width} × {height} texels"),
         ("colour texture", f"{texels.shape[1]} × {texels.shape[0]}, {_FORMATS[model.colour]}"),
         ("method", model.method),
@@ -85,5 +92,5 @@ def atlas_page(
     ]
     if model.colour == "mixed":
         rows, columns = model.block_texels.shape[1:3]
-        figures.insert(4, ("its blocks", f"{columns} × {rows}, BC6H"))
+        figures.insert(-4, ("its blocks", f"{columns} × {rows}, BC6H"))
     return Page("atlas", model.name, "A lightmap read through a table, on this GPU.", figures, manifest, arrays)

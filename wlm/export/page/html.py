@@ -93,6 +93,11 @@ def pack_triangles(geometry: Geometry, up: Literal["y", "z"]) -> tuple[dict[str,
     return {name: values for name, values in parts.items() if values is not None}, box
 
 
+def compare_sizes(stored: int, original: int, kind: str = "half floats") -> list[tuple[str, str]]:
+    """Returns rows of a page's table: the bytes of the original as numbers of a kind, and its ratio to those stored."""
+    return [(f"original as {kind}", f"{original:,} bytes"), ("ratio", f"{original / stored:.1f}×")]
+
+
 def asset(name: str) -> str:
     """Returns the text of a file of `assets`."""
     return (resources.files("wlm.export.page") / "assets" / name).read_text(encoding="utf-8").rstrip("\n")

@@ -14,7 +14,7 @@ import numpy as np
 from wlm.bundle import Bundle
 from wlm.errors import WlmError
 from wlm.export.engines.kit import filled
-from wlm.export.page.html import Page, pack_triangles
+from wlm.export.page.html import Page, compare_sizes, pack_triangles
 from wlm.formats.geometry import read_geometry
 from wlm.formats.shared_exponent import pack_rgb9e5
 from wlm.lightmap.bundle import sheet_bundle
@@ -85,6 +85,7 @@ def lightmap_page(
     kinds = {kind: sum(count[kind] for count in counts) for kind in counts[0]}
     figures = [
         ("file", f"{file_bytes:,} bytes"),
+        *compare_sizes(file_bytes, half_bytes(whole)),
         ("bits per texel and hour", f"{file_bytes * 8 / (model.width * model.height * len(times)):.3f}"),
         ("lightmaps", f"{model.width} × {model.height}, {len(times)} {'hour' if len(times) == 1 else 'hours'}"),
         ("tiles", ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)),
@@ -99,6 +100,11 @@ def lightmap_page(
         rest = f", without the file's {others} other sheet{'' if others == 1 else 's'}" if others else ""
         note += f" Shown is {sheet.plain.label}{rest}."
     return Page("lightmap", whole.name, note, figures, manifest, arrays, [filled("lightmap_table.js").rstrip("\n")])
+
+
+def half_bytes(whole: LightmapModel) -> int:
+    """Returns the bytes of the lightmaps of a model, of all sheets and times, as half floats."""
+    return sum(6 * own.width * own.height * len(own.times) for own in whole.sheets.values())
 
 
 def pack_groups(whole: LightmapModel, sheet: Sheet) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:

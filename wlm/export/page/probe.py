@@ -12,7 +12,7 @@ import numpy as np
 
 from wlm.bundle import filled
 from wlm.errors import WlmError
-from wlm.export.page.html import Page, pack_triangles
+from wlm.export.page.html import Page, compare_sizes, pack_triangles
 from wlm.formats.geometry import read_geometry
 from wlm.probe.bundle import bundle
 from wlm.probe.data import load
@@ -35,7 +35,8 @@ def probe_page(
     up: Literal["y", "z"] = "y",
 ) -> Page:
     """Makes the HTML page of a probe model, which shows spheres at the positions of the model or the original."""
-    model, file_bytes = load_model(paths[0], "probe").at(time), paths[0].stat().st_size
+    whole, file_bytes = load_model(paths[0], "probe"), paths[0].stat().st_size
+    model = whole.at(time)
     coefficients = sh_count(model.outputs)
     if coefficients is None:
         raise WlmError(
@@ -78,7 +79,7 @@ def probe_page(
     figures = [
         ("file", f"{file_bytes:,} bytes"),
         ("bits per probe", f"{file_bytes * 8 / model.probes:.1f}"),
-        ("size", f"{100 * file_bytes / (4 * model.outputs * model.probes):.2f}% of float32"),
+        *compare_sizes(file_bytes, 4 * model.outputs * model.probes * max(len(whole.times), 1), "float32"),
         ("live probes", f"{len(places):,} of {model.probes:,}"),
         *((name, str(value)) for name, value in model.content.facts().items()),
         ("profile", model.profile.name),

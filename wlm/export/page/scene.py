@@ -11,8 +11,8 @@ import numpy as np
 
 from wlm.errors import WlmError
 from wlm.export.engines.kit import filled
-from wlm.export.page.html import Page, asset
-from wlm.export.page.lightmap import pack_groups, pack_originals
+from wlm.export.page.html import Page, asset, compare_sizes
+from wlm.export.page.lightmap import half_bytes, pack_groups, pack_originals
 from wlm.export.page.smoke import pack_frames
 from wlm.formats.hours import DAY
 from wlm.formats.light import read_light
@@ -98,7 +98,10 @@ def _page(scene: Scene, progress: OnProgress | None) -> Page:
     step = -(-max(first.shape) // _FIRST_SIDE)
     arrays["first"] = pack_rgb9e5(first[step // 2 :: step, step // 2 :: step])
     manifest["scene"]["first"] = arrays["first"].shape[1::-1]
+    stored = scene.light.file_bytes()
     figures = [
+        ("file of lightmaps", f"{stored:,} bytes"),
+        *compare_sizes(stored, half_bytes(scene.light)),
         ("lightmaps", f"{model.width} × {model.height}, {len(manifest['times'])} hours"),
         ("light groups", ", ".join(groups)),
         ("triangles", f"{len(scene.mesh.triangle):,}"),

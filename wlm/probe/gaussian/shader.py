@@ -20,11 +20,6 @@ _REACHED = {
     "sphere": "dot(d, d) < cut * cut * longest * longest",
 }
 
-_MAGNITUDE = """
-        // The last output is the logarithm of the magnitude.
-        if (i + 4 > WLM_PROBE_OUTPUTS)
-            light *= exp(min(y[{place}], 0.0));"""
-
 _LONGEST = """
     float longest = max(s.x, max(s.y, s.z));"""
 
@@ -53,7 +48,7 @@ def probe_glsl(content: Gaussians) -> str:
         outputs=content.outputs,
         columns=content.columns,
         form=" and their magnitude" if content.relative else "",
-        magnitude=_MAGNITUDE.format(place=content.outputs % 4) if content.relative else "",
+        magnitude=filled(__package__, "magnitude.glsl", place=content.outputs % 4) if content.relative else "",
         clamp=clamp_glsl(content.outputs),
         reach="a sphere" if sphere else "an ellipsoid",
         channels=channels,

@@ -22,15 +22,6 @@ _ABOUT = {
     "reference": "live: indices of some live probes; values: their light.",
 }
 
-_BASIS = """\
-        number *= magnitude{unit};
-        for (int d = 0; d < WLM_PROBE_OUTPUTS; ++d) {{
-            uint word = WLM_PROBE_PROBES(basis + (k - cluster - 1) * {words} + d / {per_word});
-            values[d] += number * {number};
-        }}"""
-
-_UNIT = "        values[k - 1] = magnitude * number;"
-
 _KINDS = {
     "int8": {"per_word": 4, "unit": " / 127.0", "number": "float(int(word << uint(24 - d % 4 * 8)) >> 24)"},
     "float16": {"per_word": 2, "unit": "", "number": "(d % 2 == 0 ? unpackHalf2x16(word).x : unpackHalf2x16(word).y)"},
@@ -85,7 +76,7 @@ def component_glsl(outputs: int, kind: str) -> str:
         group_words=GROUP // 32,
         directions=f"{form['per_word']} {kind} in a word, from the lowest bits" if kind else "unit vectors",
         clamp=clamp_glsl(outputs),
-        body=_BASIS.format(words=words, **form) if kind else _UNIT,
+        body=filled(__package__, "basis.glsl" if kind else "unit.glsl", words=words, **form),
     )
     coefficients = sh_count(outputs)
     if coefficients is None:

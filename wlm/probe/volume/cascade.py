@@ -1,11 +1,11 @@
 """The cascaded lighting volume: nested grids of blocks around the viewer, filled from the probes as the viewer moves.
 
-It implements gaussian-probe-compression, section 3.4; docs/probe.md lists the departures. Blocks are stored in the rows
-of one array, the pool, which is also a cache: a block that left its window stays until its row is needed. A block
-without a probe near it is never decoded, takes no memory and is missing when light is read. Where light changes over
-the day, blocks of another hour are decoded again. A window covers no more
-blocks than the scene has along each axis, and stays on the scene. Light is read from the finest level that has a block
-there, as `wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights` describes the light of a block.
+It implements gaussian-probe-compression, section 3.4; docs/probe-volume.md lists the departures. Blocks are stored in
+the rows of one array, the pool, which is also a cache: a block that left its window stays until its row is needed. A
+block without a probe near it is never decoded, takes no memory and is missing when light is read. Where light changes
+over the day, blocks of another hour are decoded again. A window covers no more blocks than the scene has along each
+axis, and stays on the scene. Light is read from the finest level that has a block there, as
+`wlm_kernels.probe.volume.read` describes; `wlm_kernels.probe.volume_weights` describes the light of a block.
 
 Everything except the windows' origins is computed on the device in launches of fixed sizes: on CUDA a frame is one
 CUDA graph.

@@ -5,14 +5,10 @@ class AtlasPage {
     const {manifest} = page, {gl} = graphics, [width, height] = manifest.atlas.colour;
     this.graphics = graphics;
     this.manifest = manifest;
-    const half = [gl.RGB16F, gl.RGB, gl.HALF_FLOAT];
-    this.textures = {
-      wlm_atlas_colour: graphics.plain(width, height, half, page.array('colour', Uint16Array), gl.LINEAR),
-    };
-    if (page.has('blocks')) {
-      const size = manifest.atlas.blocks;
-      this.textures.wlm_atlas_blocks = graphics.plain(...size, half, page.array('blocks', Uint16Array), gl.LINEAR);
-    }
+    const {forms = {}} = manifest.atlas;
+    const upload = (name, size) => graphics[forms[name] ?? 'halves'](...size, (Type) => page.array(name, Type), gl.LINEAR);
+    this.textures = {wlm_atlas_colour: upload('colour', [width, height])};
+    if (page.has('blocks')) this.textures.wlm_atlas_blocks = upload('blocks', manifest.atlas.blocks);
     if (page.has('lut')) {
       const [across, down] = manifest.atlas.lut, tiles = manifest.atlas.method === 'tiles';
       const lut = this.lut = page.array('lut', Uint16Array);
@@ -28,6 +24,7 @@ class AtlasPage {
     const tell = (...texel) => this.#tell(...texel);
     this.surface = new Surface(graphics, page, this.source, this.display, panel, changed, tell);
     this.originals = new Originals(graphics, page);
+    this.places = page.array(page.has('coordinate') ? 'coordinate' : 'uv', Float32Array);
   }
 
   draw() {
@@ -53,6 +50,13 @@ class AtlasPage {
     const [wide, high] = sizes.map((size) => (blocks ? side * (size - code + 1) : size + 1));
     const [left, top] = places.map((place) => (blocks ? side * place : place));
     return `tile ${x}, ${y}: ${wide} × ${high} texels${blocks ? ' of blocks' : ''} at ${left}, ${top}`;
+  }
+
+  // Light of up to 4,096 vertices, for the exposure.
+  async brightness() {
+    const count = this.places.length / 2, step = Math.ceil(count / 4096);
+    const chosen = Array.from({length: Math.ceil(count / step)}, (_, i) => 2 * i * step).flatMap((at) => [this.places[at], this.places[at + 1]]);
+    return this.#light(chosen).filter((_, i) => i % 4 < 3);
   }
 
   // For scripts: RGBA light at coordinates [N, 2].

@@ -10,9 +10,11 @@ function explainCamera(panel, drag, reset) {
   panel.explain('drag', drag);
   if (drag !== 'move') panel.explain('shift + drag', 'move');
   panel.explain('wheel, two fingers', 'zoom, move');
+  panel.explain('shift + arrows, page up, page down', 'the same by keys, once the picture has the focus');
   panel.key('r', 'R, double-click', 'begin again', reset);
 }
 
+const STEP = 30;  // pixels that an arrow key moves the pointer, as it were
 const FOCAL = 2.4;  // of the perspective, in halves of the picture's height
 const FILLED = 0.93;  // of the picture, at first
 
@@ -34,6 +36,7 @@ class Camera {
       if (this.active) this.#zoom(Math.exp(event.deltaY * 0.001));
     }, {passive: false});
     canvas.addEventListener('dblclick', () => this.reset());
+    canvas.addEventListener('keydown', (event) => this.#key(event));
     // The right button moves the view, too.
     canvas.addEventListener('contextmenu', (event) => event.preventDefault());
     this.started = true;
@@ -67,12 +70,27 @@ class Camera {
       this.#zoom(span(before) / span(now));
     } else if (this.still && !event.shiftKey) {
       // A single touch has another use.
-    } else if (this.flat || event.shiftKey || event.buttons & 6) this.#pan(dx, dy);
+    } else this.#drag(dx, dy, event.shiftKey || event.buttons & 6);
+    this.pointers.set(event.pointerId, now);
+    this.changed();
+  }
+
+  // Moves or turns the view by pixels.
+  #drag(dx, dy, moves) {
+    if (this.flat || moves) this.#pan(dx, dy);
     else {
       this.yaw -= dx * 0.006;
       this.pitch = Math.min(Math.max(this.pitch + dy * 0.006, -1.55), 1.55);
     }
-    this.pointers.set(event.pointerId, now);
+  }
+
+  #key(event) {
+    const turn = {ArrowLeft: [STEP, 0], ArrowRight: [-STEP, 0], ArrowUp: [0, STEP], ArrowDown: [0, -STEP]}[event.key];
+    const zoom = {PageUp: 1 / 1.1, PageDown: 1.1}[event.key];
+    if (!this.active || !(turn && event.shiftKey || zoom)) return;
+    event.preventDefault();
+    if (zoom) this.#zoom(zoom);
+    else this.#drag(...turn, false);
     this.changed();
   }
 

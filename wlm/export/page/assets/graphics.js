@@ -25,6 +25,12 @@ class Graphics {
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
   }
 
+  // The colour of the page, which follows the browser's choice of light or dark.
+  get paper() {
+    const text = getComputedStyle(document.body).backgroundColor;
+    return text.match(/[\d.]+/g).slice(0, 3).map((x) => x / 255);
+  }
+
   program(vertex, fragment) {
     const {gl} = this, program = gl.createProgram();
     for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -83,6 +89,33 @@ class Graphics {
     const {gl} = this, result = this.#texture(gl.TEXTURE_2D, filter, wraps);
     gl.texImage2D(gl.TEXTURE_2D, 0, form[0], width, height, 0, form[1], form[2], values);
     return {...result, width, height};
+  }
+
+  // Make textures of three half floats, of nine bits and a shared exponent, or of BC6H blocks; `read` gives the array.
+  halves(width, height, read, filter) {
+    const {gl} = this;
+    return this.plain(width, height, [gl.RGB16F, gl.RGB, gl.HALF_FLOAT], read(Uint16Array), filter);
+  }
+
+  exponents(width, height, read, filter) { return this.plain(width, height, this.shared(), read(Uint32Array), filter); }
+
+  hdrBlocks(width, height, read, filter) {
+    const {gl} = this, form = this.bptc?.COMPRESSED_RGB_BPTC_UNSIGNED_FLOAT_EXT;
+    if (!form) throw new Error('this browser can not show BC6H textures');
+    // Blocks are uploaded whole, and copied: a size in texels that are no whole blocks is not allowed.
+    const [across, down] = [width, height].map((side) => 4 * Math.ceil(side / 4)), blocks = this.#texture(gl.TEXTURE_2D, gl.NEAREST);
+    gl.compressedTexImage2D(gl.TEXTURE_2D, 0, form, across, down, 0, read(Uint8Array));
+    const copied = this.target(width, height, this.half(), filter);
+    this.copier ??= this.program(WHOLE, `${HEAD}
+uniform sampler2D u_blocks;
+out vec4 texel;
+void main() { texel = texelFetch(u_blocks, ivec2(gl_FragCoord.xy), 0); }`);
+    gl.viewport(0, 0, width, height);
+    gl.disable(gl.DEPTH_TEST);
+    this.use(this.copier, {u_blocks: blocks});
+    this.draw(3);
+    this.discard(blocks);
+    return copied;
   }
 
   // Makes a texture of BC7 blocks, which are unpacked if the browser does not support them.
@@ -196,7 +229,7 @@ class Graphics {
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, width, height);
-    gl.clearColor(0.106, 0.106, 0.122, 1);
+    gl.clearColor(...this.paper, 1);
     gl.enable(gl.DEPTH_TEST);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     return {width, height, ratio};

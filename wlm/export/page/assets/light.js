@@ -59,8 +59,9 @@ class Display {
   constructor(page, panel, changed) {
     this.values = {u_exposure: page.manifest.exposure, u_tone: page.manifest.tone ?? 0, u_view: 0, u_wipe: 0, u_gain: 8};
     this.share = 0.5;
+    this.page = page;
     const stops = (value) => `${value > 0 ? '+' : ''}${value.toFixed(1)} EV`;
-    panel.slider('exposure', {
+    this.stop = panel.slider('exposure', {
       min: -8, max: 8, step: 0.1, value: 0, text: stops, keys: ['[', ']'], by: 0.5,
       changed: (value) => { this.values.u_exposure = page.manifest.exposure * 2 ** value; changed(); },
     });
@@ -90,6 +91,12 @@ class Display {
       place();
       changed();
     };
+  }
+
+  // Sets the exposure that the slider starts from.
+  expose(factor) {
+    this.page.manifest.exposure = factor;
+    this.stop(0);
   }
 
   // Whether the original is visible.

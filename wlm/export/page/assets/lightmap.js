@@ -152,7 +152,7 @@ class LightmapPage {
     const {manifest} = page, {gl} = graphics, {times, period} = manifest;
     Object.assign(this, {graphics, page, manifest, panel, changed, times, period});
     const texture = () => graphics.target(manifest.width, manifest.height, graphics.half(), gl.LINEAR);
-    const next = texture(), valid = this.#mask(page.array('valid', Uint8Array));
+    const next = texture(), valid = this.valid = this.#mask(page.array('valid', Uint8Array));
     this.groups = manifest.groups.map((_, number) => new LightGroup(graphics, page, number, next, valid));
     this.program = graphics.program(WHOLE, HEAD + MAIN_ADD);
     // The sum of the groups.
@@ -181,8 +181,8 @@ class LightmapPage {
   }
 
   makeSurface() {
-    const {graphics, page, display, panel, changed} = this;
-    return new Surface(graphics, page, LIGHT, display, panel, changed, (column, row) => this.#tell(column, row));
+    const {graphics, page, display, panel, changed, valid} = this;
+    return new Surface(graphics, page, LIGHT, display, panel, changed, (column, row) => this.#tell(column, row), valid);
   }
 
   // The controls of a group: its weight, and its colour as a screen shows it.
@@ -314,6 +314,12 @@ class LightmapPage {
       decoded: [red, green, blue],
       original: originals.times[index] === this.shown ? originals.texel(index, column, row) : undefined,
     };
+  }
+
+  // Light of the valid texels at the first hour, for the exposure.
+  async brightness() {
+    const texels = await this.read(this.time), step = 4 * Math.ceil(texels.length / (1 << 20));
+    return texels.filter((_, i) => i % step < 3);
   }
 
   // For scripts: RGBA radiance of the whole map at an hour, row by row.

@@ -16,11 +16,12 @@ function fail(error) {
   message.hidden = false;
 }
 
-async function start() {
-  const page = await readContent(), {manifest} = page;
+// Shows a page until `signal`, if given, is aborted.
+async function start(page, signal) {
+  const {manifest} = page;
   const graphics = new Graphics(document.getElementById('view'));
   graphics.black = graphics.plain(1, 1, graphics.shared(), new Uint32Array(1), graphics.gl.NEAREST);
-  const panel = new Panel(document.getElementById('panel'), manifest.title, manifest.note);
+  const panel = new Panel(document.getElementById('panel'), manifest.title, manifest.note, signal);
   let dirty = true, last = performance.now(), drawn = -Infinity;
   const changed = () => { dirty = true; };
   const kind = new KINDS[manifest.kind](graphics, page, panel, changed);
@@ -28,6 +29,11 @@ async function start() {
   panel.key('h', 'H', 'fold this panel', panel.fold);
   document.getElementById('message').hidden = true;
   const loop = (time) => {
+    if (signal?.aborted) {
+      // Browsers keep few contexts.
+      graphics.gl.getExtension('WEBGL_lose_context')?.loseContext();
+      return;
+    }
     const elapsed = time - last;
     last = time;
     try {
@@ -46,10 +52,12 @@ async function start() {
     }
     requestAnimationFrame(loop);
   };
-  window.addEventListener('resize', changed);
+  window.addEventListener('resize', changed, {signal});
+  matchMedia('(prefers-color-scheme: light)').addEventListener('change', changed, {signal});
   requestAnimationFrame(loop);
-  return {kind, manifest, graphics};
+  return {kind, page, manifest, graphics};
 }
 
-// A script awaits `wlm` and calls `kind.read(...)`.
-window.wlm = start().catch((error) => { fail(error); throw error; });
+// A script awaits `wlm` and calls `kind.read(...)`; of the viewer it calls `open(files)`, which gives the same.
+const begin = async () => typeof openViewer === 'undefined' ? start(await readContent()) : openViewer();
+window.wlm = begin().catch((error) => { fail(error); throw error; });

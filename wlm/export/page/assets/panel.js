@@ -1,7 +1,7 @@
 // The panel: sliders, choices, a table of figures, and keyboard actions.
 
 class Panel {
-  constructor(root, title, note) {
+  constructor(root, title, note, signal) {
     this.root = root;
     this.rows = new Map();
     this.keys = new Map();    // by key: what it does
@@ -27,7 +27,8 @@ class Panel {
     this.#add(help, 'summary').textContent = 'mouse, touch and keys';
     this.help = this.#add(help, 'table');
     window.addEventListener('keydown', (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      const view = event.shiftKey && event.key.startsWith('Arrow');  // they turn the camera
+      if (view || event.ctrlKey || event.metaKey || event.altKey) return;
       const key = event.key === '=' ? '+' : event.key.toLowerCase(), {target} = event;
       // Buttons use the space bar themselves, and sliders the arrow keys.
       if (target.matches?.('button, summary') && key === ' ') return;
@@ -36,7 +37,7 @@ class Panel {
       if (!action) return;
       event.preventDefault();
       action();
-    });
+    }, {signal});
     this.fold = () => fold.onclick();
   }
 

@@ -112,6 +112,11 @@ in vec3 v_original;
 out vec4 colour;
 ${DISPLAY}
 void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
+    this.ball = 1;
+    panel.slider('ball size', {
+      min: 0.1, max: 2, step: 0.05, value: 1, text: (value) => `${value.toFixed(2)}×`,
+      changed: (value) => { this.ball = value; changed(); },
+    });
     this.display = new Display(page, panel, changed);
     this.camera = new Camera(graphics.canvas, manifest.low, manifest.high, {up: manifest.up, changed});
     explainCamera(panel, 'turn the camera', () => this.camera.reset());
@@ -200,11 +205,28 @@ void main() { colour = vec4(wlm_shown(v_decoded, v_original), 1.0); }`);
       if (this.hidden === i + 1) continue;
       const tables = Object.fromEntries(group.places.tables.map((table, c) => [`u_table_${c}`, table]));
       graphics.use(this.drawer, {
-        ...tables, ...this.display.uniforms(width), u_camera: this.camera.matrix(), u_radius: group.radius,
+        ...tables, ...this.display.uniforms(width), u_camera: this.camera.matrix(), u_radius: this.ball * group.radius,
         u_centres: group.places.texture, u_original: group.original,
       });
       graphics.drawGeometry(group.geometry, group.instances, this.oneSided && group.radius === 0);
     }
+  }
+
+  // Light of the balls from 32 sides, for the exposure.
+  async brightness() {
+    const numbers = await this.read(), count = this.groups[0].places.count, light = new Float32Array(96 * count);
+    for (let side = 0; side < 32; ++side) {
+      const z = 1 - (2 * side + 1) / 32, turn = side * Math.PI * (3 - Math.sqrt(5)), r = Math.sqrt(1 - z * z);
+      const [x, y] = [r * Math.cos(turn), r * Math.sin(turn)];
+      const weights = [
+        0.2820948, 0.325735 * y, 0.325735 * z, 0.325735 * x, 0.2731371 * x * y, 0.2731371 * y * z,
+        0.0788479 * (3 * z * z - 1), 0.2731371 * x * z, 0.1365686 * (x * x - y * y),
+      ];
+      for (let i = 0; i < count; ++i) {
+        for (const k of [0, 1, 2]) light[96 * i + 3 * side + k] = weights.reduce((sum, w, c) => sum + w * numbers[27 * i + 3 * c + k], 0);
+      }
+    }
+    return light;
   }
 
   // For scripts: the 27 numbers of each probe; for group 1 those of the mesh's vertices.

@@ -45,16 +45,20 @@ void main()
 class SmokePage {
   constructor(graphics, page, panel, changed) {
     const {manifest} = page, {gl} = graphics, {frames, planes} = manifest.smoke;
-    Object.assign(this, {graphics, manifest, frame: 0, plane: 0, light: 1, glow: 1, toward: [0.6, 0.5, 0.62]});
+    Object.assign(this, {graphics, manifest, plane: 0, light: 1, glow: 1, toward: [0.6, 0.5, 0.62]});
     const {width, height} = manifest, form = [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
     const texture = (name) => graphics.plain(width, height, form, page.array(name, Uint8Array), gl.LINEAR);
     this.frames = Array.from({length: frames}, (_, i) => ({
       u_first: texture(`first_${i}`), u_second: texture(`second_${i}`), u_most: manifest.smoke.most[i],
     }));
+    // The page opens on the frame with most smoke.
+    const opaque = (i) => page.array(`second_${i}`, Uint8Array).reduce((sum, code, k) => sum + (k % 4 === 2 ? code : 0), 0);
+    const amounts = Array.from({length: frames}, (_, i) => opaque(i));
+    this.frame = amounts.indexOf(Math.max(...amounts));
     this.program = graphics.program(BILLBOARD, SHADE);
     if (frames > 1) {
       this.setFrame = panel.slider('frame', {
-        min: 0, max: frames - 1, step: 1, value: 0, text: (value) => `${value + 1}/${frames}`,
+        min: 0, max: frames - 1, step: 1, value: this.frame, text: (value) => `${value + 1}/${frames}`,
         keys: ['arrowleft', 'arrowright'], next: (value, direction) => (value + direction + frames) % frames,
         changed: (value) => { this.frame = value; changed(); },
       });

@@ -16,9 +16,10 @@ void main()
     gl_Position = u_camera * vec4(u_unwrapped ? vec3(a_uv.x * u_aspect, -a_uv.y, 0.0) : a_position, 1.0);
 }`;
 
-// A page passes `source`, GLSL with vec3 wlm_light(), and `tell`, as for `Reading`.
+// A page passes `source`, GLSL with vec3 wlm_light(), and `tell`, as for `Reading`; `mask` is a texture of the texels in
+// charts, if the page has no array of that name.
 class Surface {
-  constructor(graphics, page, source, display, panel, changed, tell) {
+  constructor(graphics, page, source, display, panel, changed, tell, mask) {
     const {manifest} = page;
     Object.assign(this, {graphics, display, changed, aspect: manifest.width / manifest.height});
     this.program = graphics.program(SURFACE, `${HEAD}
@@ -26,18 +27,19 @@ in vec2 v_uv;
 in vec2 v_coordinate;
 uniform sampler2D u_original, u_mask;
 uniform bool u_unwrapped;
+uniform vec3 u_paper;
 out vec4 colour;
 ${source}
 ${DISPLAY}
 void main()
 {
     colour = vec4(wlm_shown(wlm_light(), texture(u_original, v_uv).rgb), 1.0);
-    // Texels outside charts are not visible on the mesh, and are in no score.
-    if (u_view == ${VIEWS.indexOf('error')} && u_unwrapped && texture(u_mask, v_uv).r == 0.0) colour.rgb = vec3(0.3);
+    // Texels outside charts are not visible on the mesh, and are in no score: there the page is seen.
+    if (u_unwrapped && texture(u_mask, v_uv).r == 0.0) colour.rgb = u_view == ${VIEWS.indexOf('error')} ? vec3(0.3) : u_paper;
 }`);
-    const [width, height] = page.has('mask') ? [manifest.width, manifest.height] : [1, 1], {gl} = graphics;
-    const mask = page.has('mask') ? page.array('mask', Uint8Array) : new Uint8Array([255]);
-    this.mask = graphics.plain(width, height, [gl.R8, gl.RED, gl.UNSIGNED_BYTE], mask, gl.NEAREST);
+    const {gl} = graphics, bytes = [gl.R8, gl.RED, gl.UNSIGNED_BYTE], {width, height} = manifest;
+    this.mask = page.has('mask') ? graphics.plain(width, height, bytes, page.array('mask', Uint8Array), gl.NEAREST)
+      : mask ?? graphics.plain(1, 1, bytes, new Uint8Array([255]), gl.NEAREST);
     const uv = page.has('uv') ? page.array('uv', Float32Array) : new Float32Array([0, 0, 1, 0, 1, 1, 0, 1]);
     const indices = page.has('triangles') ? page.array('triangles', Uint32Array) : new Uint32Array([0, 1, 2, 0, 2, 3]);
     const position = page.has('position') ? page.array('position', Float32Array) : new Float32Array(uv.length * 1.5);
@@ -85,7 +87,7 @@ void main()
   draw(uniforms, original) {
     const {graphics} = this, {width} = graphics.begin();
     graphics.use(this.program, {
-      ...uniforms, ...this.display.uniforms(width), ...this.shape(), u_mask: this.mask,
+      ...uniforms, ...this.display.uniforms(width), ...this.shape(), u_mask: this.mask, u_paper: graphics.paper,
       u_original: original ?? graphics.black,
     });
     graphics.drawGeometry(this.geometry, 1, this.culled);

@@ -133,8 +133,8 @@ void wlm_probe_decode(float f[WLM_PROBE_LATENT], vec3 x, out float values[WLM_PR
         vec4 y = wlm_probe_outputs(a, WLM_PROBE_HIDDEN_FOURS, at);
         at += 1 + 4 * WLM_PROBE_HIDDEN_FOURS;
         for (int c = 0; c < 4 && i + c < WLM_PROBE_OUTPUTS; ++c)
-            values[i + c] = y[c];@magnitude@
-    }
+            values[i + c] = y[c];
+@magnitude@    }
     for (int i = 0; i < WLM_PROBE_OUTPUTS; ++i)
         values[i] *= light;@clamp@
 }

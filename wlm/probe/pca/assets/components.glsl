@@ -75,6 +75,5 @@ void wlm_probe_values(int probe, out float values[WLM_PROBE_OUTPUTS])
             magnitude = exp(number);
             continue;
         }
-@body@
-    }@clamp@
+@body@    }@clamp@
 }

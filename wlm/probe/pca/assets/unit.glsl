@@ -1,0 +1,1 @@
+        values[k - 1] = magnitude * number;
