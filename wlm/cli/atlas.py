@@ -84,21 +84,17 @@ def compress(
     output: Annotated[Path, opt.output_option("OUT.wlm", "The file to write.")],
     settings: dict[str, Any],
     options: LightOptions,
+    work: opt.FitOptions,
     lightmaps: _Lights = None,
     profile: opt.Profile = "standard",
-    seed: opt.Seed = 0,
-    device: opt.Device = "cpu",
-    resume: opt.Resume = False,
-    checkpoint_every: opt.CheckpointEvery = 30.0,
 ) -> None:
     """Compress the lightmaps of a mesh or a scene, in one state or several, into one file together with the triangles.
 
     Finished stages are saved in OUT.wlm.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with
     --resume to continue exactly.
     """
-    work = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
     load = lambda: options.load(mesh, lightmaps)  # noqa: E731
-    _, model, facts = models.fit("atlas", load, output, profile, settings, **work)
+    _, model, facts = models.fit("atlas", load, output, profile, settings, work)
     console.show_facts(model.name, facts | _facts(model))
     console.note_warnings(model.report.get("lost light", ()))
 

@@ -103,32 +103,15 @@ def compress(
     output: Annotated[Path, opt.output_option("OUT.wlm", "The file to write.")],
     settings: dict[str, Any],
     options: SetOptions,
+    work: opt.FitOptions,
     profile: opt.Profile = "M",
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Processes that fit tiles in parallel, with the same result; default one per two cores, one on a GPU.",
-        ),
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(metavar="ADDRESS", help='Fit on a Ray cluster (extra `cluster`): ray://HOST:10001, or "auto".'),
-    ] = None,
-    seed: opt.Seed = 0,
-    device: opt.Device = "cpu",
-    resume: opt.Resume = False,
-    checkpoint_every: opt.CheckpointEvery = 30.0,
 ) -> None:
     """Compress lightmaps over time into one file.
 
     The fit is saved in OUT.wlm.partial from time to time and on Ctrl-C or SIGTERM; repeat the command with --resume to
     continue exactly. Lightmaps of more than 1 GiB are kept in a temporary file (TMPDIR) during the fit.
     """
-    work = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every}
-    work |= {"workers": workers, "cluster": cluster}
-    _, model, facts = models.fit("lightmap", lambda: options.load(set_path), output, profile, settings, **work)
+    _, model, facts = models.fit("lightmap", lambda: options.load(set_path), output, profile, settings, work)
     console.show_facts(model.name, facts | _facts(model))
     _show_sheets(model)
     console.note_warnings(model.warnings)

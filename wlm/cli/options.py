@@ -3,7 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -96,19 +96,50 @@ def output_option(metavar: str, help_text: str) -> Any:
     return typer.Option("--output", "-o", metavar=metavar, help=help_text)
 
 
+@dataclass(frozen=True)
+class PlaceOptions:
+    """Options that state where long work runs, see `wlm.dispatch.Place`."""
+
+    device: Device = "cpu"
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Processes that share the work; with --device cuda on all GPUs of this machine."
+        ),
+    ] = None
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", help='Share the work on a Ray cluster (extra `cluster`): ray://HOST:10001, or "auto".'
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
+class FitOptions(PlaceOptions):
+    """Options of a fit."""
+
+    seed: Seed = 0
+    resume: Resume = False
+    checkpoint_every: CheckpointEvery = 30.0
+
+
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command an option for each field of a dataclass, the type of the command's parameter `options`."""
+    """Gives a command an option for each field of the dataclasses that are types of its parameters."""
     signature = inspect.signature(command)
-    kind = signature.parameters["options"].annotation
-    names = [field.name for field in fields(kind)]
+    kinds = {name: each.annotation for name, each in signature.parameters.items() if is_dataclass(each.annotation)}
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
-        command(options=kind(**{name: values.pop(name) for name in names}), **values)
+        made = {
+            name: kind(**{each.name: values.pop(each.name) for each in fields(kind)}) for name, kind in kinds.items()
+        }
+        command(**made, **values)
 
-    own = [parameter for name, parameter in signature.parameters.items() if name != "options"]
+    own = [parameter for name, parameter in signature.parameters.items() if name not in kinds]
     shared = [
         inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type)
+        for kind in kinds.values()
         for field in fields(kind)
     ]
     # typer reads both.

@@ -48,11 +48,13 @@ _At = Annotated[
 
 
 @with_settings("wlm.probe:Profile")
+@opt.with_options
 @console.exclusive
 def compress(
     probes: _Probes,
     output: Annotated[Path, opt.output_option("OUT.wlm", "The file to write.")],
     settings: dict[str, Any],
+    work: opt.FitOptions,
     profile: opt.Profile = "standard",
     positions: Annotated[
         bool, typer.Option("--positions", help="Also store the positions of the probes, 16 bits per axis.")
@@ -62,10 +64,6 @@ def compress(
     convention: _Convention = None,
     order: _Order = None,
     axes: _Axes = None,
-    seed: opt.Seed = 0,
-    device: opt.Device = "cpu",
-    resume: opt.Resume = False,
-    checkpoint_every: opt.CheckpointEvery = 30.0,
 ) -> None:
     """Compress light probes into one file: Gaussians and a small network, or principal components for small sets.
 
@@ -83,8 +81,7 @@ def compress(
     from wlm.probe.hours import listed_times
 
     inputs = {} if mesh is None else {"geometry": read_geometry(mesh, with_uv=False)}
-    options = {"seed": seed, "device": device, "resume": resume, "every": checkpoint_every, "positions": positions}
-    data, model, facts = models.fit("probe", load, output, profile, settings, inputs=inputs, **options)
+    data, model, facts = models.fit("probe", load, output, profile, settings, work, inputs, positions=positions)
     size = facts["bytes on disk"]
     facts |= {
         "share of the probes as float32": f"{size / data.float_bytes:.2%}",
