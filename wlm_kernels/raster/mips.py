@@ -184,7 +184,7 @@ def sample_backward(
     Args:
         texture, uv, size, levels, level, filter, boundary: Arguments of `sample`.
         grad_out: float [B N, C], gradient of the result.
-        grad_texture: float [B R, W, C * K], to which the gradient is added; of shape [0, 0, 0] if it is not wanted. Each
+        grad_texture: float [B R, W, C * K], to which the gradient is added; of shape [0, 0, 0] if it is not wanted. A
             channel has K sums, which the caller adds up: sample i adds to number i % K. With K = 32 the threads of a
             warp do not wait for one another where many samples read few texels.
         grad_uv: vec2 [B N], written; of shape [0] if it is not wanted.
